@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: MIT
+"""tsfusion: depth sensors in, one exact 3-D map out.
+
+Names are loaded on first use, so that a scanner which needs only `Client` and `Keyframe` never
+imports Taichi.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tsfusion.client import Client as Client
+    from tsfusion.config import Config as Config
+    from tsfusion.config import VolumeConfig as VolumeConfig
+    from tsfusion.datasets import open_dataset as open_dataset
+    from tsfusion.errors import TsfusionError as TsfusionError
+    from tsfusion.keyframe import Intrinsics as Intrinsics
+    from tsfusion.keyframe import Keyframe as Keyframe
+    from tsfusion.mesh import Mesh as Mesh
+    from tsfusion.volume import Volume as Volume
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Client": "client",
+    "Config": "config",
+    "Intrinsics": "keyframe",
+    "Keyframe": "keyframe",
+    "Mesh": "mesh",
+    "TsfusionError": "errors",
+    "Volume": "volume",
+    "VolumeConfig": "config",
+    "open_dataset": "datasets",
+}
+__all__ = ["__version__", *_HOME]  # noqa: PLE0604
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(import_module(f"tsfusion.{_HOME[name]}"), name)
+    raise AttributeError(f"module 'tsfusion' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

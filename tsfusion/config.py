@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: MIT
+"""Every setting, its default, its unit and its bounds. Nothing else in the package holds a default.
+
+A TOML file has one table a struct (`[volume]`, `[server]`, `[client]`); unknown keys are errors.
+"""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct
+
+from tsfusion.errors import InvalidConfig
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:  # pragma: no cover
+    import tomli as tomllib
+
+Regularizer = Literal["off", "paper", "ray"]
+SensorName = Literal["kinect", "tof", "realsense", "stereo", "lidar", "scanner"]
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+Port = Annotated[int, Meta(ge=0, le=65535)]
+
+
+class SensorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Depth noise of a sensor, and what follows from it.
+
+    σ(z) = sigma_floor + sigma_slope · (z − sigma_z0)², metres; z = depth along the optical axis
+    (ray length for points). With a known baseline·fx, `disparity_sigma` px replaces the slope:
+    σ(z) = sigma_floor + disparity_sigma · z² / baseline_fx.
+    The support half-width of a ray is `3 σ(z)`, held between `min_support` and `max_support` voxels.
+    """
+
+    sigma_floor: NonNegative
+    sigma_slope: NonNegative = 0.0
+    sigma_z0: float = 0.0
+    disparity_sigma: NonNegative = 0.0
+    min_range: NonNegative = 0.1
+    max_range: Positive = 10.0
+    min_support: Annotated[float, Meta(ge=1, le=16)] = 3.0
+    max_support: Annotated[float, Meta(ge=1, le=16)] = 6.0
+    regularizer: Regularizer = "off"
+    smoothness: NonNegative = 1.0
+    feedback: bool = False
+    min_weight: NonNegative = 2.0
+
+
+# Kinect v1: Nguyen, Izadi and Lovell 2012 (axial noise). Stereo: Δz = z² Δd / (b·f).
+SENSORS: dict[str, SensorModel] = {
+    "kinect": SensorModel(sigma_floor=0.0012, sigma_slope=0.0019, sigma_z0=0.4, max_range=5.0),
+    "tof": SensorModel(sigma_floor=0.0015, sigma_slope=0.0005, max_range=8.0),
+    "realsense": SensorModel(
+        sigma_floor=0.001, sigma_slope=0.0025, disparity_sigma=0.08, max_range=6.0, regularizer="ray"
+    ),
+    "stereo": SensorModel(
+        sigma_floor=0.005, sigma_slope=0.0026, disparity_sigma=0.5, min_range=0.3, max_range=30.0,
+        max_support=10.0, regularizer="ray", smoothness=10.0, feedback=True,
+    ),  # fmt: skip
+    "lidar": SensorModel(
+        sigma_floor=0.02, min_range=1.0, max_range=100.0, min_weight=0.5, regularizer="off"
+    ),
+    "scanner": SensorModel(sigma_floor=0.0002, min_range=0.0, max_range=100.0, min_weight=0.5),
+}
+
+
+class VolumeConfig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The map and how keyframes enter it. None = what the sensor preset says."""
+
+    voxel_size: Positive = 0.02  # metres
+    sensor: SensorName = "kinect"
+    regularizer: Regularizer | None = None
+    smoothness: NonNegative | None = None  # λ of eq. 3
+    min_support: Annotated[float, Meta(ge=1, le=16)] | None = None  # voxels
+    max_support: Annotated[float, Meta(ge=1, le=16)] | None = None  # voxels
+    min_range: NonNegative | None = None  # metres
+    max_range: Positive | None = None  # metres
+    min_weight: NonNegative | None = None  # full-confidence samples a voxel needs to be meshed
+    feedback: bool | None = None  # smooth the smoothed values again (recursion) or the raw ones
+    bundle: bool = True  # rays of a neighbourhood that end in one voxel become one
+    color: bool = True
+    threads: Annotated[int, Meta(ge=1, le=256)] | None = None  # None = all cores
+    max_blocks: Annotated[int, Meta(ge=1, le=4_000_000)] = 4_000_000
+    max_blocks_per_keyframe: Annotated[int, Meta(ge=1, le=1 << 19)] = 1 << 17
+
+    def model(self, sensor: str | None = None) -> SensorModel:
+        """The sensor model of a keyframe (default: the map's), with this config's own choices on top."""
+        name = sensor or self.sensor
+        if name not in SENSORS:
+            raise InvalidConfig(f"sensor must be one of {', '.join(SENSORS)}, got {name!r}")
+        chosen = {
+            key: value
+            for key in SensorModel.__struct_fields__
+            if (value := getattr(self, key, None)) is not None
+        }
+        return msgspec.structs.replace(SENSORS[name], **chosen)
+
+
+class ServerConfig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The server daemon."""
+
+    listen: str = "tcp://127.0.0.1:5555"
+    control: str | None = None  # None = the port after `listen`'s
+    state: str = "tsfusion-state"  # folder: journal/, map.tsf
+    max_frame_bytes: Annotated[int, Meta(ge=1024)] = 32 << 20
+    segment_bytes: Annotated[int, Meta(ge=1 << 16)] = 256 << 20
+    window_keyframes: Annotated[int, Meta(ge=1, le=1024)] = 8  # credit: unacknowledged keyframes a client
+    window_bytes: Annotated[int, Meta(ge=1 << 16)] = 16 << 20
+    checkpoint_every: Annotated[int, Meta(ge=0)] = 500  # keyframes; 0 = only at shutdown
+    mesh_interval: NonNegative = 0.2  # seconds between incremental meshes while busy
+
+
+class ClientConfig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The scanner's sending side."""
+
+    address: str = "tcp://127.0.0.1:5555"
+    control: str | None = None
+    jpeg_quality: Annotated[int, Meta(ge=1, le=100)] = 90
+    segment_bytes: Annotated[int, Meta(ge=1 << 16)] = 64 << 20
+    connect_timeout: Positive = 10.0  # seconds
+    stall_timeout: Positive = 2.0  # seconds without progress before everything unacknowledged is resent
+
+
+class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A whole configuration file."""
+
+    volume: VolumeConfig = VolumeConfig()
+    server: ServerConfig = ServerConfig()
+    client: ClientConfig = ClientConfig()
+
+
+AnyStruct = TypeVar("AnyStruct", bound=Struct)
+
+
+def make(struct: type[AnyStruct], settings: dict[str, Any]) -> AnyStruct:
+    """Build a config struct, checking names, types and bounds.
+
+    Raises:
+        InvalidConfig: naming the key and what was expected.
+    """
+    try:
+        return msgspec.convert(settings, struct)
+    except msgspec.ValidationError as error:
+        raise InvalidConfig(f"{error} (in {settings})") from error
+
+
+def load(path: str | Path | None) -> Config:
+    """Read a TOML file; None gives the defaults.
+
+    Raises:
+        InvalidConfig: when the file is missing, not TOML, or holds an unknown key or a bad value.
+    """
+    if path is None:
+        return Config()
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise InvalidConfig(f"cannot read the configuration {path}: {error.strerror}") from error
+    try:
+        return msgspec.convert(tomllib.loads(text), Config)
+    except tomllib.TOMLDecodeError as error:
+        raise InvalidConfig(f"{path} is not TOML: {error}") from error
+    except msgspec.ValidationError as error:
+        raise InvalidConfig(f"{path}: {error}") from error
+
+
+def override(config: AnyStruct, **changes: Any) -> AnyStruct:
+    """`config` with every change that is not None, checked again."""
+    settings = msgspec.structs.asdict(config)
+    settings.update({key: value for key, value in changes.items() if value is not None})
+    return make(type(config), settings)

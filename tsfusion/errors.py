@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: MIT
+"""Every error tsfusion raises on purpose.
+
+    TsfusionError
+    ├── InvalidKeyframe      (ValueError)  a keyframe's field is not what it must be
+    ├── InvalidConfig        (ValueError)  a setting is unknown, of the wrong type or out of range
+    ├── DatasetError                       a recorded dataset is missing, empty or malformed
+    ├── DecodeError                        bytes from a socket or a journal are not a keyframe
+    ├── JournalError                       the journal or spool cannot be read or written
+    ├── MapError
+    │   ├── MapFull                        a keyframe needs more blocks than the limits allow
+    │   ├── WeightOverflow                 a voxel has taken as many votes as its integers hold
+    │   └── CheckpointError                a saved map is missing, torn or of another version
+    ├── TransportError
+    │   ├── ServerUnreachable              nobody answered on the control socket in time
+    │   ├── FlushTimeout                   keyframes were still unacknowledged at the deadline
+    │   └── KeyframeRefused                the server will never take this keyframe, and said why
+    ├── OutputError                        a result cannot be written
+    └── MissingDependency                  an optional package is needed; the message names the command
+
+The command line prints any of these as one line and exits with status 1.
+"""
+
+
+class TsfusionError(Exception):
+    """Base of all errors raised on purpose."""
+
+
+class InvalidKeyframe(TsfusionError, ValueError):
+    """A keyframe's field is not what it must be: the message names field, value and expectation."""
+
+
+class InvalidConfig(TsfusionError, ValueError):
+    """A setting is unknown, of the wrong type or out of range."""
+
+
+class DatasetError(TsfusionError):
+    """A recorded dataset is missing, empty or malformed."""
+
+
+class DecodeError(TsfusionError):
+    """Bytes from a socket or a journal are not a keyframe."""
+
+
+class JournalError(TsfusionError):
+    """The journal or spool cannot be read or written."""
+
+
+class MapError(TsfusionError):
+    """The map cannot do what was asked."""
+
+
+class MapFull(MapError):
+    """A keyframe needs more blocks than the limits allow; the map is as it was before."""
+
+
+class WeightOverflow(MapError):
+    """A voxel has taken as many votes as its integers hold; the map is as it was before."""
+
+
+class CheckpointError(MapError):
+    """A saved map is missing, torn or of another version."""
+
+
+class TransportError(TsfusionError):
+    """The link between scanner and server failed."""
+
+
+class ServerUnreachable(TransportError):
+    """Nobody answered on the control socket in time."""
+
+
+class FlushTimeout(TransportError):
+    """Keyframes were still unacknowledged at the deadline (they stay in the spool)."""
+
+
+class KeyframeRefused(TransportError):
+    """The server will never take this keyframe, and said why."""
+
+
+class OutputError(TsfusionError):
+    """A result cannot be written."""
+
+
+class MissingDependency(TsfusionError):
+    """An optional package is needed; the message names the command that installs it."""

@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: MIT
+"""Taichi kernels: free functions over NumPy arrays; the state they work on lives in their callers."""
+
+import os
+
+from tsfusion.errors import MissingDependency
+
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # the banner goes to stdout
+try:
+    import taichi  # noqa: F401
+except ImportError as error:
+    raise MissingDependency(
+        "fusing needs taichi, which has no build for this platform; "
+        "run `tsfusion serve` on an x86-64 machine and send keyframes to it from here"
+    ) from error

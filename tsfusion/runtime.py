@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: MIT
+"""Taichi is started once, here, on the thread that will launch kernels."""
+
+import os
+from contextlib import redirect_stdout
+from io import StringIO
+from types import ModuleType
+
+_started_threads: int | None = None
+
+
+def start(threads: int | None = None) -> ModuleType:
+    """Start Taichi's CPU backend (once a process) and return the `taichi` module.
+
+    The thread count of the first call stands: a second `ti.init` would tear kernels down. Results never
+    depend on it.
+
+    Raises:
+        MissingDependency: where taichi has no wheel (Linux aarch64, Intel Macs).
+    """
+    global _started_threads  # noqa: PLW0603  the one piece of process-wide state: Taichi itself is global
+    import tsfusion.kernels  # noqa: F401  says what to do where there is no taichi
+    import taichi as ti
+
+    if _started_threads is None:
+        _started_threads = threads or os.cpu_count() or 1
+        with redirect_stdout(StringIO()):  # `ti.init` prints; a program may be reading our stdout
+            ti.init(
+                arch=ti.cpu,
+                cpu_max_num_threads=_started_threads,
+                fast_math=False,  # a reassociated float would make two kernels disagree
+                offline_cache=True,
+                log_level=ti.ERROR,
+            )
+    return ti
+
+
+def threads() -> int | None:
+    """The thread count Taichi runs with; None before `start`."""
+    return _started_threads
