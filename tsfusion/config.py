@@ -56,12 +56,17 @@ SENSORS: dict[str, SensorModel] = {
         sigma_floor=0.001, sigma_slope=0.0025, disparity_sigma=0.08, max_range=6.0, regularizer="ray"
     ),
     "stereo": SensorModel(
-        sigma_floor=0.005, sigma_slope=0.0026, disparity_sigma=0.5, min_range=0.3, max_range=30.0,
-        max_support=10.0, regularizer="ray", smoothness=10.0, feedback=True,
+        sigma_floor=0.005,
+        sigma_slope=0.0026,
+        disparity_sigma=0.5,
+        min_range=0.3,
+        max_range=30.0,
+        max_support=10.0,
+        regularizer="ray",
+        smoothness=10.0,
+        feedback=True,
     ),  # fmt: skip
-    "lidar": SensorModel(
-        sigma_floor=0.02, min_range=1.0, max_range=100.0, min_weight=0.5, regularizer="off"
-    ),
+    "lidar": SensorModel(sigma_floor=0.02, min_range=1.0, max_range=100.0, min_weight=0.5, regularizer="off"),
     "scanner": SensorModel(sigma_floor=0.0002, min_range=0.0, max_range=100.0, min_weight=0.5),
 }
 

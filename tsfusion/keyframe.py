@@ -145,7 +145,9 @@ class Keyframe:
         object.__setattr__(self, "disparity", disparity)
         object.__setattr__(self, "disparity_scale", _positive("disparity_scale", self.disparity_scale))
         if self.baseline_fx is None:
-            raise InvalidKeyframe("baseline_fx must be given with disparity (baseline in metres × fx in pixels)")
+            raise InvalidKeyframe(
+                "baseline_fx must be given with disparity (baseline in metres × fx in pixels)"
+            )
         self._check_camera()
 
     def _check_points(self) -> None:

@@ -56,7 +56,9 @@ def extract(wanted: NDArray[np.int64], layers: Layers, min_weight: float) -> Mes
     positions, normals, colors = (
         np.concatenate(column) if column else np.empty((0, 3), dtype)
         for column, dtype in zip(
-            zip(*parts, strict=True) if parts else ((), (), ()), (np.float32, np.float32, np.uint8), strict=True
+            zip(*parts, strict=True) if parts else ((), (), ()),
+            (np.float32, np.float32, np.uint8),
+            strict=True,
         )
     )
     return Mesh(positions, faces, normals, colors if layers.color_rgn is not None else None)
@@ -66,7 +68,12 @@ class _Batch:
     """Some blocks, their values gathered with a border."""
 
     def __init__(
-        self, keys: NDArray[np.int64], first: int, wanted: NDArray[np.int64], layers: Layers, min_weight: float
+        self,
+        keys: NDArray[np.int64],
+        first: int,
+        wanted: NDArray[np.int64],
+        layers: Layers,
+        min_weight: float,
     ) -> None:
         self.keys, self.first, self.layers = keys, first, layers
         around = keys[:, None] + _AROUND

@@ -152,9 +152,7 @@ class Scratch:
         return self.rays
 
 
-def model_parameters(
-    model: SensorModel, voxel_size: float, baseline_fx: float | None
-) -> NDArray[np.float64]:
+def model_parameters(model: SensorModel, voxel_size: float, baseline_fx: float | None) -> NDArray[np.float64]:
     """The kernel's `model` argument (9 float64, see kernels/rays.py)."""
     slope, z0 = model.sigma_slope, model.sigma_z0
     if baseline_fx is not None and model.disparity_sigma > 0:

@@ -114,9 +114,7 @@ class Volume:
         self._dirty.array[slots] = 0
         return unpack_keys(self._keys.array[slots])
 
-    def extract_mesh(
-        self, min_weight: float | None = None, blocks: NDArray[np.int32] | None = None
-    ) -> Mesh:
+    def extract_mesh(self, min_weight: float | None = None, blocks: NDArray[np.int32] | None = None) -> Mesh:
         """The surface, by marching cubes over the whole map or over the cells of some blocks.
 
         Args:

@@ -19,7 +19,9 @@ def warm_up(config: VolumeConfig) -> None:
     color = np.zeros((16, 16, 3), np.uint8)
     metres = np.full((16, 16), near, np.float32)
     units = np.full((16, 16), 1000, np.uint16)
-    rays = np.dstack([*np.meshgrid(np.linspace(-0.4, 0.4, 16), np.linspace(-0.4, 0.4, 16)), np.ones((16, 16))])
+    rays = np.dstack(
+        [*np.meshgrid(np.linspace(-0.4, 0.4, 16), np.linspace(-0.4, 0.4, 16)), np.ones((16, 16))]
+    )
     points = (rays * near).reshape(-1, 3).astype(np.float32)
     keyframes = [
         Keyframe(depth=metres, intrinsics=camera, T_world_camera=pose, color=color),

@@ -9,6 +9,7 @@ from it, does not depend on which thread came first. No locks, no compare-and-sw
 import taichi as ti
 
 from tsfusion.kernels.traversal import (
+    RUN,
     block_key,
     hash_key,
     next_axis,
@@ -91,35 +92,36 @@ def touch_blocks(
 ):
     """Insert every block that a ray's band crosses: the voxel traversal, eight voxels at a time."""
     mask = table.shape[0] - 1
-    ti.loop_config(block_dim=1)
-    for band in range(band_count.shape[0]):
-        last = ti.i64(0)
-        for r in range(band_start[band], band_start[band] + band_count[band]):
-            if ray_weight(rays, r) > 0:
-                voxel, crossing, interval, direction, distance = ray_start(rays, r)
-                end = ray_length(rays, r)
-                block = voxel >> 3
-                step = vec3i(0)
-                for a in ti.static(range(3)):
-                    step[a] = sign(direction[a])
-                    left = voxel[a] & 7
-                    if direction[a] > 0:
-                        left = 7 - left
-                    crossing[a] += left * interval[a]
-                    interval[a] *= 8
-                inside = 1
-                while inside == 1:
-                    key = pack(block[0], block[1], block[2])
-                    if key != last:
-                        set_insert(table, mask, key, overflow)
-                        last = key
-                    axis = next_axis(crossing)
+    for run in range(band_count.shape[0] * RUN):
+        if run % RUN == 0:
+            band = run // RUN
+            last = ti.i64(0)
+            for r in range(band_start[band], band_start[band] + band_count[band]):
+                if ray_weight(rays, r) > 0:
+                    voxel, crossing, interval, direction, distance = ray_start(rays, r)
+                    end = ray_length(rays, r)
+                    block = voxel >> 3
+                    step = vec3i(0)
                     for a in ti.static(range(3)):
-                        if axis == a:
-                            if crossing[a] >= end:
-                                inside = 0
-                            crossing[a] += interval[a]
-                            block[a] += step[a]
+                        step[a] = sign(direction[a])
+                        left = voxel[a] & 7
+                        if direction[a] > 0:
+                            left = 7 - left
+                        crossing[a] += left * interval[a]
+                        interval[a] *= 8
+                    inside = 1
+                    while inside == 1:
+                        key = pack(block[0], block[1], block[2])
+                        if key != last:
+                            set_insert(table, mask, key, overflow)
+                            last = key
+                        axis = next_axis(crossing)
+                        for a in ti.static(range(3)):
+                            if axis == a:
+                                if crossing[a] >= end:
+                                    inside = 0
+                                crossing[a] += interval[a]
+                                block[a] += step[a]
 
 
 @ti.kernel

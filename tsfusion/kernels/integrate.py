@@ -11,6 +11,7 @@ import taichi as ti
 from tsfusion.kernels.blocks import touched_index
 from tsfusion.kernels.traversal import (
     MAX_CROSSED,
+    RUN,
     next_axis,
     offset_in_block,
     ray_length,
@@ -57,46 +58,47 @@ def integrate_rays(
     frame_color: ti.types.ndarray(dtype=ti.i64, ndim=3),
 ):
     """Add every voxel each ray crosses in its band to the keyframe's sums."""
-    ti.loop_config(block_dim=1)
-    for band in range(band_count.shape[0]):
-        last = vec3i(2147483647)
-        index = -1
-        for r in range(band_start[band], band_start[band] + band_count[band]):
-            weight = ray_weight(rays, r)
-            if weight > 0:
-                voxel, crossing, interval, direction, distance = ray_start(rays, r)
-                end = ray_length(rays, r)
-                inside = 1
-                steps = 0
-                while inside == 1 and steps < MAX_CROSSED:
-                    block = voxel >> 3
-                    if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
-                        last = block
-                        index = touched_index(table, table_index, voxel)
-                    if index >= 0:
-                        m = quantize(distance, quanta_per_voxel)
-                        value = (ti.cast(m * weight, ti.i64) << WEIGHT_BITS) + weight
-                        ti.atomic_add(frame[index, offset_in_block(voxel)], value)
-                    axis = next_axis(crossing)
-                    for a in ti.static(range(3)):
-                        if axis == a:
-                            if crossing[a] >= end:
-                                inside = 0
-                            crossing[a] += interval[a]
-                            voxel[a] += sign(direction[a])
-                            distance -= abs(direction[a])
-                    steps += 1
-                if has_color == 1:
-                    hit = vec3i(rays[r, 0] >> 10, rays[r, 1] >> 10, rays[r, 2] >> 10)
-                    at = touched_index(table, table_index, hit)
-                    if at >= 0:
-                        rgb = rays[r, 7]
-                        red = ti.cast((rgb >> 16) & 255, ti.i64)
-                        green = ti.cast((rgb >> 8) & 255, ti.i64)
-                        blue = ti.cast(rgb & 255, ti.i64)
-                        o = offset_in_block(hit)
-                        ti.atomic_add(frame_color[at, o, 0], (red << 32) + green)
-                        ti.atomic_add(frame_color[at, o, 1], (blue << 32) + 1)
+    for run in range(band_count.shape[0] * RUN):
+        if run % RUN == 0:
+            band = run // RUN
+            last = vec3i(2147483647)
+            index = -1
+            for r in range(band_start[band], band_start[band] + band_count[band]):
+                weight = ray_weight(rays, r)
+                if weight > 0:
+                    voxel, crossing, interval, direction, distance = ray_start(rays, r)
+                    end = ray_length(rays, r)
+                    inside = 1
+                    steps = 0
+                    while inside == 1 and steps < MAX_CROSSED:
+                        block = voxel >> 3
+                        if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
+                            last = block
+                            index = touched_index(table, table_index, voxel)
+                        if index >= 0:
+                            m = quantize(distance, quanta_per_voxel)
+                            value = (ti.cast(m * weight, ti.i64) << WEIGHT_BITS) + weight
+                            ti.atomic_add(frame[index, offset_in_block(voxel)], value)
+                        axis = next_axis(crossing)
+                        for a in ti.static(range(3)):
+                            if axis == a:
+                                if crossing[a] >= end:
+                                    inside = 0
+                                crossing[a] += interval[a]
+                                voxel[a] += sign(direction[a])
+                                distance -= abs(direction[a])
+                        steps += 1
+                    if has_color == 1:
+                        hit = vec3i(rays[r, 0] >> 10, rays[r, 1] >> 10, rays[r, 2] >> 10)
+                        at = touched_index(table, table_index, hit)
+                        if at >= 0:
+                            rgb = rays[r, 7]
+                            red = ti.cast((rgb >> 16) & 255, ti.i64)
+                            green = ti.cast((rgb >> 8) & 255, ti.i64)
+                            blue = ti.cast(rgb & 255, ti.i64)
+                            o = offset_in_block(hit)
+                            ti.atomic_add(frame_color[at, o, 0], (red << 32) + green)
+                            ti.atomic_add(frame_color[at, o, 1], (blue << 32) + 1)
 
 
 @ti.kernel
@@ -111,20 +113,22 @@ def refuse_blocks(
 ) -> ti.i32:
     """How many touched blocks would leave their lanes' range: weights too large, or below zero."""
     refused = 0
-    for i in range(count):
-        slot = touched_slots[i]
-        bad = 0
-        for v in range(CUBE):
-            w = ti.i32(0)
-            n = ti.i64(0)
-            if slot >= 0:
-                w = lane_weight(sums[slot, v])
-                if has_color == 1:
-                    n = color_rgn[slot, v] & 65535
-            after = w + sign_ * lane_weight(frame[i, v])
-            if after < 0 or after >= WEIGHT_LIMIT or n + 1 >= COLOR_LIMIT:
-                bad = 1
-        refused += bad
+    for run in range(count * RUN):
+        if run % RUN == 0:
+            i = run // RUN
+            slot = touched_slots[i]
+            bad = 0
+            for v in range(CUBE):
+                w = ti.i32(0)
+                n = ti.i64(0)
+                if slot >= 0:
+                    w = lane_weight(sums[slot, v])
+                    if has_color == 1:
+                        n = color_rgn[slot, v] & 65535
+                after = w + sign_ * lane_weight(frame[i, v])
+                if after < 0 or after >= WEIGHT_LIMIT or n + 1 >= COLOR_LIMIT:
+                    bad = 1
+            refused += bad
     return refused
 
 
@@ -139,17 +143,19 @@ def commit_blocks(
 ) -> ti.i32:
     """Add (or subtract) the keyframe's sums to the map's, one owner a block. Returns the voxels changed."""
     voxels = 0
-    for i in range(count):
-        slot = touched_slots[i]
-        changed = 0
-        for v in range(CUBE):
-            value = frame[i, v]
-            if value != 0:
-                sums[slot, v] += sign_ * value
-                changed += 1
-        if changed > 0:
-            dirty[slot] = ti.u8(1)
-        voxels += changed
+    for run in range(count * RUN):
+        if run % RUN == 0:
+            i = run // RUN
+            slot = touched_slots[i]
+            changed = 0
+            for v in range(CUBE):
+                value = frame[i, v]
+                if value != 0:
+                    sums[slot, v] = sums[slot, v] + sign_ * value
+                    changed += 1
+            if changed > 0:
+                dirty[slot] = ti.u8(1)
+            voxels += changed
     return voxels
 
 
@@ -163,15 +169,17 @@ def commit_color(
     color_b: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
     """One vote a voxel and keyframe: the mean colour of the rays that ended in it."""
-    for i in range(count):
-        slot = touched_slots[i]
-        for v in range(CUBE):
-            blue_n = frame_color[i, v, 1]
-            n = blue_n & ti.i64(4294967295)
-            if n > 0:
-                red_green = frame_color[i, v, 0]
-                red = (red_green >> 32) // n
-                green = (red_green & ti.i64(4294967295)) // n
-                blue = (blue_n >> 32) // n
-                color_rgn[slot, v] += sign_ * ((red << 40) + (green << 16) + 1)
-                color_b[slot, v] += sign_ * ti.cast(blue, ti.i32)
+    for run in range(count * RUN):
+        if run % RUN == 0:
+            i = run // RUN
+            slot = touched_slots[i]
+            for v in range(CUBE):
+                blue_n = frame_color[i, v, 1]
+                n = blue_n & ti.i64(4294967295)
+                if n > 0:
+                    red_green = frame_color[i, v, 0]
+                    red = (red_green >> 32) // n
+                    green = (red_green & ti.i64(4294967295)) // n
+                    blue = (blue_n >> 32) // n
+                    color_rgn[slot, v] = color_rgn[slot, v] + sign_ * ((red << 40) + (green << 16) + 1)
+                    color_b[slot, v] = color_b[slot, v] + sign_ * ti.cast(blue, ti.i32)

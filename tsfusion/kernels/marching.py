@@ -9,7 +9,7 @@ unseen), so that everything after reads one dense array.
 import taichi as ti
 
 from tsfusion.kernels.integrate import CUBE, lane_distance, lane_weight
-from tsfusion.kernels.traversal import unpack, vec3i
+from tsfusion.kernels.traversal import RUN, unpack, vec3i
 
 PAD = 11
 PADDED = PAD * PAD * PAD
@@ -45,23 +45,25 @@ def gather_values(
     min_weight: ti.i32,
     padded: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
-    for b in range(count):
-        for x in range(-1, 10):
-            for y in range(-1, 10):
-                for z in range(-1, 10):
-                    p = vec3i(x, y, z)
-                    slot = neighbours[b, neighbour_of(p)]
-                    value = ti.math.nan
-                    if slot >= 0:
-                        o = ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)
-                        packed = sums[slot, o]
-                        w = lane_weight(packed)
-                        if w >= min_weight:
-                            if use_regularised == 1:
-                                value = regularised[slot, o]
-                            else:
-                                value = ti.cast(lane_distance(packed), ti.f32) / ti.cast(w, ti.f32)
-                    padded[b, at(x, y, z)] = value
+    for run in range(count * RUN):
+        if run % RUN == 0:
+            b = run // RUN
+            for x in range(-1, 10):
+                for y in range(-1, 10):
+                    for z in range(-1, 10):
+                        p = vec3i(x, y, z)
+                        slot = neighbours[b, neighbour_of(p)]
+                        value = ti.math.nan
+                        if slot >= 0:
+                            o = ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)
+                            packed = sums[slot, o]
+                            w = lane_weight(packed)
+                            if w >= min_weight:
+                                if use_regularised == 1:
+                                    value = regularised[slot, o]
+                                else:
+                                    value = ti.cast(lane_distance(packed), ti.f32) / ti.cast(w, ti.f32)
+                        padded[b, at(x, y, z)] = value
 
 
 @ti.func
@@ -95,35 +97,37 @@ def count_elements(
     triangles: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
     """Per block: each cell's case, and which voxel edges carry a vertex (crossed, in a wanted whole cell)."""
-    for b in range(count):
-        vertex_total = 0
-        triangle_total = 0
-        for o in range(CUBE):
-            p = voxel_of(o)
-            here = padded[b, at(p[0], p[1], p[2])]
-            axes = 0
-            case = 0
-            if here == here:
-                if meshed[b, 13] == 1:
-                    case = ti.max(cell_case(padded, b, p), 0)
-                for axis in ti.static(range(3)):
-                    end = p
-                    end[axis] += 1
-                    if crosses(here, padded[b, at(end[0], end[1], end[2])]):
-                        used = 0
-                        for k in ti.static(range(4)):
-                            cell = p
-                            cell[(axis + 1) % 3] -= k & 1
-                            cell[(axis + 2) % 3] -= k >> 1
-                            if meshed[b, neighbour_of(cell)] == 1 and cell_case(padded, b, cell) >= 0:
-                                used = 1
-                        axes |= used << axis
-            cases[first + b, o] = ti.cast(case, ti.u8)
-            triangle_total += triangle_count[case]
-            edges[first + b, o] = (vertex_total << 3) | axes
-            vertex_total += (axes & 1) + (axes >> 1 & 1) + (axes >> 2 & 1)
-        vertices[first + b] = vertex_total
-        triangles[first + b] = triangle_total
+    for run in range(count * RUN):
+        if run % RUN == 0:
+            b = run // RUN
+            vertex_total = 0
+            triangle_total = 0
+            for o in range(CUBE):
+                p = voxel_of(o)
+                here = padded[b, at(p[0], p[1], p[2])]
+                axes = 0
+                case = 0
+                if here == here:
+                    if meshed[b, 13] == 1:
+                        case = ti.max(cell_case(padded, b, p), 0)
+                    for axis in ti.static(range(3)):
+                        end = p
+                        end[axis] += 1
+                        if crosses(here, padded[b, at(end[0], end[1], end[2])]):
+                            used = 0
+                            for k in ti.static(range(4)):
+                                cell = p
+                                cell[(axis + 1) % 3] -= k & 1
+                                cell[(axis + 2) % 3] -= k >> 1
+                                if meshed[b, neighbour_of(cell)] == 1 and cell_case(padded, b, cell) >= 0:
+                                    used = 1
+                            axes |= used << axis
+                cases[first + b, o] = ti.cast(case, ti.u8)
+                triangle_total += triangle_count[case]
+                edges[first + b, o] = (vertex_total << 3) | axes
+                vertex_total += (axes & 1) + (axes >> 1 & 1) + (axes >> 2 & 1)
+            vertices[first + b] = vertex_total
+            triangles[first + b] = triangle_total
 
 
 @ti.func
@@ -182,48 +186,50 @@ def emit_vertices(
     normals: ti.types.ndarray(dtype=ti.f32, ndim=2),
     colors: ti.types.ndarray(dtype=ti.u8, ndim=2),
 ):
-    for b in range(count):
-        corner = unpack(keys[b]) * 8
-        for o in range(CUBE):
-            axes = edges[first + b, o] & 7
-            vertex = starts[b] + (edges[first + b, o] >> 3)
-            p = voxel_of(o)
-            for axis in ti.static(range(3)):
-                if axes >> axis & 1 == 1:
-                    q = p
-                    q[axis] += 1
-                    here = padded[b, at(p[0], p[1], p[2])]
-                    there = padded[b, at(q[0], q[1], q[2])]
-                    # kept off the voxel centres, where the vertices of several edges would fall together
-                    t = ti.min(ti.max(here / (here - there), 0.001), 0.999)
-                    normal = vec3f(0.0)
-                    for a in ti.static(range(3)):
-                        position = ti.cast(corner[a] + p[a], ti.f64) + 0.5
-                        if ti.static(a == axis):
-                            position += ti.cast(t, ti.f64)
-                        positions[vertex, a] = ti.cast(position * voxel_size, ti.f32)
-                        normal[a] = (1.0 - t) * slope(padded, b, p, a) + t * slope(padded, b, q, a)
-                    length = normal.norm()
-                    if not (length > 0.0):
+    for run in range(count * RUN):
+        if run % RUN == 0:
+            b = run // RUN
+            corner = unpack(keys[b]) * 8
+            for o in range(CUBE):
+                axes = edges[first + b, o] & 7
+                vertex = starts[b] + (edges[first + b, o] >> 3)
+                p = voxel_of(o)
+                for axis in ti.static(range(3)):
+                    if axes >> axis & 1 == 1:
+                        q = p
+                        q[axis] += 1
+                        here = padded[b, at(p[0], p[1], p[2])]
+                        there = padded[b, at(q[0], q[1], q[2])]
+                        # kept off the voxel centres, where the vertices of several edges would fall together
+                        t = ti.min(ti.max(here / (here - there), 0.001), 0.999)
                         normal = vec3f(0.0)
-                        normal[axis] = ti.select(there > here, 1.0, -1.0)
-                        length = 1.0
-                    for a in ti.static(range(3)):
-                        normals[vertex, a] = normal[a] / length
-                    if has_color == 1:
-                        total = ti.Vector([0.0, 0.0, 0.0, 0.0])
-                        total = add_color(neighbours, b, p, 1.0 - t, color_rgn, color_b, total)
-                        total = add_color(neighbours, b, q, t, color_rgn, color_b, total)
-                        if total[3] == 0.0:  # the surface moved off the voxels that rays ended in
-                            for n in range(27):
-                                r = p + vec3i(n // 9 - 1, n // 3 % 3 - 1, n % 3 - 1)
-                                total = add_color(neighbours, b, r, 1.0, color_rgn, color_b, total)
                         for a in ti.static(range(3)):
-                            shade = ti.cast(GREY, ti.f32)
-                            if total[3] > 0.0:
-                                shade = total[a] / total[3]
-                            colors[vertex, a] = ti.cast(shade + 0.5, ti.u8)
-                    vertex += 1
+                            position = ti.cast(corner[a] + p[a], ti.f64) + 0.5
+                            if ti.static(a == axis):
+                                position += ti.cast(t, ti.f64)
+                            positions[vertex, a] = ti.cast(position * voxel_size, ti.f32)
+                            normal[a] = (1.0 - t) * slope(padded, b, p, a) + t * slope(padded, b, q, a)
+                        length = normal.norm()
+                        if not (length > 0.0):
+                            normal = vec3f(0.0)
+                            normal[axis] = ti.select(there > here, 1.0, -1.0)
+                            length = 1.0
+                        for a in ti.static(range(3)):
+                            normals[vertex, a] = normal[a] / length
+                        if has_color == 1:
+                            total = ti.Vector([0.0, 0.0, 0.0, 0.0])
+                            total = add_color(neighbours, b, p, 1.0 - t, color_rgn, color_b, total)
+                            total = add_color(neighbours, b, q, t, color_rgn, color_b, total)
+                            if total[3] == 0.0:  # the surface moved off the voxels that rays ended in
+                                for n in range(27):
+                                    r = p + vec3i(n // 9 - 1, n // 3 % 3 - 1, n % 3 - 1)
+                                    total = add_color(neighbours, b, r, 1.0, color_rgn, color_b, total)
+                            for a in ti.static(range(3)):
+                                shade = ti.cast(GREY, ti.f32)
+                                if total[3] > 0.0:
+                                    shade = total[a] / total[3]
+                                colors[vertex, a] = ti.cast(shade + 0.5, ti.u8)
+                        vertex += 1
 
 
 @ti.kernel
@@ -238,23 +244,25 @@ def emit_faces(
     edge_corner: ti.types.ndarray(dtype=ti.i32, ndim=1),
     faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
-    for b in range(cases.shape[0]):
-        face = first_triangle[b]
-        for o in range(CUBE):
-            case = ti.cast(cases[b, o], ti.i32)
-            p = voxel_of(o)
-            for n in range(triangle_count[case]):
-                for k in range(3):
-                    e = triangle_edges[case, 3 * n + k]
-                    corner = edge_corner[e]
-                    q = p + vec3i(corner & 1, corner >> 1 & 1, corner >> 2 & 1)
-                    owner = forward[b, (q[0] >> 3) | (q[1] >> 3) << 1 | (q[2] >> 3) << 2]
-                    entry = edges[owner, ((q[0] & 7) << 6) | ((q[1] & 7) << 3) | (q[2] & 7)]
-                    axis = e >> 2
-                    before = 0
-                    if axis > 0:
-                        before += entry & 1
-                    if axis > 1:
-                        before += entry >> 1 & 1
-                    faces[face, k] = first_vertex[owner] + (entry >> 3) + before
-                face += 1
+    for run in range(cases.shape[0] * RUN):
+        if run % RUN == 0:
+            b = run // RUN
+            face = first_triangle[b]
+            for o in range(CUBE):
+                case = ti.cast(cases[b, o], ti.i32)
+                p = voxel_of(o)
+                for n in range(triangle_count[case]):
+                    for k in range(3):
+                        e = triangle_edges[case, 3 * n + k]
+                        corner = edge_corner[e]
+                        q = p + vec3i(corner & 1, corner >> 1 & 1, corner >> 2 & 1)
+                        owner = forward[b, (q[0] >> 3) | (q[1] >> 3) << 1 | (q[2] >> 3) << 2]
+                        entry = edges[owner, ((q[0] & 7) << 6) | ((q[1] & 7) << 3) | (q[2] & 7)]
+                        axis = e >> 2
+                        before = 0
+                        if axis > 0:
+                            before += entry & 1
+                        if axis > 1:
+                            before += entry >> 1 & 1
+                        faces[face, k] = first_vertex[owner] + (entry >> 3) + before
+                    face += 1

@@ -11,7 +11,7 @@ hash table and a region of the ray buffer to itself.
 
 import taichi as ti
 
-from tsfusion.kernels.traversal import DIRECTION_ONE, POSITION_BITS, VOXEL_LIMIT, pack, unpack
+from tsfusion.kernels.traversal import DIRECTION_ONE, POSITION_BITS, RUN, VOXEL_LIMIT, pack, unpack
 
 TILE = 16
 TILE_SAMPLES = TILE * TILE
@@ -89,17 +89,18 @@ def add_sample(
         listed[band, count] = i
         count += 1
     w = ti.cast(weight, ti.i64)
-    table[band, i, 1] += (x & 1023) * w
-    table[band, i, 2] += (y & 1023) * w
-    table[band, i, 3] += (z & 1023) * w
-    table[band, i, 4] += w
-    table[band, i, 5] += half * w
-    table[band, i, 6] += ((color >> 16) & 255) * w
-    table[band, i, 7] += ((color >> 8) & 255) * w
-    table[band, i, 8] += (color & 255) * w
+    # not `+=`: Taichi makes that atomic, and a band has its table to itself
+    table[band, i, 1] = table[band, i, 1] + (x & 1023) * w
+    table[band, i, 2] = table[band, i, 2] + (y & 1023) * w
+    table[band, i, 3] = table[band, i, 3] + (z & 1023) * w
+    table[band, i, 4] = table[band, i, 4] + w
+    table[band, i, 5] = table[band, i, 5] + half * w
+    table[band, i, 6] = table[band, i, 6] + ((color >> 16) & 255) * w
+    table[band, i, 7] = table[band, i, 7] + ((color >> 8) & 255) * w
+    table[band, i, 8] = table[band, i, 8] + (color & 255) * w
     if has_origin == 1:
         for a in ti.static(range(3)):
-            table[band, i, 9 + a] += ti.cast(ti.floor(origin[a] * 1024.0), ti.i64) * w
+            table[band, i, 9 + a] = table[band, i, 9 + a] + ti.cast(ti.floor(origin[a] * 1024.0), ti.i64) * w
     return count
 
 
@@ -173,56 +174,57 @@ def rays_from_image(
     bands = band_count.shape[0]
     origin = vec3(camera[3, 0], camera[3, 1], camera[3, 2])
     du = vec3(camera[0, 0], camera[0, 1], camera[0, 2])
-    ti.loop_config(block_dim=1)
-    for band in range(bands):
-        first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // bands, ti.i32)
-        last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // bands, ti.i32)
-        band_start[band] = first_tile * TILE_SAMPLES
-        out = first_tile * TILE_SAMPLES
-        samples = 0
-        for tile in range(first_tile, last_tile):
-            top = tile // tiles_x * TILE
-            left = tile % tiles_x * TILE
-            entries = 0
-            for v in range(top, ti.min(top + TILE, height)):
-                row = vec3(0.0)
-                for a in ti.static(range(3)):
-                    row[a] = camera[1, a] * v + camera[2, a]
-                for u in range(left, ti.min(left + TILE, width)):
-                    raw = ti.cast(image[v, u], ti.f64)
-                    z = raw * scale
-                    if is_disparity == 1:
-                        z = scale / ti.max(raw, 1e-9)
-                    trust = 255.0
-                    if has_confidence == 1:
-                        trust = ti.cast(confidence[v, u], ti.f64)
-                    # False for NaN as well
-                    if raw > 0.0 and z >= model[7] and z <= model[8] and trust > 0.0:
-                        p = origin + (row + du * ti.cast(u, ti.f64)) * z
-                        if in_reach(p):
-                            sigma = noise_sigma(model, z)
-                            weight = sample_weight(model, sigma, trust)
-                            half = half_width(model, sigma)
-                            rgb = 0
-                            if has_color == 1:
-                                rgb = (
-                                    (ti.cast(color[v, u, 2], ti.i32) << 16)
-                                    | (ti.cast(color[v, u, 1], ti.i32) << 8)
-                                    | ti.cast(color[v, u, 0], ti.i32)
-                                )
-                            samples += 1
-                            if bundle == 1:
-                                entries = add_sample(
-                                    table, listed, band, entries, p, origin, 0, weight, half, rgb
-                                )
-                            else:
-                                write_sample(rays, out, p, origin, weight, half, rgb)
-                                out += 1
-            if bundle == 1:
-                flush_tile(table, listed, band, entries, rays, out, origin, 0)
-                out += entries
-        band_count[band] = out - first_tile * TILE_SAMPLES
-        band_samples[band] = samples
+    for run in range(bands * RUN):
+        if run % RUN == 0:
+            band = run // RUN
+            first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // bands, ti.i32)
+            last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // bands, ti.i32)
+            band_start[band] = first_tile * TILE_SAMPLES
+            out = first_tile * TILE_SAMPLES
+            samples = 0
+            for tile in range(first_tile, last_tile):
+                top = tile // tiles_x * TILE
+                left = tile % tiles_x * TILE
+                entries = 0
+                for v in range(top, ti.min(top + TILE, height)):
+                    row = vec3(0.0)
+                    for a in ti.static(range(3)):
+                        row[a] = camera[1, a] * v + camera[2, a]
+                    for u in range(left, ti.min(left + TILE, width)):
+                        raw = ti.cast(image[v, u], ti.f64)
+                        z = raw * scale
+                        if is_disparity == 1:
+                            z = scale / ti.max(raw, 1e-9)
+                        trust = 255.0
+                        if has_confidence == 1:
+                            trust = ti.cast(confidence[v, u], ti.f64)
+                        # False for NaN as well
+                        if raw > 0.0 and z >= model[7] and z <= model[8] and trust > 0.0:
+                            p = origin + (row + du * ti.cast(u, ti.f64)) * z
+                            if in_reach(p):
+                                sigma = noise_sigma(model, z)
+                                weight = sample_weight(model, sigma, trust)
+                                half = half_width(model, sigma)
+                                rgb = 0
+                                if has_color == 1:
+                                    rgb = (
+                                        (ti.cast(color[v, u, 2], ti.i32) << 16)
+                                        | (ti.cast(color[v, u, 1], ti.i32) << 8)
+                                        | ti.cast(color[v, u, 0], ti.i32)
+                                    )
+                                samples += 1
+                                if bundle == 1:
+                                    entries = add_sample(
+                                        table, listed, band, entries, p, origin, 0, weight, half, rgb
+                                    )
+                                else:
+                                    write_sample(rays, out, p, origin, weight, half, rgb)
+                                    out += 1
+                if bundle == 1:
+                    flush_tile(table, listed, band, entries, rays, out, origin, 0)
+                    out += entries
+            band_count[band] = out - first_tile * TILE_SAMPLES
+            band_samples[band] = samples
 
 
 @ti.kernel
@@ -247,52 +249,53 @@ def rays_from_points(
     tiles = (count + TILE_SAMPLES - 1) // TILE_SAMPLES
     bands = band_count.shape[0]
     own_origins = ti.select(origins.shape[0] == 1, 0, 1)
-    ti.loop_config(block_dim=1)
-    for band in range(bands):
-        first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // bands, ti.i32)
-        last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // bands, ti.i32)
-        band_start[band] = first_tile * TILE_SAMPLES
-        out = first_tile * TILE_SAMPLES
-        samples = 0
-        for tile in range(first_tile, last_tile):
-            entries = 0
-            origin = vec3(0.0)
-            for n in range(tile * TILE_SAMPLES, ti.min((tile + 1) * TILE_SAMPLES, count)):
-                o = vec3(0.0)
-                q = vec3(0.0)
-                for a in ti.static(range(3)):
-                    o[a] = ti.cast(origins[n * own_origins, a], ti.f64)
-                    q[a] = ti.cast(points[n, a], ti.f64)
-                span = (q - o).norm()
-                trust = 255.0
-                if has_confidence == 1:
-                    trust = ti.cast(confidence[n], ti.f64)
-                if span > 0.0 and span >= model[7] and span <= model[8] and trust > 0.0:
-                    p = vec3(0.0)
+    for run in range(bands * RUN):
+        if run % RUN == 0:
+            band = run // RUN
+            first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // bands, ti.i32)
+            last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // bands, ti.i32)
+            band_start[band] = first_tile * TILE_SAMPLES
+            out = first_tile * TILE_SAMPLES
+            samples = 0
+            for tile in range(first_tile, last_tile):
+                entries = 0
+                origin = vec3(0.0)
+                for n in range(tile * TILE_SAMPLES, ti.min((tile + 1) * TILE_SAMPLES, count)):
+                    o = vec3(0.0)
+                    q = vec3(0.0)
                     for a in ti.static(range(3)):
-                        p[a] = pose[a, 0] * q[0] + pose[a, 1] * q[1] + pose[a, 2] * q[2] + pose[a, 3]
-                        origin[a] = pose[a, 0] * o[0] + pose[a, 1] * o[1] + pose[a, 2] * o[2] + pose[a, 3]
-                    if in_reach(p) and in_reach(origin):
-                        sigma = noise_sigma(model, span)
-                        weight = sample_weight(model, sigma, trust)
-                        half = half_width(model, sigma)
-                        rgb = 0
-                        if has_color == 1:
-                            rgb = (
-                                (ti.cast(color[n, 2], ti.i32) << 16)
-                                | (ti.cast(color[n, 1], ti.i32) << 8)
-                                | ti.cast(color[n, 0], ti.i32)
-                            )
-                        samples += 1
-                        if bundle == 1:
-                            entries = add_sample(
-                                table, listed, band, entries, p, origin, own_origins, weight, half, rgb
-                            )
-                        else:
-                            write_sample(rays, out, p, origin, weight, half, rgb)
-                            out += 1
-            if bundle == 1:
-                flush_tile(table, listed, band, entries, rays, out, origin, own_origins)
-                out += entries
-        band_count[band] = out - first_tile * TILE_SAMPLES
-        band_samples[band] = samples
+                        o[a] = ti.cast(origins[n * own_origins, a], ti.f64)
+                        q[a] = ti.cast(points[n, a], ti.f64)
+                    span = (q - o).norm()
+                    trust = 255.0
+                    if has_confidence == 1:
+                        trust = ti.cast(confidence[n], ti.f64)
+                    if span > 0.0 and span >= model[7] and span <= model[8] and trust > 0.0:
+                        p = vec3(0.0)
+                        for a in ti.static(range(3)):
+                            p[a] = pose[a, 0] * q[0] + pose[a, 1] * q[1] + pose[a, 2] * q[2] + pose[a, 3]
+                            origin[a] = pose[a, 0] * o[0] + pose[a, 1] * o[1] + pose[a, 2] * o[2] + pose[a, 3]
+                        if in_reach(p) and in_reach(origin):
+                            sigma = noise_sigma(model, span)
+                            weight = sample_weight(model, sigma, trust)
+                            half = half_width(model, sigma)
+                            rgb = 0
+                            if has_color == 1:
+                                rgb = (
+                                    (ti.cast(color[n, 2], ti.i32) << 16)
+                                    | (ti.cast(color[n, 1], ti.i32) << 8)
+                                    | ti.cast(color[n, 0], ti.i32)
+                                )
+                            samples += 1
+                            if bundle == 1:
+                                entries = add_sample(
+                                    table, listed, band, entries, p, origin, own_origins, weight, half, rgb
+                                )
+                            else:
+                                write_sample(rays, out, p, origin, weight, half, rgb)
+                                out += 1
+                if bundle == 1:
+                    flush_tile(table, listed, band, entries, rays, out, origin, own_origins)
+                    out += entries
+            band_count[band] = out - first_tile * TILE_SAMPLES
+            band_samples[band] = samples

@@ -18,6 +18,7 @@ from tsfusion.kernels.blocks import touched_index
 from tsfusion.kernels.integrate import CUBE, lane_distance, lane_weight
 from tsfusion.kernels.traversal import (
     MAX_CROSSED,
+    RUN,
     next_axis,
     offset_in_block,
     ray_length,
@@ -88,59 +89,62 @@ def smooth_rays(
 ):
     """Gather y along each ray from the map (slot ≥ 0: before this keyframe) and the keyframe's sums, solve,
     and add x̂ to `votes` as (Σ x̂ · 16) · 2²⁴ + n."""
-    ti.loop_config(block_dim=1)
-    for band in range(band_count.shape[0]):
-        for r in range(band_start[band], band_start[band] + band_count[band]):
-            if ray_weight(rays, r) > 0:
-                voxel, crossing, interval, direction, distance = ray_start(rays, r)
-                end = ray_length(rays, r)
-                n = 0
-                total = ti.f32(0.0)
-                index = -1
-                block = voxel >> 3
-                fresh = 1
-                inside = 1
-                while inside == 1 and n < MAX_CROSSED:
-                    here = voxel >> 3
-                    if fresh == 1 or here[0] != block[0] or here[1] != block[1] or here[2] != block[2]:
-                        block = here
-                        fresh = 0
-                        index = touched_index(table, table_index, voxel)
-                    o = offset_in_block(voxel)
-                    added = frame[index, o]
-                    slot = touched_slots[index]
-                    w_old = ti.f32(0.0)
-                    old = ti.f32(0.0)
-                    if slot >= 0:
-                        w_old = ti.cast(lane_weight(sums[slot, o]), ti.f32)
-                        old = ti.cast(lane_distance(sums[slot, o]), ti.f32)
-                        if feedback == 1:
-                            old = w_old * regularised[slot, o]
-                    w = w_old + ti.cast(lane_weight(added), ti.f32)
-                    t = ti.cast(distance, ti.f32) * ti.cast(quanta_per_voxel, ti.f32) / 65536.0
-                    signal[band, n, 0] = t
-                    signal[band, n, 1] = (old + ti.cast(lane_distance(added), ti.f32)) / w - t
-                    signal[band, n, 2] = w
-                    crossed[band, n, 0] = index
-                    crossed[band, n, 1] = o
-                    total += w
-                    n += 1
-                    axis = next_axis(crossing)
-                    for a in ti.static(range(3)):
-                        if axis == a:
-                            if crossing[a] >= end:
-                                inside = 0
-                            crossing[a] += interval[a]
-                            voxel[a] += sign(direction[a])
-                            distance -= abs(direction[a])
-                for i in range(n):
-                    signal[band, i, 2] = ti.select(weighted == 1, signal[band, i, 2] * n / total, 1.0)
-                if n >= 3:
-                    solve_signal(signal, band, n, smoothness)
-                for i in range(n):
-                    x = signal[band, i, 0] + signal[band, i, 1]
-                    vote = ti.cast(ti.floor(x * VOTE_SCALE + 0.5), ti.i64)
-                    ti.atomic_add(votes[crossed[band, i, 0], crossed[band, i, 1]], (vote << VOTE_BITS) + 1)
+    for run in range(band_count.shape[0] * RUN):
+        if run % RUN == 0:
+            band = run // RUN
+            for r in range(band_start[band], band_start[band] + band_count[band]):
+                if ray_weight(rays, r) > 0:
+                    voxel, crossing, interval, direction, distance = ray_start(rays, r)
+                    end = ray_length(rays, r)
+                    n = 0
+                    total = ti.f32(0.0)
+                    index = -1
+                    block = voxel >> 3
+                    fresh = 1
+                    inside = 1
+                    while inside == 1 and n < MAX_CROSSED:
+                        here = voxel >> 3
+                        if fresh == 1 or here[0] != block[0] or here[1] != block[1] or here[2] != block[2]:
+                            block = here
+                            fresh = 0
+                            index = touched_index(table, table_index, voxel)
+                        o = offset_in_block(voxel)
+                        added = frame[index, o]
+                        slot = touched_slots[index]
+                        w_old = ti.f32(0.0)
+                        old = ti.f32(0.0)
+                        if slot >= 0:
+                            w_old = ti.cast(lane_weight(sums[slot, o]), ti.f32)
+                            old = ti.cast(lane_distance(sums[slot, o]), ti.f32)
+                            if feedback == 1:
+                                old = w_old * regularised[slot, o]
+                        w = w_old + ti.cast(lane_weight(added), ti.f32)
+                        t = ti.cast(distance, ti.f32) * ti.cast(quanta_per_voxel, ti.f32) / 65536.0
+                        signal[band, n, 0] = t
+                        signal[band, n, 1] = (old + ti.cast(lane_distance(added), ti.f32)) / w - t
+                        signal[band, n, 2] = w
+                        crossed[band, n, 0] = index
+                        crossed[band, n, 1] = o
+                        total += w
+                        n += 1
+                        axis = next_axis(crossing)
+                        for a in ti.static(range(3)):
+                            if axis == a:
+                                if crossing[a] >= end:
+                                    inside = 0
+                                crossing[a] += interval[a]
+                                voxel[a] += sign(direction[a])
+                                distance -= abs(direction[a])
+                    for i in range(n):
+                        signal[band, i, 2] = ti.select(weighted == 1, signal[band, i, 2] * n / total, 1.0)
+                    if n >= 3:
+                        solve_signal(signal, band, n, smoothness)
+                    for i in range(n):
+                        x = signal[band, i, 0] + signal[band, i, 1]
+                        vote = ti.cast(ti.floor(x * VOTE_SCALE + 0.5), ti.i64)
+                        ti.atomic_add(
+                            votes[crossed[band, i, 0], crossed[band, i, 1]], (vote << VOTE_BITS) + 1
+                        )
 
 
 @ti.kernel
@@ -151,12 +155,14 @@ def commit_regularised(
     regularised: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
     """A voxel's value becomes the mean of what its rays propose."""
-    for i in range(count):
-        for v in range(CUBE):
-            packed = votes[i, v]
-            if packed != 0:
-                n = ti.cast(packed & ((1 << VOTE_BITS) - 1), ti.f32)
-                regularised[touched_slots[i], v] = ti.cast(packed >> VOTE_BITS, ti.f32) / (n * VOTE_SCALE)
+    for run in range(count * RUN):
+        if run % RUN == 0:
+            i = run // RUN
+            for v in range(CUBE):
+                packed = votes[i, v]
+                if packed != 0:
+                    n = ti.cast(packed & ((1 << VOTE_BITS) - 1), ti.f32)
+                    regularised[touched_slots[i], v] = ti.cast(packed >> VOTE_BITS, ti.f32) / (n * VOTE_SCALE)
 
 
 @ti.kernel
@@ -167,11 +173,13 @@ def reset_regularised(
     regularised: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
     """Fall back to the raw values Σ w·m / Σ w, where a retraction has left no smoothed ones."""
-    for i in range(count):
-        slot = touched_slots[i]
-        for v in range(CUBE):
-            w = lane_weight(sums[slot, v])
-            value = ti.f32(0.0)
-            if w > 0:
-                value = ti.cast(lane_distance(sums[slot, v]), ti.f32) / ti.cast(w, ti.f32)
-            regularised[slot, v] = value
+    for run in range(count * RUN):
+        if run % RUN == 0:
+            i = run // RUN
+            slot = touched_slots[i]
+            for v in range(CUBE):
+                w = lane_weight(sums[slot, v])
+                value = ti.f32(0.0)
+                if w > 0:
+                    value = ti.cast(lane_distance(sums[slot, v]), ti.f32) / ti.cast(w, ti.f32)
+                regularised[slot, v] = value

@@ -14,6 +14,10 @@ RAY_FIELDS = 8
 MAX_CROSSED = 64  # voxels in one ray's band: 2 · 16 · √3 and the ends
 VOXEL_LIMIT = 1 << 20  # |voxel coordinate| < VOXEL_LIMIT − 64, so that a band stays inside 21 bits
 
+# Taichi 1.7's CPU backend hands out a parallel loop in runs of 512 iterations, whatever `block_dim` says
+# (measured: a loop of 512 heavy iterations ran on one thread). One unit of work is therefore one run.
+RUN = 512
+
 POSITION_BITS = 10
 DIRECTION_ONE = 1 << 16
 NEVER = 1 << 25  # a crossing far behind the longest band

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: MIT
+"""A z-buffer rasteriser: which triangle each pixel sees.
+
+Vertices come in camera coordinates (x right, y down, z forward). A pixel keeps the smallest
+`depth bits << 32 | triangle`, by an atomic minimum: the picture does not depend on thread order.
+Triangles whose back is turned are not drawn, so a room opens like a doll's house.
+"""
+
+import taichi as ti
+import taichi.math as tm
+
+EMPTY = (1 << 63) - 1
+
+
+@ti.func
+def corner(vertices: ti.types.ndarray(), i):
+    return tm.vec3(vertices[i, 0], vertices[i, 1], vertices[i, 2])
+
+
+@ti.func
+def cut(a, b, near):
+    """Where the edge from a (in front of the near plane) to b (behind it) meets the plane."""
+    t = (near - a.z) / (b.z - a.z)
+    return tm.vec3(a.x + t * (b.x - a.x), a.y + t * (b.y - a.y), near)
+
+
+@ti.func
+def edge(a, b, p):
+    return (b.x - a.x) * (p.y - a.y) - (b.y - a.y) * (p.x - a.x)
+
+
+@ti.func
+def fill(seen: ti.types.ndarray(), a, b, c, triangle, focal, width, height):
+    """Draw one triangle that lies wholly in front of the near plane."""
+    centre = tm.vec2(0.5 * (width - 1), 0.5 * (height - 1))
+    pa = centre + focal * a.xy / a.z
+    pb = centre + focal * b.xy / b.z
+    pc = centre + focal * c.xy / c.z
+    area = edge(pa, pb, pc)
+    if area != 0.0:
+        low = ti.ceil(tm.max(ti.min(ti.min(pa, pb), pc), 0.0))
+        high = ti.floor(ti.min(ti.max(ti.max(pa, pb), pc), tm.vec2(width - 1, height - 1)))
+        for v in range(ti.cast(low.y, ti.i32), ti.cast(high.y, ti.i32) + 1):
+            for u in range(ti.cast(low.x, ti.i32), ti.cast(high.x, ti.i32) + 1):
+                p = tm.vec2(u, v)
+                wa = edge(pb, pc, p) / area
+                wb = edge(pc, pa, p) / area
+                wc = edge(pa, pb, p) / area
+                if wa >= 0.0 and wb >= 0.0 and wc >= 0.0:
+                    depth = 1.0 / (wa / a.z + wb / b.z + wc / c.z)
+                    bits = ti.cast(ti.bit_cast(ti.cast(depth, ti.f32), ti.i32), ti.i64)
+                    ti.atomic_min(seen[v, u], (bits << 32) | ti.cast(triangle, ti.i64))
+
+
+@ti.kernel
+def rasterise(
+    seen: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    vertices: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    focal: ti.f32,
+    near: ti.f32,
+):
+    """Fill `seen` (H, W), which holds EMPTY, from `vertices` (n, 3) and `faces` (m, 3)."""
+    height, width = seen.shape[0], seen.shape[1]
+    for f in range(faces.shape[0]):
+        a = corner(vertices, faces[f, 0])
+        b = corner(vertices, faces[f, 1])
+        c = corner(vertices, faces[f, 2])
+        facing = tm.dot(tm.cross(b - a, c - a), a)
+        if facing < 0.0:  # the normal points towards the eye
+            in_front = 0
+            for k in ti.static(range(3)):
+                in_front += ti.cast(vertices[faces[f, k], 2] >= near, ti.i32)
+            # Turn the triangle until the corner that differs from the others stands first.
+            for _ in range(2):
+                odd = (a.z >= near) if in_front == 1 else (a.z < near)
+                if (in_front == 1 or in_front == 2) and not odd:
+                    d = a
+                    a = b
+                    b = c
+                    c = d
+            if in_front == 3:
+                fill(seen, a, b, c, f, focal, width, height)
+            elif in_front == 2:
+                ab = cut(b, a, near)
+                ac = cut(c, a, near)
+                fill(seen, ab, b, c, f, focal, width, height)
+                fill(seen, ab, c, ac, f, focal, width, height)
+            elif in_front == 1:
+                fill(seen, a, cut(a, b, near), cut(a, c, near), f, focal, width, height)
+
+
+@ti.kernel
+def shade(
+    image: ti.types.ndarray(dtype=ti.f32, ndim=3),
+    seen: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    vertices: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    normals: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    colors: ti.types.ndarray(dtype=ti.u8, ndim=2),
+    focal: ti.f32,
+    up_x: ti.f32,
+    up_y: ti.f32,
+    up_z: ti.f32,
+    empty: ti.i64,
+):
+    """Write `image` (H, W, 4): linear RGB in 0…1 and depth in metres, where `seen` is not EMPTY.
+
+    `normals` and `up` are in camera coordinates; `colors` (n, 3) are sRGB. A lamp at the eye gives form,
+    a hemisphere around `up` tells floors from walls.
+    """
+    height, width = seen.shape[0], seen.shape[1]
+    for v, u in ti.ndrange(height, width):
+        if seen[v, u] != empty:
+            f = ti.cast(seen[v, u], ti.i32)  # the low half
+            ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
+            a, b, c = corner(vertices, ia), corner(vertices, ib), corner(vertices, ic)
+            ray = tm.vec3((u - 0.5 * (width - 1)) / focal, (v - 0.5 * (height - 1)) / focal, 1.0)
+            # Barycentric weights of the ray through the triangle's plane (Möller and Trumbore 1997).
+            wa = tm.dot(ray, tm.cross(b, c))
+            wb = tm.dot(ray, tm.cross(c, a))
+            wc = tm.dot(ray, tm.cross(a, b))
+            total = wa + wb + wc
+            if total != 0.0:
+                wa, wb, wc = wa / total, wb / total, wc / total
+            else:
+                wa, wb, wc = 1.0, 0.0, 0.0
+            wa, wb, wc = tm.clamp(wa, 0.0, 1.0), tm.clamp(wb, 0.0, 1.0), tm.clamp(wc, 0.0, 1.0)
+            normal = wa * corner(normals, ia) + wb * corner(normals, ib) + wc * corner(normals, ic)
+            normal /= ti.max(normal.norm(), 1e-9)
+            facing = ti.max(-tm.dot(normal, ray) / ray.norm(), 0.0)
+            sky = 0.5 + 0.5 * tm.dot(normal, tm.vec3(up_x, up_y, up_z))
+            light = 0.25 + 0.45 * facing + 0.35 * sky
+            for k in ti.static(range(3)):
+                color = (wa * colors[ia, k] + wb * colors[ib, k] + wc * colors[ic, k]) / 255.0
+                image[v, u, k] = ti.min(light * color**2.2, 1.0)
+            image[v, u, 3] = wa * a.z + wb * b.z + wc * c.z
