@@ -4,6 +4,8 @@
 A TOML file has one table a struct (`[volume]`, `[server]`, `[client]`); unknown keys are errors.
 """
 
+import math
+import re
 import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -25,7 +27,17 @@ NonNegative = Annotated[float, Meta(ge=0)]
 Port = Annotated[int, Meta(ge=0, le=65535)]
 
 
-class SensorModel(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What all settings have in common: no infinity, no NaN (both are legal TOML)."""
+
+    def __post_init__(self) -> None:
+        for key in self.__struct_fields__:
+            value = getattr(self, key)
+            if isinstance(value, float) and not math.isfinite(value):
+                raise ValueError(f"{key}: expected a finite number, got {value}")
+
+
+class SensorModel(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Depth noise of a sensor, and what follows from it.
 
     σ(z) = sigma_floor + sigma_slope · (z − sigma_z0)², metres; z = depth along the optical axis
@@ -71,7 +83,7 @@ SENSORS: dict[str, SensorModel] = {
 }
 
 
-class VolumeConfig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The map and how keyframes enter it. None = what the sensor preset says."""
 
     voxel_size: Positive = 0.02  # metres
@@ -103,7 +115,7 @@ class VolumeConfig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
         return msgspec.structs.replace(SENSORS[name], **chosen)
 
 
-class ServerConfig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The server daemon."""
 
     listen: str = "tcp://127.0.0.1:5555"
@@ -117,7 +129,7 @@ class ServerConfig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     mesh_interval: NonNegative = 0.2  # seconds between incremental meshes while busy
 
 
-class ClientConfig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The scanner's sending side."""
 
     address: str = "tcp://127.0.0.1:5555"
@@ -128,7 +140,7 @@ class ClientConfig(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     stall_timeout: Positive = 2.0  # seconds without progress before everything unacknowledged is resent
 
 
-class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A whole configuration file."""
 
     volume: VolumeConfig = VolumeConfig()
@@ -148,7 +160,19 @@ def make(struct: type[AnyStruct], settings: dict[str, Any]) -> AnyStruct:
     try:
         return msgspec.convert(settings, struct)
     except msgspec.ValidationError as error:
-        raise InvalidConfig(f"{error} (in {settings})") from error
+        raise InvalidConfig(_explain(struct, settings, str(error))) from error
+
+
+def _explain(struct: type[Struct], settings: dict[str, Any], problem: str) -> str:
+    """msgspec's message with the setting's name first, the words it may be, and what it was."""
+    match = re.fullmatch(r"(.+) - at `\$\.(\w+)`", problem)
+    if match is None:
+        return problem[:1].lower() + problem[1:]
+    expectation, key = match.groups()
+    words = re.findall(r"'(\w+)'", str(struct.__annotations__[key]))
+    if words and expectation.startswith("Invalid enum value"):
+        expectation = f"expected one of {', '.join(words)}"
+    return f"{key}: {expectation[:1].lower()}{expectation[1:]}, got {settings.get(key)!r}"
 
 
 def load(path: str | Path | None) -> Config:

@@ -1,19 +1,24 @@
 # SPDX-License-Identifier: MIT
 """Arrays that grow without copying: anonymous memory whose pages the operating system adds on first touch."""
 
+import ctypes
 import mmap
 import sys
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+
+MAX_ITEMS = (1 << 22) - 1  # × 512 voxels stays below the 2³¹ elements that a Taichi kernel can index
 
 
 class GrowingArray:
     """A zero-initialised array (capacity, *item) whose capacity can grow.
 
     On Linux growing moves page-table entries, not bytes (`mremap`), and pages never touched take no
-    memory; elsewhere it copies. Views taken from `array` must be dropped before `reserve`.
+    memory; elsewhere it copies. Take `array` anew after every `reserve`: an older one, or a view of it,
+    points to memory that is gone.
     """
 
     def __init__(self, item: tuple[int, ...], dtype: DTypeLike, capacity: int) -> None:
@@ -35,7 +40,7 @@ class GrowingArray:
         """Make room for `capacity` items; new items are zero."""
         if capacity <= self.capacity:
             return
-        capacity = max(capacity, 2 * self.capacity)
+        capacity = max(capacity, min(2 * self.capacity, MAX_ITEMS))
         if sys.platform != "linux":
             grown = np.zeros((capacity, *self._item), self._dtype)
             grown[: self.capacity] = self.array
@@ -45,6 +50,11 @@ class GrowingArray:
         if self._map is None:
             self._map = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
         else:
-            self.array = np.zeros((0, *self._item), self._dtype)  # lets go of the mapping
             self._map.resize(size)
-        self.array = np.frombuffer(self._map, self._dtype).reshape(capacity, *self._item)
+        # By address, not as a buffer of the map: Taichi's launches leave reference cycles around their
+        # arguments, and a map with a buffer still exported refuses to be resized.
+        address = ctypes.addressof(ctypes.c_char.from_buffer(self._map))
+        interface = {
+            "version": 3, "data": (address, False), "typestr": self._dtype.str, "shape": (capacity, *self._item)
+        }  # fmt: skip
+        self.array = np.asarray(SimpleNamespace(__array_interface__=interface))

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: MIT
+"""Slow twins of the kernels in plain NumPy and Python: the same mathematics, written for reading."""
+
+from collections import defaultdict
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.kernels import mc_tables
+
+Voxel = tuple[int, int, int]
+WEIGHT_ONE = 16
+MAX_BUNDLE_WEIGHT = 255
+MAX_DISTANCE = 1023
+NEVER = 1 << 25
+
+
+def sample(parameters: NDArray[np.float64], z: float, confidence: float) -> tuple[int, int]:
+    """(weight, half-width in 2⁻⁸ voxel) of one sample at depth z."""
+    floor, slope, z0, low, high, voxel_size, full, _, _ = parameters
+    sigma = floor + slope * (z - z0) * (z - z0)
+    ratio = min(1.0, full / sigma)
+    weight = max(int(np.floor(WEIGHT_ONE * ratio * ratio * confidence / 255.0 + 0.5)), 1)
+    half = int(min(max(3.0 * sigma / voxel_size, low), high) * 256.0)
+    return weight, half
+
+
+def make_ray(end: Any, direction: Any, half: int, weight: int, color: int = 0) -> NDArray[np.int32]:
+    """One ray of eight int32; `end` int 2⁻¹⁰ voxel, `direction` float of any length."""
+    direction = np.asarray(direction, np.float64)
+    unit = np.floor(direction / np.linalg.norm(direction) * 65536 + 0.5).astype(np.int64)
+    return np.array([*end, *unit, half << 16 | weight, color], np.int32)
+
+
+def fixed(p: Any) -> NDArray[np.int64]:
+    return np.floor(np.asarray(p, np.float64) * 1024.0).astype(np.int64)
+
+
+def crossed(ray: NDArray[np.int32]) -> list[tuple[Voxel, int]]:
+    """The voxels a ray crosses in its band, in order, with their distances (2⁻¹⁶ voxel)."""
+    end, u = [int(x) for x in ray[:3]], [int(x) for x in ray[3:6]]
+    half = (int(ray[6]) >> 16) << 8
+    start = [(e << 6) - (a * half >> 16) for e, a in zip(end, u, strict=True)]
+    voxel = [s >> 16 for s in start]
+    crossing, interval = [NEVER] * 3, [NEVER] * 3
+    for a in range(3):
+        if abs(u[a]) > 128:
+            inverse = 65536.0 / abs(u[a])
+            gap = 65536 - (start[a] & 65535) if u[a] > 0 else start[a] & 65535
+            interval[a], crossing[a] = int(inverse * 65536.0), int(gap * inverse)
+    distance = sum(((e << 6) - (v << 16) - 32768) * a for e, v, a in zip(end, voxel, u, strict=True)) >> 16
+    found = []
+    while True:
+        found.append(((voxel[0], voxel[1], voxel[2]), distance))
+        axis = min(range(3), key=lambda a: (crossing[a], a))
+        if crossing[axis] >= 2 * half:
+            return found
+        crossing[axis] += interval[axis]
+        voxel[axis] += 1 if u[axis] >= 0 else -1
+        distance -= abs(u[axis])
+
+
+def blocks_of(rays: NDArray[np.int32]) -> set[Voxel]:
+    return {(v[0] >> 3, v[1] >> 3, v[2] >> 3) for ray in rays for v, _ in crossed(ray)}
+
+
+def quantize(distance: int, quanta_per_voxel: int) -> int:
+    return max(-MAX_DISTANCE, min(MAX_DISTANCE, (distance * quanta_per_voxel + 32768) >> 16))
+
+
+def integrate(rays: NDArray[np.int32], quanta_per_voxel: int) -> dict[Voxel, tuple[int, int]]:
+    """(Σ w·m, Σ w) of every voxel the rays cross."""
+    sums: dict[Voxel, tuple[int, int]] = defaultdict(lambda: (0, 0))
+    for ray in rays:
+        w = int(ray[6]) & 65535
+        for voxel, distance in crossed(ray):
+            s, total = sums[voxel]
+            sums[voxel] = (s + w * quantize(distance, quanta_per_voxel), total + w)
+    return dict(sums)
+
+
+def bundle(samples: list[tuple[Any, Any, int, int]]) -> list[NDArray[np.int32]]:
+    """Bundle one tile's samples (point, origin, weight, half-width; positions in voxels)."""
+    groups: dict[Voxel, list[tuple[Any, Any, int, int]]] = defaultdict(list)
+    for one in samples:
+        x, y, z = fixed(one[0]) >> 10
+        groups[int(x), int(y), int(z)].append(one)
+    rays = []
+    for voxel, members in groups.items():
+        w = sum(m[2] for m in members)
+        inside = sum((fixed(m[0]) & 1023) * m[2] for m in members) // w
+        end = np.array(voxel) * 1024 + inside
+        origin = sum(fixed(m[1]) * m[2] for m in members) / w / 1024.0
+        half = sum(m[3] * m[2] for m in members) // w
+        rays.append(make_ray(end, (end + 0.5) / 1024.0 - origin, half, min(w, MAX_BUNDLE_WEIGHT)))
+    return rays
+
+
+def solve(y: Any, a: Any, t: Any, smoothness: float) -> NDArray[np.float64]:
+    """x̂ = argmin (x − y)ᵀ A (x − y) + λ ‖D2 (x − t)‖², by a dense solve."""
+    y, a, t = (np.asarray(v, np.float64) for v in (y, a, t))
+    n = len(y)
+    if n < 3:
+        return y
+    D2 = np.zeros((n - 2, n))
+    for i in range(n - 2):
+        D2[i, i : i + 3] = (1, -2, 1)
+    return t + np.linalg.solve(np.diag(a) + smoothness * D2.T @ D2, a * (y - t))
+
+
+def smooth(
+    rays: NDArray[np.int32],
+    quanta_per_voxel: int,
+    before: dict[Voxel, tuple[float, int]],
+    smoothness: float,
+    weighted: bool,
+) -> dict[Voxel, float]:
+    """Regularised values after these rays; `before` holds (value, weight) of the voxels seen before."""
+    added = integrate(rays, quanta_per_voxel)
+    votes = defaultdict(list)
+    for ray in rays:
+        voxels = crossed(ray)
+        t = [distance * quanta_per_voxel / 65536 for _, distance in voxels]
+        w, y = [], []
+        for voxel, _ in voxels:
+            x_old, w_old = before.get(voxel, (0.0, 0))
+            s, w_new = added[voxel]
+            w.append(w_old + w_new)
+            y.append((w_old * x_old + s) / (w_old + w_new))
+        a = np.array(w) / np.mean(w) if weighted else np.ones(len(w))
+        for (voxel, _), x in zip(voxels, solve(y, a, t, smoothness), strict=True):
+            votes[voxel].append(x)
+    return {voxel: float(np.mean(xs)) for voxel, xs in votes.items()}
+
+
+def marching_cubes(values: dict[Voxel, float]) -> list[tuple[tuple[float, float, float], ...]]:
+    """Triangles, as positions in voxels (voxel centres at + 0.5), over all cells with eight known corners."""
+    triangles = []
+    for cell in values:
+        corners = [tuple(np.add(cell, c)) for c in mc_tables.CORNERS]
+        if not all(c in values for c in corners):
+            continue
+        case = sum(1 << i for i, c in enumerate(corners) if values[c] < 0)
+        edges = mc_tables.TRIANGLE_EDGES[case, : 3 * mc_tables.TRIANGLE_COUNT[case]]
+        points = []
+        for e in edges:
+            a, b = (corners[i] for i in mc_tables.EDGES[e])
+            t = min(max(values[a] / (values[a] - values[b]), 0.001), 0.999)
+            points.append(tuple(np.array(a) + 0.5 + t * (np.array(b) - np.array(a))))
+        triangles += [tuple(points[i : i + 3]) for i in range(0, len(points), 3)]
+    return triangles
+
+
+def segment_voxels(ray: NDArray[np.int32]) -> set[Voxel]:
+    """Voxels the band's segment runs through, found by dense sampling: no traversal to get wrong."""
+    end, u = ray[:3] / 1024.0, ray[3:6] / 65536.0
+    half = (int(ray[6]) >> 16) / 256.0
+    t = np.linspace(-half, half, 20001)
+    return {(int(x), int(y), int(z)) for x, y, z in np.floor(end + t[:, None] * u)}
+
+
+def neighbours(voxel: Voxel) -> set[Voxel]:
+    return {tuple(np.add(voxel, d)) for d in product((-1, 0, 1), repeat=3)}  # type: ignore[misc]

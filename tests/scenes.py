@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: MIT
+"""Small scenes with known answers, rendered by formula."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion import Intrinsics, Keyframe
+
+CAMERA = Intrinsics(120.0, 120.0, 79.5, 59.5)
+SHAPE = (120, 160)
+
+
+def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """T_world_camera of a camera at `eye` that looks at `target`, OpenCV axes."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    T[:3, 3] = eye
+    return T
+
+
+def directions(T: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(H, W, 3) world directions of the pixels, scaled so that depth is the ray parameter."""
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    rays = np.dstack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(SHAPE)])
+    return rays @ T[:3, :3].T
+
+
+def sphere_keyframe(T: NDArray[np.float64], radius: float) -> Keyframe:
+    """A sphere around the origin, float32 depth."""
+    d, o = directions(T), T[:3, 3]
+    a, b, c = (d * d).sum(-1), (d @ o), o @ o - radius**2
+    inside = b * b - a * c
+    depth = np.where(inside > 0, (-b - np.sqrt(np.maximum(inside, 0))) / a, 0).astype(np.float32)
+    color = np.full((*SHAPE, 3), (20, 120, 220), np.uint8)  # BGR
+    return Keyframe(depth=depth, color=color, intrinsics=CAMERA, T_world_camera=T)
+
+
+def sphere_views(radius: float, count: int = 26) -> list[Keyframe]:
+    """Views from all around (Fibonacci directions), three radii away."""
+    i = np.arange(count) + 0.5
+    polar, azimuth = np.arccos(1 - 2 * i / count), np.pi * (1 + 5**0.5) * i
+    eyes = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], axis=1)
+    return [sphere_keyframe(look_at(3 * radius * eye, np.zeros(3)), radius) for eye in eyes]
+
+
+def plane_keyframe(T: NDArray[np.float64], normal: NDArray[np.float64], offset: float) -> Keyframe:
+    """The plane normal · p = offset, float32 depth."""
+    with np.errstate(divide="ignore"):
+        depth = (offset - T[:3, 3] @ normal) / (directions(T) @ normal)
+    depth = np.where((depth > 0.1) & (depth < 4), depth, 0).astype(np.float32)
+    return Keyframe(depth=depth, intrinsics=CAMERA, T_world_camera=T)

@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: MIT
+"""Laws of the map: it is a sum, whatever the order, the threads or the history."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import reference
+import scenes
+from numpy.typing import NDArray
+
+from tsfusion import Keyframe, Volume
+from tsfusion.errors import InvalidConfig, MapError, MapFull, WeightOverflow
+from tsfusion.volume import cells_of, pack_keys, unpack_keys
+
+VIEWS = scenes.sphere_views(0.4, 8)
+
+
+def volume_of(keyframes: list[Keyframe], **settings: object) -> Volume:
+    volume = Volume(**{"voxel_size": 0.02, "threads": 2, **settings})
+    for keyframe in keyframes:
+        volume.integrate(keyframe)
+    return volume
+
+
+def bytes_of(volume: Volume) -> dict[str, bytes]:
+    used = volume._used_slots()
+    return {name: layer[used].tobytes() for name, layer in volume._layers().items()}
+
+
+@pytest.mark.parametrize("bundle", [True, False])
+def test_the_volume_holds_exactly_the_twins_sums(bundle: bool) -> None:
+    depth = np.zeros(scenes.SHAPE, np.float32)
+    depth[40:70, 60:95] = VIEWS[0].measurement[40:70, 60:95]
+    keyframe = Keyframe(depth=depth, intrinsics=scenes.CAMERA, T_world_camera=VIEWS[0].T_world_camera)
+    volume = volume_of([keyframe, keyframe], bundle=bundle)
+    scratch = volume._scratch
+    spans = zip(scratch.band_start, scratch.band_count, strict=True)
+    rays = np.vstack([scratch.rays[start : start + count] for start, count in spans])
+    expected = reference.integrate(rays, volume._quanta_per_voxel)
+    found = {}
+    for slot, corner in enumerate(unpack_keys(volume._keys.array[: volume._count]) * 8):
+        for o in np.flatnonzero(volume._sums.array[slot]):
+            found[tuple((corner + (o >> 6, o >> 3 & 7, o & 7)).tolist())] = int(volume._sums.array[slot, o])
+    assert found == {voxel: 2 * ((s << 27) + w) for voxel, (s, w) in expected.items()}
+
+
+@pytest.mark.parametrize("regularizer", ["off", "paper", "ray"])
+def test_any_order_gives_the_same_hash(regularizer: str) -> None:
+    hashes = {volume_of(VIEWS, regularizer=regularizer).map_hash() for _ in range(2)}
+    hashes.add(volume_of(VIEWS[::-1], regularizer=regularizer).map_hash())
+    hashes.add(volume_of(VIEWS[4:] + VIEWS[:4], regularizer="off").map_hash())
+    assert len(hashes) == 1
+
+
+def test_one_thread_gives_the_hash_of_two() -> None:
+    here = Path(__file__).parent
+    script = (
+        "import scenes; from tsfusion import Volume\n"
+        "for regularizer in ('off', 'ray'):\n"
+        "    v = Volume(voxel_size=0.02, threads={}, regularizer=regularizer)\n"
+        "    [v.integrate(k) for k in scenes.sphere_views(0.4, 4)]\n"
+        "    print(v.map_hash(), v.color_hash(), v._layers().get('regularised', v._sums.array).tobytes().__hash__())\n"
+    )
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", script.format(threads)],
+            cwd=here, env={"PYTHONPATH": str(here), "PYTHONHASHSEED": "0"},
+            capture_output=True, text=True, check=True, timeout=120,
+        ).stdout
+        for threads in (1, 2)
+    }  # fmt: skip
+    assert len(found) == 1
+
+
+@pytest.mark.parametrize("bundle", [True, False])
+def test_retract_restores_the_bytes(bundle: bool) -> None:
+    volume = volume_of(VIEWS[:3], bundle=bundle)
+    before, map_hash, color_hash = bytes_of(volume), volume.map_hash(), volume.color_hash()
+    for keyframe in VIEWS[3:6]:
+        volume.integrate(keyframe)
+    assert volume.map_hash() != map_hash
+    for keyframe in VIEWS[3:6]:
+        volume.retract(keyframe)
+    assert (volume.map_hash(), volume.color_hash()) == (map_hash, color_hash)
+    assert bytes_of(volume) == before
+    assert volume.stats().keyframes == 3
+
+
+def test_a_moved_keyframe_is_a_retraction_and_an_addition() -> None:
+    volume = volume_of(VIEWS[:4])
+    volume.retract(VIEWS[1])
+    volume.integrate(VIEWS[6])
+    assert volume.map_hash() == volume_of([VIEWS[0], VIEWS[2], VIEWS[3], VIEWS[6]]).map_hash()
+
+
+def test_what_the_map_does_not_hold_cannot_be_retracted() -> None:
+    volume = volume_of(VIEWS[:2])
+    before = bytes_of(volume)
+    with pytest.raises(MapError, match="does not hold"):
+        volume.retract(VIEWS[5])
+    assert bytes_of(volume) == before
+
+
+def test_a_shift_by_whole_blocks_shifts_the_map() -> None:
+    shift = np.array([3, -2, 5])
+    moved = []
+    for keyframe in VIEWS[:3]:
+        T = keyframe.T_world_camera.copy()
+        T[:3, 3] += shift * 8 * 0.0625  # powers of two: the sums round alike
+        moved.append(Keyframe(depth=keyframe.depth, intrinsics=keyframe.intrinsics, T_world_camera=T))
+    here = [
+        Keyframe(depth=k.depth, intrinsics=k.intrinsics, T_world_camera=k.T_world_camera) for k in VIEWS[:3]
+    ]
+    a, b = volume_of(here, voxel_size=0.0625), volume_of(moved, voxel_size=0.0625)
+    keys_a = unpack_keys(a._keys.array[a._used_slots()])
+    keys_b = unpack_keys(b._keys.array[b._used_slots()])
+    assert {tuple(k) for k in keys_a + shift} == {tuple(k) for k in keys_b}
+    assert a._sums.array.sum() == pytest.approx(b._sums.array.sum(), rel=1e-3)
+
+
+def test_no_smoothness_equals_plain_fusion() -> None:
+    volume = volume_of(VIEWS, regularizer="ray", smoothness=0.0)
+    used = volume._used_slots()
+    sums, smoothed = volume._sums.array[used], volume._regularised.array[used]
+    weight = sums & ((1 << 27) - 1)
+    plain = (sums >> 27) / np.maximum(weight, 1)
+    assert np.abs(plain - smoothed)[weight > 0].max() <= 1 / 16
+
+
+def test_dirty_blocks_are_reported_once() -> None:
+    volume = volume_of(VIEWS[:1])
+    dirty = volume.take_dirty()
+    assert {tuple(b) for b in dirty} == {tuple(b) for b in unpack_keys(volume._keys.array[: volume._count])}
+    assert len(volume.take_dirty()) == 0
+    stats = volume.integrate(VIEWS[1])
+    assert len(volume.take_dirty()) == stats.blocks
+
+
+def test_cells_of_a_block_reach_one_block_down_each_axis() -> None:
+    cells = cells_of(np.array([[0, 0, 0], [0, 0, 1]], np.int32))
+    assert len(cells) == 12
+    assert {tuple(c) for c in cells} >= {(0, 0, 0), (-1, -1, -1), (-1, -1, 1)}
+
+
+def test_an_empty_keyframe_changes_nothing() -> None:
+    volume = volume_of(VIEWS[:1])
+    before = volume.map_hash()
+    empty = np.zeros(scenes.SHAPE, np.uint16)
+    stats = volume.integrate(Keyframe(depth=empty, intrinsics=scenes.CAMERA, T_world_camera=np.eye(4)))
+    assert (stats.samples, stats.rays, stats.voxels, stats.blocks) == (0, 0, 0, 0)
+    assert stats.invalid == empty.size
+    volume.integrate(Keyframe(points=np.zeros((0, 3), np.float32), T_world_camera=np.eye(4)))
+    assert volume.map_hash() == before
+    assert Volume(voxel_size=0.02).extract_mesh().faces.shape == (0, 3)
+
+
+def test_points_far_outside_the_reach_of_keys_are_dropped_and_counted() -> None:
+    points = np.array([[0, 0, 50.0], [0, 0, 2.0]], np.float32)
+    T = np.eye(4)
+    T[0, 3] = 9e5
+    volume = Volume(voxel_size=0.02, sensor="lidar")
+    assert volume.integrate(Keyframe(points=points, T_world_camera=T)).invalid == 2
+    assert volume.stats().blocks == 0
+
+
+def test_confidence_zero_is_no_return_and_half_is_less() -> None:
+    keyframe, full = VIEWS[0], volume_of(VIEWS[:1])
+    for value, check in ((0, lambda w: w == 0), (128, lambda w: 0 < w < weights(full))):
+        doubted = Keyframe(
+            depth=keyframe.depth, intrinsics=keyframe.intrinsics, T_world_camera=keyframe.T_world_camera,
+            confidence=np.full(scenes.SHAPE, value, np.uint8),
+        )  # fmt: skip
+        assert check(weights(volume_of([doubted])))
+
+
+def weights(volume: Volume) -> int:
+    return int((volume._sums.array & ((1 << 27) - 1)).sum())
+
+
+def test_the_limits_hold_and_leave_the_map_alone() -> None:
+    volume = volume_of(VIEWS[:1])
+    small = volume_of(VIEWS[:1], max_blocks=volume.stats().blocks)
+    before = bytes_of(small)
+    with pytest.raises(MapFull, match="max_blocks"):
+        small.integrate(VIEWS[4])
+    assert bytes_of(small) == before
+    with pytest.raises(MapFull, match="max_blocks_per_keyframe"):
+        volume_of(VIEWS[:1], max_blocks_per_keyframe=3)
+
+
+def test_full_voxels_refuse_more_and_lose_nothing() -> None:
+    volume = volume_of(VIEWS[:1])
+    slot, voxel = np.argwhere(volume._sums.array != 0)[0]
+    volume._sums.array[slot, voxel] = (1 << 26) - 1
+    before = bytes_of(volume)
+    with pytest.raises(WeightOverflow):
+        volume.integrate(VIEWS[0])
+    assert bytes_of(volume) == before
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"voxel_size": 0.0}, "voxel_size"),
+        ({"voxel_size": float("nan")}, "voxel_size"),
+        ({"voxel_size": float("inf")}, "voxel_size"),
+        ({"sensor": "sonar"}, "sensor"),
+        ({"regularizer": "tv"}, "regularizer"),
+        ({"voxelsize": 0.02}, "voxelsize"),
+        ({"min_range": 5.0, "max_range": 2.0}, "min_range"),
+        ({"min_support": 9.0, "max_support": 4.0}, "min_support"),
+    ],
+)
+def test_a_bad_setting_is_named(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(InvalidConfig, match=message):
+        Volume(**settings)
+
+
+def test_memory_grows_without_losing_a_bit() -> None:
+    volume = volume_of(VIEWS, voxel_size=0.004)
+    assert volume.stats().blocks > 2048  # past two growths of every array
+    backwards = volume_of(VIEWS[::-1], voxel_size=0.004)
+    assert volume.map_hash() == backwards.map_hash()
+    assert volume.stats().bytes_per_block <= 12_300
+
+
+def test_kernels_stay_in_bounds(tmp_path: Path) -> None:
+    """Taichi's debug mode checks every array access; it needs a process of its own."""
+    script = (
+        "import numpy as np, scenes\n"
+        "from tsfusion import runtime, Volume, Keyframe\n"
+        "import taichi as ti\n"
+        f"ti.init(arch=ti.cpu, debug=True, offline_cache=False, log_level=ti.ERROR)\n"
+        "runtime._started_threads = 2\n"
+        "v = Volume(voxel_size=0.04, regularizer='ray')\n"
+        "for k in scenes.sphere_views(0.4, 2): v.integrate(k)\n"
+        "r = np.random.default_rng(0).uniform(-3, 3, (700, 3)).astype(np.float32)\n"
+        "v.integrate(Keyframe(points=r, T_world_camera=np.eye(4)))\n"
+        "v.retract(Keyframe(points=r, T_world_camera=np.eye(4)))\n"
+        "assert len(v.extract_mesh(min_weight=0).faces)\n"
+    )
+    here = Path(__file__).parent
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=here, env={"PYTHONPATH": str(here)},
+        capture_output=True, text=True, timeout=240, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def random_cloud(seed: int, count: int) -> NDArray[np.float32]:
+    return np.random.default_rng(seed).uniform(-4, 4, (count, 3)).astype(np.float32)
+
+
+def test_points_in_any_order_of_keyframes_and_two_sensors() -> None:
+    keyframes = [
+        Keyframe(points=random_cloud(i, 3000), T_world_camera=np.eye(4), sensor="lidar") for i in range(3)
+    ]
+    a = volume_of([*VIEWS[:2], *keyframes])
+    b = volume_of([*keyframes[::-1], *VIEWS[1::-1]])
+    assert a.map_hash() == b.map_hash()
