@@ -47,6 +47,20 @@ def read_points(path: Path) -> NDArray[np.float32]:
     return np.array([row.split()[:3] for row in rows], dtype=np.float64).astype(np.float32)
 
 
+def read_rows(path: Path) -> NDArray[np.int64]:
+    """(N,) the range grid's row of every vertex."""
+    head, body = path.read_bytes().replace(b"\r\n", b"\n").split(b"end_header\n", 1)
+    sizes = dict(
+        line.split()[1:3] for line in head.splitlines() if line.startswith((b"element", b"obj_info num"))
+    )
+    cells = body.splitlines()[int(sizes[b"vertex"]) :]
+    rows = np.full(int(sizes[b"vertex"]), -1)
+    for index, cell in enumerate(cells):
+        if cell[:1] == b"1":
+            rows[int(cell.split()[1])] = index // int(sizes[b"num_cols"])
+    return rows
+
+
 def pose(translation_quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     """`tx ty tz qx qy qz qw` of bun.conf → (4, 4) T_world_scan; its quaternion is the conjugate of ours."""
     q = translation_quaternion[3:] / np.linalg.norm(translation_quaternion[3:])

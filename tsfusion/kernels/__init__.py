@@ -8,7 +8,7 @@ from tsfusion.errors import MissingDependency
 os.environ.setdefault("HOME", os.path.expanduser("~"))  # without it (a daemon's environment) taichi aborts
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # the banner goes to stdout
 try:
-    import taichi  # noqa: F401
+    import taichi as taichi
 except ImportError as error:
     raise MissingDependency(
         "fusing needs taichi, which has no build for this platform; "

@@ -98,7 +98,7 @@ def touch_blocks(
             last = ti.i64(0)
             for r in range(band_start[band], band_start[band] + band_count[band]):
                 if ray_weight(rays, r) > 0:
-                    voxel, crossing, interval, direction, distance = ray_start(rays, r)
+                    voxel, crossing, interval, direction, _ = ray_start(rays, r)
                     end = ray_length(rays, r)
                     block = voxel >> 3
                     step = vec3i(0)

@@ -11,20 +11,21 @@ hash table and a region of the ray buffer to itself.
 
 import taichi as ti
 
-from tsfusion.kernels.traversal import DIRECTION_ONE, POSITION_BITS, RUN, VOXEL_LIMIT, pack, unpack
+from tsfusion.kernels.traversal import DIRECTION_ONE, POSITION_BITS, RUN, VOXEL_LIMIT, pack, unpack, vec3i
 
 TILE = 16
 TILE_SAMPLES = TILE * TILE
 TABLE_SIZE = 512  # twice a tile's samples
-TABLE_FIELDS = 12  # key, Σ position·w (3), Σw, Σ half·w, Σ colour (3), Σ origin·w (3)
+SUM_FIELDS = 8  # Σ position·w (3, within the voxel), Σw, Σ half·w, Σ colour·w (3): a tile's fit 31 bits
 WEIGHT_ONE = 16  # a full-confidence sample
 MAX_BUNDLE_WEIGHT = 255  # more samples of one voxel in one tile are not independent evidence
 
 vec3 = ti.types.vector(3, ti.f64)
-vec6 = ti.types.vector(6, ti.f64)
+vec3l = ti.types.vector(3, ti.i64)
+vec8i = ti.types.vector(SUM_FIELDS, ti.i32)
 
-# `model`: σ floor, σ slope, σ z0, least and most half-width (voxels), voxel size, σ below which weight is full,
-# least and most range. See config.SensorModel.
+# `model`: σ floor, σ slope, σ z0, least and most half-width (voxels), voxel size, σ below which the weight is
+# full, least and most range. See config.SensorModel.
 MODEL_FIELDS = 9
 
 
@@ -54,98 +55,92 @@ def in_reach(p):
 
 
 @ti.func
-def write_ray(rays: ti.template(), r, x, y, z, direction, half, weight, color):
-    """`x y z` int32 2⁻¹⁰ voxel; direction any length, float64."""
+def write_ray(rays: ti.template(), r, end, direction, half, weight, color):
+    """`end` int32 2⁻¹⁰ voxel; direction any length, float64."""
     length = direction.norm()
     usable = weight
     if length <= 0.0:
         usable = 0
         length = 1.0
-    rays[r, 0] = x
-    rays[r, 1] = y
-    rays[r, 2] = z
     for a in ti.static(range(3)):
+        rays[r, a] = end[a]
         rays[r, 3 + a] = ti.cast(ti.floor(direction[a] / length * DIRECTION_ONE + 0.5), ti.i32)
     rays[r, 6] = (half << 16) | usable
     rays[r, 7] = color
 
 
 @ti.func
-def add_sample(
-    table: ti.template(), listed: ti.template(), band, entries, p, origin, has_origin, weight, half, color
-):
-    """Add one sample to the tile's table; returns the number of entries."""
-    x = ti.cast(ti.floor(p[0] * 1024.0), ti.i32)
-    y = ti.cast(ti.floor(p[1] * 1024.0), ti.i32)
-    z = ti.cast(ti.floor(p[2] * 1024.0), ti.i32)
-    vx, vy, vz = x >> POSITION_BITS, y >> POSITION_BITS, z >> POSITION_BITS
-    key = pack(vx, vy, vz)
-    i = ((vx * 73856093) ^ (vy * 19349663) ^ (vz * 83492791)) & (TABLE_SIZE - 1)
+def fixed_point(p):
+    """Position in voxels → int32 2⁻¹⁰ voxel."""
+    q = vec3i(0)
+    for a in ti.static(range(3)):
+        q[a] = ti.cast(ti.floor(p[a] * 1024.0), ti.i32)
+    return q
+
+
+@ti.func
+def sample_sums(q, weight, half, color):
+    """What one sample adds to its bundle: `SUM_FIELDS`."""
+    return vec8i(
+        (q[0] & 1023) * weight,
+        (q[1] & 1023) * weight,
+        (q[2] & 1023) * weight,
+        weight,
+        half * weight,
+        ((color >> 16) & 255) * weight,
+        ((color >> 8) & 255) * weight,
+        (color & 255) * weight,
+    )
+
+
+@ti.func
+def add_run(
+    keys: ti.template(), sums: ti.template(), origins: ti.template(), listed: ti.template(), band, entries,
+    voxel, run, origin, has_origin,
+):  # fmt: skip
+    """Add a run of consecutive samples of one voxel to the tile's table; returns the number of entries."""
+    key = pack(voxel[0], voxel[1], voxel[2])
+    i = ((voxel[0] * 73856093) ^ (voxel[1] * 19349663) ^ (voxel[2] * 83492791)) & (TABLE_SIZE - 1)
     count = entries
-    while table[band, i, 0] != key and table[band, i, 0] != 0:  # never full: a tile has half its size
+    while keys[band, i] != key and keys[band, i] != 0:  # never full: a tile has half its size
         i = (i + 1) & (TABLE_SIZE - 1)
-    if table[band, i, 0] == 0:
-        table[band, i, 0] = key
+    if keys[band, i] == 0:
+        keys[band, i] = key
         listed[band, count] = i
         count += 1
-    w = ti.cast(weight, ti.i64)
     # not `+=`: Taichi makes that atomic, and a band has its table to itself
-    table[band, i, 1] = table[band, i, 1] + (x & 1023) * w
-    table[band, i, 2] = table[band, i, 2] + (y & 1023) * w
-    table[band, i, 3] = table[band, i, 3] + (z & 1023) * w
-    table[band, i, 4] = table[band, i, 4] + w
-    table[band, i, 5] = table[band, i, 5] + half * w
-    table[band, i, 6] = table[band, i, 6] + ((color >> 16) & 255) * w
-    table[band, i, 7] = table[band, i, 7] + ((color >> 8) & 255) * w
-    table[band, i, 8] = table[band, i, 8] + (color & 255) * w
+    for f in ti.static(range(SUM_FIELDS)):
+        sums[band, i, f] = sums[band, i, f] + run[f]
     if has_origin == 1:
         for a in ti.static(range(3)):
-            table[band, i, 9 + a] = table[band, i, 9 + a] + ti.cast(ti.floor(origin[a] * 1024.0), ti.i64) * w
+            origins[band, i, a] = origins[band, i, a] + origin[a]
     return count
 
 
 @ti.func
 def flush_tile(
-    table: ti.template(),
-    listed: ti.template(),
-    band,
-    entries,
-    rays: ti.template(),
-    first,
-    common_origin,
-    has_origin,
-):
+    keys: ti.template(), sums: ti.template(), origins: ti.template(), listed: ti.template(), band, entries,
+    rays: ti.template(), first, common_origin, has_origin,
+):  # fmt: skip
     """Turn the tile's entries into rays `first …` and clear them."""
     for n in range(entries):
         i = listed[band, n]
-        w = table[band, i, 4]
-        voxel = unpack(table[band, i, 0])
-        position = vec3(0.0)
+        w = sums[band, i, 3]
+        mean = vec8i(0)
+        for f in ti.static(range(SUM_FIELDS)):
+            mean[f] = ti.raw_div(sums[band, i, f], w)
+            sums[band, i, f] = 0
+        end = unpack(keys[band, i]) * 1024 + vec3i(mean[0], mean[1], mean[2])
+        keys[band, i] = 0
         origin = common_origin
-        fixed = voxel * 1024
+        direction = vec3(0.0)
         for a in ti.static(range(3)):
-            fixed[a] += ti.cast(table[band, i, 1 + a] // w, ti.i32)
-            position[a] = (ti.cast(fixed[a], ti.f64) + 0.5) / 1024.0
             if has_origin == 1:
-                origin[a] = ti.cast(table[band, i, 9 + a], ti.f64) / ti.cast(w, ti.f64) / 1024.0
-        half = ti.cast(table[band, i, 5] // w, ti.i32)
-        color = (
-            (ti.cast(table[band, i, 6] // w, ti.i32) << 16)
-            | (ti.cast(table[band, i, 7] // w, ti.i32) << 8)
-            | ti.cast(table[band, i, 8] // w, ti.i32)
-        )
-        weight = ti.cast(ti.min(w, MAX_BUNDLE_WEIGHT), ti.i32)
-        write_ray(rays, first + n, fixed[0], fixed[1], fixed[2], position - origin, half, weight, color)
-        for f in ti.static(range(TABLE_FIELDS)):
-            table[band, i, f] = 0
-
-
-@ti.func
-def write_sample(rays: ti.template(), r, p, origin, weight, half, color):
-    x = ti.cast(ti.floor(p[0] * 1024.0), ti.i32)
-    y = ti.cast(ti.floor(p[1] * 1024.0), ti.i32)
-    z = ti.cast(ti.floor(p[2] * 1024.0), ti.i32)
-    write_ray(rays, r, x, y, z, p - origin, half, weight, color)
+                origin[a] = ti.cast(origins[band, i, a], ti.f64) / w / 1024.0
+                origins[band, i, a] = 0
+            direction[a] = (ti.cast(end[a], ti.f64) + 0.5) / 1024.0 - origin[a]
+        color = (mean[5] << 16) | (mean[6] << 8) | mean[7]
+        write_ray(rays, first + n, end, direction, mean[4], ti.min(w, MAX_BUNDLE_WEIGHT), color)
 
 
 @ti.kernel
@@ -160,7 +155,9 @@ def rays_from_image(
     camera: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (4, 3) voxels: du, dv, corner direction, origin
     model: ti.types.ndarray(dtype=ti.f64, ndim=1),
     bundle: ti.i32,
-    table: ti.types.ndarray(dtype=ti.i64, ndim=3),
+    table_keys: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    table_sums: ti.types.ndarray(dtype=ti.i32, ndim=3),
+    table_origins: ti.types.ndarray(dtype=ti.i64, ndim=3),
     listed: ti.types.ndarray(dtype=ti.i32, ndim=2),
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
     band_start: ti.types.ndarray(dtype=ti.i32, ndim=1),
@@ -174,9 +171,9 @@ def rays_from_image(
     bands = band_count.shape[0]
     origin = vec3(camera[3, 0], camera[3, 1], camera[3, 2])
     du = vec3(camera[0, 0], camera[0, 1], camera[0, 2])
-    for run in range(bands * RUN):
-        if run % RUN == 0:
-            band = run // RUN
+    for unit in range(bands * RUN):
+        if unit % RUN == 0:
+            band = unit // RUN
             first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // bands, ti.i32)
             last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // bands, ti.i32)
             band_start[band] = first_tile * TILE_SAMPLES
@@ -186,6 +183,9 @@ def rays_from_image(
                 top = tile // tiles_x * TILE
                 left = tile % tiles_x * TILE
                 entries = 0
+                voxel = vec3i(0)
+                run = vec8i(0)
+                none = vec3l(0)
                 for v in range(top, ti.min(top + TILE, height)):
                     row = vec3(0.0)
                     for a in ti.static(range(3)):
@@ -213,15 +213,36 @@ def rays_from_image(
                                         | ti.cast(color[v, u, 0], ti.i32)
                                     )
                                 samples += 1
+                                end = fixed_point(p)
                                 if bundle == 1:
-                                    entries = add_sample(
-                                        table, listed, band, entries, p, origin, 0, weight, half, rgb
-                                    )
+                                    here = end >> POSITION_BITS
+                                    if run[3] > 0 and any(here != voxel):
+                                        entries = add_run(
+                                            table_keys,
+                                            table_sums,
+                                            table_origins,
+                                            listed,
+                                            band,
+                                            entries,
+                                            voxel,
+                                            run,
+                                            none,
+                                            0,
+                                        )
+                                        run = vec8i(0)
+                                    voxel = here
+                                    run += sample_sums(end, weight, half, rgb)
                                 else:
-                                    write_sample(rays, out, p, origin, weight, half, rgb)
+                                    write_ray(rays, out, end, p - origin, half, weight, rgb)
                                     out += 1
                 if bundle == 1:
-                    flush_tile(table, listed, band, entries, rays, out, origin, 0)
+                    if run[3] > 0:
+                        entries = add_run(
+                            table_keys, table_sums, table_origins, listed, band, entries, voxel, run, none, 0
+                        )
+                    flush_tile(
+                        table_keys, table_sums, table_origins, listed, band, entries, rays, out, origin, 0
+                    )
                     out += entries
             band_count[band] = out - first_tile * TILE_SAMPLES
             band_samples[band] = samples
@@ -238,7 +259,9 @@ def rays_from_points(
     pose: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (3, 4), metres → voxels
     model: ti.types.ndarray(dtype=ti.f64, ndim=1),
     bundle: ti.i32,
-    table: ti.types.ndarray(dtype=ti.i64, ndim=3),
+    table_keys: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    table_sums: ti.types.ndarray(dtype=ti.i32, ndim=3),
+    table_origins: ti.types.ndarray(dtype=ti.i64, ndim=3),
     listed: ti.types.ndarray(dtype=ti.i32, ndim=2),
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
     band_start: ti.types.ndarray(dtype=ti.i32, ndim=1),
@@ -249,9 +272,9 @@ def rays_from_points(
     tiles = (count + TILE_SAMPLES - 1) // TILE_SAMPLES
     bands = band_count.shape[0]
     own_origins = ti.select(origins.shape[0] == 1, 0, 1)
-    for run in range(bands * RUN):
-        if run % RUN == 0:
-            band = run // RUN
+    for unit in range(bands * RUN):
+        if unit % RUN == 0:
+            band = unit // RUN
             first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // bands, ti.i32)
             last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // bands, ti.i32)
             band_start[band] = first_tile * TILE_SAMPLES
@@ -260,6 +283,9 @@ def rays_from_points(
             for tile in range(first_tile, last_tile):
                 entries = 0
                 origin = vec3(0.0)
+                voxel = vec3i(0)
+                run = vec8i(0)
+                origins_sum = vec3l(0)
                 for n in range(tile * TILE_SAMPLES, ti.min((tile + 1) * TILE_SAMPLES, count)):
                     o = vec3(0.0)
                     q = vec3(0.0)
@@ -287,15 +313,60 @@ def rays_from_points(
                                     | ti.cast(color[n, 0], ti.i32)
                                 )
                             samples += 1
+                            end = fixed_point(p)
                             if bundle == 1:
-                                entries = add_sample(
-                                    table, listed, band, entries, p, origin, own_origins, weight, half, rgb
-                                )
+                                here = end >> POSITION_BITS
+                                if run[3] > 0 and any(here != voxel):
+                                    entries = add_run(
+                                        table_keys,
+                                        table_sums,
+                                        table_origins,
+                                        listed,
+                                        band,
+                                        entries,
+                                        voxel,
+                                        run,
+                                        origins_sum,
+                                        own_origins,
+                                    )
+                                    run = vec8i(0)
+                                    origins_sum = vec3l(0)
+                                voxel = here
+                                run += sample_sums(end, weight, half, rgb)
+                                if own_origins == 1:
+                                    for a in ti.static(range(3)):
+                                        origins_sum[a] += (
+                                            ti.cast(ti.floor(origin[a] * 1024.0), ti.i64) * weight
+                                        )
                             else:
-                                write_sample(rays, out, p, origin, weight, half, rgb)
+                                write_ray(rays, out, end, p - origin, half, weight, rgb)
                                 out += 1
                 if bundle == 1:
-                    flush_tile(table, listed, band, entries, rays, out, origin, own_origins)
+                    if run[3] > 0:
+                        entries = add_run(
+                            table_keys,
+                            table_sums,
+                            table_origins,
+                            listed,
+                            band,
+                            entries,
+                            voxel,
+                            run,
+                            origins_sum,
+                            own_origins,
+                        )
+                    flush_tile(
+                        table_keys,
+                        table_sums,
+                        table_origins,
+                        listed,
+                        band,
+                        entries,
+                        rays,
+                        out,
+                        origin,
+                        own_origins,
+                    )
                     out += entries
             band_count[band] = out - first_tile * TILE_SAMPLES
             band_samples[band] = samples

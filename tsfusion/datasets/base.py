@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: MIT
+"""What a dataset is, and how its files are read with one clear error each."""
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.errors import DatasetError, InvalidKeyframe
+from tsfusion.keyframe import Intrinsics, Keyframe, check_intrinsics
+
+
+@runtime_checkable
+class Dataset(Protocol):
+    """Keyframes by index: what `replay` needs, and all it needs.
+
+    Attributes:
+        name: what to call it in a report.
+        sensor: name of the sensor model (`kinect`, `tof`, `stereo`, `lidar`).
+        timestamps_ns: (n,) int64 nanoseconds of the sensor's clock; None where none were recorded.
+        skipped: frames left out at opening, by reason.
+    """
+
+    name: str
+    sensor: str
+    timestamps_ns: NDArray[np.int64] | None
+    skipped: dict[str, int]
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> Keyframe: ...
+
+    def __iter__(self) -> Iterator[Keyframe]: ...
+
+
+class Frames:
+    """Indexing and iteration over `_load(index)`; files are opened there, not before."""
+
+    name: str
+    sensor: str
+    timestamps_ns: NDArray[np.int64] | None = None
+    skipped: dict[str, int]
+
+    def __len__(self) -> int:
+        raise NotImplementedError
+
+    def _load(self, index: int) -> Keyframe:
+        raise NotImplementedError
+
+    def __getitem__(self, index: int) -> Keyframe:
+        count = len(self)
+        if not -count <= index < count:
+            raise IndexError(f"{self.name} has {count} keyframes, got index {index}")
+        index %= count
+        try:
+            return self._load(index)
+        except InvalidKeyframe as error:
+            raise DatasetError(f"keyframe {index} of {self.name}: {error}") from error
+
+    def __iter__(self) -> Iterator[Keyframe]:
+        return (self[index] for index in range(len(self)))
+
+    def _stamp(self, index: int) -> int:
+        return 0 if self.timestamps_ns is None else int(self.timestamps_ns[index])
+
+
+class Selection(Frames):
+    """Some keyframes of another dataset, in the order given; `select` makes one.
+
+    Has the other's `distance` where it has one: the measure of a world whose surface is known.
+    """
+
+    distance: Callable[[NDArray[np.floating]], NDArray[np.float64]]
+
+    def __init__(self, dataset: Dataset, indices: Sequence[int]) -> None:
+        self.name, self.sensor, self.skipped = dataset.name, dataset.sensor, dataset.skipped
+        self._dataset, self._indices = dataset, list(indices)
+        if hasattr(dataset, "distance"):
+            self.distance = dataset.distance
+        if dataset.timestamps_ns is not None:
+            self.timestamps_ns = dataset.timestamps_ns[self._indices]
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def _load(self, index: int) -> Keyframe:
+        return self._dataset[self._indices[index]]
+
+
+def select(
+    dataset: Dataset, *, start: int = 0, stop: int | None = None, stride: int = 1, limit: int | None = None
+) -> Selection:
+    """Every `stride`-th keyframe of `dataset[start:stop]`, at most `limit` of them.
+
+    Raises:
+        DatasetError: when none is left.
+    """
+    if stride < 1:
+        raise DatasetError(f"stride must be >= 1, got {stride}")
+    indices = range(len(dataset))[start:stop:stride][:limit]
+    if not indices:
+        raise DatasetError(
+            f"{dataset.name} has {len(dataset)} keyframes; "
+            f"start {start}, stop {stop} and limit {limit} leave none"
+        )
+    return Selection(dataset, indices)
+
+
+def folder(path: str | Path, layout: str) -> Path:
+    """`path` as an existing folder."""
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise DatasetError(f"{path} does not exist; expected a folder in the {layout} layout")
+    if not path.is_dir():
+        raise DatasetError(f"{path} is not a folder; expected a folder in the {layout} layout")
+    return path
+
+
+def read_lines(path: Path, content: str) -> list[tuple[int, str]]:
+    """(line number, text) of every line that is neither blank nor a `#` comment.
+
+    Copes with CRLF and a byte order mark.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise DatasetError(f"{path} is missing; expected {content}") from error
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{path} is not a text file; expected {content}") from error
+    except OSError as error:
+        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
+    numbered = ((number, line.strip()) for number, line in enumerate(text.splitlines(), 1))
+    return [(number, line) for number, line in numbered if line and not line.startswith("#")]
+
+
+def read_numbers(path: Path, content: str, *, columns: int | None = None) -> NDArray[np.float64]:
+    """A text table: (rows, columns) float64, finite; with `columns` None all rows must be equally long."""
+    lines = read_lines(path, content)
+    if not lines:
+        raise DatasetError(f"{path} is empty; expected {content}")
+    columns = columns or len(lines[0][1].split())
+    return np.array([numbers(path, number, line.split(), columns, content) for number, line in lines])
+
+
+def numbers(path: Path, line: int, words: list[str], count: int, content: str) -> list[float]:
+    """`words` as exactly `count` finite numbers."""
+    try:
+        values = [float(word) for word in words]
+    except ValueError as error:
+        raise DatasetError(f"{path}:{line}: {error}; expected {content}") from error
+    if len(values) != count:
+        raise DatasetError(f"{path}:{line}: {len(values)} numbers, expected {count}: {content}")
+    if not np.isfinite(values).all():
+        raise DatasetError(f"{path}:{line}: not finite: {' '.join(words)}; expected {content}")
+    return values
+
+
+def read_image(path: Path, what: str) -> NDArray[Any]:
+    """Any image as stored: (H, W) or (H, W, 3) BGR."""
+    if not path.is_file():
+        raise DatasetError(f"{path} is missing; expected {what}")
+    image: NDArray[Any] | None = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise DatasetError(f"{path} cannot be decoded; expected {what}")
+    return image
+
+
+def read_depth(path: Path, *, invalid: int | None = None) -> NDArray[np.uint16]:
+    """(H, W) uint16 depth; pixels equal to `invalid` become 0."""
+    depth = read_image(path, "a 16-bit depth image")
+    if depth.dtype != np.uint16 or depth.ndim != 2:
+        raise DatasetError(
+            f"{path} must hold one 16-bit channel, got shape {depth.shape} of {depth.dtype} "
+            "(was it saved again as 8 bits?)"
+        )
+    if invalid is not None:
+        depth[depth == invalid] = 0
+    return depth
+
+
+def read_color(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 BGR of the depth image's `shape`."""
+    if not path.is_file():
+        raise DatasetError(f"{path} is missing; expected a colour image")
+    color: NDArray[np.uint8] | None = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if color is None:
+        raise DatasetError(f"{path} cannot be decoded; expected a colour image")
+    if color.shape[:2] != shape:
+        raise DatasetError(
+            f"{path} is {color.shape[1]}×{color.shape[0]}, its depth image {shape[1]}×{shape[0]}; "
+            "expected equal sizes"
+        )
+    return color
+
+
+def read_intrinsics(path: Path) -> Intrinsics:
+    """A 3×3 camera matrix in a text file."""
+    K = read_numbers(path, "a 3×3 camera matrix", columns=3)
+    if K.shape != (3, 3) or K[1, 0] or abs(K[2] - (0, 0, 1)).max() > 1e-9:
+        raise DatasetError(f"{path} must hold a 3×3 camera matrix ending in 0 0 1, got {K.tolist()}")
+    return checked_intrinsics(Intrinsics(*map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))), path)
+
+
+def checked_intrinsics(intrinsics: Intrinsics, source: object) -> Intrinsics:
+    """`intrinsics`, or an error that names where they came from."""
+    try:
+        check_intrinsics(intrinsics)
+    except InvalidKeyframe as error:
+        raise DatasetError(f"{source}: {error}") from error
+    return intrinsics
+
+
+def require_frames(count: int, path: Path, expected: str, skipped: dict[str, int]) -> None:
+    """Raise unless at least one frame is left."""
+    if count:
+        return
+    reasons = "; ".join(f"{number} {reason}" for reason, number in skipped.items() if number)
+    raise DatasetError(
+        f"{path} holds no usable frames; expected {expected}" + (f" ({reasons})" if reasons else "")
+    )

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: MIT
+"""Trajectories: the text formats of the field, and the pose at a time between two of them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.datasets.base import numbers, read_lines, read_numbers
+from tsfusion.errors import DatasetError, InvalidKeyframe
+from tsfusion.keyframe import check_pose
+
+Pose = NDArray[np.float64]  # (4, 4) T_world_camera
+
+_EXACT_NS = 1_000_000  # a pose this near in time needs no neighbour
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses in time order.
+
+    Attributes:
+        timestamps_ns: (n,) int64, strictly increasing.
+        translations: (n, 3) float64, metres.
+        quaternions: (n, 4) float64, x y z w, unit length.
+    """
+
+    timestamps_ns: NDArray[np.int64]
+    translations: NDArray[np.float64]
+    quaternions: NDArray[np.float64]
+
+    def at(self, timestamp_ns: int, *, max_gap_ns: int) -> Pose | None:
+        """The pose at a time: SLERP and linear between the neighbours, never beyond the ends.
+
+        None when the neighbours are more than `max_gap_ns` apart, unless one is within a millisecond.
+        """
+        stamps = self.timestamps_ns
+        right = int(np.searchsorted(stamps, timestamp_ns))
+        nearest = min(
+            (i for i in (right - 1, right) if 0 <= i < len(stamps)),
+            key=lambda i: abs(int(stamps[i]) - timestamp_ns),
+        )
+        if right in (0, len(stamps)) or stamps[right] - stamps[right - 1] > max_gap_ns:
+            near = abs(int(stamps[nearest]) - timestamp_ns) <= _EXACT_NS
+            return rigid(self.quaternions[nearest], self.translations[nearest]) if near else None
+        share = (timestamp_ns - stamps[right - 1]) / (stamps[right] - stamps[right - 1])
+        t = (1 - share) * self.translations[right - 1] + share * self.translations[right]
+        return rigid(slerp(self.quaternions[right - 1], self.quaternions[right], share), t)
+
+
+def slerp(q0: NDArray[np.float64], q1: NDArray[np.float64], share: float) -> NDArray[np.float64]:
+    """The unit quaternion `share` of the way from `q0` to `q1`, the short way round."""
+    cosine = float(q0 @ q1)
+    if cosine < 0:
+        q1, cosine = -q1, -cosine
+    if cosine > 0.9999995:  # the sine below would lose its digits
+        mixed = (1 - share) * q0 + share * q1
+    else:
+        angle = np.arccos(cosine)
+        mixed = (np.sin((1 - share) * angle) * q0 + np.sin(share * angle) * q1) / np.sin(angle)
+    unit: NDArray[np.float64] = mixed / np.linalg.norm(mixed)
+    return unit
+
+
+def rigid(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> Pose:
+    """(4, 4) from a unit quaternion (x y z w) and a translation."""
+    x, y, z, w = quaternion
+    T = np.eye(4)
+    T[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    T[:3, 3] = translation
+    return T
+
+
+def nanoseconds(seconds: str, path: Path, line: int) -> int:
+    """Decimal seconds as exact integer nanoseconds (a double holds a Unix stamp only to 0.2 µs)."""
+    whole, _, fraction = seconds.partition(".")
+    if not whole.isdigit() or (fraction and not fraction.isdigit()):
+        try:
+            stamp = round(float(seconds) * 1e9)
+        except (ValueError, OverflowError) as error:
+            raise DatasetError(f"{path}:{line}: timestamp must be seconds, got {seconds!r}") from error
+    else:
+        stamp = int(whole) * 1_000_000_000 + int((fraction + "000000000")[:9])
+    if not 0 <= stamp < 2**63:
+        raise DatasetError(f"{path}:{line}: timestamp must be seconds >= 0, got {seconds!r}")
+    return stamp
+
+
+def read_tum(path: Path) -> Trajectory:
+    """`timestamp tx ty tz qx qy qz qw` a line (TUM RGB-D, CoRBS, most SLAM systems)."""
+    content = "`timestamp tx ty tz qx qy qz qw` a line"
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in read_lines(path, content):
+        words = line.replace(",", " ").split()
+        values = numbers(path, number, words, 8, content)
+        norm = float(np.linalg.norm(values[4:]))
+        if abs(norm - 1) > 0.01:
+            raise DatasetError(f"{path}:{number}: quaternion must have length 1, got {norm:.4g}")
+        stamps.append(nanoseconds(words[0], path, number))
+        rows.append(values[1:])
+    if not rows:
+        raise DatasetError(f"{path} holds no poses; expected {content}")
+    order = np.unique(np.array(stamps, dtype=np.int64), return_index=True)[1]
+    table = np.array(rows)[order]
+    quaternions = table[:, 3:] / np.linalg.norm(table[:, 3:], axis=1, keepdims=True)
+    return Trajectory(np.array(stamps, dtype=np.int64)[order], table[:, :3], quaternions)
+
+
+def read_kitti(path: Path) -> list[Pose]:
+    """3×4 row-major matrices, one a line; the line number is the frame number."""
+    table = read_numbers(path, "12 numbers a line, a 3×4 row-major camera-to-world matrix", columns=12)
+    return [_pose(row.reshape(3, 4), f"{path}, pose {index}") for index, row in enumerate(table)]
+
+
+def read_matrix(path: Path) -> Pose:
+    """One 4×4 camera-to-world matrix in a file (7-Scenes)."""
+    table = read_numbers(path, "a 4×4 camera-to-world matrix", columns=4)
+    if table.shape != (4, 4):
+        raise DatasetError(f"{path} must hold 4 rows of 4 numbers, got {len(table)} rows")
+    return _pose(table, str(path))
+
+
+def read_matrix_rows(path: Path) -> list[Pose]:
+    """4×4 matrices, one a line of 16 numbers (HoloLens folders)."""
+    table = read_numbers(path, "16 numbers a line, a 4×4 row-major camera-to-world matrix", columns=16)
+    return [_pose(row.reshape(4, 4), f"{path}, pose {index}") for index, row in enumerate(table)]
+
+
+def read_log(path: Path) -> list[tuple[int, Pose]]:
+    """Redwood / Open3D `.log`: a line of three integers, then a 4×4 camera-to-world matrix; repeated."""
+    lines = read_lines(path, "a Redwood trajectory: three integers, then a 4×4 matrix, repeated")
+    if not lines or len(lines) % 5:
+        raise DatasetError(
+            f"{path} has {len(lines)} lines; expected five a pose: three integers, then a 4×4 matrix"
+        )
+    poses = []
+    for start in range(0, len(lines), 5):
+        number, head = lines[start]
+        words = head.split()
+        if len(words) != 3 or not words[0].isdigit():
+            raise DatasetError(f"{path}:{number}: three integers expected before each matrix, got {head!r}")
+        rows = [numbers(path, n, line.split(), 4, "a 4×4 matrix") for n, line in lines[start + 1 : start + 5]]
+        poses.append((int(words[0]), _pose(np.array(rows), f"{path}:{number}")))
+    return poses
+
+
+def _pose(matrix: NDArray[np.float64], where: str) -> Pose:
+    T = np.eye(4)
+    T[: len(matrix)] = matrix
+    try:
+        return check_pose(T)
+    except InvalidKeyframe as error:
+        raise DatasetError(f"{where}: {error}") from error

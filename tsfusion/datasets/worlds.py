@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: MIT
+"""The synthetic worlds: tables of solids with a known signed distance, and a path through each.
+
+A world is the union of its solids; the renderer casts rays at the same table.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Solids = NDArray[np.float64]  # (m, 11): kind, centre xyz, half sizes xyz, cos yaw, sin yaw, material, variant
+
+# As in kernels/synthetic.py, which cannot be imported without Taichi; a test compares them.
+ROOM, BOX, SPHERE, CYLINDER, GROUND = range(5)
+INTERIOR, WOOD, MARBLE, STRIPES, ROAD, PAVEMENT, FACADE, PAINT, METAL, BARK, LEAVES, GLASS = range(12)
+
+_CHUNK = 1 << 16  # points measured at once
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """Solids and the sensor's path.
+
+    Attributes:
+        solids: (m, 11) float64, metres.
+        path: `path(index, count)` → (4, 4) T_world_camera, OpenCV axes.
+    """
+
+    name: str
+    solids: Solids
+    path: Callable[[int, int], NDArray[np.float64]]
+
+    def distance(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Signed distance to the nearest surface: (n, 3) metres → (n,) float64, negative inside solids.
+
+        Exact outside every solid; inside it is exact where solids do not overlap.
+        """
+        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        result = np.full(len(points), np.inf)
+        for start in range(0, len(points), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            for solid in self.solids:
+                np.minimum(result[part], _distance(solid, points[part]), out=result[part])
+        return result
+
+    def near(self, position: NDArray[np.float64], reach: float) -> Solids:
+        """The solids that begin within `reach` metres of `position`."""
+        half = np.linalg.norm(self.solids[:, 4:7], axis=1)
+        away = np.linalg.norm(self.solids[:, 1:4] - position, axis=1) - half
+        endless = np.isin(self.solids[:, 0], (ROOM, GROUND))
+        return np.ascontiguousarray(self.solids[endless | (away < reach)])
+
+
+def room() -> World:
+    """A 4×4×2.8 m room with a sphere, a box and a column; the path is a closed circle looking inward."""
+    solids = [
+        solid(ROOM, (0, 0, 1.4), (2, 2, 1.4), INTERIOR),
+        solid(SPHERE, (0.6, 0.3, 0.5), (0.5, 0.5, 0.5), MARBLE),
+        solid(BOX, (-0.7, 0.6, 0.4), (0.4, 0.3, 0.4), WOOD),
+        solid(CYLINDER, (0, -0.8, 0.6), (0.15, 0.15, 0.6), STRIPES),
+    ]
+    return World("room", np.array(solids), _circle)
+
+
+def street(length: float = 80.0) -> World:
+    """A street along x: road, pavements, facades, parked cars, lamp posts, trees and bins.
+
+    Built piece by piece from x = -16 m on, so that a longer street begins like a shorter one.
+    """
+    rng = {side: np.random.default_rng(20 + side) for side in (-1, 1)}
+    solids = [
+        solid(GROUND, (0, 0, 0), (0, 0, 0), ROAD),
+        solid(BOX, (length / 2, 7.5, 0.0), (length / 2 + 200, 3.0, 0.14), PAVEMENT),
+        solid(BOX, (length / 2, -7.5, 0.0), (length / 2 + 200, 3.0, 0.14), PAVEMENT),
+    ]
+    for side in (-1, 1):
+        solids += _houses(rng[side], side, length)
+        solids += _kerbside(rng[side], side, length)
+    return World("street", np.array(solids), _drive)
+
+
+def solid(
+    kind: int,
+    center: tuple[float, ...],
+    half: tuple[float, ...],
+    material: int,
+    *,
+    yaw: float = 0.0,
+    variant: int = 0,
+) -> list[float]:
+    """One row of the table."""
+    return [kind, *center, *half, np.cos(yaw), np.sin(yaw), material, variant]
+
+
+def look_at(position: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) T_world_camera at `position` with its optical axis through `target`; z is up in the world."""
+    forward = target - position
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    T[:3, 3] = position
+    return T
+
+
+def _circle(index: int, count: int) -> NDArray[np.float64]:
+    angle = 2.5 + 2 * np.pi * index / count
+    position = np.array([0.9 * np.cos(angle), 0.9 * np.sin(angle), 1.5])
+    return look_at(position, np.array([1.2 * np.cos(angle - 2.5), 1.2 * np.sin(angle - 2.5), 0.6]))
+
+
+def _drive(index: int, count: int) -> NDArray[np.float64]:
+    """One metre a keyframe in the right lane, swaying a little."""
+    x = float(index)
+    position = np.array([x, -1.15 + 0.25 * np.sin(0.11 * x), 1.65 + 0.02 * np.sin(0.7 * x)])
+    ahead = np.array([x + 10, -1.15 + 0.25 * np.sin(0.11 * (x + 10)), 1.6 + 0.03 * np.sin(0.9 * x)])
+    return look_at(position, ahead)
+
+
+def _houses(rng: np.random.Generator, side: int, length: float) -> list[list[float]]:
+    """Houses side by side with an alley now and then, each with a door step and balconies."""
+    solids, x, number = [], -16.0, 0
+    while x < length + 60:
+        width, height, front = rng.uniform(7, 13), rng.uniform(6.5, 12.0), rng.uniform(8.6, 9.4)
+        number += 1
+        middle = x + width / 2
+        solids.append(
+            solid(
+                BOX,
+                (middle, side * (front + 4), height / 2),
+                (width / 2, 4, height / 2),
+                FACADE,
+                variant=number,
+            )
+        )
+        solids.append(solid(BOX, (middle, side * (front - 0.25), 0.1), (0.8, 0.25, 0.25), PAVEMENT))
+        if rng.uniform() < 0.6:
+            solids.append(solid(BOX, (middle, side * (front - 0.4), 3.35), (1.3, 0.4, 0.5), METAL))
+        x += width + (rng.uniform(2.0, 3.5) if rng.uniform() < 0.3 else 0.0)
+    return solids
+
+
+def _kerbside(rng: np.random.Generator, side: int, length: float) -> list[list[float]]:
+    """Parked cars, and on the pavement posts, trees and bins in turn."""
+    solids, x, number = [], -13.0, 0
+    while x < length + 50:
+        number += 1
+        if rng.uniform() < 0.7:
+            solids += _car(rng, x, side * 3.45, number)
+        along = x + rng.uniform(2.6, 3.4)
+        if number % 3 == 0:
+            solids.append(solid(CYLINDER, (along, side * 4.9, 2.6), (0.08, 0.08, 2.6), METAL))
+            solids.append(solid(BOX, (along, side * 4.4, 5.15), (0.12, 0.55, 0.06), METAL))
+        elif number % 3 == 1:
+            crown = rng.uniform(0.9, 1.35)
+            solids.append(solid(CYLINDER, (along, side * 5.4, 1.3), (0.15, 0.15, 1.3), BARK))
+            solids.append(solid(SPHERE, (along, side * 5.4, 2.2 + crown), (crown,) * 3, LEAVES))
+        else:
+            solids.append(
+                solid(BOX, (along, side * 6.6, 0.65), (0.5, 0.35, 0.55), PAINT, variant=90 + number)
+            )
+        x += rng.uniform(5.6, 7.5)
+    return solids
+
+
+def _car(rng: np.random.Generator, x: float, y: float, number: int) -> list[list[float]]:
+    yaw = rng.normal(0, 0.025)
+    long, wide = rng.uniform(1.95, 2.3), rng.uniform(0.82, 0.9)
+    body = solid(BOX, (x, y, 0.53), (long, wide, 0.33), PAINT, yaw=yaw, variant=number)
+    cabin = solid(BOX, (x - 0.25, y, 1.12), (0.52 * long, 0.88 * wide, 0.27), GLASS, yaw=yaw)
+    roof = solid(BOX, (x - 0.25, y, 1.42), (0.5 * long, 0.86 * wide, 0.03), PAINT, yaw=yaw, variant=number)
+    return [body, cabin, roof]
+
+
+def _distance(row: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    kind, half, (cosine, sine) = int(row[0]), row[4:7], row[7:9]
+    p = points - row[1:4]
+    p = np.stack([cosine * p[:, 0] + sine * p[:, 1], cosine * p[:, 1] - sine * p[:, 0], p[:, 2]], axis=1)
+    q = np.abs(p) - half
+    if kind == CYLINDER:
+        q = np.stack([np.hypot(p[:, 0], p[:, 1]) - half[0], q[:, 2]], axis=1)
+    result: NDArray[np.float64] = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
+    if kind == GROUND:
+        result = p[:, 2]
+    elif kind == SPHERE:
+        result = np.linalg.norm(p, axis=1) - half[0]
+    elif kind == ROOM:
+        result = -q.max(axis=1)
+    return result
