@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tsfusion import Keyframe, Volume
 from tsfusion.errors import InvalidConfig, MapError, MapFull, WeightOverflow
-from tsfusion.volume import cells_of, pack_keys, unpack_keys
+from tsfusion.volume import cells_of, unpack_keys
 
 VIEWS = scenes.sphere_views(0.4, 8)
 
@@ -233,7 +233,7 @@ def test_kernels_stay_in_bounds(tmp_path: Path) -> None:
         "import numpy as np, scenes\n"
         "from tsfusion import runtime, Volume, Keyframe\n"
         "import taichi as ti\n"
-        f"ti.init(arch=ti.cpu, debug=True, offline_cache=False, log_level=ti.ERROR)\n"
+        "ti.init(arch=ti.cpu, debug=True, offline_cache=False, log_level=ti.ERROR)\n"
         "runtime._started_threads = 2\n"
         "v = Volume(voxel_size=0.04, regularizer='ray')\n"
         "for k in scenes.sphere_views(0.4, 2): v.integrate(k)\n"

@@ -171,7 +171,8 @@ class Keyframe:
             )
         if not isinstance(self.intrinsics, Intrinsics):
             raise InvalidKeyframe(
-                f"intrinsics must be given with {self.kind} as Intrinsics(fx, fy, cx, cy), got {self.intrinsics!r}"
+                f"intrinsics must be given with {self.kind} as Intrinsics(fx, fy, cx, cy), "
+                f"got {self.intrinsics!r}"
             )
         check_intrinsics(self.intrinsics)
 
@@ -197,6 +198,8 @@ def check_pose(pose: Any) -> NDArray[np.float64]:
     if not np.isfinite(T).all():
         raise InvalidKeyframe(f"T_world_camera must be finite, got {T.tolist()}")
     R, t = T[:3, :3], T[:3, 3]
+    if np.abs(R).max() > 2:  # so far off that RᵀR could overflow
+        raise InvalidKeyframe(f"T_world_camera must hold a rotation, got entries up to {np.abs(R).max():.3g}")
     deviation = float(np.abs(R.T @ R - np.eye(3)).max())
     if deviation > _ROTATION_TOLERANCE or np.linalg.det(R) <= 0:
         raise InvalidKeyframe(

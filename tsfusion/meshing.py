@@ -49,8 +49,9 @@ def extract(wanted: NDArray[np.int64], layers: Layers, min_weight: float) -> Mes
         part.count(cases, edges, vertex_counts, triangle_counts)
         parts.append(part.emit(edges, vertex_counts))
     faces = np.empty((int(triangle_counts.sum()), 3), np.int32)
+    forward = _index(keys, keys[:, None] + _FORWARD)
     marching.emit_faces(
-        cases, edges, _index(keys, keys[:, None] + _FORWARD), _starts(vertex_counts), _starts(triangle_counts),
+        cases, edges, forward, _starts(vertex_counts), _starts(triangle_counts),
         mc_tables.TRIANGLE_COUNT, mc_tables.TRIANGLE_EDGES, mc_tables.EDGE_CORNER, faces,
     )  # fmt: skip
     positions, normals, colors = (

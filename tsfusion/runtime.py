@@ -19,8 +19,7 @@ def start(threads: int | None = None) -> ModuleType:
         MissingDependency: where taichi has no wheel (Linux aarch64, Intel Macs).
     """
     global _started_threads  # noqa: PLW0603  the one piece of process-wide state: Taichi itself is global
-    import tsfusion.kernels  # noqa: F401  says what to do where there is no taichi
-    import taichi as ti
+    from tsfusion.kernels import taichi as ti  # says what to do where there is none
 
     if _started_threads is None:
         _started_threads = threads or os.cpu_count() or 1
@@ -32,7 +31,8 @@ def start(threads: int | None = None) -> ModuleType:
                 offline_cache=True,
                 log_level=ti.ERROR,
             )
-    return ti
+    module: ModuleType = ti
+    return module
 
 
 def threads() -> int | None:

@@ -33,8 +33,12 @@ class Scratch:
         self.band_start = np.zeros(BANDS, np.int32)
         self.band_count = np.zeros(BANDS, np.int32)
         self.band_samples = np.zeros(BANDS, np.int32)
-        self._samples = np.zeros((BANDS, rays.TABLE_SIZE, rays.TABLE_FIELDS), np.int64)
-        self._listed = np.zeros((BANDS, rays.TILE_SAMPLES), np.int32)
+        self._bundles = (
+            np.zeros((BANDS, rays.TABLE_SIZE), np.int64),
+            np.zeros((BANDS, rays.TABLE_SIZE, rays.SUM_FIELDS), np.int32),
+            np.zeros((BANDS, rays.TABLE_SIZE, 3), np.int64),
+            np.zeros((BANDS, rays.TILE_SAMPLES), np.int32),
+        )
         self.signal = np.zeros((BANDS, MAX_CROSSED, smooth.SIGNAL_FIELDS), np.float32)
         self.crossed = np.zeros((BANDS, MAX_CROSSED, 2), np.int32)
         self._overflow = np.zeros(1, np.int32)
@@ -61,7 +65,7 @@ class Scratch:
         parameters = model_parameters(model, voxel_size, keyframe.baseline_fx)
         T = keyframe.T_world_camera
         common = (
-            int(bundle), self._samples, self._listed, self._rays_for(keyframe.shape),
+            int(bundle), *self._bundles, self._rays_for(keyframe.shape),
             self.band_start, self.band_count, self.band_samples,
         )  # fmt: skip
         if keyframe.kind == "points":
@@ -109,8 +113,8 @@ class Scratch:
                     break
             if count > self.max_blocks or len(self.table) > 8 * self.max_blocks:
                 raise MapFull(
-                    f"a keyframe may touch at most max_blocks_per_keyframe = {self.max_blocks} blocks, this one "
-                    f"touches {count or 'far more'}; check its depth scale, or raise voxel_size"
+                    f"a keyframe may touch at most max_blocks_per_keyframe = {self.max_blocks} blocks, "
+                    f"this one touches {count or 'far more'}; check its depth scale, or raise voxel_size"
                 )
             self._set_table_size(2 * len(self.table))
         self.touched = count
@@ -132,6 +136,7 @@ class Scratch:
     @property
     def nbytes(self) -> int:
         arrays = [value for value in vars(self).values() if isinstance(value, np.ndarray)]
+        arrays += self._bundles
         return sum(a.nbytes for a in arrays) + sum(
             g.array.nbytes for g in (self._frame, self._frame_color, self._votes)
         )

@@ -55,6 +55,9 @@ class GrowingArray:
         # arguments, and a map with a buffer still exported refuses to be resized.
         address = ctypes.addressof(ctypes.c_char.from_buffer(self._map))
         interface = {
-            "version": 3, "data": (address, False), "typestr": self._dtype.str, "shape": (capacity, *self._item)
-        }  # fmt: skip
+            "version": 3,
+            "data": (address, False),
+            "typestr": self._dtype.str,
+            "shape": (capacity, *self._item),
+        }
         self.array = np.asarray(SimpleNamespace(__array_interface__=interface))

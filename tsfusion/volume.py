@@ -276,8 +276,8 @@ class Volume:
         fresh = np.flatnonzero(s.touched_slots[: s.touched] < 0)
         if sign > 0 and self._count + len(fresh) > self.config.max_blocks:
             raise MapFull(
-                f"the map may hold at most max_blocks = {self.config.max_blocks} blocks; it has {self._count} "
-                f"and this keyframe needs {len(fresh)} more"
+                f"the map may hold at most max_blocks = {self.config.max_blocks} blocks; "
+                f"it has {self._count} and this keyframe needs {len(fresh)} more"
             )
         s.touched_slots[fresh] = np.arange(self._count, self._count + len(fresh), dtype=np.int32)
         self._insert(s.touched_keys[fresh])
