@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: MIT
+"""What the fuser does with each message, in this process; its link is a list."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from wire import wall
+
+import tsfusion
+from tsfusion import VolumeConfig, codec
+from tsfusion.errors import InvalidConfig
+from tsfusion.fuser import MAP_FILE, Fuser
+from tsfusion.journal import Journal, Position
+from tsfusion.transport import Command, work
+
+VOLUME = VolumeConfig(voxel_size=0.04, threads=1)
+
+
+class Link:
+    """Takes what the fuser sends."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[work.ToGateway, list[Any]]] = []
+
+    def send_multipart(self, frames: list[Any], copy: bool) -> None:
+        assert not copy
+        self.sent.append((work.to_gateway.decode(frames[0]), frames[1:]))
+
+    def last(self) -> Any:
+        return self.sent[-1][0]
+
+
+def fill(state: Path, count: int) -> list[Position]:
+    journal = Journal(state / "journal", 1 << 20)
+    session = bytes(16)
+    positions = [
+        journal.append(
+            codec.encode(wall(i), session=session, seq=i + 1, jpeg_quality=90), session=session, seq=i + 1
+        )
+        for i in range(count)
+    ]
+    journal.close()
+    return positions
+
+
+def opened(state: Path, volume: VolumeConfig = VOLUME, **settings: Any) -> tuple[Fuser, Link]:
+    link = Link()
+    begin = work.Begin(str(state), volume, **{"mesh_interval": 0.0, "checkpoint_every": 0, **settings})
+    return Fuser(link, begin), link  # type: ignore[arg-type]
+
+
+def status(fuser: Fuser, link: Link) -> work.FuserStatus:
+    fuser.take(work.Ask(1, Command(name="status")))
+    answer = link.last()
+    assert answer.status is not None
+    return answer.status  # type: ignore[no-any-return]
+
+
+def test_keyframes_are_fused_meshed_and_checkpointed(tmp_path: Path) -> None:
+    positions = fill(tmp_path, 3)
+    fuser, link = opened(tmp_path)
+    assert fuser.ready().position == Position(0, 0)
+    assert not fuser.mesh_due(idle=True)
+    for index, position in enumerate(positions):
+        fuser.take(work.Fuse(index, position))
+        done = link.last()
+        assert (done.index, done.reason, done.fused_ns > done.fuse_start_ns > 0) == (index, None, True)
+    assert fuser.mesh_due(idle=True)
+    fuser.mesh()
+    assert (link.last().index, link.sent[-1][1]) == (2, [])
+    fuser.take(work.Finish())
+    assert fuser.exit_status == 0
+    again, link_again = opened(tmp_path)
+    assert again.ready().position == positions[-1]
+    assert status(again, link_again) == status(fuser, link)
+
+
+def test_watchers_get_the_triangles(tmp_path: Path) -> None:
+    (position,) = fill(tmp_path, 1)
+    fuser, link = opened(tmp_path)
+    fuser.take(work.Publish(True))
+    fuser.take(work.Fuse(0, position))
+    fuser.mesh()
+    meshed, frames = link.sent[-1]
+    assert isinstance(meshed, work.Meshed)
+    assert meshed.layout is not None
+    assert [memoryview(frame).nbytes % 3 for frame in frames] == [0] * 5
+
+
+def test_what_cannot_be_fused_is_counted_also_after_a_restart(tmp_path: Path) -> None:
+    positions = fill(tmp_path, 2)
+    fuser, link = opened(tmp_path, checkpoint_every=1)
+    fuser.take(work.Fuse(0, Position(7, 42)))
+    assert link.last().reason == "JournalError"
+    fuser.take(work.Fuse(1, positions[0], skip="crash"))
+    assert link.last().reason == "crash"
+    rejected = {"JournalError": 1, "crash": 1}
+    assert status(fuser, link).keyframes_rejected == rejected
+    assert status(*opened(tmp_path)).keyframes_rejected == rejected
+
+
+def saved(state: Path) -> Path:
+    volume = tsfusion.Volume(VOLUME)
+    volume.integrate(wall())
+    return volume.save(state / MAP_FILE, meta={"position": [1, 42], "rejected": {}})
+
+
+def test_a_map_of_other_settings_is_one_clear_error(tmp_path: Path) -> None:
+    saved(tmp_path)
+    with pytest.raises(InvalidConfig, match=r"was made with voxel_size = 0\.04, got 0\.05: use another"):
+        opened(tmp_path, VolumeConfig(voxel_size=0.05))
+    opened(tmp_path, VolumeConfig(voxel_size=0.04, threads=2, max_blocks=10_000))
+
+
+def test_a_damaged_checkpoint_is_set_aside_and_the_journal_fused_anew(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = saved(tmp_path)
+    stored = bytearray(path.read_bytes())
+    stored[len(stored) // 2] ^= 1
+    path.write_bytes(stored)
+    fuser, _ = opened(tmp_path)
+    assert fuser.ready().position == Position(0, 0)
+    assert "built again from the journal" in caplog.text
+    assert path.with_suffix(".damaged").exists()

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: MIT
+"""Addresses, control messages, clocks, and the gateway's bookkeeping."""
+
+import socket
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from tsfusion.errors import DecodeError, InvalidConfig, ServerUnreachable, TransportError
+from tsfusion.journal import Position, Scan
+from tsfusion.sessions import Delays, KeyframeIndex, Session, Sessions
+from tsfusion.transport import ClockOffset, Command, control_address, messages, request, sockets
+from tsfusion.transport.messages import Ack, Hello, Nack, Ping, Pong, Stamps, Welcome
+
+SESSION = bytes(range(16))
+
+
+def test_the_control_socket_is_the_next_port_unless_told() -> None:
+    assert control_address("tcp://127.0.0.1:5555") == "tcp://127.0.0.1:5556"
+    assert control_address("tcp://127.0.0.1:5555", "tcp://127.0.0.1:9000") == "tcp://127.0.0.1:9000"
+    assert control_address("tcp://[::1]:5555") == "tcp://[::1]:5556"
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        *("", "127.0.0.1:5555", "tcp://127.0.0.1", "tcp://:5555", "udp://127.0.0.1:5"),
+        *("tcp://127.0.0.1:99999", "tcp://127.0.0.1:5555/x", "tcp://host:port"),
+    ],
+)
+def test_a_malformed_address_is_one_clear_error(address: str) -> None:
+    with pytest.raises(InvalidConfig, match="an address looks like"):
+        control_address(address)
+
+
+@pytest.mark.parametrize("address", ["tcp://0.0.0.0:5555", "tcp://*:5555", "tcp://192.168.1.4:5555"])
+def test_only_this_machine_may_connect(address: str) -> None:
+    with pytest.raises(InvalidConfig, match="ssh"):
+        sockets.check_loopback(address)
+    sockets.check_loopback("tcp://127.0.0.1:5555")
+    sockets.check_loopback("tcp://localhost:5555")
+
+
+def test_a_taken_port_is_one_clear_error() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(TransportError, match=f"cannot listen on {address}: Address already in use"):
+            sockets.check_free(address)
+
+
+def test_a_dead_server_is_one_clear_error() -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{unused.getsockname()[1]}"
+        with pytest.raises(ServerUnreachable, match=f"no server answered at {address} within 0.2 s"):
+            request(address, Command(name="status"), timeout=0.2)
+
+
+def test_control_messages_keep_their_bytes() -> None:
+    """As others implement them: a change here is a new wire version."""
+    key = "000102030405060708090a0b0c0d0e0f"
+    golden = {
+        Hello(SESSION, 1): f"83a474797065a568656c6c6fa773657373696f6ec410{key}a776657273696f6e01",
+        Ping(b"", 5, None): (
+            "84a474797065a470696e67a773657373696f6ec400a773656e745f6e7305a96f66667365745f6e73c0"
+        ),
+    }
+    for message, stored in golden.items():
+        assert messages.encode(message).hex() == stored
+        assert messages.decode_to_server(bytes.fromhex(stored)) == message
+    for answer in (
+        Welcome("e", 1, 3, 2, 8, 1, 1),
+        Ack(SESSION, 3, 2, (Stamps(3, 1, 2, 3, 4, 5),), resend=True),
+        Nack(SESSION, 3, "door", "crc", "damaged"),
+        Pong("e", 1, 2, 3),
+    ):
+        assert messages.decode_to_client(messages.encode(answer)) == answer
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        *(b"", b"\xc1", b"\x80", b"hello", b"\x91" * 500, b"\xa5\xff\xff\xff\xff\xff"),
+        msgspec.msgpack.encode({"type": "hello", "session": b"short", "version": 1}),
+        msgspec.msgpack.encode({"type": "shutdown"}),
+    ],
+)
+def test_bad_control_messages_raise_one_error(frame: bytes) -> None:
+    with pytest.raises(DecodeError):
+        messages.decode_to_server(frame)
+    with pytest.raises(DecodeError):
+        messages.decode_to_client(frame)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_clock_estimate_stays_within_its_bound(seed: int) -> None:
+    """Asymmetric jitter, as on Wi-Fi: the truth lies within half the best round trip."""
+    rng = np.random.default_rng(seed)
+    true_offset, clock = 3_217_000_000, ClockOffset()
+    assert (clock.offset_ns, clock.bound_ns, clock.count) == (None, 0, 0)
+    for i in range(40):
+        there, work, back = (int(1e6 * value) for value in rng.exponential((2.0, 0.1, 0.5)) + 0.05)
+        sent = i * 10**8
+        clock.add(
+            sent, sent + there + true_offset, sent + there + work + true_offset, sent + there + work + back
+        )
+        assert clock.offset_ns is not None
+        assert abs(clock.offset_ns - true_offset) <= clock.bound_ns
+    assert clock.count == 16
+
+
+# --- sessions ---
+
+
+def test_each_keyframe_is_admitted_once_and_in_order() -> None:
+    session = Session(SESSION, 0)
+    assert session.admit(1, 0) == "next"
+    session.durable = 5
+    assert [session.admit(seq, seq - 1) for seq in (5, 6, 7)] == ["duplicate", "next", "gap"]
+    assert session.admit(9, 5) == session.admit(9, 0) == "next"  # the client dropped 6 to 8
+    assert session.admit(9, 6) == "gap"
+
+
+def test_strangers_do_not_grow_the_sessions() -> None:
+    sessions = Sessions()
+    for i in range(3000):
+        sessions.connect(i.to_bytes(16, "big"), b"id")
+        assert sessions.admit(i.to_bytes(16, "big"), 1, 0) == "next"
+    assert len(sessions) == 0
+    assert sessions.route((0).to_bytes(16, "big")) is None
+    assert sessions.route((2999).to_bytes(16, "big")) is not None
+
+
+def index_of(*records: tuple[int, int, bytes, int]) -> tuple[KeyframeIndex, Sessions]:
+    index, sessions = KeyframeIndex(), Sessions()
+    index.recover([Scan(Position(a, b), key, seq, 0) for a, b, key, seq in records], sessions)
+    return index, sessions
+
+
+def test_recovery_counts_a_keyframe_once() -> None:
+    other = bytes(16)
+    index, sessions = index_of(
+        (1, 42, SESSION, 1), (1, 90, other, 1), (1, 140, SESSION, 2), (2, 42, SESSION, 2)
+    )
+    entries = [index[i] for i in range(len(index))]
+    assert [(entry.position.segment, entry.stamps.seq) for entry in entries] == [(1, 1), (1, 1), (1, 2)]
+    assert sessions.open(SESSION).durable == 2
+    assert (index.after(Position(0, 0)), index.after(Position(1, 90)), index.after(Position(2, 42))) == (
+        0,
+        2,
+        3,
+    )
+
+
+def test_the_index_keeps_stamps() -> None:
+    index, sessions = KeyframeIndex(), Sessions()
+    index.add(Position(1, 42), sessions.open(SESSION), 1, captured_ns=5, received_ns=6, durable_ns=7)
+    index.fused(0, 8, 9)
+    assert index[0].stamps == Stamps(1, 6, 7, 8, 9, 0)
+    assert index[0].captured_ns == 5
+
+
+def test_delays_are_of_the_clients_clock() -> None:
+    delays = Delays()
+    assert delays.summary().count == 0
+    delays.add(0, 5_000_000, 0)
+    delays.add(5, 5_000_000, None)
+    for ms in (10, 20, 30):
+        delays.add(1_000_000_000, 1_000_000_000 + 7_000_000 + ms * 1_000_000, 7_000_000)
+    summary: Any = delays.summary()
+    assert (summary.count, summary.mean, summary.p50, summary.max) == (3, 20.0, 20.0, 30.0)

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: MIT
+"""Keyframes and server processes for the tests of the wire."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from tsfusion import Intrinsics, Keyframe
+from tsfusion.config import ServerConfig, VolumeConfig
+
+DEADLINE = 60.0
+CAMERA = Intrinsics(40.0, 40.0, 31.5, 23.5)
+SHAPE = (48, 64)
+_SERVE = """
+import sys, msgspec
+from tsfusion import server
+from tsfusion.config import ServerConfig, VolumeConfig
+from tsfusion.errors import TsfusionError
+config = msgspec.json.decode(sys.argv[1], type=ServerConfig)
+volume = msgspec.json.decode(sys.argv[2], type=VolumeConfig)
+try:
+    sys.exit(server.run(config, volume, lambda a: print(a.data, a.control, a.publish, flush=True)))
+except TsfusionError as error:
+    sys.exit(f"{type(error).__name__}: {error}")
+"""
+
+
+def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = x, y, z
+    return T
+
+
+def wall(i: int = 0, **fields: Any) -> Keyframe:
+    """A wavy wall a good metre away, seen from a place that depends on `i`."""
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    depth = (1200 + 40 * np.sin(u / 9 + i) + 3 * v).astype(np.uint16)
+    depth[:2] = 0
+    color = np.dstack([u * 3, v * 4, np.full(SHAPE, (37 * i) % 256)]).astype(np.uint8)
+    given = {"T_world_camera": pose(0.03 * i), "timestamp_ns": 10**9 + i, **fields}
+    return Keyframe(depth=depth, color=color, intrinsics=CAMERA, **given)
+
+
+def until(reached: Callable[[], bool], deadline: float = DEADLINE) -> None:
+    """Poll; fails the test when it is not reached in time."""
+    end = time.monotonic() + deadline
+    while not reached():
+        assert time.monotonic() < end, "deadline"
+        time.sleep(0.005)
+
+
+class Server:
+    """`server.run` in a process of its own."""
+
+    def __init__(self, state: Path, volume: VolumeConfig | None = None, **settings: Any) -> None:
+        config = ServerConfig(**{"listen": "tcp://127.0.0.1:0", "state": str(state), **settings})
+        volume = volume or VolumeConfig(voxel_size=0.04, threads=1)
+        arguments = [msgspec.json.encode(one).decode() for one in (config, volume)]
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", _SERVE, *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        self.address, self.control, self.publish = (self.process.stdout.readline().split() or [""] * 3)[:3]
+
+    def terminate(self) -> int:
+        """SIGTERM; the exit status."""
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(DEADLINE)
+
+    def kill(self) -> None:
+        """SIGKILL, as the kernel does it when memory runs out."""
+        self.process.kill()
+        self.process.wait(DEADLINE)
+
+    def said(self) -> str:
+        """Its last words, once it has ended."""
+        return self.process.communicate(timeout=DEADLINE)[1].strip()
+
+    def fuser_pid(self) -> int:
+        """The fuser, its only child."""
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        assert len(children) == 1, children
+        return int(children[0])
+
+
+@contextmanager
+def serving(state: Path, volume: VolumeConfig | None = None, **settings: Any) -> Iterator[Server]:
+    """A ready server, gone afterwards whatever happens."""
+    server = Server(state, volume, **settings)
+    try:
+        if not server.address:
+            raise RuntimeError(server.said())
+        yield server
+    finally:
+        if server.process.poll() is None:
+            server.kill()
+        for pipe in (server.process.stdout, server.process.stderr):
+            if pipe is not None:
+                pipe.close()
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs (a zombie does not)."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return Path(f"/proc/{pid}/stat").read_text().split(")")[1].split()[0] != "Z"

@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: MIT
+"""The fuser: the one process with Taichi. Reads the journal where the gateway points, and adds to the map.
+
+It ends when the gateway does (its standard input closes), at whatever moment: the last checkpoint and the
+journal are enough to begin again.
+"""
+
+import logging
+import platform
+import signal
+import sys
+import time
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+import zmq
+from numpy.typing import NDArray
+
+from tsfusion import codec, journal, process
+from tsfusion.config import VolumeConfig
+from tsfusion.errors import CheckpointError, InvalidConfig, TsfusionError
+from tsfusion.mesh import Mesh
+from tsfusion.transport import sockets, work
+from tsfusion.transport.messages import MeshLayout
+
+if TYPE_CHECKING:
+    from tsfusion.volume import Volume
+
+MAP_FILE = "map.tsf"
+JOURNAL_FOLDER = "journal"
+# Settings that may differ between a map and the server that goes on with it: none changes the sums.
+_FREE_SETTINGS = ("threads", "max_blocks", "max_blocks_per_keyframe", "min_weight")
+
+log = logging.getLogger(__name__)
+
+
+class Fuser:
+    """The map of one state folder, and what to do with each message of the gateway."""
+
+    def __init__(self, link: sockets.AnySocket, begin: work.Begin) -> None:
+        self._link = link
+        self._begin = begin
+        self._state = Path(begin.state)
+        self._position = journal.Position(0, 0)
+        self._rejected: dict[str, int] = {}
+        self._since_checkpoint = 0
+        self._watched = False
+        self._fused_index = self._meshed_index = -1
+        self._meshed_at = 0.0
+        self._hashes: tuple[int, str, str] | None = None
+        self.exit_status: int | None = None
+        self._volume = self._open()
+
+    def _open(self) -> "Volume":
+        from tsfusion.volume import Volume
+
+        path = self._state / MAP_FILE
+        volume = None
+        if path.exists():
+            volume = _resume(path, self._begin.volume)
+        if volume is None:
+            volume = Volume(self._begin.volume)
+        elif "position" not in volume.meta:
+            raise CheckpointError(
+                f"{path} was not saved by a server: it does not say where the journal goes on"
+            )
+        else:
+            self._position = journal.Position(*volume.meta["position"])
+            self._rejected = dict(volume.meta["rejected"])
+        volume.warm_up()
+        return volume
+
+    def ready(self) -> work.Ready:
+        """Where the map stands in the journal."""
+        return work.Ready(self._position)
+
+    def take(self, message: work.ToFuser) -> None:
+        """Do what the gateway says."""
+        if isinstance(message, work.Fuse):
+            self._fuse(message)
+        elif isinstance(message, work.Ask):
+            self._answer(message)
+        elif isinstance(message, work.Publish):
+            self._watched = message.wanted
+        elif isinstance(message, work.Finish):
+            self.exit_status = 0 if self._checkpoint() else 1
+
+    def mesh_due(self, idle: bool) -> bool:
+        """Whether the mesh is behind and it is time: at once when idle, else at most every interval."""
+        behind = self._fused_index > self._meshed_index
+        return behind and (idle or time.monotonic() - self._meshed_at >= self._begin.mesh_interval)
+
+    def mesh(self) -> None:
+        """Bring the mesh up to date with the map."""
+        from tsfusion.volume import cells_of
+
+        blocks = self._volume.take_dirty()
+        mesh = self._volume.extract_mesh(blocks=cells_of(blocks))
+        self._meshed_index, self._meshed_at = self._fused_index, time.monotonic()
+        stamp = time.monotonic_ns()
+        if self._watched:
+            layout, frames = _mesh_frames(mesh)
+            cells = np.ascontiguousarray(cells_of(blocks)).data
+            self._send(work.Meshed(self._meshed_index, stamp, len(blocks), layout), [cells, *frames])
+        else:
+            self._send(work.Meshed(self._meshed_index, stamp))
+
+    def _fuse(self, order: work.Fuse) -> None:
+        start = time.monotonic_ns()
+        self._position = order.position
+        reason, message = order.skip, ""
+        if reason is None:
+            try:
+                record = journal.read(self._state / JOURNAL_FOLDER, self._position)
+                self._volume.integrate(codec.decode(record.frames))
+            except TsfusionError as error:
+                reason, message = _reason(error), str(error)
+        if reason is not None:
+            self._rejected[reason] = self._rejected.get(reason, 0) + 1
+        self._fused_index = order.index
+        self._send(work.Done(order.index, start, time.monotonic_ns(), reason, message))
+        self._since_checkpoint += 1
+        if self._begin.checkpoint_every and self._since_checkpoint >= self._begin.checkpoint_every:
+            self._checkpoint()
+
+    def _checkpoint(self) -> bool:
+        if self._since_checkpoint == 0:
+            return True
+        meta = {"position": [self._position.segment, self._position.offset], "rejected": self._rejected}
+        try:
+            self._volume.save(self._state / MAP_FILE, meta=meta)
+        except TsfusionError as error:
+            # Nothing is lost: the next start fuses the journal from the checkpoint before this one.
+            log.error("no checkpoint: %s", error)
+            self._since_checkpoint = 1
+            return False
+        self._since_checkpoint = 0
+        return True
+
+    def _answer(self, ask: work.Ask) -> None:
+        try:
+            if ask.command.name == "mesh":
+                layout, frames = _mesh_frames(self._volume.extract_mesh(ask.command.min_weight))
+                self._send(work.Answer(ask.number, layout=layout), frames)
+            else:
+                self._send(work.Answer(ask.number, status=self._status()))
+        except TsfusionError as error:
+            self._send(work.Answer(ask.number, error=str(error)))
+
+    def _status(self) -> work.FuserStatus:
+        stats = self._volume.stats()
+        if self._hashes is None or self._hashes[0] != self._fused_index:
+            self._hashes = (self._fused_index, self._volume.map_hash(), self._volume.color_hash())
+        return work.FuserStatus(
+            keyframes_fused=self._volume.keyframes,
+            keyframes_rejected=self._rejected,
+            blocks=stats.blocks,
+            voxels=stats.voxels,
+            map_bytes=stats.bytes,
+            map_hash=self._hashes[1],
+            color_hash=self._hashes[2],
+            peak_rss_bytes=process.peak_rss_bytes(),
+            versions={
+                "python": platform.python_version(),
+                **{name: version(name) for name in ("tsfusion", "taichi", "numpy", "pyzmq")},
+            },
+            config=msgspec.to_builtins(self._volume.config),
+        )
+
+    def _send(self, message: Any, frames: list[Any] | None = None) -> None:
+        self._link.send_multipart([work.encode(message), *(frames or [])], copy=False)
+
+
+def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
+    from tsfusion.volume import Volume
+
+    try:
+        volume = Volume.load(path, threads=wanted.threads)
+    except CheckpointError as error:
+        aside = path.with_suffix(".damaged")
+        log.error("%s; it is kept as %s, and the map is built again from the journal", error, aside)
+        path.replace(aside)
+        return None
+    for name in VolumeConfig.__struct_fields__:
+        here, there = getattr(wanted, name), getattr(volume.config, name)
+        if name not in _FREE_SETTINGS and here != there:
+            raise InvalidConfig(
+                f"the map in {path.parent} was made with {name} = {there}, got {here}: use another state "
+                f"folder, or remove {path.name} to build the map again from the journal"
+            )
+    return volume
+
+
+def _mesh_frames(mesh: Mesh) -> tuple[MeshLayout, list[Any]]:
+    arrays: list[NDArray[Any]] = [mesh.vertices, mesh.faces, mesh.normals]
+    if mesh.colors is not None:
+        arrays.append(mesh.colors)
+    layout = MeshLayout(vertices=len(mesh.vertices), faces=len(mesh.faces), colors=mesh.colors is not None)
+    return layout, [np.ascontiguousarray(array).data for array in arrays]
+
+
+def _reason(error: TsfusionError) -> str:
+    return error.reason if isinstance(error, codec.Refused) else type(error).__name__
+
+
+def run(endpoint: str) -> int:
+    """Serve the gateway at `endpoint` until it says so or goes away; the exit status."""
+    context: zmq.Context[Any] = zmq.Context()
+    link = sockets.pair(context)
+    try:
+        link.connect(endpoint)
+        link.send(work.encode(work.Started()))
+        return _serve(link)
+    finally:
+        link.close(linger=1000)
+        context.term()
+
+
+def _serve(link: sockets.AnySocket) -> int:
+    poller = zmq.Poller()
+    poller.register(link, zmq.POLLIN)
+    poller.register(sys.stdin.fileno(), zmq.POLLIN)
+    fuser: Fuser | None = None
+    while fuser is None or fuser.exit_status is None:
+        idle = not poller.poll(0)
+        if fuser is not None and fuser.mesh_due(idle):
+            fuser.mesh()
+            continue
+        events = dict(poller.poll())
+        if sys.stdin.fileno() in events:  # nothing is ever written there: the gateway has gone
+            return 1
+        message = work.to_fuser.decode(link.recv())
+        if isinstance(message, work.Begin):
+            fuser = _begin(link, message)
+            if fuser is None:
+                return 1
+        elif fuser is not None:
+            fuser.take(message)
+    return fuser.exit_status
+
+
+def _begin(link: sockets.AnySocket, message: work.Begin) -> Fuser | None:
+    try:
+        fuser = Fuser(link, message)
+    except TsfusionError as error:
+        name = next(kind.__name__ for kind in type(error).__mro__ if kind.__module__ == "tsfusion.errors")
+        link.send(work.encode(work.Failed(name, str(error))))
+        return None
+    link.send(work.encode(fuser.ready()))
+    return fuser
+
+
+def main() -> int:
+    """`python -m tsfusion.fuser ENDPOINT`, as the gateway starts it."""
+    logging.basicConfig(format="tsfusion fuser: %(levelname)s: %(message)s")
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # a terminal or supervisor signals all; the gateway decides
+    return run(sys.argv[1])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

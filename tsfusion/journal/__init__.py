@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: MIT
+"""The write-ahead log of keyframe messages: MCAP segments in a folder.
+
+A keyframe is on the disk when `Journal.append` returns. MCAP cannot be appended to, so each start opens a
+new segment. One chunk a keyframe, uncompressed: the arrays are compressed already, and a chunk has a CRC.
+"""
+
+from tsfusion.journal.segments import (
+    Position,
+    Record,
+    Scan,
+    read,
+    read_at,
+    records,
+    scan,
+    segment_path,
+    segments,
+)
+from tsfusion.journal.writer import Journal
+
+__all__ = [
+    "Journal",
+    "Position",
+    "Record",
+    "Scan",
+    "read",
+    "read_at",
+    "records",
+    "scan",
+    "segment_path",
+    "segments",
+]

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: MIT
+"""Writing the log: append, wait for the disk, begin the next segment."""
+
+import contextlib
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from mcap.writer import CompressionType, Writer
+
+from tsfusion.journal.segments import LAYOUT, Position, Scan, failed, pack, scan, segment_path, segments
+
+TOPIC = "/keyframes"
+ENCODING = "x-tsfusion"
+_CHANNEL = 1
+
+
+class Journal:
+    """The one writer of a folder of segments.
+
+    Args:
+        folder: made when absent.
+        segment_bytes: a segment that has grown past this is closed and the next begun.
+        sync: wait for the disk at each append (fdatasync); without it a power cut may lose the tail.
+
+    Attributes:
+        found: what the segments of earlier runs hold, in journal order; the caller may empty it.
+        damaged: how many of their records could not be read.
+
+    Raises:
+        JournalError: when the folder cannot be read or written.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str], segment_bytes: int, *, sync: bool = True) -> None:
+        self.folder = Path(folder)
+        self._segment_bytes = segment_bytes
+        self._sync = sync
+        self._file: BinaryIO | None = None
+        self._writer: Any = None
+        self.found: list[Scan] = []
+        self.damaged = 0
+        self.closed_bytes = 0
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise failed("create the journal", self.folder, error) from error
+        self._recover()
+
+    def _recover(self) -> None:
+        numbers = segments(self.folder)
+        for number in numbers:
+            path = segment_path(self.folder, number)
+            found, damaged = scan(path)
+            self.found += found
+            self.damaged += damaged
+            self.closed_bytes += path.stat().st_size
+        self._number = numbers[-1] + 1 if numbers else 1
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all segments."""
+        return self.closed_bytes + (self._file.tell() if self._file else 0)
+
+    @property
+    def segment(self) -> int:
+        """The number of the segment that is (or will be) written to."""
+        return self._number
+
+    def append(self, frames: Sequence[Any], *, session: bytes, seq: int) -> Position:
+        """Write one message; it is on the disk when this returns.
+
+        Raises:
+            JournalError: when the disk refuses. Nothing of the message counts then.
+        """
+        payload = pack(frames, session, seq)
+        try:
+            file = self._open()
+            position = Position(self._number, file.tell())
+            now = time.time_ns()
+            self._writer.add_message(
+                _CHANNEL, log_time=now, publish_time=now, data=payload, sequence=seq % 2**32
+            )
+            file.flush()
+            if self._sync:
+                os.fdatasync(file.fileno())
+            if file.tell() >= self._segment_bytes:
+                self.rotate()
+        except OSError as error:
+            self._abandon()
+            raise failed("write", self.folder, error) from error
+        return position
+
+    def begin_after(self, segment: int) -> None:
+        """Number new segments above one that a map remembers, though its file may have been removed."""
+        if self._file is None:
+            self._number = max(self._number, segment + 1)
+
+    def rotate(self) -> None:
+        """Close the segment with its index; the next append begins another."""
+        if self._file is None:
+            return
+        self._writer.finish()
+        self._file.flush()
+        if self._sync:
+            os.fdatasync(self._file.fileno())
+        self._abandon()
+
+    def close(self) -> None:
+        """Finish the segment. The journal may be read, not written, from here on."""
+        try:
+            self.rotate()
+        except OSError as error:
+            self._abandon()
+            raise failed("close", self.folder, error) from error
+
+    def forget(self, number: int) -> None:
+        """Delete a closed segment whose keyframes are safe elsewhere."""
+        path = segment_path(self.folder, number)
+        try:
+            self.closed_bytes -= path.stat().st_size
+            path.unlink()
+        except OSError as error:
+            raise failed("delete", path, error) from error
+
+    def _open(self) -> BinaryIO:
+        if self._file is None:
+            path = segment_path(self.folder, self._number)
+            self._file = path.open("xb")
+            self._writer = Writer(self._file, chunk_size=1, compression=CompressionType.NONE)
+            self._writer.start()
+            schema = self._writer.register_schema("tsfusion.keyframe", "", LAYOUT)
+            self._writer.register_channel(TOPIC, ENCODING, schema)
+            if self._sync:
+                _sync_folder(self.folder)
+        return self._file
+
+    def _abandon(self) -> None:
+        if self._file is not None:
+            with contextlib.suppress(OSError):  # a full disk fails here a second time
+                self._file.close()
+            self.closed_bytes += segment_path(self.folder, self._number).stat().st_size
+            self._file = self._writer = None
+            self._number += 1
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

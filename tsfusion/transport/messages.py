@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: MIT
+"""What scanner and server say to each other on the control socket (msgpack of tagged structs).
+
+All `*_ns` stamps of the server are its own monotonic clock; the client shifts them to its own.
+"""
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct
+
+from tsfusion.errors import DecodeError
+
+SessionId = Annotated[bytes, Meta(min_length=16, max_length=16)]
+Seq = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
+
+
+class Hello(Struct, frozen=True, tag="hello"):
+    """A client opens (or re-opens) its session."""
+
+    session: SessionId
+    version: int  # wire format it speaks
+
+
+class Welcome(Struct, frozen=True, tag="welcome"):
+    """The server's answer. A new `epoch` is a new server process: resend everything after `durable`."""
+
+    epoch: str
+    version: int
+    durable: Seq  # the highest seq of this session that is on the server's disk; 0 = none
+    fused: Seq  # the highest that the map has taken or refused; 0 = none
+    window_keyframes: int  # credit: sent, not yet durable
+    window_bytes: int
+    max_frame_bytes: int
+
+
+class Stamps(Struct, frozen=True, array_like=True):
+    """When the server did what with one keyframe; 0 = not yet."""
+
+    seq: Seq
+    received_ns: int = 0
+    durable_ns: int = 0
+    fuse_start_ns: int = 0
+    fused_ns: int = 0
+    meshed_ns: int = 0
+
+
+class Ack(Struct, frozen=True, tag="ack"):
+    """Progress. Everything up to `durable` may leave the spool.
+
+    `resend` asks to go back to durable + 1 at once: something in between never came.
+    """
+
+    session: SessionId
+    durable: Seq
+    fused: Seq
+    stamps: tuple[Stamps, ...] = ()
+    resend: bool = False
+
+
+class Nack(Struct, frozen=True, tag="nack"):
+    """This keyframe will never be in the map.
+
+    Attributes:
+        stage: `door` = it was not journaled and must not be sent again; `map` = it is journaled, but the
+            map could not take it.
+    """
+
+    session: SessionId
+    seq: Seq
+    stage: Literal["door", "map"]
+    reason: str
+    message: str
+
+
+class Ping(Struct, frozen=True, tag="ping"):
+    """`offset_ns`: what the client takes the server's clock minus its own to be (None = not yet known)."""
+
+    session: bytes
+    sent_ns: int
+    offset_ns: int | None = None
+
+
+class Pong(Struct, frozen=True, tag="pong"):
+    epoch: str
+    ping_sent_ns: int
+    received_ns: int
+    sent_ns: int
+    durable: Seq = 0
+    fused: Seq = 0
+
+
+class Command(Struct, frozen=True, tag="command", kw_only=True):
+    """A request of a person or program; answered by one Reply."""
+
+    name: Literal["ping", "status", "mesh"]
+    min_weight: float | None = None
+
+
+class Reply(Struct, frozen=True, tag="reply", kw_only=True):
+    """The answer to a Command; arrays of a mesh follow as raw frames."""
+
+    name: str
+    error: str | None = None
+    status: "Status | None" = None
+    mesh: "MeshLayout | None" = None
+
+
+class MeshLayout(Struct, frozen=True, kw_only=True):
+    """Shapes of the frames that follow: vertices float32, faces int32, normals float32, colors uint8."""
+
+    vertices: int
+    faces: int
+    colors: bool
+
+
+class DelaySummary(Struct, frozen=True, kw_only=True):
+    """Milliseconds from capture to fused of the last keyframes (at most 1024)."""
+
+    count: int = 0
+    mean: float = 0.0
+    p50: float = 0.0
+    p95: float = 0.0
+    p99: float = 0.0
+    max: float = 0.0
+
+
+class Status(Struct, frozen=True, kw_only=True):
+    """How a server is doing. Counts are of the whole journal and map; the delay of this process."""
+
+    epoch: str
+    state: str  # folder
+    fuser: Literal["starting", "idle", "busy"]
+    uptime_s: float
+    keyframes_durable: int
+    keyframes_fused: int
+    keyframes_rejected: dict[str, int]  # journaled, but not fusable: reason → count
+    messages_refused: dict[str, int]  # never journaled: reason → count
+    duplicates: int
+    sessions: int
+    blocks: int
+    voxels: int
+    map_bytes: int
+    map_hash: str
+    color_hash: str
+    journal_bytes: int
+    journal_damaged: int  # records the recovery scan could not read
+    fuser_restarts: int
+    peak_rss_bytes: dict[str, int]  # server (gateway), fuser
+    delay_ms: DelaySummary
+    config: dict[str, Any]  # server and volume settings
+    versions: dict[str, str]
+
+
+class KeyframeTimes(Struct, kw_only=True):
+    """The latency ledger's row: one keyframe, every stamp on the client's monotonic clock; 0 = unknown.
+
+    `clock_bound_ns`: the server's stamps are right to within ± this (half the best round trip).
+    """
+
+    seq: int
+    timestamp_ns: int = 0  # the sensor's own clock
+    captured_ns: int = 0
+    sent_ns: int = 0
+    received_ns: int = 0
+    durable_ns: int = 0
+    fuse_start_ns: int = 0
+    fused_ns: int = 0
+    meshed_ns: int = 0
+    clock_bound_ns: int = 0
+
+
+ToServer = Hello | Ping | Command
+ToClient = Welcome | Ack | Nack | Pong | Reply
+_TO_SERVER = msgspec.msgpack.Decoder(ToServer)
+_TO_CLIENT = msgspec.msgpack.Decoder(ToClient)
+encode = msgspec.msgpack.encode
+
+
+def decode_to_server(frame: Any) -> ToServer:
+    """Raises DecodeError for anything but a message to the server."""
+    return _decode(_TO_SERVER, frame)  # type: ignore[no-any-return]
+
+
+def decode_to_client(frame: Any) -> ToClient:
+    """Raises DecodeError for anything but a message to the client."""
+    return _decode(_TO_CLIENT, frame)  # type: ignore[no-any-return]
+
+
+def _decode(decoder: Any, frame: Any) -> Any:
+    try:
+        return decoder.decode(frame)
+    except Exception as error:  # msgspec also raises UnicodeDecodeError and RecursionError
+        raise DecodeError(f"not a control message: {error}") from error
