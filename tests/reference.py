@@ -163,3 +163,34 @@ def segment_voxels(ray: NDArray[np.int32]) -> set[Voxel]:
 
 def neighbours(voxel: Voxel) -> set[Voxel]:
     return {tuple(np.add(voxel, d)) for d in product((-1, 0, 1), repeat=3)}  # type: ignore[misc]
+
+
+def trace(distance: Any, origin: Any, directions: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+    """Twin of `kernels.synthetic.cast`: sphere tracing on a signed distance; 0 = nothing within reach."""
+    length = np.linalg.norm(directions, axis=1)
+    t = np.zeros(len(directions))
+    for _ in range(300):
+        t += distance(origin + directions * t[:, None]) / length
+    found = (np.abs(distance(origin + directions * t[:, None])) < 1e-6) & (t < reach)
+    return np.where(found, t, 0.0)
+
+
+def see(
+    vertices: NDArray[np.float32], faces: NDArray[np.int32], focal: float, shape: tuple[int, int], near: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Twin of `kernels.raster`: the front-facing triangle each pixel sees (−1 = none) and its depth."""
+    height, width = shape
+    v, u = np.mgrid[:height, :width]
+    rays = np.dstack([(u - (width - 1) / 2) / focal, (v - (height - 1) / 2) / focal, np.ones(shape)])
+    seen, depth = np.full(shape, -1, np.int64), np.full(shape, np.inf)
+    for f, (a, b, c) in enumerate(vertices[faces].astype(np.float64)):
+        normal = np.cross(b - a, c - a)
+        if normal @ a >= 0:
+            continue
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = (normal @ a) / (rays @ normal)
+        p = rays * z[..., None]
+        inside = [np.cross(q - o, p - o) @ normal >= 0 for o, q in ((a, b), (b, c), (c, a))]
+        hit = np.logical_and.reduce(inside) & (z >= near) & (z < depth)
+        seen[hit], depth[hit] = f, z[hit]
+    return seen, np.where(seen >= 0, depth, 0.0)

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tsfusion import Mesh, Volume
+from tsfusion.blockstore import cells_of, pack_keys, unpack_keys
 from tsfusion.errors import OutputError
 from tsfusion.meshing import Layers, extract
-from tsfusion.volume import cells_of, pack_keys, unpack_keys
 
 
 def edge_uses(faces: NDArray[np.int32]) -> NDArray[np.int64]:
@@ -148,7 +148,7 @@ def test_tiles_of_dirty_blocks_make_up_the_whole_mesh() -> None:
 
 
 def blocks_of(volume: Volume) -> list[tuple[int, ...]]:
-    return [tuple(int(c) for c in b) for b in unpack_keys(volume._keys.array[volume._used_slots()])]
+    return [tuple(int(c) for c in b) for b in unpack_keys(volume._store.keys[volume._store.used()])]
 
 
 def as_set(blocks: NDArray[np.int32]) -> set[tuple[int, ...]]:

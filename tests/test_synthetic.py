@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import reference
 from geometry import depth_metres, points_world, warp_residual
 
 from tsfusion.datasets import Synthetic, worlds
@@ -223,3 +224,16 @@ def test_the_tables_of_solids_and_materials_agree_with_the_kernel():
 def test_a_world_that_cannot_be_made_is_one_clear_line(settings, match):
     with pytest.raises(DatasetError, match=match):
         Synthetic(**settings)
+
+
+@pytest.mark.parametrize("world", ["room", "street"])
+def test_rays_meet_what_the_twin_meets_first(world):
+    dataset = Synthetic(world, "kinect", noise=False, color=False, width=40)
+    for index in (3,):
+        keyframe = dataset[index]
+        T = keyframe.T_world_camera
+        directions = dataset._directions @ T[:3, :3].T
+        expected = reference.trace(dataset.distance, T[:3, 3], directions, 5.9).reshape(keyframe.shape)
+        found = np.where(depth_metres(keyframe) < 5.9, depth_metres(keyframe), 0)
+        agree = np.abs(found - expected) < 2e-4
+        assert agree.mean() > 0.99  # the rest graze an edge

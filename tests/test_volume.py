@@ -12,8 +12,8 @@ import scenes
 from numpy.typing import NDArray
 
 from tsfusion import Keyframe, Volume
+from tsfusion.blockstore import cells_of, unpack_keys
 from tsfusion.errors import InvalidConfig, MapError, MapFull, WeightOverflow
-from tsfusion.volume import cells_of, unpack_keys
 
 VIEWS = scenes.sphere_views(0.4, 8)
 
@@ -26,8 +26,8 @@ def volume_of(keyframes: list[Keyframe], **settings: object) -> Volume:
 
 
 def bytes_of(volume: Volume) -> dict[str, bytes]:
-    used = volume._used_slots()
-    return {name: layer[used].tobytes() for name, layer in volume._layers().items()}
+    used = volume._store.used()
+    return {name: layer[used].tobytes() for name, layer in volume._store.layers().items()}
 
 
 @pytest.mark.parametrize("bundle", [True, False])
@@ -41,9 +41,9 @@ def test_the_volume_holds_exactly_the_twins_sums(bundle: bool) -> None:
     rays = np.vstack([scratch.rays[start : start + count] for start, count in spans])
     expected = reference.integrate(rays, volume._quanta_per_voxel)
     found = {}
-    for slot, corner in enumerate(unpack_keys(volume._keys.array[: volume._count]) * 8):
-        for o in np.flatnonzero(volume._sums.array[slot]):
-            found[tuple((corner + (o >> 6, o >> 3 & 7, o & 7)).tolist())] = int(volume._sums.array[slot, o])
+    for slot, corner in enumerate(unpack_keys(volume._store.keys) * 8):
+        for o in np.flatnonzero(volume._store.sums[slot]):
+            found[tuple((corner + (o >> 6, o >> 3 & 7, o & 7)).tolist())] = int(volume._store.sums[slot, o])
     assert found == {voxel: 2 * ((s << 27) + w) for voxel, (s, w) in expected.items()}
 
 
@@ -62,7 +62,8 @@ def test_one_thread_gives_the_hash_of_two() -> None:
         "for regularizer in ('off', 'ray'):\n"
         "    v = Volume(voxel_size=0.02, threads={}, regularizer=regularizer)\n"
         "    [v.integrate(k) for k in scenes.sphere_views(0.4, 4)]\n"
-        "    print(v.map_hash(), v.color_hash(), v._layers().get('regularised', v._sums.array).tobytes().__hash__())\n"
+        "    layers = v._store.layers().values()\n"
+        "    print(v.map_hash(), v.color_hash(), [hash(layer.tobytes()) for layer in layers])\n"
     )
     found = {
         subprocess.run(
@@ -115,16 +116,16 @@ def test_a_shift_by_whole_blocks_shifts_the_map() -> None:
         Keyframe(depth=k.depth, intrinsics=k.intrinsics, T_world_camera=k.T_world_camera) for k in VIEWS[:3]
     ]
     a, b = volume_of(here, voxel_size=0.0625), volume_of(moved, voxel_size=0.0625)
-    keys_a = unpack_keys(a._keys.array[a._used_slots()])
-    keys_b = unpack_keys(b._keys.array[b._used_slots()])
+    keys_a = unpack_keys(a._store.keys[a._store.used()])
+    keys_b = unpack_keys(b._store.keys[b._store.used()])
     assert {tuple(k) for k in keys_a + shift} == {tuple(k) for k in keys_b}
-    assert a._sums.array.sum() == pytest.approx(b._sums.array.sum(), rel=1e-3)
+    assert a._store.sums.sum() == pytest.approx(b._store.sums.sum(), rel=1e-3)
 
 
 def test_no_smoothness_equals_plain_fusion() -> None:
     volume = volume_of(VIEWS, regularizer="ray", smoothness=0.0)
-    used = volume._used_slots()
-    sums, smoothed = volume._sums.array[used], volume._regularised.array[used]
+    used = volume._store.used()
+    sums, smoothed = volume._store.sums[used], volume._store.regularised[used]
     weight = sums & ((1 << 27) - 1)
     plain = (sums >> 27) / np.maximum(weight, 1)
     assert np.abs(plain - smoothed)[weight > 0].max() <= 1 / 16
@@ -133,7 +134,7 @@ def test_no_smoothness_equals_plain_fusion() -> None:
 def test_dirty_blocks_are_reported_once() -> None:
     volume = volume_of(VIEWS[:1])
     dirty = volume.take_dirty()
-    assert {tuple(b) for b in dirty} == {tuple(b) for b in unpack_keys(volume._keys.array[: volume._count])}
+    assert {tuple(b) for b in dirty} == {tuple(b) for b in unpack_keys(volume._store.keys)}
     assert len(volume.take_dirty()) == 0
     stats = volume.integrate(VIEWS[1])
     assert len(volume.take_dirty()) == stats.blocks
@@ -177,7 +178,7 @@ def test_confidence_zero_is_no_return_and_half_is_less() -> None:
 
 
 def weights(volume: Volume) -> int:
-    return int((volume._sums.array & ((1 << 27) - 1)).sum())
+    return int((volume._store.sums & ((1 << 27) - 1)).sum())
 
 
 def test_the_limits_hold_and_leave_the_map_alone() -> None:
@@ -193,8 +194,8 @@ def test_the_limits_hold_and_leave_the_map_alone() -> None:
 
 def test_full_voxels_refuse_more_and_lose_nothing() -> None:
     volume = volume_of(VIEWS[:1])
-    slot, voxel = np.argwhere(volume._sums.array != 0)[0]
-    volume._sums.array[slot, voxel] = (1 << 26) - 1
+    slot, voxel = np.argwhere(volume._store.sums != 0)[0]
+    volume._store.sums[slot, voxel] = (1 << 26) - 1
     before = bytes_of(volume)
     with pytest.raises(WeightOverflow):
         volume.integrate(VIEWS[0])

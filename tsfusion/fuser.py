@@ -95,7 +95,7 @@ class Fuser:
 
     def mesh(self) -> None:
         """Bring the mesh up to date with the map."""
-        from tsfusion.volume import cells_of
+        from tsfusion.blockstore import cells_of
 
         blocks = self._volume.take_dirty()
         mesh = self._volume.extract_mesh(blocks=cells_of(blocks))

@@ -12,17 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion import checkpoint, runtime
+from tsfusion.blockstore import BlockStore, pack_keys, unpack_keys
 from tsfusion.config import VolumeConfig, make, override
 from tsfusion.errors import InvalidConfig, MapError, MapFull, WeightOverflow
-from tsfusion.kernels import blocks, integrate, smooth
+from tsfusion.kernels import integrate, smooth
 from tsfusion.kernels.integrate import CUBE, MAX_DISTANCE
 from tsfusion.keyframe import Keyframe
 from tsfusion.mesh import Mesh
 from tsfusion.meshing import Layers, extract
 from tsfusion.scratch import Scratch
-from tsfusion.storage import GrowingArray
-
-_HASH_CHUNK = 1024  # blocks
+from tsfusion.warmup import warm_up_keyframes
 
 
 class IntegrateStats(msgspec.Struct, frozen=True):
@@ -79,15 +78,7 @@ class Volume:
         self._scratch = Scratch(
             color=config.color, regularised=self._smooths, max_blocks=config.max_blocks_per_keyframe
         )
-        self._count = 0
-        self._keys = GrowingArray((), np.int64, 1024)  # block key of each slot
-        self._sums = GrowingArray((CUBE,), np.int64, 1024)
-        self._color_rgn = GrowingArray((CUBE,), np.int64, 1024 if config.color else 1)
-        self._color_b = GrowingArray((CUBE,), np.int32, 1024 if config.color else 1)
-        self._regularised = GrowingArray((CUBE,), np.float32, 1024 if self._smooths else 1)
-        self._dirty = GrowingArray((), np.uint8, 1024)
-        self._hash_keys = np.zeros(4096, np.int64)
-        self._hash_slots = np.zeros(4096, np.int32)
+        self._store = BlockStore(color=config.color, regularised=self._smooths)
 
     def integrate(self, keyframe: Keyframe) -> IntegrateStats:
         """Add a keyframe. On an error the map is as it was.
@@ -110,9 +101,7 @@ class Volume:
 
     def take_dirty(self) -> NDArray[np.int32]:
         """Coordinates of the blocks changed since the last call: (n, 3) int32, in units of 8 voxels."""
-        slots = np.flatnonzero(self._dirty.array[: self._count])
-        self._dirty.array[slots] = 0
-        return unpack_keys(self._keys.array[slots])
+        return unpack_keys(self._store.keys[self._store.take_dirty()])
 
     def extract_mesh(self, min_weight: float | None = None, blocks: NDArray[np.int32] | None = None) -> Mesh:
         """The surface, by marching cubes over the whole map or over the cells of some blocks.
@@ -126,16 +115,18 @@ class Volume:
             min_weight = self.model.min_weight
         if not min_weight >= 0:
             raise InvalidConfig(f"min_weight must be ≥ 0, got {min_weight}")
-        chosen = self._keys.array[: self._count]
+        store = self._store
+        chosen = store.keys
         if blocks is not None:
-            chosen = chosen[self._slots_of(pack_keys(blocks)) if len(blocks) else []]
+            slots = store.slots_of(pack_keys(blocks))
+            chosen = np.unique(chosen[slots[slots >= 0]])
         layers = Layers(
-            sums=self._sums.array,
-            color_rgn=self._color_rgn.array if self.config.color else None,
-            color_b=self._color_b.array,
-            regularised=self._regularised.array if self._smooths else None,
-            hash_keys=self._hash_keys,
-            hash_slots=self._hash_slots,
+            sums=store.sums,
+            color_rgn=store.color_rgn if self.config.color else None,
+            color_b=store.color_b,
+            regularised=store.regularised if self._smooths else None,
+            hash_keys=store.hash_keys,
+            hash_slots=store.hash_slots,
             voxel_size=self.config.voxel_size,
         )
         return extract(np.sort(chosen), layers, min_weight)
@@ -147,41 +138,41 @@ class Volume:
         """
         digest = hashlib.blake2b(digest_size=16)
         digest.update(struct.pack("<di", self.config.voxel_size, self._quanta_per_voxel))
-        for keys, sums in self._sorted_blocks(self._sums.array):
-            digest.update(keys)
-            digest.update(sums)
+        for keys, sums in self._store.in_order("sums"):
+            digest.update(keys.data)
+            digest.update(sums.data)
         return digest.hexdigest()
 
     def color_hash(self) -> str:
         """Hex digest of the exact colour sums."""
         digest = hashlib.blake2b(digest_size=16)
         if self.config.color:
-            for array in (self._color_rgn.array, self._color_b.array):
-                for keys, sums in self._sorted_blocks(array):
-                    digest.update(keys)
-                    digest.update(sums)
+            for layer in ("color_rgn", "color_b"):
+                for keys, sums in self._store.in_order(layer):
+                    digest.update(keys.data)
+                    digest.update(sums.data)
         return digest.hexdigest()
 
     def stats(self) -> VolumeStats:
         """Counts and exact bytes."""
-        layers = [self._keys, self._sums, self._dirty]
-        layers += [self._color_rgn, self._color_b] if self.config.color else []
-        layers += [self._regularised] if self._smooths else []
-        per_block = sum(layer.item_bytes for layer in layers)
+        store = self._store
         return VolumeStats(
             keyframes=self.keyframes,
-            blocks=self._count,
-            voxels=self._count * CUBE,
-            bytes=self._count * per_block + self._hash_keys.nbytes + self._hash_slots.nbytes,
-            bytes_per_block=per_block,
+            blocks=store.count,
+            voxels=store.count * CUBE,
+            bytes=store.nbytes,
+            bytes_per_block=store.bytes_per_block,
             scratch_bytes=self._scratch.nbytes,
         )
 
     def warm_up(self) -> None:
         """Compile every kernel, so that the first keyframe is not slower than the rest."""
-        from tsfusion.warmup import warm_up
-
-        warm_up(self.config)
+        throwaway = Volume(override(self.config, max_blocks_per_keyframe=1 << 14))
+        for keyframe in warm_up_keyframes(self.model, self.config.voxel_size):
+            throwaway.integrate(keyframe)
+            throwaway.retract(keyframe)
+            throwaway.integrate(keyframe)
+        throwaway.extract_mesh(min_weight=0)
 
     def save(self, path: str | os.PathLike[str], meta: dict[str, Any] | None = None) -> Path:
         """Write a checkpoint: complete and on disk, or not at all.
@@ -193,13 +184,13 @@ class Volume:
         Raises:
             CheckpointError: when the file cannot be written.
         """
+        layers = self._store.layers()
         header = checkpoint.Header(
             config=self.config, keyframes=self.keyframes, map_hash=self.map_hash(),
-            meta=self.meta if meta is None else meta, layers=list(self._layers()),
+            meta=self.meta if meta is None else meta, layers=list(layers),
         )  # fmt: skip
-        used = self._used_slots()
-        keys = self._keys.array[used]
-        return checkpoint.write(Path(path), header, keys, used, self._layers())
+        used = self._store.used()
+        return checkpoint.write(Path(path), header, self._store.keys[used], used, layers)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], threads: int | None = None) -> "Volume":
@@ -210,28 +201,20 @@ class Volume:
         """
         header, keys, stored = checkpoint.read(Path(path))
         volume = cls(msgspec.structs.replace(header.config, threads=threads))
-        volume._insert(keys)
-        for name, array in volume._layers().items():
+        volume._store.insert(keys)
+        for name, array in volume._store.layers().items():
             array[: len(keys)] = stored[name]
         volume.keyframes = header.keyframes
         volume.meta = header.meta
         checkpoint.verify(Path(path), header, volume.map_hash())
         return volume
 
-    def _layers(self) -> dict[str, NDArray[Any]]:
-        layers: dict[str, NDArray[Any]] = {"sums": self._sums.array}
-        if self.config.color:
-            layers |= {"color_rgn": self._color_rgn.array, "color_b": self._color_b.array}
-        if self._smooths:
-            layers |= {"regularised": self._regularised.array}
-        return layers
-
     def _apply(self, keyframe: Keyframe, sign: int) -> IntegrateStats:
         scratch = self._scratch
         model = self.config.model(keyframe.sensor)
         samples = scratch.make_rays(keyframe, model, self.config.voxel_size, self.config.bundle)
         ray_count = int(scratch.band_count.sum())
-        scratch.touch(self._hash_keys, self._hash_slots)
+        scratch.touch(self._store.hash_keys, self._store.hash_slots)
         try:
             self._sum_rays(keyframe)
             self._check(sign)
@@ -260,8 +243,8 @@ class Volume:
     def _check(self, sign: int) -> None:
         s = self._scratch
         refused = integrate.refuse_blocks(
-            s.touched_slots, s.touched, sign, s.frame, self._sums.array,
-            self._color_rgn.array, int(self.config.color),
+            s.touched_slots, s.touched, sign, s.frame, self._store.sums,
+            self._store.color_rgn, int(self.config.color),
         )  # fmt: skip
         if refused and sign < 0:
             raise MapError(f"cannot retract a keyframe the map does not hold ({refused} blocks disagree)")
@@ -274,34 +257,14 @@ class Volume:
     def _allocate(self, sign: int) -> int:
         s = self._scratch
         fresh = np.flatnonzero(s.touched_slots[: s.touched] < 0)
-        if sign > 0 and self._count + len(fresh) > self.config.max_blocks:
+        if sign > 0 and self._store.count + len(fresh) > self.config.max_blocks:
             raise MapFull(
                 f"the map may hold at most max_blocks = {self.config.max_blocks} blocks; "
-                f"it has {self._count} and this keyframe needs {len(fresh)} more"
+                f"it has {self._store.count} and this keyframe needs {len(fresh)} more"
             )
-        s.touched_slots[fresh] = np.arange(self._count, self._count + len(fresh), dtype=np.int32)
-        self._insert(s.touched_keys[fresh])
+        s.touched_slots[fresh] = np.arange(self._store.count, self._store.count + len(fresh), dtype=np.int32)
+        self._store.insert(s.touched_keys[fresh])
         return len(fresh)
-
-    def _insert(self, keys: NDArray[np.int64]) -> None:
-        """Append blocks with distinct new keys; their voxels are zero."""
-        first, self._count = self._count, self._count + len(keys)
-        for layer in (self._keys, self._sums, self._dirty):
-            layer.reserve(self._count)
-        if self.config.color:
-            self._color_rgn.reserve(self._count)
-            self._color_b.reserve(self._count)
-        if self._smooths:
-            self._regularised.reserve(self._count)
-        self._keys.array[first : self._count] = keys
-        if 2 * self._count > len(self._hash_keys):
-            size = 1 << (4 * self._count - 1).bit_length()
-            self._hash_keys = np.zeros(size, np.int64)
-            self._hash_slots = np.zeros(size, np.int32)
-            first = 0
-        blocks.insert_blocks(
-            self._keys.array, first, self._count - first, first, self._hash_keys, self._hash_slots
-        )
 
     def _smooth_rays(self) -> None:
         s, model = self._scratch, self.model
@@ -309,59 +272,22 @@ class Volume:
         smooth.smooth_rays(
             s.rays, s.band_start, s.band_count, s.table, s.table_index, s.touched_slots,
             self._quanta_per_voxel, model.smoothness, int(weighted), int(model.feedback or not weighted),
-            s.frame, self._sums.array, self._regularised.array, s.signal, s.crossed, s.votes,
+            s.frame, self._store.sums, self._store.regularised, s.signal, s.crossed, s.votes,
         )  # fmt: skip
 
     def _commit(self, keyframe: Keyframe, sign: int) -> int:
         s = self._scratch
         voxels = int(
             integrate.commit_blocks(
-                s.touched_slots, s.touched, sign, s.frame, self._sums.array, self._dirty.array
+                s.touched_slots, s.touched, sign, s.frame, self._store.sums, self._store.dirty
             )
         )
         if self.config.color and keyframe.color is not None:
             integrate.commit_color(
-                s.touched_slots, s.touched, sign, s.frame_color, self._color_rgn.array, self._color_b.array
+                s.touched_slots, s.touched, sign, s.frame_color, self._store.color_rgn, self._store.color_b
             )
         if self._smooths and sign > 0:
-            smooth.commit_regularised(s.touched_slots, s.touched, s.votes, self._regularised.array)
+            smooth.commit_regularised(s.touched_slots, s.touched, s.votes, self._store.regularised)
         elif self._smooths:
-            smooth.reset_regularised(s.touched_slots, s.touched, self._sums.array, self._regularised.array)
+            smooth.reset_regularised(s.touched_slots, s.touched, self._store.sums, self._store.regularised)
         return voxels
-
-    def _slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
-        slots = np.empty(len(keys), np.int32)
-        blocks.find_blocks(keys, self._hash_keys, self._hash_slots, slots)
-        return np.unique(slots[slots >= 0])
-
-    def _used_slots(self) -> NDArray[np.int64]:
-        """Slots with any weight, by block key."""
-        order = np.argsort(self._keys.array[: self._count])
-        chunks = [order[i : i + _HASH_CHUNK] for i in range(0, len(order), _HASH_CHUNK)]
-        used = [chunk[self._sums.array[chunk].any(axis=1)] for chunk in chunks]
-        return np.concatenate(used) if used else order
-
-    def _sorted_blocks(self, layer: NDArray[Any]) -> Any:
-        used = self._used_slots()
-        for i in range(0, len(used), _HASH_CHUNK):
-            chunk = used[i : i + _HASH_CHUNK]
-            yield self._keys.array[chunk], layer[chunk]
-
-
-def pack_keys(coordinates: NDArray[np.int32]) -> NDArray[np.int64]:
-    """(n, 3) block coordinates → (n,) int64 keys, as `kernels.traversal.pack`."""
-    x, y, z = (np.asarray(coordinates, np.int64) + (1 << 20)).reshape(-1, 3).T
-    return np.ascontiguousarray(x << 42 | y << 21 | z)
-
-
-def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int32]:
-    """(n,) keys → (n, 3) int32 block coordinates."""
-    mask = (1 << 21) - 1
-    return (np.stack([keys >> 42, keys >> 21, keys], axis=1) & mask).astype(np.int32) - (1 << 20)
-
-
-def cells_of(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The blocks whose cells read these blocks: themselves and their neighbours towards −x, −y, −z."""
-    shifts = np.stack(np.meshgrid([0, -1], [0, -1], [0, -1], indexing="ij"), axis=-1).reshape(-1, 3)
-    spread = (np.asarray(coordinates, np.int32)[:, None] + shifts.astype(np.int32)).reshape(-1, 3)
-    return np.unique(spread, axis=0)

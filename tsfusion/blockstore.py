@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: MIT
+"""The map's memory: blocks of 8³ voxels in slots, found by their packed coordinates."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.kernels import blocks
+from tsfusion.kernels.integrate import CUBE
+from tsfusion.storage import GrowingArray
+
+_FIRST_CAPACITY = 1024
+_CHUNK = 1024  # blocks read at a time where a whole layer would be copied
+
+
+class BlockStore:
+    """Slots 0 … count-1, each with a key and one row of 512 voxels in every layer.
+
+    Layers, (slot, 512): `sums` int64; with colour `color_rgn` int64 and `color_b` int32; when smoothing
+    `regularised` float32 (kernels/integrate.py and smooth.py say what they hold). `dirty` is (slot,) uint8.
+    A layer the map does not have is one row of zeros, so that kernels can be handed it.
+    """
+
+    def __init__(self, *, color: bool, regularised: bool) -> None:
+        self.count = 0
+        self.hash_keys = np.zeros(4 * _FIRST_CAPACITY, np.int64)
+        self.hash_slots = np.zeros(4 * _FIRST_CAPACITY, np.int32)
+        self._keys = GrowingArray((), np.int64, _FIRST_CAPACITY)
+        self._dirty = GrowingArray((), np.uint8, _FIRST_CAPACITY)
+        present = {"sums": True, "color_rgn": color, "color_b": color, "regularised": regularised}
+        dtypes = {"sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "regularised": np.float32}
+        self._layers = {
+            name: GrowingArray((CUBE,), dtypes[name], _FIRST_CAPACITY if there else 1)
+            for name, there in present.items()
+        }
+        self._present = [name for name, there in present.items() if there]
+
+    @property
+    def keys(self) -> NDArray[np.int64]:
+        return self._keys.array[: self.count]
+
+    @property
+    def sums(self) -> NDArray[np.int64]:
+        return self._layers["sums"].array
+
+    @property
+    def color_rgn(self) -> NDArray[np.int64]:
+        return self._layers["color_rgn"].array
+
+    @property
+    def color_b(self) -> NDArray[np.int32]:
+        return self._layers["color_b"].array
+
+    @property
+    def regularised(self) -> NDArray[np.float32]:
+        return self._layers["regularised"].array
+
+    @property
+    def dirty(self) -> NDArray[np.uint8]:
+        return self._dirty.array
+
+    def layers(self) -> dict[str, NDArray[Any]]:
+        """The layers the map has, by name."""
+        return {name: self._layers[name].array for name in self._present}
+
+    def insert(self, keys: NDArray[np.int64]) -> None:
+        """Append blocks with distinct new keys; their voxels are zero."""
+        first, self.count = self.count, self.count + len(keys)
+        for array in (self._keys, self._dirty, *(self._layers[name] for name in self._present)):
+            array.reserve(self.count)
+        self._keys.array[first : self.count] = keys
+        if 2 * self.count > len(self.hash_keys):
+            size = 1 << (4 * self.count - 1).bit_length()
+            self.hash_keys = np.zeros(size, np.int64)
+            self.hash_slots = np.zeros(size, np.int32)
+            first = 0
+        blocks.insert_blocks(
+            self._keys.array, first, self.count - first, first, self.hash_keys, self.hash_slots
+        )
+
+    def slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
+        """(n,) slots of keys, -1 where there is no such block."""
+        slots = np.empty(len(keys), np.int32)
+        blocks.find_blocks(keys, self.hash_keys, self.hash_slots, slots)
+        return slots
+
+    def take_dirty(self) -> NDArray[np.int64]:
+        """Slots changed since the last call."""
+        slots = np.flatnonzero(self.dirty[: self.count])
+        self.dirty[slots] = 0
+        return slots
+
+    def used(self) -> NDArray[np.int64]:
+        """Slots with any vote left, in the order of their keys."""
+        order = np.argsort(self.keys)
+        chunks = [order[i : i + _CHUNK] for i in range(0, len(order), _CHUNK)]
+        return np.concatenate([order[:0], *(chunk[self.sums[chunk].any(axis=1)] for chunk in chunks)])
+
+    def in_order(self, layer: str) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
+        """Keys and rows of the used blocks in key order, some at a time."""
+        used = self.used()
+        for i in range(0, len(used), _CHUNK):
+            chunk = used[i : i + _CHUNK]
+            yield self.keys[chunk], self._layers[layer].array[chunk]
+
+    @property
+    def bytes_per_block(self) -> int:
+        arrays = (self._keys, self._dirty, *(self._layers[name] for name in self._present))
+        return sum(array.item_bytes for array in arrays)
+
+    @property
+    def nbytes(self) -> int:
+        """What the blocks and their hash take."""
+        return self.count * self.bytes_per_block + self.hash_keys.nbytes + self.hash_slots.nbytes
+
+
+def pack_keys(coordinates: NDArray[np.int32]) -> NDArray[np.int64]:
+    """(n, 3) block coordinates → (n,) int64 keys, as `kernels.traversal.pack`."""
+    x, y, z = (np.asarray(coordinates, np.int64) + (1 << 20)).reshape(-1, 3).T
+    return np.ascontiguousarray(x << 42 | y << 21 | z)
+
+
+def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int32]:
+    """(n,) keys → (n, 3) int32 block coordinates."""
+    mask = (1 << 21) - 1
+    return (np.stack([keys >> 42, keys >> 21, keys], axis=1) & mask).astype(np.int32) - (1 << 20)
+
+
+def cells_of(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The blocks whose cells read these blocks: themselves and their neighbours towards −x, −y, −z."""
+    shifts = np.stack(np.meshgrid([0, -1], [0, -1], [0, -1], indexing="ij"), axis=-1).reshape(-1, 3)
+    spread = (np.asarray(coordinates, np.int32)[:, None] + shifts.astype(np.int32)).reshape(-1, 3)
+    return np.unique(spread, axis=0)
