@@ -28,6 +28,10 @@ def test_each_measurement_is_accepted_and_normalised() -> None:
     assert (keyframe.kind, keyframe.shape) == ("depth", (4, 5))
     assert keyframe.measurement.flags.c_contiguous
     assert keyframe.T_world_camera.dtype == np.float64
+    narrow = Intrinsics(np.float32(500), 500, np.float32(320), 240)
+    camera = Keyframe(depth=DEPTH, intrinsics=narrow, T_world_camera=np.eye(4)).intrinsics
+    assert camera == CAMERA
+    assert type(camera.fx) is float
     stereo = Keyframe(disparity=DEPTH, baseline_fx=380.0, intrinsics=CAMERA, T_world_camera=np.eye(4))
     assert stereo.kind == "disparity"
     cloud = Keyframe(points=POINTS, origins=np.zeros(3, np.float32), T_world_camera=np.eye(4))
@@ -51,6 +55,7 @@ def test_each_measurement_is_accepted_and_normalised() -> None:
         ({"depth": DEPTH, "intrinsics": Intrinsics(-5.0, 5.0, 1.0, 1.0)}, "fx > 0"),
         ({"depth": DEPTH, "intrinsics": Intrinsics(5.0, 0.0, 1.0, 1.0)}, "fy != 0"),
         ({"depth": DEPTH, "intrinsics": Intrinsics(5.0, 5.0, np.nan, 1.0)}, "finite"),
+        ({"depth": DEPTH, "intrinsics": Intrinsics("a", 5.0, 1.0, 1.0)}, "four numbers"),
         ({"depth": DEPTH, "depth_scale": 0.0}, "depth_scale must be finite and > 0, got 0.0"),
         ({"depth": DEPTH, "depth_scale": "x"}, "depth_scale must be a number"),
         ({"depth": DEPTH, "color": np.zeros((4, 5), np.uint8)}, r"color must have shape \(4, 5, 3\)"),

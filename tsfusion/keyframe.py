@@ -174,14 +174,18 @@ class Keyframe:
                 f"intrinsics must be given with {self.kind} as Intrinsics(fx, fy, cx, cy), "
                 f"got {self.intrinsics!r}"
             )
-        check_intrinsics(self.intrinsics)
+        object.__setattr__(self, "intrinsics", check_intrinsics(self.intrinsics))
 
 
-def check_intrinsics(intrinsics: Intrinsics) -> None:
-    """Raise InvalidKeyframe unless all four are finite, `fx > 0` and `fy != 0`."""
-    fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
+def check_intrinsics(intrinsics: Intrinsics) -> Intrinsics:
+    """The four as Python floats; raises InvalidKeyframe unless they are finite, `fx > 0` and `fy != 0`."""
+    try:
+        fx, fy, cx, cy = map(float, msgspec.structs.astuple(intrinsics))
+    except (TypeError, ValueError) as error:
+        raise InvalidKeyframe(f"intrinsics must be four numbers, got {intrinsics}") from error
     if not np.isfinite([fx, fy, cx, cy]).all() or fx <= 0 or fy == 0:
         raise InvalidKeyframe(f"intrinsics must be finite with fx > 0 and fy != 0, got {intrinsics}")
+    return Intrinsics(fx, fy, cx, cy)
 
 
 def check_pose(pose: Any) -> NDArray[np.float64]:
