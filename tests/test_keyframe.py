@@ -36,6 +36,8 @@ def test_each_measurement_is_accepted_and_normalised() -> None:
     assert stereo.kind == "disparity"
     cloud = Keyframe(points=POINTS, origins=np.zeros(3, np.float32), T_world_camera=np.eye(4))
     assert (cloud.kind, cloud.shape) == ("points", (3,))
+    wide = Keyframe(points=POINTS.astype(np.float64), T_world_camera=np.eye(4))
+    assert wide.measurement.dtype == np.float32
     assert (
         Keyframe(depth=DEPTH.astype(">u2"), intrinsics=CAMERA, T_world_camera=np.eye(4)).measurement.max()
         == 1
@@ -65,7 +67,7 @@ def test_each_measurement_is_accepted_and_normalised() -> None:
         ({"depth": DEPTH, "captured_ns": 1.5}, "captured_ns must be an integer"),
         ({"disparity": DEPTH}, "baseline_fx must be given"),
         ({"disparity": DEPTH, "baseline_fx": np.inf}, "baseline_fx must be finite"),
-        ({"points": POINTS.astype(np.float64)}, "points must be float32"),
+        ({"points": POINTS.astype(np.int32)}, "points must be float32 or float64, got int32"),
         ({"points": POINTS[:, :2]}, "points must have shape"),
         ({"points": POINTS, "origins": np.zeros((2, 3), np.float32)}, "origins must have shape"),
         ({"points": POINTS, "origins": np.full(3, np.nan, np.float32)}, "origins must be finite"),

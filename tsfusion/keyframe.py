@@ -50,8 +50,8 @@ class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
 class Keyframe:
     """One posed measurement. Give exactly one of `depth`, `disparity` and `points`.
 
-    Arrays are read, never written; they are converted only where that loses nothing (contiguity,
-    byte order). Pixels or points without a return are not errors: depth 0, NaN or negative,
+    Arrays are read, never written; they are made contiguous and native, and float64 points become float32
+    (0.01 mm at 100 m). Pixels or points without a return are not errors: depth 0, NaN or negative,
     disparity 0, a point with a non-finite coordinate.
 
     Attributes:
@@ -151,13 +151,18 @@ class Keyframe:
         self._check_camera()
 
     def _check_points(self) -> None:
-        points = _array("points", self.points, (np.float32,), (None, 3))
+        points = _array("points", self.points, (np.float32, np.float64), (None, 3)).astype(
+            np.float32, copy=False
+        )
         object.__setattr__(self, "points", points)
         if len(points) > MAX_POINTS:
             raise InvalidKeyframe(f"points must be at most {MAX_POINTS}, got {len(points)}")
         if self.origins is not None:
             one = np.ndim(self.origins) == 1
-            origins = _array("origins", self.origins, (np.float32,), (3,) if one else (len(points), 3))
+            shape = (3,) if one else (len(points), 3)
+            origins = _array("origins", self.origins, (np.float32, np.float64), shape).astype(
+                np.float32, copy=False
+            )
             if not np.isfinite(origins).all():
                 raise InvalidKeyframe("origins must be finite, got NaN or infinity")
             object.__setattr__(self, "origins", origins)
