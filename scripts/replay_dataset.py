@@ -1,0 +1,13 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: MIT
+"""Replay a recorded dataset through the whole path: the same as `tsfusion replay`.
+
+python scripts/replay_dataset.py PATH --voxel-size 0.02 --out out
+"""
+
+import sys
+
+from tsfusion.cli import main
+
+if __name__ == "__main__":
+    main(["replay", *sys.argv[1:]])

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: MIT
+"""Running the real `tsfusion` command, with deadlines."""
+
+import json
+import os
+import selectors
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+COMMAND = [sys.executable, "-m", "tsfusion"]
+DEADLINE = 120.0  # seconds: a cold kernel compilation on a slow machine
+
+
+def environment() -> dict[str, str]:
+    """This one without tsfusion's own variables."""
+    return {key: value for key, value in os.environ.items() if not key.startswith("TSFUSION_")}
+
+
+def tsfusion(
+    *arguments: object, timeout: float = DEADLINE, **more: Any
+) -> "subprocess.CompletedProcess[str]":
+    """Run a command to its end."""
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=timeout, env=environment(),
+        check=False, stdin=subprocess.DEVNULL, **more,
+    )  # fmt: skip
+
+
+def started(*arguments: object) -> "subprocess.Popen[str]":
+    """Start a command; its stderr goes with its stdout."""
+    return subprocess.Popen(
+        [*COMMAND, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        env=environment(), stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+
+
+def read_until(process: "subprocess.Popen[str]", word: str, timeout: float = DEADLINE) -> str:
+    """The first line that holds `word`."""
+    assert process.stdout is not None
+    deadline = time.monotonic() + timeout
+    seen = []
+    with selectors.DefaultSelector() as selector:
+        selector.register(process.stdout, selectors.EVENT_READ)
+        while time.monotonic() < deadline:
+            if not selector.select(0.2):
+                continue
+            line = process.stdout.readline()
+            if word in line:
+                return line
+            if not line:
+                break
+            seen.append(line)
+    raise AssertionError(f"no line with {word!r} came, but:\n{''.join(seen)}")
+
+
+@contextmanager
+def server(state: Path, *arguments: object) -> Iterator[tuple[str, "subprocess.Popen[str]"]]:
+    """A running `tsfusion serve` on free ports: its address and process."""
+    process = started("serve", "--listen", "tcp://127.0.0.1:0", "--state", state, "--json", *arguments)
+    try:
+        ready = json.loads(read_until(process, '"ready"'))
+        yield ready["listen"], process
+    finally:
+        end(process)
+
+
+def end(process: "subprocess.Popen[str]", number: int = signal.SIGTERM, timeout: float = 60.0) -> int:
+    """Send a signal, wait, and give the exit status."""
+    if process.poll() is None:
+        process.send_signal(number)
+    try:
+        return process.wait(timeout)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        raise
+    finally:
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def descendants(pid: int) -> list[int]:
+    """Every process below `pid` (Linux)."""
+    children = Path(f"/proc/{pid}/task/{pid}/children")
+    direct = [int(word) for word in children.read_text().split()] if children.exists() else []
+    return [pid for child in direct for pid in (child, *descendants(child))]
+
+
+def alive(pid: int) -> bool:
+    """Whether a process exists and is no zombie (Linux)."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def eventually(condition: Callable[[], bool], timeout: float = 30.0) -> bool:
+    """Poll until it holds; False at the deadline."""
+    deadline = time.monotonic() + timeout
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.05)
+    return True

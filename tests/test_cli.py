@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: MIT
+"""The `tsfusion` command as a person or a script meets it: output, exit status, and what is left behind."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from commands import tsfusion
+
+from tsfusion import __version__, config
+from tsfusion.cli import main
+from tsfusion.config import Config
+
+Here = Callable[..., "subprocess.CompletedProcess[str]"]
+
+VERBS = ["demo", "replay", "serve", "mesh", "status", "doctor", "config", "datasets"]
+
+
+def scene(folder: Path, *, pose: str | None = None, depth: bytes | None = None) -> Path:
+    """A one-frame dataset in the 7-Scenes layout."""
+    import cv2
+    import numpy as np
+
+    folder.mkdir()
+    image = np.full((48, 64), 1500, np.uint16)
+    (folder / "frame-000000.depth.png").write_bytes(
+        cv2.imencode(".png", image)[1].tobytes() if depth is None else depth
+    )
+    (folder / "frame-000000.pose.txt").write_text(pose or "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    return folder
+
+
+@pytest.fixture
+def here(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Here]:
+    """Run a command line in this process, in an empty folder: quicker where no real process is needed."""
+    monkeypatch.chdir(tmp_path)
+    for name in [name for name in os.environ if name.startswith("TSFUSION_")]:
+        monkeypatch.delenv(name)
+    handler = signal.getsignal(signal.SIGTERM)
+
+    def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
+        words = [str(argument) for argument in arguments]
+        with pytest.raises(SystemExit) as exit_status:
+            main(words)
+        said = capsys.readouterr()
+        assert isinstance(exit_status.value.code, int)
+        return subprocess.CompletedProcess(words, exit_status.value.code, said.out, said.err)
+
+    yield run
+    signal.signal(signal.SIGTERM, handler)
+
+
+def one_line(done: "subprocess.CompletedProcess[str]", *, status: int = 1) -> str:
+    """The message of a command that failed as it should."""
+    assert done.returncode == status, done.stderr
+    lines = done.stderr.strip().splitlines()
+    messages = [line for line in lines if line.startswith("tsfusion: ")]
+    assert len(messages) == 1, done.stderr
+    assert lines[-1] == messages[0], done.stderr
+    assert "Traceback" not in done.stderr
+    return messages[0]
+
+
+def test_help_names_every_verb() -> None:
+    done = tsfusion("--help")
+    assert done.returncode == 0
+    assert all(verb in done.stdout for verb in VERBS)
+
+
+def test_nothing_is_help_and_version_is_a_line(here: Here) -> None:
+    assert "Usage" in here().stdout
+    assert here("--version").stdout == f"tsfusion {__version__}\n"
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_help(here: Here, verb: str) -> None:
+    done = here(verb, "--help")
+    assert done.returncode == 0
+    assert "Usage" in done.stdout
+
+
+def test_help_is_quick() -> None:
+    def seconds() -> float:
+        started = time.perf_counter()
+        tsfusion("--help")
+        return time.perf_counter() - started
+
+    assert min(seconds() for _ in range(3)) < 1.0  # 0.15 s on a quiet machine; CI is not quiet
+    program = (
+        "import sys, tsfusion.cli; "
+        "sys.exit(', '.join({'numpy', 'zmq', 'cv2', 'msgspec', 'taichi', 'trimesh'} & set(sys.modules)) or 0)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+
+
+def test_config_dump_is_read_back(here: Here, tmp_path: Path) -> None:
+    text = here("config", "dump").stdout
+    assert "voxel_size = 0.02  # > 0; metres" in text
+    (tmp_path / "a.toml").write_text(text)
+    assert config.load(tmp_path / "a.toml") == Config()
+    (tmp_path / "b.toml").write_text('[volume]\nvoxel_size = 0.5\nmax_range = 7\n[server]\nstate = "ä\\"b"\n')
+    changed = config.load(tmp_path / "b.toml")
+    (tmp_path / "c.toml").write_text(here("config", "dump", "--config", tmp_path / "b.toml").stdout)
+    assert config.load(tmp_path / "c.toml") == changed != Config()
+    dumped = json.loads(here("config", "dump", "--json", "--config", tmp_path / "b.toml").stdout)
+    assert dumped["volume"]["voxel_size"] == 0.5
+
+
+def test_datasets_list(here: Here, tmp_path: Path) -> None:
+    assert "7-Scenes" in here("datasets", "list").stdout
+    scene(tmp_path / "kitchen")
+    found = json.loads(here("datasets", "list", tmp_path, "--json").stdout)
+    assert [row["sensor"] for row in found] == ["kinect"]
+    assert "no datasets" in here("datasets", "list", tmp_path / "kitchen" / "none").stderr
+
+
+def test_doctor() -> None:
+    done = tsfusion("doctor", "--json")
+    report = json.loads(done.stdout)
+    assert done.returncode == 0, report
+    assert report["ok"]
+    names = {check["name"] for check in report["checks"]}
+    assert {"python", "taichi", "numpy", "kernels", "loopback"} <= names
+
+
+def test_doctor_says_what_to_do(here: Here, tmp_path: Path) -> None:
+    done = here("doctor", tmp_path / "missing")
+    assert done.returncode == 1
+    assert done.stdout.count("✗") == 1
+    assert "→ choose another folder" in done.stdout
+    assert "✓ numpy" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["replay", "missing"], "missing does not exist"),
+        (["replay", "empty"], "in no layout known"),
+        (["replay", "synthetic:cave"], "world must be one of"),
+        (["replay", "synthetic:room", "--voxel-size", "-1"], "voxel_size: expected"),
+        (["replay", "synthetic:room", "--sensor", "sonar"], "sensor: expected one of kinect"),
+        (["replay", "synthetic:room", "--regularizer", "very"], "regularizer: expected one of off"),
+        (["replay", "synthetic:room", "--config", "missing.toml"], "missing.toml: No such file"),
+        (["replay", "synthetic:room", "--out", "file"], "not a folder"),
+        (["replay", "synthetic:room", "--out", "file/out"], "cannot write"),
+        (["demo", "--out", "/proc/out"], "cannot write"),
+        (["demo", "--world", "cave"], "world must be one of"),
+        (["mesh", "missing", "a.ply"], "missing does not exist"),
+        (["mesh", "empty", "a.ply"], "no keyframes"),
+        (["mesh", "garbage.tsf", "a.ply"], "not a tsfusion map"),
+        (["mesh", "garbage.tsf", "a.stl"], "ending in .ply, .glb, .obj"),
+        (["mesh", "garbage.tsf", "missing/a.ply"], "cannot write"),
+        (["mesh", "nonsense://x", "a.ply"], "an address looks like"),
+        (["serve", "--listen", "nonsense"], "an address looks like"),
+        (["serve", "--listen", "tcp://0.0.0.0:5555"], "127.0.0.1"),
+        (["serve", "--state", "file"], "cannot write the state folder"),
+        (["serve", "--threads", "0"], "threads: expected"),
+        (["serve", "--max-range", "0.01"], "min_range"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    here: Here, arguments: list[str], words: str, tmp_path: Path
+) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").write_text("here first")
+    (tmp_path / "garbage.tsf").write_bytes(bytes(range(200)))
+    done = here(*arguments)
+    assert words in one_line(done)
+    left = {path.name for path in tmp_path.rglob("*")} - {"tsfusion-state", "journal", "lock"}
+    assert left == {"empty", "file", "garbage.tsf"}
+    assert (tmp_path / "file").read_text() == "here first"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["replay"], ["fly"], ["replay", "x", "--fast"], ["serve", "--voxel-size", "small"], ["config"]],
+)
+def test_wrong_usage_is_status_2(here: Here, arguments: list[str]) -> None:
+    assert "see --help" in one_line(here(*arguments), status=2)
+
+
+@pytest.mark.parametrize(
+    ("broken", "words"),
+    [
+        ({"pose": "nan 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"}, "nan"),
+        ({"pose": "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"}, "rotation"),
+        ({"depth": b""}, "cannot be decoded"),
+    ],
+)
+def test_a_broken_dataset_leaves_nothing(
+    here: Here, broken: dict[str, str], words: str, tmp_path: Path
+) -> None:
+    scene(tmp_path / "scene", **broken)
+    done = here("replay", tmp_path / "scene", "--out", tmp_path / "out")
+    assert words in one_line(done).lower()
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+def test_dead_server(here: Here, tmp_path: Path) -> None:
+    with socket.socket() as reserved:
+        reserved.bind(("127.0.0.1", 0))  # bound, never listening: nobody answers here
+        address = f"tcp://127.0.0.1:{reserved.getsockname()[1]}"
+        assert "no server" in one_line(here("status", "--connect", address, "--timeout", 0.3))
+        (tmp_path / "quick.toml").write_text("[client]\nconnect_timeout = 0.3\n")
+        done = here(
+            "replay", "synthetic:room", "--connect", address, "--config", tmp_path / "quick.toml",
+            "--out", tmp_path / "out",
+        )  # fmt: skip
+        assert "no server" in one_line(done)
+    assert [path.name for path in tmp_path.iterdir()] == ["quick.toml"]
+
+
+def test_busy_port(here: Here, tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        done = here("serve", "--listen", address, "--state", tmp_path / "state")
+    assert f"cannot listen on {address}" in one_line(done)

@@ -1,0 +1,28 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion config dump`."""
+
+import typer
+
+from tsfusion.cli import options
+
+app = typer.Typer(help="The settings and their defaults.")
+
+
+@app.callback()
+def _group() -> None:
+    """Keeps `dump` a verb of its own while it is the only one."""
+
+
+@app.command()
+def dump(config: options.ConfigFile = None, json: options.Json = False) -> None:
+    """Print every setting as commented TOML: the defaults, or what FILE makes of them."""
+    from tsfusion import config as settings
+    from tsfusion import config_toml
+
+    loaded = settings.load(config)
+    if json:
+        from tsfusion.cli import show
+
+        show.as_json(loaded)
+    else:
+        typer.echo(config_toml.dumps(loaded), nl=False)

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion doctor`: is everything here that a run needs, and if not, what to do."""
+
+import platform
+import shutil
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib import import_module, metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tsfusion.cli import options
+
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
+
+PYTHONS = ((3, 10), (3, 13))
+DISK_BYTES = 2_000_000_000
+# `tsfusion.kernels` imports taichi without its banner.
+_MODULES = {"opencv-python-headless": "cv2", "pyzmq": "zmq", "taichi": "tsfusion.kernels"}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One check: what was looked at, what was found, and what to do if it is wrong."""
+
+    name: str
+    ok: bool
+    found: str
+    advice: str = ""
+
+
+def doctor(
+    path: Annotated[
+        Path, typer.Argument(metavar="DIR", help="A folder on the disk that is to hold maps.")
+    ] = Path(),
+    json: options.Json = False,
+) -> int:
+    """Check the installation, a line a check, and say what to do; status 1 when something is wrong."""
+    findings = []
+    for finding in check(path):
+        findings.append(finding)
+        if not json:
+            _show(finding)
+    ok = all(finding.ok for finding in findings)
+    if json:
+        from tsfusion.cli import show
+
+        show.as_json({"ok": ok, "checks": findings})
+    elif ok:
+        typer.echo("all good: try `tsfusion demo`")
+    return 0 if ok else 1
+
+
+def check(path: Path) -> Iterator[Finding]:
+    """Every finding, as soon as it is known."""
+    yield _python()
+    yield from _packages()
+    yield _guarded(_kernels, "kernels", "pip install --force-reinstall taichi")
+    yield _guarded(_port, "loopback", "let this user listen on 127.0.0.1")
+    yield _disk(path)
+
+
+def _show(finding: Finding) -> None:
+    mark = typer.style("✓", fg="green") if finding.ok else typer.style("✗", fg="red")
+    advice = f" → {finding.advice}" if finding.advice else ""
+    typer.echo(f"{mark} {finding.name}: {finding.found}{advice}")
+
+
+def _python() -> Finding:
+    low, high = (".".join(map(str, version)) for version in PYTHONS)
+    ok = PYTHONS[0] <= sys.version_info[:2] <= PYTHONS[1]
+    found = f"{platform.python_version()} on {platform.platform(terse=True)} {platform.machine()}"
+    return Finding("python", ok, found, "" if ok else f"install Python {low} to {high}")
+
+
+def _packages() -> Iterator[Finding]:
+    """A finding for each package the installation says it needs on this machine, extras left out."""
+    try:
+        from packaging.requirements import Requirement
+
+        requirements = [Requirement(line) for line in metadata.requires("tsfusion") or []]
+    except (ImportError, metadata.PackageNotFoundError) as error:
+        yield Finding(
+            "packages", False, f"tsfusion is not installed completely ({error})", "pip install tsfusion"
+        )
+        return
+    for requirement in sorted(requirements, key=lambda requirement: requirement.name):
+        if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+            yield _package(requirement)
+        elif requirement.name == "taichi":
+            advice = "this machine can send keyframes, not fuse them: run `tsfusion serve` on x86-64"
+            yield Finding("taichi", False, f"no build for {platform.machine()}", advice)
+
+
+def _package(requirement: "Requirement") -> Finding:
+    name = requirement.name
+    advice = f"pip install '{name}{requirement.specifier}'"
+    try:
+        version = metadata.version(name)
+        import_module(_MODULES.get(name, name))
+    except metadata.PackageNotFoundError:
+        return Finding(name, False, "missing", advice)
+    except Exception as error:  # noqa: BLE001  whatever an import of a broken package raises is the finding
+        return Finding(name, False, f"{version} does not import: {error}", f"{advice} --force-reinstall")
+    if not requirement.specifier.contains(version, prereleases=True):
+        return Finding(name, False, f"{version}, needs {requirement.specifier}", advice)
+    return Finding(name, True, version)
+
+
+def _kernels() -> Finding:
+    """Compile (or load) and run a kernel, and compare with what it must give."""
+    import numpy as np
+
+    from tsfusion.mesh import Mesh
+    from tsfusion.preview import Camera, draw
+
+    started = time.perf_counter()
+    corners = np.array([(-9, -9, 2), (-9, 9, 2), (9, 9, 2)], np.float32)
+    normals = np.tile(np.array((0, 0, -1), np.float32), (3, 1))
+    depth = draw(Mesh(corners, np.array([(0, 1, 2)], np.int32), normals), Camera(np.eye(4)), 8, 8)[..., 3]
+    seconds = time.perf_counter() - started
+    if depth[6, 1] != 2:
+        return Finding(
+            "kernels", False, f"a kernel gave {depth[6, 1]} where 2 is right", "please report this"
+        )
+    return Finding("kernels", True, f"Taichi runs; first kernel after {seconds:.1f} s")
+
+
+def _port() -> Finding:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return Finding(
+            "loopback", True, f"can listen on 127.0.0.1 (port {listener.getsockname()[1]} was free)"
+        )
+
+
+def _disk(path: Path) -> Finding:
+    name = f"disk {path.absolute()}"
+    try:
+        with tempfile.TemporaryFile(dir=path):
+            free = shutil.disk_usage(path).free
+    except OSError as error:
+        return Finding(name, False, f"cannot be written: {error.strerror}", "choose another folder")
+    advice = "" if free >= DISK_BYTES else "free some space: journals grow by about 0.1–0.3 MB a keyframe"
+    return Finding(name, not advice, f"{free / 1e9:.1f} GB free", advice)
+
+
+def _guarded(look: Callable[[], Finding], name: str, advice: str) -> Finding:
+    """The finding, or what went wrong while looking."""
+    try:
+        return look()
+    except Exception as error:  # noqa: BLE001  a doctor reports what it meets
+        return Finding(name, False, f"{type(error).__name__}: {error}", advice)

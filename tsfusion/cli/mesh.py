@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion mesh`."""
+
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tsfusion.cli import options
+
+if TYPE_CHECKING:
+    from tsfusion.config import VolumeConfig
+    from tsfusion.mesh import Mesh
+    from tsfusion.recording import Recording
+    from tsfusion.volume import Volume
+
+MAP_FILE = "map.tsf"
+
+
+def mesh(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="SOURCE", help="A map (.tsf), a state folder, a journal (folder or .mcap), or tcp://…"
+        ),
+    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="A .ply, .glb or .obj file.")],
+    *,
+    preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw it, too.")] = None,
+    min_weight: options.MinWeight = None,
+    control: options.Control = None,
+    voxel_size: options.VoxelSize = None,
+    sensor: options.Sensor = None,
+    regularizer: options.Regularizer = None,
+    smoothness: options.Smoothness = None,
+    max_range: options.MaxRange = None,
+    threads: options.Threads = None,
+    config: options.ConfigFile = None,
+    json: options.Json = False,
+) -> None:
+    """Write the mesh of a saved map, of a journal (fused anew, with these map flags), or of a live server."""
+    from tsfusion.mesh import FORMATS
+    from tsfusion.results import check_writable
+
+    check_writable(out, FORMATS)
+    if preview is not None:
+        check_writable(preview, (".png",))
+    if "://" in source:
+        from tsfusion.client import fetch_mesh
+
+        made = fetch_mesh(source, control=control, min_weight=min_weight)
+    else:
+        chosen = options.configuration(
+            config, voxel_size=voxel_size, sensor=sensor, regularizer=regularizer, smoothness=smoothness,
+            max_range=max_range, threads=threads,
+        )  # fmt: skip
+        flags = (voxel_size, sensor, regularizer, smoothness, max_range, config)
+        given = any(flag is not None for flag in flags)
+        made = _volume(Path(source), chosen.volume, given=given, quiet=json).extract_mesh(min_weight)
+    made.save(out)
+    if preview is not None:
+        from tsfusion.preview import render
+
+        render(made, preview)
+    _tell(made, out, json)
+
+
+def _volume(source: Path, config: "VolumeConfig", *, given: bool, quiet: bool) -> "Volume":
+    """The saved map where there is a complete one, else a new one of every keyframe of the journal."""
+    from tsfusion.config import override
+    from tsfusion.errors import DatasetError
+    from tsfusion.volume import Volume
+
+    if not source.exists():
+        raise DatasetError(f"{source} does not exist; expected a map (.tsf), a state folder or a journal")
+    if source.suffix == ".tsf":
+        return Volume.load(source, threads=config.threads)
+    from tsfusion.recording import Recording
+
+    recording = Recording(source)
+    saved = source / MAP_FILE
+    if saved.is_file() and not given:
+        volume = Volume.load(saved, threads=config.threads)
+        if volume.keyframes == len(recording):
+            return volume
+        config = override(volume.config, threads=config.threads)  # the server died before it saved the rest
+    return _fuse(recording, Volume(config), quiet)
+
+
+def _fuse(recording: "Recording", volume: "Volume", quiet: bool) -> "Volume":
+    """Add every keyframe; as in the server, one that the map cannot take is counted and left out."""
+    from tsfusion.cli import show
+    from tsfusion.errors import MapError
+
+    left_out: Counter[str] = Counter()
+    with show.progress(quiet=quiet) as progress:
+        progress.stage(f"fusing {recording.name}")
+        for index, keyframe in enumerate(recording, 1):
+            try:
+                volume.integrate(keyframe)
+            except MapError as error:
+                left_out[str(error)] += 1
+            progress.count(index, volume.keyframes, len(recording))
+    for reason, count in left_out.items():
+        typer.echo(f"left out {count} keyframes: {reason}", err=True)
+    return volume
+
+
+def _tell(made: "Mesh", out: Path, json: bool) -> None:
+    from tsfusion.cli import show
+
+    figures: dict[str, Any] = {"path": str(out), "vertices": len(made.vertices), "triangles": len(made.faces)}
+    if json:
+        show.as_json(figures)
+    else:
+        vertices, triangles = show.grouped(figures["vertices"]), show.grouped(figures["triangles"])
+        typer.echo(f"{out}: {vertices} vertices, {triangles} triangles")

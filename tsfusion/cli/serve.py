@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion serve`."""
+
+import os
+import signal
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tsfusion.cli import options
+
+if TYPE_CHECKING:
+    from tsfusion.transport import Addresses
+
+
+def serve(
+    *,
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS", envvar="TSFUSION_LISTEN", help="Where keyframes arrive; port 0 = any free."
+        ),
+    ] = None,
+    control: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS", envvar="TSFUSION_CONTROL", help="Where commands do; else the next port."
+        ),
+    ] = None,
+    state: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DIR", envvar="TSFUSION_STATE", help="Journal and map; what is there is taken up again."
+        ),
+    ] = None,
+    voxel_size: options.VoxelSize = None,
+    sensor: options.Sensor = None,
+    regularizer: options.Regularizer = None,
+    smoothness: options.Smoothness = None,
+    max_range: options.MaxRange = None,
+    threads: options.Threads = None,
+    config: options.ConfigFile = None,
+    json: options.Json = False,
+    until_eof: Annotated[bool, typer.Option("--until-eof", hidden=True)] = False,
+) -> int:
+    """Fuse keyframes that scanners send; SIGTERM or Ctrl-C saves the map and ends.
+
+    Prints one line with `ready` once keyframes are welcome: every kernel is compiled by then.
+    """
+    started = time.monotonic()
+    from tsfusion import server
+
+    chosen = options.configuration(
+        config, listen=listen, control=control, state=state, voxel_size=voxel_size, sensor=sensor,
+        regularizer=regularizer, smoothness=smoothness, max_range=max_range, threads=threads,
+    )  # fmt: skip
+    if until_eof:
+        threading.Thread(target=_stop_at_eof, daemon=True).start()
+
+    def on_ready(addresses: "Addresses") -> None:
+        _announce(addresses, chosen.server.state, time.monotonic() - started, json)
+
+    return server.run(chosen.server, chosen.volume, on_ready)
+
+
+def _announce(addresses: "Addresses", state: str, seconds: float, json: bool) -> None:
+    if json:
+        from tsfusion.cli import show
+
+        show.as_json_line(
+            {
+                "ready": True, "listen": addresses.data, "control": addresses.control,
+                "publish": addresses.publish, "state": state, "seconds": round(seconds, 3),
+            }
+        )  # fmt: skip
+    else:
+        typer.echo(
+            f"ready in {seconds:.1f} s: keyframes {addresses.data}, control {addresses.control}, "
+            f"mesh updates {addresses.publish}, state {state}"
+        )
+    sys.stdout.flush()
+
+
+def _stop_at_eof() -> None:
+    """End as by SIGTERM when the parent closes our stdin, which it does even when it is killed."""
+    while os.read(sys.stdin.fileno(), 4096):  # unbuffered: no lock is held when the interpreter ends
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
