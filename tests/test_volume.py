@@ -192,14 +192,17 @@ def test_the_limits_hold_and_leave_the_map_alone() -> None:
         volume_of(VIEWS[:1], max_blocks_per_keyframe=3)
 
 
-def test_full_voxels_refuse_more_and_lose_nothing() -> None:
+@pytest.mark.parametrize("layer", ["sums", "color_rgn"])
+def test_full_voxels_refuse_more_and_lose_nothing(layer: str) -> None:
     volume = volume_of(VIEWS[:1])
-    slot, voxel = np.argwhere(volume._store.sums != 0)[0]
-    volume._store.sums[slot, voxel] = (1 << 26) - 1
+    array = volume._store.layers()[layer]
+    slot, voxel = np.argwhere(array != 0)[0]
+    array[slot, voxel] = (1 << 26 if layer == "sums" else 1 << 15) - 1
     before = bytes_of(volume)
     with pytest.raises(WeightOverflow):
         volume.integrate(VIEWS[0])
     assert bytes_of(volume) == before
+    volume.retract(VIEWS[0])  # making room is always allowed
 
 
 @pytest.mark.parametrize(

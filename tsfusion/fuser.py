@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 MAP_FILE = "map.tsf"
 JOURNAL_FOLDER = "journal"
+_FUSING_SHARE = 3  # a busy fuser meshes for at most a quarter of its time
 # Settings that may differ between a map and the server that goes on with it: none changes the sums.
 _FREE_SETTINGS = ("threads", "max_blocks", "max_blocks_per_keyframe", "min_weight")
 
@@ -49,7 +50,7 @@ class Fuser:
         self._since_checkpoint = 0
         self._watched = False
         self._fused_index = self._meshed_index = -1
-        self._meshed_at = 0.0
+        self._next_mesh = 0.0
         self._hashes: tuple[int, str, str] | None = None
         self.exit_status: int | None = None
         self._volume = self._open()
@@ -89,17 +90,20 @@ class Fuser:
             self.exit_status = 0 if self._checkpoint() else 1
 
     def mesh_due(self, idle: bool) -> bool:
-        """Whether the mesh is behind and it is time: at once when idle, else at most every interval."""
+        """Whether the mesh is behind and it is time: at once when idle, else so that fusing comes first."""
         behind = self._fused_index > self._meshed_index
-        return behind and (idle or time.monotonic() - self._meshed_at >= self._begin.mesh_interval)
+        return behind and (idle or time.monotonic() >= self._next_mesh)
 
     def mesh(self) -> None:
         """Bring the mesh up to date with the map."""
         from tsfusion.blockstore import cells_of
 
+        started = time.monotonic()
         blocks = self._volume.take_dirty()
         mesh = self._volume.extract_mesh(blocks=cells_of(blocks))
-        self._meshed_index, self._meshed_at = self._fused_index, time.monotonic()
+        self._meshed_index = self._fused_index
+        pause = max(self._begin.mesh_interval, _FUSING_SHARE * (time.monotonic() - started))
+        self._next_mesh = time.monotonic() + pause
         stamp = time.monotonic_ns()
         if self._watched:
             layout, frames = _mesh_frames(mesh)

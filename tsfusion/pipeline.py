@@ -154,7 +154,7 @@ def replay(
             )
         progress.stage("writing the results")
         shutil.rmtree(scratch)
-        return _write(work, run, mesh, partial(_summarise, run, mesh, status, child))
+        return _write(work, run, mesh, _summarise(run, mesh, status, child))
 
 
 @contextmanager
@@ -181,6 +181,7 @@ class _Run:
         self.dataset = dataset
         self.poses: list[NDArray[np.float64]] = []
         self.seconds = 0.0
+        self.peak_rss_bytes = 0  # while scanning: drawing the result is not a scanner's work
         self.records: list[KeyframeTimes] = []
         self.rate: float | None = None
         self.stats = scanner.stats
@@ -208,6 +209,7 @@ class _Run:
             self.poses.append(keyframe.T_world_camera)
         self._wait(lambda: self._done >= len(self.dataset))
         self.seconds = time.monotonic() - started
+        self.peak_rss_bytes = process.peak_rss_bytes()
 
     def _may_send(self, index: int) -> bool:
         return index - self._done < AHEAD
@@ -235,13 +237,12 @@ def _is_time(due: float) -> bool:
     return time.monotonic() >= due
 
 
-def _write(work: Path, run: _Run, mesh: Mesh, summarise: Callable[[], RunSummary]) -> RunSummary:
+def _write(work: Path, run: _Run, mesh: Mesh, summary: RunSummary) -> RunSummary:
     mesh.save(work / "mesh.ply")
     mesh.save(work / "mesh.glb")
     preview.render(mesh, work / "preview.png", poses=run.poses)
     ledger.write_csv(run.records, work / "delay.csv")
     ledger.plot(run.records, work / "delay.png")
-    summary = summarise()  # last: it tells the peak memory of the whole run
     text = msgspec.json.format(msgspec.json.encode(summary), indent=2)
     (work / RECORD).write_bytes(text + b"\n")
     return summary
@@ -266,7 +267,7 @@ def _summarise(run: _Run, mesh: Mesh, status: Status, child: ServerChild | None)
         clock_bound_ms=delays.clock_bound_ms,
         mesh={"vertices": len(mesh.vertices), "triangles": len(mesh.faces)},
         accuracy=measure(surface, mesh) if surface else None,
-        peak_rss_bytes={**_server_rss(status), "client": process.peak_rss_bytes()},
+        peak_rss_bytes={**_server_rss(status), "client": run.peak_rss_bytes},
         config={**status.config, "rate": run.rate},
         versions=versions(),
     )

@@ -27,6 +27,7 @@ class Scratch:
 
     def __init__(self, *, color: bool, regularised: bool, max_blocks: int) -> None:
         self.color = color
+        self.colored = False  # the current keyframe brings colour, and the map keeps it
         self.regularised = regularised
         self.max_blocks = max_blocks
         self.rays = np.zeros((0, RAY_FIELDS), np.int32)
@@ -63,6 +64,7 @@ class Scratch:
     def make_rays(self, keyframe: Keyframe, model: SensorModel, voxel_size: float, bundle: bool) -> int:
         """Fill `rays`; returns the number of valid samples."""
         parameters = model_parameters(model, voxel_size, keyframe.baseline_fx)
+        self.colored = self.color and keyframe.color is not None
         T = keyframe.T_world_camera
         common = (
             int(bundle), *self._bundles, self._rays_for(keyframe.shape),
@@ -119,7 +121,7 @@ class Scratch:
             self._set_table_size(2 * len(self.table))
         self.touched = count
         self._frame.reserve(count)
-        if self.color:
+        if self.colored:
             self._frame_color.reserve(count)
         if self.regularised:
             self._votes.reserve(count)
@@ -127,7 +129,7 @@ class Scratch:
     def clear(self) -> None:
         """Zero the sums of the current keyframe, whatever became of it."""
         self.frame[: self.touched] = 0
-        if self.color:
+        if self.colored:
             self.frame_color[: self.touched] = 0
         if self.regularised:
             self.votes[: self.touched] = 0

@@ -216,12 +216,12 @@ class Volume:
         ray_count = int(scratch.band_count.sum())
         scratch.touch(self._store.hash_keys, self._store.hash_slots)
         try:
-            self._sum_rays(keyframe)
+            self._sum_rays()
             self._check(sign)
             new = self._allocate(sign)
             if self._smooths and sign > 0:
                 self._smooth_rays()
-            voxels = self._commit(keyframe, sign)
+            voxels = self._commit(sign)
             touched = scratch.touched
         finally:
             scratch.clear()
@@ -232,19 +232,18 @@ class Volume:
             blocks=touched, new_blocks=new, voxels=voxels,
         )  # fmt: skip
 
-    def _sum_rays(self, keyframe: Keyframe) -> None:
+    def _sum_rays(self) -> None:
         s = self._scratch
-        colored = int(self.config.color and keyframe.color is not None)
         integrate.integrate_rays(
             s.rays, s.band_start, s.band_count, s.table, s.table_index,
-            self._quanta_per_voxel, colored, s.frame, s.frame_color,
+            self._quanta_per_voxel, int(s.colored), s.frame, s.frame_color,
         )  # fmt: skip
 
     def _check(self, sign: int) -> None:
         s = self._scratch
         refused = integrate.refuse_blocks(
             s.touched_slots, s.touched, sign, s.frame, self._store.sums,
-            self._store.color_rgn, int(self.config.color),
+            self._store.color_rgn, int(s.colored),
         )  # fmt: skip
         if refused and sign < 0:
             raise MapError(f"cannot retract a keyframe the map does not hold ({refused} blocks disagree)")
@@ -275,14 +274,14 @@ class Volume:
             s.frame, self._store.sums, self._store.regularised, s.signal, s.crossed, s.votes,
         )  # fmt: skip
 
-    def _commit(self, keyframe: Keyframe, sign: int) -> int:
+    def _commit(self, sign: int) -> int:
         s = self._scratch
         voxels = int(
             integrate.commit_blocks(
                 s.touched_slots, s.touched, sign, s.frame, self._store.sums, self._store.dirty
             )
         )
-        if self.config.color and keyframe.color is not None:
+        if s.colored:
             integrate.commit_color(
                 s.touched_slots, s.touched, sign, s.frame_color, self._store.color_rgn, self._store.color_b
             )

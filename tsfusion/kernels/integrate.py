@@ -126,7 +126,7 @@ def refuse_blocks(
                     if has_color == 1:
                         n = color_rgn[slot, v] & 65535
                 after = w + sign_ * lane_weight(frame[i, v])
-                if after < 0 or after >= WEIGHT_LIMIT or n + 1 >= COLOR_LIMIT:
+                if after < 0 or after >= WEIGHT_LIMIT or n + sign_ >= COLOR_LIMIT:
                     bad = 1
             refused += bad
     return refused
