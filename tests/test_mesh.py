@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from tsfusion import Mesh, Volume
 from tsfusion.blockstore import cells_of, pack_keys, unpack_keys
-from tsfusion.errors import OutputError
+from tsfusion.errors import InvalidConfig, OutputError
 from tsfusion.meshing import Layers, extract
 
 
@@ -153,6 +153,12 @@ def blocks_of(volume: Volume) -> list[tuple[int, ...]]:
 
 def as_set(blocks: NDArray[np.int32]) -> set[tuple[int, ...]]:
     return {tuple(int(c) for c in b) for b in blocks}
+
+
+@pytest.mark.parametrize("weight", [-1.0, float("nan"), float("inf"), 1e308])
+def test_an_impossible_weight_is_named(weight: float) -> None:
+    with pytest.raises(InvalidConfig, match="min_weight must be from 0 to"):
+        Volume(voxel_size=0.02).extract_mesh(min_weight=weight)
 
 
 def test_blocks_that_do_not_exist_give_an_empty_mesh() -> None:

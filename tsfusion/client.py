@@ -61,8 +61,8 @@ class Client:
         config: ClientConfig | None = None,
     ) -> None:
         self._config = config or ClientConfig()
-        address = sockets.join(*sockets.split(address))
-        self._control = control_address(address, control)
+        address = sockets.target(address)
+        self._control = sockets.target(control_address(address, control))
         self._outbox = Outbox(Spool(spool, self._config.segment_bytes))
         self._sender = Sender(address, self._control, self._outbox, self._config.stall_timeout)
         self._sending = threading.Lock()
@@ -211,7 +211,9 @@ def fetch_status(address: str, *, control: str | None = None, timeout: float = 1
         ServerUnreachable: when nobody answers in `timeout` seconds.
         TransportError: when the server cannot say.
     """
-    reply, _ = request(control_address(address, control), Command(name="status"), timeout=timeout)
+    reply, _ = request(
+        control_address(sockets.target(address), control), Command(name="status"), timeout=timeout
+    )
     if reply.status is None:
         raise TransportError(f"the server at {address} answered without a status")
     return reply.status
@@ -227,7 +229,7 @@ def fetch_mesh(
         TransportError: when the server cannot make it.
     """
     command = Command(name="mesh", min_weight=min_weight)
-    reply, frames = request(control_address(address, control), command, timeout=timeout)
+    reply, frames = request(control_address(sockets.target(address), control), command, timeout=timeout)
     if reply.mesh is None:
         raise TransportError(f"the server at {address} answered without a mesh")
     return mesh_of(reply.mesh, frames)

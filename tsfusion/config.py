@@ -187,12 +187,12 @@ def load(path: str | Path | None) -> Config:
     if path is None:
         return Config()
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        content = Path(path).read_bytes()
     except OSError as error:
         raise InvalidConfig(f"cannot read the configuration {path}: {error.strerror}") from error
     try:
-        return msgspec.convert(tomllib.loads(text), Config)
-    except tomllib.TOMLDecodeError as error:
+        return msgspec.convert(tomllib.loads(content.decode("utf-8")), Config)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InvalidConfig(f"{path} is not TOML: {error}") from error
     except msgspec.ValidationError as error:
         raise InvalidConfig(f"{path}: {error}") from error

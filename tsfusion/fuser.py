@@ -7,9 +7,11 @@ journal are enough to begin again.
 
 import logging
 import platform
+import select
 import signal
 import sys
 import time
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -151,8 +153,9 @@ class Fuser:
                 self._send(work.Answer(ask.number, layout=layout), frames)
             else:
                 self._send(work.Answer(ask.number, status=self._status()))
-        except TsfusionError as error:
-            self._send(work.Answer(ask.number, error=str(error)))
+        except (TsfusionError, ArithmeticError, ValueError, MemoryError) as error:
+            # whatever was asked, the map goes on: a crash would be blamed on the next keyframe
+            self._send(work.Answer(ask.number, error=str(error) or type(error).__name__))
 
     def _status(self) -> work.FuserStatus:
         stats = self._volume.stats()
@@ -221,6 +224,16 @@ def run(endpoint: str) -> int:
     finally:
         link.close(linger=1000)
         context.term()
+        _remove(endpoint)
+
+
+def _remove(endpoint: str) -> None:
+    """Clear up behind a gateway that was killed; one that lives has use for the folder, or removes it."""
+    if select.select([sys.stdin], [], [], 0)[0]:
+        file = Path(endpoint.removeprefix("ipc://"))
+        with suppress(OSError):
+            file.unlink(missing_ok=True)
+            file.parent.rmdir()
 
 
 def _serve(link: sockets.AnySocket) -> int:

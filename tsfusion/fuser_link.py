@@ -46,7 +46,7 @@ class FuserLink:
         self._folder = Path(tempfile.mkdtemp(prefix="tsfusion-"))  # a socket's path has to be short
         self._failed_starts = 0
         self._crashes: dict[int, int] = {}
-        self._finishing = False
+        self._finishing = self._finish_sent = False
         self.restarts = 0
         self._start()
 
@@ -79,20 +79,23 @@ class FuserLink:
         """Whether another position may be handed out."""
         return self.ready and not self._finishing and len(self.in_flight) < _AHEAD
 
-    def send(self, message: work.ToFuser) -> None:
-        """Hand over a message; a dead fuser's are lost with it."""
+    def send(self, message: work.ToFuser) -> bool:
+        """Hand over a message; False when there is no room for it now. A dead fuser's are lost with it."""
         try:
             self.socket.send(work.encode(message), zmq.NOBLOCK)
         except zmq.Again:
-            log.debug("the fuser takes no messages: %r", message)
+            return False
+        return True
 
-    def fuse(self, position: Position) -> None:
-        """Hand out the keyframe `next_index`, which lies there."""
+    def fuse(self, position: Position) -> bool:
+        """Hand out the keyframe `next_index`, which lies there; False when it has to be tried again."""
         index = self.next_index
         skip = "crash" if self._crashes.get(index, 0) >= _MAX_CRASHES else None
-        self.send(work.Fuse(index, position, skip))
+        if not self.send(work.Fuse(index, position, skip)):
+            return False
         self.in_flight.append(index)
         self.next_index += 1
+        return True
 
     def receive(self) -> tuple[work.ToGateway, Sequence[zmq.Frame]] | None:
         """The next message and its frames, or None.
@@ -141,9 +144,10 @@ class FuserLink:
         self._start()
 
     def finish(self) -> None:
-        """Ask for a checkpoint and the end of the process."""
+        """Ask for a checkpoint and the end of the process. Call it until `ended`: there may be no room."""
+        if not self._finish_sent:
+            self._finish_sent = self.send(work.Finish())
         self._finishing = True
-        self.send(work.Finish())
 
     @property
     def finished_well(self) -> bool:

@@ -20,7 +20,7 @@ from tsfusion.config import ServerConfig
 from tsfusion.errors import DecodeError, JournalError
 from tsfusion.fuser_link import FuserLink
 from tsfusion.journal import Journal
-from tsfusion.ports import Ports, each, send_now
+from tsfusion.ports import Departures, Ports, each, send_now
 from tsfusion.sessions import Delays, KeyframeIndex, Sessions
 from tsfusion.transport import messages, sockets, work
 from tsfusion.transport.sockets import MESH_TOPIC
@@ -51,7 +51,9 @@ class Gateway:
         self._duplicates = 0
         self._questions: dict[int, tuple[bytes, str]] = {}
         self._question_count = 0
+        self._meshes = Departures()
         self._topics: set[bytes] = set()  # that somebody subscribed to
+        self._watched: bool | None = None  # what the fuser knows of it
         self._accepting = True
         self._started = time.monotonic()
 
@@ -83,8 +85,12 @@ class Gateway:
             if socket in events:
                 each(socket, handle)
         self._hear_fuser()
+        watched = bool(self._topics)
+        if self.fuser.ready and watched != self._watched and self.fuser.send(work.Publish(watched)):
+            self._watched = watched
         while self.fuser.wants_work and self.fuser.next_index < len(self._index):
-            self.fuser.fuse(self._index[self.fuser.next_index].position)
+            if not self.fuser.fuse(self._index[self.fuser.next_index].position):
+                break
 
     # --- keyframes ---
 
@@ -169,9 +175,9 @@ class Gateway:
 
     def _on_ping(self, identity: bytes, ping: messages.Ping) -> None:
         received_ns = time.monotonic_ns()
-        route, session = self._sessions.route(ping.session), self._sessions.get(ping.session)
-        if route is not None:
-            route.offset_ns = ping.offset_ns
+        route = self._sessions.heard(ping.session) or self._sessions.connect(ping.session, identity)
+        route.offset_ns = ping.offset_ns
+        session = self._sessions.get(ping.session)
         durable, fused = (session.durable, session.fused) if session else (0, 0)
         pong = messages.Pong(self.epoch, ping.sent_ns, received_ns, time.monotonic_ns(), durable, fused)
         self._answer(identity, pong)
@@ -179,21 +185,34 @@ class Gateway:
     def _on_command(self, identity: bytes, command: messages.Command) -> None:
         if command.name == "ping":
             self._answer(identity, messages.Reply(name="ping"))
-        elif not self.fuser.ready or len(self._questions) >= _MAX_QUESTIONS:
-            busy = "too many questions at once" if self.fuser.ready else "the fuser restarts; ask again"
+        elif busy := self._ask(identity, command):
             self._answer(identity, messages.Reply(name=command.name, error=busy))
-        else:
-            self._question_count += 1
-            self._questions[self._question_count] = (identity, command.name)
-            self.fuser.send(work.Ask(self._question_count, command))
+
+    def _ask(self, identity: bytes, command: messages.Command) -> str:
+        """Pass a question to the fuser; or say why not."""
+        question = (identity, command.name)
+        if not self.fuser.ready:
+            return "the fuser restarts; ask again"
+        if command.name == "mesh" and (
+            question in self._questions.values() or self._meshes.pending(identity)
+        ):
+            return "the mesh that was asked for before is still on its way"
+        self._question_count += 1
+        if len(self._questions) >= _MAX_QUESTIONS or not self.fuser.send(
+            work.Ask(self._question_count, command)
+        ):
+            return "too many questions at once"
+        self._questions[self._question_count] = question
+        return ""
 
     def _on_subscription(self, frames: list[zmq.Frame]) -> None:
         change, topic = frames[0].bytes[:1], frames[0].bytes[1:]
         if change == b"\x01" and MESH_TOPIC.startswith(topic):
             self._topics.add(topic)
-        else:
+        elif change == b"\x00":
             self._topics.discard(topic)
-        self.fuser.send(work.Publish(bool(self._topics)))
+        elif change != b"\x01":
+            self._refused["subscription"] += 1
 
     # --- fuser ---
 
@@ -224,7 +243,7 @@ class Gateway:
             for index in range(self.fuser.next_index):
                 entry = self._index[index]
                 self._sessions.numbered(entry.session).fused = entry.stamps.seq
-        self.fuser.send(work.Publish(bool(self._topics)))
+        self._watched = None
 
     def _on_done(self, done: work.Done) -> None:
         again = self._index[done.index].stamps.fused_ns  # by a fuser that died before its checkpoint
@@ -257,7 +276,7 @@ class Gateway:
         identity, name = self._questions.pop(answer.number, (b"", ""))
         status = self._status(answer.status) if answer.status is not None else None
         reply = messages.Reply(name=name, error=answer.error, status=status, mesh=answer.layout)
-        self._answer(identity, reply, frames)
+        self._answer(identity, reply, self._meshes.wrap(identity, frames) if frames else ())
 
     def _status(self, fuser: work.FuserStatus) -> messages.Status:
         return messages.Status(

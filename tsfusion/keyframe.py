@@ -16,6 +16,7 @@ Kind = Literal["depth", "disparity", "points"]
 MAX_IMAGE_SIDE = 8192
 MAX_POINTS = 2_000_000
 MAX_TRANSLATION = 1e6
+MAX_SENSOR_NAME = 32
 _ROTATION_TOLERANCE = 1e-3
 _ROTATION_EXACT = 1e-9
 
@@ -103,6 +104,12 @@ class Keyframe:
             put(self, "color", _array("color", self.color, (np.uint8,), (*self.shape, 3)))
         if self.confidence is not None:
             put(self, "confidence", _array("confidence", self.confidence, (np.uint8,), self.shape))
+        if self.sensor is not None and not (
+            isinstance(self.sensor, str) and 0 < len(self.sensor) <= MAX_SENSOR_NAME
+        ):
+            raise InvalidKeyframe(
+                f"sensor must be a name of 1 to {MAX_SENSOR_NAME} characters, got {self.sensor!r}"
+            )
         if self.baseline_fx is not None:
             put(self, "baseline_fx", _positive("baseline_fx", self.baseline_fx))
         for name in ("timestamp_ns", "captured_ns"):

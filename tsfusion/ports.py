@@ -2,7 +2,7 @@
 """The server's three sockets, and how the gateway reads and writes them without ever waiting."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import zmq
@@ -54,3 +54,22 @@ def send_now(socket: sockets.AnySocket, frames: list[Any]) -> None:
         socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
     except zmq.Again:
         log.warning("an answer was dropped: its connection is full")
+
+
+class Departures:
+    """Large answers that have not left yet, one a connection: who does not read must not fill our memory."""
+
+    def __init__(self) -> None:
+        self._trackers: dict[bytes, zmq.MessageTracker] = {}
+
+    def pending(self, identity: bytes) -> bool:
+        """Whether an earlier one still waits for its reader. One whose reader is gone does not."""
+        self._trackers = {key: tracker for key, tracker in self._trackers.items() if not tracker.done}
+        return identity in self._trackers
+
+    def wrap(self, identity: bytes, frames: Sequence[zmq.Frame]) -> list[zmq.Frame]:
+        """The frames anew, so that it shows when the last has left."""
+        *others, last = (frame.buffer for frame in frames)
+        tracked = zmq.Frame(last, track=True, copy=False, copy_threshold=0)
+        self._trackers[identity] = tracked.tracker
+        return [*(zmq.Frame(other, copy=False) for other in others), tracked]

@@ -132,7 +132,7 @@ class Sender:
         try:
             message = messages.decode_to_client(b"".join(frames))
         except DecodeError as error:
-            log.warning("the server sent %s", error)
+            self._on_nonsense(error)
             return
         self._heard = time.monotonic()
         with self._outbox.changed:
@@ -146,6 +146,12 @@ class Sender:
                 self._moved = self._heard
             elif isinstance(message, messages.Pong):
                 self._on_pong(message, returned_ns)
+
+    def _on_nonsense(self, error: DecodeError) -> None:
+        if self._welcome is None and not self._outbox.problem:
+            with self._outbox.changed:
+                self._outbox.problem = f"what answers at {self._control} is no tsfusion server: {error}"
+        log.debug("the server sent %s", error)
 
     def _on_welcome(self, welcome: messages.Welcome) -> None:
         if welcome.version != codec.VERSION:
@@ -225,11 +231,11 @@ class Sender:
             return
         try:
             frames = self._outbox.spool.read(entry)
-        except JournalError as error:
+            sent_ns = time.monotonic_ns()
+            head = codec.stamp(frames[0], previous=previous, sent_ns=sent_ns)
+        except (JournalError, DecodeError) as error:
             self._give_up(entry, "spool", str(error))
             return
-        sent_ns = time.monotonic_ns()
-        head = codec.stamp(frames[0], previous=previous, sent_ns=sent_ns)
         try:
             self._push.send_multipart([head, *frames[1:]], zmq.NOBLOCK, copy=False)
         except zmq.Again:

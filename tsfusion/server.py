@@ -78,6 +78,7 @@ def _serve(gateway: Gateway, signals: list[int]) -> int:
     gateway.fuser.finish()
     while not gateway.fuser.ended() and len(signals) == 1:
         gateway.step()
+        gateway.fuser.finish()
     return 0 if gateway.fuser.finished_well else 1
 
 

@@ -86,12 +86,19 @@ class Sessions:
         """A session by its number."""
         return self._all[number]
 
-    def connect(self, key: bytes, identity: bytes) -> None:
+    def connect(self, key: bytes, identity: bytes) -> Route:
         """Answers for this session go to this connection. Strangers push out the longest unheard only."""
-        self._routes[key] = Route(identity)
+        route = self._routes[key] = Route(identity)
         self._routes.move_to_end(key)
         while len(self._routes) > _MAX_ROUTES:
             self._routes.popitem(last=False)
+        return route
+
+    def heard(self, key: bytes) -> Route | None:
+        """The connection of a session that is alive, now the last of those that strangers could push out."""
+        if key in self._routes:
+            self._routes.move_to_end(key)
+        return self._routes.get(key)
 
     def route(self, key: bytes) -> Route | None:
         """The connection of a session's client, if it ever said hello here."""

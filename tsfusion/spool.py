@@ -7,6 +7,7 @@ cache costs less than holding the queue in memory, and bounds it.
 """
 
 import fcntl
+import logging
 import os
 import secrets
 import shutil
@@ -19,6 +20,8 @@ from msgspec import Struct
 
 from tsfusion import journal
 from tsfusion.errors import JournalError
+
+log = logging.getLogger(__name__)
 
 # A restarted scanner skips numbers: those of records that a power cut took must never be used again.
 _RESTART_GAP = 1024
@@ -101,7 +104,14 @@ class Spool:
         while len(self._segments) > 1 and not (
             self.waiting and self.waiting[0].position.segment <= self._segments[0]
         ):
-            self._journal.forget(self._segments.popleft())
+            self._forget(self._segments.popleft())
+
+    def _forget(self, segment: int) -> None:
+        """Delete a segment; one that stays is only sent once more, and recognised."""
+        try:
+            self._journal.forget(segment)
+        except JournalError as error:
+            log.warning("%s", error)
 
     def close(self) -> None:
         """Release the folder. An empty spool takes its files with it: the next starts a new session."""
@@ -110,7 +120,7 @@ class Spool:
             shutil.rmtree(self.folder, ignore_errors=True)
         elif not self.waiting:
             for segment in self._segments:
-                self._journal.forget(segment)
+                self._forget(segment)
         self._lock.close()
 
 
@@ -123,8 +133,10 @@ def lock_folder(folder: Path, kind: str, owner: str) -> BinaryIO:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         file = (folder / "lock").open("ab")
-    except OSError as error:
-        raise JournalError(f"cannot write the {kind} folder {folder}: {error.strerror}") from error
+    except (OSError, ValueError) as error:  # ValueError: a name with a NUL
+        raise JournalError(
+            f"cannot write the {kind} folder {folder}: {getattr(error, 'strerror', error)}"
+        ) from error
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:

@@ -17,6 +17,7 @@ from tsfusion.config import VolumeConfig, make, override
 from tsfusion.errors import InvalidConfig, MapError, MapFull, WeightOverflow
 from tsfusion.kernels import integrate, smooth
 from tsfusion.kernels.integrate import CUBE, MAX_DISTANCE
+from tsfusion.kernels.rays import WEIGHT_ONE
 from tsfusion.keyframe import Keyframe
 from tsfusion.mesh import Mesh
 from tsfusion.meshing import Layers, extract
@@ -113,8 +114,9 @@ class Volume:
         """
         if min_weight is None:
             min_weight = self.model.min_weight
-        if not min_weight >= 0:
-            raise InvalidConfig(f"min_weight must be ≥ 0, got {min_weight}")
+        most = integrate.WEIGHT_LIMIT / WEIGHT_ONE
+        if not 0 <= min_weight <= most:
+            raise InvalidConfig(f"min_weight must be from 0 to {most:.0f}, got {min_weight}")
         store = self._store
         chosen = store.keys
         if blocks is not None:
@@ -250,7 +252,7 @@ class Volume:
         if refused:
             raise WeightOverflow(
                 f"{refused} blocks hold voxels that have taken all the votes their integers hold "
-                f"({integrate.WEIGHT_LIMIT / 16:.0f} full samples); use bundle=True or a smaller voxel_size"
+                f"({integrate.WEIGHT_LIMIT / WEIGHT_ONE:.0f} full samples); use bundle=True or a smaller voxel_size"
             )
 
     def _allocate(self, sign: int) -> int:

@@ -19,6 +19,7 @@ from tsfusion.codec.header import Refused
 _ZSTD_LEVEL = 1
 _MAX_WINDOW_BYTES = 1 << 24
 _SAMPLE = 512
+_MAX_JPEG_SEGMENTS = 1024  # before the frame header; a colour profile is the longest, with 255
 _MM_LIMIT = 2**31 - 1
 
 
@@ -113,7 +114,9 @@ def image_size(frame: Any) -> tuple[int, int]:
 
 def _jpeg_size(view: memoryview) -> tuple[int, int]:
     at = 2
-    while at + 9 <= view.nbytes and view[at] == 0xFF:
+    for _ in range(_MAX_JPEG_SEGMENTS):  # 32 MB of tiny ones would take seconds
+        if at + 9 > view.nbytes or view[at] != 0xFF:
+            break
         marker, length = view[at + 1], int.from_bytes(view[at + 2 : at + 4], "big")
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start-of-frame segment
             height, width = struct.unpack(">HH", view[at + 5 : at + 9])

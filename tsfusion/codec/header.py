@@ -11,7 +11,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from tsfusion.errors import DecodeError
-from tsfusion.keyframe import Intrinsics
+from tsfusion.keyframe import MAX_SENSOR_NAME, Intrinsics
 
 MAGIC = b"TSF"
 VERSION = 1
@@ -64,7 +64,7 @@ class Header(Struct, frozen=True, kw_only=True, omit_defaults=True):
     scale: float | None = None
     intrinsics: Intrinsics | None = None
     baseline_fx: float | None = None
-    sensor: Annotated[str, Meta(max_length=32)] | None = None
+    sensor: Annotated[str, Meta(max_length=MAX_SENSOR_NAME)] | None = None
     timestamp_ns: Natural = 0
     captured_ns: Natural = 0
 

@@ -2,6 +2,7 @@
 """Writing the log: append, wait for the disk, begin the next segment."""
 
 import contextlib
+import logging
 import os
 import time
 from collections.abc import Sequence
@@ -15,6 +16,8 @@ from tsfusion.journal.segments import LAYOUT, Position, Scan, failed, pack, scan
 TOPIC = "/keyframes"
 ENCODING = "x-tsfusion"
 _CHANNEL = 1
+
+log = logging.getLogger(__name__)
 
 
 class Journal:
@@ -39,6 +42,7 @@ class Journal:
         self._sync = sync
         self._file: BinaryIO | None = None
         self._writer: Any = None
+        self._first = 0  # where the open segment's first record starts
         self.found: list[Scan] = []
         self.damaged = 0
         self.closed_bytes = 0
@@ -75,6 +79,7 @@ class Journal:
             JournalError: when the disk refuses. Nothing of the message counts then.
         """
         payload = pack(frames, session, seq)
+        position = Position(self._number, 0)
         try:
             file = self._open()
             position = Position(self._number, file.tell())
@@ -85,12 +90,20 @@ class Journal:
             file.flush()
             if self._sync:
                 os.fdatasync(file.fileno())
-            if file.tell() >= self._segment_bytes:
-                self.rotate()
         except OSError as error:
-            self._abandon()
+            self._abandon(position.offset)
             raise failed("write", self.folder, error) from error
+        if file.tell() >= self._segment_bytes:
+            self._rotate_or_abandon()
         return position
+
+    def _rotate_or_abandon(self) -> None:
+        """The keyframe is on the disk, whatever becomes of the index that readers can do without."""
+        try:
+            self.rotate()
+        except OSError as error:
+            log.warning("%s", failed("close", segment_path(self.folder, self._number), error))
+            self._abandon()
 
     def begin_after(self, segment: int) -> None:
         """Number new segments above one that a map remembers, though its file may have been removed."""
@@ -127,6 +140,7 @@ class Journal:
     def _open(self) -> BinaryIO:
         if self._file is None:
             path = segment_path(self.folder, self._number)
+            self._first = 0
             self._file = path.open("xb")
             self._writer = Writer(self._file, chunk_size=1, compression=CompressionType.NONE)
             self._writer.start()
@@ -134,15 +148,26 @@ class Journal:
             self._writer.register_channel(TOPIC, ENCODING, schema)
             if self._sync:
                 _sync_folder(self.folder)
+            self._first = self._file.tell()
         return self._file
 
-    def _abandon(self) -> None:
-        if self._file is not None:
-            with contextlib.suppress(OSError):  # a full disk fails here a second time
-                self._file.close()
-            self.closed_bytes += segment_path(self.folder, self._number).stat().st_size
-            self._file = self._writer = None
-            self._number += 1
+    def _abandon(self, end: int | None = None) -> None:
+        """Leave the segment. What lies behind `end` was told as failed: it must not be found later on."""
+        if self._file is None:
+            return
+        path, number = segment_path(self.folder, self._number), self._number
+        with contextlib.suppress(OSError):  # a full disk fails here a second time
+            self._file.close()
+        self._file = self._writer = None
+        self._number += 1
+        with contextlib.suppress(OSError):
+            if end is not None and end <= self._first:
+                path.unlink()
+                self._number = number
+            else:
+                if end is not None:
+                    os.truncate(path, end)
+                self.closed_bytes += path.stat().st_size
 
 
 def _sync_folder(folder: Path) -> None:

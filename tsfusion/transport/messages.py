@@ -76,7 +76,7 @@ class Nack(Struct, frozen=True, tag="nack"):
 class Ping(Struct, frozen=True, tag="ping"):
     """`offset_ns`: what the client takes the server's clock minus its own to be (None = not yet known)."""
 
-    session: bytes
+    session: Annotated[bytes, Meta(max_length=16)]
     sent_ns: int
     offset_ns: int | None = None
 

@@ -5,10 +5,10 @@ No ZeroMQ heartbeats: a full PULL stops reading them and drops live connections 
 lingers: what must survive is in the spool.
 """
 
+import re
 import socket
 from ipaddress import ip_address
 from typing import Any
-from urllib.parse import urlsplit
 
 import zmq
 from msgspec import Struct
@@ -19,6 +19,8 @@ CONTROL_MAX_BYTES = 64 << 10
 MESH_TOPIC = b"mesh"
 _TCP_OPTIONS: dict[int, int] = {zmq.RECONNECT_IVL: 100, zmq.RECONNECT_IVL_MAX: 1000, zmq.TCP_KEEPALIVE: 1}
 _RANDOM_PORT_TRIES = 32
+LAST_PORT = 65535
+_ADDRESS = re.compile(r"tcp://((?P<host>[\w.*-]+)|\[(?P<host6>[\w:.%]+)\]):(?P<port>[0-9]{1,5}|\*)", re.ASCII)
 
 AnySocket = zmq.Socket[Any]
 
@@ -85,12 +87,11 @@ def split(address: str) -> tuple[str, int]:
     Raises:
         InvalidConfig: for anything else.
     """
-    try:
-        parts = urlsplit(address.replace(":*", ":0"))
-        if parts.scheme == "tcp" and parts.hostname and parts.port is not None and not parts.path:
-            return parts.hostname, parts.port
-    except ValueError:
-        pass
+    match = _ADDRESS.fullmatch(address)
+    if match is not None:
+        port = int(match["port"].replace("*", "0"))
+        if port <= LAST_PORT:
+            return match["host"] or match["host6"], port
     raise InvalidConfig(f"an address looks like tcp://127.0.0.1:5555, got {address!r}")
 
 
@@ -103,8 +104,22 @@ def control_address(address: str, control: str | None = None) -> str:
     """The control socket that belongs to a data address: the next port, unless given."""
     if control is not None:
         return join(*split(control))
+    return _following(address, "control")
+
+
+def _following(address: str, purpose: str) -> str:
     host, port = split(address)
+    if port == LAST_PORT:
+        raise InvalidConfig(f"{address} has no next port for {purpose}: choose a lower one")
     return join(host, port + 1)
+
+
+def target(address: str) -> str:
+    """An address to connect to, in its plain form. Raises InvalidConfig."""
+    host, port = split(address)
+    if port == 0:
+        raise InvalidConfig(f"connecting needs a port, got {address}")
+    return join(host, port)
 
 
 def check_loopback(address: str) -> None:
@@ -146,10 +161,9 @@ def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, t
         try:
             bound.append((data, _bind(data, join(host, port))))
             bound.append((control, _bind(control, control_address(bound[0][1], to))))
-            control_host, control_port = split(bound[1][1])
-            bound.append((publish, _bind(publish, join(control_host, control_port + 1))))
+            bound.append((publish, _bind(publish, _following(bound[1][1], "mesh updates"))))
             return Addresses(*(address for _, address in bound))
-        except TransportError:
+        except (TransportError, InvalidConfig):
             for made, address in bound:
                 made.unbind(address)
             if not last:

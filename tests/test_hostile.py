@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: MIT
+"""What goes wrong around a server: strangers, full disks, missing files. Its other clients do not notice."""
+
+import os
+import sys
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zmq
+from wire import DEADLINE, Server, serving, until, wall
+
+from tsfusion import Client, VolumeConfig, codec, config, fuser_link
+from tsfusion.client import fetch_status
+from tsfusion.codec.header import pack
+from tsfusion.config import ServerConfig
+from tsfusion.errors import (
+    InvalidConfig,
+    JournalError,
+    ServerUnreachable,
+    TransportError,
+)
+from tsfusion.fuser_link import FuserLink
+from tsfusion.journal import Position
+from tsfusion.sessions import Sessions
+from tsfusion.spool import Spool
+from tsfusion.transport import Command, messages, request, sockets, work
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with serving(tmp_path_factory.mktemp("shared")) as server:
+        yield server
+
+
+@contextmanager
+def connected(kind: Callable[..., sockets.AnySocket], address: str) -> Iterator[sockets.AnySocket]:
+    context: zmq.Context[Any] = zmq.Context()
+    made = kind(context)
+    try:
+        made.connect(address)
+        yield made
+    finally:
+        made.close()
+        context.term()
+
+
+# --- strangers ---
+
+
+def xsub(context: "zmq.Context[Any]") -> sockets.AnySocket:
+    made: sockets.AnySocket = context.socket(zmq.XSUB)
+    made.setsockopt(zmq.LINGER, 1000)
+    return made
+
+
+def test_a_stranger_cannot_unsubscribe_a_viewer(shared: Server) -> None:
+    with connected(sockets.subscriber, shared.publish) as viewer, Client(shared.address) as client:
+        with connected(xsub, shared.publish) as stranger:
+            stranger.send(b"\x01mes")
+            for message in (b"\x05mesh", b"", b"\x02", b"rubbish"):
+                stranger.send(message)
+            client.send(wall(1))
+            client.wait_fused(timeout=DEADLINE)
+            assert viewer.poll(10_000)
+        while viewer.poll(500):
+            viewer.recv_multipart()
+        client.send(wall(2))
+        assert viewer.poll(10_000)
+
+
+def test_strangers_do_not_push_out_a_client_that_is_heard() -> None:
+    sessions = Sessions()
+    sessions.connect(b"client", b"1")
+    for number in range(3000):
+        sessions.connect(number.to_bytes(16, "big"), b"2")
+        if number % 500 == 0:
+            sessions.heard(b"client")
+    assert sessions.route(b"client") is not None
+    assert sessions.heard(b"nobody") is None
+
+
+def test_a_client_goes_on_after_a_flood_of_greetings(shared: Server) -> None:
+    with Client(shared.address) as client, connected(sockets.dealer, shared.control) as stranger:
+        client.connect()
+        for _ in range(1100):
+            stranger.send(messages.encode(messages.Hello(os.urandom(16), 1)))
+        asked = time.monotonic()
+        request(shared.control, Command(name="ping"), timeout=DEADLINE)
+        until(lambda: time.monotonic() - asked > 1.0)  # two pings
+        client.send(wall(3))
+        client.wait_meshed(timeout=10)
+
+
+def test_a_jpeg_of_a_million_segments_does_not_hold_the_gateway_up() -> None:
+    good = codec.encode(wall(), session=bytes(16), seq=1, jpeg_quality=90)
+    header = codec.unpack(good[0])
+    evil = b"\xff\xd8" + b"\xff\xe0\x00\x02" * (4 << 20)
+    color = msgspec.structs.replace(header.buffers[1], bytes=len(evil), crc32=zlib.crc32(evil))
+    head = pack(msgspec.structs.replace(header, buffers=(header.buffers[0], color)))
+    started = time.process_time()
+    with pytest.raises(codec.Refused, match="without a frame header"):
+        codec.check([head, good[1], evil])
+    assert time.process_time() - started < 0.1
+
+
+def test_who_does_not_fetch_a_mesh_gets_no_second_one(shared: Server) -> None:
+    """Else each would wait in the server's memory."""
+
+    def one_at_a_time(context: "zmq.Context[Any]") -> sockets.AnySocket:
+        made = sockets.dealer(context)
+        made.setsockopt(zmq.RCVHWM, 1)
+        made.setsockopt(zmq.RCVBUF, 4096)
+        return made
+
+    with Client(shared.address) as client:
+        client.send(wall(4))
+        client.wait_fused(timeout=DEADLINE)
+    replies = []
+    with connected(one_at_a_time, shared.control) as stranger:
+        for _ in range(60):
+            stranger.send(messages.encode(Command(name="mesh", min_weight=0.0)))
+            request(shared.control, Command(name="status"), timeout=DEADLINE)
+        until(lambda: fetch_status(shared.address).fuser != "busy")
+        while stranger.poll(1000):
+            replies.append(messages.decode_to_client(stranger.recv_multipart()[0]))
+    errors = [reply.error for reply in replies if isinstance(reply, messages.Reply) and reply.error]
+    assert any("still on its way" in error for error in errors)
+
+
+# --- orders to a fuser that has no room for them ---
+
+_SLOW = """
+import sys, time, zmq
+from tsfusion.journal import Position
+from tsfusion.transport import sockets, work
+
+link = sockets.pair(zmq.Context())
+link.connect(sys.argv[1])
+link.send(work.encode(work.Started()))
+while True:
+    message = work.to_fuser.decode(link.recv())
+    if isinstance(message, work.Begin):
+        link.send(work.encode(work.Ready(Position(0, 0))))
+        time.sleep(1)
+    if isinstance(message, work.Fuse):
+        link.send(work.encode(work.Done(message.index, 1, 2)))
+    if isinstance(message, work.Publish):
+        time.sleep(0.0001)
+    if isinstance(message, work.Finish):
+        sys.exit(0)
+"""
+
+
+def test_orders_that_find_no_room_are_given_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fuser_link, "COMMAND", (sys.executable, "-c", _SLOW))
+    context: zmq.Context[Any] = zmq.Context()
+    link = FuserLink(context, ServerConfig(state=str(tmp_path)), VolumeConfig())
+    try:
+
+        def heard() -> bool:
+            link.receive()
+            return link.ready
+
+        until(heard)
+        while link.send(work.Publish(True)):
+            pass
+        assert not link.fuse(Position(1, 8))
+        assert (link.next_index, list(link.in_flight)) == (0, [])
+        until(lambda: link.fuse(Position(1, 8)))
+        assert (link.next_index, list(link.in_flight)) == (1, [0])
+        link.finish()
+        while link.send(work.Publish(True)):
+            pass
+        until(lambda: link.receive() is not None)
+        until(lambda: link.ended() or link.finish() is not None)
+        assert link.finished_well
+    finally:
+        link.close()
+        context.term()
+
+
+# --- settings and addresses ---
+
+
+def test_a_configuration_that_is_not_text_is_one_clear_error(tmp_path: Path) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_bytes(b"\xff\xfe[[[")
+    with pytest.raises(InvalidConfig, match="is not TOML: "):
+        config.load(path)
+
+
+@pytest.mark.parametrize(
+    "address", ["tcp://a b:5555", "tcp://127.0.0.1:5555?x", "tcp://u@127.0.0.1:5", "tcp://\0:5"]
+)
+def test_an_address_that_is_none_is_refused(address: str) -> None:
+    with pytest.raises(InvalidConfig, match="an address looks like"):
+        sockets.split(address)
+
+
+def test_the_last_port_has_no_next_one() -> None:
+    with pytest.raises(InvalidConfig, match=r"65535 has no next port for control"):
+        sockets.control_address("tcp://127.0.0.1:65535")
+    with pytest.raises(InvalidConfig, match="needs a port"):
+        request("tcp://127.0.0.1:0", Command(name="ping"), timeout=1.0)
+
+
+def test_a_patience_of_ages_is_no_error(shared: Server) -> None:
+    reply, _ = request(shared.control, Command(name="ping"), timeout=1e300)
+    assert reply.name == "ping"
+
+
+def test_a_state_folder_that_cannot_be_named(tmp_path: Path) -> None:
+    with pytest.raises(JournalError, match="cannot write the spool folder"):
+        Spool(f"{tmp_path}/a\0b", 1 << 20)
+
+
+def test_a_port_that_speaks_something_else(shared: Server) -> None:
+    with pytest.raises(TransportError, match="no server answered"):
+        request(shared.publish, Command(name="ping"), timeout=0.3)
+
+
+@contextmanager
+def answering(answer: bytes) -> Iterator[str]:
+    """The data address of a control socket that answers everything so."""
+    context: zmq.Context[Any] = zmq.Context()
+    router = sockets.router(context)
+    port = router.bind_to_random_port("tcp://127.0.0.1")
+    stop = threading.Event()
+
+    def answer_all() -> None:
+        while not stop.is_set():
+            if router.poll(20):
+                router.send_multipart([router.recv_multipart()[0], answer])
+
+    thread = threading.Thread(target=answer_all)
+    thread.start()
+    try:
+        yield f"tcp://127.0.0.1:{port - 1}"
+    finally:
+        stop.set()
+        thread.join()
+        router.close()
+        context.term()
+
+
+def test_who_answers_with_nonsense_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    with answering(b"nonsense") as address:
+        with pytest.raises(TransportError, match=r"what answers at tcp://.* is no tsfusion server"):
+            fetch_status(address)
+        with Client(address) as client, pytest.raises(ServerUnreachable, match="is no tsfusion server"):
+            client.connect(timeout=0.5)
+    assert caplog.text == ""
