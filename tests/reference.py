@@ -135,6 +135,50 @@ def smooth(
     return {voxel: float(np.mean(xs)) for voxel, xs in votes.items()}
 
 
+def commit(
+    sums: NDArray[np.int64], slots: NDArray[np.int32], frame: NDArray[np.int64], sign: int
+) -> NDArray[np.int64]:
+    """The map's sums after adding (or taking away) a keyframe's."""
+    after = sums.copy()
+    for slot, row in zip(slots, frame, strict=True):
+        after[slot] += sign * row
+    return after
+
+
+def commit_color(
+    rgn: NDArray[np.int64], blue: NDArray[np.int32], slots: NDArray[np.int32], frame: Any, sign: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Colour lanes after one vote a voxel: the mean of `frame[block, voxel]`'s list of (r, g, b)."""
+    rgn, blue = rgn.copy(), blue.copy()
+    for (block, voxel), colors in frame.items():
+        r, g, b = (int(sum(c)) // len(colors) for c in zip(*colors, strict=True))
+        rgn[slots[block], voxel] += sign * ((r << 40) + (g << 16) + 1)
+        blue[slots[block], voxel] += sign * b
+    return rgn, blue
+
+
+def refused(sums: Any, slots: Any, frame: Any, frame_colors: Any, rgn: Any, sign: int) -> int:
+    """How many blocks would have too many votes, or fewer than none."""
+    count = 0
+    for block, slot in enumerate(slots):
+        bad = False
+        for voxel in range(512):
+            weight = sign * (int(frame[block, voxel]) & 0x7FFFFFF)
+            votes = sign * ((block, voxel) in frame_colors)
+            if slot >= 0:
+                weight += int(sums[slot, voxel]) & 0x7FFFFFF
+                votes += (int(rgn[slot, voxel]) & 0xFFFF) if votes else 0
+            bad = bad or not 0 <= weight < 1 << 26 or not 0 <= votes < 1 << 15
+        count += bad
+    return count
+
+
+def raw_values(sums: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Σ w·m / Σ w, 0 where there is no weight."""
+    weight = sums & 0x7FFFFFF
+    return np.where(weight > 0, (sums >> 27) / np.maximum(weight, 1), 0.0)
+
+
 def marching_cubes(values: dict[Voxel, float]) -> list[tuple[tuple[float, float, float], ...]]:
     """Triangles, as positions in voxels (voxel centres at + 0.5), over all cells with eight known corners."""
     triangles = []
@@ -147,10 +191,47 @@ def marching_cubes(values: dict[Voxel, float]) -> list[tuple[tuple[float, float,
         points = []
         for e in edges:
             a, b = (corners[i] for i in mc_tables.EDGES[e])
-            t = min(max(values[a] / (values[a] - values[b]), 0.001), 0.999)
-            points.append(tuple(np.array(a) + 0.5 + t * (np.array(b) - np.array(a))))
+            points.append(tuple(np.array(a) + 0.5 + share(values, a, b) * (np.array(b) - np.array(a))))
         triangles += [tuple(points[i : i + 3]) for i in range(0, len(points), 3)]
     return triangles
+
+
+def share(values: dict[Voxel, float], a: Any, b: Any) -> float:
+    """Where between voxels a and b the value crosses zero."""
+    return min(max(values[a] / (values[a] - values[b]), 0.001), 0.999)
+
+
+def slope(values: dict[Voxel, float], voxel: Any) -> NDArray[np.float64]:
+    """Central differences, one-sided where only one neighbour is known."""
+    found = np.zeros(3)
+    for axis, step in enumerate(np.eye(3, dtype=int)):
+        low, high = (tuple(int(x) for x in np.array(voxel) + s * step) for s in (-1, 1))
+        if low in values and high in values:
+            found[axis] = (values[high] - values[low]) / 2
+        elif high in values:
+            found[axis] = values[high] - values[voxel]
+        elif low in values:
+            found[axis] = values[voxel] - values[low]
+    return found
+
+
+def vertex(values: dict[Voxel, float], colors: dict[Voxel, Any], position: Any) -> tuple[Any, Any]:
+    """(unit normal, RGB) of the vertex at a position in voxels: twin of `emit_vertices`."""
+    away = np.abs(np.asarray(position) - 0.5 - np.round(np.asarray(position) - 0.5))
+    axis = int(np.argmax(away))
+    a = np.round(np.asarray(position) - 0.5).astype(int)
+    a[axis] = int(np.floor(position[axis] - 0.5))
+    b = a.copy()
+    b[axis] += 1
+    a, b = tuple(a.tolist()), tuple(b.tolist())
+    t = share(values, a, b)
+    normal = (1 - t) * slope(values, a) + t * slope(values, b)
+    votes = [(s, colors[v]) for s, v in ((1 - t, a), (t, b)) if v in colors]
+    if not votes:
+        votes = [(1.0, colors[v]) for v in sorted(neighbours(a)) if v in colors]
+    total = sum(s for s, _ in votes)
+    rgb = sum(s * np.array(c, float) for s, c in votes) / total if votes else np.full(3, 160.0)
+    return normal / np.linalg.norm(normal), np.floor(rgb + 0.5)
 
 
 def segment_voxels(ray: NDArray[np.int32]) -> set[Voxel]:
@@ -194,3 +275,15 @@ def see(
         hit = np.logical_and.reduce(inside) & (z >= near) & (z < depth)
         seen[hit], depth[hit] = f, z[hit]
     return seen, np.where(seen >= 0, depth, 0.0)
+
+
+def shade(corners: Any, normals: Any, colors: Any, ray: Any, up: Any) -> NDArray[np.float64]:
+    """Twin of `kernels.raster.shade` for one pixel of one triangle: linear RGB."""
+    weights = np.linalg.solve(np.asarray(corners, float).T, ray)
+    weights = np.clip(weights / weights.sum(), 0, 1)
+    normal = weights @ np.asarray(normals, float)
+    normal /= np.linalg.norm(normal)
+    facing = max(-normal @ ray / np.linalg.norm(ray), 0.0)
+    light = 0.25 + 0.45 * facing + 0.35 * (0.5 + 0.5 * normal @ up)
+    result: NDArray[np.float64] = np.minimum(light * (weights @ np.asarray(colors, float) / 255) ** 2.2, 1.0)
+    return result

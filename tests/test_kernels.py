@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from tsfusion import Intrinsics, Keyframe, runtime
 from tsfusion.config import SENSORS
-from tsfusion.kernels import blocks, integrate, mc_tables, smooth
+from tsfusion.kernels import blocks, integrate, mc_tables, raster, smooth
 from tsfusion.scratch import Scratch, model_parameters
 
-QUANTA = 146
+QUANTA = integrate.QUANTA_PER_VOXEL
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -76,7 +76,7 @@ def voxels_of(scratch: Scratch, sums: NDArray[np.int64]) -> dict[tuple[int, int,
 def sum_rays(scratch: Scratch) -> None:
     integrate.integrate_rays(
         scratch.rays, scratch.band_start, scratch.band_count, scratch.table, scratch.table_index,
-        QUANTA, 0, scratch.frame, scratch.frame_color,
+        0, scratch.frame, scratch.frame_color,
     )  # fmt: skip
 
 
@@ -146,7 +146,7 @@ def test_smoothing_equals_a_dense_solve(case: str, weighted: bool) -> None:
             before[voxel] = (float(values[i, o]), int(weights[i, o]))
     smooth.smooth_rays(
         scratch.rays, scratch.band_start, scratch.band_count, scratch.table, scratch.table_index,
-        scratch.touched_slots, QUANTA, smoothness, int(weighted), 1, scratch.frame,
+        scratch.touched_slots, smoothness, int(weighted), 1, scratch.frame,
         weights.astype(np.int64), values, scratch.signal, scratch.crossed, scratch.votes,
     )  # fmt: skip
     scratch.touched_slots[: scratch.touched] = np.arange(scratch.touched)
@@ -266,14 +266,109 @@ def rays_of(scratch: Scratch) -> NDArray[np.int32]:
     return np.vstack([scratch.rays[s : s + n] for s, n in spans])
 
 
+def smoothed(rays: NDArray[np.int32], sums: NDArray[np.int64], smoothness: float) -> NDArray[np.float32]:
+    """Kernel's values (touched, 512) with A = W and y from `sums` and these rays; NaN where no ray went."""
+    scratch = load(rays)
+    sum_rays(scratch)
+    scratch.touched_slots[: scratch.touched] = np.arange(scratch.touched)
+    after = np.full((scratch.touched, 512), np.nan, np.float32)
+    smooth.smooth_rays(
+        scratch.rays, scratch.band_start, scratch.band_count, scratch.table, scratch.table_index,
+        scratch.touched_slots, smoothness, 1, 0, scratch.frame, sums, after,
+        scratch.signal, scratch.crossed, scratch.votes,
+    )  # fmt: skip
+    smooth.commit_regularised(scratch.touched_slots, scratch.touched, scratch.votes, after)
+    return after
+
+
 def test_a_ramp_passes_the_smoother_unchanged() -> None:
-    t = np.sort(np.random.default_rng(0).uniform(-5, 5, 12))[::-1]
-    assert np.allclose(reference.solve(t + 3.0, np.ones(12), t, 50.0), t + 3.0)
+    for ray in CASES["many"][:40]:
+        scratch = load(ray[None])
+        sum_rays(scratch)
+        plain = reference.raw_values(scratch.frame[: scratch.touched])
+        after = smoothed(ray[None], np.zeros((scratch.touched, 512), np.int64), 1000.0)
+        crossed = np.isfinite(after)
+        assert crossed.sum() == len(reference.crossed(ray))
+        # the stored ramp is rounded to quanta; nothing else may bend it
+        assert np.abs(after - plain)[crossed].max() <= 0.75
 
 
 def test_no_smoothness_returns_the_signal() -> None:
-    y = np.random.default_rng(0).normal(size=9)
-    assert np.allclose(reference.solve(y, np.ones(9), np.linspace(4, -4, 9), 0.0), y)
+    rays = CASES["crowded"]
+    scratch = load(rays)
+    sum_rays(scratch)
+    random = np.random.default_rng(8)
+    weight = random.integers(1, 500, (scratch.touched, 512))
+    before = (random.integers(-900, 900, weight.shape) * weight << 27) + weight
+    after = smoothed(rays, before, 0.0)
+    plain = reference.raw_values(before + scratch.frame[: scratch.touched])
+    crossed = np.isfinite(after)
+    assert np.abs(after - plain)[crossed].max() <= 0.05
+
+
+def random_commit(seed: int) -> tuple[Scratch, NDArray, NDArray, NDArray, dict]:
+    """A scratch with colour whose blocks are partly in a map of random sums, and its colours as lists."""
+    random = np.random.default_rng(seed)
+    scratch = Scratch(color=True, regularised=False, max_blocks=1 << 17)
+    rays = CASES["many"].copy()
+    rays[:, 7] = random.integers(0, 1 << 24, len(rays))
+    scratch.rays, scratch.colored = rays, True
+    scratch.band_count[0] = len(rays)
+    scratch.touch(np.zeros(64, np.int64), np.zeros(64, np.int32))
+    integrate.integrate_rays(
+        scratch.rays, scratch.band_start, scratch.band_count, scratch.table, scratch.table_index,
+        1, scratch.frame, scratch.frame_color,
+    )  # fmt: skip
+    scratch.touched_slots[: scratch.touched] = random.permutation(scratch.touched)
+    colors: dict = {}
+    for ray in rays:
+        hit = ray[:3] >> 10
+        key = int(sum((int(h >> 3) + (1 << 20)) << s for h, s in zip(hit, (42, 21, 0), strict=True)))
+        block = int(np.flatnonzero(scratch.touched_keys[: scratch.touched] == key)[0])
+        offset = int((hit[0] & 7) << 6 | (hit[1] & 7) << 3 | hit[2] & 7)
+        rgb = (int(ray[7]) >> 16, int(ray[7]) >> 8 & 255, int(ray[7]) & 255)
+        colors.setdefault((block, offset), []).append(rgb)
+    weight = random.integers(0, 1000, (scratch.touched, 512))
+    sums = (random.integers(-900, 900, weight.shape) * weight << 27) + weight
+    rgn = random.integers(0, 1 << 60, weight.shape) & ~np.int64(0xFFFF) | random.integers(
+        0, 100, weight.shape
+    )
+    return scratch, sums, rgn, random.integers(0, 1 << 20, weight.shape).astype(np.int32), colors
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_commits_equal_the_twin_to_the_bit(sign: int) -> None:
+    scratch, sums, rgn, blue, colors = random_commit(21)
+    n, slots = scratch.touched, scratch.touched_slots[: scratch.touched]
+    expected = reference.commit(sums, slots, scratch.frame[:n], sign)
+    expected_rgn, expected_blue = reference.commit_color(rgn, blue, slots, colors, sign)
+    dirty = np.zeros(n, np.uint8)
+    changed = integrate.commit_blocks(scratch.touched_slots, n, sign, scratch.frame, sums, dirty)
+    integrate.commit_color(scratch.touched_slots, n, sign, scratch.frame_color, rgn, blue)
+    assert changed == np.count_nonzero(scratch.frame[:n])
+    assert dirty.all()
+    assert (sums == expected).all()
+    assert (rgn == expected_rgn).all()
+    assert (blue == expected_blue).all()
+    values = np.full(sums.shape, np.nan, np.float32)
+    smooth.reset_regularised(scratch.touched_slots, n, sums, values)
+    assert np.allclose(values, reference.raw_values(sums), rtol=1e-6)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_refusals_equal_the_twin(sign: int) -> None:
+    scratch, sums, rgn, _, colors = random_commit(22)
+    n, slots = scratch.touched, scratch.touched_slots[: scratch.touched]
+    sums[:] = (1 << 26) - 200 if sign > 0 else 200
+    rgn[:] = 1
+    rgn[slots[::5]] = (1 << 15) - 1 if sign > 0 else 0
+    slots[::7] = -1
+    expected = reference.refused(sums, slots, scratch.frame[:n], colors, rgn, sign)
+    assert 0 < expected < n
+    found = integrate.refuse_blocks(
+        scratch.touched_slots, n, sign, scratch.frame, scratch.frame_color, sums, rgn, 1
+    )
+    assert found == expected
 
 
 def test_marching_cubes_cases_are_closed_and_complementary() -> None:
@@ -281,3 +376,26 @@ def test_marching_cubes_cases_are_closed_and_complementary() -> None:
         edges = mc_tables.TRIANGLE_EDGES[case, : 3 * mc_tables.TRIANGLE_COUNT[case]]
         crossing = {e for e, (a, b) in enumerate(mc_tables.EDGES) if (case >> a & 1) != (case >> b & 1)}
         assert set(edges.tolist()) == crossing
+
+
+def test_shading_equals_the_twin() -> None:
+    random = np.random.default_rng(31)
+    centres = random.uniform((-2, -1.5, 2), (2, 1.5, 6), (40, 1, 3))
+    vertices = (centres + random.normal(0, 0.6, (40, 3, 3))).reshape(-1, 3).astype(np.float32)
+    vertices[:, 2] = np.maximum(vertices[:, 2], 0.5)
+    normals = random.normal(size=vertices.shape)
+    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+    colors = random.integers(0, 256, vertices.shape).astype(np.uint8)
+    faces = np.arange(120, dtype=np.int32).reshape(-1, 3)
+    focal, up = 50.0, np.array([0.0, -0.8, -0.6])
+    seen = np.full((48, 64), raster.EMPTY, np.int64)
+    image = np.zeros((48, 64, 4), np.float32)
+    raster.rasterise(seen, vertices, faces, focal, 0.05)
+    raster.shade(image, seen, vertices, faces, normals, colors, focal, *up, raster.EMPTY)
+    pixels = np.argwhere(seen != raster.EMPTY)
+    assert len(pixels) > 500
+    for v, u in pixels[::7]:
+        corner = faces[seen[v, u] & 0xFFFFFFFF]
+        ray = np.array([(u - 31.5) / focal, (v - 23.5) / focal, 1.0])
+        expected = reference.shade(vertices[corner], normals[corner], colors[corner], ray, up)
+        assert np.allclose(image[v, u, :3], expected, atol=2e-3)

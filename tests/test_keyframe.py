@@ -38,6 +38,7 @@ def test_each_measurement_is_accepted_and_normalised() -> None:
     assert (cloud.kind, cloud.shape) == ("points", (3,))
     wide = Keyframe(points=POINTS.astype(np.float64), T_world_camera=np.eye(4))
     assert wide.measurement.dtype == np.float32
+    assert np.isinf(Keyframe(points=np.full((1, 3), 1e300), T_world_camera=np.eye(4)).measurement).all()
     assert (
         Keyframe(depth=DEPTH.astype(">u2"), intrinsics=CAMERA, T_world_camera=np.eye(4)).measurement.max()
         == 1
@@ -68,6 +69,8 @@ def test_each_measurement_is_accepted_and_normalised() -> None:
         ({"disparity": DEPTH}, "baseline_fx must be given"),
         ({"disparity": DEPTH, "baseline_fx": np.inf}, "baseline_fx must be finite"),
         ({"points": POINTS.astype(np.int32)}, "points must be float32 or float64, got int32"),
+        ({"points": [[1.0, 2.0, 3.0], [1.0]]}, "points must be an array, got list"),
+        ({"points": POINTS, "intrinsics": CAMERA}, "intrinsics go with images"),
         ({"points": POINTS[:, :2]}, "points must have shape"),
         ({"points": POINTS, "origins": np.zeros((2, 3), np.float32)}, "origins must have shape"),
         ({"points": POINTS, "origins": np.full(3, np.nan, np.float32)}, "origins must be finite"),
@@ -83,7 +86,7 @@ def test_each_measurement_is_accepted_and_normalised() -> None:
 )  # fmt: skip
 def test_what_is_wrong_is_named(fields: dict[str, Any], message: str) -> None:
     given = {"intrinsics": CAMERA, "T_world_camera": np.eye(4), **fields}
-    if "points" in fields and "depth" not in fields:
+    if "points" in fields and "intrinsics" not in fields and "depth" not in fields:
         given.pop("intrinsics")
     with pytest.raises(InvalidKeyframe, match=message):
         Keyframe(**given)

@@ -14,9 +14,10 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tsfusion import Mesh, Volume
+from tsfusion import Mesh, Volume, runtime
 from tsfusion.blockstore import cells_of, pack_keys, unpack_keys
 from tsfusion.errors import InvalidConfig, OutputError
+from tsfusion.kernels import blocks
 from tsfusion.meshing import Layers, extract
 
 
@@ -33,11 +34,11 @@ def check_sound(mesh: Mesh) -> None:
     assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-5)
 
 
-def random_layers(seed: int, known: float) -> tuple[Layers, NDArray[np.int64], dict]:
-    """A 3×2×2 patch of blocks, around the origin, of noise in all 256 cases; a share of voxels unseen."""
-    from tsfusion import runtime
-    from tsfusion.kernels import blocks
-
+def random_layers(
+    seed: int, known: float
+) -> tuple[Layers, NDArray[np.int64], dict[reference.Voxel, float], dict[reference.Voxel, tuple[float, ...]]]:
+    """A 3×2×2 patch of blocks around the origin: noise in all 256 cases, a share of voxels unseen, a third
+    coloured. Returns the layers, the keys, and values and colours by voxel."""
     runtime.start(2)
     random = np.random.default_rng(seed)
     coordinates = np.array([(x, y, z) for x in (-2, -1, 0) for y in (-1, 0) for z in (-1, 0)], np.int32)
@@ -45,14 +46,21 @@ def random_layers(seed: int, known: float) -> tuple[Layers, NDArray[np.int64], d
     distance = random.integers(-500, 500, (12, 512))
     weight = 160 * (random.random((12, 512)) < known)
     sums = (distance * weight << 27) + weight
+    votes = random.integers(1, 9, (12, 512)) * (random.random((12, 512)) < 0.33)
+    channels = random.integers(0, 256, (3, 12, 512)) * votes
+    rgn = (channels[0] << 40) + (channels[1] << 16) + votes
     hash_keys, hash_slots = np.zeros(64, np.int64), np.zeros(64, np.int32)
     blocks.insert_blocks(keys, 0, 12, 0, hash_keys, hash_slots)
-    values = {}
-    for slot, offset in np.argwhere(weight > 0):
+    values, colors = {}, {}
+    for slot, offset in np.ndindex(12, 512):
         voxel = coordinates[slot] * 8 + (offset >> 6, offset >> 3 & 7, offset & 7)
-        values[tuple(int(v) for v in voxel)] = float(distance[slot, offset])
-    layers = Layers(sums, None, np.zeros((1, 512), np.int32), None, hash_keys, hash_slots, 1.0)
-    return layers, keys, values
+        key = (int(voxel[0]), int(voxel[1]), int(voxel[2]))
+        if weight[slot, offset]:
+            values[key] = float(distance[slot, offset])
+        if votes[slot, offset]:
+            colors[key] = tuple(channels[:, slot, offset] / votes[slot, offset])
+    layers = Layers(sums, rgn, channels[2].astype(np.int32), None, hash_keys, hash_slots, 1.0)
+    return layers, keys, values, colors
 
 
 def triangles_of(mesh: Mesh) -> Counter:
@@ -68,7 +76,7 @@ def summary(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("known", [1.0, 0.9])
 def test_extraction_equals_the_twin_on_noise(known: float) -> None:
-    layers, keys, values = random_layers(3, known)
+    layers, keys, values, colors = random_layers(3, known)
     mesh = extract(np.sort(keys), layers, 1.0)
     expected = np.array(reference.marching_cubes(values))
     found = mesh.vertices[mesh.faces].astype(np.float64)
@@ -78,10 +86,15 @@ def test_extraction_equals_the_twin_on_noise(known: float) -> None:
     assert distance.max() < 1e-4
     assert len(np.unique(partner)) == len(found)
     check_sound(mesh)
+    for i in range(0, len(mesh.vertices), 29):
+        normal, rgb = reference.vertex(values, colors, mesh.vertices[i].astype(np.float64))
+        assert np.allclose(mesh.normals[i], normal, atol=1e-3)
+        assert mesh.colors is not None
+        assert np.abs(mesh.colors[i] - rgb).max() <= 1
 
 
 def test_noise_gives_a_manifold_with_a_border_only_where_the_map_ends() -> None:
-    layers, keys, _ = random_layers(4, 1.0)
+    layers, keys, _, _ = random_layers(4, 1.0)
     mesh = extract(np.sort(keys), layers, 1.0)
     edges = np.sort(
         np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1

@@ -158,18 +158,16 @@ class Keyframe:
         self._check_camera()
 
     def _check_points(self) -> None:
-        points = _array("points", self.points, (np.float32, np.float64), (None, 3)).astype(
-            np.float32, copy=False
-        )
+        if self.intrinsics is not None:
+            raise InvalidKeyframe(f"intrinsics go with images, not with points; got {self.intrinsics!r}")
+        points = _single("points", self.points, (None, 3))
         object.__setattr__(self, "points", points)
         if len(points) > MAX_POINTS:
             raise InvalidKeyframe(f"points must be at most {MAX_POINTS}, got {len(points)}")
         if self.origins is not None:
             one = np.ndim(self.origins) == 1
             shape = (3,) if one else (len(points), 3)
-            origins = _array("origins", self.origins, (np.float32, np.float64), shape).astype(
-                np.float32, copy=False
-            )
+            origins = _single("origins", self.origins, shape)
             if not np.isfinite(origins).all():
                 raise InvalidKeyframe("origins must be finite, got NaN or infinity")
             object.__setattr__(self, "origins", origins)
@@ -237,7 +235,10 @@ def check_pose(pose: Any) -> NDArray[np.float64]:
 
 def _array(name: str, value: Any, dtypes: tuple[type, ...], shape: tuple[int | None, ...]) -> NDArray[Any]:
     expected = " or ".join(np.dtype(dtype).name for dtype in dtypes)
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except ValueError as error:  # rows of unequal length
+        raise InvalidKeyframe(f"{name} must be an array, got {type(value).__name__}: {error}") from error
     if array.dtype.type not in dtypes:
         raise InvalidKeyframe(f"{name} must be {expected}, got {array.dtype}")
     if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
@@ -246,6 +247,12 @@ def _array(name: str, value: Any, dtypes: tuple[type, ...], shape: tuple[int | N
     if array.size == 0 and name in ("depth", "disparity"):
         raise InvalidKeyframe(f"{name} must not be empty, got shape {array.shape}")
     return np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("="))
+
+
+def _single(name: str, value: Any, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
+    """float32 from float32 or float64; what is too large for it becomes infinite, which is no return."""
+    with np.errstate(over="ignore"):
+        return _array(name, value, (np.float32, np.float64), shape).astype(np.float32, copy=False)
 
 
 def _positive(name: str, value: Any) -> float:

@@ -16,7 +16,7 @@ from tsfusion.blockstore import BlockStore, pack_keys, unpack_keys
 from tsfusion.config import VolumeConfig, make, override
 from tsfusion.errors import InvalidConfig, MapError, MapFull, WeightOverflow
 from tsfusion.kernels import integrate, smooth
-from tsfusion.kernels.integrate import CUBE, MAX_DISTANCE
+from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.rays import WEIGHT_ONE
 from tsfusion.keyframe import Keyframe
 from tsfusion.mesh import Mesh
@@ -51,7 +51,7 @@ class Volume:
     """A sparse volume that keyframes are added to, and exactly removed from.
 
     Give a `VolumeConfig` or its fields: `Volume(voxel_size=0.02, sensor="kinect", regularizer="ray")`.
-    Use it from one thread (Taichi's).
+    Use it from one thread (Taichi's). `threads` counts for the first volume of a process: Taichi starts once.
 
     Raises:
         InvalidConfig: for an unknown setting or a value out of range.
@@ -73,8 +73,6 @@ class Volume:
         self.meta: dict[str, Any] = {}
         self.keyframes = 0
         runtime.start(config.threads)
-        # one voxel beyond the widest band, so that no voxel a ray crosses is clipped
-        self._quanta_per_voxel = int(MAX_DISTANCE / (model.max_support + 1))
         self._smooths = model.regularizer != "off"
         self._scratch = Scratch(
             color=config.color, regularised=self._smooths, max_blocks=config.max_blocks_per_keyframe
@@ -96,7 +94,8 @@ class Volume:
         Smoothed values cannot be un-smoothed: in the blocks it touched they fall back to the raw ones.
 
         Raises:
-            MapError: the map does not hold this keyframe.
+            MapError: the map cannot hold this keyframe: a voxel of it has fewer votes than would be taken
+                away. A keyframe never integrated goes unnoticed where others left votes enough.
         """
         return self._apply(keyframe, -1)
 
@@ -120,6 +119,8 @@ class Volume:
         store = self._store
         chosen = store.keys
         if blocks is not None:
+            if np.shape(blocks)[1:] != (3,) or np.asarray(blocks).dtype.kind != "i":
+                raise InvalidConfig(f"blocks must be (n, 3) integers, got {np.asarray(blocks)!r}")
             slots = store.slots_of(pack_keys(blocks))
             chosen = np.unique(chosen[slots[slots >= 0]])
         layers = Layers(
@@ -139,7 +140,7 @@ class Volume:
         Colour and smoothed values are not part of it (colour may travel lossily; smoothing has an order).
         """
         digest = hashlib.blake2b(digest_size=16)
-        digest.update(struct.pack("<di", self.config.voxel_size, self._quanta_per_voxel))
+        digest.update(struct.pack("<di", self.config.voxel_size, integrate.QUANTA_PER_VOXEL))
         for keys, sums in self._store.in_order("sums"):
             digest.update(keys.data)
             digest.update(sums.data)
@@ -212,6 +213,8 @@ class Volume:
         return volume
 
     def _apply(self, keyframe: Keyframe, sign: int) -> IntegrateStats:
+        if sign < 0 and self.keyframes == 0:
+            raise MapError("cannot retract a keyframe from a map that holds none")
         scratch = self._scratch
         model = self.config.model(keyframe.sensor)
         samples = scratch.make_rays(keyframe, model, self.config.voxel_size, self.config.bundle)
@@ -238,13 +241,13 @@ class Volume:
         s = self._scratch
         integrate.integrate_rays(
             s.rays, s.band_start, s.band_count, s.table, s.table_index,
-            self._quanta_per_voxel, int(s.colored), s.frame, s.frame_color,
+            int(s.colored), s.frame, s.frame_color,
         )  # fmt: skip
 
     def _check(self, sign: int) -> None:
         s = self._scratch
         refused = integrate.refuse_blocks(
-            s.touched_slots, s.touched, sign, s.frame, self._store.sums,
+            s.touched_slots, s.touched, sign, s.frame, s.frame_color, self._store.sums,
             self._store.color_rgn, int(s.colored),
         )  # fmt: skip
         if refused and sign < 0:
@@ -252,7 +255,8 @@ class Volume:
         if refused:
             raise WeightOverflow(
                 f"{refused} blocks hold voxels that have taken all the votes their integers hold "
-                f"({integrate.WEIGHT_LIMIT / WEIGHT_ONE:.0f} full samples); use bundle=True or a smaller voxel_size"
+                f"({integrate.WEIGHT_LIMIT / WEIGHT_ONE:.0f} full samples, {integrate.COLOR_LIMIT} colours); "
+                "use bundle=True or a smaller voxel_size"
             )
 
     def _allocate(self, sign: int) -> int:
@@ -272,7 +276,7 @@ class Volume:
         weighted = model.regularizer == "ray"
         smooth.smooth_rays(
             s.rays, s.band_start, s.band_count, s.table, s.table_index, s.touched_slots,
-            self._quanta_per_voxel, model.smoothness, int(weighted), int(model.feedback or not weighted),
+            model.smoothness, int(weighted), int(model.feedback or not weighted),
             s.frame, self._store.sums, self._store.regularised, s.signal, s.crossed, s.votes,
         )  # fmt: skip
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Additive integer integration: rays → this keyframe's sums → the map's sums.
 
-A voxel's sum is one int64, (Σ w·m) · 2²⁷ + Σ w: m = signed distance along the ray in quanta, |m| ≤ 1023.
+A voxel's sum is one int64, (Σ w·m) · 2²⁷ + Σ w: m = signed distance along the ray in sixtieths of a voxel,
+|m| ≤ 1023, which is beyond the widest band there can be.
 Colour is (Σ R) · 2⁴⁰ + (Σ G) · 2¹⁶ + n in an int64 and Σ B in an int32, one vote a keyframe.
 Addition modulo 2⁶⁴ is a group: any order gives the same bytes, and subtracting restores them.
 """
@@ -24,7 +25,8 @@ from tsfusion.kernels.traversal import (
 WEIGHT_BITS = 27
 WEIGHT_MASK = (1 << WEIGHT_BITS) - 1
 WEIGHT_LIMIT = 1 << 26  # leaves room for one keyframe, so that a lane cannot carry unnoticed
-MAX_DISTANCE = 1023  # quanta
+QUANTA_PER_VOXEL = 60
+MAX_DISTANCE = 1023  # quanta: the widest half-width, 16 voxels, and one to spare
 COLOR_LIMIT = 1 << 15  # keyframes that may colour one voxel
 CUBE = 512
 
@@ -40,8 +42,8 @@ def lane_distance(packed):
 
 
 @ti.func
-def quantize(distance, quanta_per_voxel):
-    q = (ti.cast(distance, ti.i64) * quanta_per_voxel + 32768) >> 16
+def quantize(distance):
+    q = (ti.cast(distance, ti.i64) * QUANTA_PER_VOXEL + 32768) >> 16
     return ti.cast(ti.min(ti.max(q, -MAX_DISTANCE), MAX_DISTANCE), ti.i32)
 
 
@@ -52,7 +54,6 @@ def integrate_rays(
     band_count: ti.types.ndarray(dtype=ti.i32, ndim=1),
     table: ti.types.ndarray(dtype=ti.i64, ndim=1),
     table_index: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    quanta_per_voxel: ti.i32,
     has_color: ti.i32,
     frame: ti.types.ndarray(dtype=ti.i64, ndim=2),
     frame_color: ti.types.ndarray(dtype=ti.i64, ndim=3),
@@ -76,7 +77,7 @@ def integrate_rays(
                             last = block
                             index = touched_index(table, table_index, voxel)
                         if index >= 0:
-                            m = quantize(distance, quanta_per_voxel)
+                            m = quantize(distance)
                             value = (ti.cast(m * weight, ti.i64) << WEIGHT_BITS) + weight
                             ti.atomic_add(frame[index, offset_in_block(voxel)], value)
                         axis = next_axis(crossing)
@@ -107,11 +108,12 @@ def refuse_blocks(
     count: ti.i32,
     sign_: ti.i32,
     frame: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    frame_color: ti.types.ndarray(dtype=ti.i64, ndim=3),
     sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
     color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
     has_color: ti.i32,
 ) -> ti.i32:
-    """How many touched blocks would leave their lanes' range: weights too large, or below zero."""
+    """How many touched blocks would leave their lanes' range: too many votes, or fewer than none."""
     refused = 0
     for run in range(count * RUN):
         if run % RUN == 0:
@@ -119,14 +121,16 @@ def refuse_blocks(
             slot = touched_slots[i]
             bad = 0
             for v in range(CUBE):
-                w = ti.i32(0)
-                n = ti.i64(0)
+                weight = sign_ * lane_weight(frame[i, v])
+                votes = 0
+                if has_color == 1:
+                    votes = sign_ * ti.min(ti.cast(frame_color[i, v, 1] & ti.i64(4294967295), ti.i32), 1)
+                colored = votes
                 if slot >= 0:
-                    w = lane_weight(sums[slot, v])
-                    if has_color == 1:
-                        n = color_rgn[slot, v] & 65535
-                after = w + sign_ * lane_weight(frame[i, v])
-                if after < 0 or after >= WEIGHT_LIMIT or n + sign_ >= COLOR_LIMIT:
+                    weight += lane_weight(sums[slot, v])
+                    if votes != 0:
+                        colored += ti.cast(color_rgn[slot, v] & 65535, ti.i32)
+                if weight < 0 or weight >= WEIGHT_LIMIT or colored < 0 or colored >= COLOR_LIMIT:
                     bad = 1
             refused += bad
     return refused

@@ -45,6 +45,7 @@ def gather_values(
     min_weight: ti.i32,
     padded: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
+    """Fill `padded` (blocks, 11³) with smoothed or raw values in quanta; NaN below `min_weight`."""
     for run in range(count * RUN):
         if run % RUN == 0:
             b = run // RUN
@@ -186,6 +187,7 @@ def emit_vertices(
     normals: ti.types.ndarray(dtype=ti.f32, ndim=2),
     colors: ti.types.ndarray(dtype=ti.u8, ndim=2),
 ):
+    """Position, unit normal and colour of every vertex: where the value crosses zero along its edge."""
     for run in range(count * RUN):
         if run % RUN == 0:
             b = run // RUN
@@ -244,6 +246,7 @@ def emit_faces(
     edge_corner: ti.types.ndarray(dtype=ti.i32, ndim=1),
     faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
+    """Each cell's triangles, as the numbers of the vertices on its edges."""
     for run in range(cases.shape[0] * RUN):
         if run % RUN == 0:
             b = run // RUN

@@ -143,6 +143,51 @@ def flush_tile(
         write_ray(rays, first + n, end, direction, mean[4], ti.min(w, MAX_BUNDLE_WEIGHT), color)
 
 
+@ti.func
+def take_sample(
+    keys: ti.template(), sums: ti.template(), origins: ti.template(), listed: ti.template(),
+    rays: ti.template(), band, out, entries, voxel, run, origin_sum, p, origin, has_origin, weight, half,
+    color, bundle,
+):  # fmt: skip
+    """Take one sample into the current run, or (exact) write it as a ray.
+
+    Returns `out` (next ray), `entries` (of the tile's table), and the run: its voxel, sums and Σ origin·w.
+    """
+    end = fixed_point(p)
+    if bundle == 0:
+        write_ray(rays, out, end, p - origin, half, weight, color)
+        out += 1
+    else:
+        here = end >> POSITION_BITS
+        if run[3] > 0 and any(here != voxel):
+            entries = add_run(keys, sums, origins, listed, band, entries, voxel, run, origin_sum, has_origin)
+            run = vec8i(0)
+            origin_sum = vec3l(0)
+        voxel = here
+        run += sample_sums(end, weight, half, color)
+        if has_origin == 1:
+            for a in ti.static(range(3)):
+                origin_sum[a] += ti.cast(ti.floor(origin[a] * 1024.0), ti.i64) * weight
+    return out, entries, voxel, run, origin_sum
+
+
+@ti.func
+def end_tile(
+    keys: ti.template(), sums: ti.template(), origins: ti.template(), listed: ti.template(),
+    rays: ti.template(), band, out, entries, voxel, run, origin_sum, origin, has_origin,
+):  # fmt: skip
+    """Add the last run and write the tile's rays; returns the next ray's place."""
+    if run[3] > 0:
+        entries = add_run(keys, sums, origins, listed, band, entries, voxel, run, origin_sum, has_origin)
+    flush_tile(keys, sums, origins, listed, band, entries, rays, out, origin, has_origin)
+    return out + entries
+
+
+@ti.func
+def bgr(blue, green, red):
+    return (ti.cast(red, ti.i32) << 16) | (ti.cast(green, ti.i32) << 8) | ti.cast(blue, ti.i32)
+
+
 @ti.kernel
 def rays_from_image(
     image: ti.types.ndarray(ndim=2),
@@ -155,9 +200,9 @@ def rays_from_image(
     camera: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (4, 3) voxels: du, dv, corner direction, origin
     model: ti.types.ndarray(dtype=ti.f64, ndim=1),
     bundle: ti.i32,
-    table_keys: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    table_sums: ti.types.ndarray(dtype=ti.i32, ndim=3),
-    table_origins: ti.types.ndarray(dtype=ti.i64, ndim=3),
+    keys: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    sums: ti.types.ndarray(dtype=ti.i32, ndim=3),
+    origins: ti.types.ndarray(dtype=ti.i64, ndim=3),
     listed: ti.types.ndarray(dtype=ti.i32, ndim=2),
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
     band_start: ti.types.ndarray(dtype=ti.i32, ndim=1),
@@ -176,16 +221,12 @@ def rays_from_image(
             band = unit // RUN
             first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // bands, ti.i32)
             last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // bands, ti.i32)
-            band_start[band] = first_tile * TILE_SAMPLES
             out = first_tile * TILE_SAMPLES
             samples = 0
             for tile in range(first_tile, last_tile):
                 top = tile // tiles_x * TILE
                 left = tile % tiles_x * TILE
-                entries = 0
-                voxel = vec3i(0)
-                run = vec8i(0)
-                none = vec3l(0)
+                entries, voxel, run, none = 0, vec3i(0), vec8i(0), vec3l(0)
                 for v in range(top, ti.min(top + TILE, height)):
                     row = vec3(0.0)
                     for a in ti.static(range(3)):
@@ -203,47 +244,19 @@ def rays_from_image(
                             p = origin + (row + du * ti.cast(u, ti.f64)) * z
                             if in_reach(p):
                                 sigma = noise_sigma(model, z)
-                                weight = sample_weight(model, sigma, trust)
-                                half = half_width(model, sigma)
                                 rgb = 0
                                 if has_color == 1:
-                                    rgb = (
-                                        (ti.cast(color[v, u, 2], ti.i32) << 16)
-                                        | (ti.cast(color[v, u, 1], ti.i32) << 8)
-                                        | ti.cast(color[v, u, 0], ti.i32)
-                                    )
+                                    rgb = bgr(color[v, u, 0], color[v, u, 1], color[v, u, 2])
                                 samples += 1
-                                end = fixed_point(p)
-                                if bundle == 1:
-                                    here = end >> POSITION_BITS
-                                    if run[3] > 0 and any(here != voxel):
-                                        entries = add_run(
-                                            table_keys,
-                                            table_sums,
-                                            table_origins,
-                                            listed,
-                                            band,
-                                            entries,
-                                            voxel,
-                                            run,
-                                            none,
-                                            0,
-                                        )
-                                        run = vec8i(0)
-                                    voxel = here
-                                    run += sample_sums(end, weight, half, rgb)
-                                else:
-                                    write_ray(rays, out, end, p - origin, half, weight, rgb)
-                                    out += 1
-                if bundle == 1:
-                    if run[3] > 0:
-                        entries = add_run(
-                            table_keys, table_sums, table_origins, listed, band, entries, voxel, run, none, 0
-                        )
-                    flush_tile(
-                        table_keys, table_sums, table_origins, listed, band, entries, rays, out, origin, 0
-                    )
-                    out += entries
+                                out, entries, voxel, run, none = take_sample(
+                                    keys, sums, origins, listed, rays, band, out, entries, voxel, run, none,
+                                    p, origin, 0, sample_weight(model, sigma, trust),
+                                    half_width(model, sigma), rgb, bundle,
+                                )  # fmt: skip
+                out = end_tile(
+                    keys, sums, origins, listed, rays, band, out, entries, voxel, run, none, origin, 0
+                )
+            band_start[band] = first_tile * TILE_SAMPLES
             band_count[band] = out - first_tile * TILE_SAMPLES
             band_samples[band] = samples
 
@@ -251,7 +264,7 @@ def rays_from_image(
 @ti.kernel
 def rays_from_points(
     points: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    origins: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (1, 3) or (N, 3), sensor frame
+    starts: ti.types.ndarray(dtype=ti.f32, ndim=2),  # of the rays, sensor frame: (1, 3) or (N, 3)
     color: ti.types.ndarray(dtype=ti.u8, ndim=2),
     has_color: ti.i32,
     confidence: ti.types.ndarray(dtype=ti.u8, ndim=1),
@@ -259,38 +272,35 @@ def rays_from_points(
     pose: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (3, 4), metres → voxels
     model: ti.types.ndarray(dtype=ti.f64, ndim=1),
     bundle: ti.i32,
-    table_keys: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    table_sums: ti.types.ndarray(dtype=ti.i32, ndim=3),
-    table_origins: ti.types.ndarray(dtype=ti.i64, ndim=3),
+    keys: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    sums: ti.types.ndarray(dtype=ti.i32, ndim=3),
+    origins: ti.types.ndarray(dtype=ti.i64, ndim=3),
     listed: ti.types.ndarray(dtype=ti.i32, ndim=2),
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
     band_start: ti.types.ndarray(dtype=ti.i32, ndim=1),
     band_count: ti.types.ndarray(dtype=ti.i32, ndim=1),
     band_samples: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
+    """As `rays_from_image`, for points in any order; range is measured along the ray."""
     count = points.shape[0]
     tiles = (count + TILE_SAMPLES - 1) // TILE_SAMPLES
     bands = band_count.shape[0]
-    own_origins = ti.select(origins.shape[0] == 1, 0, 1)
+    own_starts = ti.select(starts.shape[0] == 1, 0, 1)
     for unit in range(bands * RUN):
         if unit % RUN == 0:
             band = unit // RUN
             first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // bands, ti.i32)
             last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // bands, ti.i32)
-            band_start[band] = first_tile * TILE_SAMPLES
             out = first_tile * TILE_SAMPLES
             samples = 0
             for tile in range(first_tile, last_tile):
-                entries = 0
+                entries, voxel, run, origin_sum = 0, vec3i(0), vec8i(0), vec3l(0)
                 origin = vec3(0.0)
-                voxel = vec3i(0)
-                run = vec8i(0)
-                origins_sum = vec3l(0)
                 for n in range(tile * TILE_SAMPLES, ti.min((tile + 1) * TILE_SAMPLES, count)):
                     o = vec3(0.0)
                     q = vec3(0.0)
                     for a in ti.static(range(3)):
-                        o[a] = ti.cast(origins[n * own_origins, a], ti.f64)
+                        o[a] = ti.cast(starts[n * own_starts, a], ti.f64)
                         q[a] = ti.cast(points[n, a], ti.f64)
                     span = (q - o).norm()
                     trust = 255.0
@@ -303,70 +313,19 @@ def rays_from_points(
                             origin[a] = pose[a, 0] * o[0] + pose[a, 1] * o[1] + pose[a, 2] * o[2] + pose[a, 3]
                         if in_reach(p) and in_reach(origin):
                             sigma = noise_sigma(model, span)
-                            weight = sample_weight(model, sigma, trust)
-                            half = half_width(model, sigma)
                             rgb = 0
                             if has_color == 1:
-                                rgb = (
-                                    (ti.cast(color[n, 2], ti.i32) << 16)
-                                    | (ti.cast(color[n, 1], ti.i32) << 8)
-                                    | ti.cast(color[n, 0], ti.i32)
-                                )
+                                rgb = bgr(color[n, 0], color[n, 1], color[n, 2])
                             samples += 1
-                            end = fixed_point(p)
-                            if bundle == 1:
-                                here = end >> POSITION_BITS
-                                if run[3] > 0 and any(here != voxel):
-                                    entries = add_run(
-                                        table_keys,
-                                        table_sums,
-                                        table_origins,
-                                        listed,
-                                        band,
-                                        entries,
-                                        voxel,
-                                        run,
-                                        origins_sum,
-                                        own_origins,
-                                    )
-                                    run = vec8i(0)
-                                    origins_sum = vec3l(0)
-                                voxel = here
-                                run += sample_sums(end, weight, half, rgb)
-                                if own_origins == 1:
-                                    for a in ti.static(range(3)):
-                                        origins_sum[a] += (
-                                            ti.cast(ti.floor(origin[a] * 1024.0), ti.i64) * weight
-                                        )
-                            else:
-                                write_ray(rays, out, end, p - origin, half, weight, rgb)
-                                out += 1
-                if bundle == 1:
-                    if run[3] > 0:
-                        entries = add_run(
-                            table_keys,
-                            table_sums,
-                            table_origins,
-                            listed,
-                            band,
-                            entries,
-                            voxel,
-                            run,
-                            origins_sum,
-                            own_origins,
-                        )
-                    flush_tile(
-                        table_keys,
-                        table_sums,
-                        table_origins,
-                        listed,
-                        band,
-                        entries,
-                        rays,
-                        out,
-                        origin,
-                        own_origins,
-                    )
-                    out += entries
+                            out, entries, voxel, run, origin_sum = take_sample(
+                                keys, sums, origins, listed, rays, band, out, entries, voxel, run, origin_sum,
+                                p, origin, own_starts, sample_weight(model, sigma, trust),
+                                half_width(model, sigma), rgb, bundle,
+                            )  # fmt: skip
+                out = end_tile(
+                    keys, sums, origins, listed, rays, band, out, entries, voxel, run, origin_sum, origin,
+                    own_starts,
+                )  # fmt: skip
+            band_start[band] = first_tile * TILE_SAMPLES
             band_count[band] = out - first_tile * TILE_SAMPLES
             band_samples[band] = samples

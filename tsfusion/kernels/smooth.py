@@ -15,7 +15,7 @@ one owner a block writes the mean of its voxels' x̂.
 import taichi as ti
 
 from tsfusion.kernels.blocks import touched_index
-from tsfusion.kernels.integrate import CUBE, lane_distance, lane_weight
+from tsfusion.kernels.integrate import CUBE, QUANTA_PER_VOXEL, lane_distance, lane_weight
 from tsfusion.kernels.traversal import (
     MAX_CROSSED,
     RUN,
@@ -76,7 +76,6 @@ def smooth_rays(
     table: ti.types.ndarray(dtype=ti.i64, ndim=1),
     table_index: ti.types.ndarray(dtype=ti.i32, ndim=1),
     touched_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    quanta_per_voxel: ti.i32,
     smoothness: ti.f32,
     weighted: ti.i32,  # A = diag(W) or I
     feedback: ti.i32,  # y from the stored regularised values, or from the raw sums
@@ -119,7 +118,7 @@ def smooth_rays(
                             if feedback == 1:
                                 old = w_old * regularised[slot, o]
                         w = w_old + ti.cast(lane_weight(added), ti.f32)
-                        t = ti.cast(distance, ti.f32) * ti.cast(quanta_per_voxel, ti.f32) / 65536.0
+                        t = ti.cast(distance, ti.f32) * (QUANTA_PER_VOXEL / 65536.0)
                         signal[band, n, 0] = t
                         signal[band, n, 1] = (old + ti.cast(lane_distance(added), ti.f32)) / w - t
                         signal[band, n, 2] = w
