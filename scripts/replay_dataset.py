@@ -7,7 +7,7 @@ python scripts/replay_dataset.py PATH --voxel-size 0.02 --out out
 
 import sys
 
-from tsfusion.cli import main
+from tsfusion.__main__ import main
 
 if __name__ == "__main__":
     main(["replay", *sys.argv[1:]])

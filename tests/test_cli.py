@@ -10,16 +10,21 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from commands import tsfusion
 
 from tsfusion import __version__, config
 from tsfusion.cli import main
 from tsfusion.config import Config
+from tsfusion.datasets import Dataset
+from tsfusion.errors import InvalidConfig, OutputError
 
 Here = Callable[..., "subprocess.CompletedProcess[str]"]
 
+NOBODY = "tcp://127.0.0.1:9"  # the discard port: nobody listens there, and nobody may without being root
 VERBS = ["demo", "replay", "serve", "mesh", "status", "doctor", "config", "datasets"]
 
 
@@ -119,8 +124,13 @@ def test_datasets_list(here: Here, tmp_path: Path) -> None:
     assert "7-Scenes" in here("datasets", "list").stdout
     scene(tmp_path / "kitchen")
     found = json.loads(here("datasets", "list", tmp_path, "--json").stdout)
-    assert [row["sensor"] for row in found] == ["kinect"]
-    assert "no datasets" in here("datasets", "list", tmp_path / "kitchen" / "none").stderr
+    assert found == [{"path": str(tmp_path), "name": "7-Scenes kitchen", "sensor": "kinect", "keyframes": 1}]
+    assert "kinect  1 keyframes" in here("datasets", "list", tmp_path).stdout
+    layouts = json.loads(here("datasets", "list", "--json").stdout)
+    assert all(value == value.strip() for row in layouts for value in row.values())
+    (tmp_path / "empty").mkdir()
+    assert "no datasets" in here("datasets", "list", tmp_path / "empty").stderr
+    assert "missing does not exist" in one_line(here("datasets", "list", tmp_path / "missing"))
 
 
 def test_doctor() -> None:
@@ -146,9 +156,15 @@ def test_doctor_says_what_to_do(here: Here, tmp_path: Path) -> None:
         (["replay", "missing"], "missing does not exist"),
         (["replay", "empty"], "in no layout known"),
         (["replay", "synthetic:cave"], "world must be one of"),
-        (["replay", "synthetic:room", "--voxel-size", "-1"], "voxel_size: expected"),
-        (["replay", "synthetic:room", "--sensor", "sonar"], "sensor: expected one of kinect"),
-        (["replay", "synthetic:room", "--regularizer", "very"], "regularizer: expected one of off"),
+        (["replay", "synthetic:room", "--voxel-size", "-1"], "voxel_size must be > 0, got -1.0"),
+        (
+            ["replay", "synthetic:room", "--sensor", "sonar"],
+            "sensor must be one of kinect, tof, realsense, stereo, lidar, scanner, got 'sonar'",
+        ),
+        (
+            ["replay", "synthetic:room", "--regularizer", "very"],
+            "regularizer must be one of off, paper, ray, got 'very'",
+        ),
         (["replay", "synthetic:room", "--config", "missing.toml"], "missing.toml: No such file"),
         (["replay", "synthetic:room", "--out", "file"], "not a folder"),
         (["replay", "synthetic:room", "--out", "file/out"], "cannot write"),
@@ -163,16 +179,27 @@ def test_doctor_says_what_to_do(here: Here, tmp_path: Path) -> None:
         (["serve", "--listen", "nonsense"], "an address looks like"),
         (["serve", "--listen", "tcp://0.0.0.0:5555"], "127.0.0.1"),
         (["serve", "--state", "file"], "cannot write the state folder"),
-        (["serve", "--threads", "0"], "threads: expected"),
+        (["serve", "--threads", "0"], "threads must be >= 1, got 0"),
         (["serve", "--max-range", "0.01"], "min_range"),
+        (["serve", "--config", "file"], "is not TOML"),
+        (["replay", "synthetic:room", "--start", "99"], "has 40 keyframes, none after the first 99"),
+        (["replay", "synthetic:room", "--sequence", "06"], "a synthetic dataset takes no `sequence`"),
+        (["replay", "synthetic:room", "--connect", NOBODY, "--state", "s"], "--state has no effect with"),
+        (["replay", "synthetic:room", "--connect", NOBODY, "--voxel-size", "1"], "`tsfusion serve`"),
+        (["replay", "synthetic:room", "--control", NOBODY], "--control has no effect without --connect"),
+        (["mesh", "garbage.tsf", "a.ply", "--voxel-size", "1"], "--voxel-size has no effect on a saved map"),
+        (["mesh", "garbage.tsf", "a.ply", "--control", NOBODY], "only a live server"),
+        (["mesh", NOBODY, "a.ply", "--threads", "1"], "--threads has no effect on a live server's map"),
+        (["mesh", NOBODY, "a.ply"], "no server answered at tcp://127.0.0.1:10 within 0.2 s"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(
-    here: Here, arguments: list[str], words: str, tmp_path: Path
+    here: Here, arguments: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("here first")
     (tmp_path / "garbage.tsf").write_bytes(bytes(range(200)))
+    monkeypatch.setattr("tsfusion.client._ANSWER_TIMEOUT", 0.2)
     done = here(*arguments)
     assert words in one_line(done)
     left = {path.name for path in tmp_path.rglob("*")} - {"tsfusion-state", "journal", "lock"}
@@ -213,7 +240,7 @@ def test_dead_server(here: Here, tmp_path: Path) -> None:
         (tmp_path / "quick.toml").write_text("[client]\nconnect_timeout = 0.3\n")
         done = here(
             "replay", "synthetic:room", "--connect", address, "--config", tmp_path / "quick.toml",
-            "--out", tmp_path / "out",
+            "--out", tmp_path / "new" / "folders" / "out",
         )  # fmt: skip
         assert "no server" in one_line(done)
     assert [path.name for path in tmp_path.iterdir()] == ["quick.toml"]
@@ -226,3 +253,99 @@ def test_busy_port(here: Here, tmp_path: Path) -> None:
         address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
         done = here("serve", "--listen", address, "--state", tmp_path / "state")
     assert f"cannot listen on {address}" in one_line(done)
+
+
+@pytest.fixture
+def replayed(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What `replay` asks of the pipeline, which is not run."""
+    asked: dict[str, Any] = {}
+
+    def record(dataset: Dataset, out: Path, **settings: Any) -> None:
+        asked.update(settings, dataset=dataset)
+        raise OutputError("recorded")
+
+    monkeypatch.setattr("tsfusion.pipeline.replay", record)
+    return asked
+
+
+@pytest.mark.parametrize(
+    ("toml", "flags", "sensor"),
+    [
+        ("", [], "stereo"),
+        ("[volume]\nvoxel_size = 0.5\n", [], "stereo"),
+        ("[volume]\nsensor = 'kinect'\n", [], "kinect"),
+        ("[volume]\nsensor = 'tof'\n", [], "tof"),
+        ("[volume]\nsensor = 'tof'\n", ["--sensor", "kinect"], "kinect"),
+    ],
+)
+@pytest.mark.parametrize("command", [["replay", "synthetic:street:stereo"], ["demo", "--world", "street"]])
+def test_a_sensor_that_was_chosen_beats_the_datasets(
+    here: Here, replayed: dict[str, Any], tmp_path: Path, command: list[str], toml: str, flags: list[str],
+    sensor: str,
+) -> None:  # fmt: skip
+    if command[0] == "demo" and sensor == "tof":
+        pytest.skip("there is no synthetic tof camera")
+    (tmp_path / "a.toml").write_text(toml)
+    assert "recorded" in one_line(here(*command, "--config", "a.toml", *flags))
+    assert replayed["volume"].sensor == sensor
+
+
+def test_a_sensor_chosen_in_the_environment_counts(
+    here: Here, replayed: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TSFUSION_SENSOR", "kinect")
+    here("replay", "synthetic:street:stereo")
+    assert replayed["volume"].sensor == "kinect"
+
+
+def test_flags_of_the_environment_are_not_refused(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They may be meant for other commands."""
+    monkeypatch.setenv("TSFUSION_VOXEL_SIZE", "0.5")
+    monkeypatch.setattr("tsfusion.client._ANSWER_TIMEOUT", 0.2)
+    assert "no server" in one_line(here("mesh", NOBODY, "a.ply"))
+
+
+@pytest.mark.parametrize(
+    ("toml", "words"),
+    [
+        ("[volume]\nvoxel_size = -1\n", "a.toml: volume.voxel_size must be > 0, got -1"),
+        ("[volume]\nvoxel_size = inf\n", "voxel_size must be finite, got inf"),
+        ("[volume]\nsensor = 'ear'\n", "volume.sensor must be one of kinect, tof,"),
+        ("[volume]\nthreads = 'x'\n", "volume.threads must be a whole number, got 'x'"),
+        ("[server]\nlisten = 3\n", "server.listen must be text, got 3"),
+        ("[volume]\nspeed = 1\n", "unknown setting volume.speed"),
+        ("speed = 1\n", "unknown setting speed"),
+        ("volume = 1\n", "volume must be a table, got 1"),
+    ],
+)
+def test_a_bad_setting_is_named_once(here: Here, tmp_path: Path, toml: str, words: str) -> None:
+    (tmp_path / "a.toml").write_text(toml)
+    said = one_line(here("config", "dump", "--config", "a.toml"))
+    assert words in said
+    assert said.count("got") <= 1
+
+
+def test_settings_may_be_numpy_scalars() -> None:
+    made = config.make(config.VolumeConfig, {"voxel_size": np.float32(0.25), "threads": np.int64(2)})
+    assert (made.voxel_size, made.threads) == (0.25, 2)
+    with pytest.raises(InvalidConfig, match=r"^voxel_size must be > 0, got -1.0$"):
+        config.make(config.VolumeConfig, {"voxel_size": np.float32(-1)})
+
+
+def test_ctrl_c_while_modules_load_is_no_traceback() -> None:
+    """The command is interrupted at its first import beyond the door."""
+    program = (
+        "import builtins, os, signal, sys\n"
+        "from tsfusion.__main__ import main\n"
+        "load = builtins.__import__\n"
+        "def interrupted(name, *rest):\n"
+        "    if name == 'tsfusion': os.kill(os.getpid(), signal.SIGINT)\n"
+        "    return load(name, *rest)\n"
+        "builtins.__import__ = interrupted\n"
+        "main(['--version'])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == -signal.SIGINT
+    assert done.stderr == ""

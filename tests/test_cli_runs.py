@@ -16,8 +16,9 @@ import pytest
 import trimesh
 from commands import alive, descendants, end, eventually, read_until, server, started, tsfusion
 
-from tsfusion import Client, Keyframe, Volume, VolumeConfig
+from tsfusion import Client, FlushTimeout, Keyframe, Volume, VolumeConfig
 from tsfusion.datasets import Synthetic
+from tsfusion.results import building
 
 RESULTS = {"mesh.ply", "mesh.glb", "preview.png", "delay.csv", "delay.png", "run.json"}
 VOXEL = 0.08
@@ -148,6 +149,23 @@ def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
     assert Volume.load(tmp_path / "state" / "map.tsf").keyframes == 3
 
 
+def test_a_server_that_fell_silent_is_not_called_slow(tmp_path: Path) -> None:
+    with (
+        server(tmp_path / "state", "--voxel-size", VOXEL) as (address, process),
+        Client(address, spool=tmp_path / "spool") as client,
+    ):
+        client.connect()
+        process.send_signal(signal.SIGSTOP)
+        try:
+            client.send(room(1)[0])
+            heard = r"nothing was heard from the server at tcp://\S+ for [12]\.\d s; they stay in .*spool"
+            with pytest.raises(FlushTimeout, match=heard):
+                client.flush(timeout=1.5)
+        finally:
+            process.send_signal(signal.SIGCONT)
+        client.flush(timeout=30)
+
+
 @pytest.mark.slow
 def test_ready_line_is_for_people_too(tmp_path: Path) -> None:
     process = started("serve", "--listen", "tcp://127.0.0.1:0", "--state", tmp_path / "state")
@@ -161,15 +179,19 @@ def test_ready_line_is_for_people_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
-def test_interrupted_replay_leaves_nothing(number: signal.Signals, tmp_path: Path) -> None:
-    process = started(
-        "replay", "synthetic:room", "--rate", 0.5, "--voxel-size", VOXEL, "--out", tmp_path / "out"
-    )
+@pytest.mark.parametrize(
+    ("number", "word"),
+    [(signal.SIGINT, "interrupted"), pytest.param(signal.SIGTERM, "terminated", marks=pytest.mark.slow)],
+)
+def test_interrupted_replay_leaves_nothing(number: signal.Signals, word: str, tmp_path: Path) -> None:
+    process = slow_replay(tmp_path / "new" / "out")
     read_until(process, "scanning")
     below = descendants(process.pid)
     assert len(below) == 2  # gateway and fuser
-    assert end(process, number) == 128 + number
+    process.send_signal(number)
+    said = process.communicate(timeout=60)[0]
+    assert process.returncode == 128 + number
+    assert said.strip().splitlines()[-1] == f"tsfusion: {word}"
     assert eventually(lambda: not any(map(alive, below)))
     assert list(tmp_path.iterdir()) == []
 
@@ -177,14 +199,16 @@ def test_interrupted_replay_leaves_nothing(number: signal.Signals, tmp_path: Pat
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
 def test_a_killed_replay_takes_its_server_along(tmp_path: Path) -> None:
-    process = started(
-        "replay", "synthetic:room", "--rate", 0.5, "--voxel-size", VOXEL, "--out", tmp_path / "out"
-    )
+    process = slow_replay(tmp_path / "out")
     read_until(process, "scanning")
     below = descendants(process.pid)
     end(process, signal.SIGKILL)
     assert eventually(lambda: not any(map(alive, below)))
     assert not (tmp_path / "out").exists()
+    assert len(list(tmp_path.iterdir())) == 1
+    with building(tmp_path / "out"):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 @pytest.mark.slow
@@ -216,7 +240,8 @@ def test_demo(tmp_path: Path) -> None:
     done = tsfusion("demo", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     run = json.loads((tmp_path / "out" / "run.json").read_text())
-    assert run["keyframes_fused"] == 40
+    assert run["keyframes_fused"] == 90
+    assert run["mesh"]["vertices"] > 160_000  # the path shows all of the room
     assert run["accuracy"]["mean_mm"] < 2
     assert run["delay_ms"]["mean"] < 500
     assert "from the known surface" in done.stdout

@@ -231,7 +231,7 @@ def test_which_sequence_must_be_clear(tmp_path):
         KITTI(root, "99")
     shutil.copytree(root / "sequences" / "06", root / "sequences" / "07")
     with pytest.raises(
-        DatasetError, match=r"holds 2 KITTI sequences with data \(06, 07\); expected the option"
+        DatasetError, match=r"holds 2 KITTI sequences with data \(06, 07\); name one with --sequence"
     ):
         open_dataset(root)
     assert open_dataset(root / "sequences" / "06").name == "KITTI 06 stereo"

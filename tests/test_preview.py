@@ -9,9 +9,19 @@ import pytest
 import reference
 import trimesh
 
+from tsfusion.datasets import Synthetic
 from tsfusion.errors import OutputError
 from tsfusion.mesh import Mesh
-from tsfusion.preview import BACKGROUND, Camera, choose_camera, draw, render, up_direction
+from tsfusion.preview import (
+    BACKGROUND,
+    Camera,
+    choose_camera,
+    draw,
+    height_colors,
+    render,
+    sensor_up,
+    up_direction,
+)
 
 
 def from_trimesh(shape: trimesh.Trimesh, colors: np.ndarray | None = None) -> Mesh:
@@ -106,7 +116,30 @@ def test_up_comes_from_the_poses_and_is_refined_by_the_floor() -> None:
     turned = np.eye(4)
     turned[:3, :3] = tilt
     poses = [turned @ look((0, 0, 1), (math.cos(a), math.sin(a), 0)) @ nod for a in np.linspace(0, 2, 9)]
-    assert up_direction(tilted, poses) == pytest.approx(tilt @ (0, 0, 1), abs=1e-3)
+    ups = [sensor_up(pose, "kinect") for pose in poses]
+    assert up_direction(tilted, ups) == pytest.approx(tilt @ (0, 0, 1), abs=1e-3)
+
+
+def test_a_lidar_stands_upright_too() -> None:
+    for sensor in ("kinect", "stereo", "lidar"):
+        dataset = Synthetic("street", sensor, count=3)
+        ups = [sensor_up(dataset.pose(index), sensor) for index in range(3)]
+        assert np.mean(ups, axis=0) == pytest.approx((0, 0, 1), abs=0.05)
+
+
+def test_without_colour_height_is_shown() -> None:
+    """From below to above the ramp gets lighter; grey everywhere is no colour either."""
+    room = box_room()
+    ramp = height_colors(room.vertices, np.array((0.0, 0.0, 1.0))).astype(int).sum(axis=1)
+    low = room.vertices[:, 2] < 1
+    assert ramp[low].max() < ramp[~low].min()
+    grey = Mesh(room.vertices, room.faces, room.normals, np.full_like(room.vertices, 160, np.uint8))
+    camera = choose_camera(room, np.array((0.0, 0.0, 1.0)), aspect=1.6)
+    image = draw(room, camera, 80, 50)
+    assert (draw(grey, camera, 80, 50) == image).all()
+    assert np.ptp(image[..., :3], axis=2).max() > 0.1
+    painted = Mesh(room.vertices, room.faces, room.normals, (room.vertices * 20 + 100).astype(np.uint8))
+    assert (draw(painted, camera, 80, 50) != image).any()
 
 
 def test_chosen_camera_looks_into_the_room_from_outside() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import reference
 from geometry import depth_metres, points_world, warp_residual
+from scipy.spatial import cKDTree
 
 from tsfusion.datasets import Synthetic, worlds
 from tsfusion.datasets.synthetic import DEPTH_SCALE, kinect, stereo
@@ -70,6 +71,21 @@ def test_the_room_is_that_of_the_reference_images(data):
             np.std((image - theirs)[difference <= 2]) for image in (noisy[index].depth.astype(int), reference)
         )
         assert ours == pytest.approx(their, rel=0.02)
+
+
+def test_the_tour_sees_the_room_from_everywhere_within():
+    """Every keyframe stands in free space; walls, floor and things come into view from near and in front."""
+    tour = Synthetic("room", count=90, path="tour", noise=False, color=False, width=64)
+    poses = np.array([tour.pose(index) for index in range(90)])
+    assert tour.distance(poses[:, :3, 3]).min() > 0.15
+    seen = np.concatenate([points_world(keyframe) for keyframe in tour])
+    surface = np.random.default_rng(3).uniform((-2, -2, 0), (2, 2, 2.4), (4000, 3))
+    surface[:, 2] *= np.arange(4000) % 2  # half of them on the floor, the others on the walls
+    wall = surface[:, 2] > 0
+    surface[wall, 0] = np.sign(surface[wall, 0]) * 2
+    surface = surface[np.abs(tour.distance(surface)) < 1e-9]
+    assert (cKDTree(seen).query(surface)[0] < 0.06).mean() > 0.97
+    assert Synthetic("room", count=1, path="tour")[0].shape == (240, 320)
 
 
 def test_the_signed_distance_of_the_room_is_the_documented_formula():
@@ -217,6 +233,8 @@ def test_the_tables_of_solids_and_materials_agree_with_the_kernel():
         ({"world": "moon"}, "world must be one of room, street, got 'moon'"),
         ({"sensor": "sonar"}, "must be kinect, stereo or lidar, got 'sonar'"),
         ({"count": 0}, "expected count >= 1, .*got count 0"),
+        ({"path": "loop"}, "path must be one of circle, tour, got 'loop'"),
+        ({"world": "street", "path": "tour"}, "path must be one of drive, got 'tour'"),
         ({"seed": -1}, "expected .*seed >= 0"),
         ({"width": 3}, "expected .*width >= 16"),
     ],

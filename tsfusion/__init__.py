@@ -13,7 +13,22 @@ if TYPE_CHECKING:
     from tsfusion.config import Config as Config
     from tsfusion.config import VolumeConfig as VolumeConfig
     from tsfusion.datasets import open_dataset as open_dataset
+    from tsfusion.errors import CheckpointError as CheckpointError
+    from tsfusion.errors import DatasetError as DatasetError
+    from tsfusion.errors import DecodeError as DecodeError
+    from tsfusion.errors import FlushTimeout as FlushTimeout
+    from tsfusion.errors import InvalidConfig as InvalidConfig
+    from tsfusion.errors import InvalidKeyframe as InvalidKeyframe
+    from tsfusion.errors import JournalError as JournalError
+    from tsfusion.errors import KeyframeRefused as KeyframeRefused
+    from tsfusion.errors import MapError as MapError
+    from tsfusion.errors import MapFull as MapFull
+    from tsfusion.errors import MissingDependency as MissingDependency
+    from tsfusion.errors import OutputError as OutputError
+    from tsfusion.errors import ServerUnreachable as ServerUnreachable
+    from tsfusion.errors import TransportError as TransportError
     from tsfusion.errors import TsfusionError as TsfusionError
+    from tsfusion.errors import WeightOverflow as WeightOverflow
     from tsfusion.keyframe import Intrinsics as Intrinsics
     from tsfusion.keyframe import Keyframe as Keyframe
     from tsfusion.mesh import Mesh as Mesh
@@ -21,16 +36,21 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
+_ERRORS = (
+    "CheckpointError", "DatasetError", "DecodeError", "FlushTimeout", "InvalidConfig", "InvalidKeyframe",
+    "JournalError", "KeyframeRefused", "MapError", "MapFull", "MissingDependency", "OutputError",
+    "ServerUnreachable", "TransportError", "TsfusionError", "WeightOverflow",
+)  # fmt: skip
 _HOME = {
     "Client": "client",
     "Config": "config",
     "Intrinsics": "keyframe",
     "Keyframe": "keyframe",
     "Mesh": "mesh",
-    "TsfusionError": "errors",
     "Volume": "volume",
     "VolumeConfig": "config",
     "open_dataset": "datasets",
+    **dict.fromkeys(_ERRORS, "errors"),
 }
 __all__ = ["__version__", *_HOME]  # noqa: PLE0604
 

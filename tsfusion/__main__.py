@@ -1,7 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""`python -m tsfusion` is the `tsfusion` command."""
+"""The `tsfusion` command's door, also for `python -m tsfusion`."""
 
-from tsfusion.cli import main
+import signal
+from typing import NoReturn
+
+
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Run a command line (default: this process's) and exit; Ctrl-C while modules load ends it silently."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from tsfusion import cli
+
+    cli.main(arguments)
+
 
 if __name__ == "__main__":
     main()

@@ -163,10 +163,10 @@ def _check_digest(file: BinaryIO, path: Path) -> None:
 
 
 def _exactly(file: BinaryIO, size: int, path: Path) -> bytes:
-    data = file.read(size)
-    if len(data) != size:
+    content = file.read(size)
+    if len(content) != size:
         raise CheckpointError(f"{path} is cut short")
-    return data
+    return content
 
 
 def _sync_folder(folder: Path) -> None:

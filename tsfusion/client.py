@@ -29,10 +29,13 @@ from tsfusion.mesh import Mesh
 from tsfusion.outbox import ClientStats, Outbox
 from tsfusion.sender import Sender
 from tsfusion.spool import Spool
-from tsfusion.transport import Command, KeyframeTimes, Status, control_address, request, sockets
+from tsfusion.transport import Command, KeyframeTimes, Reply, Status, control_address, request, sockets
 from tsfusion.transport.messages import MeshLayout
 
 __all__ = ["Client", "ClientStats", "fetch_mesh", "fetch_status"]
+
+_ANSWER_TIMEOUT = 5.0  # seconds; the gateway is never busy, so who says nothing for so long is not there
+_SILENCE = 1.0  # seconds; the server answers a ping every half second
 
 log = logging.getLogger(__name__)
 
@@ -197,11 +200,14 @@ class Client:
     def _why(self) -> str:
         if self._outbox.problem:
             return self._outbox.problem
-        if not self._outbox.connected:
+        heard = self._sender.heard
+        silence = time.monotonic() - heard
+        if not heard:
             return f"no server answers at {self._control}"
-        if self._outbox.spool.temporary:
-            return "the server is behind"
-        return f"the server is behind; they stay in {self._outbox.spool.folder}"
+        why = "the server is behind"
+        if silence > _SILENCE:
+            why = f"nothing was heard from the server at {self._control} for {silence:.1f} s"
+        return why if self._outbox.spool.temporary else f"{why}; they stay in {self._outbox.spool.folder}"
 
 
 def fetch_status(address: str, *, control: str | None = None, timeout: float = 10.0) -> Status:
@@ -211,9 +217,7 @@ def fetch_status(address: str, *, control: str | None = None, timeout: float = 1
         ServerUnreachable: when nobody answers in `timeout` seconds.
         TransportError: when the server cannot say.
     """
-    reply, _ = request(
-        control_address(sockets.target(address), control), Command(name="status"), timeout=timeout
-    )
+    reply, _ = _ask(address, control, Command(name="status"), timeout)
     if reply.status is None:
         raise TransportError(f"the server at {address} answered without a status")
     return reply.status
@@ -225,14 +229,24 @@ def fetch_mesh(
     """The whole mesh of the server at a data address, as of now.
 
     Raises:
-        ServerUnreachable: when nobody answers in `timeout` seconds.
+        ServerUnreachable: when nobody is there (known after a few seconds), or the mesh takes longer than
+            `timeout` seconds.
         TransportError: when the server cannot make it.
     """
-    command = Command(name="mesh", min_weight=min_weight)
-    reply, frames = request(control_address(sockets.target(address), control), command, timeout=timeout)
+    reply, frames = _ask(address, control, Command(name="mesh", min_weight=min_weight), timeout)
     if reply.mesh is None:
         raise TransportError(f"the server at {address} answered without a mesh")
     return mesh_of(reply.mesh, frames)
+
+
+def _ask(
+    address: str, control: str | None, command: Command, timeout: float
+) -> tuple[Reply, list[memoryview]]:
+    """The fuser's answer. That takes its time, so it is asked first whether anybody is there."""
+    address = control_address(sockets.target(address), control)
+    if timeout > _ANSWER_TIMEOUT:
+        request(address, Command(name="ping"), timeout=_ANSWER_TIMEOUT)
+    return request(address, command, timeout=timeout)
 
 
 def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
+import numpy as np
 from msgspec import Meta, Struct
 
 from tsfusion.errors import InvalidConfig
@@ -34,7 +35,7 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         for key in self.__struct_fields__:
             value = getattr(self, key)
             if isinstance(value, float) and not math.isfinite(value):
-                raise ValueError(f"{key}: expected a finite number, got {value}")
+                raise ValueError(f"{key} must be finite, got {value}")
 
 
 class SensorModel(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -153,6 +154,14 @@ class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 AnyStruct = TypeVar("AnyStruct", bound=Struct)
 
+_KINDS = {
+    "float": "a number",
+    "int": "a whole number",
+    "str": "text",
+    "bool": "true or false",
+    "object": "a table",
+}
+
 
 def make(struct: type[AnyStruct], settings: dict[str, Any]) -> AnyStruct:
     """Build a config struct, checking names, types and bounds.
@@ -160,41 +169,54 @@ def make(struct: type[AnyStruct], settings: dict[str, Any]) -> AnyStruct:
     Raises:
         InvalidConfig: naming the key and what was expected.
     """
+    plain = {key: v.item() if isinstance(v, np.generic) else v for key, v in settings.items()}
     try:
-        return msgspec.convert(settings, struct)
+        return msgspec.convert(plain, struct)
     except msgspec.ValidationError as error:
-        raise InvalidConfig(_explain(struct, settings, str(error))) from error
+        raise InvalidConfig(_explain(struct, plain, str(error))) from error
 
 
 def _explain(struct: type[Struct], settings: dict[str, Any], problem: str) -> str:
-    """msgspec's message with the setting's name first, the words it may be, and what it was."""
-    match = re.fullmatch(r"(.+) - at `\$\.(\w+)`", problem)
-    if match is None:
-        return problem[:1].lower() + problem[1:]
-    expectation, key = match.groups()
-    words = re.findall(r"'(\w+)'", str(struct.__annotations__[key]))
-    if words and expectation.startswith("Invalid enum value"):
-        expectation = f"expected one of {', '.join(words)}"
-    return f"{key}: {expectation[:1].lower()}{expectation[1:]}, got {settings.get(key)!r}"
+    """msgspec's message in our words: `voxel_size must be > 0, got -0.05`; of a file, with the table."""
+    problem, _, place = problem.partition(" - at `$.")
+    *tables, key = place.rstrip("`").split(".")
+    if unknown := re.search(r"unknown field `(.+)`", problem):
+        return f"unknown setting {'.'.join(filter(None, (place.rstrip('`'), unknown[1])))}"
+    wanted = re.match(r"Expected `(\w+)[^`]*`(?: ([<>]=? \S+?)(?:\.0)?)?(?:,|$)|Invalid enum", problem)
+    if wanted is None:
+        return problem
+    value: Any = settings
+    for table in tables:
+        struct, value = struct.__annotations__[table], value[table]
+    words = ", ".join(re.findall(r"(?<!class )'(\w+)'", str(struct.__annotations__[key])))
+    must_be = f"one of {words}" if words else wanted[2] or _KINDS.get(wanted[1], wanted[1])
+    return f"{'.'.join((*tables, key))} must be {must_be}, got {value[key]!r}"
 
 
-def load(path: str | Path | None) -> Config:
+def load(path: str | Path | None, **volume: Any) -> Config:
     """Read a TOML file; None gives the defaults.
+
+    Args:
+        volume: settings of the map that hold where the file says nothing of them.
 
     Raises:
         InvalidConfig: when the file is missing, not TOML, or holds an unknown key or a bad value.
     """
     if path is None:
-        return Config()
+        return Config(volume=make(VolumeConfig, volume))
     try:
         content = Path(path).read_bytes()
     except OSError as error:
         raise InvalidConfig(f"cannot read the configuration {path}: {error.strerror}") from error
     try:
-        return msgspec.convert(tomllib.loads(content.decode("utf-8")), Config)
+        tables = tomllib.loads(content.decode("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InvalidConfig(f"{path} is not TOML: {error}") from error
-    except msgspec.ValidationError as error:
+    if isinstance(given := tables.get("volume", {}), dict):
+        tables["volume"] = {**volume, **given}
+    try:
+        return make(Config, tables)
+    except InvalidConfig as error:
         raise InvalidConfig(f"{path}: {error}") from error
 
 

@@ -65,7 +65,7 @@ class Gateway:
     def stop_accepting(self) -> None:
         """Take no more keyframes; clients keep what is not acknowledged."""
         self._accepting = False
-        self.ports.data.close()
+        self.ports.keyframes.close()
 
     def step(self) -> None:
         """Wait for something to happen (a moment at most) and deal with it.
@@ -78,7 +78,7 @@ class Gateway:
             self.ports.publish: self._on_subscription,
         }
         if self._accepting:
-            handlers[self.ports.data] = self._on_keyframe
+            handlers[self.ports.keyframes] = self._on_keyframe
         polled = [(socket, zmq.POLLIN) for socket in (self.fuser.socket, *handlers)]
         events = dict(zmq.zmq_poll(polled, _TICK_MS))
         for socket, handle in handlers.items():

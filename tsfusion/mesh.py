@@ -65,8 +65,8 @@ class Mesh:
             ".glb": {"include_normals": True},
             ".obj": {"include_normals": True},
         }[suffix]
-        data = mesh.export(file_type=suffix[1:], **options)
-        return data.encode() if isinstance(data, str) else bytes(data)
+        content = mesh.export(file_type=suffix[1:], **options)
+        return content.encode() if isinstance(content, str) else bytes(content)
 
 
 def _srgb_to_linear() -> NDArray[np.uint8]:

@@ -150,7 +150,7 @@ def replay(
         if not len(mesh.faces):
             raise OutputError(
                 f"the map has no surface to write: {run.stats.fused} of {run.stats.sent} keyframes fused; "
-                "send more of them or lower min_weight"
+                "send more of them or lower --min-weight"
             )
         progress.stage("writing the results")
         shutil.rmtree(scratch)
@@ -179,7 +179,7 @@ class _Run:
         progress: Progress,
     ) -> None:
         self.dataset = dataset
-        self.poses: list[NDArray[np.float64]] = []
+        self.ups: list[NDArray[np.float64]] = []
         self.seconds = 0.0
         self.peak_rss_bytes = 0  # while scanning: drawing the result is not a scanner's work
         self.records: list[KeyframeTimes] = []
@@ -206,7 +206,7 @@ class _Run:
                 due = max(due + 1 / rate, time.monotonic())  # a sensor that was late does not catch up
                 self._wait(partial(_is_time, due), patience=None)
             self._scanner.send(dataclasses.replace(keyframe, captured_ns=time.monotonic_ns()))
-            self.poses.append(keyframe.T_world_camera)
+            self.ups.append(preview.sensor_up(keyframe.T_world_camera, self.dataset.sensor))
         self._wait(lambda: self._done >= len(self.dataset))
         self.seconds = time.monotonic() - started
         self.peak_rss_bytes = process.peak_rss_bytes()
@@ -240,7 +240,7 @@ def _is_time(due: float) -> bool:
 def _write(work: Path, run: _Run, mesh: Mesh, summary: RunSummary) -> RunSummary:
     mesh.save(work / "mesh.ply")
     mesh.save(work / "mesh.glb")
-    preview.render(mesh, work / "preview.png", poses=run.poses)
+    preview.render(mesh, work / "preview.png", ups=run.ups)
     ledger.write_csv(run.records, work / "delay.csv")
     ledger.plot(run.records, work / "delay.png")
     text = msgspec.json.format(msgspec.json.encode(summary), indent=2)

@@ -20,7 +20,7 @@ class Ports:
     """Keyframes in, control both ways, mesh updates out."""
 
     def __init__(self, context: "zmq.Context[Any]", server: ServerConfig) -> None:
-        self.data = sockets.pull(context, server.max_frame_bytes)
+        self.keyframes = sockets.pull(context, server.max_frame_bytes)
         self.control = sockets.router(context)
         self.publish = sockets.publisher(context)
 
@@ -30,11 +30,11 @@ class Ports:
         Raises:
             TransportError: when a port is taken.
         """
-        return sockets.bind(self.data, self.control, self.publish, server.listen, server.control)
+        return sockets.bind(self.keyframes, self.control, self.publish, server.listen, server.control)
 
     def close(self) -> None:
         """Close them; nothing lingers."""
-        for socket in (self.data, self.control, self.publish):
+        for socket in (self.keyframes, self.control, self.publish):
             socket.close()
 
 

@@ -15,7 +15,7 @@ from tsfusion.errors import OutputError
 from tsfusion.mesh import Mesh
 
 BACKGROUND = (0.93, 0.94, 0.96)  # linear RGB
-_GREY = 190
+_RAMP = (0.12, 0.8)  # of the colour map: its ends are too dark to shade, and too pale for the background
 _OVERSAMPLING = 2
 _ELEVATIONS = (28.0, 42.0, 58.0)  # degrees above the ground
 _AZIMUTHS = 12
@@ -44,7 +44,7 @@ def render(
     width: int = 1280,
     height: int = 800,
     camera: Camera | None = None,
-    poses: Sequence[NDArray[np.float64]] = (),
+    ups: Sequence[NDArray[np.float64]] = (),
 ) -> Path:
     """Draw `mesh` to a PNG file; complete or not at all.
 
@@ -53,8 +53,8 @@ def render(
     Args:
         width: pixels.
         height: pixels.
-        camera: None = chosen by `choose_camera` from the mesh and `poses`.
-        poses: the sensor's `T_world_camera` matrices, which tell where up is.
+        camera: None = chosen by `choose_camera` from the mesh and `ups`.
+        ups: `sensor_up` of the keyframes, which tells where up is; none = +z.
 
     Raises:
         OutputError: for an empty mesh or a place that cannot be written.
@@ -62,7 +62,7 @@ def render(
     path = Path(path)
     if not len(mesh.faces):
         raise OutputError(f"nothing to draw in {path}: the mesh has no triangles (yet)")
-    up = up_direction(mesh, poses)
+    up = up_direction(mesh, ups)
     camera = camera or choose_camera(mesh, up, aspect=width / height)
     image = draw(mesh, camera, width * _OVERSAMPLING, height * _OVERSAMPLING, up=up)
     _write_png(_develop(image, _OVERSAMPLING), path)
@@ -89,8 +89,11 @@ def draw(
     raster.rasterise(seen, vertices, faces, focal, camera.near)
     image = np.zeros((height, width, 4), np.float32)
     image[..., :3] = BACKGROUND
-    colors = mesh.colors if mesh.colors is not None else np.full((len(vertices), 3), _GREY, np.uint8)
-    up_camera = R.T @ (np.array((0.0, 0.0, 1.0)) if up is None else up)
+    up = np.array((0.0, 0.0, 1.0)) if up is None else up
+    colors = mesh.colors
+    if colors is None or not np.ptp(colors, axis=0).any():
+        colors = height_colors(mesh.vertices, up)
+    up_camera = R.T @ up
     raster.shade(
         image, seen, vertices, faces, _float32(mesh.normals @ R), np.ascontiguousarray(colors),
         focal, *(float(x) for x in up_camera), raster.EMPTY,
@@ -98,15 +101,35 @@ def draw(
     return image
 
 
-def up_direction(mesh: Mesh, poses: Sequence[NDArray[np.float64]] = ()) -> NDArray[np.float64]:
+def height_colors(vertices: NDArray[np.float32], up: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """(n, 3) uint8 RGB for a mesh without colour: dark blue is low, light green high."""
+    import cv2
+
+    height = vertices @ up
+    low, high = np.percentile(height, (1, 98)) if len(height) else (0.0, 1.0)
+    share = ((height - low) / max(high - low, 1e-6)).clip(0, 1)
+    level = np.round(255 * (_RAMP[0] + (_RAMP[1] - _RAMP[0]) * share**0.7)).astype(np.uint8).reshape(-1, 1)
+    bgr: NDArray[np.uint8] = cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS) if len(level) else level
+    return bgr.reshape(-1, 3)[:, ::-1]
+
+
+def sensor_up(T_world_sensor: NDArray[np.float64], sensor: str) -> NDArray[np.float64]:
+    """(3,) float64, world: away from the ground, for a sensor that is held upright.
+
+    A LiDAR's own axes are x forward, y left, z up; a camera's are x right, y down, z forward.
+    """
+    return T_world_sensor[:3, 2] if sensor == "lidar" else -T_world_sensor[:3, 1]
+
+
+def up_direction(mesh: Mesh, ups: Sequence[NDArray[np.float64]] = ()) -> NDArray[np.float64]:
     """(3,) unit float64: away from the ground.
 
-    People hold cameras upright, so the mean of the poses' -y axes is near; the floor's normals make it exact.
-    Without poses, +z.
+    Sensors are held upright, so the mean of their `ups` is near; the floor's normals make it exact.
+    Without any, +z.
     """
     up = np.array((0.0, 0.0, 1.0))
-    if len(poses):
-        mean = -np.mean([pose[:3, 1] for pose in poses], axis=0)
+    if len(ups):
+        mean = np.mean(ups, axis=0)
         if np.linalg.norm(mean) > 1e-3:
             up = mean / np.linalg.norm(mean)
     normals = mesh.normals[:: max(1, len(mesh.normals) // 100_000)].astype(np.float64)
@@ -139,10 +162,10 @@ def _score(mesh: Mesh, camera: Camera, aspect: float) -> float:
 
 
 def _core(vertices: NDArray[np.float32]) -> NDArray[np.float64]:
-    """At most 20 000 vertices without the strays: those inside the 1 % to 99 % range of each axis."""
+    """At most 20 000 vertices without the strays: those about the 3 % to 97 % range of each axis."""
     sample = vertices[:: max(1, len(vertices) // 20_000)].astype(np.float64)
-    low, high = np.percentile(sample, (1, 99), axis=0)
-    margin = 0.02 * (high - low)
+    low, high = np.percentile(sample, (3, 97), axis=0)
+    margin = 0.05 * (high - low)
     inside = ((sample >= low - margin) & (sample <= high + margin)).all(axis=1)
     return sample[inside] if inside.any() else sample
 
@@ -183,12 +206,12 @@ def _develop(image: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
 def _write_png(rgb: NDArray[np.uint8], path: Path) -> None:
     import cv2
 
-    done, data = cv2.imencode(".png", rgb[..., ::-1])
+    done, encoded = cv2.imencode(".png", rgb[..., ::-1])
     partial = path.with_name(f".{path.name}.partial")
     try:
         if not done:
             raise OutputError(f"cannot encode the picture {path}")
-        partial.write_bytes(data.tobytes())
+        partial.write_bytes(encoded.tobytes())
         os.replace(partial, path)
     except OSError as error:
         partial.unlink(missing_ok=True)

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
 """The folder a run leaves behind: whole, or not there."""
 
+import fcntl
 import os
 import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tsfusion.errors import OutputError
@@ -20,32 +21,74 @@ def building(out: str | os.PathLike[str]) -> Iterator[Path]:
 
     A new `out` appears in one rename. In an existing one each file replaces its namesake and everything else
     stays; its old `run.json` goes first and the new one comes last, so a `run.json` always describes its
-    neighbours.
+    neighbours. An error leaves nothing, no parent folder either; what a killed run left goes with the next.
 
     Raises:
         OutputError: at once, when `out` cannot be written.
     """
     out = Path(out).expanduser().absolute()
-    work = _workplace(out)
-    try:
+    if os.path.exists(out) and not out.is_dir():
+        raise OutputError(f"cannot write to {out}: it is not a folder")
+    with _parents(out), _workplace(out) as work:
         yield work
         _move(work, out)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
 
 
-def _workplace(out: Path) -> Path:
-    """A new folder on the file system of `out`: inside it where it exists, beside it where not."""
+@contextmanager
+def _parents(out: Path) -> Iterator[None]:
+    """The folders above `out`; those made here go when the block fails and nothing else came into them."""
+    missing = [parent for parent in out.parents if not os.path.exists(parent)]  # innermost first
     try:
-        if out.exists() and not out.is_dir():
-            raise OutputError(f"cannot write to {out}: it is not a folder")
-        place = out if out.is_dir() else out.parent
-        place.mkdir(parents=True, exist_ok=True)
-        work = place / f".{out.name}.partial-{secrets.token_hex(4)}"
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot write to {out}: {error.strerror}") from error
+        yield
+    except BaseException:
+        for parent in missing:
+            with suppress(OSError):
+                parent.rmdir()
+        raise
+
+
+@contextmanager
+def _workplace(out: Path) -> Iterator[Path]:
+    """A folder on the file system of `out`, locked while the block runs: inside `out` if that exists."""
+    prefix = f".{out.name}.partial-"
+    for place in (out, out.parent):
+        _sweep(place, prefix)
+    work = (out if out.is_dir() else out.parent) / (prefix + secrets.token_hex(4))
+    try:
         work.mkdir()
+        lock = _lock(work)
     except OSError as error:
         raise OutputError(f"cannot write to {out}: {error.strerror}") from error
-    return work
+    try:
+        yield work
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+        os.close(lock)
+
+
+def _lock(folder: Path) -> int:
+    """A handle that holds the folder until it is closed, by us or by our death; raises OSError."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(handle)
+        raise
+    return handle
+
+
+def _sweep(place: Path, prefix: str) -> None:
+    """Remove the work folders whose owner is dead."""
+    with suppress(OSError):
+        for path in [path for path in place.iterdir() if path.name.startswith(prefix)]:
+            with suppress(OSError):  # somebody is at work there, or it is not ours to remove
+                lock = _lock(path)
+                shutil.rmtree(path, ignore_errors=True)
+                os.close(lock)
 
 
 def _move(work: Path, out: Path) -> None:

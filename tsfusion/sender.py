@@ -49,6 +49,11 @@ class Sender:
         self._asked_again = False
         self._blocked = False  # the data socket takes no more for now
 
+    @property
+    def heard(self) -> float:
+        """When the server last said something, `time.monotonic()`; 0 = never. From any thread."""
+        return self._heard
+
     def wake(self) -> None:
         """There is something new in the outbox. From any thread."""
         with suppress(OSError):  # it is being woken already, or has ended

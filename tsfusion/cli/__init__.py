@@ -15,7 +15,8 @@ import typer
 from tsfusion.cli import config, datasets, doctor, mesh, replay, serve, status
 from tsfusion.errors import TsfusionError
 
-INTERRUPTED = 130
+INTERRUPTED = 128 + signal.SIGINT
+TERMINATED = 128 + signal.SIGTERM
 # Typer's own click or the real one, by version: both name it so.
 _UsageError: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
@@ -51,8 +52,11 @@ def _root(
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run a command line (default: this process's) and exit.
 
-    Every error raised on purpose becomes one line on stderr and status 1; a wrong flag status 2; Ctrl-C 130.
+    Every error raised on purpose becomes one line on stderr and status 1; a wrong flag status 2; Ctrl-C 130;
+    SIGTERM 143.
     """
+    if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:  # as `__main__` leaves it
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, _terminated)
     try:
         code = app(arguments, standalone_mode=False)
@@ -62,6 +66,10 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         _fail(f"{error.format_message()} (see --help)", 2)  # type: ignore[attr-defined]
     except (KeyboardInterrupt, typer.Abort):
         _fail("interrupted", INTERRUPTED)
+    except SystemExit as ended:
+        if ended.code == TERMINATED:
+            _fail("terminated", TERMINATED)
+        raise
     except BrokenPipeError:  # the reader of our output went away
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
@@ -77,4 +85,4 @@ def _fail(message: str, code: int) -> NoReturn:
 
 def _terminated(signum: int, frame: FrameType | None) -> NoReturn:
     """Unwind as Ctrl-C does: what was half-built goes, children end."""
-    sys.exit(128 + signum)
+    sys.exit(TERMINATED)

@@ -3,7 +3,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -34,28 +34,46 @@ def list_(
         show.as_json(rows)
         return
     for row in rows:
-        typer.echo("  ".join(row.values()))
+        typer.echo(_line(**row))
     if not rows:
         typer.echo(f"no datasets in or under {path}", err=True)
 
 
-def _layouts() -> list[dict[str, str]]:
+def _line(name: str, *, description: str = "", path: str = "", sensor: str = "", keyframes: int = 0) -> str:
+    return f"{path}  {name}  {sensor}  {keyframes} keyframes" if path else f"{name:<16}  {description}"
+
+
+def _layouts() -> list[dict[str, Any]]:
     from tsfusion.datasets import LAYOUTS
 
-    return [{"name": f"{name:<16}", "description": description} for name, description in LAYOUTS]
+    return [{"name": name, "description": description} for name, description in LAYOUTS]
 
 
-def _found(path: Path, depth: int) -> Iterator[dict[str, str]]:
-    """The datasets in and under a folder, not looking inside one that was found."""
+def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
+    """The datasets in and under a folder, not looking inside one that was found.
+
+    Raises:
+        DatasetError: when there is no folder.
+    """
     from tsfusion.datasets import open_dataset
     from tsfusion.errors import DatasetError
 
     try:
         dataset = open_dataset(path)
     except DatasetError:
-        below = sorted(child for child in path.iterdir() if child.is_dir()) if path.is_dir() and depth else []
-        for child in below:
+        if not path.is_dir():
+            raise
+        for child in _folders_in(path) if depth else []:
             yield from _found(child, depth - 1)
         return
-    count = f"{len(dataset)} keyframes"
-    yield {"path": str(path), "name": dataset.name, "sensor": str(dataset.sensor), "keyframes": count}
+    yield {
+        "path": str(path), "name": dataset.name, "sensor": dataset.sensor, "keyframes": len(dataset),
+    }  # fmt: skip
+
+
+def _folders_in(path: Path) -> list[Path]:
+    try:
+        return sorted(child for child in path.iterdir() if child.is_dir())
+    except OSError as error:
+        typer.echo(f"cannot look into {path}: {error.strerror}", err=True)
+        return []

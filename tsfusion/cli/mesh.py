@@ -19,6 +19,7 @@ MAP_FILE = "map.tsf"
 
 
 def mesh(
+    context: typer.Context,
     source: Annotated[
         str,
         typer.Argument(
@@ -47,10 +48,22 @@ def mesh(
     if preview is not None:
         check_writable(preview, (".png",))
     if "://" in source:
+        options.refuse(
+            context, (*options.MAP_FLAGS, "threads", "config"),
+            "has no effect on a live server's map: give it to `tsfusion serve`",
+        )  # fmt: skip
         from tsfusion.client import fetch_mesh
 
         made = fetch_mesh(source, control=control, min_weight=min_weight)
     else:
+        options.refuse(
+            context, ("control",), f"has no effect on {source}: only a live server (tcp://…) has one"
+        )
+        if source.endswith(".tsf"):
+            options.refuse(
+                context, options.MAP_FLAGS,
+                "has no effect on a saved map: give the state folder or the journal to fuse it anew",
+            )  # fmt: skip
         chosen = options.configuration(
             config, voxel_size=voxel_size, sensor=sensor, regularizer=regularizer, smoothness=smoothness,
             max_range=max_range, threads=threads,

@@ -4,6 +4,7 @@
 A flag beats its environment variable, which beats the file, which beats the default in `tsfusion.config`.
 """
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from tsfusion.config import Config
 
 _MAP = "Map"
+MAP_FLAGS = ("voxel_size", "sensor", "regularizer", "smoothness", "max_range")
 
 ConfigFile = Annotated[
     Path | None,
@@ -86,10 +88,24 @@ Control = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for a program to read.")]
 
 
-def configuration(file: Path | None, **flags: Any) -> "Config":
+def refuse(context: typer.Context, names: Collection[str], reason: str) -> None:
+    """Raise InvalidConfig when one of these parameters was typed: it would be ignored.
+
+    One that the environment sets may be meant for other commands.
+    """
+    from tsfusion.errors import InvalidConfig
+
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if parameter.name in names and source is not None and source.name == "COMMANDLINE":
+            raise InvalidConfig(f"{parameter.opts[0]} {reason}")
+
+
+def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **flags: Any) -> "Config":
     """The file's settings (or the defaults) with every flag that was given on top.
 
     Args:
+        preset: settings of the `volume` table that beat the defaults, and nothing else.
         flags: settings of the `volume` and `server` tables by name; None = not given.
 
     Raises:
@@ -97,7 +113,7 @@ def configuration(file: Path | None, **flags: Any) -> "Config":
     """
     from tsfusion import config
 
-    loaded = config.load(file)
+    loaded = config.load(file, **(preset or {}))
     volume, server = (
         {key: value for key, value in flags.items() if key in struct.__struct_fields__}
         for struct in (config.VolumeConfig, config.ServerConfig)

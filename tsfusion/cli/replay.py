@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from tsfusion.datasets import Dataset
 
 _DATASET = "Dataset"
+_STREET = {"sensor": "stereo", "voxel_size": 0.1}  # a Kinect sees no street
 Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Where the results go.")]
 Rate = Annotated[
     float | None,
@@ -27,6 +28,7 @@ Limit = Annotated[
 
 
 def replay(
+    context: typer.Context,
     path: Annotated[
         Path, typer.Argument(metavar="PATH", help="A dataset; `tsfusion datasets list` names the layouts.")
     ],
@@ -68,25 +70,36 @@ def replay(
     """Send a recorded dataset (or a journal) through the whole path; leave mesh, picture and figures."""
     from tsfusion.datasets import select
 
-    chosen = options.configuration(
-        config, voxel_size=voxel_size, sensor=sensor, regularizer=regularizer, smoothness=smoothness,
-        max_range=max_range, threads=threads,
-    )  # fmt: skip
+    if connect is not None:
+        options.refuse(
+            context, (*options.MAP_FLAGS, "threads", "state"),
+            "has no effect with --connect: give it to the `tsfusion serve` that listens there",
+        )  # fmt: skip
+    else:
+        options.refuse(context, ("control",), "has no effect without --connect")
     dataset = _open(path, sequence=sequence, modality=modality, poses=poses)
+    chosen = options.configuration(
+        config, preset={"sensor": dataset.sensor}, voxel_size=voxel_size, sensor=sensor,
+        regularizer=regularizer, smoothness=smoothness, max_range=max_range, threads=threads,
+    )  # fmt: skip
     if start or stride > 1 or max_keyframes is not None:
         dataset = select(dataset, start=start, stride=stride, limit=max_keyframes)
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count} frames {reason}", err=True)
     _run(
         dataset, out, chosen, connect=connect, control=control, rate=rate, min_weight=min_weight, state=state,
-        sensor_given=sensor is not None, json=json,
+        json=json,
     )  # fmt: skip
 
 
 def _open(path: Path, **given: Any) -> "Dataset":
     if path.suffix == ".mcap" or any(path.glob("*.mcap")) or any(path.glob("journal/*.mcap")):
+        from tsfusion.errors import DatasetError
         from tsfusion.recording import Recording
 
+        for name, value in given.items():
+            if value is not None:
+                raise DatasetError(f"--{name} has no effect on a journal")
         return Recording(path)
     from tsfusion.datasets import open_dataset
 
@@ -97,11 +110,14 @@ def demo(
     *,
     out: Out = Path("out"),
     world: Annotated[str, typer.Option(metavar="NAME", help="room, or street (stereo, 0.1 m).")] = "room",
-    count: Annotated[int, typer.Option(metavar="N", min=1, help="Keyframes.")] = 40,
+    count: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Keyframes; else 90, in the street 40.")
+    ] = None,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the sensor's noise.")] = 0,
     rate: Annotated[
-        float, typer.Option("--rate", metavar="HZ", min=1e-3, help="Keyframes per second.")
-    ] = 4.0,
+        float | None,
+        typer.Option("--rate", metavar="HZ", min=1e-3, help="Keyframes per second; else 6, in the street 4."),
+    ] = None,
     voxel_size: options.VoxelSize = None,
     sensor: options.Sensor = None,
     regularizer: options.Regularizer = None,
@@ -112,16 +128,17 @@ def demo(
     json: options.Json = False,
 ) -> None:
     """Scan a synthetic world whose surface is known, and measure how far the mesh is from it."""
-    if world == "street":  # a Kinect sees no street
-        sensor, voxel_size = sensor or "stereo", voxel_size or 0.1
     chosen = options.configuration(
-        config, voxel_size=voxel_size, sensor=sensor, regularizer=regularizer, smoothness=smoothness,
-        threads=threads,
+        config, preset=_STREET if world == "street" else None, voxel_size=voxel_size, sensor=sensor,
+        regularizer=regularizer, smoothness=smoothness, threads=threads,
     )  # fmt: skip
     from tsfusion.datasets import Synthetic
 
-    dataset = Synthetic(world, sensor=chosen.volume.sensor, count=count, seed=seed)
-    _run(dataset, out, chosen, rate=rate, min_weight=min_weight, sensor_given=True, json=json)
+    path, usual_count, usual_rate = ("tour", 90, 6.0) if world == "room" else (None, 40, 4.0)
+    dataset = Synthetic(
+        world, sensor=chosen.volume.sensor, count=count or usual_count, seed=seed, path=path
+    )  # fmt: skip
+    _run(dataset, out, chosen, rate=rate or usual_rate, min_weight=min_weight, json=json)
 
 
 def _run(
@@ -129,7 +146,6 @@ def _run(
     out: Path,
     chosen: "Config",
     *,
-    sensor_given: bool,
     json: bool,
     state: Path | None = None,
     control: str | None = None,
@@ -137,16 +153,14 @@ def _run(
 ) -> None:
     from tsfusion import pipeline
     from tsfusion.cli import show
-    from tsfusion.config import VolumeConfig, override
+    from tsfusion.config import override
 
-    volume = chosen.volume
-    if not sensor_given and volume.sensor == VolumeConfig().sensor:
-        volume = override(volume, sensor=dataset.sensor)
     server = override(chosen.server, listen="tcp://127.0.0.1:0", state=str(state)) if state else None
+    client = override(chosen.client, control=control)
     with show.progress(quiet=json) as progress:
         run = pipeline.replay(
-            dataset, out, volume=volume, server=server, client=override(chosen.client, control=control),
-            progress=progress, **settings,
+            dataset, out, volume=chosen.volume, server=server, client=client, progress=progress,
+            **settings,
         )  # fmt: skip
     if json:
         show.as_json(run)

@@ -111,5 +111,5 @@ def _open(
     known = [key for key in inspect.signature(opener).parameters if key not in ("path", "root")]
     unknown = sorted(set(options) - set(known))
     if unknown:
-        raise DatasetError(f"the {name} layout has no option {unknown[0]!r}; it has {', '.join(known)}")
+        raise DatasetError(f"a {name} dataset takes no `{unknown[0]}`")
     return opener(*places, **options)

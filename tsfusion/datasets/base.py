@@ -100,12 +100,12 @@ def select(
     """
     if stride < 1:
         raise DatasetError(f"stride must be >= 1, got {stride}")
+    if limit is not None and limit < 1:
+        raise DatasetError(f"limit must be >= 1, got {limit}")
     indices = range(len(dataset))[start:stop:stride][:limit]
     if not indices:
-        raise DatasetError(
-            f"{dataset.name} has {len(dataset)} keyframes; "
-            f"start {start}, stop {stop} and limit {limit} leave none"
-        )
+        kept = f"after the first {start}" if stop is None else f"from {start} up to {stop}"
+        raise DatasetError(f"{dataset.name} has {len(dataset)} keyframes, none {kept}")
     return Selection(dataset, indices)
 
 

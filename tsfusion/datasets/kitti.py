@@ -134,7 +134,7 @@ def _only_sequence(root: Path) -> str:
     if len(found) != 1:
         raise DatasetError(
             f"{root} holds {len(found)} KITTI sequences with data ({', '.join(found)}); "
-            "expected the option `sequence` to name one, or the path of one"
+            "name one with --sequence, or give its own path"
         )
     return found[0]
 

@@ -71,9 +71,11 @@ class Synthetic(Frames):
         seed: of the noise; the world does not change.
         width: of the image, pixels; default 320 in the room, 620 in the street. The noise in pixels stays.
         color: render colour too.
+        path: of the sensor; `circle` (looking in, default) or `tour` (all of it) in the room, `drive` in the
+            street.
 
     Raises:
-        DatasetError: for an unknown world or sensor, or a count or width below 1.
+        DatasetError: for an unknown world, sensor or path, or a count or width below 1.
     """
 
     def __init__(
@@ -86,6 +88,7 @@ class Synthetic(Frames):
         noise: bool = True,
         width: int | None = None,
         color: bool = True,
+        path: str | None = None,
     ) -> None:
         if world not in WORLDS:
             raise DatasetError(f"world must be one of {', '.join(WORLDS)}, got {world!r}")
@@ -99,6 +102,10 @@ class Synthetic(Frames):
         self.name, self.sensor, self.skipped = f"synthetic {world}", sensor, {}
         self.timestamps_ns = np.arange(count, dtype=np.int64) * FRAME_NS
         self.world = WORLDS[world](count)
+        path = path or next(iter(self.world.paths))
+        if path not in self.world.paths:
+            raise DatasetError(f"path must be one of {', '.join(self.world.paths)}, got {path!r}")
+        self._path = self.world.paths[path]
         self.camera = _resized(CAMERAS[world], width)
         self.lidar = LIDARS[world]
         self._count, self._seed, self._noise, self._with_color = count, seed, noise, color
@@ -113,7 +120,7 @@ class Synthetic(Frames):
 
     def pose(self, index: int) -> NDArray[np.float64]:
         """(4, 4) T_world_camera of a keyframe; for LiDAR, T_world_sensor."""
-        T = self.world.path(index, self._count)
+        T = self._path(index, self._count)
         return T @ _T_CAMERA_LIDAR if self.sensor == "lidar" else T
 
     def _load(self, index: int) -> Keyframe:

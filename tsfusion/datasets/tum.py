@@ -177,7 +177,7 @@ def _trajectory(root: Path, given: str | Path | None) -> Path:
     if not found:
         raise DatasetError(
             f"{root / 'groundtruth.txt'} is missing; expected `timestamp tx ty tz qx qy qz qw` a line "
-            "(a trajectory elsewhere can be given with the option `trajectory`)"
+            "(one elsewhere: open_dataset(path, trajectory=FILE) in Python)"
         )
     return found[0]
 

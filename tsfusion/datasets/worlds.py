@@ -25,12 +25,12 @@ class World:
 
     Attributes:
         solids: (m, 11) float64, metres.
-        path: `path(index, count)` → (4, 4) T_world_camera, OpenCV axes.
+        paths: `paths[name](index, count)` → (4, 4) T_world_camera, OpenCV axes; the first is the usual one.
     """
 
     name: str
     solids: Solids
-    path: Callable[[int, int], NDArray[np.float64]]
+    paths: dict[str, Callable[[int, int], NDArray[np.float64]]]
 
     def distance(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Signed distance to the nearest surface: (n, 3) metres → (n,) float64, negative inside solids.
@@ -54,14 +54,14 @@ class World:
 
 
 def room() -> World:
-    """A 4×4×2.8 m room with a sphere, a box and a column; the path is a closed circle looking inward."""
+    """A 4×4×2.8 m room with a sphere, a box and a column; the usual path is a closed circle."""
     solids = [
         solid(ROOM, (0, 0, 1.4), (2, 2, 1.4), INTERIOR),
         solid(SPHERE, (0.6, 0.3, 0.5), (0.5, 0.5, 0.5), MARBLE),
         solid(BOX, (-0.7, 0.6, 0.4), (0.4, 0.3, 0.4), WOOD),
         solid(CYLINDER, (0, -0.8, 0.6), (0.15, 0.15, 0.6), STRIPES),
     ]
-    return World("room", np.array(solids), _circle)
+    return World("room", np.array(solids), {"circle": _circle, "tour": _tour})
 
 
 def street(length: float = 80.0) -> World:
@@ -78,7 +78,7 @@ def street(length: float = 80.0) -> World:
     for side in (-1, 1):
         solids += _houses(rng[side], side, length)
         solids += _kerbside(rng[side], side, length)
-    return World("street", np.array(solids), _drive)
+    return World("street", np.array(solids), {"drive": _drive})
 
 
 def solid(
@@ -110,6 +110,21 @@ def _circle(index: int, count: int) -> NDArray[np.float64]:
     angle = 2.5 + 2 * np.pi * index / count
     position = np.array([0.9 * np.cos(angle), 0.9 * np.sin(angle), 1.5])
     return look_at(position, np.array([1.2 * np.cos(angle - 2.5), 1.2 * np.sin(angle - 2.5), 0.6]))
+
+
+def _tour(index: int, count: int) -> NDArray[np.float64]:
+    """All of the room in three rounds: the things, the foot of the walls, their upper part."""
+    first, second = 2 * count // 5, 7 * count // 10
+    start, end = next(part for part in ((0, first), (first, second), (second, count)) if index < part[1])
+    angle = 2.5 + 2 * np.pi * (index - start) / (end - start)
+    toward = np.array([np.cos(angle), np.sin(angle), 0.0])
+    wall = 2 * toward / np.abs(toward).max()
+    if index < first:
+        height, ahead = ((1.1, 0.0), (2.1, 0.7))[index % 2]  # the things, and the floor behind them
+        return look_at(1.66 * toward + (0, 0, height), ahead * toward + (0, 0, 0.4))
+    if index < second:
+        return look_at(0.8 * toward + (0, 0, 2.1), wall + (0, 0, 0.4))
+    return look_at(0.03 * toward + (0, 0, 1.31), wall + (0, 0, 1.7))
 
 
 def _drive(index: int, count: int) -> NDArray[np.float64]:

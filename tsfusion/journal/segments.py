@@ -197,15 +197,15 @@ def pack(frames: Sequence[Any], session: bytes, seq: int) -> bytes:
 
 
 def _unpack_message(message: Message, position: Position) -> Record:
-    data = memoryview(message.data)
-    session, seq, count = _HEAD.unpack_from(data)
+    body = memoryview(message.data)
+    session, seq, count = _HEAD.unpack_from(body)
     at = _HEAD.size + 4 * count
     frames = []
-    for length in struct.unpack_from(f"<{count}I", data, _HEAD.size):
-        frames.append(data[at : at + length])
+    for length in struct.unpack_from(f"<{count}I", body, _HEAD.size):
+        frames.append(body[at : at + length])
         at += length
-    if at != data.nbytes:
-        raise JournalError(f"a record of {data.nbytes} bytes at {position} says it has {at}")
+    if at != body.nbytes:
+        raise JournalError(f"a record of {body.nbytes} bytes at {position} says it has {at}")
     return Record(position, session, seq, message.log_time, frames)
 
 
