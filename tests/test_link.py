@@ -134,6 +134,7 @@ def test_a_stop_drains_and_a_start_goes_on(tmp_path: Path, offline_hash: str) ->
             scanner.start()
         for scanner in scanners:
             scanner.join(DEADLINE)
+        server.process.send_signal(signal.SIGTERM)  # as `timeout` does: to the process, and to its group
         assert server.terminate() == 0
     with serving(tmp_path) as server:
         status = fetch_status(server.address)

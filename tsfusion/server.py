@@ -2,6 +2,7 @@
 """The server: a gateway that journals and acknowledges keyframes, and the fuser it keeps at work."""
 
 import signal
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -19,6 +20,7 @@ from tsfusion.spool import lock_folder
 from tsfusion.transport import Addresses, sockets
 
 JOURNAL_FOLDER = "journal"
+_SECOND_SIGNAL = 1.0  # seconds after the first
 
 
 def run(
@@ -26,7 +28,8 @@ def run(
 ) -> int:
     """Serve until SIGTERM or SIGINT, then drain the journal into the map and write a checkpoint.
 
-    A second signal skips the drain: the next start makes up for it. Call it from the main thread.
+    A second signal, a second or more after the first, skips the drain: the next start makes up for it.
+    Call it from the main thread.
 
     Args:
         server: `listen` with port 0 draws a random one.
@@ -87,8 +90,14 @@ def _signals() -> Iterator[list[int]]:
     """The signals to stop that have come, as they come."""
     came: list[int] = []
 
+    last = 0.0
+
     def note(number: int, _frame: FrameType | None) -> None:
-        came.append(number)
+        nonlocal last
+        # `timeout` and some supervisors signal a process and then its group: one request, not two
+        if not came or time.monotonic() - last > _SECOND_SIGNAL:
+            came.append(number)
+            last = time.monotonic()
 
     before = {number: signal.signal(number, note) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
