@@ -274,8 +274,8 @@ def replayed(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         ("", [], "stereo"),
         ("[volume]\nvoxel_size = 0.5\n", [], "stereo"),
         ("[volume]\nsensor = 'kinect'\n", [], "kinect"),
-        ("[volume]\nsensor = 'tof'\n", [], "tof"),
-        ("[volume]\nsensor = 'tof'\n", ["--sensor", "kinect"], "kinect"),
+        ("[volume]\nsensor = 'lidar'\n", [], "lidar"),
+        ("[volume]\nsensor = 'lidar'\n", ["--sensor", "kinect"], "kinect"),
     ],
 )
 @pytest.mark.parametrize("command", [["replay", "synthetic:street:stereo"], ["demo", "--world", "street"]])
@@ -283,8 +283,6 @@ def test_a_sensor_that_was_chosen_beats_the_datasets(
     here: Here, replayed: dict[str, Any], tmp_path: Path, command: list[str], toml: str, flags: list[str],
     sensor: str,
 ) -> None:  # fmt: skip
-    if command[0] == "demo" and sensor == "tof":
-        pytest.skip("there is no synthetic tof camera")
     (tmp_path / "a.toml").write_text(toml)
     assert "recorded" in one_line(here(*command, "--config", "a.toml", *flags))
     assert replayed["volume"].sensor == sensor

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import pytest
 import zmq
-from wire import DEADLINE, Server, serving, until, wall
+from wire import DEADLINE, Server, connected, serving, until, wall
 
 from tsfusion import Client, VolumeConfig, codec, config, fuser_link
 from tsfusion.client import fetch_status
@@ -37,18 +37,6 @@ from tsfusion.transport import Command, messages, request, sockets, work
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     with serving(tmp_path_factory.mktemp("shared")) as server:
         yield server
-
-
-@contextmanager
-def connected(kind: Callable[..., sockets.AnySocket], address: str) -> Iterator[sockets.AnySocket]:
-    context: zmq.Context[Any] = zmq.Context()
-    made = kind(context)
-    try:
-        made.connect(address)
-        yield made
-    finally:
-        made.close()
-        context.term()
 
 
 # --- strangers ---

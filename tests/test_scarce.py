@@ -5,14 +5,12 @@ import errno
 import os
 import resource
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zmq
-from wire import DEADLINE, Server, alive, serving, until, wall
+from wire import DEADLINE, Server, alive, connected, serving, until, wall
 
 from tsfusion import Client, journal
 from tsfusion.config import ClientConfig
@@ -32,18 +30,6 @@ QUICK = ClientConfig(stall_timeout=0.5)
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     with serving(tmp_path_factory.mktemp("shared")) as server:
         yield server
-
-
-@contextmanager
-def connected(kind: Callable[..., sockets.AnySocket], address: str) -> Iterator[sockets.AnySocket]:
-    context: zmq.Context[Any] = zmq.Context()
-    made = kind(context)
-    try:
-        made.connect(address)
-        yield made
-    finally:
-        made.close()
-        context.term()
 
 
 # --- scarce file descriptors, a full or vanishing disk ---

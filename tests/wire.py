@@ -13,9 +13,11 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import zmq
 
 from tsfusion import Intrinsics, Keyframe
 from tsfusion.config import ServerConfig, VolumeConfig
+from tsfusion.transport import sockets
 
 DEADLINE = 60.0
 CAMERA = Intrinsics(40.0, 40.0, 31.5, 23.5)
@@ -118,3 +120,16 @@ def alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     return Path(f"/proc/{pid}/stat").read_text().split(")")[1].split()[0] != "Z"
+
+
+@contextmanager
+def connected(kind: Callable[..., sockets.AnySocket], address: str) -> Iterator[sockets.AnySocket]:
+    """A socket of this kind at an address, gone afterwards."""
+    context: zmq.Context[Any] = zmq.Context()
+    made = kind(context)
+    try:
+        made.connect(address)
+        yield made
+    finally:
+        made.close()
+        context.term()

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.transport import KeyframeTimes
+from tsfusion.transport.messages import Spread
 
 TARGET_MS = 500.0
 
@@ -28,17 +29,6 @@ _STAMPS = (
     "timestamp_ns", "captured_ns", "sent_ns", "received_ns", "durable_ns",
     "fuse_start_ns", "fused_ns", "meshed_ns", "clock_bound_ns",
 )  # fmt: skip
-
-
-class Spread(msgspec.Struct, frozen=True):
-    """Milliseconds over the keyframes that have both stamps; all 0 where none has."""
-
-    count: int = 0
-    mean: float = 0.0
-    p50: float = 0.0
-    p95: float = 0.0
-    p99: float = 0.0
-    max: float = 0.0
 
 
 class Summary(msgspec.Struct, frozen=True):
@@ -76,9 +66,10 @@ def spread(values_ms: NDArray[np.float64]) -> Spread:
     known = values_ms[~np.isnan(values_ms)]
     if not len(known):
         return Spread()
-    p50, p95, p99 = np.percentile(known, (50, 95, 99))
-    figures = [round(float(x), 3) for x in (known.mean(), p50, p95, p99, known.max())]
-    return Spread(len(known), *figures)
+    mean, p50, p95, p99, most = (
+        round(float(x), 3) for x in (known.mean(), *np.percentile(known, (50, 95, 99)), known.max())
+    )
+    return Spread(count=len(known), mean=mean, p50=p50, p95=p95, p99=p99, max=most)
 
 
 def slope(values_ms: NDArray[np.float64]) -> float:

@@ -27,6 +27,7 @@ from tsfusion.keyframe import Keyframe
 from tsfusion.mesh import Mesh
 from tsfusion.results import RECORD, building
 from tsfusion.transport import KeyframeTimes, Status
+from tsfusion.transport.messages import Spread
 
 AHEAD = 3  # keyframes under way when no rate is asked for: fusing, waiting, travelling
 PATIENCE = 60.0  # seconds without a newly fused keyframe before a run gives up
@@ -73,9 +74,9 @@ class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
     server_start_seconds: float | None  # None: the server was there already
     map_hash: str
     blocks: int
-    delay_ms: ledger.Spread
+    delay_ms: Spread
     delay_slope_ms_per_keyframe: float
-    stages_ms: dict[str, ledger.Spread]
+    stages_ms: dict[str, Spread]
     clock_bound_ms: float
     mesh: dict[str, int]
     accuracy: Accuracy | None

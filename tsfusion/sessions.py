@@ -10,8 +10,9 @@ from typing import Literal
 import numpy as np
 from msgspec import Struct
 
+from tsfusion import ledger
 from tsfusion.journal import Position, Scan
-from tsfusion.transport.messages import DelaySummary, Stamps
+from tsfusion.transport.messages import Spread, Stamps
 
 _MAX_ROUTES = 1024
 _DELAYS = 1024
@@ -185,12 +186,6 @@ class Delays:
         if captured_ns and offset_ns is not None:
             self._recent_ms.append((fused_ns - captured_ns - offset_ns) / 1e6)
 
-    def summary(self) -> DelaySummary:
+    def summary(self) -> Spread:
         """Mean, percentiles and maximum."""
-        if not self._recent_ms:
-            return DelaySummary()
-        values = np.array(self._recent_ms)
-        p50, p95, p99 = np.percentile(values, (50, 95, 99)).tolist()
-        return DelaySummary(
-            count=len(values), mean=float(values.mean()), p50=p50, p95=p95, p99=p99, max=float(values.max())
-        )
+        return ledger.spread(np.array(self._recent_ms))

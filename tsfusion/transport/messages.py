@@ -114,8 +114,8 @@ class MeshLayout(Struct, frozen=True, kw_only=True):
     colors: bool
 
 
-class DelaySummary(Struct, frozen=True, kw_only=True):
-    """Milliseconds from capture to fused of the last keyframes (at most 1024)."""
+class Spread(Struct, frozen=True, kw_only=True):
+    """Milliseconds over so many keyframes; all 0 where there is none."""
 
     count: int = 0
     mean: float = 0.0
@@ -147,7 +147,7 @@ class Status(Struct, frozen=True, kw_only=True):
     journal_damaged: int  # records the recovery scan could not read
     fuser_restarts: int
     peak_rss_bytes: dict[str, int]  # server (gateway), fuser
-    delay_ms: DelaySummary
+    delay_ms: Spread  # capture to fused, of the last 1024 keyframes
     config: dict[str, Any]  # server and volume settings
     versions: dict[str, str]
 
