@@ -33,8 +33,3 @@ def start(threads: int | None = None) -> ModuleType:
             )
     module: ModuleType = ti
     return module
-
-
-def threads() -> int | None:
-    """The thread count Taichi runs with; None before `start`."""
-    return _started_threads

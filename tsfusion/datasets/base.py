@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What a dataset is, and how its files are read with one clear error each."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -36,7 +37,7 @@ class Dataset(Protocol):
     def __iter__(self) -> Iterator[Keyframe]: ...
 
 
-class Frames:
+class Frames(ABC):
     """Indexing and iteration over `_load(index)`; files are opened there, not before."""
 
     name: str
@@ -44,11 +45,11 @@ class Frames:
     timestamps_ns: NDArray[np.int64] | None = None
     skipped: dict[str, int]
 
-    def __len__(self) -> int:
-        raise NotImplementedError
+    @abstractmethod
+    def __len__(self) -> int: ...
 
-    def _load(self, index: int) -> Keyframe:
-        raise NotImplementedError
+    @abstractmethod
+    def _load(self, index: int) -> Keyframe: ...
 
     def __getitem__(self, index: int) -> Keyframe:
         count = len(self)
