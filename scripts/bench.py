@@ -126,16 +126,13 @@ class Stages:
 
     @contextmanager
     def watch(self) -> Iterator[None]:
-        from tsfusion.kernels import blocks, integrate, rays, smooth
-        from tsfusion.scratch import Scratch
+        from tsfusion.kernels import blocks, integrate, points, rays, smooth
 
         watched: list[tuple[Any, str, str]] = [
-            (rays, "rays_from_image", "rays"), (rays, "rays_from_points", "rays"),
-            (blocks, "touch_blocks", "allocate"), (blocks, "index_blocks", "allocate"),
-            (blocks, "insert_blocks", "allocate"), (integrate, "integrate_rays", "integrate"),
-            (integrate, "refuse_blocks", "check"), (smooth, "smooth_rays", "regularise"),
-            (smooth, "commit_regularised", "regularise"), (integrate, "commit_blocks", "commit"),
-            (integrate, "commit_color", "commit color"), (Scratch, "clear", "clear"),
+            (rays, "rays_from_image", "rays"), (points, "rays_from_points", "rays"),
+            (blocks, "insert_blocks", "allocate"), (integrate, "add_rays", "integrate"),
+            (integrate, "largest_weights", "check"), (smooth, "smooth_rays", "regularise"),
+            (smooth, "commit_votes", "regularise"),
         ]  # fmt: skip
         originals = [(owner, name, getattr(owner, name)) for owner, name, _ in watched]
         for owner, name, stage in watched:

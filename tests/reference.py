@@ -14,24 +14,54 @@ Voxel = tuple[int, int, int]
 WEIGHT_ONE = 16
 MAX_BUNDLE_WEIGHT = 255
 MAX_DISTANCE = 1023
-NEVER = 1 << 25
+NEVER = 1 << 30
 
 
-def sample(parameters: NDArray[np.float64], z: float, confidence: float) -> tuple[int, int]:
-    """(weight, half-width in 2⁻⁸ voxel) of one sample at depth z."""
-    floor, slope, z0, low, high, voxel_size, full, _, _ = parameters
+def sample(parameters: NDArray[np.float64], z: float, trust: float) -> tuple[int, int]:
+    """(weight, half-width in 2⁻⁸ voxel) of samples at depth z whose confidences sum to `trust`."""
+    floor, slope, z0, low, high, voxel_size, full = parameters[:7]
     sigma = floor + slope * (z - z0) * (z - z0)
-    ratio = min(1.0, full / sigma)
-    weight = max(int(np.floor(WEIGHT_ONE * ratio * ratio * confidence / 255.0 + 0.5)), 1)
+    weight = int(WEIGHT_ONE * trust / 255.0 * min(1.0, max((full / sigma) ** 2, 1 / WEIGHT_ONE)) + 0.5)
     half = int(min(max(3.0 * sigma / voxel_size, low), high) * 256.0)
-    return weight, half
+    return min(max(weight, 1), MAX_BUNDLE_WEIGHT), half
 
 
-def make_ray(end: Any, direction: Any, half: int, weight: int, color: int = 0) -> NDArray[np.int32]:
-    """One ray of eight int32; `end` int 2⁻¹⁰ voxel, `direction` float of any length."""
-    direction = np.asarray(direction, np.float64)
-    unit = np.floor(direction / np.linalg.norm(direction) * 65536 + 0.5).astype(np.int64)
-    return np.array([*end, *unit, half << 16 | weight, color], np.int32)
+def make_ray(
+    end: Any, direction: Any, half: int, weight: int, color: int = 0, normal: Any = None
+) -> NDArray[np.int32]:
+    """One ray; `end` int 2⁻¹⁰ voxel, `direction` float of any length, `half` 2⁻⁸ voxel; with the `normal` of
+    the plane it ends on, or none."""
+    u = np.asarray(direction, np.float64) / np.linalg.norm(direction)
+    unit = [int(x) for x in np.floor(u * 65536 + 0.5)]
+    gradient = u if normal is None else np.asarray(normal) / (np.asarray(normal) @ u)
+    loss = [int(x) for x in np.floor(gradient * 65536 + 0.5)]
+    exact = [int(e) << 6 for e in end]
+    start = [e - (u * half >> 8) for e, u in zip(exact, unit, strict=True)]
+    voxel = [s >> 16 for s in start]
+    crossing, interval = [NEVER] * 3, [NEVER] * 3
+    for a in range(3):
+        if abs(unit[a]) > 8:
+            inverse = 65536.0 / abs(unit[a])
+            gap = 65536 - (start[a] & 65535) if unit[a] > 0 else start[a] & 65535
+            interval[a], crossing[a] = int(inverse * 65536.0), int(gap * inverse)
+    distance = sum((e - (v << 16) - 32768) * g for e, v, g in zip(exact, voxel, loss, strict=True)) >> 16
+    downward = sum(1 << a for a in range(3) if unit[a] < 0)
+    loss = [-g if x < 0 else g for g, x in zip(loss, unit, strict=True)]
+    packed = np.uint32(weight << 24 | color).astype(np.int32)
+    last = (distance, half << 9, half << 8 | downward, packed)
+    return np.array([*voxel, *crossing, *interval, *loss, *last], np.int32)
+
+
+def weight_of(ray: NDArray[np.int32]) -> int:
+    return int(ray[15]) >> 24 & 255
+
+
+def end_of(ray: NDArray[np.int32]) -> Voxel:
+    """The voxel in which the ray ends."""
+    for (voxel, _), leaves in crossed_until(ray):
+        if leaves > int(ray[14]):
+            return voxel
+    raise AssertionError
 
 
 def fixed(p: Any) -> NDArray[np.int64]:
@@ -40,26 +70,22 @@ def fixed(p: Any) -> NDArray[np.int64]:
 
 def crossed(ray: NDArray[np.int32]) -> list[tuple[Voxel, int]]:
     """The voxels a ray crosses in its band, in order, with their distances (2⁻¹⁶ voxel)."""
-    end, u = [int(x) for x in ray[:3]], [int(x) for x in ray[3:6]]
-    half = (int(ray[6]) >> 16) << 8
-    start = [(e << 6) - (a * half >> 16) for e, a in zip(end, u, strict=True)]
-    voxel = [s >> 16 for s in start]
-    crossing, interval = [NEVER] * 3, [NEVER] * 3
-    for a in range(3):
-        if abs(u[a]) > 128:
-            inverse = 65536.0 / abs(u[a])
-            gap = 65536 - (start[a] & 65535) if u[a] > 0 else start[a] & 65535
-            interval[a], crossing[a] = int(inverse * 65536.0), int(gap * inverse)
-    distance = sum(((e << 6) - (v << 16) - 32768) * a for e, v, a in zip(end, voxel, u, strict=True)) >> 16
+    return [found for found, _ in crossed_until(ray)]
+
+
+def crossed_until(ray: NDArray[np.int32]) -> list[tuple[tuple[Voxel, int], int]]:
+    """As `crossed`, each with where along the band the ray leaves it."""
+    voxel, crossing, interval, loss = ([int(x) for x in ray[i : i + 3]] for i in (0, 3, 6, 9))
+    distance = int(ray[12])
     found = []
     while True:
-        found.append(((voxel[0], voxel[1], voxel[2]), distance))
         axis = min(range(3), key=lambda a: (crossing[a], a))
-        if crossing[axis] >= 2 * half:
+        found.append((((voxel[0], voxel[1], voxel[2]), distance), crossing[axis]))
+        if crossing[axis] >= int(ray[13]):
             return found
         crossing[axis] += interval[axis]
-        voxel[axis] += 1 if u[axis] >= 0 else -1
-        distance -= abs(u[axis])
+        voxel[axis] += -1 if int(ray[14]) >> axis & 1 else 1
+        distance -= loss[axis]
 
 
 def blocks_of(rays: NDArray[np.int32]) -> set[Voxel]:
@@ -74,28 +100,65 @@ def integrate(rays: NDArray[np.int32], quanta_per_voxel: int) -> dict[Voxel, tup
     """(Σ w·m, Σ w) of every voxel the rays cross."""
     sums: dict[Voxel, tuple[int, int]] = defaultdict(lambda: (0, 0))
     for ray in rays:
-        w = int(ray[6]) & 65535
+        w = weight_of(ray)
         for voxel, distance in crossed(ray):
             s, total = sums[voxel]
             sums[voxel] = (s + w * quantize(distance, quanta_per_voxel), total + w)
     return dict(sums)
 
 
-def bundle(samples: list[tuple[Any, Any, int, int]]) -> list[NDArray[np.int32]]:
-    """Bundle one tile's samples (point, origin, weight, half-width; positions in voxels)."""
-    groups: dict[Voxel, list[tuple[Any, Any, int, int]]] = defaultdict(list)
-    for one in samples:
-        x, y, z = fixed(one[0]) >> 10
-        groups[int(x), int(y), int(z)].append(one)
-    rays = []
-    for voxel, members in groups.items():
-        w = sum(m[2] for m in members)
-        inside = sum((fixed(m[0]) & 1023) * m[2] for m in members) // w
-        end = np.array(voxel) * 1024 + inside
-        origin = sum(fixed(m[1]) * m[2] for m in members) / w / 1024.0
-        half = sum(m[3] * m[2] for m in members) // w
-        rays.append(make_ray(end, (end + 0.5) / 1024.0 - origin, half, min(w, MAX_BUNDLE_WEIGHT)))
-    return rays
+def colors(rays: NDArray[np.int32]) -> dict[Voxel, tuple[int, int, int, int]]:
+    """(Σ R, Σ G, Σ B, n) of the voxels that rays end in."""
+    sums: dict[Voxel, tuple[int, int, int, int]] = defaultdict(lambda: (0, 0, 0, 0))
+    for ray in rays:
+        packed = int(ray[15])
+        vote = (packed >> 16 & 255, packed >> 8 & 255, packed & 255, 1)
+        voxel = end_of(ray)
+        r, g, b, n = (a + c for a, c in zip(sums[voxel], vote, strict=True))
+        sums[voxel] = (r, g, b, n)
+    return dict(sums)
+
+
+CELLS = [(1, 1), (2, 1), (2, 2), (3, 2), (3, 3), (4, 3), (4, 4), (6, 4), (6, 6), (12, 6), (12, 12)]
+
+
+def cell_shape(depths: NDArray[np.float64], pitch: float) -> tuple[int, int]:
+    """(width, height) of a tile's cells in pixels; `pitch` = voxels a pixel spans at 1 m."""
+    pixel = float(depths[depths > 0].mean()) * pitch
+    return max((w, h) for w, h in CELLS if w * h * pixel**2 <= 1 or w == 1)
+
+
+def tile_plane(depths: NDArray[np.float64], sigma: float, voxel_size: float) -> tuple[float, float] | None:
+    """(∂z/∂x, ∂z/∂y) a pixel, if the tile is flat."""
+    y, x = np.nonzero(depths)
+    if len(y) < 36 or sigma >= voxel_size:
+        return None
+    system = np.stack([x, y, np.ones(len(x))], axis=1)
+    plane, *_ = np.linalg.lstsq(system, depths[y, x], rcond=None)
+    residual = float(((system @ plane - depths[y, x]) ** 2).mean())
+    if residual >= 2 * sigma**2 + (0.1 * voxel_size) ** 2:
+        return None
+    return float(plane[0]), float(plane[1])
+
+
+def layers(z: NDArray[np.float64], tolerance: Any) -> list[NDArray[np.bool_]]:
+    """The valid samples of a cell by layer of depth, nearest first."""
+    found, floor = [], 0.0
+    while (z > floor).any():
+        ceiling = z[z > floor].min() + tolerance(z[z > floor].min())
+        found.append((z > floor) & (z <= ceiling))
+        floor = ceiling
+    return found
+
+
+def runs(points: NDArray[np.float64], voxel_size: float) -> list[NDArray[np.intp]]:
+    """Consecutive valid points within a voxel of the first of them."""
+    found: list[list[int]] = []
+    for i in np.flatnonzero(np.isfinite(points).all(axis=1)):
+        if not found or np.linalg.norm(points[i] - points[found[-1][0]]) > voxel_size:
+            found.append([])
+        found[-1].append(int(i))
+    return [np.array(run) for run in found]
 
 
 def solve(y: Any, a: Any, t: Any, smoothness: float) -> NDArray[np.float64]:
@@ -133,44 +196,6 @@ def smooth(
         for (voxel, _), x in zip(voxels, solve(y, a, t, smoothness), strict=True):
             votes[voxel].append(x)
     return {voxel: float(np.mean(xs)) for voxel, xs in votes.items()}
-
-
-def commit(
-    sums: NDArray[np.int64], slots: NDArray[np.int32], frame: NDArray[np.int64], sign: int
-) -> NDArray[np.int64]:
-    """The map's sums after adding (or taking away) a keyframe's."""
-    after = sums.copy()
-    for slot, row in zip(slots, frame, strict=True):
-        after[slot] += sign * row
-    return after
-
-
-def commit_color(
-    rgn: NDArray[np.int64], blue: NDArray[np.int32], slots: NDArray[np.int32], frame: Any, sign: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Colour lanes after one vote a voxel: the mean of `frame[block, voxel]`'s list of (r, g, b)."""
-    rgn, blue = rgn.copy(), blue.copy()
-    for (block, voxel), colors in frame.items():
-        r, g, b = (int(sum(c)) // len(colors) for c in zip(*colors, strict=True))
-        rgn[slots[block], voxel] += sign * ((r << 40) + (g << 16) + 1)
-        blue[slots[block], voxel] += sign * b
-    return rgn, blue
-
-
-def refused(sums: Any, slots: Any, frame: Any, frame_colors: Any, rgn: Any, sign: int) -> int:
-    """How many blocks would have too many votes, or fewer than none."""
-    count = 0
-    for block, slot in enumerate(slots):
-        bad = False
-        for voxel in range(512):
-            weight = sign * (int(frame[block, voxel]) & 0x7FFFFFF)
-            votes = sign * ((block, voxel) in frame_colors)
-            if slot >= 0:
-                weight += int(sums[slot, voxel]) & 0x7FFFFFF
-                votes += (int(rgn[slot, voxel]) & 0xFFFF) if votes else 0
-            bad = bad or not 0 <= weight < 1 << 26 or not 0 <= votes < 1 << 15
-        count += bad
-    return count
 
 
 def raw_values(sums: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -234,12 +259,11 @@ def vertex(values: dict[Voxel, float], colors: dict[Voxel, Any], position: Any) 
     return normal / np.linalg.norm(normal), np.floor(rgb + 0.5)
 
 
-def segment_voxels(ray: NDArray[np.int32]) -> set[Voxel]:
-    """Voxels the band's segment runs through, found by dense sampling: no traversal to get wrong."""
-    end, u = ray[:3] / 1024.0, ray[3:6] / 65536.0
-    half = (int(ray[6]) >> 16) / 256.0
+def segment_voxels(end: Any, direction: Any, half: float) -> set[Voxel]:
+    """Voxels within `half` voxels of `end` along a line, by dense sampling: no traversal to get wrong."""
     t = np.linspace(-half, half, 20001)
-    return {(int(x), int(y), int(z)) for x, y, z in np.floor(end + t[:, None] * u)}
+    u = np.asarray(direction, np.float64) / np.linalg.norm(direction)
+    return {(int(x), int(y), int(z)) for x, y, z in np.floor(np.asarray(end) / 1024.0 + t[:, None] * u)}
 
 
 def neighbours(voxel: Voxel) -> set[Voxel]:

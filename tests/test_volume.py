@@ -39,8 +39,7 @@ def test_the_volume_holds_exactly_the_twins_sums(bundle: bool) -> None:
     keyframe = Keyframe(depth=depth, intrinsics=scenes.CAMERA, T_world_camera=VIEWS[0].T_world_camera)
     volume = volume_of([keyframe, keyframe], bundle=bundle)
     scratch = volume._scratch
-    spans = zip(scratch.band_start, scratch.band_count, strict=True)
-    rays = np.vstack([scratch.rays[start : start + count] for start, count in spans])
+    rays = np.vstack([scratch.rays[start : start + count] for start, count in scratch.bands[:, :2]])
     expected = reference.integrate(rays, QUANTA_PER_VOXEL)
     found = {}
     for slot, corner in enumerate(unpack_keys(volume._store.keys) * 8):
@@ -151,10 +150,9 @@ def test_a_shift_by_whole_blocks_shifts_the_map() -> None:
 def test_no_smoothness_equals_plain_fusion() -> None:
     volume = volume_of(VIEWS, regularizer="ray", smoothness=0.0)
     used = volume._store.used()
-    sums, smoothed = volume._store.sums[used], volume._store.regularised[used]
+    sums, correction = volume._store.sums[used], volume._store.correction[used]
     weight = sums & ((1 << 27) - 1)
-    plain = (sums >> 27) / np.maximum(weight, 1)
-    assert np.abs(plain - smoothed)[weight > 0].max() <= 1 / 16
+    assert np.abs(correction / np.maximum(weight, 1)).max() <= 1 / 16
 
 
 def test_dirty_blocks_are_reported_once() -> None:
@@ -177,7 +175,7 @@ def test_an_empty_keyframe_changes_nothing() -> None:
     before = volume.map_hash()
     empty = np.zeros(scenes.SHAPE, np.uint16)
     stats = volume.integrate(Keyframe(depth=empty, intrinsics=scenes.CAMERA, T_world_camera=np.eye(4)))
-    assert (stats.samples, stats.rays, stats.voxels, stats.blocks) == (0, 0, 0, 0)
+    assert (stats.samples, stats.rays, stats.updates, stats.blocks) == (0, 0, 0, 0)
     assert stats.invalid == empty.size
     volume.integrate(Keyframe(points=np.zeros((0, 3), np.float32), T_world_camera=np.eye(4)))
     assert volume.map_hash() == before
@@ -218,17 +216,58 @@ def test_the_limits_hold_and_leave_the_map_alone() -> None:
         volume_of(VIEWS[:1], max_blocks_per_keyframe=3)
 
 
-@pytest.mark.parametrize("layer", ["sums", "color_rgn"])
-def test_full_voxels_refuse_more_and_lose_nothing(layer: str) -> None:
+def test_full_voxels_refuse_more_and_lose_nothing() -> None:
     volume = volume_of(VIEWS[:1])
-    array = volume._store.layers()[layer]
-    slot, voxel = np.argwhere(array != 0)[0]
-    array[slot, voxel] = (1 << 26 if layer == "sums" else 1 << 15) - 1
-    before = bytes_of(volume)
+    slot, voxel = np.argwhere(volume._store.sums != 0)[0]
+    volume._store.sums[slot, voxel] = (1 << 26) - 1
+    volume._store.bounds[slot] = (1 << 26) - 1
+    before, blocks = bytes_of(volume), volume.stats().blocks
     with pytest.raises(WeightOverflow):
         volume.integrate(VIEWS[0])
+    moved = VIEWS[0].T_world_camera.copy()
+    moved[:3, 3] += 0.1  # needs blocks that must not stay either
+    with pytest.raises(WeightOverflow):
+        volume.integrate(replace(VIEWS[0], T_world_camera=moved))
     assert bytes_of(volume) == before
+    assert volume.stats().blocks == blocks
     volume.retract(VIEWS[0])  # making room is always allowed
+
+
+def test_a_bound_that_is_too_cautious_is_looked_up() -> None:
+    volume = volume_of(VIEWS[:1])
+    volume._store.bounds[:] = (1 << 26) - 1
+    volume.integrate(VIEWS[1])
+    assert volume.map_hash() == volume_of(VIEWS[:2]).map_hash()
+    weight = (volume._store.sums & ((1 << 27) - 1)).max(axis=1)
+    touched = volume._scratch.touched_slots
+    assert (volume._store.bounds[touched] == weight[touched]).all()
+
+
+def test_a_settled_colour_takes_no_more_votes() -> None:
+    volume = volume_of(VIEWS[:1])
+    voted = volume._store.color_rgn != 0
+    volume._store.color_rgn[voted] |= 1 << 15
+    before = volume._store.color_rgn.copy()
+    volume.integrate(VIEWS[0])
+    assert (volume._store.color_rgn[voted[: len(before)]] == before[voted]).all()
+
+
+def test_a_keyframe_too_heavy_for_one_go_gives_the_same_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = volume_of(VIEWS[:3])
+    monkeypatch.setattr("tsfusion.integration.PART_WEIGHT", 20_000)
+    parts = volume_of(VIEWS[:3])
+    assert len(list(parts._integrator._parts())) > 3
+    assert parts.map_hash() == whole.map_hash()
+    parts.retract(VIEWS[2])
+    assert parts.map_hash() == volume_of(VIEWS[:2]).map_hash()
+
+
+def test_a_full_set_of_missing_blocks_is_grown_and_loses_nothing() -> None:
+    volume = Volume(voxel_size=0.005, threads=2)
+    volume._scratch.missing = np.zeros(64, np.int64)
+    volume.integrate(VIEWS[0])
+    assert len(volume._scratch.missing) > 64
+    assert volume.map_hash() == volume_of(VIEWS[:1], voxel_size=0.005).map_hash()
 
 
 @pytest.mark.parametrize(

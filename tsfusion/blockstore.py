@@ -19,18 +19,23 @@ class BlockStore:
     """Slots 0 … count-1, each with a key and one row of 512 voxels in every layer.
 
     Layers, (slot, 512): `sums` int64; with colour `color_rgn` int64 and `color_b` int32; when smoothing
-    `regularised` float32 (kernels/integrate.py and smooth.py say what they hold). `dirty` is (slot,) uint8.
+    `correction` float32 (kernels/integrate.py and smooth.py say what they hold). Beside them, one number a
+    block: `dirty` uint8, and int32 `stamps` (the last keyframe that touched it), `places` (where in that
+    keyframe's list), `bounds` (no voxel has more weight than this).
     A layer the map does not have is one row of zeros, so that kernels can be handed it.
     """
 
-    def __init__(self, *, color: bool, regularised: bool) -> None:
+    def __init__(self, *, color: bool, corrected: bool) -> None:
         self.count = 0
         self.hash_keys = np.zeros(4 * _FIRST_CAPACITY, np.int64)
         self.hash_slots = np.zeros(4 * _FIRST_CAPACITY, np.int32)
         self._keys = GrowingArray((), np.int64, _FIRST_CAPACITY)
         self._dirty = GrowingArray((), np.uint8, _FIRST_CAPACITY)
-        present = {"sums": True, "color_rgn": color, "color_b": color, "regularised": regularised}
-        dtypes = {"sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "regularised": np.float32}
+        self._stamps, self._places, self._bounds = (
+            GrowingArray((), np.int32, _FIRST_CAPACITY) for _ in range(3)
+        )
+        present = {"sums": True, "color_rgn": color, "color_b": color, "correction": corrected}
+        dtypes = {"sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "correction": np.float32}
         self._layers = {
             name: GrowingArray((CUBE,), dtypes[name], _FIRST_CAPACITY if there else 1)
             for name, there in present.items()
@@ -54,12 +59,24 @@ class BlockStore:
         return self._layers["color_b"].array
 
     @property
-    def regularised(self) -> NDArray[np.float32]:
-        return self._layers["regularised"].array
+    def correction(self) -> NDArray[np.float32]:
+        return self._layers["correction"].array
 
     @property
     def dirty(self) -> NDArray[np.uint8]:
         return self._dirty.array
+
+    @property
+    def stamps(self) -> NDArray[np.int32]:
+        return self._stamps.array
+
+    @property
+    def places(self) -> NDArray[np.int32]:
+        return self._places.array
+
+    @property
+    def bounds(self) -> NDArray[np.int32]:
+        return self._bounds.array
 
     def layers(self) -> dict[str, NDArray[Any]]:
         """The layers the map has, by name."""
@@ -68,17 +85,20 @@ class BlockStore:
     def insert(self, keys: NDArray[np.int64]) -> None:
         """Append blocks with distinct new keys; their voxels are zero."""
         first, self.count = self.count, self.count + len(keys)
-        for array in (self._keys, self._dirty, *(self._layers[name] for name in self._present)):
+        for array in self._arrays():
             array.reserve(self.count)
         self._keys.array[first : self.count] = keys
         if 2 * self.count > len(self.hash_keys):
-            size = 1 << (4 * self.count - 1).bit_length()
-            self.hash_keys = np.zeros(size, np.int64)
-            self.hash_slots = np.zeros(size, np.int32)
-            first = 0
-        blocks.insert_blocks(
-            self._keys.array, first, self.count - first, first, self.hash_keys, self.hash_slots
-        )
+            self._rebuild_hash(1 << (4 * self.count - 1).bit_length())
+        else:
+            self._index(first)
+
+    def drop(self, count: int) -> None:
+        """Take back the newest blocks, so that `count` remain; their voxels must be zero."""
+        for array in (self._keys, self._dirty, self._stamps, self._places, self._bounds):
+            array.array[count : self.count] = 0
+        self.count = count
+        self._rebuild_hash(len(self.hash_keys))
 
     def slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
         """(n,) slots of keys, -1 where there is no such block."""
@@ -105,10 +125,23 @@ class BlockStore:
             chunk = used[i : i + _CHUNK]
             yield self.keys[chunk], self._layers[layer].array[chunk]
 
+    def _rebuild_hash(self, size: int) -> None:
+        self.hash_keys = np.zeros(size, np.int64)
+        self.hash_slots = np.zeros(size, np.int32)
+        self._index(0)
+
+    def _index(self, first: int) -> None:
+        blocks.insert_blocks(
+            self._keys.array, first, self.count - first, first, self.hash_keys, self.hash_slots
+        )
+
     @property
     def bytes_per_block(self) -> int:
-        arrays = (self._keys, self._dirty, *(self._layers[name] for name in self._present))
-        return sum(array.item_bytes for array in arrays)
+        return sum(array.item_bytes for array in self._arrays())
+
+    def _arrays(self) -> tuple[GrowingArray, ...]:
+        layers = (self._layers[name] for name in self._present)
+        return (self._keys, self._dirty, self._stamps, self._places, self._bounds, *layers)
 
     @property
     def nbytes(self) -> int:

@@ -26,7 +26,7 @@ from tsfusion.errors import CheckpointError
 MAGIC = b"TSFMAP1\n"
 CHUNK = 1024  # blocks
 CUBE = 512  # voxels a block
-DTYPES = {"sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "regularised": np.float32}
+DTYPES = {"sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "correction": np.float32}
 
 
 class Header(msgspec.Struct, kw_only=True):

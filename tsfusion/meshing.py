@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tsfusion.kernels import marching, mc_tables
 from tsfusion.kernels.blocks import find_blocks
 from tsfusion.kernels.integrate import CUBE
-from tsfusion.kernels.rays import WEIGHT_ONE
+from tsfusion.kernels.samples import WEIGHT_ONE
 from tsfusion.mesh import Mesh
 
 BATCH = 4096  # blocks; 22 MB of gathered values
@@ -27,7 +27,7 @@ class Layers:
     sums: NDArray[np.int64]
     color_rgn: NDArray[np.int64] | None
     color_b: NDArray[np.int32]
-    regularised: NDArray[np.float32] | None
+    correction: NDArray[np.float32] | None
     hash_keys: NDArray[np.int64]
     hash_slots: NDArray[np.int32]
     voxel_size: float
@@ -81,7 +81,7 @@ class _Batch:
         self.neighbours = _slots(around.ravel(), layers).reshape(around.shape)
         self.meshed = (_index(wanted, around) >= 0).astype(np.uint8)
         self.padded = np.empty((len(keys), marching.PADDED), np.float32)
-        smoothed = layers.regularised
+        smoothed = layers.correction
         marching.gather_values(
             len(keys), self.neighbours, layers.sums,
             np.zeros((1, CUBE), np.float32) if smoothed is None else smoothed, int(smoothed is not None),

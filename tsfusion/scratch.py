@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Memory for one keyframe at a time: its rays, the blocks they touch and its sums. Reused, never per call."""
+"""Memory for one keyframe at a time: its rays and what they touch. Reused, never per call."""
 
 from typing import Any
 
@@ -7,170 +7,132 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.config import SensorModel
-from tsfusion.errors import MapFull
-from tsfusion.kernels import blocks, rays, smooth
-from tsfusion.kernels.integrate import CUBE
-from tsfusion.kernels.traversal import MAX_CROSSED, RAY_FIELDS
+from tsfusion.kernels import points, rays, smooth
+from tsfusion.kernels.integrate import CUBE, TOUCHED_COUNT, TOUCHED_HEADER, TOUCHED_OVERFLOW
+from tsfusion.kernels.traversal import BAND_FIELDS, MAX_CROSSED, RAY_FIELDS, SAMPLES
 from tsfusion.keyframe import Keyframe
 from tsfusion.storage import GrowingArray
 
 BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thread count
 FULL_WEIGHT_SIGMA = 0.25  # voxels: noise below this no longer shows in the map
+_NOTHING = {len(shape): np.zeros(shape, np.uint8) for shape in ((1,), (1, 3), (1, 1, 3))}
 
 
 class Scratch:
-    """Rays of the current keyframe (`rays`, by `band_start`/`band_count`) and what they touch.
+    """Rays of the current keyframe (`rays`, by `bands`), the slots of the blocks they touch (`touched`), and
+    the keys of those that the map does not have (`missing`, a hash set)."""
 
-    After `touch`, block `i < touched` has key `touched_keys[i]`, slot `touched_slots[i]` (-1 = new) and the
-    sums `frame[i]`; `table`/`table_index` find `i` from a key.
-    """
-
-    def __init__(self, *, color: bool, regularised: bool, max_blocks: int) -> None:
+    def __init__(self, *, color: bool, regularised: bool) -> None:
         self.color = color
         self.colored = False  # the current keyframe brings colour, and the map keeps it
-        self.regularised = regularised
-        self.max_blocks = max_blocks
         self.rays = np.zeros((0, RAY_FIELDS), np.int32)
-        self.band_start = np.zeros(BANDS, np.int32)
-        self.band_count = np.zeros(BANDS, np.int32)
-        self.band_samples = np.zeros(BANDS, np.int32)
-        self._bundles = (
-            np.zeros((BANDS, rays.TABLE_SIZE), np.int64),
-            np.zeros((BANDS, rays.TABLE_SIZE, rays.SUM_FIELDS), np.int32),
-            np.zeros((BANDS, rays.TABLE_SIZE, 3), np.int64),
-            np.zeros((BANDS, rays.TILE_SAMPLES), np.int32),
-        )
-        self.signal = np.zeros((BANDS, MAX_CROSSED, smooth.SIGNAL_FIELDS), np.float32)
-        self.crossed = np.zeros((BANDS, MAX_CROSSED, 2), np.int32)
-        self._overflow = np.zeros(1, np.int32)
-        self._set_table_size(1 << 14)
-        self._frame = GrowingArray((CUBE,), np.int64, 1024)
-        self._frame_color = GrowingArray((CUBE, 2), np.int64, 1024 if color else 1)
+        self.deferred = np.zeros(0, np.int32)
+        self.bands = np.zeros((BANDS, BAND_FIELDS), np.int32)
+        self.missing = np.zeros(1 << 15, np.int64)
+        self._depths = np.zeros((BANDS, rays.TILE_SAMPLES), np.int32)
+        self._touched = GrowingArray((), np.int32, 1024)
+        units = BANDS if regularised else 1
+        self.signal = np.zeros((units, MAX_CROSSED, smooth.SIGNAL_FIELDS), np.float32)
+        self.crossed = np.zeros((units, MAX_CROSSED, 2), np.int32)
         self._votes = GrowingArray((CUBE,), np.int64, 1024 if regularised else 1)
-        self.touched = 0
 
     @property
-    def frame(self) -> NDArray[np.int64]:
-        return self._frame.array
-
-    @property
-    def frame_color(self) -> NDArray[np.int64]:
-        return self._frame_color.array
+    def touched(self) -> NDArray[np.int32]:
+        """Count, overflow of `missing`, and the slots (kernels/integrate.py)."""
+        return self._touched.array
 
     @property
     def votes(self) -> NDArray[np.int64]:
+        """Votes of the smoother for each touched block; zero between keyframes."""
         return self._votes.array
+
+    @property
+    def touched_slots(self) -> NDArray[np.int32]:
+        return self.touched[TOUCHED_HEADER : TOUCHED_HEADER + self.touched[TOUCHED_COUNT]]
+
+    def reserve_touched(self, blocks: int) -> None:
+        """Make room for touching all `blocks` of the map."""
+        self._touched.reserve(TOUCHED_HEADER + blocks)
 
     def make_rays(self, keyframe: Keyframe, model: SensorModel, voxel_size: float, bundle: bool) -> int:
         """Fill `rays`; returns the number of valid samples."""
         parameters = model_parameters(model, voxel_size, keyframe.baseline_fx)
         self.colored = self.color and keyframe.color is not None
         T = keyframe.T_world_camera
-        common = (
-            int(bundle), *self._bundles, self._rays_for(keyframe.shape),
-            self.band_start, self.band_count, self.band_samples,
-        )  # fmt: skip
         if keyframe.kind == "points":
+            self._reserve_rays(len(keyframe.measurement))
             pose = np.ascontiguousarray(T[:3]) / voxel_size
             origins = keyframe.origins if keyframe.origins is not None else np.zeros(3, np.float32)
-            rays.rays_from_points(
+            points.rays_from_points(
                 keyframe.points, origins.reshape(-1, 3),
-                *_optional(keyframe.color, (1, 3)), *_optional(keyframe.confidence, (1,)),
-                pose, parameters, *common,
+                *_optional(keyframe.color if self.colored else None, 2), *_optional(keyframe.confidence, 1),
+                pose, parameters, int(bundle), self.rays, self.bands,
             )  # fmt: skip
         else:
-            assert keyframe.intrinsics is not None  # checked by Keyframe
-            if keyframe.kind == "disparity":
-                assert keyframe.baseline_fx is not None
-                scale = keyframe.baseline_fx / keyframe.disparity_scale
-            else:
-                scale = keyframe.depth_scale if keyframe.measurement.dtype == np.uint16 else 1.0
-            K = keyframe.intrinsics
-            R = T[:3, :3] / voxel_size
-            du, dv = R[:, 0] / K.fx, R[:, 1] / K.fy
-            camera = np.stack([du, dv, R[:, 2] - K.cx * du - K.cy * dv, T[:3, 3] / voxel_size])
+            height, width = keyframe.shape
+            self._reserve_rays(-(-height // rays.TILE) * -(-width // rays.TILE) * rays.TILE_SAMPLES)
             rays.rays_from_image(
-                keyframe.measurement, int(keyframe.kind == "disparity"), scale,
-                *_optional(keyframe.color, (1, 1, 3)), *_optional(keyframe.confidence, (1, 1)),
-                camera, parameters, *common,
+                keyframe.measurement, int(keyframe.kind == "disparity"), _depth_scale(keyframe),
+                *_optional(keyframe.color if self.colored else None, 3), *_optional(keyframe.confidence, 2),
+                _camera(keyframe, voxel_size), parameters, int(bundle), self._depths, self.rays, self.bands,
             )  # fmt: skip
-        return int(self.band_samples.sum())
+        return int(self.bands[:, SAMPLES].sum())
 
-    def touch(self, map_keys: NDArray[np.int64], map_slots: NDArray[np.int32]) -> None:
-        """Find the blocks the rays cross and make room for their sums.
+    def take_missing(self) -> NDArray[np.int64]:
+        """Keys of the missing blocks, in an order that only the set decides; it is empty after."""
+        keys = self.missing[self.missing != 0]
+        self.missing[:] = 0
+        return keys
 
-        Raises:
-            MapFull: when they are more than `max_blocks` (a wrong scale or pose, usually).
-        """
-        while True:
-            self.table[:] = 0
-            self._overflow[0] = 0
-            blocks.touch_blocks(self.rays, self.band_start, self.band_count, self.table, self._overflow)
-            count = 0
-            if not self._overflow[0]:
-                count = blocks.index_blocks(
-                    self.table, self.table_index, map_keys, map_slots, self.touched_keys, self.touched_slots
-                )
-                if count <= min(len(self.touched_keys), self.max_blocks):
-                    break
-            if count > self.max_blocks or len(self.table) > 8 * self.max_blocks:
-                raise MapFull(
-                    f"a keyframe may touch at most max_blocks_per_keyframe = {self.max_blocks} blocks, "
-                    f"this one touches {count or 'far more'}; check its depth scale, or raise voxel_size"
-                )
-            self._set_table_size(2 * len(self.table))
-        self.touched = count
-        self._frame.reserve(count)
-        if self.colored:
-            self._frame_color.reserve(count)
-        if self.regularised:
-            self._votes.reserve(count)
+    def grow_missing(self) -> None:
+        """Double the set after an overflow; it is empty after."""
+        self.missing = np.zeros(2 * len(self.missing), np.int64)
+        self.touched[TOUCHED_OVERFLOW] = 0
 
-    def clear(self) -> None:
-        """Zero the sums of the current keyframe, whatever became of it."""
-        self.frame[: self.touched] = 0
-        if self.colored:
-            self.frame_color[: self.touched] = 0
-        if self.regularised:
-            self.votes[: self.touched] = 0
-        self.touched = 0
+    def reserve_votes(self) -> None:
+        self._votes.reserve(int(self.touched[TOUCHED_COUNT]))
 
     @property
     def nbytes(self) -> int:
         arrays = [value for value in vars(self).values() if isinstance(value, np.ndarray)]
-        arrays += self._bundles
-        return sum(a.nbytes for a in arrays) + sum(
-            g.array.nbytes for g in (self._frame, self._frame_color, self._votes)
-        )
+        return sum(a.nbytes for a in arrays) + sum(g.array.nbytes for g in (self._touched, self._votes))
 
-    def _set_table_size(self, size: int) -> None:
-        self.table = np.zeros(size, np.int64)
-        self.table_index = np.zeros(size, np.int32)
-        self.touched_keys = np.zeros(size // 4, np.int64)  # a fuller table is grown first
-        self.touched_slots = np.zeros(size // 4, np.int32)
-
-    def _rays_for(self, shape: tuple[int, ...]) -> NDArray[np.int32]:
-        if len(shape) == 2:
-            tiles = -(-shape[0] // rays.TILE) * -(-shape[1] // rays.TILE)
-        else:
-            tiles = -(-shape[0] // rays.TILE_SAMPLES)
-        if len(self.rays) < tiles * rays.TILE_SAMPLES:
-            self.rays = np.zeros((tiles * rays.TILE_SAMPLES, RAY_FIELDS), np.int32)
-        return self.rays
+    def _reserve_rays(self, count: int) -> None:
+        if len(self.rays) < count:
+            self.rays = np.zeros((count, RAY_FIELDS), np.int32)
+            self.deferred = np.zeros(count, np.int32)
 
 
 def model_parameters(model: SensorModel, voxel_size: float, baseline_fx: float | None) -> NDArray[np.float64]:
-    """The kernel's `model` argument (9 float64, see kernels/rays.py)."""
+    """The kernel's `model` argument (11 float64, see kernels/rays.py)."""
     slope, z0 = model.sigma_slope, model.sigma_z0
     if baseline_fx is not None and model.disparity_sigma > 0:
         slope, z0 = model.disparity_sigma / baseline_fx, 0.0
     return np.array(
         [
             model.sigma_floor, slope, z0, model.min_support, model.max_support, voxel_size,
-            FULL_WEIGHT_SIGMA * voxel_size, model.min_range, model.max_range,
+            FULL_WEIGHT_SIGMA * voxel_size, model.min_range, model.max_range, 1.0,
+            3 * 256 / voxel_size,
         ]
     )  # fmt: skip
 
 
-def _optional(array: NDArray[np.uint8] | None, shape: tuple[int, ...]) -> tuple[NDArray[Any], int]:
-    return (np.zeros(shape, np.uint8), 0) if array is None else (array, 1)
+def _depth_scale(keyframe: Keyframe) -> float:
+    """Metres a unit, or metres times units (disparity)."""
+    if keyframe.kind == "disparity":
+        assert keyframe.baseline_fx is not None  # checked by Keyframe
+        return keyframe.baseline_fx / keyframe.disparity_scale
+    return keyframe.depth_scale if keyframe.measurement.dtype == np.uint16 else 1.0
+
+
+def _camera(keyframe: Keyframe, voxel_size: float) -> NDArray[np.float64]:
+    """(4, 3) float64: what a pixel's step right, its step down, pixel (0, 0) and the centre are in voxels."""
+    K, T = keyframe.intrinsics, keyframe.T_world_camera
+    assert K is not None  # checked by Keyframe
+    R = T[:3, :3] / voxel_size
+    du, dv = R[:, 0] / K.fx, R[:, 1] / K.fy
+    return np.stack([du, dv, R[:, 2] - K.cx * du - K.cy * dv, T[:3, 3] / voxel_size])
+
+
+def _optional(array: NDArray[np.uint8] | None, dims: int) -> tuple[NDArray[Any], int]:
+    return (_NOTHING[dims], 0) if array is None else (array, 1)

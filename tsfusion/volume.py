@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from tsfusion import checkpoint, runtime
 from tsfusion.blockstore import BlockStore, pack_keys, unpack_keys
 from tsfusion.config import VolumeConfig, make, override
-from tsfusion.errors import InvalidConfig, MapError, MapFull, WeightOverflow
+from tsfusion.errors import InvalidConfig, MapError
+from tsfusion.integration import Integrator
 from tsfusion.kernels import integrate, smooth
 from tsfusion.kernels.integrate import CUBE
-from tsfusion.kernels.rays import WEIGHT_ONE
+from tsfusion.kernels.samples import WEIGHT_ONE
+from tsfusion.kernels.traversal import COUNT
 from tsfusion.keyframe import Keyframe
 from tsfusion.mesh import Mesh
 from tsfusion.meshing import Layers, extract
@@ -33,7 +35,7 @@ class IntegrateStats(msgspec.Struct, frozen=True):
     rays: int
     blocks: int  # touched
     new_blocks: int
-    voxels: int  # changed
+    updates: int  # of voxels by rays
 
 
 class VolumeStats(msgspec.Struct, frozen=True):
@@ -74,10 +76,9 @@ class Volume:
         self.keyframes = 0
         runtime.start(config.threads)
         self._smooths = model.regularizer != "off"
-        self._scratch = Scratch(
-            color=config.color, regularised=self._smooths, max_blocks=config.max_blocks_per_keyframe
-        )
-        self._store = BlockStore(color=config.color, regularised=self._smooths)
+        self._scratch = Scratch(color=config.color, regularised=self._smooths)
+        self._store = BlockStore(color=config.color, corrected=self._smooths)
+        self._integrator = Integrator(self._store, self._scratch, config)
 
     def integrate(self, keyframe: Keyframe) -> IntegrateStats:
         """Add a keyframe. On an error the map is as it was.
@@ -127,7 +128,7 @@ class Volume:
             sums=store.sums,
             color_rgn=store.color_rgn if self.config.color else None,
             color_b=store.color_b,
-            regularised=store.regularised if self._smooths else None,
+            correction=store.correction if self._smooths else None,
             hash_keys=store.hash_keys,
             hash_slots=store.hash_slots,
             voxel_size=self.config.voxel_size,
@@ -215,84 +216,29 @@ class Volume:
     def _apply(self, keyframe: Keyframe, sign: int) -> IntegrateStats:
         if sign < 0 and self.keyframes == 0:
             raise MapError("cannot retract a keyframe from a map that holds none")
-        scratch = self._scratch
+        scratch, store, before = self._scratch, self._store, self._store.count
         model = self.config.model(keyframe.sensor)
         samples = scratch.make_rays(keyframe, model, self.config.voxel_size, self.config.bundle)
-        ray_count = int(scratch.band_count.sum())
-        scratch.touch(self._store.hash_keys, self._store.hash_slots)
-        try:
-            self._sum_rays()
-            self._check(sign)
-            new = self._allocate(sign)
-            if self._smooths and sign > 0:
-                self._smooth_rays()
-            voxels = self._commit(sign)
-            touched = scratch.touched
-        finally:
-            scratch.clear()
+        updates = self._integrator.apply(sign)
+        if self._smooths:
+            self._smooth(sign)
         self.keyframes += sign
         total = int(np.prod(keyframe.shape))
         return IntegrateStats(
-            samples=samples, invalid=total - samples, rays=ray_count,
-            blocks=touched, new_blocks=new, voxels=voxels,
+            samples=samples, invalid=total - samples, rays=int(scratch.bands[:, COUNT].sum()),
+            blocks=len(scratch.touched_slots), new_blocks=store.count - before, updates=updates,
         )  # fmt: skip
 
-    def _sum_rays(self) -> None:
-        s = self._scratch
-        integrate.integrate_rays(
-            s.rays, s.band_start, s.band_count, s.table, s.table_index,
-            int(s.colored), s.frame, s.frame_color,
-        )  # fmt: skip
-
-    def _check(self, sign: int) -> None:
-        s = self._scratch
-        refused = integrate.refuse_blocks(
-            s.touched_slots, s.touched, sign, s.frame, s.frame_color, self._store.sums,
-            self._store.color_rgn, int(s.colored),
-        )  # fmt: skip
-        if refused and sign < 0:
-            raise MapError(f"cannot retract a keyframe the map does not hold ({refused} blocks disagree)")
-        if refused:
-            raise WeightOverflow(
-                f"{refused} blocks hold voxels that have taken all the votes their integers hold "
-                f"({integrate.WEIGHT_LIMIT / WEIGHT_ONE:.0f} full samples, {integrate.COLOR_LIMIT} colours); "
-                "use bundle=True or a smaller voxel_size"
-            )
-
-    def _allocate(self, sign: int) -> int:
-        s = self._scratch
-        fresh = np.flatnonzero(s.touched_slots[: s.touched] < 0)
-        if sign > 0 and self._store.count + len(fresh) > self.config.max_blocks:
-            raise MapFull(
-                f"the map may hold at most max_blocks = {self.config.max_blocks} blocks; "
-                f"it has {self._store.count} and this keyframe needs {len(fresh)} more"
-            )
-        s.touched_slots[fresh] = np.arange(self._store.count, self._store.count + len(fresh), dtype=np.int32)
-        self._store.insert(s.touched_keys[fresh])
-        return len(fresh)
-
-    def _smooth_rays(self) -> None:
-        s, model = self._scratch, self.model
+    def _smooth(self, sign: int) -> None:
+        """Bring the regularised layer up to date in the blocks just touched."""
+        s, store, model = self._scratch, self._store, self.model
+        if sign < 0:
+            store.correction[s.touched_slots] = 0
+            return
+        s.reserve_votes()
         weighted = model.regularizer == "ray"
         smooth.smooth_rays(
-            s.rays, s.band_start, s.band_count, s.table, s.table_index, s.touched_slots,
-            model.smoothness, int(weighted), int(model.feedback or not weighted),
-            s.frame, self._store.sums, self._store.regularised, s.signal, s.crossed, s.votes,
+            s.rays, s.bands, store.hash_keys, store.hash_slots, store.places, model.smoothness, int(weighted),
+            int(model.feedback or not weighted), store.sums, store.correction, s.signal, s.crossed, s.votes,
         )  # fmt: skip
-
-    def _commit(self, sign: int) -> int:
-        s = self._scratch
-        voxels = int(
-            integrate.commit_blocks(
-                s.touched_slots, s.touched, sign, s.frame, self._store.sums, self._store.dirty
-            )
-        )
-        if s.colored:
-            integrate.commit_color(
-                s.touched_slots, s.touched, sign, s.frame_color, self._store.color_rgn, self._store.color_b
-            )
-        if self._smooths and sign > 0:
-            smooth.commit_regularised(s.touched_slots, s.touched, s.votes, self._store.regularised)
-        elif self._smooths:
-            smooth.reset_regularised(s.touched_slots, s.touched, self._store.sums, self._store.regularised)
-        return voxels
+        smooth.commit_votes(s.touched, store.sums, s.votes, store.correction)

@@ -1,34 +1,49 @@
 # SPDX-License-Identifier: MIT
-"""Additive integer integration: rays → this keyframe's sums → the map's sums.
+"""Additive integer integration: rays → the map's sums.
 
 A voxel's sum is one int64, (Σ w·m) · 2²⁷ + Σ w: m = signed distance along the ray in sixtieths of a voxel,
 |m| ≤ 1023, which is beyond the widest band there can be.
-Colour is (Σ R) · 2⁴⁰ + (Σ G) · 2¹⁶ + n in an int64 and Σ B in an int32, one vote a keyframe.
+Colour is (Σ R) · 2⁴⁰ + (Σ G) · 2¹⁶ + n in an int64 and Σ B in an int32, one vote a ray.
 Addition modulo 2⁶⁴ is a group: any order gives the same bytes, and subtracting restores them.
 """
 
 import taichi as ti
 
-from tsfusion.kernels.blocks import touched_index
+from tsfusion.kernels.blocks import map_find, set_insert
 from tsfusion.kernels.traversal import (
-    MAX_CROSSED,
+    COUNT,
+    CROSSING,
+    DEFERRED,
+    DISTANCE,
+    END,
+    INTERVAL,
+    LENGTH,
+    LOSS,
     RUN,
-    next_axis,
+    START,
+    UPDATES,
+    VOXEL,
+    WEIGHT_COLOR,
+    block_key,
+    next_step,
     offset_in_block,
-    ray_length,
-    ray_start,
+    ray_vector,
     ray_weight,
-    sign,
+    steps,
     vec3i,
 )
 
 WEIGHT_BITS = 27
 WEIGHT_MASK = (1 << WEIGHT_BITS) - 1
-WEIGHT_LIMIT = 1 << 26  # leaves room for one keyframe, so that a lane cannot carry unnoticed
+WEIGHT_LIMIT = 1 << 26  # half of what the lane holds: going over, or below none, shows before it can carry
 QUANTA_PER_VOXEL = 60
 MAX_DISTANCE = 1023  # quanta: the widest half-width, 16 voxels, and one to spare
-COLOR_LIMIT = 1 << 15  # keyframes that may colour one voxel
+COLOR_LIMIT = 1 << 15  # votes after which a voxel's colour is settled and takes no more
 CUBE = 512
+
+# `touched`: how many blocks, whether `missing` was too small, whether a colour was taken away that was not
+# there, and then the blocks' slots
+TOUCHED_COUNT, TOUCHED_OVERFLOW, TOUCHED_MISMATCH, TOUCHED_HEADER = 0, 1, 2, 3
 
 
 @ti.func
@@ -43,147 +58,149 @@ def lane_distance(packed):
 
 @ti.func
 def quantize(distance):
-    q = (ti.cast(distance, ti.i64) * QUANTA_PER_VOXEL + 32768) >> 16
-    return ti.cast(ti.min(ti.max(q, -MAX_DISTANCE), MAX_DISTANCE), ti.i32)
+    """Distance in 2⁻¹⁶ voxel → quanta."""
+    held = ti.min(ti.max(distance, -(18 << 16)), 18 << 16)
+    return ti.min(ti.max((held * QUANTA_PER_VOXEL + 32768) >> 16, -MAX_DISTANCE), MAX_DISTANCE)
 
 
-@ti.kernel
-def integrate_rays(
-    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    band_start: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    band_count: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    table: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    table_index: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    has_color: ti.i32,
-    frame: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    frame_color: ti.types.ndarray(dtype=ti.i64, ndim=3),
+@ti.func
+def touch(
+    slot, stamp, stamps: ti.template(), places: ti.template(), dirty: ti.template(), touched: ti.template()
 ):
-    """Add every voxel each ray crosses in its band to the keyframe's sums."""
-    for run in range(band_count.shape[0] * RUN):
-        if run % RUN == 0:
-            band = run // RUN
-            last = vec3i(2147483647)
-            index = -1
-            for r in range(band_start[band], band_start[band] + band_count[band]):
-                weight = ray_weight(rays, r)
-                if weight > 0:
-                    voxel, crossing, interval, direction, distance = ray_start(rays, r)
-                    end = ray_length(rays, r)
-                    inside = 1
-                    steps = 0
-                    while inside == 1 and steps < MAX_CROSSED:
-                        block = voxel >> 3
-                        if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
-                            last = block
-                            index = touched_index(table, table_index, voxel)
-                        if index >= 0:
-                            m = quantize(distance)
-                            value = (ti.cast(m * weight, ti.i64) << WEIGHT_BITS) + weight
-                            ti.atomic_add(frame[index, offset_in_block(voxel)], value)
-                        axis = next_axis(crossing)
-                        for a in ti.static(range(3)):
-                            if axis == a:
-                                if crossing[a] >= end:
-                                    inside = 0
-                                crossing[a] += interval[a]
-                                voxel[a] += sign(direction[a])
-                                distance -= abs(direction[a])
-                        steps += 1
-                    if has_color == 1:
-                        hit = vec3i(rays[r, 0] >> 10, rays[r, 1] >> 10, rays[r, 2] >> 10)
-                        at = touched_index(table, table_index, hit)
-                        if at >= 0:
-                            rgb = rays[r, 7]
-                            red = ti.cast((rgb >> 16) & 255, ti.i64)
-                            green = ti.cast((rgb >> 8) & 255, ti.i64)
-                            blue = ti.cast(rgb & 255, ti.i64)
-                            o = offset_in_block(hit)
-                            ti.atomic_add(frame_color[at, o, 0], (red << 32) + green)
-                            ti.atomic_add(frame_color[at, o, 1], (blue << 32) + 1)
+    """List the block, once a keyframe."""
+    if stamps[slot] != stamp:
+        if ti.atomic_max(stamps[slot], stamp) != stamp:
+            place = ti.atomic_add(touched[TOUCHED_COUNT], 1)
+            touched[TOUCHED_HEADER + place] = slot
+            places[slot] = place
+            dirty[slot] = ti.u8(1)
+
+
+@ti.func
+def vote_color(
+    slot, o, sign_, packed, color_rgn: ti.template(), color_b: ti.template(), touched: ti.template()
+):
+    """One vote for the colour in the low 24 bits of `packed`. A count just below 2¹⁶ has gone below none."""
+    votes = ti.cast(color_rgn[slot, o] & 65535, ti.i32)
+    if sign_ < 0 or votes < COLOR_LIMIT or votes >= COLOR_LIMIT + (COLOR_LIMIT >> 1):
+        red = ti.cast((packed >> 16) & 255, ti.i64)
+        green = ti.cast((packed >> 8) & 255, ti.i64)
+        before = ti.atomic_add(color_rgn[slot, o], sign_ * ((red << 40) + (green << 16) + 1))
+        ti.atomic_add(color_b[slot, o], sign_ * (packed & 255))
+        if sign_ < 0 and (before & 65535) == 0:
+            touched[TOUCHED_MISMATCH] = 1
 
 
 @ti.kernel
-def refuse_blocks(
-    touched_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    count: ti.i32,
+def add_rays(
+    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    deferred: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    only_deferred: ti.i32,
+    first_band: ti.i32,
+    last_band: ti.i32,
     sign_: ti.i32,
-    frame: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    frame_color: ti.types.ndarray(dtype=ti.i64, ndim=3),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    has_color: ti.i32,
-) -> ti.i32:
-    """How many touched blocks would leave their lanes' range: too many votes, or fewer than none."""
-    refused = 0
-    for run in range(count * RUN):
-        if run % RUN == 0:
-            i = run // RUN
-            slot = touched_slots[i]
-            bad = 0
-            for v in range(CUBE):
-                weight = sign_ * lane_weight(frame[i, v])
-                votes = 0
-                if has_color == 1:
-                    votes = sign_ * ti.min(ti.cast(frame_color[i, v, 1] & ti.i64(4294967295), ti.i32), 1)
-                colored = votes
-                if slot >= 0:
-                    weight += lane_weight(sums[slot, v])
-                    if votes != 0:
-                        colored += ti.cast(color_rgn[slot, v] & 65535, ti.i32)
-                if weight < 0 or weight >= WEIGHT_LIMIT or colored < 0 or colored >= COLOR_LIMIT:
-                    bad = 1
-            refused += bad
-    return refused
-
-
-@ti.kernel
-def commit_blocks(
-    touched_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    count: ti.i32,
-    sign_: ti.i32,
-    frame: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    oldest: ti.i32,
+    hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    missing: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    stamp: ti.i32,
+    stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
     dirty: ti.types.ndarray(dtype=ti.u8, ndim=1),
-) -> ti.i32:
-    """Add (or subtract) the keyframe's sums to the map's, one owner a block. Returns the voxels changed."""
-    voxels = 0
-    for run in range(count * RUN):
-        if run % RUN == 0:
-            i = run // RUN
-            slot = touched_slots[i]
-            changed = 0
-            for v in range(CUBE):
-                value = frame[i, v]
-                if value != 0:
-                    sums[slot, v] = sums[slot, v] + sign_ * value
-                    changed += 1
-            if changed > 0:
-                dirty[slot] = ti.u8(1)
-            voxels += changed
-    return voxels
-
-
-@ti.kernel
-def commit_color(
-    touched_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    count: ti.i32,
-    sign_: ti.i32,
-    frame_color: ti.types.ndarray(dtype=ti.i64, ndim=3),
+    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    has_color: ti.i32,
     color_rgn: ti.types.ndarray(dtype=ti.i64, ndim=2),
     color_b: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
-    """One vote a voxel and keyframe: the mean colour of the rays that ended in it."""
+    """Add to every voxel that each ray crosses in its band, in blocks of slot ≥ `oldest`.
+
+    Rays that cross blocks the map does not have are listed in `deferred`, the keys in `missing`; when those
+    blocks exist, a second call with `only_deferred` and `oldest` = the first new slot adds the rest.
+    """
+    mask = missing.shape[0] - 1
+    hash_mask = hash_keys.shape[0] - 1
+    for run in range((last_band - first_band) * RUN):
+        if run % RUN == 0:
+            band = first_band + run // RUN
+            start = bands[band, START]
+            count = bands[band, COUNT]
+            if only_deferred == 1:
+                count = bands[band, DEFERRED]
+            last = vec3i(2147483647)
+            slot = -1
+            postponed = 0
+            updates = 0
+            for n in range(count):
+                r = start + n
+                if only_deferred == 1:
+                    r = deferred[start + n]
+                weight = ray_weight(rays, r)
+                if weight > 0:
+                    voxel = ray_vector(rays, r, VOXEL)
+                    crossing = ray_vector(rays, r, CROSSING)
+                    interval = ray_vector(rays, r, INTERVAL)
+                    loss = ray_vector(rays, r, LOSS)
+                    towards = steps(rays[r, END])
+                    distance = rays[r, DISTANCE]
+                    length = rays[r, LENGTH]
+                    end = rays[r, END]
+                    colored = 1 - has_color
+                    incomplete = 0
+                    inside = 1
+                    while inside == 1:
+                        block = voxel >> 3
+                        if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
+                            last = block
+                            key = block_key(voxel)
+                            slot = map_find(hash_keys, hash_slots, hash_mask, key)
+                            if slot < 0:
+                                if set_insert(missing, mask, key) == 1:
+                                    touched[TOUCHED_OVERFLOW] = 1
+                            else:
+                                touch(slot, stamp, stamps, places, dirty, touched)
+                        step, next_crossing = next_step(crossing)
+                        if slot >= oldest:
+                            o = offset_in_block(voxel)
+                            m = quantize(distance) * (sign_ * weight)
+                            value = (ti.cast(m, ti.i64) << WEIGHT_BITS) + sign_ * weight
+                            ti.atomic_add(sums[slot, o], value)
+                            updates += 1
+                            if colored == 0 and next_crossing > end:
+                                packed = rays[r, WEIGHT_COLOR]
+                                vote_color(slot, o, sign_, packed, color_rgn, color_b, touched)
+                        if slot < 0:
+                            incomplete = 1
+                        if next_crossing > end:
+                            colored = 1
+                        if next_crossing >= length:
+                            inside = 0
+                        crossing += interval & step
+                        voxel += towards & step
+                        distance -= (loss & step).sum()
+                    if incomplete == 1:
+                        deferred[start + postponed] = r
+                        postponed += 1
+            if only_deferred == 0:
+                bands[band, DEFERRED] = postponed
+                bands[band, UPDATES] = updates
+            else:
+                bands[band, UPDATES] = bands[band, UPDATES] + updates
+
+
+@ti.kernel
+def largest_weights(
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """`bounds[slot]` = the largest weight lane in each touched block."""
+    count = touched[TOUCHED_COUNT]
     for run in range(count * RUN):
         if run % RUN == 0:
-            i = run // RUN
-            slot = touched_slots[i]
+            slot = touched[TOUCHED_HEADER + run // RUN]
+            most = 0
             for v in range(CUBE):
-                blue_n = frame_color[i, v, 1]
-                n = blue_n & ti.i64(4294967295)
-                if n > 0:
-                    red_green = frame_color[i, v, 0]
-                    red = (red_green >> 32) // n
-                    green = (red_green & ti.i64(4294967295)) // n
-                    blue = (blue_n >> 32) // n
-                    color_rgn[slot, v] = color_rgn[slot, v] + sign_ * ((red << 40) + (green << 16) + 1)
-                    color_b[slot, v] = color_b[slot, v] + sign_ * ti.cast(blue, ti.i32)
+                most = ti.max(most, lane_weight(sums[slot, v]))
+            bounds[slot] = most

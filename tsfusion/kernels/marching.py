@@ -61,7 +61,9 @@ def gather_values(
                             w = lane_weight(packed)
                             if w >= min_weight:
                                 if use_regularised == 1:
-                                    value = regularised[slot, o]
+                                    value = (
+                                        ti.cast(lane_distance(packed), ti.f32) + regularised[slot, o]
+                                    ) / ti.cast(w, ti.f32)
                                 else:
                                     value = ti.cast(lane_distance(packed), ti.f32) / ti.cast(w, ti.f32)
                         padded[b, at(x, y, z)] = value

@@ -1,191 +1,190 @@
 # SPDX-License-Identifier: MIT
-"""Rays from depth, disparity or points.
+"""Rays from depth or disparity images.
 
-Samples are taken in tiles (16×16 pixels, or 256 consecutive points). In a tile, samples that end in the
-same voxel are bundled into one ray through their weighted mean; sums are integers, so the result does not
-depend on threads. With `bundle = 0` every sample is a ray of its own.
+An image is read in tiles of 12×12 pixels. In a tile, the pixels of a cell about as wide as a voxel are bundled
+into one ray through their mean, a layer of depth at a time. Where the whole tile is flat, its plane gives the
+distance that the ray's voxels have to the surface; elsewhere it is the distance to the ray's end. Sums are
+integers, so nothing depends on threads. With `bundle = 0` every pixel is a ray.
 
-Tiles are handed out in `bands`, contiguous runs of tiles: one band is one unit of parallel work, with a
-hash table and a region of the ray buffer to itself.
+One unit of parallel work is a band, a contiguous run of tiles with a region of the ray buffer to itself.
 """
 
 import taichi as ti
 
-from tsfusion.kernels.traversal import DIRECTION_ONE, POSITION_BITS, RUN, VOXEL_LIMIT, pack, unpack, vec3i
+from tsfusion.kernels.samples import (
+    bundle_weight,
+    fixed_point,
+    half_width,
+    in_reach,
+    layer_depth,
+    noise_sigma,
+    vec3,
+)
+from tsfusion.kernels.traversal import COUNT, RUN, SAMPLES, START, WEIGHT, write_ray
 
-TILE = 16
+TILE = 12  # divided by both sides of every cell
 TILE_SAMPLES = TILE * TILE
-TABLE_SIZE = 512  # twice a tile's samples
-SUM_FIELDS = 8  # Σ position·w (3, within the voxel), Σw, Σ half·w, Σ colour·w (3): a tile's fit 31 bits
-WEIGHT_ONE = 16  # a full-confidence sample
-MAX_BUNDLE_WEIGHT = 255  # more samples of one voxel in one tile are not independent evidence
-
-vec3 = ti.types.vector(3, ti.f64)
-vec3l = ti.types.vector(3, ti.i64)
-vec8i = ti.types.vector(SUM_FIELDS, ti.i32)
-
-# `model`: σ floor, σ slope, σ z0, least and most half-width (voxels), voxel size, σ below which the weight is
-# full, least and most range. See config.SensorModel.
-MODEL_FIELDS = 9
+CELLS = ((2, 1), (2, 2), (3, 2), (3, 3), (4, 3), (4, 4), (6, 4), (6, 6), (12, 6), (12, 12))  # wide, high
+CELL_AREA = 1.0  # voxels across the ray
+LEAST_PLANE = 36  # samples for a plane
+PLANE_NOISE = 2.0  # the most mean squared residual of a plane, in σ² …
+PLANE_ROUGHNESS = 0.1 * 1024.0  # … and, squared, on top of it: 2⁻¹⁰ voxel
+PLANE_SIGMA = 1.0  # voxels: with more noise than that a plane says nothing about voxels
+LEAST_FACING = 0.15  # cosine between plane normal and ray: what is seen more edge-on has no plane
 
 
 @ti.func
-def noise_sigma(model: ti.template(), z):
-    return model[0] + model[1] * (z - model[2]) * (z - model[2])
-
-
-@ti.func
-def sample_weight(model: ti.template(), sigma, confidence):
-    ratio = ti.min(1.0, model[6] / sigma)
-    w = ti.cast(ti.floor(WEIGHT_ONE * ratio * ratio * confidence / 255.0 + 0.5), ti.i32)
-    return ti.max(w, 1)
-
-
-@ti.func
-def half_width(model: ti.template(), sigma):
-    """Support half-width, 2⁻⁸ voxel: three sigma, held between the preset's bounds."""
-    voxels = ti.min(ti.max(3.0 * sigma / model[5], model[3]), model[4])
-    return ti.cast(voxels * 256.0, ti.i32)
-
-
-@ti.func
-def in_reach(p):
-    limit = ti.cast(VOXEL_LIMIT - 64, ti.f64)
-    return ti.abs(p[0]) < limit and ti.abs(p[1]) < limit and ti.abs(p[2]) < limit
-
-
-@ti.func
-def write_ray(rays: ti.template(), r, end, direction, half, weight, color):
-    """`end` int32 2⁻¹⁰ voxel; direction any length, float64."""
-    length = direction.norm()
-    usable = weight
-    if length <= 0.0:
-        usable = 0
-        length = 1.0
-    for a in ti.static(range(3)):
-        rays[r, a] = end[a]
-        rays[r, 3 + a] = ti.cast(ti.floor(direction[a] / length * DIRECTION_ONE + 0.5), ti.i32)
-    rays[r, 6] = (half << 16) | usable
-    rays[r, 7] = color
-
-
-@ti.func
-def fixed_point(p):
-    """Position in voxels → int32 2⁻¹⁰ voxel."""
-    q = vec3i(0)
-    for a in ti.static(range(3)):
-        q[a] = ti.cast(ti.floor(p[a] * 1024.0), ti.i32)
-    return q
-
-
-@ti.func
-def sample_sums(q, weight, half, color):
-    """What one sample adds to its bundle: `SUM_FIELDS`."""
-    return vec8i(
-        (q[0] & 1023) * weight,
-        (q[1] & 1023) * weight,
-        (q[2] & 1023) * weight,
-        weight,
-        half * weight,
-        ((color >> 16) & 255) * weight,
-        ((color >> 8) & 255) * weight,
-        (color & 255) * weight,
-    )
-
-
-@ti.func
-def add_run(
-    keys: ti.template(), sums: ti.template(), origins: ti.template(), listed: ti.template(), band, entries,
-    voxel, run, origin, has_origin,
+def load_tile(
+    image: ti.template(), is_disparity, scale, confidence: ti.template(), has_confidence,
+    model: ti.template(), top, left, depths: ti.template(), band,
 ):  # fmt: skip
-    """Add a run of consecutive samples of one voxel to the tile's table; returns the number of entries."""
-    key = pack(voxel[0], voxel[1], voxel[2])
-    i = ((voxel[0] * 73856093) ^ (voxel[1] * 19349663) ^ (voxel[2] * 83492791)) & (TABLE_SIZE - 1)
-    count = entries
-    while keys[band, i] != key and keys[band, i] != 0:  # never full: a tile has half its size
-        i = (i + 1) & (TABLE_SIZE - 1)
-    if keys[band, i] == 0:
-        keys[band, i] = key
-        listed[band, count] = i
-        count += 1
-    # not `+=`: Taichi makes that atomic, and a band has its table to itself
-    for f in ti.static(range(SUM_FIELDS)):
-        sums[band, i, f] = sums[band, i, f] + run[f]
-    if has_origin == 1:
-        for a in ti.static(range(3)):
-            origins[band, i, a] = origins[band, i, a] + origin[a]
-    return count
+    """Fill `depths[band]` with the tile's depths in 2⁻¹⁰ voxel, 0 = none. Returns their count and sum."""
+    bottom = ti.min(TILE, image.shape[0] - top)
+    right = ti.min(TILE, image.shape[1] - left)
+    factor = ti.cast(scale, ti.f32)
+    per_metre = ti.cast(1024.0 / model[5], ti.f32)
+    nearest, farthest = ti.cast(model[7], ti.f32), ti.cast(model[8], ti.f32)
+    if bottom < TILE or right < TILE:
+        for i in range(TILE_SAMPLES):
+            depths[band, i] = 0
+    valid = 0
+    total = ti.i64(0)
+    for y in range(bottom):
+        for x in range(right):
+            raw = ti.cast(image[top + y, left + x], ti.f32)
+            z = raw * factor
+            if is_disparity == 1:
+                z = factor / ti.max(raw, 1e-9)
+            q = 0
+            # False for NaN as well
+            if raw > 0.0 and z >= nearest and z <= farthest:
+                q = ti.cast(z * per_metre, ti.i32)
+                if has_confidence == 1:
+                    if confidence[top + y, left + x] == 0:
+                        q = 0
+            depths[band, y * TILE + x] = q
+            valid += ti.cast(q > 0, ti.i32)
+            total += q
+    return valid, total
 
 
 @ti.func
-def flush_tile(
-    keys: ti.template(), sums: ti.template(), origins: ti.template(), listed: ti.template(), band, entries,
-    rays: ti.template(), first, common_origin, has_origin,
+def fit_plane(depths: ti.template(), band, anchor, sigma):
+    """Least squares q = c + x·slope_x + y·slope_y over the tile; depths and `sigma` in 2⁻¹⁰ voxel, `anchor`
+    near the depths. Returns (1, slope_x, slope_y), or zeros where the tile is not flat."""
+    sx, sy, sxx, sxy, syy, n = 0, 0, 0, 0, 0, 0
+    sq, sxq, syq, sqq = ti.i64(0), ti.i64(0), ti.i64(0), ti.i64(0)
+    for y in range(TILE):
+        row_n, row_x, row_xx, row_q, row_xq = 0, 0, 0, ti.i64(0), ti.i64(0)
+        for x in range(TILE):
+            q = depths[band, y * TILE + x]
+            if q > 0:
+                d = ti.cast(ti.min(ti.max(q - anchor, -(1 << 20)), 1 << 20), ti.i64)
+                row_n += 1
+                row_x += x
+                row_xx += x * x
+                row_q += d
+                row_xq += d * x
+                sqq += d * d
+        n += row_n
+        sx += row_x
+        sy += y * row_n
+        sxx += row_xx
+        sxy += y * row_x
+        syy += y * y * row_n
+        sq += row_q
+        sxq += row_xq
+        syq += row_q * y
+    planar, slope_x, slope_y = 0, 0.0, 0.0
+    if n >= LEAST_PLANE:
+        mean_q = ti.cast(sq, ti.f64) / n
+        cxx = sxx - ti.cast(sx * sx, ti.f64) / n
+        cyy = syy - ti.cast(sy * sy, ti.f64) / n
+        cxy = sxy - ti.cast(sx * sy, ti.f64) / n
+        cxq = ti.cast(sxq, ti.f64) - mean_q * sx
+        cyq = ti.cast(syq, ti.f64) - mean_q * sy
+        determinant = cxx * cyy - cxy * cxy
+        if determinant > 0.05 * cxx * cyy:
+            slope_x = (cxq * cyy - cyq * cxy) / determinant
+            slope_y = (cyq * cxx - cxq * cxy) / determinant
+            left_over = ti.cast(sqq, ti.f64) - mean_q * sq - slope_x * cxq - slope_y * cyq
+            if left_over < n * (PLANE_NOISE * sigma * sigma + PLANE_ROUGHNESS * PLANE_ROUGHNESS):
+                planar = 1
+    return planar, slope_x, slope_y
+
+
+@ti.func
+def plane_gradient(ray, du, dv, z, slope_x, slope_y):
+    """n / (n·u) of the plane through `ray`·z whose depth has these slopes a pixel; zero if seen edge-on."""
+    normal = (du * z + ray * slope_x).cross(dv * z + ray * slope_y)
+    along = normal.dot(ray)
+    gradient = vec3(0.0)
+    if along * along > LEAST_FACING * LEAST_FACING * normal.norm_sqr() * ray.norm_sqr():
+        gradient = normal * (ray.norm() / along)
+    return gradient
+
+
+@ti.func
+def cell_shape(pixel):
+    """Width and height in pixels of the largest cell within `CELL_AREA`; `pixel` = voxels a pixel spans."""
+    wide, high = 1, 1
+    for w, h in ti.static(CELLS):
+        if w * h * pixel * pixel <= CELL_AREA:
+            wide, high = w, h
+    return wide, high
+
+
+@ti.func
+def layer_sums(depths: ti.template(), band, x0, y0, wide, high, above, up_to):
+    """Of the cell's depths in (`above`, `up_to`]: least, largest, count, Σ depth, Σ x, Σ y."""
+    low, top, n, sum_q, sum_x, sum_y = 1 << 30, 0, 0, ti.i64(0), 0, 0
+    for y in range(y0, y0 + high):
+        for x in range(x0, x0 + wide):
+            q = depths[band, y * TILE + x]
+            if q > above and q <= up_to:
+                low = ti.min(low, q)
+                top = ti.max(top, q)
+                n += 1
+                sum_q += q
+                sum_x += x
+                sum_y += y
+    return low, top, n, sum_q, sum_x, sum_y
+
+
+@ti.func
+def layer_color(
+    color: ti.template(), has_color, confidence: ti.template(), has_confidence, top, left,
+    depths: ti.template(), band, x0, y0, wide, high, low, up_to, n,
 ):  # fmt: skip
-    """Turn the tile's entries into rays `first …` and clear them."""
-    for n in range(entries):
-        i = listed[band, n]
-        w = sums[band, i, 3]
-        mean = vec8i(0)
-        for f in ti.static(range(SUM_FIELDS)):
-            mean[f] = ti.raw_div(sums[band, i, f], w)
-            sums[band, i, f] = 0
-        end = unpack(keys[band, i]) * 1024 + vec3i(mean[0], mean[1], mean[2])
-        keys[band, i] = 0
-        origin = common_origin
-        direction = vec3(0.0)
-        for a in ti.static(range(3)):
-            if has_origin == 1:
-                origin[a] = ti.cast(origins[band, i, a], ti.f64) / w / 1024.0
-                origins[band, i, a] = 0
-            direction[a] = (ti.cast(end[a], ti.f64) + 0.5) / 1024.0 - origin[a]
-        color = (mean[5] << 16) | (mean[6] << 8) | mean[7]
-        write_ray(rays, first + n, end, direction, mean[4], ti.min(w, MAX_BUNDLE_WEIGHT), color)
+    """Mean colour 0xRRGGBB and summed confidence of the cell's `n` samples with depths in [low, up_to]."""
+    red, green, blue, trust = 0, 0, 0, 0
+    for y in range(y0, y0 + high):
+        for x in range(x0, x0 + wide):
+            q = depths[band, y * TILE + x]
+            if q >= low and q <= up_to:
+                if has_confidence == 1:
+                    trust += ti.cast(confidence[top + y, left + x], ti.i32)
+                if has_color == 1:
+                    blue += ti.cast(color[top + y, left + x, 0], ti.i32)
+                    green += ti.cast(color[top + y, left + x, 1], ti.i32)
+                    red += ti.cast(color[top + y, left + x, 2], ti.i32)
+    if has_confidence == 0:
+        trust = 255 * n
+    return ((red // n) << 16) | ((green // n) << 8) | (blue // n), trust
 
 
 @ti.func
-def take_sample(
-    keys: ti.template(), sums: ti.template(), origins: ti.template(), listed: ti.template(),
-    rays: ti.template(), band, out, entries, voxel, run, origin_sum, p, origin, has_origin, weight, half,
-    color, bundle,
-):  # fmt: skip
-    """Take one sample into the current run, or (exact) write it as a ray.
-
-    Returns `out` (next ray), `entries` (of the tile's table), and the run: its voxel, sums and Σ origin·w.
-    """
-    end = fixed_point(p)
-    if bundle == 0:
-        write_ray(rays, out, end, p - origin, half, weight, color)
-        out += 1
-    else:
-        here = end >> POSITION_BITS
-        if run[3] > 0 and any(here != voxel):
-            entries = add_run(keys, sums, origins, listed, band, entries, voxel, run, origin_sum, has_origin)
-            run = vec8i(0)
-            origin_sum = vec3l(0)
-        voxel = here
-        run += sample_sums(end, weight, half, color)
-        if has_origin == 1:
-            for a in ti.static(range(3)):
-                origin_sum[a] += ti.cast(ti.floor(origin[a] * 1024.0), ti.i64) * weight
-    return out, entries, voxel, run, origin_sum
-
-
-@ti.func
-def end_tile(
-    keys: ti.template(), sums: ti.template(), origins: ti.template(), listed: ti.template(),
-    rays: ti.template(), band, out, entries, voxel, run, origin_sum, origin, has_origin,
-):  # fmt: skip
-    """Add the last run and write the tile's rays; returns the next ray's place."""
-    if run[3] > 0:
-        entries = add_run(keys, sums, origins, listed, band, entries, voxel, run, origin_sum, has_origin)
-    flush_tile(keys, sums, origins, listed, band, entries, rays, out, origin, has_origin)
-    return out + entries
-
-
-@ti.func
-def bgr(blue, green, red):
-    return (ti.cast(red, ti.i32) << 16) | (ti.cast(green, ti.i32) << 8) | ti.cast(blue, ti.i32)
+def is_supported(depths: ti.template(), band, y, x, q, tolerance):
+    """Whether a neighbour in the tile has nearly the same depth."""
+    found = 0
+    for k in range(9):
+        v = y + k // 3 - 1
+        u = x + k % 3 - 1
+        if found == 0 and k != 4 and v >= 0 and v < TILE and u >= 0 and u < TILE:
+            other = depths[band, v * TILE + u]
+            if other > 0 and abs(other - q) <= tolerance:
+                found = 1
+    return found
 
 
 @ti.kernel
@@ -200,132 +199,93 @@ def rays_from_image(
     camera: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (4, 3) voxels: du, dv, corner direction, origin
     model: ti.types.ndarray(dtype=ti.f64, ndim=1),
     bundle: ti.i32,
-    keys: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    sums: ti.types.ndarray(dtype=ti.i32, ndim=3),
-    origins: ti.types.ndarray(dtype=ti.i64, ndim=3),
-    listed: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    depths: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (bands, TILE_SAMPLES)
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    band_start: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    band_count: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    band_samples: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
     """paper eq. 1 (with u = column, v = row), in voxel units: point = origin + z (u·du + v·dv + corner)."""
-    height, width = image.shape[0], image.shape[1]
-    tiles_x = (width + TILE - 1) // TILE
-    tiles = tiles_x * ((height + TILE - 1) // TILE)
-    bands = band_count.shape[0]
-    origin = vec3(camera[3, 0], camera[3, 1], camera[3, 2])
+    tiles_x = (image.shape[1] + TILE - 1) // TILE
+    tiles = tiles_x * ((image.shape[0] + TILE - 1) // TILE)
+    count = bands.shape[0]
     du = vec3(camera[0, 0], camera[0, 1], camera[0, 2])
-    for unit in range(bands * RUN):
-        if unit % RUN == 0:
-            band = unit // RUN
-            first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // bands, ti.i32)
-            last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // bands, ti.i32)
+    dv = vec3(camera[1, 0], camera[1, 1], camera[1, 2])
+    corner = vec3(camera[2, 0], camera[2, 1], camera[2, 2])
+    origin = vec3(camera[3, 0], camera[3, 1], camera[3, 2])
+    pitch = ti.max(du.norm(), dv.norm())
+    unit = model[5] / 1024.0  # metres
+    for run in range(count * RUN):
+        if run % RUN == 0:
+            band = run // RUN
+            first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // count, ti.i32)
+            last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // count, ti.i32)
             out = first_tile * TILE_SAMPLES
-            samples = 0
+            samples, total_weight = 0, 0
             for tile in range(first_tile, last_tile):
                 top = tile // tiles_x * TILE
                 left = tile % tiles_x * TILE
-                entries, voxel, run, none = 0, vec3i(0), vec8i(0), vec3l(0)
-                for v in range(top, ti.min(top + TILE, height)):
-                    row = vec3(0.0)
-                    for a in ti.static(range(3)):
-                        row[a] = camera[1, a] * v + camera[2, a]
-                    for u in range(left, ti.min(left + TILE, width)):
-                        raw = ti.cast(image[v, u], ti.f64)
-                        z = raw * scale
-                        if is_disparity == 1:
-                            z = scale / ti.max(raw, 1e-9)
-                        trust = 255.0
-                        if has_confidence == 1:
-                            trust = ti.cast(confidence[v, u], ti.f64)
-                        # False for NaN as well
-                        if raw > 0.0 and z >= model[7] and z <= model[8] and trust > 0.0:
-                            p = origin + (row + du * ti.cast(u, ti.f64)) * z
-                            if in_reach(p):
-                                sigma = noise_sigma(model, z)
-                                rgb = 0
-                                if has_color == 1:
-                                    rgb = bgr(color[v, u, 0], color[v, u, 1], color[v, u, 2])
-                                samples += 1
-                                out, entries, voxel, run, none = take_sample(
-                                    keys, sums, origins, listed, rays, band, out, entries, voxel, run, none,
-                                    p, origin, 0, sample_weight(model, sigma, trust),
-                                    half_width(model, sigma), rgb, bundle,
-                                )  # fmt: skip
-                out = end_tile(
-                    keys, sums, origins, listed, rays, band, out, entries, voxel, run, none, origin, 0
+                valid, total = load_tile(
+                    image, is_disparity, scale, confidence, has_confidence, model, top, left, depths, band
                 )
-            band_start[band] = first_tile * TILE_SAMPLES
-            band_count[band] = out - first_tile * TILE_SAMPLES
-            band_samples[band] = samples
-
-
-@ti.kernel
-def rays_from_points(
-    points: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    starts: ti.types.ndarray(dtype=ti.f32, ndim=2),  # of the rays, sensor frame: (1, 3) or (N, 3)
-    color: ti.types.ndarray(dtype=ti.u8, ndim=2),
-    has_color: ti.i32,
-    confidence: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    has_confidence: ti.i32,
-    pose: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (3, 4), metres → voxels
-    model: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    bundle: ti.i32,
-    keys: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    sums: ti.types.ndarray(dtype=ti.i32, ndim=3),
-    origins: ti.types.ndarray(dtype=ti.i64, ndim=3),
-    listed: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    band_start: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    band_count: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    band_samples: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
-    """As `rays_from_image`, for points in any order; range is measured along the ray."""
-    count = points.shape[0]
-    tiles = (count + TILE_SAMPLES - 1) // TILE_SAMPLES
-    bands = band_count.shape[0]
-    own_starts = ti.select(starts.shape[0] == 1, 0, 1)
-    for unit in range(bands * RUN):
-        if unit % RUN == 0:
-            band = unit // RUN
-            first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // bands, ti.i32)
-            last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // bands, ti.i32)
-            out = first_tile * TILE_SAMPLES
-            samples = 0
-            for tile in range(first_tile, last_tile):
-                entries, voxel, run, origin_sum = 0, vec3i(0), vec8i(0), vec3l(0)
-                origin = vec3(0.0)
-                for n in range(tile * TILE_SAMPLES, ti.min((tile + 1) * TILE_SAMPLES, count)):
-                    o = vec3(0.0)
-                    q = vec3(0.0)
-                    for a in ti.static(range(3)):
-                        o[a] = ti.cast(starts[n * own_starts, a], ti.f64)
-                        q[a] = ti.cast(points[n, a], ti.f64)
-                    span = (q - o).norm()
-                    trust = 255.0
-                    if has_confidence == 1:
-                        trust = ti.cast(confidence[n], ti.f64)
-                    if span > 0.0 and span >= model[7] and span <= model[8] and trust > 0.0:
-                        p = vec3(0.0)
-                        for a in ti.static(range(3)):
-                            p[a] = pose[a, 0] * q[0] + pose[a, 1] * q[1] + pose[a, 2] * q[2] + pose[a, 3]
-                            origin[a] = pose[a, 0] * o[0] + pose[a, 1] * o[1] + pose[a, 2] * o[2] + pose[a, 3]
-                        if in_reach(p) and in_reach(origin):
-                            sigma = noise_sigma(model, span)
-                            rgb = 0
-                            if has_color == 1:
-                                rgb = bgr(color[n, 0], color[n, 1], color[n, 2])
-                            samples += 1
-                            out, entries, voxel, run, origin_sum = take_sample(
-                                keys, sums, origins, listed, rays, band, out, entries, voxel, run, origin_sum,
-                                p, origin, own_starts, sample_weight(model, sigma, trust),
-                                half_width(model, sigma), rgb, bundle,
-                            )  # fmt: skip
-                out = end_tile(
-                    keys, sums, origins, listed, rays, band, out, entries, voxel, run, origin_sum, origin,
-                    own_starts,
-                )  # fmt: skip
-            band_start[band] = first_tile * TILE_SAMPLES
-            band_count[band] = out - first_tile * TILE_SAMPLES
-            band_samples[band] = samples
+                if valid > 0:
+                    mean = ti.cast(total, ti.f64) / valid * unit
+                    wide, high, planar, slope_x, slope_y = 1, 1, 0, 0.0, 0.0
+                    if bundle == 1:
+                        wide, high = cell_shape(mean * pitch)
+                        sigma = noise_sigma(model, mean)
+                        if sigma < PLANE_SIGMA * model[5]:
+                            anchor = ti.cast(mean / unit, ti.i32)
+                            planar, slope_x, slope_y = fit_plane(depths, band, anchor, sigma / unit)
+                    across = TILE // wide
+                    for cell in range(across * (TILE // high)):
+                        y0 = cell // across * high
+                        x0 = cell % across * wide
+                        above = 0
+                        while above >= 0:  # one layer of depth after the other
+                            low, deepest, n, sum_q, sum_x, sum_y = layer_sums(
+                                depths, band, x0, y0, wide, high, above, 1 << 30
+                            )
+                            tolerance = 0
+                            if n > 0:
+                                tolerance = ti.cast(layer_depth(model, low * unit) / unit, ti.i32)
+                            more = n > 1 and deepest - low > tolerance
+                            if more:
+                                low, deepest, n, sum_q, sum_x, sum_y = layer_sums(
+                                    depths, band, x0, y0, wide, high, above, low + tolerance
+                                )
+                            keep = n > 0
+                            if n == 1 and model[9] > 0.0:
+                                keep = is_supported(depths, band, sum_y, sum_x, low, tolerance) == 1
+                            if keep:
+                                z = (ti.cast(sum_q, ti.f64) / n + 0.5) * unit
+                                u = left + ti.cast(sum_x, ti.f64) / n
+                                v = top + ti.cast(sum_y, ti.f64) / n
+                                ray = corner + du * u + dv * v
+                                p = origin + ray * z
+                                if in_reach(p):
+                                    rgb, trust = 0, 255 * n
+                                    if has_confidence == 1 or has_color == 1:
+                                        rgb, trust = layer_color(
+                                            color, has_color, confidence, has_confidence, top, left, depths,
+                                            band, x0, y0, wide, high, low, low + tolerance, n,
+                                        )  # fmt: skip
+                                    gradient = vec3(0.0)
+                                    if planar == 1:
+                                        gradient = plane_gradient(
+                                            ray, du, dv, z, slope_x * unit, slope_y * unit
+                                        )
+                                    sigma = noise_sigma(model, z)
+                                    weight = bundle_weight(model, sigma, trust)
+                                    half = half_width(model, sigma)
+                                    write_ray(
+                                        rays, out, fixed_point(p), ray, gradient, half, half, weight, rgb
+                                    )
+                                    total_weight += weight
+                                    samples += n
+                                    out += 1
+                            above = -1
+                            if more:
+                                above = low + tolerance
+            bands[band, START] = first_tile * TILE_SAMPLES
+            bands[band, COUNT] = out - first_tile * TILE_SAMPLES
+            bands[band, SAMPLES] = samples
+            bands[band, WEIGHT] = total_weight

@@ -14,17 +14,34 @@ one owner a block writes the mean of its voxels' x̂.
 
 import taichi as ti
 
-from tsfusion.kernels.blocks import touched_index
-from tsfusion.kernels.integrate import CUBE, QUANTA_PER_VOXEL, lane_distance, lane_weight
+from tsfusion.kernels.blocks import map_find
+from tsfusion.kernels.integrate import (
+    CUBE,
+    QUANTA_PER_VOXEL,
+    TOUCHED_COUNT,
+    TOUCHED_HEADER,
+    lane_distance,
+    lane_weight,
+)
 from tsfusion.kernels.traversal import (
+    COUNT,
+    CROSSING,
+    DISTANCE,
+    END,
+    INTERVAL,
+    LENGTH,
+    LOSS,
     MAX_CROSSED,
     RUN,
-    next_axis,
+    START,
+    VOXEL,
+    block_key,
+    next_step,
     offset_in_block,
-    ray_length,
-    ray_start,
+    ray_vector,
     ray_weight,
-    sign,
+    steps,
+    vec3i,
 )
 
 SIGNAL_FIELDS = 5  # t, y − t and then x̂ − t, A, and the two off-diagonals of L
@@ -71,69 +88,63 @@ def solve_signal(signal: ti.template(), band, n, smoothness):
 @ti.kernel
 def smooth_rays(
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    band_start: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    band_count: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    table: ti.types.ndarray(dtype=ti.i64, ndim=1),
-    table_index: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    touched_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
     smoothness: ti.f32,
     weighted: ti.i32,  # A = diag(W) or I
     feedback: ti.i32,  # y from the stored regularised values, or from the raw sums
-    frame: ti.types.ndarray(dtype=ti.i64, ndim=2),
     sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    regularised: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    correction: ti.types.ndarray(dtype=ti.f32, ndim=2),
     signal: ti.types.ndarray(dtype=ti.f32, ndim=3),
     crossed: ti.types.ndarray(dtype=ti.i32, ndim=3),
     votes: ti.types.ndarray(dtype=ti.i64, ndim=2),
 ):
-    """Gather y along each ray from the map (slot ≥ 0: before this keyframe) and the keyframe's sums, solve,
-    and add x̂ to `votes` as (Σ x̂ · 16) · 2²⁴ + n."""
-    for run in range(band_count.shape[0] * RUN):
+    """Gather y along each ray, solve, and add x̂ to `votes` as (Σ x̂ · 16) · 2²⁴ + n."""
+    hash_mask = hash_keys.shape[0] - 1
+    for run in range(bands.shape[0] * RUN):
         if run % RUN == 0:
             band = run // RUN
-            for r in range(band_start[band], band_start[band] + band_count[band]):
+            last = vec3i(2147483647)
+            slot = -1
+            for r in range(bands[band, START], bands[band, START] + bands[band, COUNT]):
                 if ray_weight(rays, r) > 0:
-                    voxel, crossing, interval, direction, distance = ray_start(rays, r)
-                    end = ray_length(rays, r)
+                    voxel = ray_vector(rays, r, VOXEL)
+                    crossing = ray_vector(rays, r, CROSSING)
+                    interval = ray_vector(rays, r, INTERVAL)
+                    loss = ray_vector(rays, r, LOSS)
+                    towards = steps(rays[r, END])
+                    distance = rays[r, DISTANCE]
+                    length = rays[r, LENGTH]
                     n = 0
                     total = ti.f32(0.0)
-                    index = -1
-                    block = voxel >> 3
-                    fresh = 1
                     inside = 1
                     while inside == 1 and n < MAX_CROSSED:
-                        here = voxel >> 3
-                        if fresh == 1 or here[0] != block[0] or here[1] != block[1] or here[2] != block[2]:
-                            block = here
-                            fresh = 0
-                            index = touched_index(table, table_index, voxel)
+                        block = voxel >> 3
+                        if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
+                            last = block
+                            slot = map_find(hash_keys, hash_slots, hash_mask, block_key(voxel))
                         o = offset_in_block(voxel)
-                        added = frame[index, o]
-                        slot = touched_slots[index]
-                        w_old = ti.f32(0.0)
-                        old = ti.f32(0.0)
-                        if slot >= 0:
-                            w_old = ti.cast(lane_weight(sums[slot, o]), ti.f32)
-                            old = ti.cast(lane_distance(sums[slot, o]), ti.f32)
-                            if feedback == 1:
-                                old = w_old * regularised[slot, o]
-                        w = w_old + ti.cast(lane_weight(added), ti.f32)
+                        packed = sums[slot, o]
+                        w = ti.cast(lane_weight(packed), ti.f32)
+                        s = ti.cast(lane_distance(packed), ti.f32)
+                        if feedback == 1:
+                            s += correction[slot, o]
                         t = ti.cast(distance, ti.f32) * (QUANTA_PER_VOXEL / 65536.0)
                         signal[band, n, 0] = t
-                        signal[band, n, 1] = (old + ti.cast(lane_distance(added), ti.f32)) / w - t
+                        signal[band, n, 1] = s / w - t
                         signal[band, n, 2] = w
-                        crossed[band, n, 0] = index
+                        crossed[band, n, 0] = places[slot]
                         crossed[band, n, 1] = o
                         total += w
                         n += 1
-                        axis = next_axis(crossing)
-                        for a in ti.static(range(3)):
-                            if axis == a:
-                                if crossing[a] >= end:
-                                    inside = 0
-                                crossing[a] += interval[a]
-                                voxel[a] += sign(direction[a])
-                                distance -= abs(direction[a])
+                        step, next_crossing = next_step(crossing)
+                        if next_crossing >= length:
+                            inside = 0
+                        crossing += interval & step
+                        voxel += towards & step
+                        distance -= (loss & step).sum()
                     for i in range(n):
                         signal[band, i, 2] = ti.select(weighted == 1, signal[band, i, 2] * n / total, 1.0)
                     if n >= 3:
@@ -147,38 +158,24 @@ def smooth_rays(
 
 
 @ti.kernel
-def commit_regularised(
-    touched_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    count: ti.i32,
-    votes: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    regularised: ti.types.ndarray(dtype=ti.f32, ndim=2),
-):
-    """A voxel's value becomes the mean of what its rays propose."""
-    for run in range(count * RUN):
-        if run % RUN == 0:
-            i = run // RUN
-            for v in range(CUBE):
-                packed = votes[i, v]
-                if packed != 0:
-                    n = ti.cast(packed & ((1 << VOTE_BITS) - 1), ti.f32)
-                    regularised[touched_slots[i], v] = ti.cast(packed >> VOTE_BITS, ti.f32) / (n * VOTE_SCALE)
-
-
-@ti.kernel
-def reset_regularised(
-    touched_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    count: ti.i32,
+def commit_votes(
+    touched: ti.types.ndarray(dtype=ti.i32, ndim=1),
     sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    regularised: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    votes: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    correction: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
-    """Fall back to the raw values Σ w·m / Σ w, where a retraction has left no smoothed ones."""
+    """A voxel's value (Σ w·m + correction) / Σ w becomes the mean of what its rays propose; clears `votes`."""
+    count = touched[TOUCHED_COUNT]
     for run in range(count * RUN):
         if run % RUN == 0:
             i = run // RUN
-            slot = touched_slots[i]
+            slot = touched[TOUCHED_HEADER + i]
             for v in range(CUBE):
-                w = lane_weight(sums[slot, v])
-                value = ti.f32(0.0)
-                if w > 0:
-                    value = ti.cast(lane_distance(sums[slot, v]), ti.f32) / ti.cast(w, ti.f32)
-                regularised[slot, v] = value
+                vote = votes[i, v]
+                if vote != 0:
+                    packed = sums[slot, v]
+                    n = ti.cast(vote & ((1 << VOTE_BITS) - 1), ti.f64)
+                    x = ti.cast(vote >> VOTE_BITS, ti.f64) / (n * VOTE_SCALE)
+                    moved = x * lane_weight(packed) - ti.cast(lane_distance(packed), ti.f64)
+                    correction[slot, v] = ti.cast(moved, ti.f32)
+                    votes[i, v] = 0

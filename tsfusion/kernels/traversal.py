@@ -1,16 +1,26 @@
 # SPDX-License-Identifier: MIT
 """Integer geometry shared by all kernels: voxel keys, and the traversal of the voxels a ray crosses.
 
-A ray is eight int32 (`RAY_FIELDS`), made once per keyframe. Everything after that is integer arithmetic
-or single IEEE operations without a multiply-add to contract, so every kernel visits the same voxels.
+A ray is `RAY_FIELDS` int32, made once per keyframe: where its band begins and how it goes on. Everything
+after that is integer arithmetic, so every kernel visits the same voxels.
 
 Units: position 2⁻¹⁰ voxel, direction 2⁻¹⁶, distance along the ray 2⁻¹⁶ voxel.
 """
 
 import taichi as ti
 
-# end point x y z, unit direction x y z, half-width (2⁻⁸ voxel) << 16 | weight, colour 0xRRGGBB
-RAY_FIELDS = 8
+# First voxel of the band (3), next crossing an axis (3), crossing interval an axis (3), what the distance
+# loses with a step an axis (3), signed distance of the first voxel's centre to the surface along the ray
+# (positive before it), length of the band, where in it the end point lies (its low 3 bits: which axes go
+# down), weight << 24 | 0xRRGGBB.
+RAY_FIELDS = 16
+VOXEL, CROSSING, INTERVAL, LOSS = 0, 3, 6, 9
+DISTANCE, LENGTH, END, WEIGHT_COLOR = 12, 13, 14, 15
+
+# A band of the keyframe: a contiguous run of rays that one thread works on.
+BAND_FIELDS = 8
+START, COUNT, SAMPLES, WEIGHT, DEFERRED, UPDATES = 0, 1, 2, 3, 4, 5
+
 MAX_CROSSED = 64  # voxels in one ray's band: 2 · 16 · √3 and the ends
 VOXEL_LIMIT = 1 << 20  # |voxel coordinate| < VOXEL_LIMIT − 64, so that a band stays inside 21 bits
 
@@ -20,7 +30,8 @@ RUN = 512
 
 POSITION_BITS = 10
 DIRECTION_ONE = 1 << 16
-NEVER = 1 << 25  # a crossing far behind the longest band
+NEVER = 1 << 30  # a crossing far behind the longest band
+LEAST_DIRECTION = 8  # an axis slower than this is not crossed: 2⁻¹³, one voxel in 8192
 
 vec3i = ti.types.vector(3, ti.i32)
 
@@ -54,65 +65,79 @@ def hash_key(key):
 
 
 @ti.func
-def ray_weight(rays: ti.template(), r):
-    return rays[r, 6] & 65535
+def write_ray(rays: ti.template(), r, end, direction, gradient, before, behind, weight, color):
+    """Write ray `r`.
 
-
-@ti.func
-def ray_length(rays: ti.template(), r):
-    """Length of the band, 2⁻¹⁶ voxel."""
-    return (rays[r, 6] >> 16) << 9
-
-
-@ti.func
-def ray_start(rays: ti.template(), r):
-    """First voxel of the band, next crossing and crossing interval an axis, direction, and the signed
-    distance (along the ray, positive before the end point) of the first voxel's centre."""
-    half = (rays[r, 6] >> 16) << 8
-    voxel = vec3i(0)
-    crossing = vec3i(0)
-    interval = vec3i(0)
-    direction = vec3i(0)
+    `end` int32 2⁻¹⁰ voxel; `direction` float64 of any length; the band reaches `before` and `behind` the
+    end point, int32 2⁻⁸ voxel. A ray without a direction gets no weight.
+    `gradient`, float64, is what the distance along the ray to the surface loses with a voxel along each axis:
+    n / (n·u) for a plane of normal n; zero stands for the plane across the ray, whose gradient is u.
+    """
+    length = direction.norm()
+    usable = weight
+    if length <= 0.0:
+        usable = 0
+        length = 1.0
+    unit = direction * (DIRECTION_ONE / length)
+    slope = gradient
+    if gradient.norm_sqr() == 0.0:
+        slope = unit / DIRECTION_ONE
     dot = ti.i64(0)
+    downward = 0
     for a in ti.static(range(3)):
-        u = rays[r, 3 + a]
-        end = ti.cast(rays[r, a], ti.i64) << 6
-        start = end - ((ti.cast(u, ti.i64) * half) >> 16)
-        v = ti.cast(start >> 16, ti.i32)
+        u = ti.cast(ti.floor(unit[a] + 0.5), ti.i32)
+        exact = ti.cast(end[a], ti.i64) << 6
+        start = exact - ((ti.cast(u, ti.i64) * before) >> 8)
+        voxel = ti.cast(start >> 16, ti.i32)
         inside = ti.cast(start & 65535, ti.i32)
         gap = inside
         if u > 0:
             gap = 65536 - inside
-        next_crossing = NEVER
-        step = NEVER
-        if abs(u) > 128:
+        crossing = NEVER
+        interval = NEVER
+        if abs(u) > LEAST_DIRECTION:
             inverse = 65536.0 / ti.cast(abs(u), ti.f64)
-            step = ti.cast(inverse * 65536.0, ti.i32)
-            next_crossing = ti.cast(ti.cast(gap, ti.f64) * inverse, ti.i32)
-        voxel[a] = v
-        crossing[a] = next_crossing
-        interval[a] = step
-        direction[a] = u
-        dot += (end - (ti.cast(v, ti.i64) << 16) - 32768) * u
-    return voxel, crossing, interval, direction, ti.cast(dot >> 16, ti.i32)
+            interval = ti.cast(inverse * 65536.0, ti.i32)
+            crossing = ti.cast(ti.cast(gap, ti.f64) * inverse, ti.i32)
+        rays[r, VOXEL + a] = voxel
+        rays[r, CROSSING + a] = crossing
+        rays[r, INTERVAL + a] = interval
+        loss = ti.cast(ti.floor(slope[a] * DIRECTION_ONE + 0.5), ti.i32)
+        dot += (exact - (ti.cast(voxel, ti.i64) << 16) - 32768) * loss
+        if u < 0:
+            downward |= 1 << a
+            loss = -loss
+        rays[r, LOSS + a] = loss
+    rays[r, DISTANCE] = ti.cast(dot >> 16, ti.i32)
+    rays[r, LENGTH] = (before + behind) << 8
+    rays[r, END] = (before << 8) | downward
+    rays[r, WEIGHT_COLOR] = (usable << 24) | color
 
 
 @ti.func
-def next_axis(crossing):
-    axis = 2
-    if crossing[0] <= crossing[1] and crossing[0] <= crossing[2]:
-        axis = 0
-    elif crossing[1] <= crossing[2]:
-        axis = 1
-    return axis
+def ray_weight(rays: ti.template(), r):
+    return (rays[r, WEIGHT_COLOR] >> 24) & 255
 
 
 @ti.func
-def sign(x):
-    s = 1
-    if x < 0:
-        s = -1
-    return s
+def ray_vector(rays: ti.template(), r, first: ti.template()):
+    return vec3i(rays[r, first], rays[r, first + 1], rays[r, first + 2])
+
+
+@ti.func
+def next_step(crossing):
+    """All bits in the axis that is crossed next (the first of equals), none in the others. No branch: which
+    axis comes next is what a processor predicts worst."""
+    nearest = ti.min(crossing[0], crossing[1], crossing[2])
+    x = -ti.cast(crossing[0] == nearest, ti.i32)
+    y = -ti.cast(crossing[1] == nearest, ti.i32) & ~x
+    return vec3i(x, y, ~(x | y)), nearest
+
+
+@ti.func
+def steps(end):
+    """+1 or −1 an axis, from a ray's `END`."""
+    return vec3i(1 - 2 * (end & 1), 1 - (end & 2), 1 - ((end & 4) >> 1))
 
 
 @ti.func
