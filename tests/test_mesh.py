@@ -18,7 +18,8 @@ from tsfusion import Mesh, Volume, runtime
 from tsfusion.blockstore import cells_of, pack_keys, unpack_keys
 from tsfusion.errors import InvalidConfig, OutputError
 from tsfusion.kernels import blocks
-from tsfusion.meshing import Layers, extract
+from tsfusion.meshing import extract
+from tsfusion.surface import Layers
 
 
 def edge_uses(faces: NDArray[np.int32]) -> NDArray[np.int64]:
@@ -59,7 +60,7 @@ def random_layers(
             values[key] = float(distance[slot, offset])
         if votes[slot, offset]:
             colors[key] = tuple(channels[:, slot, offset] / votes[slot, offset])
-    layers = Layers(sums, rgn, channels[2].astype(np.int32), None, hash_keys, hash_slots, 1.0)
+    layers = Layers(sums, rgn, channels[2].astype(np.int32), None, hash_keys, hash_slots, 12, 1.0)
     return layers, keys, values, colors
 
 

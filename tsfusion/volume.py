@@ -20,8 +20,9 @@ from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.rays import WEIGHT_ONE
 from tsfusion.keyframe import Keyframe
 from tsfusion.mesh import Mesh
-from tsfusion.meshing import Layers, extract
+from tsfusion.meshing import MeshScratch, extract
 from tsfusion.scratch import Scratch
+from tsfusion.surface import Layers
 from tsfusion.warmup import warm_up_keyframes
 
 
@@ -78,6 +79,7 @@ class Volume:
             color=config.color, regularised=self._smooths, max_blocks=config.max_blocks_per_keyframe
         )
         self._store = BlockStore(color=config.color, regularised=self._smooths)
+        self._mesh_scratch = MeshScratch()
 
     def integrate(self, keyframe: Keyframe) -> IntegrateStats:
         """Add a keyframe. On an error the map is as it was.
@@ -130,9 +132,10 @@ class Volume:
             regularised=store.regularised if self._smooths else None,
             hash_keys=store.hash_keys,
             hash_slots=store.hash_slots,
+            count=store.count,
             voxel_size=self.config.voxel_size,
         )
-        return extract(np.sort(chosen), layers, min_weight)
+        return extract(np.sort(chosen), layers, min_weight, self._mesh_scratch)
 
     def map_hash(self) -> str:
         """Hex digest of the exact sums: equal for the same keyframes in any order, on any number of threads.
@@ -165,7 +168,7 @@ class Volume:
             voxels=store.count * CUBE,
             bytes=store.nbytes,
             bytes_per_block=store.bytes_per_block,
-            scratch_bytes=self._scratch.nbytes,
+            scratch_bytes=self._scratch.nbytes + self._mesh_scratch.nbytes,
         )
 
     def warm_up(self) -> None:
