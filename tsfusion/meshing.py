@@ -110,7 +110,7 @@ def extract(
     faces = np.empty((triangles, 3), np.int32)
     marching.emit_faces(
         count, around, inside, active, edges, starts, first,
-        mc_tables.TRIANGLE_COUNT, mc_tables.TRIANGLE_EDGES, mc_tables.EDGE_CORNER, faces,
+        mc_tables.TRIANGLE_COUNT, mc_tables.TRIANGLE_STARTS, faces,
     )  # fmt: skip
     scratch.release()
     return Mesh(positions, faces, normals, colors if has_color else None)

@@ -123,8 +123,8 @@ class Volume:
         if blocks is not None:
             if np.shape(blocks)[1:] != (3,) or np.asarray(blocks).dtype.kind != "i":
                 raise InvalidConfig(f"blocks must be (n, 3) integers, got {np.asarray(blocks)!r}")
-            slots = store.slots_of(pack_keys(blocks))
-            chosen = np.unique(chosen[slots[slots >= 0]])
+            chosen = np.unique(pack_keys(blocks))
+            chosen = chosen[store.slots_of(chosen) >= 0]
         layers = Layers(
             sums=store.sums,
             color_rgn=store.color_rgn if self.config.color else None,

@@ -39,12 +39,12 @@ def gather(r, count, first, last, around: ti.template(), values: ti.template(), 
             padded[band, to - 1] = ti.math.nan
             if below < count:
                 padded[band, to - 1] = values[below, o + 7]
+            run = ti.Vector([ti.math.nan] * 8)
             if middle < count:
-                for z in range(8):
-                    padded[band, to + z] = values[middle, o + z]
-            else:
-                for z in range(8):
-                    padded[band, to + z] = ti.math.nan
+                for z in ti.static(range(8)):
+                    run[z] = values[middle, o + z]
+            for z in ti.static(range(8)):
+                padded[band, to + z] = run[z]
             padded[band, to + 8] = ti.math.nan
             padded[band, to + 9] = ti.math.nan
             if above < count:
@@ -89,7 +89,7 @@ def normal_at(padded: ti.template(), band, i, axis, t):
         rising = padded[band, i + step] > padded[band, i]
         for a in ti.static(range(3)):
             normal[a] = ti.select(a == axis, ti.select(rising, 1.0, -1.0), 0.0)
-    return normal / length
+    return normal * (1.0 / length)
 
 
 @ti.func
@@ -209,8 +209,7 @@ def emit_faces(
     starts: ti.types.ndarray(dtype=ti.i32, ndim=2),
     first: ti.types.ndarray(dtype=ti.i32, ndim=2),
     triangle_count: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    triangle_edges: ti.types.ndarray(dtype=ti.i32, ndim=2),
-    edge_corner: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    triangle_starts: ti.types.ndarray(dtype=ti.i32, ndim=2),
     faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
     """Each cell's triangles, as the numbers of the vertices on its edges."""
@@ -228,14 +227,16 @@ def emit_faces(
                             j = lowest(left)
                             left &= left - ti.u64(1)
                             case = case_of(low, high, j)
-                            for n in range(3 * triangle_count[case]):
-                                e = triangle_edges[case, n]
-                                corner = edge_corner[e]
-                                q = vec3i(x, j >> 3, j & 7)
-                                q += vec3i(corner & 1, corner >> 1 & 1, corner >> 2)
-                                owner = around[r, neighbour_of(q)]
-                                plane = 3 * (q[0] & 7) + (e >> 2)
-                                voxel = ((q[1] & 7) << 3) | (q[2] & 7)
-                                faces[face + n // 3, n % 3] = vertex_on(edges, starts, first, owner, plane, voxel)
-                            face += triangle_count[case]
+                            for n in range(triangle_count[case]):
+                                corners = vec3i(0)
+                                for k in ti.static(range(3)):
+                                    e = triangle_starts[case, 3 * n + k]
+                                    q = vec3i(x + (e & 1), (j >> 3) + (e >> 1 & 1), (j & 7) + (e >> 2 & 1))
+                                    owner = around[r, neighbour_of(q)]
+                                    plane = 3 * (q[0] & 7) + (e >> 3)
+                                    voxel = ((q[1] & 7) << 3) | (q[2] & 7)
+                                    corners[k] = vertex_on(edges, starts, first, owner, plane, voxel)
+                                for k in ti.static(range(3)):
+                                    faces[face, k] = corners[k]
+                                face += 1
                         low = high

@@ -4,10 +4,22 @@
 import taichi as ti
 
 from tsfusion.kernels.blocks import map_find
-from tsfusion.kernels.integrate import CUBE, lane_distance, lane_weight
+from tsfusion.kernels.integrate import CUBE, WEIGHT_BITS, lane_weight
 from tsfusion.kernels.traversal import RUN
 
 BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thread count
+
+# A loop that stores to an array does not become vector code (LLVM cannot know that the array's address is
+# not what is stored to); one that stores to a small local vector does: 0.5 µs a block instead of 1.4.
+STRIDE = 32
+
+
+@ti.func
+def distance_as_float(packed):
+    """Nearest float32 to a lane of at most 37 bits. AVX2 converts vectors of int32, not of int64."""
+    high = ti.cast(ti.cast(packed >> (WEIGHT_BITS + 16), ti.i32), ti.f32)
+    low = ti.cast(ti.cast(packed >> WEIGHT_BITS, ti.i32) & 65535, ti.f32)
+    return high * 65536.0 + low
 
 
 @ti.kernel
@@ -29,7 +41,6 @@ def read_values(
             band = run // RUN
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
                 slot = map_find(map_keys, map_slots, mask, keys[r])
-                # the inner loops have no branches: LLVM makes vectors of them
                 if slot < 0:
                     for o in range(CUBE):
                         values[r, o] = ti.math.nan
@@ -38,8 +49,12 @@ def read_values(
                         w = lane_weight(sums[slot, o])
                         values[r, o] = ti.select(w >= min_weight, regularised[slot, o], ti.math.nan)
                 else:
-                    for o in range(CUBE):
-                        packed = sums[slot, o]
-                        w = lane_weight(packed)
-                        value = ti.cast(lane_distance(packed), ti.f32) / ti.cast(w, ti.f32)
-                        values[r, o] = ti.select(w >= min_weight, value, ti.math.nan)
+                    for start in range(0, CUBE // STRIDE):
+                        row = ti.Vector([0.0] * STRIDE)
+                        for i in range(STRIDE):
+                            packed = sums[slot, STRIDE * start + i]
+                            w = lane_weight(packed)
+                            value = distance_as_float(packed) / ti.cast(w, ti.f32)
+                            row[i] = ti.select(w >= min_weight, value, ti.math.nan)
+                        for i in ti.static(range(STRIDE)):
+                            values[r, STRIDE * start + i] = row[i]
