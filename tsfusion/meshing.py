@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""Mesh extraction: which blocks are read, and the numbering; the work is in `kernels/cells.py`, `marching.py`."""
+"""Mesh extraction: which blocks are read, and working memory; the work is in `kernels/cells.py` and
+`kernels/marching.py`."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -179,6 +179,7 @@ class Volume:
             throwaway.retract(keyframe)
             throwaway.integrate(keyframe)
         throwaway.extract_mesh(min_weight=0)
+        throwaway.extract_mesh(min_weight=0, blocks=throwaway.take_dirty()[:1])
 
     def save(self, path: str | os.PathLike[str], meta: dict[str, Any] | None = None) -> Path:
         """Write a checkpoint: complete and on disk, or not at all.

@@ -8,7 +8,7 @@ the number of bits before its own.
 
 import taichi as ti
 
-from tsfusion.kernels.cells import AROUND, HERE, case_of, corner_planes, lowest
+from tsfusion.kernels.cells import case_of, corner_planes, lowest
 from tsfusion.kernels.traversal import RUN, unpack, vec3i
 from tsfusion.kernels.values import BANDS
 
@@ -98,7 +98,9 @@ def axis_step(axis):
 
 
 @ti.func
-def add_color(slots: ti.template(), around: ti.template(), r, p, share, rgn: ti.template(), b: ti.template(), total):
+def add_color(
+    slots: ti.template(), around: ti.template(), r, p, share, rgn: ti.template(), b: ti.template(), total
+):
     """Add the mean colour at voxel p, weighted; the fourth element counts the weight."""
     slot = slots[around[r, neighbour_of(p)]]
     result = total
@@ -115,7 +117,9 @@ def add_color(slots: ti.template(), around: ti.template(), r, p, share, rgn: ti.
 
 
 @ti.func
-def color_at(slots: ti.template(), around: ti.template(), r, p, axis, t, rgn: ti.template(), b: ti.template()):
+def color_at(
+    slots: ti.template(), around: ti.template(), r, p, axis, t, rgn: ti.template(), b: ti.template()
+):
     """Colour at the share t of voxel p's edge along `axis`, rounded."""
     q = p
     for a in ti.static(range(3)):
@@ -177,7 +181,7 @@ def emit_vertices(
                             i = ((p[0] + 1) * PAD + p[1] + 1) * PAD + p[2] + 1
                             here = padded[band, i]
                             there = padded[band, i + axis_step(axis)]
-                            # kept off the voxel centres, where the vertices of several edges would fall together
+                            # kept off the voxel centres, where several edges' vertices would fall together
                             t = ti.min(ti.max(here / (here - there), 0.001), 0.999)
                             normal = normal_at(padded, band, i, axis, t)
                             for a in ti.static(range(3)):

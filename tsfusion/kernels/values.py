@@ -49,7 +49,7 @@ def read_values(
                         w = lane_weight(sums[slot, o])
                         values[r, o] = ti.select(w >= min_weight, regularised[slot, o], ti.math.nan)
                 else:
-                    for start in range(0, CUBE // STRIDE):
+                    for start in range(CUBE // STRIDE):
                         row = ti.Vector([0.0] * STRIDE)
                         for i in range(STRIDE):
                             packed = sums[slot, STRIDE * start + i]
