@@ -102,7 +102,10 @@ def add_color(
     slots: ti.template(), around: ti.template(), r, p, share, rgn: ti.template(), b: ti.template(), total
 ):
     """Add the mean colour at voxel p, weighted; the fourth element counts the weight."""
-    slot = slots[around[r, neighbour_of(p)]]
+    row = r
+    if ((p[0] | p[1] | p[2]) & ~7) != 0:
+        row = around[r, neighbour_of(p)]
+    slot = slots[row]
     result = total
     if slot >= 0:
         o = ((p[0] & 7) << 6) | ((p[1] & 7) << 3) | (p[2] & 7)
@@ -236,7 +239,9 @@ def emit_faces(
                                 for k in ti.static(range(3)):
                                     e = triangle_starts[case, 3 * n + k]
                                     q = vec3i(x + (e & 1), (j >> 3) + (e >> 1 & 1), (j & 7) + (e >> 2 & 1))
-                                    owner = around[r, neighbour_of(q)]
+                                    owner = r
+                                    if ((q[0] | q[1] | q[2]) & 8) != 0:
+                                        owner = around[r, neighbour_of(q)]
                                     plane = 3 * (q[0] & 7) + (e >> 3)
                                     voxel = ((q[1] & 7) << 3) | (q[2] & 7)
                                     corners[k] = vertex_on(edges, starts, first, owner, plane, voxel)
