@@ -41,20 +41,18 @@ def read_values(
             band = run // RUN
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
                 slot = map_find(map_keys, map_slots, mask, keys[r])
-                if slot < 0:
-                    for o in range(CUBE):
-                        values[r, o] = ti.math.nan
-                elif use_regularised == 1:
-                    for o in range(CUBE):
-                        w = lane_weight(sums[slot, o])
-                        values[r, o] = ti.select(w >= min_weight, regularised[slot, o], ti.math.nan)
-                else:
-                    for start in range(CUBE // STRIDE):
-                        row = ti.Vector([0.0] * STRIDE)
+                for start in range(CUBE // STRIDE):
+                    row = ti.Vector([ti.math.nan] * STRIDE)
+                    if slot >= 0 and use_regularised == 1:
+                        for i in range(STRIDE):
+                            w = lane_weight(sums[slot, STRIDE * start + i])
+                            value = regularised[slot, STRIDE * start + i]
+                            row[i] = ti.select(w >= min_weight, value, ti.math.nan)
+                    elif slot >= 0:
                         for i in range(STRIDE):
                             packed = sums[slot, STRIDE * start + i]
                             w = lane_weight(packed)
                             value = distance_as_float(packed) / ti.cast(w, ti.f32)
                             row[i] = ti.select(w >= min_weight, value, ti.math.nan)
-                        for i in ti.static(range(STRIDE)):
-                            values[r, STRIDE * start + i] = row[i]
+                    for i in ti.static(range(STRIDE)):
+                        values[r, STRIDE * start + i] = row[i]
