@@ -221,6 +221,25 @@ def marching_cubes(values: dict[Voxel, float]) -> list[tuple[tuple[float, float,
     return triangles
 
 
+def crossed_cells(
+    values: dict[Voxel, float], meshed: set[Voxel]
+) -> tuple[set[Voxel], set[tuple[Voxel, int]], dict[Voxel, int]]:
+    """Cells of the `meshed` blocks that the surface crosses, the edges (voxel, axis) that carry their
+    vertices, and how many triangles each has: twin of `kernels.cells.find_cells`."""
+    edges, triangles = set(), {}
+    for cell in values:
+        corners = [tuple(int(x) for x in np.add(cell, c)) for c in mc_tables.CORNERS]
+        if tuple(c >> 3 for c in cell) not in meshed or not all(c in values for c in corners):
+            continue
+        case = sum(1 << i for i, c in enumerate(corners) if values[c] < 0)  # type: ignore[index]
+        if 0 < case < 255:
+            triangles[cell] = int(mc_tables.TRIANGLE_COUNT[case])
+            for e, (a, b) in enumerate(mc_tables.EDGES):
+                if (case >> a & 1) != (case >> b & 1):
+                    edges.add((corners[a], e // 4))
+    return set(triangles), edges, triangles  # type: ignore[return-value]
+
+
 def share(values: dict[Voxel, float], a: Any, b: Any) -> float:
     """Where between voxels a and b the value crosses zero."""
     return min(max(values[a] / (values[a] - values[b]), 0.001), 0.999)

@@ -324,11 +324,10 @@ def close(found: NDArray[np.int32], expected: list[NDArray[np.int32]]) -> None:
 
 
 def ray_ends(rays: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n,) the distance of the coordinate origin to each ray's plane, voxels: independent of the first voxel."""
+    """(n,) the distance of the coordinate origin to each ray's plane, voxels: free of the first voxel."""
     downward = rays[:, 14].astype(int)[:, None] >> np.arange(3) & 1
-    return ((rays[:, :3] + 0.5) * rays[:, 9:12] * (1 - 2 * downward)).sum(axis=1) / 65536 + rays[
-        :, 12
-    ] / 65536
+    gradient = rays[:, 9:12] * (1 - 2 * downward)
+    return (((rays[:, :3] + 0.5) * gradient).sum(axis=1) + rays[:, 12]) / 65536
 
 
 def rays_of(scratch: Scratch) -> NDArray[np.int32]:

@@ -19,8 +19,8 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("processes", frozenset({"server", "gateway", "sessions", "ports", "fuser_link", "fuser",
                              "client", "sender", "outbox", "spool", "recording"})),
     ("views and sources", frozenset({"datasets", "ledger", "preview", "results"})),
-    ("map and wire", frozenset({"volume", "integration", "blockstore", "meshing", "scratch", "storage", "checkpoint",
-                                "warmup",
+    ("map and wire", frozenset({"volume", "integration", "surface", "blockstore", "meshing", "scratch",
+                                "storage", "checkpoint", "warmup",
                                 "journal", "transport", "codec"})),
     ("ground", frozenset({"kernels", "runtime", "mesh", "keyframe", "config", "config_toml", "errors",
                           "process"})),
@@ -29,11 +29,11 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
 # All others run where there is no Taichi, and answer while kernels run.
 MAY_REACH_TAICHI = frozenset({
     "__main__", "cli", "pipeline", "fuser", "datasets", "preview",
-    "volume", "integration", "blockstore", "meshing", "scratch", "storage", "checkpoint", "warmup", "kernels",
-    "runtime",
+    "volume", "integration", "surface", "blockstore", "meshing", "scratch", "storage", "checkpoint",
+    "warmup", "kernels", "runtime",
 })  # fmt: skip
 MAY_IMPORT_KERNELS = frozenset({
-    "kernels", "runtime", "volume", "integration", "blockstore", "meshing", "scratch", "preview",
+    "kernels", "runtime", "volume", "integration", "surface", "blockstore", "meshing", "scratch", "preview",
     "datasets.synthetic",
 })  # fmt: skip
 

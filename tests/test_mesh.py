@@ -18,7 +18,8 @@ from tsfusion import Mesh, Volume, runtime
 from tsfusion.blockstore import cells_of, pack_keys, unpack_keys
 from tsfusion.errors import InvalidConfig, OutputError
 from tsfusion.kernels import blocks
-from tsfusion.meshing import Layers, extract
+from tsfusion.meshing import MeshScratch, extract
+from tsfusion.surface import Layers
 
 
 def edge_uses(faces: NDArray[np.int32]) -> NDArray[np.int64]:
@@ -59,7 +60,7 @@ def random_layers(
             values[key] = float(distance[slot, offset])
         if votes[slot, offset]:
             colors[key] = tuple(channels[:, slot, offset] / votes[slot, offset])
-    layers = Layers(sums, rgn, channels[2].astype(np.int32), None, hash_keys, hash_slots, 1.0)
+    layers = Layers(sums, rgn, channels[2].astype(np.int32), None, hash_keys, hash_slots, 12, 1.0)
     return layers, keys, values, colors
 
 
@@ -158,6 +159,41 @@ def test_tiles_of_dirty_blocks_make_up_the_whole_mesh() -> None:
     tiles = triangles_of(volume.extract_mesh(min_weight=1, blocks=changed)) + triangles_of(kept)
     assert tiles == triangles_of(volume.extract_mesh(min_weight=1))
     assert tiles != whole
+
+
+def test_the_mesh_does_not_depend_on_where_blocks_lie_in_memory() -> None:
+    views = scenes.sphere_views(0.4, 4)
+    meshes = []
+    for keyframes in (views, views[::-1]):
+        volume = Volume(voxel_size=0.02)
+        for keyframe in keyframes:
+            volume.integrate(keyframe)
+        meshes.append(volume.extract_mesh(min_weight=1))
+    a, b = meshes
+    for name in ("vertices", "faces", "normals", "colors"):
+        assert getattr(a, name).tobytes() == getattr(b, name).tobytes(), name
+
+
+@pytest.mark.parametrize("known", [1.0, 0.9])
+def test_a_part_equals_the_same_cells_of_the_whole(known: float) -> None:
+    layers, keys, _, _ = random_layers(5, known)
+    keys = np.sort(keys)
+    whole = extract(keys, layers, 1.0)
+    assert whole.colors is not None
+    looks = {tuple(v): (*n, *c) for v, n, c in zip(
+        whole.vertices.tolist(), whole.normals.tolist(), whole.colors.tolist(), strict=True)}  # fmt: skip
+    scratch = MeshScratch()  # what an earlier mesh left in it must not show
+    total: Counter = Counter()
+    for part in (keys[:0], keys[:1], keys[1:8], keys[8:9], keys[9:]):
+        mesh = extract(part, layers, 1.0, scratch)
+        assert mesh.colors is not None
+        total += triangles_of(mesh)
+        for v, n, c in zip(mesh.vertices.tolist(), mesh.normals.tolist(), mesh.colors.tolist(), strict=True):
+            assert looks[tuple(v)] == (*n, *c)
+        again = extract(part, layers, 1.0)
+        assert again.faces.tobytes() == mesh.faces.tobytes()
+        assert again.vertices.tobytes() == mesh.vertices.tobytes()
+    assert total == triangles_of(whole)
 
 
 def blocks_of(volume: Volume) -> list[tuple[int, ...]]:

@@ -310,6 +310,7 @@ def test_kernels_stay_in_bounds(tmp_path: Path) -> None:
         "v.integrate(Keyframe(points=r, T_world_camera=np.eye(4)))\n"
         "v.retract(Keyframe(points=r, T_world_camera=np.eye(4)))\n"
         "assert len(v.extract_mesh(min_weight=0).faces)\n"
+        "assert len(v.extract_mesh(min_weight=0, blocks=v.take_dirty()[::3]).faces)\n"
     )
     here = Path(__file__).parent
     done = subprocess.run(

@@ -13,6 +13,7 @@ from tsfusion.storage import GrowingArray
 
 _FIRST_CAPACITY = 1024
 _CHUNK = 1024  # blocks read at a time where a whole layer would be copied
+_BEHIND = np.array([x << 42 | y << 21 | z for x in (0, 1) for y in (0, 1) for z in (0, 1)])  # in packed keys
 
 
 class BlockStore:
@@ -163,6 +164,4 @@ def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int32]:
 
 def cells_of(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
     """The blocks whose cells read these blocks: themselves and their neighbours towards −x, −y, −z."""
-    shifts = np.stack(np.meshgrid([0, -1], [0, -1], [0, -1], indexing="ij"), axis=-1).reshape(-1, 3)
-    spread = (np.asarray(coordinates, np.int32)[:, None] + shifts.astype(np.int32)).reshape(-1, 3)
-    return np.unique(spread, axis=0)
+    return unpack_keys(np.unique((pack_keys(coordinates)[:, None] - _BEHIND).ravel()))

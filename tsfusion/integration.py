@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Adds the rays of one keyframe to the map, all or none of them, or takes them away again.
 
-Rays go straight into the map's sums. What would make a keyframe unacceptable (no room for its blocks, a lane
-that overflows) shows during or after that; the same rays are then added with the opposite sign, which restores
-every byte, because the sums are integers.
+Rays go straight into the map's sums. What would make a keyframe unacceptable (no room for its blocks, a
+lane that overflows) shows during or after that; the same rays are then added with the opposite sign, which
+restores every byte, because the sums are integers.
 """
 
 from collections.abc import Iterator

@@ -1,129 +1,124 @@
 # SPDX-License-Identifier: MIT
-"""Mesh extraction: plans the batches and the numbering; the work is in `kernels/marching.py`."""
-
-from dataclasses import dataclass
-from typing import Any
+"""Mesh extraction: which blocks are read, and working memory; the work is in `kernels/cells.py` and
+`kernels/marching.py`."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.kernels import marching, mc_tables
-from tsfusion.kernels.blocks import find_blocks
+from tsfusion.kernels import cells, marching, mc_tables
+from tsfusion.kernels.blocks import find_blocks, insert_blocks
 from tsfusion.kernels.integrate import CUBE
-from tsfusion.kernels.samples import WEIGHT_ONE
+from tsfusion.kernels.values import BANDS
 from tsfusion.mesh import Mesh
+from tsfusion.storage import GrowingArray
+from tsfusion.surface import Layers, values_of
 
-BATCH = 4096  # blocks; 22 MB of gathered values
-
-_KEY_STEP = np.array([1 << 42, 1 << 21, 1], np.int64)  # one block along x, y, z in a packed key
-_AROUND = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]) @ _KEY_STEP
-_FORWARD = np.array([(c & 1, c >> 1 & 1, c >> 2 & 1) for c in range(8)]) @ _KEY_STEP
-
-
-@dataclass(frozen=True)
-class Layers:
-    """What a mesh is read from: the map's arrays (slot, 512) and its hash."""
-
-    sums: NDArray[np.int64]
-    color_rgn: NDArray[np.int64] | None
-    color_b: NDArray[np.int32]
-    correction: NDArray[np.float32] | None
-    hash_keys: NDArray[np.int64]
-    hash_slots: NDArray[np.int32]
-    voxel_size: float
+_KEEP = 1 << 14  # blocks whose working memory is kept for the next mesh: 45 MB
+_NO_COLOR = np.zeros((1, CUBE), np.int64)
+_NO_SLOTS = np.zeros(1, np.int32)
 
 
-def extract(wanted: NDArray[np.int64], layers: Layers, min_weight: float) -> Mesh:
-    """Mesh of the cells of the blocks `wanted` (sorted distinct keys)."""
-    # a cell's edges may belong to the next block along x, y, z
-    keys = np.unique((wanted[:, None] + _FORWARD).ravel())
-    keys = keys[_slots(keys, layers) >= 0]
-    blocks = len(keys)
-    cases = np.zeros((blocks, CUBE), np.uint8)
-    edges = np.zeros((blocks, CUBE), np.int32)
-    vertex_counts = np.zeros(blocks, np.int32)
-    triangle_counts = np.zeros(blocks, np.int32)
-    parts = []
-    for first in range(0, blocks, BATCH):
-        part = _Batch(keys[first : first + BATCH], first, wanted, layers, min_weight)
-        part.count(cases, edges, vertex_counts, triangle_counts)
-        parts.append(part.emit(edges, vertex_counts))
-    faces = np.empty((int(triangle_counts.sum()), 3), np.int32)
-    forward = _index(keys, keys[:, None] + _FORWARD)
-    marching.emit_faces(
-        cases, edges, forward, _starts(vertex_counts), _starts(triangle_counts),
-        mc_tables.TRIANGLE_COUNT, mc_tables.TRIANGLE_EDGES, mc_tables.EDGE_CORNER, faces,
-    )  # fmt: skip
-    positions, normals, colors = (
-        np.concatenate(column) if column else np.empty((0, 3), dtype)
-        for column, dtype in zip(
-            zip(*parts, strict=True) if parts else ((), (), ()),
-            (np.float32, np.float32, np.uint8),
-            strict=True,
+class MeshScratch:
+    """Working memory of one extraction: a row a block, and one row for the blocks that are not there.
+
+    What the arrays hold is said in `kernels/cells.py`.
+    """
+
+    def __init__(self) -> None:
+        self.padded = np.empty((BANDS, marching.PADDED), np.float32)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._table = np.zeros(0, np.int64)
+        self._table_rows = np.zeros(0, np.int32)
+        self._found = GrowingArray((), np.int64, 0)
+        self.values = GrowingArray((CUBE,), np.float32, 0)
+        self.around = GrowingArray((cells.AROUND,), np.int32, 0)
+        self.seen = GrowingArray((8,), np.uint64, 0)
+        self.inside = GrowingArray((8,), np.uint64, 0)
+        self.active = GrowingArray((8,), np.uint64, 0)
+        self.edges = GrowingArray((cells.PLANES,), np.uint64, 0)
+        self.starts = GrowingArray((cells.PLANES,), np.int32, 0)
+        self.state = GrowingArray((4,), np.int32, 0)
+        self.first = GrowingArray((2,), np.int32, 0)
+
+    def _arrays(self) -> list[GrowingArray]:
+        return [value for value in vars(self).values() if isinstance(value, GrowingArray)]
+
+    def reserve(self, rows: int) -> None:
+        for array in self._arrays():
+            array.reserve(rows + 1)
+
+    def release(self) -> None:
+        """Give the memory of a large mesh back."""
+        if self.values.capacity > _KEEP:
+            self._forget()
+
+    def table(self, keys: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """An empty hash with room for some keys."""
+        size = 1 << max(4, (2 * keys).bit_length())
+        if len(self._table) < size:
+            self._table, self._table_rows = np.zeros(size, np.int64), np.zeros(size, np.int32)
+        self._table[:size] = 0
+        return self._table[:size], self._table_rows[:size]
+
+    def keys_around(self, wanted: NDArray[np.int64], layers: Layers) -> NDArray[np.int64]:
+        """Sorted keys of the map's blocks that are, or touch, a wanted one."""
+        if len(wanted) == layers.count:
+            return wanted
+        most = min(cells.AROUND * len(wanted), layers.count)
+        self._found.reserve(most)
+        table, _ = self.table(most)
+        found = cells.collect_around(
+            len(wanted), wanted, layers.hash_keys, layers.hash_slots, table, self._found.array
         )
-    )
-    return Mesh(positions, faces, normals, colors if layers.color_rgn is not None else None)
+        return np.sort(self._found.array[:found])
 
-
-class _Batch:
-    """Some blocks, their values gathered with a border."""
-
-    def __init__(
-        self,
-        keys: NDArray[np.int64],
-        first: int,
-        wanted: NDArray[np.int64],
-        layers: Layers,
-        min_weight: float,
-    ) -> None:
-        self.keys, self.first, self.layers = keys, first, layers
-        around = keys[:, None] + _AROUND
-        self.neighbours = _slots(around.ravel(), layers).reshape(around.shape)
-        self.meshed = (_index(wanted, around) >= 0).astype(np.uint8)
-        self.padded = np.empty((len(keys), marching.PADDED), np.float32)
-        smoothed = layers.correction
-        marching.gather_values(
-            len(keys), self.neighbours, layers.sums,
-            np.zeros((1, CUBE), np.float32) if smoothed is None else smoothed, int(smoothed is not None),
-            max(1, int(np.ceil(min_weight * WEIGHT_ONE))), self.padded,
+    @property
+    def nbytes(self) -> int:
+        return self.padded.nbytes + self._table.nbytes + self._table_rows.nbytes + sum(
+            array.array.nbytes for array in self._arrays()
         )  # fmt: skip
 
-    def count(self, cases: Any, edges: Any, vertex_counts: Any, triangle_counts: Any) -> None:
-        marching.count_elements(
-            len(self.keys), self.meshed, self.padded, mc_tables.TRIANGLE_COUNT, self.first,
-            cases, edges, vertex_counts, triangle_counts,
-        )  # fmt: skip
 
-    def emit(
-        self, edges: NDArray[np.int32], vertex_counts: NDArray[np.int32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-        counts = vertex_counts[self.first : self.first + len(self.keys)]
-        total = int(counts.sum())
-        positions = np.empty((total, 3), np.float32)
-        normals = np.empty((total, 3), np.float32)
-        has_color = self.layers.color_rgn is not None
-        colors = np.empty((total, 3), np.uint8) if has_color else np.empty((0, 3), np.uint8)
-        rgn = self.layers.color_rgn if self.layers.color_rgn is not None else np.zeros((1, CUBE), np.int64)
-        marching.emit_vertices(
-            len(self.keys), self.keys, self.neighbours, self.padded, self.first, edges, _starts(counts),
-            self.layers.voxel_size, rgn, self.layers.color_b, int(has_color), positions, normals, colors,
-        )  # fmt: skip
-        return positions, normals, colors
-
-
-def _starts(counts: NDArray[np.int32]) -> NDArray[np.int32]:
-    return (np.cumsum(counts) - counts).astype(np.int32)
-
-
-def _index(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Position of each query in the sorted `keys`, −1 where absent."""
-    if not len(keys):
-        return np.full(queries.shape, -1, np.int32)
-    at = np.minimum(np.searchsorted(keys, queries), len(keys) - 1)
-    return np.where(keys[at] == queries, at, -1).astype(np.int32)
+def extract(
+    wanted: NDArray[np.int64], layers: Layers, min_weight: float, scratch: MeshScratch | None = None
+) -> Mesh:
+    """Mesh of the cells of the map's blocks `wanted` (sorted distinct keys)."""
+    scratch = scratch or MeshScratch()
+    keys = scratch.keys_around(wanted, layers)
+    count = len(keys)
+    scratch.reserve(count)
+    values = values_of(keys, layers, min_weight, scratch.values.array)
+    table, table_rows = scratch.table(count)
+    insert_blocks(keys, 0, count, 0, table, table_rows)
+    around, inside, active = scratch.around.array, scratch.inside.array, scratch.active.array
+    edges, starts, first = scratch.edges.array, scratch.starts.array, scratch.first.array
+    cells.find_cells(
+        count, keys, len(wanted), wanted, table, table_rows, values, mc_tables.TRIANGLE_COUNT,
+        around, scratch.seen.array, inside, active, edges, starts, scratch.state.array, first,
+    )  # fmt: skip
+    vertices, triangles = first[count]
+    positions, normals = np.empty((vertices, 3), np.float32), np.empty((vertices, 3), np.float32)
+    has_color = layers.color_rgn is not None
+    colors = np.empty((vertices if has_color else 0, 3), np.uint8)
+    slots = _slots(keys, layers) if has_color else _NO_SLOTS
+    marching.emit_vertices(
+        count, keys, around, values, edges, first, scratch.padded, layers.voxel_size, slots,
+        _NO_COLOR if layers.color_rgn is None else layers.color_rgn, layers.color_b, int(has_color),
+        positions, normals, colors,
+    )  # fmt: skip
+    faces = np.empty((triangles, 3), np.int32)
+    marching.emit_faces(
+        count, around, inside, active, edges, starts, first,
+        mc_tables.TRIANGLE_COUNT, mc_tables.TRIANGLE_STARTS, faces,
+    )  # fmt: skip
+    scratch.release()
+    return Mesh(positions, faces, normals, colors if has_color else None)
 
 
 def _slots(keys: NDArray[np.int64], layers: Layers) -> NDArray[np.int32]:
-    slots = np.empty(len(keys), np.int32)
+    """The slot of every key, and −1 for the row of the blocks that are not there."""
+    slots = np.full(len(keys) + 1, -1, np.int32)
     find_blocks(keys, layers.hash_keys, layers.hash_slots, slots)
     return slots

@@ -80,7 +80,7 @@ class Scratch:
 
     def take_missing(self) -> NDArray[np.int64]:
         """Keys of the missing blocks, in an order that only the set decides; it is empty after."""
-        keys = self.missing[self.missing != 0]
+        keys: NDArray[np.int64] = self.missing[self.missing != 0]
         self.missing[:] = 0
         return keys
 

@@ -22,8 +22,9 @@ from tsfusion.kernels.samples import WEIGHT_ONE
 from tsfusion.kernels.traversal import COUNT
 from tsfusion.keyframe import Keyframe
 from tsfusion.mesh import Mesh
-from tsfusion.meshing import Layers, extract
+from tsfusion.meshing import MeshScratch, extract
 from tsfusion.scratch import Scratch
+from tsfusion.surface import Layers
 from tsfusion.warmup import warm_up_keyframes
 
 
@@ -79,6 +80,7 @@ class Volume:
         self._scratch = Scratch(color=config.color, regularised=self._smooths)
         self._store = BlockStore(color=config.color, corrected=self._smooths)
         self._integrator = Integrator(self._store, self._scratch, config)
+        self._mesh_scratch = MeshScratch()
 
     def integrate(self, keyframe: Keyframe) -> IntegrateStats:
         """Add a keyframe. On an error the map is as it was.
@@ -122,8 +124,8 @@ class Volume:
         if blocks is not None:
             if np.shape(blocks)[1:] != (3,) or np.asarray(blocks).dtype.kind != "i":
                 raise InvalidConfig(f"blocks must be (n, 3) integers, got {np.asarray(blocks)!r}")
-            slots = store.slots_of(pack_keys(blocks))
-            chosen = np.unique(chosen[slots[slots >= 0]])
+            chosen = np.unique(pack_keys(blocks))
+            chosen = chosen[store.slots_of(chosen) >= 0]
         layers = Layers(
             sums=store.sums,
             color_rgn=store.color_rgn if self.config.color else None,
@@ -131,9 +133,10 @@ class Volume:
             correction=store.correction if self._smooths else None,
             hash_keys=store.hash_keys,
             hash_slots=store.hash_slots,
+            count=store.count,
             voxel_size=self.config.voxel_size,
         )
-        return extract(np.sort(chosen), layers, min_weight)
+        return extract(np.sort(chosen), layers, min_weight, self._mesh_scratch)
 
     def map_hash(self) -> str:
         """Hex digest of the exact sums: equal for the same keyframes in any order, on any number of threads.
@@ -166,7 +169,7 @@ class Volume:
             voxels=store.count * CUBE,
             bytes=store.nbytes,
             bytes_per_block=store.bytes_per_block,
-            scratch_bytes=self._scratch.nbytes,
+            scratch_bytes=self._scratch.nbytes + self._mesh_scratch.nbytes,
         )
 
     def warm_up(self) -> None:
@@ -177,6 +180,7 @@ class Volume:
             throwaway.retract(keyframe)
             throwaway.integrate(keyframe)
         throwaway.extract_mesh(min_weight=0)
+        throwaway.extract_mesh(min_weight=0, blocks=throwaway.take_dirty()[:1])
 
     def save(self, path: str | os.PathLike[str], meta: dict[str, Any] | None = None) -> Path:
         """Write a checkpoint: complete and on disk, or not at all.

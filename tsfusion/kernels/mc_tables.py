@@ -110,3 +110,5 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
 
 
 TRIANGLE_COUNT, TRIANGLE_EDGES = _table()
+# the same, each edge as 8·axis + the corner it starts from
+TRIANGLE_STARTS = np.where(TRIANGLE_EDGES < 0, 0, 8 * EDGE_AXIS[TRIANGLE_EDGES] + EDGE_CORNER[TRIANGLE_EDGES])

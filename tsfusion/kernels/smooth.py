@@ -164,7 +164,7 @@ def commit_votes(
     votes: ti.types.ndarray(dtype=ti.i64, ndim=2),
     correction: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
-    """A voxel's value (Σ w·m + correction) / Σ w becomes the mean of what its rays propose; clears `votes`."""
+    """A voxel's value (Σ w·m + correction) / Σ w becomes the mean that its rays propose; clears `votes`."""
     count = touched[TOUCHED_COUNT]
     for run in range(count * RUN):
         if run % RUN == 0:
