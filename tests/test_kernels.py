@@ -294,8 +294,8 @@ def expected_rays(
                 v, u = np.argwhere(layer).mean(axis=0) + (y * high, x * wide)
                 z = cell[layer].mean()
                 if filtered and layer.sum() == 1:
-                    v0, u0 = int(v), int(u)
-                    around = tile[max(v0 - 1, 0) : v0 + 2, max(u0 - 1, 0) : u0 + 2]
+                    v0, u0 = int(v) + 12 * top, int(u) + 12 * left
+                    around = metres[max(v0 - 1, 0) : v0 + 2, max(u0 - 1, 0) : u0 + 2]
                     if ((around > 0) & (np.abs(around - z) <= tolerance(z))).sum() < 2:
                         continue
                 v, u = v + 12 * top, u + 12 * left
@@ -340,7 +340,9 @@ def test_rays_from_images_equal_the_twin(kind: str, bundled: bool) -> None:
     keyframe, voxel_size = image_keyframe(11, kind), 0.05
     parameters = model_parameters(SENSORS["stereo"], voxel_size, keyframe.baseline_fx)
     scratch = Scratch(color=False, regularised=False)
-    samples = scratch.make_rays(keyframe, SENSORS["stereo"], voxel_size, bundled)
+    samples = scratch.make_rays(
+        keyframe, VolumeConfig(sensor="stereo", voxel_size=voxel_size, bundle=bundled)
+    )
     expected, used = expected_rays(keyframe, parameters, voxel_size, bundled, filtered=True)
     assert 0 < used < np.count_nonzero(depth_of(keyframe, parameters))  # some lone pixels are dropped
     assert samples == used
@@ -352,7 +354,7 @@ def test_a_plane_is_met_exactly_by_every_voxel_beside_a_ray() -> None:
     keyframe = scenes.plane_keyframe(np.eye(4), normal, offset)
     voxel_size = 0.05
     here = Map()
-    here.scratch.make_rays(keyframe, SENSORS["kinect"], voxel_size, True)
+    here.scratch.make_rays(keyframe, VolumeConfig(voxel_size=voxel_size))
     here.apply(rays_of(here.scratch))
     errors, across = [], []
     for voxel, at in here.voxels().items():
@@ -382,7 +384,8 @@ def test_rays_from_points_equal_the_twin(own_origins: bool, bundled: bool) -> No
     keyframe = Keyframe(points=points, origins=origins, T_world_camera=pose)
     voxel_size, model = 0.2, SENSORS["scanner"]
     scratch = Scratch(color=False, regularised=False)
-    samples = scratch.make_rays(keyframe, model, voxel_size, bundled)
+    config = VolumeConfig(sensor="scanner", voxel_size=voxel_size, bundle=bundled)
+    samples = scratch.make_rays(keyframe, config)
     parameters = model_parameters(model, voxel_size, None)
     starts = np.zeros((700, 3)) if origins is None else origins.astype(np.float64)
     expected = []

@@ -101,6 +101,8 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     min_weight: NonNegative | None = None  # full-confidence samples a voxel needs to be meshed
     feedback: bool | None = None  # smooth the smoothed values again (recursion) or the raw ones
     bundle: bool = True  # rays of a neighbourhood that end in one voxel become one
+    outlier_filter: bool = True  # drop pixels that no neighbour supports: flying pixels, speckle
+    space_carving: bool = False  # rays also vote for the free space before their band
     color: bool = True
     threads: Annotated[int, Meta(ge=1, le=256)] | None = None  # None = all cores
     max_blocks: Annotated[int, Meta(ge=1, le=4_000_000)] = 4_000_000

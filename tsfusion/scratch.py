@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.config import SensorModel
+from tsfusion.config import SensorModel, VolumeConfig
 from tsfusion.kernels import points, rays, smooth
 from tsfusion.kernels.integrate import CUBE, TOUCHED_COUNT, TOUCHED_HEADER, TOUCHED_OVERFLOW
 from tsfusion.kernels.traversal import BAND_FIELDS, MAX_CROSSED, RAY_FIELDS, SAMPLES
@@ -54,9 +54,13 @@ class Scratch:
         """Make room for touching all `blocks` of the map."""
         self._touched.reserve(TOUCHED_HEADER + blocks)
 
-    def make_rays(self, keyframe: Keyframe, model: SensorModel, voxel_size: float, bundle: bool) -> int:
-        """Fill `rays`; returns the number of valid samples."""
-        parameters = model_parameters(model, voxel_size, keyframe.baseline_fx)
+    def make_rays(self, keyframe: Keyframe, config: VolumeConfig) -> int:
+        """Fill `rays`; returns the number of samples that went into them."""
+        voxel_size, bundle = config.voxel_size, int(config.bundle)
+        parameters = model_parameters(
+            config.model(keyframe.sensor), voxel_size, keyframe.baseline_fx,
+            outlier_filter=config.outlier_filter, space_carving=config.space_carving,
+        )  # fmt: skip
         self.colored = self.color and keyframe.color is not None
         T = keyframe.T_world_camera
         if keyframe.kind == "points":
@@ -66,7 +70,7 @@ class Scratch:
             points.rays_from_points(
                 keyframe.points, origins.reshape(-1, 3),
                 *_optional(keyframe.color if self.colored else None, 2), *_optional(keyframe.confidence, 1),
-                pose, parameters, int(bundle), self.rays, self.bands,
+                pose, parameters, bundle, self.rays, self.bands,
             )  # fmt: skip
         else:
             height, width = keyframe.shape
@@ -74,7 +78,7 @@ class Scratch:
             rays.rays_from_image(
                 keyframe.measurement, int(keyframe.kind == "disparity"), _depth_scale(keyframe),
                 *_optional(keyframe.color if self.colored else None, 3), *_optional(keyframe.confidence, 2),
-                _camera(keyframe, voxel_size), parameters, int(bundle), self._depths, self.rays, self.bands,
+                _camera(keyframe, voxel_size), parameters, bundle, self._depths, self.rays, self.bands,
             )  # fmt: skip
         return int(self.bands[:, SAMPLES].sum())
 
@@ -103,16 +107,23 @@ class Scratch:
             self.deferred = np.zeros(count, np.int32)
 
 
-def model_parameters(model: SensorModel, voxel_size: float, baseline_fx: float | None) -> NDArray[np.float64]:
-    """The kernel's `model` argument (11 float64, see kernels/rays.py)."""
+def model_parameters(
+    model: SensorModel,
+    voxel_size: float,
+    baseline_fx: float | None,
+    *,
+    outlier_filter: bool = True,
+    space_carving: bool = False,
+) -> NDArray[np.float64]:
+    """The kernel's `model` argument (12 float64, see kernels/rays.py)."""
     slope, z0 = model.sigma_slope, model.sigma_z0
     if baseline_fx is not None and model.disparity_sigma > 0:
         slope, z0 = model.disparity_sigma / baseline_fx, 0.0
     return np.array(
         [
             model.sigma_floor, slope, z0, model.min_support, model.max_support, voxel_size,
-            FULL_WEIGHT_SIGMA * voxel_size, model.min_range, model.max_range, 1.0,
-            3 * 256 / voxel_size,
+            FULL_WEIGHT_SIGMA * voxel_size, model.min_range, model.max_range, outlier_filter,
+            3 * 256 / voxel_size, space_carving,
         ]
     )  # fmt: skip
 

@@ -71,6 +71,11 @@ class Volume:
                 f"ranges must be ordered: min_range {model.min_range} < max_range {model.max_range} m, "
                 f"min_support {model.min_support} ≤ max_support {model.max_support} voxels"
             )
+        if config.space_carving and model.regularizer != "off":
+            raise InvalidConfig(
+                f"space_carving and the regularizer {model.regularizer!r} exclude each other: smoothing works on "
+                "the band around a ray's end; use regularizer = off"
+            )
         self.config = config
         self.model = model
         self.meta: dict[str, Any] = {}
@@ -221,8 +226,7 @@ class Volume:
         if sign < 0 and self.keyframes == 0:
             raise MapError("cannot retract a keyframe from a map that holds none")
         scratch, store, before = self._scratch, self._store, self._store.count
-        model = self.config.model(keyframe.sensor)
-        samples = scratch.make_rays(keyframe, model, self.config.voxel_size, self.config.bundle)
+        samples = scratch.make_rays(keyframe, self.config)
         updates = self._integrator.apply(sign)
         if self._smooths:
             self._smooth(sign)

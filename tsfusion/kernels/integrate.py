@@ -2,7 +2,8 @@
 """Additive integer integration: rays → the map's sums.
 
 A voxel's sum is one int64, (Σ w·m) · 2²⁷ + Σ w: m = signed distance along the ray in sixtieths of a voxel,
-|m| ≤ 1023, which is beyond the widest band there can be.
+|m| ≤ 1023, which is beyond the widest band there can be. Voxels before the band, where the sensor looks
+through (space carving), get the band's half-width for m.
 Colour is (Σ R) · 2⁴⁰ + (Σ G) · 2¹⁶ + n in an int64 and Σ B in an int32, one vote a ray.
 Addition modulo 2⁶⁴ is a group: any order gives the same bytes, and subtracting restores them.
 """
@@ -38,6 +39,7 @@ WEIGHT_MASK = (1 << WEIGHT_BITS) - 1
 WEIGHT_LIMIT = 1 << 26  # half of what the lane holds: going over, or below none, shows before it can carry
 QUANTA_PER_VOXEL = 60
 MAX_DISTANCE = 1023  # quanta: the widest half-width, 16 voxels, and one to spare
+FREE_SHIFT = 1  # a vote for free space before the band is half of one for a surface
 COLOR_LIMIT = 1 << 15  # votes after which a voxel's colour is settled and takes no more
 CUBE = 512
 
@@ -145,7 +147,9 @@ def add_rays(
                     towards = steps(rays[r, END])
                     distance = rays[r, DISTANCE]
                     length = rays[r, LENGTH]
-                    end = rays[r, END]
+                    end = rays[r, END] & ~7
+                    reach = length - end
+                    band_start = end - reach
                     colored = 1 - has_color
                     incomplete = 0
                     inside = 1
@@ -163,9 +167,10 @@ def add_rays(
                         step, next_crossing = next_step(crossing)
                         if slot >= oldest:
                             o = offset_in_block(voxel)
-                            m = quantize(distance) * (sign_ * weight)
-                            value = (ti.cast(m, ti.i64) << WEIGHT_BITS) + sign_ * weight
-                            ti.atomic_add(sums[slot, o], value)
+                            m, w = quantize(distance), sign_ * weight
+                            if next_crossing < band_start:
+                                m, w = quantize(reach), sign_ * ti.max(weight >> FREE_SHIFT, 1)
+                            ti.atomic_add(sums[slot, o], (ti.cast(m * w, ti.i64) << WEIGHT_BITS) + w)
                             updates += 1
                             if colored == 0 and next_crossing > end:
                                 packed = rays[r, WEIGHT_COLOR]

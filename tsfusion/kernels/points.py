@@ -8,6 +8,7 @@ One unit of parallel work is a band, a contiguous run of points with a region of
 import taichi as ti
 
 from tsfusion.kernels.samples import (
+    before_width,
     bundle_weight,
     fixed_point,
     half_width,
@@ -95,8 +96,9 @@ def rays_from_points(
                         rgb = 0
                         if has_color == 1:
                             rgb = ((red // n) << 16) | ((green // n) << 8) | (blue // n)
-                        across = vec3(0.0)
-                        write_ray(rays, out, fixed_point(end), end - origin, across, half, half, weight, rgb)
+                        ray, across = end - origin, vec3(0.0)
+                        before = before_width(model, half, ray.norm())
+                        write_ray(rays, out, fixed_point(end), ray, across, before, half, weight, rgb)
                         total_weight += weight
                         samples += n
                         out += 1

@@ -12,6 +12,7 @@ One unit of parallel work is a band, a contiguous run of tiles with a region of 
 import taichi as ti
 
 from tsfusion.kernels.samples import (
+    before_width,
     bundle_weight,
     fixed_point,
     half_width,
@@ -34,16 +35,33 @@ LEAST_FACING = 0.15  # cosine between plane normal and ray: what is seen more ed
 
 
 @ti.func
-def load_tile(
-    image: ti.template(), is_disparity, scale, confidence: ti.template(), has_confidence,
-    model: ti.template(), top, left, depths: ti.template(), band,
+def depth_at(
+    image: ti.template(), is_disparity, scale, confidence: ti.template(), has_confidence, near, far, unit,
+    v, u,
 ):  # fmt: skip
-    """Fill `depths[band]` with the tile's depths in 2⁻¹⁰ voxel, 0 = none. Returns their count and sum."""
+    """Depth of a pixel in 2⁻¹⁰ voxel (`unit` = 1 / metres of that); 0 = no usable return. All float32."""
+    raw = ti.cast(image[v, u], ti.f32)
+    z = raw * scale
+    if is_disparity == 1:
+        z = scale / ti.max(raw, 1e-9)
+    q = 0
+    # False for NaN as well
+    if raw > 0.0 and z >= near and z <= far:
+        q = ti.cast(z * unit, ti.i32)
+        if has_confidence == 1:
+            if confidence[v, u] == 0:
+                q = 0
+    return q
+
+
+@ti.func
+def load_tile(
+    image: ti.template(), is_disparity, scale, confidence: ti.template(), has_confidence, near, far, unit,
+    top, left, depths: ti.template(), band,
+):  # fmt: skip
+    """Fill `depths[band]` with the tile's depths. Returns their count and sum."""
     bottom = ti.min(TILE, image.shape[0] - top)
     right = ti.min(TILE, image.shape[1] - left)
-    factor = ti.cast(scale, ti.f32)
-    per_metre = ti.cast(1024.0 / model[5], ti.f32)
-    nearest, farthest = ti.cast(model[7], ti.f32), ti.cast(model[8], ti.f32)
     if bottom < TILE or right < TILE:
         for i in range(TILE_SAMPLES):
             depths[band, i] = 0
@@ -51,17 +69,9 @@ def load_tile(
     total = ti.i64(0)
     for y in range(bottom):
         for x in range(right):
-            raw = ti.cast(image[top + y, left + x], ti.f32)
-            z = raw * factor
-            if is_disparity == 1:
-                z = factor / ti.max(raw, 1e-9)
-            q = 0
-            # False for NaN as well
-            if raw > 0.0 and z >= nearest and z <= farthest:
-                q = ti.cast(z * per_metre, ti.i32)
-                if has_confidence == 1:
-                    if confidence[top + y, left + x] == 0:
-                        q = 0
+            q = depth_at(
+                image, is_disparity, scale, confidence, has_confidence, near, far, unit, top + y, left + x
+            )
             depths[band, y * TILE + x] = q
             valid += ti.cast(q > 0, ti.i32)
             total += q
@@ -174,14 +184,17 @@ def layer_color(
 
 
 @ti.func
-def is_supported(depths: ti.template(), band, y, x, q, tolerance):
-    """Whether a neighbour in the tile has nearly the same depth."""
+def is_supported(
+    image: ti.template(), is_disparity, scale, confidence: ti.template(), has_confidence, near, far, unit,
+    v, u, q, tolerance,
+):  # fmt: skip
+    """Whether one of the eight neighbours has nearly the same depth."""
     found = 0
     for k in range(9):
-        v = y + k // 3 - 1
-        u = x + k % 3 - 1
-        if found == 0 and k != 4 and v >= 0 and v < TILE and u >= 0 and u < TILE:
-            other = depths[band, v * TILE + u]
+        y = v + k // 3 - 1
+        x = u + k % 3 - 1
+        if found == 0 and k != 4 and y >= 0 and y < image.shape[0] and x >= 0 and x < image.shape[1]:
+            other = depth_at(image, is_disparity, scale, confidence, has_confidence, near, far, unit, y, x)
             if other > 0 and abs(other - q) <= tolerance:
                 found = 1
     return found
@@ -213,6 +226,8 @@ def rays_from_image(
     origin = vec3(camera[3, 0], camera[3, 1], camera[3, 2])
     pitch = ti.max(du.norm(), dv.norm())
     unit = model[5] / 1024.0  # metres
+    factor, per_metre = ti.cast(scale, ti.f32), ti.cast(1.0 / unit, ti.f32)
+    near, far = ti.cast(model[7], ti.f32), ti.cast(model[8], ti.f32)
     for run in range(count * RUN):
         if run % RUN == 0:
             band = run // RUN
@@ -224,8 +239,9 @@ def rays_from_image(
                 top = tile // tiles_x * TILE
                 left = tile % tiles_x * TILE
                 valid, total = load_tile(
-                    image, is_disparity, scale, confidence, has_confidence, model, top, left, depths, band
-                )
+                    image, is_disparity, factor, confidence, has_confidence, near, far, per_metre, top, left,
+                    depths, band,
+                )  # fmt: skip
                 if valid > 0:
                     mean = ti.cast(total, ti.f64) / valid * unit
                     wide, high, planar, slope_x, slope_y = 1, 1, 0, 0.0, 0.0
@@ -254,7 +270,10 @@ def rays_from_image(
                                 )
                             keep = n > 0
                             if n == 1 and model[9] > 0.0:
-                                keep = is_supported(depths, band, sum_y, sum_x, low, tolerance) == 1
+                                keep = 1 == is_supported(
+                                    image, is_disparity, factor, confidence, has_confidence, near, far,
+                                    per_metre, top + sum_y, left + sum_x, low, tolerance,
+                                )  # fmt: skip
                             if keep:
                                 z = (ti.cast(sum_q, ti.f64) / n + 0.5) * unit
                                 u = left + ti.cast(sum_x, ti.f64) / n
@@ -276,8 +295,9 @@ def rays_from_image(
                                     sigma = noise_sigma(model, z)
                                     weight = bundle_weight(model, sigma, trust)
                                     half = half_width(model, sigma)
+                                    before = before_width(model, half, ray.norm() * z)
                                     write_ray(
-                                        rays, out, fixed_point(p), ray, gradient, half, half, weight, rgb
+                                        rays, out, fixed_point(p), ray, gradient, before, half, weight, rgb
                                     )
                                     total_weight += weight
                                     samples += n

@@ -11,9 +11,10 @@ LEAST_SHARE = 1.0 / WEIGHT_ONE  # of a sample's weight stays, however noisy it i
 LAYER_SIGMAS = 4.0  # samples this many σ (and a voxel) apart are not one surface
 
 # `model`: σ floor, σ slope, σ z0, least and most half-width (voxels), voxel size, σ below which the weight is
-# full, least and most range, whether lone samples are dropped, three σ of 1 m in 2⁻⁸ voxel.
-# See config.SensorModel.
-MODEL_FIELDS = 11
+# full, least and most range, whether lone samples are dropped, three σ of 1 m in 2⁻⁸ voxel, whether the space
+# before the band is carved. See config.SensorModel.
+MODEL_FIELDS = 12
+MAX_CARVED = 2048.0  # voxels
 
 vec3 = ti.types.vector(3, ti.f64)
 vec3f = ti.types.vector(3, ti.f32)
@@ -39,6 +40,15 @@ def half_width(model: ti.template(), sigma):
     """Support half-width, 2⁻⁸ voxel: three sigma, held between the preset's bounds."""
     width = ti.min(ti.max(sigma * model[10], model[3] * 256.0), model[4] * 256.0)
     return ti.cast(width, ti.i32)
+
+
+@ti.func
+def before_width(model: ti.template(), half, length):
+    """How far before its end a ray of `length` voxels begins, 2⁻⁸ voxel: its band, or all but a voxel."""
+    before = half
+    if model[11] > 0.0:
+        before = ti.max(half, ti.cast((ti.min(length, MAX_CARVED) - 1.0) * 256.0, ti.i32))
+    return before
 
 
 @ti.func
