@@ -108,8 +108,8 @@ def plate_views(thickness: float) -> list[Keyframe]:
 
 @pytest.mark.parametrize("voxels", [1.5, 3.0, 8.0])
 def test_a_plate_seen_from_both_sides_is_no_worse_than_without_bundling(voxels: float) -> None:
-    """Bands of opposite sides overlap in a plate thinner than two of them: each side pushes the other outward,
-    as in any fusion that averages. Bundling, planes and the filter must add next to nothing to that."""
+    """Bands of opposite sides overlap in a plate thinner than two of them: each side pushes the other
+    outward, as in any fusion that averages. Bundling, planes and the filter must add next to nothing."""
     size, thickness = 0.02, voxels * 0.02
     errors = []
     for settings in ({"bundle": True}, {"bundle": False, "outlier_filter": False}):

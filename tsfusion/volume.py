@@ -73,8 +73,8 @@ class Volume:
             )
         if config.space_carving and model.regularizer != "off":
             raise InvalidConfig(
-                f"space_carving and the regularizer {model.regularizer!r} exclude each other: smoothing works on "
-                "the band around a ray's end; use regularizer = off"
+                f"space_carving and the regularizer {model.regularizer!r} exclude each other: smoothing is "
+                "for the band around a ray's end; use regularizer = off"
             )
         self.config = config
         self.model = model
