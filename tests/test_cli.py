@@ -347,3 +347,44 @@ def test_ctrl_c_while_modules_load_is_no_traceback() -> None:
     )
     assert done.returncode == -signal.SIGINT
     assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ({"truncation": 4.0}, {"min_support": 4.0, "max_support": 4.0}),
+        ({"support": "3:6.5"}, {"min_support": 3.0, "max_support": 6.5}),
+        ({"min_weight": 0.5, "max_range": 3.0}, {"min_weight": 0.5, "max_range": 3.0}),
+        ({"lambda_": 7.0}, {"smoothness": 7.0}),
+        ({"space_carving": True}, {"space_carving": True}),
+    ],
+)
+def test_map_flags_become_settings(flags: dict[str, object], expected: dict[str, object]) -> None:
+    from tsfusion.cli.options import configuration
+
+    volume = configuration(None, **flags).volume
+    assert {name: getattr(volume, name) for name in expected} == expected
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({"truncation": 4.0, "support": "3:6"}, "exclude each other"),
+        ({"support": "3-6"}, "LEAST:MOST"),
+        ({"support": "3:99"}, "max_support must be <= 16"),
+    ],
+)
+def test_a_bad_band_is_explained(flags: dict[str, object], message: str) -> None:
+    from tsfusion.cli.options import configuration
+
+    with pytest.raises(InvalidConfig, match=message):
+        configuration(None, **flags)
+
+
+@pytest.mark.parametrize("verb", ["serve", "replay", "demo", "mesh"])
+def test_every_verb_that_fuses_takes_the_map_flags(verb: str) -> None:
+    from tsfusion.cli.options import MAP_OPTIONS
+
+    shown = tsfusion(verb, "--help").stdout
+    for option in MAP_OPTIONS.values():
+        assert option.__metadata__[0].param_decls[0].partition("/")[0] in shown

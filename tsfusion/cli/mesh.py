@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 MAP_FILE = "map.tsf"
 
 
+@options.takes_map_settings
 def mesh(
     context: typer.Context,
     source: Annotated[
@@ -29,16 +30,10 @@ def mesh(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="A .ply, .glb or .obj file.")],
     *,
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw it, too.")] = None,
-    min_weight: options.MinWeight = None,
     control: options.Control = None,
-    voxel_size: options.VoxelSize = None,
-    sensor: options.Sensor = None,
-    regularizer: options.Regularizer = None,
-    smoothness: options.Smoothness = None,
-    max_range: options.MaxRange = None,
-    threads: options.Threads = None,
     config: options.ConfigFile = None,
     json: options.Json = False,
+    **settings: Any,
 ) -> None:
     """Write the mesh of a saved map, of a journal (fused anew, with these map flags), or of a live server."""
     from tsfusion.mesh import FORMATS
@@ -49,28 +44,26 @@ def mesh(
         check_writable(preview, (".png",))
     if "://" in source:
         options.refuse(
-            context, (*options.MAP_FLAGS, "threads", "config"),
+            context, {*options.MAP_OPTIONS, "config"} - {"min_weight"},
             "has no effect on a live server's map: give it to `tsfusion serve`",
         )  # fmt: skip
         from tsfusion.client import fetch_mesh
 
-        made = fetch_mesh(source, control=control, min_weight=min_weight)
+        made = fetch_mesh(source, control=control, min_weight=settings["min_weight"])
     else:
         options.refuse(
             context, ("control",), f"has no effect on {source}: only a live server (tcp://…) has one"
         )
         if source.endswith(".tsf"):
             options.refuse(
-                context, options.MAP_FLAGS,
+                context, options.MAP_OPTIONS.keys() - options.VIEW_OPTIONS,
                 "has no effect on a saved map: give the state folder or the journal to fuse it anew",
             )  # fmt: skip
-        chosen = options.configuration(
-            config, voxel_size=voxel_size, sensor=sensor, regularizer=regularizer, smoothness=smoothness,
-            max_range=max_range, threads=threads,
-        )  # fmt: skip
-        flags = (voxel_size, sensor, regularizer, smoothness, max_range, config)
-        given = any(flag is not None for flag in flags)
-        made = _volume(Path(source), chosen.volume, given=given, quiet=json).extract_mesh(min_weight)
+        chosen = options.configuration(config, **settings)
+        given = config is not None or any(
+            value is not None for name, value in settings.items() if name not in options.VIEW_OPTIONS
+        )
+        made = _volume(Path(source), chosen.volume, given=given, quiet=json).extract_mesh()
     made.save(out)
     if preview is not None:
         from tsfusion.preview import render

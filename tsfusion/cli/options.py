@@ -4,7 +4,9 @@
 A flag beats its environment variable, which beats the file, which beats the default in `tsfusion.config`.
 """
 
-from collections.abc import Collection
+import functools
+import inspect
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,65 +15,66 @@ import typer
 if TYPE_CHECKING:
     from tsfusion.config import Config
 
-_MAP = "Map"
-MAP_FLAGS = ("voxel_size", "sensor", "regularizer", "smoothness", "max_range")
-
 ConfigFile = Annotated[
     Path | None,
     typer.Option(
         "--config", metavar="FILE", envvar="TSFUSION_CONFIG", help="TOML; `tsfusion config dump` writes one."
     ),
 ]
-VoxelSize = Annotated[
-    float | None,
-    typer.Option(
-        "--voxel-size", metavar="METRES", envvar="TSFUSION_VOXEL_SIZE", rich_help_panel=_MAP,
-        help="Edge of a voxel.",
-    ),
-]  # fmt: skip
-Sensor = Annotated[
-    str | None,
-    typer.Option(
-        "--sensor", metavar="NAME", envvar="TSFUSION_SENSOR", rich_help_panel=_MAP,
-        help="Noise model: kinect, tof, realsense, stereo, lidar or scanner.",
-    ),
-]  # fmt: skip
-Regularizer = Annotated[
-    str | None,
-    typer.Option(
-        "--regularizer", metavar="MODE", envvar="TSFUSION_REGULARIZER", rich_help_panel=_MAP,
-        help="Smoothing along rays: off, paper or ray; else the sensor's.",
-    ),
-]  # fmt: skip
-Smoothness = Annotated[
-    float | None,
-    typer.Option(
-        "--lambda", metavar="NUMBER", envvar="TSFUSION_LAMBDA", rich_help_panel=_MAP,
-        help="Strength of the smoothing; else the sensor's.",
-    ),
-]  # fmt: skip
-MaxRange = Annotated[
-    float | None,
-    typer.Option(
-        "--max-range", metavar="METRES", envvar="TSFUSION_MAX_RANGE", rich_help_panel=_MAP,
-        help="Measurements beyond it are left out; else the sensor's.",
-    ),
-]  # fmt: skip
-Threads = Annotated[
-    int | None,
-    typer.Option(
-        "--threads", metavar="N", envvar="TSFUSION_THREADS", rich_help_panel=_MAP,
-        help="Kernel threads; else all cores. Results do not depend on it.",
-    ),
-]  # fmt: skip
-MinWeight = Annotated[
-    float | None,
-    typer.Option(
-        "--min-weight",
-        metavar="SAMPLES",
-        help="Full-confidence samples a voxel needs to be meshed; else the sensor's.",
-    ),
-]
+
+
+def _map_option(flag: str, metavar: str | None, help_: str) -> Any:
+    variable = "TSFUSION_" + flag.partition("/")[0].strip("-").replace("-", "_").upper()
+    return typer.Option(flag, metavar=metavar, envvar=variable, rich_help_panel="Map", help=help_)
+
+
+# By name: a setting of the `volume` table, or one that `configuration` turns into some.
+MAP_OPTIONS: dict[str, Any] = {
+    "voxel_size": Annotated[float | None, _map_option("--voxel-size", "METRES", "Edge of a voxel.")],
+    "sensor": Annotated[str | None, _map_option(
+        "--sensor", "NAME", "Noise model and presets: kinect, tof, realsense, stereo, lidar or scanner.")],
+    "regularizer": Annotated[str | None, _map_option(
+        "--regularizer", "MODE", "Smoothing along rays: off, paper or ray; else the sensor's.")],
+    "surface": Annotated[str | None, _map_option(
+        "--surface", "MODE", "What is meshed: raw, normal or field (smoothed); else the sensor's.")],
+    "lambda_": Annotated[float | None, _map_option(
+        "--lambda", "NUMBER", "Strength of the smoothing, along rays and of the field; else the sensor's.")],
+    "truncation": Annotated[float | None, _map_option(
+        "--truncation", "VOXELS", "One half-width for every ray's band, instead of 3 sigma of its noise.")],
+    "support": Annotated[str | None, _map_option(
+        "--support", "LEAST:MOST", "Bounds of a band's half-width, voxels, such as 3:6; else the sensor's.")],
+    "max_range": Annotated[float | None, _map_option(
+        "--max-range", "METRES", "Measurements beyond it are left out; else the sensor's.")],
+    "min_weight": Annotated[float | None, _map_option(
+        "--min-weight", "SAMPLES", "Full-confidence samples a voxel needs to be meshed; else the sensor's.")],
+    "space_carving": Annotated[bool | None, _map_option(
+        "--space-carving/--no-space-carving", None, "Let rays clear what they pass: slower, no ghosts.")],
+    "threads": Annotated[int | None, _map_option(
+        "--threads", "N", "Kernel threads; else all cores. Results do not depend on it.")],
+}  # fmt: skip
+VIEW_OPTIONS = ("min_weight", "surface", "lambda_", "threads")  # these change nothing that is stored
+
+
+def takes_map_settings(verb: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a verb whose last parameter is `**settings` every one of `MAP_OPTIONS`."""
+    signature = inspect.signature(verb)
+    own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+    shared = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=option)
+        for name, option in MAP_OPTIONS.items()
+    ]
+
+    @functools.wraps(verb)
+    def with_settings(*arguments: Any, **settings: Any) -> Any:
+        return verb(*arguments, **settings)
+
+    parameters = [*own, *shared]
+    del with_settings.__wrapped__
+    with_settings.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    with_settings.__annotations__ = {p.name: p.annotation for p in parameters}
+    return with_settings
+
+
 Connect = Annotated[
     str | None,
     typer.Option(
@@ -114,6 +117,9 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
     from tsfusion import config
 
     loaded = config.load(file, **(preset or {}))
+    flags |= _band(flags.pop("truncation", None), flags.pop("support", None))
+    if (smoothness := flags.pop("lambda_", None)) is not None:
+        flags |= {"smoothness": smoothness, "field_smoothness": smoothness}
     volume, server = (
         {key: value for key, value in flags.items() if key in struct.__struct_fields__}
         for struct in (config.VolumeConfig, config.ServerConfig)
@@ -123,3 +129,22 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
         server=config.override(loaded.server, **server),
         client=loaded.client,
     )
+
+
+def _band(truncation: float | None, support: str | None) -> dict[str, float]:
+    """The settings that --truncation or --support stand for."""
+    from tsfusion.errors import InvalidConfig
+
+    if truncation is not None and support is not None:
+        raise InvalidConfig(
+            "--truncation and --support exclude each other: one fixes the band, one bounds it"
+        )
+    if truncation is not None:
+        return {"min_support": truncation, "max_support": truncation}
+    if support is None:
+        return {}
+    least, _, most = support.partition(":")
+    try:
+        return {"min_support": float(least), "max_support": float(most)}
+    except ValueError as error:
+        raise InvalidConfig(f"--support must be LEAST:MOST, such as 3:6, got {support!r}") from error

@@ -27,6 +27,7 @@ Limit = Annotated[
 ]
 
 
+@options.takes_map_settings
 def replay(
     context: typer.Context,
     path: Annotated[
@@ -57,38 +58,31 @@ def replay(
     state: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Keep the own server's journal and map here.")
     ] = None,
-    voxel_size: options.VoxelSize = None,
-    sensor: options.Sensor = None,
-    regularizer: options.Regularizer = None,
-    smoothness: options.Smoothness = None,
-    max_range: options.MaxRange = None,
-    min_weight: options.MinWeight = None,
-    threads: options.Threads = None,
     config: options.ConfigFile = None,
     json: options.Json = False,
+    **settings: Any,
 ) -> None:
     """Send a recorded dataset (or a journal) through the whole path; leave mesh, picture and figures."""
     from tsfusion.datasets import select
 
     if connect is not None:
         options.refuse(
-            context, (*options.MAP_FLAGS, "threads", "state"),
+            context, {*options.MAP_OPTIONS, "state"} - {"min_weight"},
             "has no effect with --connect: give it to the `tsfusion serve` that listens there",
         )  # fmt: skip
     else:
         options.refuse(context, ("control",), "has no effect without --connect")
     dataset = _open(path, sequence=sequence, modality=modality, poses=poses)
     chosen = options.configuration(
-        config, preset={"sensor": dataset.sensor}, voxel_size=voxel_size, sensor=sensor,
-        regularizer=regularizer, smoothness=smoothness, max_range=max_range, threads=threads,
+        config, preset={"sensor": dataset.sensor}, **settings,
     )  # fmt: skip
     if start or stride > 1 or max_keyframes is not None:
         dataset = select(dataset, start=start, stride=stride, limit=max_keyframes)
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count} frames {reason}", err=True)
     _run(
-        dataset, out, chosen, connect=connect, control=control, rate=rate, min_weight=min_weight, state=state,
-        json=json,
+        dataset, out, chosen, connect=connect, control=control, rate=rate, state=state, json=json,
+        min_weight=settings["min_weight"],
     )  # fmt: skip
 
 
@@ -106,6 +100,7 @@ def _open(path: Path, **given: Any) -> "Dataset":
     return open_dataset(path, **given)
 
 
+@options.takes_map_settings
 def demo(
     *,
     out: Out = Path("out"),
@@ -118,19 +113,13 @@ def demo(
         float | None,
         typer.Option("--rate", metavar="HZ", min=1e-3, help="Keyframes per second; else 6, in the street 4."),
     ] = None,
-    voxel_size: options.VoxelSize = None,
-    sensor: options.Sensor = None,
-    regularizer: options.Regularizer = None,
-    smoothness: options.Smoothness = None,
-    min_weight: options.MinWeight = None,
-    threads: options.Threads = None,
     config: options.ConfigFile = None,
     json: options.Json = False,
+    **settings: Any,
 ) -> None:
     """Scan a synthetic world whose surface is known, and measure how far the mesh is from it."""
     chosen = options.configuration(
-        config, preset=_STREET if world == "street" else None, voxel_size=voxel_size, sensor=sensor,
-        regularizer=regularizer, smoothness=smoothness, threads=threads,
+        config, preset=_STREET if world == "street" else None, **settings,
     )  # fmt: skip
     from tsfusion.datasets import Synthetic
 
@@ -138,7 +127,7 @@ def demo(
     dataset = Synthetic(
         world, sensor=chosen.volume.sensor, count=count or usual_count, seed=seed, path=path
     )  # fmt: skip
-    _run(dataset, out, chosen, rate=rate or usual_rate, min_weight=min_weight, json=json)
+    _run(dataset, out, chosen, rate=rate or usual_rate, min_weight=settings["min_weight"], json=json)
 
 
 def _run(

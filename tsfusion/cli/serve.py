@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 import time
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from tsfusion.transport import Addresses
 
 
+@options.takes_map_settings
 def serve(
     *,
     listen: Annotated[
@@ -36,15 +37,10 @@ def serve(
             metavar="DIR", envvar="TSFUSION_STATE", help="Journal and map; what is there is taken up again."
         ),
     ] = None,
-    voxel_size: options.VoxelSize = None,
-    sensor: options.Sensor = None,
-    regularizer: options.Regularizer = None,
-    smoothness: options.Smoothness = None,
-    max_range: options.MaxRange = None,
-    threads: options.Threads = None,
     config: options.ConfigFile = None,
     json: options.Json = False,
     until_eof: Annotated[bool, typer.Option("--until-eof", hidden=True)] = False,
+    **settings: Any,
 ) -> int:
     """Fuse keyframes that scanners send; SIGTERM or Ctrl-C saves the map and ends.
 
@@ -53,10 +49,7 @@ def serve(
     started = time.monotonic()
     from tsfusion import server
 
-    chosen = options.configuration(
-        config, listen=listen, control=control, state=state, voxel_size=voxel_size, sensor=sensor,
-        regularizer=regularizer, smoothness=smoothness, max_range=max_range, threads=threads,
-    )  # fmt: skip
+    chosen = options.configuration(config, listen=listen, control=control, state=state, **settings)
     if until_eof:
         threading.Thread(target=_stop_at_eof, daemon=True).start()
 
