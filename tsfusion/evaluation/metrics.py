@@ -80,7 +80,6 @@ def segment_distance(points: NDArray[np.floating], segments: NDArray[np.floating
 
 def one_per_cell(points: NDArray[np.floating], size: float) -> NDArray[np.float64]:
     """The first of `points` (n, 3) in each cube of `size` metres: dense and sparse parts count alike."""
-    points64: NDArray[np.float64] = np.asarray(points, np.float64)
-    cell = np.floor(points64 / size).astype(np.int64) + (1 << 20)
+    cell = np.floor(points / size).astype(np.int64) + (1 << 20)
     _, first = np.unique(cell[:, 0] << 42 | cell[:, 1] << 21 | cell[:, 2], return_index=True)
-    return points64[np.sort(first)]
+    return np.asarray(points[np.sort(first)], np.float64)

@@ -24,18 +24,21 @@ def depth_metres(keyframe: Keyframe) -> NDArray[np.float64]:
     return np.where(np.isfinite(z) & (z > 0), z, 0.0)
 
 
-def points_world(keyframe: Keyframe) -> NDArray[np.float64]:
-    """(n, 3) float64 of the valid pixels, or of the points, in the world."""
+def points_camera(keyframe: Keyframe) -> NDArray[np.float64]:
+    """(n, 3) float64 of the valid pixels, or of the points, in the sensor's frame."""
     if keyframe.points is not None:
-        points = keyframe.points.astype(np.float64)
-    else:
-        z, K = depth_metres(keyframe), keyframe.intrinsics
-        assert K is not None  # a keyframe with an image has a camera
-        v, u = np.nonzero(z)
-        z = z[v, u]
-        points = np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z], axis=1)
+        return keyframe.points.astype(np.float64)
+    z, K = depth_metres(keyframe), keyframe.intrinsics
+    assert K is not None  # a keyframe with an image has a camera
+    v, u = np.nonzero(z)
+    z = z[v, u]
+    return np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z], axis=1)
+
+
+def points_world(keyframe: Keyframe) -> NDArray[np.float64]:
+    """`points_camera`, moved by the keyframe's pose."""
     T = keyframe.T_world_camera
-    moved: NDArray[np.float64] = points @ T[:3, :3].T + T[:3, 3]
+    moved: NDArray[np.float64] = points_camera(keyframe) @ T[:3, :3].T + T[:3, 3]
     return moved
 
 

@@ -182,7 +182,8 @@ def _candidates(solids: Solids, points: NDArray[np.float64]) -> Solids:
     gap = np.linalg.norm(np.maximum(np.maximum(low - solids[:, 1:4], solids[:, 1:4] - high), 0), axis=1)
     farthest = np.linalg.norm(np.maximum(high - solids[:, 1:4], solids[:, 1:4] - low), axis=1)
     endless = np.isin(solids[:, 0], (ROOM, GROUND))
-    return solids[endless | (gap - radius <= farthest[~endless].min(initial=np.inf))]
+    chosen: Solids = solids[endless | (gap - radius <= farthest[~endless].min(initial=np.inf))]
+    return chosen
 
 
 def _edges(row: Solids) -> NDArray[np.float64]:
