@@ -22,6 +22,7 @@ from tsfusion.keyframe import Intrinsics, Keyframe
 # metres, for every system; else the sensor preset's. 2.8: the things in the middle, not the walls behind
 MAX_RANGE = {"street": 30.0, "corners": 2.8, "thin": 2.8, "kitchen": 4.0, "hololens": 4.0}
 MOST_SHOWN = 100  # clean views that say what was seen
+SEEN_BY = 4  # clean samples in a cell: fewer are the outlines of round things and the rims of images
 HOLD_OUT = 5  # every fifth recorded keyframe is not fused but predicted
 
 OFF = {"regularizer": "off", "surface": "raw"}
@@ -263,11 +264,11 @@ def _recorded(setup: Setup) -> Material:
 
 
 def _seen(views: Iterable[Keyframe], setup: Setup, max_range: float | None = None) -> NDArray[np.float64]:
-    """Points of the surface that some view shows, one a cell."""
-    size, found = COMPLETE_WITHIN * setup.voxel_size, []
+    """Points of the surface that clean views show, one a cell."""
+    shown = []
     for view in views:
         points = points_world(view)
         if max_range is not None:
             points = points[np.linalg.norm(points - view.T_world_camera[:3, 3], axis=1) < max_range]
-        found.append(metrics.one_per_cell(points, size))
-    return metrics.one_per_cell(np.concatenate(found), size)
+        shown.append(points)
+    return metrics.one_per_cell(np.concatenate(shown), COMPLETE_WITHIN * setup.voxel_size, at_least=SEEN_BY)

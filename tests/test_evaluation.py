@@ -76,6 +76,7 @@ def test_distance_from_segments_by_the_chunk(monkeypatch: pytest.MonkeyPatch) ->
 def test_one_point_a_cell_whatever_the_sign() -> None:
     points = np.array([(0.01, 0, 0), (0.02, 0, 0), (-0.01, 0, 0), (0.01, 0, 0), (0.01, 0, -7.0)])
     assert (metrics.one_per_cell(points, 0.1) == points[[0, 2, 4]]).all()
+    assert (metrics.one_per_cell(points, 0.1, at_least=2) == points[[0]]).all()
     assert metrics.one_per_cell(points[:0], 0.1).shape == (0, 3)
 
 

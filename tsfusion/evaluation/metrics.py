@@ -78,8 +78,12 @@ def segment_distance(points: NDArray[np.floating], segments: NDArray[np.floating
     return result
 
 
-def one_per_cell(points: NDArray[np.floating], size: float) -> NDArray[np.float64]:
-    """The first of `points` (n, 3) in each cube of `size` metres: dense and sparse parts count alike."""
+def one_per_cell(points: NDArray[np.floating], size: float, *, at_least: int = 1) -> NDArray[np.float64]:
+    """The first of `points` (n, 3) in each cube of `size` metres that holds `at_least` so many.
+
+    Dense and sparse parts then count alike.
+    """
     cell = np.floor(points / size).astype(np.int64) + (1 << 20)
-    _, first = np.unique(cell[:, 0] << 42 | cell[:, 1] << 21 | cell[:, 2], return_index=True)
-    return np.asarray(points[np.sort(first)], np.float64)
+    key = cell[:, 0] << 42 | cell[:, 1] << 21 | cell[:, 2]
+    _, first, count = np.unique(key, return_index=True, return_counts=True)
+    return np.asarray(points[np.sort(first[count >= at_least])], np.float64)

@@ -26,7 +26,7 @@ class Truth(Protocol):
     """A surface and what was seen of it.
 
     Attributes:
-        seen: (n, 3) float64 points of it, metres, that some fused view shows without noise.
+        seen: (n, 3) float64 points of it, metres, that fused views show without noise, evenly spread.
         edges: (m, 2, 3) float64 segments where it bends sharply; none where they are not known.
     """
 
@@ -77,7 +77,8 @@ class Reference:
     """A reference mesh, sampled: the distance is that from the triangle of the nearest sample.
 
     Args:
-        measured: (n, 3) points measured on it. Seen is what lies within `reach` metres of one.
+        measured: (n, 3) points measured on it. Seen is what lies within `reach` metres of one, a point a
+            cube of that size.
 
     Raises:
         MissingDependency: without scipy.
@@ -96,7 +97,8 @@ class Reference:
 
         self._mesh = trimesh.Trimesh(vertices, faces, process=False)
         self._samples, self._face = trimesh.sample.sample_surface(self._mesh, samples, seed=0)
-        self.seen = self._samples[metrics.nearest(self._samples, measured)[0] <= reach]
+        near = metrics.nearest(self._samples, measured)[0] <= reach
+        self.seen = metrics.one_per_cell(self._samples[near], reach)
         self.edges = np.empty((0, 2, 3))
 
     def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -142,14 +144,13 @@ def measure(mesh: Mesh, truth: Truth, voxel_size: float) -> dict[str, Any]:
     near_edge = metrics.segment_distance(vertices, truth.edges) <= reach
     found["edge_mm"] = metrics.spread_mm(distance[near_edge]).mean
     try:
-        seen = metrics.one_per_cell(truth.seen, COMPLETE_WITHIN * voxel_size)
-        missed, _ = metrics.nearest(seen, vertices)
+        missed, _ = metrics.nearest(truth.seen, vertices)
     except MissingDependency:
         return rounded(found)
     complete = COMPLETE_WITHIN * voxel_size
     found["completeness"] = metrics.percent_within(missed, complete)
     found["f_score"] = metrics.f_score(found["precision"], found["completeness"])
-    at_edge = metrics.segment_distance(seen, truth.edges) <= reach
+    at_edge = metrics.segment_distance(truth.seen, truth.edges) <= reach
     found["edge_completeness"] = metrics.percent_within(missed[at_edge], complete)
     return rounded(found)
 
