@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Measure what is fused: error, completeness, normals, edges and unseen views, by method, scene and noise.
 
-    python scripts/accuracy.py --output accuracy    every row, its tables and plots (25 min on 2 cores)
-    python scripts/accuracy.py --quick              20 keyframes of one room, two kinds of noise (a minute)
-    python scripts/accuracy.py --list               the names of the rows
-    python scripts/accuracy.py --only kitchen       those whose name holds a word; several words, or each
-    python scripts/accuracy.py --output accuracy --write-docs    puts tables and plots into docs/ as well
+    python scripts/accuracy.py --output FOLDER         every row, its tables and plots (25 min on 2 cores)
+    python scripts/accuracy.py --quick                 20 keyframes of one room, two noises (a minute)
+    python scripts/accuracy.py --list                  the names of the rows
+    python scripts/accuracy.py --only kitchen bunny    those whose name holds one of these words
+    python scripts/accuracy.py --output FOLDER --tables --write-docs    what FOLDER holds, into docs/
 
 A row is a scene, a noise, a number of keyframes and a method; each runs in a process of its own. Without
 --output each row is one JSON line on stdout. A folder keeps its rows: a later run replaces those it measures
@@ -72,15 +72,22 @@ def parse() -> tuple[argparse.Namespace, argparse.ArgumentParser]:
     parser.add_argument("--list", action="store_true", help="print the names of the rows")
     parser.add_argument("--only", metavar="WORD", nargs="+", help="rows whose name holds any of these words")
     parser.add_argument("--quick", action="store_true", help="a small part, to see that all works")
-    parser.add_argument("--threads", type=int, default=1, help="threads a system may use (default 1)")
+    parser.add_argument("--threads", type=positive, default=1, help="threads a system may use (default 1)")
     cores = os.cpu_count() or 1
-    parser.add_argument("--jobs", type=int, default=cores, help=f"rows at a time (default {cores})")
+    parser.add_argument("--jobs", type=positive, default=cores, help=f"rows at a time (default {cores})")
     parser.add_argument("--output", metavar="FOLDER", type=Path, help="rows.jsonl, tables.md and plots")
     parser.add_argument("--missing", action="store_true", help="only rows that FOLDER does not hold")
     parser.add_argument("--tables", action="store_true", help="measure nothing, write tables and plots again")
     parser.add_argument("--write-docs", action="store_true", help="also into docs/accuracy.md, docs/images")
     parser.add_argument("--row", metavar="NAME", help="run this one here, in this process")
     return parser.parse_args(), parser
+
+
+def positive(text: str) -> int:
+    """A whole number from 1 on."""
+    if (number := int(text)) < 1:
+        raise argparse.ArgumentTypeError(f"expected 1 or more, got {number}")
+    return number
 
 
 def select(options: argparse.Namespace) -> list[Row]:
@@ -110,12 +117,12 @@ def measure(chosen: list[Row], options: argparse.Namespace, known: dict[str, dic
                 failed += 1
                 say(f"{name}: failed, the process ended with {error.returncode}")
                 continue
-            say(name)
             known[line["row"]] = line
             if options.output:
                 _report.keep(options.output, known)
             else:
                 print(json.dumps(line), flush=True)
+            say(name)
     finally:
         for future in running:
             future.cancel()

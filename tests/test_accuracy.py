@@ -3,6 +3,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -57,9 +58,31 @@ def test_missing_data_is_said_and_left_out(tmp_path: Path) -> None:
     assert "no stanford_bunny" in done.stderr
 
 
+def test_an_interrupt_keeps_the_rows_measured(tmp_path: Path) -> None:
+    command = [sys.executable, str(SCRIPT), "--quick", "--jobs", "1", "--output", str(tmp_path)]
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)}
+    ) as running:
+        assert running.stderr is not None
+        for line in running.stderr:
+            if line.startswith("[1/"):
+                running.send_signal(signal.SIGINT)
+                break
+        rest = running.stderr.read()
+    assert running.returncode == 130
+    assert rest.startswith("stopped; the rows measured so far are kept")
+    assert "Traceback" not in rest
+    assert len((tmp_path / "rows.jsonl").read_text().splitlines()) == 1
+    assert (tmp_path / "tables.md").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(("--only", "nowhere"), "no row has such a name"), (("--tables",), "--output folder")],
+    [
+        (("--jobs", "0"), "expected 1 or more"),
+        (("--only", "nowhere"), "no row has such a name"),
+        (("--tables",), "--output folder"),
+    ],
 )
 def test_a_mistake_is_one_line(arguments: tuple[str, ...], message: str) -> None:
     done = accuracy(*arguments)
