@@ -143,14 +143,17 @@ def plots(folder: Path, prefix: str, rows: list[dict[str, Any]]) -> list[Path]:
         question = QUESTIONS[key]
         draw = _lines if key in ("keyframes", "drift") else _bars
         panels = draw(group)
-        figure = Figure(figsize=(max(5.0, 3.2 * len(panels)), 3.6), dpi=120, layout="constrained")
-        axes = figure.subplots(1, len(panels), squeeze=False)[0]
-        for (title, paint), axis in zip(panels, axes, strict=True):
+        high, wide = -(-len(panels) // 3), min(len(panels), 3)
+        figure = Figure(figsize=(max(5.0, 3.4 * wide), 3.4 * high), dpi=100, layout="constrained")
+        axes = figure.subplots(high, wide, squeeze=False).flat
+        for axis in axes[len(panels) :]:
+            axis.set_visible(False)
+        for (title, paint), axis in zip(panels, axes, strict=False):
             paint(axis, question.figures[0])
             axis.set_title(title, fontsize=9)
             axis.spines[["top", "right"]].set_visible(False)
             axis.tick_params(labelsize=8)
-        axes[0].set_ylabel(question.figures[0].title)
+            axis.set_ylabel(question.figures[0].title, fontsize=8)
         figure.suptitle(question.title, fontsize=10)
         path = folder / f"{prefix}{question.plot}.png"
         figure.savefig(path)
@@ -188,6 +191,8 @@ def _lines(rows: list[dict[str, Any]]) -> list[Panel]:
             for method in _distinct(row["method"] for row in group):
                 points = [(row["keyframes"], figure.of(row)) for row in group if row["method"] == method]
                 style = {"color": _color(method), "marker": "o", "markersize": 3, "linewidth": 1.2}
+                if method == "default":  # on top, and what it lies on shows through
+                    style |= {"linestyle": ":", "zorder": 9, "linewidth": 2}
                 axis.plot(*zip(*points, strict=True), label=method, **style)
             counts = sorted({row["keyframes"] for row in group})
             axis.set(xscale="log", xlabel="keyframes", ylim=(0, None))
