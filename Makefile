@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 PYTHON ?= $(firstword $(wildcard .venv/bin/python) python3)
 
-.PHONY: check test bench
+.PHONY: check test bench accuracy
 
 check:  ## style and types
 	$(PYTHON) -m ruff check .
@@ -13,3 +13,6 @@ test:  ## everything; `make test ARGS="-m 'not slow'"` leaves out the long ones
 
 bench:  ## one JSON line a case
 	$(PYTHON) scripts/bench.py $(ARGS)
+
+accuracy:  ## every row, then the tables and plots of docs/accuracy.md
+	$(PYTHON) scripts/accuracy.py --output out/accuracy --write-docs $(ARGS)

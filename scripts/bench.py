@@ -14,27 +14,20 @@ import argparse
 import importlib.util
 import json
 import os
-import platform
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from _peers import DATA, Open3D, surroundings, timed_keyframes, unimportable
 from numpy.typing import NDArray
 
-from tsfusion.process import peak_rss_bytes
-
-ROOT = Path(__file__).parents[1]
-DATA = Path(os.environ.get("TSFUSION_DATA", ROOT.parent / "shared" / "data"))
 MAX_RANGE, TRUNCATION = 4.0, 4.0  # metres, voxels: the same for every system
 HOLD_OUT = 5  # every fifth recorded keyframe is not fused but predicted
-WARM_UP = 5  # keyframes not counted
 
 
 @dataclass(frozen=True)
@@ -189,55 +182,17 @@ def run_tsfusion(case: Case, source: Source, threads: int) -> dict[str, Any]:
 
 def run_open3d(case: Case, source: Source, threads: int) -> dict[str, Any]:
     os.environ["OMP_NUM_THREADS"] = str(threads)
-    import open3d as o3d
-
-    o3c, color = o3d.core, bool(case.settings.get("color"))
-    channels = (1, 1, 3) if color else (1, 1)
-    grid = o3d.t.geometry.VoxelBlockGrid(
-        attr_names=("tsdf", "weight", "color")[: len(channels)], attr_dtypes=(o3c.float32,) * len(channels),
-        attr_channels=channels, voxel_size=case.voxel_size, block_resolution=8, block_count=40_000,
-        device=o3c.Device("CPU:0"),
-    )  # fmt: skip
-
-    def integrate(keyframe: Any) -> None:
-        raw = np.ascontiguousarray(keyframe.depth)
-        scale = 1 / keyframe.depth_scale if raw.dtype == np.uint16 else 1.0
-        depth = o3d.t.geometry.Image(o3c.Tensor(raw))
-        K = o3c.Tensor(keyframe.intrinsics.matrix)
-        extrinsic = o3c.Tensor(np.linalg.inv(keyframe.T_world_camera))
-        blocks = grid.compute_unique_block_coordinates(depth, K, extrinsic, scale, MAX_RANGE, TRUNCATION)
-        if color:
-            image = o3d.t.geometry.Image(o3c.Tensor(np.ascontiguousarray(keyframe.color[..., ::-1])))
-            grid.integrate(blocks, depth, image, K, K, extrinsic, scale, MAX_RANGE, TRUNCATION)
-        else:
-            grid.integrate(blocks, depth, K, extrinsic, scale, MAX_RANGE, TRUNCATION)
-
-    cpu, wall = timed_keyframes(source.fused, integrate, lambda: None)
+    system = Open3D(
+        case.voxel_size, max_range=MAX_RANGE, truncation=TRUNCATION, color=bool(case.settings.get("color"))
+    )
+    cpu, wall = timed_keyframes(source.fused, system.integrate)
     mesh_cpu = time.process_time()
-    mesh = grid.extract_triangle_mesh(weight_threshold=2.0)
+    mesh = system.extract_mesh()
     mesh_cpu = time.process_time() - mesh_cpu
-    vertices, faces = mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy()
     return {
-        "keyframe": figures(cpu, wall), "mesh_cpu_ms": round(mesh_cpu * 1e3, 1), "triangles": len(faces),
-        "blocks": grid.hashmap().size(), "error_mm": source.error_mm(vertices, faces),
+        "keyframe": figures(cpu, wall), "mesh_cpu_ms": round(mesh_cpu * 1e3, 1), "triangles": len(mesh.faces),
+        "blocks": system.grid.hashmap().size(), "error_mm": source.error_mm(mesh.vertices, mesh.faces),
     }  # fmt: skip
-
-
-def timed_keyframes(
-    keyframes: list[Any], integrate: Callable[[Any], Any], after_warm_up: Callable[[], None]
-) -> tuple[list[float], list[float]]:
-    cpu: list[float] = []
-    wall: list[float] = []
-    for i, keyframe in enumerate(keyframes):
-        if i == WARM_UP:
-            after_warm_up()
-            cpu.clear()
-            wall.clear()
-        c, w = time.process_time(), time.perf_counter()
-        integrate(keyframe)
-        cpu.append(time.process_time() - c)
-        wall.append(time.perf_counter() - w)
-    return cpu, wall
 
 
 def figures(cpu: list[float], wall: list[float]) -> dict[str, float]:
@@ -256,41 +211,14 @@ def run_case(case: Case, threads: int, keyframes: int) -> dict[str, Any]:
     measured = run(case, source, threads)
     return {
         "case": case.name, "system": case.system, "voxel_size": case.voxel_size, "settings": case.settings,
-        **measured, "threads": threads, "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "peak_rss_bytes": peak_rss_bytes(),
-        "commit": commit(), "versions": versions(),
+        **measured, **surroundings(threads),
     }  # fmt: skip
-
-
-def commit() -> str:
-    done = subprocess.run(
-        ["git", "-C", str(ROOT), "describe", "--always", "--dirty"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return done.stdout.strip() or "unknown"
-
-
-def versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for name in ("tsfusion", "taichi", "numpy", "open3d"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
 
 
 def missing(case: Case) -> str | None:
     """Why a case cannot run here, if it cannot."""
-    if case.system == "open3d":
-        command = [sys.executable, "-c", "import open3d"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            return (
-                f"open3d cannot be imported (pip install '.[bench]'): {done.stderr.strip().splitlines()[-1]}"
-            )
+    if case.system == "open3d" and (reason := unimportable("open3d")):
+        return reason
     if case.source == "7scenes":
         if not (DATA / "7scenes" / "redkitchen").exists():
             return f"no 7scenes/redkitchen in {DATA} (set TSFUSION_DATA)"

@@ -4,34 +4,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.evaluation.predict import depth_metres, points_camera
 from tsfusion.keyframe import Keyframe
-
-
-def depth_metres(keyframe: Keyframe) -> NDArray[np.float64]:
-    """(H, W) float64 z of a depth or disparity keyframe; 0 = none."""
-    if keyframe.disparity is not None:
-        disparity = keyframe.disparity * keyframe.disparity_scale
-        assert keyframe.baseline_fx is not None
-        return np.divide(keyframe.baseline_fx, disparity, out=np.zeros(keyframe.shape), where=disparity > 0)
-    assert keyframe.depth is not None
-    scale = keyframe.depth_scale if keyframe.depth.dtype == np.uint16 else 1.0
-    return keyframe.depth.astype(np.float64) * scale
-
-
-def points_camera(keyframe: Keyframe) -> NDArray[np.float64]:
-    """(n, 3) float64 of the valid pixels, or of the points."""
-    if keyframe.points is not None:
-        return keyframe.points.astype(np.float64)
-    z, K = depth_metres(keyframe), keyframe.intrinsics
-    assert K is not None
-    v, u = np.nonzero(z)
-    z = z[v, u]
-    return np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z], axis=1)
-
-
-def points_world(keyframe: Keyframe) -> NDArray[np.float64]:
-    """`points_camera`, moved by the keyframe's pose."""
-    return move(keyframe.T_world_camera, points_camera(keyframe))
 
 
 def move(T: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:

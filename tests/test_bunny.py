@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
 """The bunny's scans: their poses meet the reference, and their rays are the scanner's."""
 
-import bunny
 import numpy as np
 import pytest
 from geometry import move
+
+from tsfusion.evaluation import bunny
 
 scipy_spatial = pytest.importorskip("scipy.spatial")
 

@@ -387,4 +387,4 @@ def test_every_verb_that_fuses_takes_the_map_flags(verb: str) -> None:
 
     shown = tsfusion(verb, "--help").stdout
     for option in MAP_OPTIONS.values():
-        assert option.__metadata__[0].param_decls[0].partition("/")[0] in shown
+        assert option.__metadata__[0].default.partition("/")[0] in shown

@@ -8,11 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from geometry import depth_metres, points_world, warp_residual
+from geometry import warp_residual
 
 from tsfusion.datasets import KITTI, open_dataset
 from tsfusion.datasets.stereo import Matcher
 from tsfusion.errors import DatasetError
+from tsfusion.evaluation.predict import depth_metres, points_world
 
 scipy_spatial = pytest.importorskip("scipy.spatial")
 

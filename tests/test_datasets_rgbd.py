@@ -7,11 +7,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from geometry import points_camera, warp_residual
+from geometry import warp_residual
 from test_datasets import seven_scenes
 
 from tsfusion.datasets import TUM, HoloLens, Redwood, SevenScenes, open_dataset
 from tsfusion.errors import DatasetError
+from tsfusion.evaluation.predict import points_camera
 from tsfusion.keyframe import Intrinsics
 
 POSE = "1 0 0 0.5\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"

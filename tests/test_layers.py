@@ -18,7 +18,7 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("whole runs", frozenset({"pipeline", "child"})),
     ("processes", frozenset({"server", "gateway", "sessions", "ports", "fuser_link", "fuser",
                              "client", "sender", "outbox", "spool", "recording"})),
-    ("views and sources", frozenset({"datasets", "ledger", "preview", "results"})),
+    ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results"})),
     ("map and wire", frozenset({"volume", "integration", "surface", "blockstore", "meshing", "scratch",
                                 "storage", "checkpoint", "warmup",
                                 "journal", "transport", "codec"})),
@@ -28,13 +28,13 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
 
 # All others run where there is no Taichi, and answer while kernels run.
 MAY_REACH_TAICHI = frozenset({
-    "__main__", "cli", "pipeline", "fuser", "datasets", "preview",
+    "__main__", "cli", "pipeline", "fuser", "datasets", "evaluation", "preview",
     "volume", "integration", "surface", "blockstore", "meshing", "scratch", "storage", "checkpoint",
     "warmup", "kernels", "runtime",
 })  # fmt: skip
 MAY_IMPORT_KERNELS = frozenset({
     "kernels", "runtime", "volume", "integration", "surface", "blockstore", "meshing", "scratch", "preview",
-    "datasets.synthetic",
+    "datasets.synthetic", "evaluation.predict",
 })  # fmt: skip
 
 

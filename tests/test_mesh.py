@@ -5,7 +5,6 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-import bunny
 import numpy as np
 import pytest
 import reference
@@ -17,6 +16,7 @@ from scipy.spatial import cKDTree
 from tsfusion import Mesh, Volume, runtime
 from tsfusion.blockstore import cells_of, pack_keys, unpack_keys
 from tsfusion.errors import InvalidConfig, OutputError
+from tsfusion.evaluation import bunny
 from tsfusion.kernels import blocks
 from tsfusion.meshing import MeshScratch, extract
 from tsfusion.surface import Layers

@@ -10,12 +10,13 @@ import cv2
 import numpy as np
 import pytest
 import reference
-from geometry import depth_metres, points_world, warp_residual
+from geometry import warp_residual
 from scipy.spatial import cKDTree
 
 from tsfusion.datasets import Synthetic, worlds
 from tsfusion.datasets.synthetic import DEPTH_SCALE, kinect, stereo
 from tsfusion.errors import DatasetError
+from tsfusion.evaluation.predict import depth_metres, points_world
 from tsfusion.keyframe import Keyframe
 
 

@@ -67,6 +67,7 @@ class Synthetic(Frames):
     - lidar: 64 × 900 rays, range error 2 cm, 2 % lost, grazing rays lost. Points carry colour.
 
     Args:
+        world: `room`, `street`, or a `World` of your own, seen with the room's camera and LiDAR.
         count: keyframes; the room's path is a closed circle, the street's goes on by a metre each.
         seed: of the noise; the world does not change.
         width: of the image, pixels; default 320 in the room, 620 in the street. The noise in pixels stays.
@@ -80,7 +81,7 @@ class Synthetic(Frames):
 
     def __init__(
         self,
-        world: str = "room",
+        world: str | worlds.World = "room",
         sensor: str = "kinect",
         *,
         count: int = 40,
@@ -90,7 +91,7 @@ class Synthetic(Frames):
         color: bool = True,
         path: str | None = None,
     ) -> None:
-        if world not in WORLDS:
+        if isinstance(world, str) and world not in WORLDS:
             raise DatasetError(f"world must be one of {', '.join(WORLDS)}, got {world!r}")
         if sensor not in ("kinect", "stereo", "lidar"):
             raise DatasetError(f"sensor of a synthetic world must be kinect, stereo or lidar, got {sensor!r}")
@@ -99,15 +100,15 @@ class Synthetic(Frames):
                 "expected count >= 1, seed >= 0 and width >= 16, "
                 f"got count {count}, seed {seed}, width {width}"
             )
-        self.name, self.sensor, self.skipped = f"synthetic {world}", sensor, {}
+        self.world = WORLDS[world](count) if isinstance(world, str) else world
+        self.name, self.sensor, self.skipped = f"synthetic {self.world.name}", sensor, {}
         self.timestamps_ns = np.arange(count, dtype=np.int64) * FRAME_NS
-        self.world = WORLDS[world](count)
         path = path or next(iter(self.world.paths))
         if path not in self.world.paths:
             raise DatasetError(f"path must be one of {', '.join(self.world.paths)}, got {path!r}")
         self._path = self.world.paths[path]
-        self.camera = _resized(CAMERAS[world], width)
-        self.lidar = LIDARS[world]
+        self.camera = _resized(CAMERAS.get(self.world.name, CAMERAS["room"]), width)
+        self.lidar = LIDARS.get(self.world.name, LIDARS["room"])
         self._count, self._seed, self._noise, self._with_color = count, seed, noise, color
         self._directions = _lidar_rays(self.lidar) if sensor == "lidar" else _camera_rays(self.camera)
 
