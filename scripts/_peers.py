@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tsfusion.evaluation.predict import depth_metres, points_world
 from tsfusion.mesh import Mesh
@@ -94,21 +95,19 @@ class VDBFusion:
 
 
 def timed_keyframes(
-    keyframes: list[Any], integrate: Callable[[Any], Any], after_warm_up: Callable[[], None] = lambda: None
-) -> tuple[list[float], list[float]]:
-    """Seconds of (CPU, wall clock) of every keyframe after the first few."""
-    cpu: list[float] = []
-    wall: list[float] = []
+    keyframes: list[Any], *steps: Callable[[Any], Any], after_warm_up: Callable[[], None] = lambda: None
+) -> NDArray[np.float64]:
+    """(steps, 2, n) seconds of CPU and of wall clock: each keyframe goes through every step in turn; the
+    first few are not counted."""
+    spent = np.zeros((len(steps), 2, len(keyframes)))
     for i, keyframe in enumerate(keyframes):
         if i == WARM_UP:
             after_warm_up()
-            cpu.clear()
-            wall.clear()
-        c, w = time.process_time(), time.perf_counter()
-        integrate(keyframe)
-        cpu.append(time.process_time() - c)
-        wall.append(time.perf_counter() - w)
-    return cpu, wall
+        for n, step in enumerate(steps):
+            cpu, wall = time.process_time(), time.perf_counter()
+            step(keyframe)
+            spent[n, :, i] = time.process_time() - cpu, time.perf_counter() - wall
+    return spent[:, :, WARM_UP:] if len(keyframes) > WARM_UP else spent
 
 
 def unimportable(module: str) -> str | None:

@@ -5,8 +5,10 @@
     python scripts/bench.py --list               the cases
     python scripts/bench.py --only 7scenes       those whose name holds a word
 
-Open3D's VoxelBlockGrid runs beside, on the same keyframes with the same range and truncation, where `open3d`
-is installed (`pip install '.[bench]'`). Machines differ and are noisy: compare ratios within one run.
+Open3D's VoxelBlockGrid runs beside, where `open3d` is installed (`pip install '.[bench]'`): in the same
+process, the same keyframes in turn, with the same range and truncation. Machines differ and are noisy: only
+`ratio` says who is faster. `remesh` is the mesh of what a keyframe changed; `floor` the least time that
+memory traffic takes.
 Recorded cases need TSFUSION_DATA (default ../shared/data) and are left out, with a word, where it is missing.
 """
 
@@ -19,10 +21,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from _floor import floor
 from _peers import DATA, Open3D, surroundings, timed_keyframes, unimportable
 from numpy.typing import NDArray
 
@@ -32,28 +35,45 @@ HOLD_OUT = 5  # every fifth recorded keyframe is not fused but predicted
 
 @dataclass(frozen=True)
 class Case:
-    """One measurement: a system, a source of keyframes and settings."""
+    """One measurement: a source of keyframes and settings."""
 
     name: str
-    system: str
     source: str
     voxel_size: float
     settings: dict[str, Any] = field(default_factory=dict)
+    threads: int | None = None  # None: as the command says
+    copies: int = 0  # of the whole scene, elsewhere, that are fused first
+
+
+PLAIN = {"color": False, "regularizer": "off", "surface": "raw"}
+COLORED = {"color": True}
 
 
 def cases() -> list[Case]:
     found = []
-    for source, sizes in (("7scenes", (0.02, 0.01)), ("room", (0.02,)), ("street", (0.1,))):
-        for size in sizes:
-            where = f"{source}-{size * 100:g}cm"
-            plain = {"color": False, "regularizer": "off"}
-            found.append(Case(f"{where}-off", "tsfusion", source, size, plain))
-            if source != "street":
-                found.append(Case(f"{where}-open3d", "open3d", source, size))
-                found.append(Case(f"{where}-color-off", "tsfusion", source, size, {**plain, "color": True}))
-                found.append(Case(f"{where}-color-open3d", "open3d", source, size, {"color": True}))
-            found.append(Case(f"{where}-ray", "tsfusion", source, size, {**plain, "regularizer": "ray"}))
-            found.append(Case(f"{where}-exact", "tsfusion", source, size, {**plain, "bundle": False}))
+    for source, size in (
+        ("7scenes", 0.02),
+        ("7scenes", 0.01),
+        ("room", 0.02),
+        ("street", 0.1),
+        ("kitti00", 0.1),
+    ):
+        where = f"{source}-{size * 100:g}cm"
+        found += [
+            Case(f"{where}-off", source, size, PLAIN),
+            Case(f"{where}-off-1thread", source, size, PLAIN, threads=1),
+            Case(f"{where}-ray", source, size, {**PLAIN, "regularizer": "ray"}),
+            Case(f"{where}-exact", source, size, {**PLAIN, "bundle": False}),
+            Case(f"{where}-field", source, size, {**PLAIN, "surface": "field"}),
+        ]
+        if source in ("7scenes", "room"):
+            found += [
+                Case(f"{where}-color-off", source, size, {**PLAIN, **COLORED}),
+                Case(f"{where}-color-default", source, size, COLORED),
+                Case(f"{where}-carving", source, size, {**PLAIN, "space_carving": True}),
+            ]
+        if (source, size) == ("7scenes", 0.02):
+            found.append(Case(f"{where}-off-20x", source, size, PLAIN, copies=19))
     return found
 
 
@@ -73,6 +93,12 @@ class Source:
             self.fused = [k for i, k in enumerate(everything) if i % HOLD_OUT]
             self.held_out = everything[::HOLD_OUT]
             self.sensor = recorded.sensor
+        elif name == "kitti00":
+            recorded = open_dataset(
+                DATA / "kitti_odometry", sequence="00", modality="lidar", poses="poses_estimated/00_ORB.txt"
+            )
+            self.fused = [recorded[i] for i in range(len(recorded))] * 4  # six scans, again and again
+            self.sensor = recorded.sensor
         else:
             sensor = "lidar" if name == "street" else "kinect"
             world = Synthetic(world=name, sensor=sensor, count=min(keyframes, 40))
@@ -80,7 +106,9 @@ class Source:
             self.distance, self.sensor = world.distance, sensor
 
     def error_mm(self, vertices: NDArray[Any], faces: NDArray[Any]) -> dict[str, float]:
-        """How far mesh and truth are apart, millimetres."""
+        """How far mesh and truth are apart, millimetres; nothing where there is no truth."""
+        if self.distance is None and not self.held_out:
+            return {}
         if self.distance is not None:
             error = np.abs(self.distance(vertices.astype(np.float64))) * 1e3
             return {"mean": round(float(error.mean()), 3), "p95": round(float(np.percentile(error, 95)), 3)}
@@ -154,7 +182,30 @@ class Stages:
         return timed
 
 
-def run_tsfusion(case: Case, source: Source, threads: int) -> dict[str, Any]:
+def run_case(case: Case, threads: int, keyframes: int) -> dict[str, Any]:
+    """Measure one case in this process, with Open3D in turn where it can do the same."""
+    threads = case.threads or threads
+    os.environ["OMP_NUM_THREADS"] = str(threads)
+    source = Source(case.source, keyframes)
+    peer = None
+    if source.sensor == "kinect" and not unimportable("open3d"):
+        color = bool(case.settings.get("color"))
+        peer = Open3D(case.voxel_size, max_range=MAX_RANGE, truncation=TRUNCATION, color=color)
+    ours = run(case, source, threads, peer)
+    row = {"case": case.name, "voxel_size": case.voxel_size, "settings": case.settings, **ours}
+    if peer is not None:
+        beside = row["open3d"]
+        mesh, beside["mesh_cpu_ms"] = timed_mesh(peer.extract_mesh)
+        beside["triangles"] = len(mesh.faces)
+        beside["error_mm"] = source.error_mm(mesh.vertices, mesh.faces)
+        row["ratio"] = {
+            "keyframe": round(row["keyframe"]["cpu_ms_median"] / beside["keyframe"]["cpu_ms_median"], 3),
+            "mesh": round(row["mesh_cpu_ms"] / beside["mesh_cpu_ms"], 3),
+        }
+    return {**row, **surroundings(threads)}
+
+
+def run(case: Case, source: Source, threads: int, peer: Open3D | None) -> dict[str, Any]:
     started = time.perf_counter()
     from tsfusion import Volume
 
@@ -164,66 +215,69 @@ def run_tsfusion(case: Case, source: Source, threads: int) -> dict[str, Any]:
     volume = Volume(**settings)
     volume.warm_up()
     start_s = time.perf_counter() - started
+    for copy in range(1, case.copies + 1):
+        for keyframe in source.fused:
+            volume.integrate(elsewhere(keyframe, 20.0 * copy))
+    volume.take_dirty()
     stages = Stages()
+
+    def remesh(_: Any) -> None:
+        volume.extract_mesh(blocks=volume.cells_to_mesh(volume.take_dirty()))
+
+    steps = (volume.integrate, remesh, *([peer.integrate] if peer else []))
     with stages.watch():
-        cpu, wall = timed_keyframes(source.fused, volume.integrate, stages.times.clear)
-        stages.keyframes = len(cpu)
-    mesh_cpu = time.process_time()
-    mesh = volume.extract_mesh()
-    mesh_cpu = time.process_time() - mesh_cpu
+        spent = timed_keyframes(source.fused, *steps, after_warm_up=stages.times.clear)
+        stages.keyframes = spent.shape[2]
+    stages_cpu_ms = stages.summary()
+    mesh, mesh_cpu_ms = timed_mesh(volume.extract_mesh)
     stats = volume.stats()
-    return {
-        "keyframe": figures(cpu, wall), "stages_cpu_ms": stages.summary(), "start_s": round(start_s, 2),
-        "mesh_cpu_ms": round(mesh_cpu * 1e3, 1), "triangles": len(mesh.faces), "map_bytes": stats.bytes,
-        "blocks": stats.blocks, "map_hash": volume.map_hash(),
-        "error_mm": source.error_mm(mesh.vertices, mesh.faces),
+    row = {
+        "keyframe": figures(spent[0]), "stages_cpu_ms": stages_cpu_ms, "start_s": round(start_s, 2),
+        "remesh": figures(spent[1]), "mesh_cpu_ms": mesh_cpu_ms, "triangles": len(mesh.faces),
+        "map_bytes": stats.bytes, "blocks": stats.blocks, "bytes_per_block": stats.bytes_per_block,
+        "map_hash": volume.map_hash(), "error_mm": source.error_mm(mesh.vertices, mesh.faces),
+        "floor": floor(volume, source.fused[-1], stages_cpu_ms),
     }  # fmt: skip
+    if peer:
+        row["open3d"] = {"keyframe": figures(spent[2])}
+    return row
 
 
-def run_open3d(case: Case, source: Source, threads: int) -> dict[str, Any]:
-    os.environ["OMP_NUM_THREADS"] = str(threads)
-    system = Open3D(
-        case.voxel_size, max_range=MAX_RANGE, truncation=TRUNCATION, color=bool(case.settings.get("color"))
-    )
-    cpu, wall = timed_keyframes(source.fused, system.integrate)
-    mesh_cpu = time.process_time()
-    mesh = system.extract_mesh()
-    mesh_cpu = time.process_time() - mesh_cpu
-    return {
-        "keyframe": figures(cpu, wall), "mesh_cpu_ms": round(mesh_cpu * 1e3, 1), "triangles": len(mesh.faces),
-        "blocks": system.grid.hashmap().size(), "error_mm": source.error_mm(mesh.vertices, mesh.faces),
-    }  # fmt: skip
+def elsewhere(keyframe: Any, metres: float) -> Any:
+    """The keyframe, moved along x."""
+    T = keyframe.T_world_camera.copy()
+    T[0, 3] += metres
+    return replace(keyframe, T_world_camera=T)
 
 
-def figures(cpu: list[float], wall: list[float]) -> dict[str, float]:
-    milliseconds = np.array([cpu, wall]) * 1e3
+def timed_mesh(extract: Callable[[], Any]) -> tuple[Any, float]:
+    """A mesh, and the least CPU milliseconds of three goes."""
+    spent = []
+    for _ in range(3):
+        begun = time.process_time()
+        mesh = extract()
+        spent.append(time.process_time() - begun)
+    return mesh, round(min(spent) * 1e3, 1)
+
+
+def figures(seconds: NDArray[np.float64]) -> dict[str, float]:
+    """Of (2, n) CPU and wall seconds."""
+    milliseconds = seconds * 1e3
     median, p95 = np.median(milliseconds, axis=1), np.percentile(milliseconds, 95, axis=1)
     return {
-        "n": len(cpu), "cpu_ms_median": round(float(median[0]), 2), "cpu_ms_p95": round(float(p95[0]), 2),
-        "wall_ms_median": round(float(median[1]), 2), "wall_ms_p95": round(float(p95[1]), 2),
-    }  # fmt: skip
-
-
-def run_case(case: Case, threads: int, keyframes: int) -> dict[str, Any]:
-    """Measure one case in this process."""
-    source = Source(case.source, keyframes)
-    run = run_open3d if case.system == "open3d" else run_tsfusion
-    measured = run(case, source, threads)
-    return {
-        "case": case.name, "system": case.system, "voxel_size": case.voxel_size, "settings": case.settings,
-        **measured, **surroundings(threads),
+        "n": seconds.shape[1], "cpu_ms_median": round(float(median[0]), 2),
+        "cpu_ms_p95": round(float(p95[0]), 2), "wall_ms_median": round(float(median[1]), 2),
+        "wall_ms_p95": round(float(p95[1]), 2),
     }  # fmt: skip
 
 
 def missing(case: Case) -> str | None:
     """Why a case cannot run here, if it cannot."""
-    if case.system == "open3d" and (reason := unimportable("open3d")):
-        return reason
-    if case.source == "7scenes":
-        if not (DATA / "7scenes" / "redkitchen").exists():
-            return f"no 7scenes/redkitchen in {DATA} (set TSFUSION_DATA)"
-        if importlib.util.find_spec("scipy") is None:
-            return "scipy is not installed (pip install '.[bench]')"
+    folder = {"7scenes": "7scenes/redkitchen", "kitti00": "kitti_odometry"}.get(case.source)
+    if folder and not (DATA / folder).exists():
+        return f"no {folder} in {DATA} (set TSFUSION_DATA)"
+    if case.source == "7scenes" and importlib.util.find_spec("scipy") is None:
+        return "scipy is not installed (pip install '.[bench]')"
     return None
 
 
@@ -247,6 +301,8 @@ def main() -> int:
     if options.case:
         print(json.dumps(run_case(chosen[0], options.threads, options.keyframes)))
         return 0
+    if reason := unimportable("open3d"):
+        print(f"without Open3D beside: {reason}", file=sys.stderr)
     status = 0
     for case in chosen:
         if reason := missing(case):
