@@ -104,9 +104,9 @@ def _setups() -> Iterator[tuple[Setup, tuple[str, ...]]]:
         for noise in ("none", "kinect", "stereo"):
             yield Setup("details", scene, noise, 60, seed=4), SOME
     yield Setup("bunny", "bunny", "recorded-scan", 6, voxel_size=0.001), everything
-    for scene in ("kitchen", "hololens"):
+    for scene, count in (("kitchen", 125), ("hololens", 40)):
         for size in (0.02, 0.01):
-            yield Setup("predicted", scene, "recorded", 125, voxel_size=size), everything
+            yield Setup("predicted", scene, "recorded", count, voxel_size=size), everything
     for noise in ("kinect", "stereo"):
         for count in (240, 1000):
             yield Setup("drift", "room", noise, count, path="still", seed=5), DRIFT

@@ -234,7 +234,9 @@ def test_a_wall_a_centimetre_off_is_predicted_a_centimetre_off() -> None:
     view = Keyframe(depth=depth, intrinsics=CAMERA, T_world_camera=np.eye(4))
     found = compare_views(wall(2.0), [view], max_range=4.0, voxel_size=VOXEL)
     assert found["median_mm"] == pytest.approx(10, abs=0.01)
-    assert found["p90_mm"] == pytest.approx(500, abs=0.01)
+    assert found["p90_mm"] == found["all_p90_mm"] == pytest.approx(500, abs=0.01)
     assert (found["within_voxel"], found["predicted"]) == pytest.approx((200 / 3, 100))
     narrow = compare_views(wall(2.0, half=0.2), [view], max_range=2.4, voxel_size=VOXEL)
+    assert narrow["all_p90_mm"] == np.inf
+    assert narrow["median_mm"] == pytest.approx(10, abs=0.01)
     assert narrow["predicted"] == pytest.approx(100 * 40 * 40 / (60 * 160), abs=0.5)
