@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: MIT
+"""The field regulariser's planning: which blocks, how many iterations; the work is in `kernels/field.py`.
+
+A view of the map's sums: the same sums give the same field, whatever their history and the threads. Blocks
+are solved with a halo of their neighbours, so that some blocks' values are those of the whole map to a
+hundredth of a voxel.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.kernels import field as kernels
+from tsfusion.kernels.blocks import find_blocks
+from tsfusion.kernels.integrate import CUBE, QUANTA_PER_VOXEL
+from tsfusion.kernels.rays import WEIGHT_ONE
+
+BATCH = 4096  # blocks solved at once, beside their halo; some 30 kB each
+ITERATIONS = 12  # Chebyshev steps a re-weighting; docs/accuracy.md shows the error against them
+LOWEST = 0.02  # eigenvalue of M⁻¹A from which on the iteration damps evenly
+LEAST_REACH = 2.0  # voxels
+COARSEST = 2  # 2³ cells a block
+
+_KEY_STEP = np.array([1 << 42, 1 << 21, 1], np.int64)  # one block along x, y, z in a packed key
+_AROUND = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]) @ _KEY_STEP
+_SIDES = np.array([sign * step for step in _KEY_STEP for sign in (-1, 1)], np.int64)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """`smoothness` λ against data weights in full-confidence samples, `edge` ε in voxels: D2 beyond it
+    counts as an edge, `reweightings` of ω after the first solve with ω = 1."""
+
+    smoothness: float
+    edge: float
+    reweightings: int
+
+    @property
+    def reach(self) -> float:
+        """Voxels: the length over which the penalty smooths; what lies deeper does not move the surface."""
+        return max(LEAST_REACH, self.smoothness**0.25)
+
+    @property
+    def coarser(self) -> int:
+        """Levels of coarser cells to start from: each shrinks λ against the data sixteenfold."""
+        return min(COARSEST, max(0, int(np.ceil(np.log2(max(self.smoothness, 1.0)) / 4)) - 1))
+
+
+@dataclass(frozen=True)
+class Sums:
+    """What the field is computed from: the map's arrays (slot, 512) and its hash."""
+
+    sums: NDArray[np.int64]
+    regularised: NDArray[np.float32] | None
+    hash_keys: NDArray[np.int64]
+    hash_slots: NDArray[np.int32]
+
+
+def solve(
+    wanted: NDArray[np.int64], layers: Sums, min_weight: float, settings: Settings
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """The regularised signed distances of some blocks.
+
+    Args:
+        wanted: sorted distinct keys; those not in the map are left out.
+        min_weight: full-confidence samples a voxel needs to count as seen.
+
+    Returns:
+        keys (n,) and their values (n, 512) float32 in quanta, NaN where unseen.
+    """
+    keys = wanted[_slots(wanted, layers) >= 0]
+    values = np.empty((len(keys), CUBE), np.float32)
+    for first in range(0, len(keys), BATCH):
+        part = keys[first : first + BATCH]
+        _Batch(part, layers, min_weight, settings).solve(values[first : first + BATCH])
+    return keys, values
+
+
+def spread(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The blocks whose field changes by more than a hundredth of a voxel with the sums of these: themselves
+    and the 26 around. They need not exist."""
+    return np.unique((keys[:, None] + _AROUND).ravel())
+
+
+@dataclass
+class _Level:
+    """Listed cells of one resolution: `bits` = log2 of the cells a side of a block."""
+
+    bits: int
+    number: NDArray[np.int32]
+    starts: NDArray[np.int32]
+    links: NDArray[np.int32]
+    y: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    x: NDArray[np.float32]
+
+    @classmethod
+    def make(cls, bits: int, number: NDArray[np.int32], counts: NDArray[np.int32]) -> "_Level":
+        total = int(counts.sum())
+        y, weight, x = (np.empty(total, np.float32) for _ in range(3))
+        starts = (np.cumsum(counts) - counts).astype(np.int32)
+        return cls(bits, number, starts, np.empty((total, 6), np.int32), y, weight, x)
+
+    def relax(self, smoothness: float, edge: float, reweightings: int, *, first: bool) -> None:
+        """Solve with ω = 1 if `first`, then with ω from the last solution, again and again."""
+        total = len(self.x)
+        omega, bent = np.zeros((total, 3), np.float32), np.empty((total, 3), np.float32)
+        inverse, step = np.empty(total, np.float32), np.zeros(total, np.float32)
+        for weigh in ([kernels.UNIT] if first else []) + [kernels.REWEIGH] * reweightings:
+            for n, (keep, gain) in enumerate(_chebyshev()):
+                kernels.bend(self.links, self.x, kernels.KEEP if n else weigh, edge, omega, bent)
+                if n == 0:
+                    kernels.precondition(self.links, self.weight, omega, smoothness, inverse)
+                kernels.relax(
+                    self.links, self.y, self.weight, inverse, bent, smoothness, keep, gain, step, self.x
+                )
+
+
+class _Batch:
+    """Some blocks and their halo, as lists of cells."""
+
+    def __init__(
+        self, wanted: NDArray[np.int64], layers: Sums, min_weight: float, settings: Settings
+    ) -> None:
+        self.wanted, self.settings = wanted, settings
+        keys = wanted
+        for _ in range(1 + settings.coarser):
+            keys = spread(keys)
+            keys = keys[_slots(keys, layers) >= 0]
+        self.keys = keys
+        self.around = _index(keys, keys[:, None] + _SIDES)
+        smoothed = layers.regularised
+        self.source: tuple[Any, ...] = (
+            _slots(keys, layers),
+            layers.sums,
+            np.zeros((1, CUBE), np.float32) if smoothed is None else smoothed,
+            int(smoothed is not None),
+            max(1, int(np.ceil(min_weight * WEIGHT_ONE))),
+        )
+
+    def solve(self, values: NDArray[np.float32]) -> None:
+        """Write the values of the wanted blocks."""
+        s = self.settings
+        levels = self._levels()
+        for depth in range(len(levels) - 1, -1, -1):
+            level, coarsest = levels[depth], depth == len(levels) - 1
+            if not coarsest:
+                coarse = levels[depth + 1]
+                kernels.refine(
+                    level.bits, coarse.links, coarse.number, coarse.starts, coarse.x,
+                    level.number, level.starts, level.x,
+                )  # fmt: skip
+            # a curvature is 4 times as large between cells of twice the size, and there are 8 times fewer
+            level.relax(
+                s.smoothness / 2**depth, s.edge * QUANTA_PER_VOXEL * 4**depth, s.reweightings, first=coarsest
+            )
+        rows = _index(self.keys, self.wanted)
+        finest = levels[0]
+        kernels.write_rows(*self.source, rows, finest.number, finest.starts, finest.x, values)
+
+    def _levels(self) -> list[_Level]:
+        blocks = len(self.keys)
+        number, counts = np.empty((blocks, CUBE), np.int32), np.empty(blocks, np.int32)
+        kernels.number_voxels(*self.source, self.settings.reach * QUANTA_PER_VOXEL, number, counts)
+        fine = _Level.make(3, number, counts)
+        kernels.list_voxels(
+            *self.source, self.around, fine.number, fine.starts, fine.links, fine.y, fine.weight, fine.x
+        )
+        levels = [fine]
+        for _ in range(self.settings.coarser):
+            number = np.empty((blocks, len(fine.number[0]) // 8), np.int32)
+            kernels.number_parents(fine.bits, fine.number, number, counts)
+            coarse = _Level.make(fine.bits - 1, number, counts)
+            kernels.list_parents(
+                fine.bits, self.around, fine.number, fine.starts, fine.y, fine.weight,
+                coarse.number, coarse.starts, coarse.links, coarse.y, coarse.weight, coarse.x,
+            )  # fmt: skip
+            levels.append(coarse)
+            fine = coarse
+        return levels
+
+
+def _chebyshev() -> Iterator[tuple[float, float]]:
+    """(share of the last step, gain of the residual) of each step, for eigenvalues in [LOWEST, 1]."""
+    middle, half = (1 + LOWEST) / 2, (1 - LOWEST) / 2
+    rho = half / middle
+    yield 0.0, 1 / middle
+    for _ in range(ITERATIONS - 1):
+        last, rho = rho, 1 / (2 * middle / half - rho)
+        yield rho * last, 2 * rho / half
+
+
+def _index(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Position of each query in the sorted `keys`, −1 where absent."""
+    if not len(keys):
+        return np.full(queries.shape, -1, np.int32)
+    at = np.minimum(np.searchsorted(keys, queries), len(keys) - 1)
+    return np.where(keys[at] == queries, at, -1).astype(np.int32)
+
+
+def _slots(keys: NDArray[np.int64], layers: Sums) -> NDArray[np.int32]:
+    slots = np.empty(len(keys), np.int32)
+    find_blocks(keys, layers.hash_keys, layers.hash_slots, slots)
+    return slots

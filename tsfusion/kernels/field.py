@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: MIT
+"""The field regulariser: paper eq. 3 carried from the ray to the volume.
+
+    x̂ = argmin Σ W (x − y)² + λ Σ over the three axes of ω |D2 x|²      D2: second differences
+
+y = Σ w·m / Σ w and W = Σ w are read from the map, x near a flat surface is a ramp with D2 x = 0, and
+ω = 1 / √(1 + (D2 x / ε)²), taken anew from x now and then, lets edges bend.
+
+The voxels near the surface are numbered into one dense list with the numbers of their neighbours. An
+iteration is two sweeps of it, each writing only its own voxel: `bend` leaves q = ω D2 x, `relax` steps
+down the gradient W (x − y) + λ D2ᵀ q. Hence no order of threads can show.
+"""
+
+import taichi as ti
+
+from tsfusion.kernels.integrate import CUBE, lane_distance, lane_weight
+from tsfusion.kernels.traversal import RUN
+from tsfusion.kernels.rays import WEIGHT_ONE
+
+NONE = -1
+KEEP, UNIT, REWEIGH = 0, 1, 2  # ω: as it is, 1, from x
+
+
+@ti.func
+def raw_value(sums: ti.template(), smoothed: ti.template(), use_smoothed, slot, o):
+    """(value in quanta, weight in units of one) of a voxel; weight 0 = unseen."""
+    packed = sums[slot, o]
+    w = lane_weight(packed)
+    value = ti.f32(0.0)
+    if w > 0:
+        if use_smoothed == 1:
+            value = smoothed[slot, o]
+        else:
+            value = ti.cast(lane_distance(packed), ti.f32) / ti.cast(w, ti.f32)
+    return value, w
+
+
+@ti.kernel
+def number_voxels(
+    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    smoothed: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    use_smoothed: ti.i32,
+    least: ti.i32,
+    reach: ti.f32,
+    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """Number the voxels of each block that were seen within `reach` quanta of the surface; −1 elsewhere."""
+    for run in range(slots.shape[0] * RUN):
+        if run % RUN == 0:
+            b = run // RUN
+            n = 0
+            for o in range(CUBE):
+                value, w = raw_value(sums, smoothed, use_smoothed, slots[b], o)
+                k = NONE
+                if w >= least and abs(value) <= reach:
+                    k = n
+                    n += 1
+                number[b, o] = k
+            counts[b] = n
+
+
+@ti.func
+def neighbour(number: ti.template(), starts: ti.template(), around: ti.template(), bits, b, o, axis, side):
+    """Number in the list of the cell before or after cell o along an axis, −1 if it is not in it."""
+    shift = (2 - axis) * bits
+    mask = (1 << bits) - 1
+    at = ((o >> shift) & mask) + 2 * side - 1
+    block = b
+    if at < 0 or at > mask:
+        block = around[b, 2 * axis + side]
+    found = NONE
+    if block >= 0:
+        k = number[block, (o & ~(mask << shift)) | ((at & mask) << shift)]
+        if k >= 0:
+            found = starts[block] + k
+    return found
+
+
+@ti.kernel
+def list_voxels(
+    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    smoothed: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    use_smoothed: ti.i32,
+    least: ti.i32,
+    around: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (blocks, 6): −x, +x, −y, +y, −z, +z; −1 = none
+    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    y: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+):
+    """Fill the list: each voxel's value, weight (full samples) and neighbours. A missing neighbour is the
+    voxel itself."""
+    for run in range(slots.shape[0] * RUN):
+        if run % RUN == 0:
+            b = run // RUN
+            for o in range(CUBE):
+                k = number[b, o]
+                if k >= 0:
+                    i = starts[b] + k
+                    value, w = raw_value(sums, smoothed, use_smoothed, slots[b], o)
+                    y[i] = value
+                    x[i] = value
+                    weight[i] = ti.cast(w, ti.f32) / WEIGHT_ONE
+                    for side in ti.static(range(6)):
+                        links[i, side] = neighbour(number, starts, around, 3, b, o, side // 2, side % 2)
+
+
+@ti.func
+def parent_of(o, bits):
+    """The cell of half the resolution that holds cell o of a block with 2^bits cells a side."""
+    mask = (1 << bits) - 1
+    x = o >> (2 * bits)
+    y = (o >> bits) & mask
+    z = o & mask
+    return ((((x >> 1) << (bits - 1)) | (y >> 1)) << (bits - 1)) | (z >> 1)
+
+
+@ti.kernel
+def number_parents(
+    bits: ti.i32,  # of the finer cells
+    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    coarse_number: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    coarse_counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """Number the cells that hold a listed finer cell."""
+    for run in range(number.shape[0] * RUN):
+        if run % RUN == 0:
+            b = run // RUN
+            for c in range(coarse_number.shape[1]):
+                coarse_number[b, c] = NONE
+            for o in range(number.shape[1]):
+                if number[b, o] >= 0:
+                    coarse_number[b, parent_of(o, bits)] = 0
+            n = 0
+            for c in range(coarse_number.shape[1]):
+                if coarse_number[b, c] == 0:
+                    coarse_number[b, c] = n
+                    n += 1
+            coarse_counts[b] = n
+
+
+@ti.kernel
+def list_parents(
+    bits: ti.i32,  # of the finer cells
+    around: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    y: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    coarse_number: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    coarse_starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    coarse_y: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    coarse_weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    coarse_x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+):
+    """Each coarse cell: the weighted mean of its finer cells, the sum of their weights, its neighbours."""
+    for run in range(number.shape[0] * RUN):
+        if run % RUN == 0:
+            b = run // RUN
+            for c in range(coarse_number.shape[1]):
+                if coarse_number[b, c] >= 0:
+                    i = coarse_starts[b] + coarse_number[b, c]
+                    coarse_y[i] = 0.0
+                    coarse_weight[i] = 0.0
+                    for side in ti.static(range(6)):
+                        links[i, side] = neighbour(
+                            coarse_number, coarse_starts, around, bits - 1, b, c, side // 2, side % 2
+                        )
+            for o in range(number.shape[1]):
+                if number[b, o] >= 0:
+                    k = starts[b] + number[b, o]
+                    i = coarse_starts[b] + coarse_number[b, parent_of(o, bits)]
+                    coarse_y[i] = coarse_y[i] + weight[k] * y[k]
+                    coarse_weight[i] = coarse_weight[i] + weight[k]
+            for c in range(coarse_number.shape[1]):
+                if coarse_number[b, c] >= 0:
+                    i = coarse_starts[b] + coarse_number[b, c]
+                    coarse_y[i] = coarse_y[i] / coarse_weight[i]
+                    coarse_x[i] = coarse_y[i]
+
+
+@ti.kernel
+def refine(
+    bits: ti.i32,  # of the finer cells
+    links: ti.types.ndarray(dtype=ti.i32, ndim=2),  # of the coarse cells
+    coarse_number: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    coarse_starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    coarse_x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+):
+    """Start the finer cells from the coarse solution, linear inside each coarse cell."""
+    for run in range(number.shape[0] * RUN):
+        if run % RUN == 0:
+            b = run // RUN
+            for o in range(number.shape[1]):
+                if number[b, o] >= 0:
+                    i = coarse_starts[b] + coarse_number[b, parent_of(o, bits)]
+                    value = coarse_x[i]
+                    for axis in ti.static(range(3)):
+                        m = links[i, 2 * axis]
+                        p = links[i, 2 * axis + 1]
+                        slope = ti.f32(0.0)
+                        if m >= 0 and p >= 0:
+                            slope = 0.5 * (coarse_x[p] - coarse_x[m])
+                        elif p >= 0:
+                            slope = coarse_x[p] - coarse_x[i]
+                        elif m >= 0:
+                            slope = coarse_x[i] - coarse_x[m]
+                        half = (o >> ((2 - axis) * bits)) & 1
+                        value += (0.5 * ti.cast(half, ti.f32) - 0.25) * slope
+                    x[starts[b] + number[b, o]] = value
+
+
+@ti.kernel
+def bend(
+    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    weigh: ti.i32,
+    edge: ti.f32,
+    omega: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    q: ti.types.ndarray(dtype=ti.f32, ndim=2),
+):
+    """q = ω D2 x along each axis, 0 where one of the three voxels is missing."""
+    for i in range(x.shape[0]):
+        for axis in ti.static(range(3)):
+            m = links[i, 2 * axis]
+            p = links[i, 2 * axis + 1]
+            bent = ti.f32(0.0)
+            if m >= 0 and p >= 0:
+                d2 = x[m] - 2.0 * x[i] + x[p]
+                if weigh == UNIT:
+                    omega[i, axis] = 1.0
+                elif weigh == REWEIGH:
+                    omega[i, axis] = 1.0 / ti.sqrt(1.0 + (d2 / edge) * (d2 / edge))
+                bent = omega[i, axis] * d2
+            q[i, axis] = bent
+
+
+@ti.kernel
+def precondition(
+    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    omega: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    smoothness: ti.f32,
+    inverse: ti.types.ndarray(dtype=ti.f32, ndim=1),
+):
+    """1 / M with M = W + 4 λ Σ |D2|ᵀ ω: then 0 < M⁻¹ A ≤ 1, as (1, −2, 1) has an l1 norm of 4."""
+    for i in range(weight.shape[0]):
+        total = ti.f32(0.0)
+        for axis in ti.static(range(3)):
+            m = links[i, 2 * axis]
+            p = links[i, 2 * axis + 1]
+            total += 2.0 * omega[i, axis]
+            if m >= 0:
+                total += omega[m, axis]
+            if p >= 0:
+                total += omega[p, axis]
+        inverse[i] = 1.0 / (weight[i] + 4.0 * smoothness * total)
+
+
+@ti.kernel
+def relax(
+    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    y: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    inverse: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    q: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    smoothness: ti.f32,
+    keep: ti.f32,  # of the last step
+    gain: ti.f32,  # of the preconditioned residual
+    step: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+):
+    """One step of the Chebyshev iteration."""
+    for i in range(x.shape[0]):
+        back = ti.f32(0.0)
+        for axis in ti.static(range(3)):
+            m = links[i, 2 * axis]
+            p = links[i, 2 * axis + 1]
+            back -= 2.0 * q[i, axis]
+            if m >= 0:
+                back += q[m, axis]
+            if p >= 0:
+                back += q[p, axis]
+        residual = weight[i] * (y[i] - x[i]) - smoothness * back
+        change = keep * step[i] + gain * inverse[i] * residual
+        step[i] = change
+        x[i] = x[i] + change
+
+
+@ti.kernel
+def write_rows(
+    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    smoothed: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    use_smoothed: ti.i32,
+    least: ti.i32,
+    rows: ti.types.ndarray(dtype=ti.i32, ndim=1),  # of the solved blocks, which of them to write
+    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
+):
+    """The field where it was solved, the raw value elsewhere, NaN where less than `least` was seen."""
+    for run in range(rows.shape[0] * RUN):
+        if run % RUN == 0:
+            r = run // RUN
+            b = rows[r]
+            for o in range(CUBE):
+                value, w = raw_value(sums, smoothed, use_smoothed, slots[b], o)
+                if number[b, o] >= 0:
+                    value = x[starts[b] + number[b, o]]
+                if w < least:
+                    value = ti.math.nan
+                values[r, o] = value
