@@ -19,7 +19,7 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("processes", frozenset({"server", "gateway", "sessions", "ports", "fuser_link", "fuser",
                              "client", "sender", "outbox", "spool", "recording"})),
     ("views and sources", frozenset({"datasets", "ledger", "preview", "results"})),
-    ("map and wire", frozenset({"volume", "blockstore", "meshing", "scratch", "storage", "checkpoint",
+    ("map and wire", frozenset({"volume", "blockstore", "field", "meshing", "scratch", "storage", "checkpoint",
                                 "warmup",
                                 "journal", "transport", "codec"})),
     ("ground", frozenset({"kernels", "runtime", "mesh", "keyframe", "config", "config_toml", "errors",
@@ -29,10 +29,12 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
 # All others run where there is no Taichi, and answer while kernels run.
 MAY_REACH_TAICHI = frozenset({
     "__main__", "cli", "pipeline", "fuser", "datasets", "preview",
-    "volume", "blockstore", "meshing", "scratch", "storage", "checkpoint", "warmup", "kernels", "runtime",
+    "volume", "blockstore", "field", "meshing", "scratch", "storage", "checkpoint", "warmup", "kernels",
+    "runtime",
 })  # fmt: skip
 MAY_IMPORT_KERNELS = frozenset({
-    "kernels", "runtime", "volume", "blockstore", "meshing", "scratch", "preview", "datasets.synthetic",
+    "kernels", "runtime", "volume", "blockstore", "field", "meshing", "scratch", "preview",
+    "datasets.synthetic",
 })  # fmt: skip
 
 

@@ -8,21 +8,23 @@ hundredth of a voxel.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.kernels import field as kernels
+from tsfusion.kernels import normals
 from tsfusion.kernels.blocks import find_blocks
 from tsfusion.kernels.integrate import CUBE, QUANTA_PER_VOXEL
 from tsfusion.kernels.rays import WEIGHT_ONE
 
-BATCH = 4096  # blocks solved at once, beside their halo; some 30 kB each
+BATCH = 8192  # blocks solved at once, beside their halo; some 10 kB each
 ITERATIONS = 12  # Chebyshev steps a re-weighting; docs/accuracy.md shows the error against them
 LOWEST = 0.02  # eigenvalue of M⁻¹A from which on the iteration damps evenly
 LEAST_REACH = 2.0  # voxels
-COARSEST = 2  # 2³ cells a block
+COARSEST = 2  # levels of coarser cells; then a block is 2³
+NORMAL_SAMPLES = 3  # voxels to each side of the surface: less would be no ray
 
 _KEY_STEP = np.array([1 << 42, 1 << 21, 1], np.int64)  # one block along x, y, z in a packed key
 _AROUND = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]) @ _KEY_STEP
@@ -49,18 +51,33 @@ class Settings:
         return min(COARSEST, max(0, int(np.ceil(np.log2(max(self.smoothness, 1.0)) / 4)) - 1))
 
 
-@dataclass(frozen=True)
-class Sums:
+class Layers(Protocol):
     """What the field is computed from: the map's arrays (slot, 512) and its hash."""
 
-    sums: NDArray[np.int64]
-    regularised: NDArray[np.float32] | None
-    hash_keys: NDArray[np.int64]
-    hash_slots: NDArray[np.int32]
+    @property
+    def sums(self) -> NDArray[np.int64]: ...
+    @property
+    def regularised(self) -> NDArray[np.float32] | None: ...
+    @property
+    def hash_keys(self) -> NDArray[np.int64]: ...
+    @property
+    def hash_slots(self) -> NDArray[np.int32]: ...
+
+
+def values_of(keys: NDArray[np.int64], layers: Layers, min_weight: float) -> NDArray[np.float32]:
+    """Signed distances of blocks in the map, without the field: (n, 512) quanta, NaN where unseen."""
+    values = np.empty((len(keys), CUBE), np.float32)
+    smoothed = layers.regularised
+    kernels.read_values(
+        _slots(keys, layers), layers.sums,
+        np.zeros((1, CUBE), np.float32) if smoothed is None else smoothed, int(smoothed is not None),
+        max(1, int(np.ceil(min_weight * WEIGHT_ONE))), values,
+    )  # fmt: skip
+    return values
 
 
 def solve(
-    wanted: NDArray[np.int64], layers: Sums, min_weight: float, settings: Settings
+    wanted: NDArray[np.int64], layers: Layers, min_weight: float, settings: Settings
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """The regularised signed distances of some blocks.
 
@@ -77,6 +94,27 @@ def solve(
         part = keys[first : first + BATCH]
         _Batch(part, layers, min_weight, settings).solve(values[first : first + BATCH])
     return keys, values
+
+
+def along_normals(
+    wanted: NDArray[np.int64], layers: Layers, min_weight: float, smoothness: float
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """As `solve`, but smoothed along the normals only: paper eq. 3 on the values sampled along the gradient."""
+    centre = np.zeros((NORMAL_SAMPLES + 1, NORMAL_SAMPLES + 1), np.float32)
+    for n in range(NORMAL_SAMPLES + 1):
+        D2 = np.diff(np.eye(2 * n + 1), 2, axis=0)
+        centre[n, : n + 1] = np.linalg.inv(np.eye(2 * n + 1) + smoothness * D2.T @ D2)[n, n:]
+    found = wanted[_slots(wanted, layers) >= 0]
+    smoothed = np.empty((len(found), CUBE), np.float32)
+    for first in range(0, len(found), BATCH):
+        part = found[first : first + BATCH]
+        keys = spread(part)
+        keys = keys[_slots(keys, layers) >= 0]
+        normals.smooth_along_normals(
+            _index(keys, part), _index(keys, part[:, None] + _AROUND), values_of(keys, layers, min_weight),
+            LEAST_REACH * QUANTA_PER_VOXEL, centre, smoothed[first : first + BATCH],
+        )  # fmt: skip
+    return found, smoothed
 
 
 def spread(keys: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -123,7 +161,7 @@ class _Batch:
     """Some blocks and their halo, as lists of cells."""
 
     def __init__(
-        self, wanted: NDArray[np.int64], layers: Sums, min_weight: float, settings: Settings
+        self, wanted: NDArray[np.int64], layers: Layers, min_weight: float, settings: Settings
     ) -> None:
         self.wanted, self.settings = wanted, settings
         keys = wanted
@@ -131,51 +169,47 @@ class _Batch:
             keys = spread(keys)
             keys = keys[_slots(keys, layers) >= 0]
         self.keys = keys
-        self.around = _index(keys, keys[:, None] + _SIDES)
-        smoothed = layers.regularised
-        self.source: tuple[Any, ...] = (
-            _slots(keys, layers),
-            layers.sums,
-            np.zeros((1, CUBE), np.float32) if smoothed is None else smoothed,
-            int(smoothed is not None),
-            max(1, int(np.ceil(min_weight * WEIGHT_ONE))),
-        )
+        self.values = values_of(keys, layers, min_weight)
+        self.levels = self._list(layers)
 
-    def solve(self, values: NDArray[np.float32]) -> None:
+    def solve(self, solved: NDArray[np.float32]) -> None:
         """Write the values of the wanted blocks."""
-        s = self.settings
-        levels = self._levels()
-        for depth in range(len(levels) - 1, -1, -1):
-            level, coarsest = levels[depth], depth == len(levels) - 1
-            if not coarsest:
-                coarse = levels[depth + 1]
+        s, coarsest = self.settings, len(self.levels) - 1
+        for depth in range(coarsest, -1, -1):
+            level = self.levels[depth]
+            if depth < coarsest:
+                coarse = self.levels[depth + 1]
                 kernels.refine(
                     level.bits, coarse.links, coarse.number, coarse.starts, coarse.x,
                     level.number, level.starts, level.x,
                 )  # fmt: skip
-            # a curvature is 4 times as large between cells of twice the size, and there are 8 times fewer
+            # between cells of twice the size a bend is 4 times as large, and there are 8 times fewer
             level.relax(
-                s.smoothness / 2**depth, s.edge * QUANTA_PER_VOXEL * 4**depth, s.reweightings, first=coarsest
-            )
+                s.smoothness / 2**depth, s.edge * QUANTA_PER_VOXEL * 4**depth, s.reweightings,
+                first=depth == coarsest,
+            )  # fmt: skip
+        finest = self.levels[0]
         rows = _index(self.keys, self.wanted)
-        finest = levels[0]
-        kernels.write_rows(*self.source, rows, finest.number, finest.starts, finest.x, values)
+        kernels.write_values(rows, self.values, finest.number, finest.starts, finest.x, solved)
 
-    def _levels(self) -> list[_Level]:
+    def _list(self, layers: Layers) -> list[_Level]:
+        """The voxels near the surface, and their coarser cells."""
         blocks = len(self.keys)
+        around = _index(self.keys, self.keys[:, None] + _SIDES)
         number, counts = np.empty((blocks, CUBE), np.int32), np.empty(blocks, np.int32)
-        kernels.number_voxels(*self.source, self.settings.reach * QUANTA_PER_VOXEL, number, counts)
+        kernels.number_voxels(self.values, self.settings.reach * QUANTA_PER_VOXEL, number, counts)
         fine = _Level.make(3, number, counts)
         kernels.list_voxels(
-            *self.source, self.around, fine.number, fine.starts, fine.links, fine.y, fine.weight, fine.x
-        )
+            self.values, _slots(self.keys, layers), layers.sums, around,
+            fine.number, fine.starts, fine.links, fine.y, fine.weight, fine.x,
+        )  # fmt: skip
         levels = [fine]
         for _ in range(self.settings.coarser):
-            number = np.empty((blocks, len(fine.number[0]) // 8), np.int32)
+            number = np.empty((blocks, fine.number.shape[1] // 8), np.int32)
             kernels.number_parents(fine.bits, fine.number, number, counts)
             coarse = _Level.make(fine.bits - 1, number, counts)
             kernels.list_parents(
-                fine.bits, self.around, fine.number, fine.starts, fine.y, fine.weight,
+                fine.bits, around, fine.number, fine.starts, fine.links, fine.y, fine.weight,
                 coarse.number, coarse.starts, coarse.links, coarse.y, coarse.weight, coarse.x,
             )  # fmt: skip
             levels.append(coarse)
@@ -201,7 +235,7 @@ def _index(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.in
     return np.where(keys[at] == queries, at, -1).astype(np.int32)
 
 
-def _slots(keys: NDArray[np.int64], layers: Sums) -> NDArray[np.int32]:
+def _slots(keys: NDArray[np.int64], layers: Layers) -> NDArray[np.int32]:
     slots = np.empty(len(keys), np.int32)
     find_blocks(keys, layers.hash_keys, layers.hash_slots, slots)
     return slots

@@ -4,6 +4,7 @@
 import hashlib
 import os
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion import checkpoint, runtime
-from tsfusion.blockstore import BlockStore, pack_keys, unpack_keys
+from tsfusion import checkpoint, field, runtime
+from tsfusion.blockstore import BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.config import VolumeConfig, make, override
 from tsfusion.errors import InvalidConfig, MapError, MapFull, WeightOverflow
 from tsfusion.kernels import integrate, smooth
@@ -103,13 +104,22 @@ class Volume:
         """Coordinates of the blocks changed since the last call: (n, 3) int32, in units of 8 voxels."""
         return unpack_keys(self._store.keys[self._store.take_dirty()])
 
+    def cells_to_mesh(self, dirty: NDArray[np.int32]) -> NDArray[np.int32]:
+        """The blocks whose mesh the changes to these blocks reach: (m, 3) int32.
+
+        They and their neighbours towards −x, −y, −z; the field carries a change into all blocks around first.
+        """
+        if self.model.surface == "field":
+            dirty = unpack_keys(field.spread(pack_keys(dirty)))
+        return cells_of(dirty)
+
     def extract_mesh(self, min_weight: float | None = None, blocks: NDArray[np.int32] | None = None) -> Mesh:
         """The surface, by marching cubes over the whole map or over the cells of some blocks.
 
         Args:
             min_weight: full-confidence samples a voxel needs to count as seen; default the sensor's.
-            blocks: (n, 3) int32 block coordinates. A mesh of every block that `take_dirty` gave, and of its
-                neighbours towards −x, −y, −z, replaces exactly what changed (`cells_of`).
+            blocks: (n, 3) int32 block coordinates. A mesh of `cells_to_mesh(take_dirty())` replaces what
+                changed.
         """
         if min_weight is None:
             min_weight = self.model.min_weight
@@ -132,7 +142,10 @@ class Volume:
             hash_slots=store.hash_slots,
             voxel_size=self.config.voxel_size,
         )
-        return extract(np.sort(chosen), layers, min_weight)
+        chosen = np.sort(chosen)
+        if self.model.surface != "raw":
+            layers = replace(layers, regularised=self._surface(chosen, layers, min_weight))
+        return extract(chosen, layers, min_weight)
 
     def map_hash(self) -> str:
         """Hex digest of the exact sums: equal for the same keyframes in any order, on any number of threads.
@@ -236,6 +249,18 @@ class Volume:
             samples=samples, invalid=total - samples, rays=ray_count,
             blocks=touched, new_blocks=new, voxels=voxels,
         )  # fmt: skip
+
+    def _surface(self, chosen: NDArray[np.int64], layers: Layers, min_weight: float) -> NDArray[np.float32]:
+        """The values to mesh the cells of these blocks from, (slot, 512)."""
+        model = self.model
+        if model.surface == "normal":
+            keys, values = field.along_normals(field.spread(chosen), layers, min_weight, model.smoothness)
+        else:
+            settings = field.Settings(model.field_smoothness, model.field_edge, model.field_reweightings)
+            keys, values = field.solve(field.spread(chosen), layers, min_weight, settings)
+        rows = np.zeros((self._store.count, CUBE), np.float32)
+        rows[self._store.slots_of(keys)] = values
+        return rows
 
     def _sum_rays(self) -> None:
         s = self._scratch

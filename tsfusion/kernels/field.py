@@ -21,40 +21,46 @@ NONE = -1
 KEEP, UNIT, REWEIGH = 0, 1, 2  # ω: as it is, 1, from x
 
 
-@ti.func
-def raw_value(sums: ti.template(), smoothed: ti.template(), use_smoothed, slot, o):
-    """(value in quanta, weight in units of one) of a voxel; weight 0 = unseen."""
-    packed = sums[slot, o]
-    w = lane_weight(packed)
-    value = ti.f32(0.0)
-    if w > 0:
-        if use_smoothed == 1:
-            value = smoothed[slot, o]
-        else:
-            value = ti.cast(lane_distance(packed), ti.f32) / ti.cast(w, ti.f32)
-    return value, w
+@ti.kernel
+def read_values(
+    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    regularised: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    use_regularised: ti.i32,
+    least: ti.i32,
+    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
+):
+    """Rows of Σ w·m / Σ w, or of the regularised layer, in quanta; NaN where less than `least` was seen."""
+    for run in range(slots.shape[0] * RUN):
+        if run % RUN == 0:
+            b = run // RUN
+            for o in range(CUBE):
+                packed = sums[slots[b], o]
+                w = lane_weight(packed)
+                value = ti.math.nan
+                if w >= least:
+                    if use_regularised == 1:
+                        value = regularised[slots[b], o]
+                    else:
+                        value = ti.cast(lane_distance(packed), ti.f32) / ti.cast(w, ti.f32)
+                values[b, o] = value
 
 
 @ti.kernel
 def number_voxels(
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    smoothed: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    use_smoothed: ti.i32,
-    least: ti.i32,
+    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
     reach: ti.f32,
     number: ti.types.ndarray(dtype=ti.i32, ndim=2),
     counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
     """Number the voxels of each block that were seen within `reach` quanta of the surface; −1 elsewhere."""
-    for run in range(slots.shape[0] * RUN):
+    for run in range(values.shape[0] * RUN):
         if run % RUN == 0:
             b = run // RUN
             n = 0
             for o in range(CUBE):
-                value, w = raw_value(sums, smoothed, use_smoothed, slots[b], o)
                 k = NONE
-                if w >= least and abs(value) <= reach:
+                if abs(values[b, o]) <= reach:  # never true of NaN
                     k = n
                     n += 1
                 number[b, o] = k
@@ -80,11 +86,9 @@ def neighbour(number: ti.template(), starts: ti.template(), around: ti.template(
 
 @ti.kernel
 def list_voxels(
+    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
     slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
     sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    smoothed: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    use_smoothed: ti.i32,
-    least: ti.i32,
     around: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (blocks, 6): −x, +x, −y, +y, −z, +z; −1 = none
     number: ti.types.ndarray(dtype=ti.i32, ndim=2),
     starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
@@ -93,19 +97,17 @@ def list_voxels(
     weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
-    """Fill the list: each voxel's value, weight (full samples) and neighbours. A missing neighbour is the
-    voxel itself."""
-    for run in range(slots.shape[0] * RUN):
+    """Fill the list: each voxel's value, its weight in full-confidence samples, and its neighbours."""
+    for run in range(values.shape[0] * RUN):
         if run % RUN == 0:
             b = run // RUN
             for o in range(CUBE):
                 k = number[b, o]
                 if k >= 0:
                     i = starts[b] + k
-                    value, w = raw_value(sums, smoothed, use_smoothed, slots[b], o)
-                    y[i] = value
-                    x[i] = value
-                    weight[i] = ti.cast(w, ti.f32) / WEIGHT_ONE
+                    y[i] = values[b, o]
+                    x[i] = values[b, o]
+                    weight[i] = ti.cast(lane_weight(sums[slots[b], o]), ti.f32) / WEIGHT_ONE
                     for side in ti.static(range(6)):
                         links[i, side] = neighbour(number, starts, around, 3, b, o, side // 2, side % 2)
 
@@ -144,22 +146,47 @@ def number_parents(
             coarse_counts[b] = n
 
 
+@ti.func
+def slope(links: ti.template(), x: ti.template(), i, axis):
+    """Difference to the next cell along an axis: central, one-sided at the rim, 0 alone."""
+    m = links[i, 2 * axis]
+    p = links[i, 2 * axis + 1]
+    result = ti.f32(0.0)
+    if m >= 0 and p >= 0:
+        result = 0.5 * (x[p] - x[m])
+    elif p >= 0:
+        result = x[p] - x[i]
+    elif m >= 0:
+        result = x[i] - x[m]
+    return result
+
+
+@ti.func
+def off_center(o, bits, axis):
+    """From its parent's centre to cell o, in cells of its size: ±½."""
+    return ti.cast((o >> ((2 - axis) * bits)) & 1, ti.f32) - 0.5
+
+
 @ti.kernel
 def list_parents(
     bits: ti.i32,  # of the finer cells
     around: ti.types.ndarray(dtype=ti.i32, ndim=2),
     number: ti.types.ndarray(dtype=ti.i32, ndim=2),
     starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
     y: ti.types.ndarray(dtype=ti.f32, ndim=1),
     weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
     coarse_number: ti.types.ndarray(dtype=ti.i32, ndim=2),
     coarse_starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    coarse_links: ti.types.ndarray(dtype=ti.i32, ndim=2),
     coarse_y: ti.types.ndarray(dtype=ti.f32, ndim=1),
     coarse_weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
     coarse_x: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
-    """Each coarse cell: the weighted mean of its finer cells, the sum of their weights, its neighbours."""
+    """Each coarse cell: the weighted mean of its finer cells, the sum of their weights, its neighbours.
+
+    Each value is moved to the cell's centre along its own slope: ramps stay ramps where cells are missing.
+    """
     for run in range(number.shape[0] * RUN):
         if run % RUN == 0:
             b = run // RUN
@@ -169,14 +196,17 @@ def list_parents(
                     coarse_y[i] = 0.0
                     coarse_weight[i] = 0.0
                     for side in ti.static(range(6)):
-                        links[i, side] = neighbour(
+                        coarse_links[i, side] = neighbour(
                             coarse_number, coarse_starts, around, bits - 1, b, c, side // 2, side % 2
                         )
             for o in range(number.shape[1]):
                 if number[b, o] >= 0:
                     k = starts[b] + number[b, o]
                     i = coarse_starts[b] + coarse_number[b, parent_of(o, bits)]
-                    coarse_y[i] = coarse_y[i] + weight[k] * y[k]
+                    value = y[k]
+                    for axis in ti.static(range(3)):
+                        value -= off_center(o, bits, axis) * slope(links, y, k, axis)
+                    coarse_y[i] = coarse_y[i] + weight[k] * value
                     coarse_weight[i] = coarse_weight[i] + weight[k]
             for c in range(coarse_number.shape[1]):
                 if coarse_number[b, c] >= 0:
@@ -205,17 +235,7 @@ def refine(
                     i = coarse_starts[b] + coarse_number[b, parent_of(o, bits)]
                     value = coarse_x[i]
                     for axis in ti.static(range(3)):
-                        m = links[i, 2 * axis]
-                        p = links[i, 2 * axis + 1]
-                        slope = ti.f32(0.0)
-                        if m >= 0 and p >= 0:
-                            slope = 0.5 * (coarse_x[p] - coarse_x[m])
-                        elif p >= 0:
-                            slope = coarse_x[p] - coarse_x[i]
-                        elif m >= 0:
-                            slope = coarse_x[i] - coarse_x[m]
-                        half = (o >> ((2 - axis) * bits)) & 1
-                        value += (0.5 * ti.cast(half, ti.f32) - 0.25) * slope
+                        value += 0.5 * off_center(o, bits, axis) * slope(links, coarse_x, i, axis)
                     x[starts[b] + number[b, o]] = value
 
 
@@ -297,27 +317,21 @@ def relax(
 
 
 @ti.kernel
-def write_rows(
-    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    smoothed: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    use_smoothed: ti.i32,
-    least: ti.i32,
-    rows: ti.types.ndarray(dtype=ti.i32, ndim=1),  # of the solved blocks, which of them to write
+def write_values(
+    rows: ti.types.ndarray(dtype=ti.i32, ndim=1),  # of the listed blocks, which of them to write
+    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
     number: ti.types.ndarray(dtype=ti.i32, ndim=2),
     starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    solved: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
-    """The field where it was solved, the raw value elsewhere, NaN where less than `least` was seen."""
+    """The field where it was solved, the value as it was elsewhere."""
     for run in range(rows.shape[0] * RUN):
         if run % RUN == 0:
             r = run // RUN
             b = rows[r]
             for o in range(CUBE):
-                value, w = raw_value(sums, smoothed, use_smoothed, slots[b], o)
+                value = values[b, o]
                 if number[b, o] >= 0:
                     value = x[starts[b] + number[b, o]]
-                if w < least:
-                    value = ti.math.nan
-                values[r, o] = value
+                solved[r, o] = value
