@@ -138,20 +138,20 @@ class _Level:
     @classmethod
     def make(cls, bits: int, number: NDArray[np.int32], counts: NDArray[np.int32]) -> "_Level":
         total = int(counts.sum())
-        y, weight, x = (np.empty(total, np.float32) for _ in range(3))
+        y, weight, x = (np.zeros(total + 1, np.float32) for _ in range(3))  # the last stands for "none"
         starts = (np.cumsum(counts) - counts).astype(np.int32)
         return cls(bits, number, starts, np.empty((total, 6), np.int32), y, weight, x)
 
     def relax(self, smoothness: float, edge: float, reweightings: int, *, first: bool) -> None:
         """Solve with ω = 1 if `first`, then with ω from the last solution, again and again."""
         total = len(self.x)
-        omega, bent = np.zeros((total, 3), np.float32), np.empty((total, 3), np.float32)
+        omega, bent = np.zeros((total, 3), np.float32), np.zeros((total, 3), np.float32)
         inverse, step = np.empty(total, np.float32), np.zeros(total, np.float32)
-        for weigh in ([kernels.UNIT] if first else []) + [kernels.REWEIGH] * reweightings:
-            for n, (keep, gain) in enumerate(_chebyshev()):
-                kernels.bend(self.links, self.x, kernels.KEEP if n else weigh, edge, omega, bent)
-                if n == 0:
-                    kernels.precondition(self.links, self.weight, omega, smoothness, inverse)
+        for flat in ([1] if first else []) + [0] * reweightings:
+            kernels.reweigh(self.links, self.x, flat, edge, omega)
+            kernels.precondition(self.links, self.weight, omega, smoothness, inverse)
+            for keep, gain in _chebyshev():
+                kernels.bend(self.links, self.x, omega, bent)
                 kernels.relax(
                     self.links, self.y, self.weight, inverse, bent, smoothness, keep, gain, step, self.x
                 )

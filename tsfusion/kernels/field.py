@@ -6,9 +6,10 @@
 y = Σ w·m / Σ w and W = Σ w are read from the map, x near a flat surface is a ramp with D2 x = 0, and
 ω = 1 / √(1 + (D2 x / ε)²), taken anew from x now and then, lets edges bend.
 
-The voxels near the surface are numbered into one dense list with the numbers of their neighbours. An
-iteration is two sweeps of it, each writing only its own voxel: `bend` leaves q = ω D2 x, `relax` steps
-down the gradient W (x − y) + λ D2ᵀ q. Hence no order of threads can show.
+The voxels near the surface are numbered into one dense list with the numbers of their neighbours; a missing
+one has the number past the end, where all is 0. An iteration is two sweeps of the list, each writing only
+its own voxel: `bend` leaves q = ω D2 x, `relax` steps down the gradient W (x − y) + λ D2ᵀ q. Hence no order
+of threads can show.
 """
 
 import taichi as ti
@@ -18,7 +19,6 @@ from tsfusion.kernels.traversal import RUN
 from tsfusion.kernels.rays import WEIGHT_ONE
 
 NONE = -1
-KEEP, UNIT, REWEIGH = 0, 1, 2  # ω: as it is, 1, from x
 
 
 @ti.kernel
@@ -68,15 +68,17 @@ def number_voxels(
 
 
 @ti.func
-def neighbour(number: ti.template(), starts: ti.template(), around: ti.template(), bits, b, o, axis, side):
-    """Number in the list of the cell before or after cell o along an axis, −1 if it is not in it."""
+def neighbour(
+    number: ti.template(), starts: ti.template(), around: ti.template(), bits, b, o, axis, side, none
+):
+    """Number in the list of the cell before or after cell o along an axis, `none` if it is not in it."""
     shift = (2 - axis) * bits
     mask = (1 << bits) - 1
     at = ((o >> shift) & mask) + 2 * side - 1
     block = b
     if at < 0 or at > mask:
         block = around[b, 2 * axis + side]
-    found = NONE
+    found = none
     if block >= 0:
         k = number[block, (o & ~(mask << shift)) | ((at & mask) << shift)]
         if k >= 0:
@@ -109,7 +111,9 @@ def list_voxels(
                     x[i] = values[b, o]
                     weight[i] = ti.cast(lane_weight(sums[slots[b], o]), ti.f32) / WEIGHT_ONE
                     for side in ti.static(range(6)):
-                        links[i, side] = neighbour(number, starts, around, 3, b, o, side // 2, side % 2)
+                        links[i, side] = neighbour(
+                            number, starts, around, 3, b, o, side // 2, side % 2, links.shape[0]
+                        )
 
 
 @ti.func
@@ -151,12 +155,13 @@ def slope(links: ti.template(), x: ti.template(), i, axis):
     """Difference to the next cell along an axis: central, one-sided at the rim, 0 alone."""
     m = links[i, 2 * axis]
     p = links[i, 2 * axis + 1]
+    none = links.shape[0]
     result = ti.f32(0.0)
-    if m >= 0 and p >= 0:
+    if m < none and p < none:
         result = 0.5 * (x[p] - x[m])
-    elif p >= 0:
+    elif p < none:
         result = x[p] - x[i]
-    elif m >= 0:
+    elif m < none:
         result = x[i] - x[m]
     return result
 
@@ -197,7 +202,8 @@ def list_parents(
                     coarse_weight[i] = 0.0
                     for side in ti.static(range(6)):
                         coarse_links[i, side] = neighbour(
-                            coarse_number, coarse_starts, around, bits - 1, b, c, side // 2, side % 2
+                            coarse_number, coarse_starts, around, bits - 1, b, c, side // 2, side % 2,
+                            coarse_links.shape[0],
                         )
             for o in range(number.shape[1]):
                 if number[b, o] >= 0:
@@ -243,25 +249,36 @@ def refine(
 def bend(
     links: ti.types.ndarray(dtype=ti.i32, ndim=2),
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    weigh: ti.i32,
-    edge: ti.f32,
     omega: ti.types.ndarray(dtype=ti.f32, ndim=2),
     q: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
-    """q = ω D2 x along each axis, 0 where one of the three voxels is missing."""
-    for i in range(x.shape[0]):
+    """q = ω D2 x along each axis."""
+    for i in range(links.shape[0]):
+        twice = 2.0 * x[i]
+        for axis in ti.static(range(3)):
+            q[i, axis] = omega[i, axis] * (x[links[i, 2 * axis]] - twice + x[links[i, 2 * axis + 1]])
+
+
+@ti.kernel
+def reweigh(
+    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    flat: ti.i32,  # ω = 1 instead
+    edge: ti.f32,
+    omega: ti.types.ndarray(dtype=ti.f32, ndim=2),
+):
+    """ω = 1 / √(1 + (D2 x / ε)²); 0 where one of the three cells is missing."""
+    for i in range(links.shape[0]):
         for axis in ti.static(range(3)):
             m = links[i, 2 * axis]
             p = links[i, 2 * axis + 1]
-            bent = ti.f32(0.0)
-            if m >= 0 and p >= 0:
-                d2 = x[m] - 2.0 * x[i] + x[p]
-                if weigh == UNIT:
-                    omega[i, axis] = 1.0
-                elif weigh == REWEIGH:
-                    omega[i, axis] = 1.0 / ti.sqrt(1.0 + (d2 / edge) * (d2 / edge))
-                bent = omega[i, axis] * d2
-            q[i, axis] = bent
+            weight = ti.f32(0.0)
+            if m < links.shape[0] and p < links.shape[0]:
+                weight = 1.0
+                if flat == 0:
+                    bent = (x[m] - 2.0 * x[i] + x[p]) / edge
+                    weight = 1.0 / ti.sqrt(1.0 + bent * bent)
+            omega[i, axis] = weight
 
 
 @ti.kernel
@@ -273,16 +290,10 @@ def precondition(
     inverse: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
     """1 / M with M = W + 4 λ Σ |D2|ᵀ ω: then 0 < M⁻¹ A ≤ 1, as (1, −2, 1) has an l1 norm of 4."""
-    for i in range(weight.shape[0]):
+    for i in range(links.shape[0]):
         total = ti.f32(0.0)
         for axis in ti.static(range(3)):
-            m = links[i, 2 * axis]
-            p = links[i, 2 * axis + 1]
-            total += 2.0 * omega[i, axis]
-            if m >= 0:
-                total += omega[m, axis]
-            if p >= 0:
-                total += omega[p, axis]
+            total += 2.0 * omega[i, axis] + omega[links[i, 2 * axis], axis] + omega[links[i, 2 * axis + 1], axis]
         inverse[i] = 1.0 / (weight[i] + 4.0 * smoothness * total)
 
 
@@ -300,18 +311,11 @@ def relax(
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
     """One step of the Chebyshev iteration."""
-    for i in range(x.shape[0]):
+    for i in range(links.shape[0]):
         back = ti.f32(0.0)
         for axis in ti.static(range(3)):
-            m = links[i, 2 * axis]
-            p = links[i, 2 * axis + 1]
-            back -= 2.0 * q[i, axis]
-            if m >= 0:
-                back += q[m, axis]
-            if p >= 0:
-                back += q[p, axis]
-        residual = weight[i] * (y[i] - x[i]) - smoothness * back
-        change = keep * step[i] + gain * inverse[i] * residual
+            back += q[links[i, 2 * axis], axis] - 2.0 * q[i, axis] + q[links[i, 2 * axis + 1], axis]
+        change = keep * step[i] + gain * inverse[i] * (weight[i] * (y[i] - x[i]) - smoothness * back)
         step[i] = change
         x[i] = x[i] + change
 
