@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tsfusion import Volume, field, runtime
-from tsfusion.blockstore import pack_keys, unpack_keys
+from tsfusion.blockstore import pack_keys
 from tsfusion.field import Settings, along_normals, solve
 from tsfusion.kernels import blocks
 from tsfusion.meshing import Layers, extract
@@ -87,7 +87,7 @@ def test_a_coarser_start_leads_to_the_same_field(monkeypatch: pytest.MonkeyPatch
     distance, weight = noisy_roof(2)
     keys, sums = map_of(distance, weight, (-2, -1, -1))
     often = Settings(smoothness=500.0, edge=0.1, reweightings=30)
-    assert often.coarser == 2
+    assert often.coarser == 1
     raw = np.where(weight > 0, np.rint(distance * QUANTA), np.nan)
     expected = reference.field(raw, weight / 16, often, QUANTA)
     monkeypatch.setattr(field, "ITERATIONS", 100)
@@ -117,7 +117,7 @@ def test_a_ramp_passes_unchanged(settings: Settings) -> None:
     keys, sums = map_of(distance, weight, (0, 0, 0))
     _, rows = solve(keys, layers_of(keys, sums), 1.0, settings)
     error = dense(rows, distance.shape) / QUANTA - distance
-    assert np.nanmax(abs(error)) < (1e-4 if settings is SETTINGS else 2e-2)
+    assert np.nanmax(abs(error)) < (1e-4 if settings is SETTINGS else 5e-2)
     assert (np.isnan(error) == (weight == 0)).all()
     _, rows = along_normals(keys, layers_of(keys, sums), 1.0, 10.0)
     error = dense(rows, distance.shape) / QUANTA - distance
@@ -176,9 +176,7 @@ def test_an_empty_map_and_absent_blocks() -> None:
 
 
 @pytest.mark.parametrize("sensor", ["kinect", "stereo"])
-def test_a_part_equals_the_whole_to_a_hundredth_voxel(
-    monkeypatch: pytest.MonkeyPatch, sensor: str
-) -> None:
+def test_a_part_equals_the_whole_to_a_hundredth_voxel(monkeypatch: pytest.MonkeyPatch, sensor: str) -> None:
     """What a keyframe changes is found again by solving its blocks and those around; nothing else moves."""
     volume = Volume(voxel_size=0.02, sensor=sensor, regularizer="off")
     random = np.random.default_rng(0)
@@ -190,7 +188,7 @@ def test_a_part_equals_the_whole_to_a_hundredth_voxel(
     settings = Settings(model.field_smoothness, model.field_edge, model.field_reweightings)
     before, old = solve(np.sort(volume._store.keys), layers(volume), 0.5, settings)
     volume.integrate(scenes.with_noise(views[-1], 0.004, random))
-    changed = field.spread(pack_keys(volume.take_dirty()))
+    changed = field.spread(pack_keys(volume.take_dirty()), layers(volume), settings)
     keys, whole = solve(np.sort(volume._store.keys), layers(volume), 0.5, settings)
     part_keys, part = solve(changed, layers(volume), 0.5, settings)
     assert 0 < len(part_keys) < len(keys)
@@ -219,7 +217,7 @@ def test_a_cube_keeps_its_edges_and_its_faces_lose_their_noise() -> None:
     keys, sums = map_of(distance, weight, (0, 0, 0))
     raw = layers_of(keys, sums)
     errors = {}
-    for name, settings in (("raw", Settings(0.0, 0.03, 0)), ("field", Settings(20.0, 0.03, 2))):
+    for name, settings in (("raw", Settings(0.0, 0.03, 0)), ("field", Settings(30.0, 0.01, 4))):
         _, rows = solve(keys, raw, 1.0, settings)
         mesh = extract(keys, Layers(**{**vars(raw), "regularised": rows}), 1.0)
         q = abs(mesh.vertices - 24.0) - 11.7
@@ -248,15 +246,16 @@ def test_smoothing_along_normals_equals_its_twin() -> None:
     assert moved > 50
 
 
-@pytest.mark.parametrize("surface", ["normal", "field"])
-def test_the_surface_of_a_noisy_sphere_improves(surface: str) -> None:
+@pytest.mark.parametrize(("surface", "share"), [("normal", 0.9), ("field", 0.5)])
+def test_the_surface_of_a_noisy_plane_improves(surface: str, share: float) -> None:
+    normal = np.array([0.3, -0.2, 0.93])
+    normal /= np.linalg.norm(normal)
     errors = {}
     for mode in ("raw", surface):
         volume = Volume(voxel_size=0.02, surface=mode)
         random = np.random.default_rng(0)
-        for view in scenes.sphere_views(0.4, 12):
-            volume.integrate(scenes.with_noise(view, 0.01, random))
-        mesh = volume.extract_mesh(min_weight=1)
-        errors[mode] = abs(np.linalg.norm(mesh.vertices, axis=1) - 0.4).mean()
-        assert (unpack_keys(volume._store.keys) >= -10).all()
-    assert errors[surface] < (0.6 if surface == "field" else 0.95) * errors["raw"]
+        for x, y in ((0.0, 0.0), (0.5, 0.2), (-0.4, 0.3), (0.1, -0.6)):
+            T = scenes.look_at(np.array([x, y, 1.5]), np.array([0.1, 0.0, 0.0]))
+            volume.integrate(scenes.with_noise(scenes.plane_keyframe(T, normal, 0.1), 0.01, random))
+        errors[mode] = abs(volume.extract_mesh(min_weight=1).vertices @ normal - 0.1).mean()
+    assert errors[surface] < share * errors["raw"]

@@ -59,11 +59,11 @@ class SensorModel(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     regularizer: Regularizer = "off"
     smoothness: NonNegative = 1.0
     feedback: bool = False
-    min_weight: NonNegative = 2.0
+    min_weight: NonNegative = 0.5
     surface: Surface = "field"
-    field_smoothness: NonNegative = 20.0
-    field_edge: Positive = 0.03
-    field_reweightings: Annotated[int, Meta(ge=0, le=16)] = 2
+    field_smoothness: NonNegative = 30.0
+    field_edge: Positive = 0.01
+    field_reweightings: Annotated[int, Meta(ge=0, le=16)] = 4
 
 
 # Kinect v1: Nguyen, Izadi and Lovell 2012 (axial noise). Stereo: Δz = z² Δd / (b·f). Streets are seen at
@@ -86,10 +86,10 @@ SENSORS: dict[str, SensorModel] = {
         regularizer="ray",
         smoothness=10.0,
         feedback=True,
-        field_smoothness=500.0,
+        field_smoothness=1000.0,
     ),
-    "lidar": SensorModel(sigma_floor=0.02, min_range=1.0, max_range=100.0, min_support=4.0, min_weight=0.5),
-    "scanner": SensorModel(sigma_floor=0.0002, min_range=0.0, max_range=100.0, min_weight=0.5),
+    "lidar": SensorModel(sigma_floor=0.02, min_range=1.0, max_range=100.0, min_support=4.0),
+    "scanner": SensorModel(sigma_floor=0.0002, min_range=0.0, max_range=100.0),
 }
 
 

@@ -23,7 +23,7 @@ BATCH = 8192  # blocks solved at once, beside their halo; some 10 kB each
 ITERATIONS = 12  # Chebyshev steps a re-weighting; docs/accuracy.md shows the error against them
 LOWEST = 0.02  # eigenvalue of M⁻¹A from which on the iteration damps evenly
 LEAST_REACH = 2.0  # voxels
-COARSEST = 2  # levels of coarser cells; then a block is 2³
+COARSE_FROM = 64.0  # λ that smooths over more voxels than so few iterations reach
 NORMAL_SAMPLES = 3  # voxels to each side of the surface: less would be no ray
 
 _KEY_STEP = np.array([1 << 42, 1 << 21, 1], np.int64)  # one block along x, y, z in a packed key
@@ -47,8 +47,8 @@ class Settings:
 
     @property
     def coarser(self) -> int:
-        """Levels of coarser cells to start from: each shrinks λ against the data sixteenfold."""
-        return min(COARSEST, max(0, int(np.ceil(np.log2(max(self.smoothness, 1.0)) / 4)) - 1))
+        """Levels of cells of twice the size to start from, where λ against the data is 16 times smaller."""
+        return int(self.smoothness >= COARSE_FROM)
 
 
 class Layers(Protocol):
@@ -99,7 +99,7 @@ def solve(
 def along_normals(
     wanted: NDArray[np.int64], layers: Layers, min_weight: float, smoothness: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """As `solve`, but smoothed along the normals only: paper eq. 3 on the values sampled along the gradient."""
+    """As `solve`, but smoothed along the normals only: paper eq. 3 on samples along the gradient."""
     centre = np.zeros((NORMAL_SAMPLES + 1, NORMAL_SAMPLES + 1), np.float32)
     for n in range(NORMAL_SAMPLES + 1):
         D2 = np.diff(np.eye(2 * n + 1), 2, axis=0)
@@ -108,8 +108,7 @@ def along_normals(
     smoothed = np.empty((len(found), CUBE), np.float32)
     for first in range(0, len(found), BATCH):
         part = found[first : first + BATCH]
-        keys = spread(part)
-        keys = keys[_slots(keys, layers) >= 0]
+        keys = around(part, layers, 1)
         normals.smooth_along_normals(
             _index(keys, part), _index(keys, part[:, None] + _AROUND), values_of(keys, layers, min_weight),
             LEAST_REACH * QUANTA_PER_VOXEL, centre, smoothed[first : first + BATCH],
@@ -117,10 +116,9 @@ def along_normals(
     return found, smoothed
 
 
-def spread(keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The blocks whose field changes by more than a hundredth of a voxel with the sums of these: themselves
-    and the 26 around. They need not exist."""
-    return np.unique((keys[:, None] + _AROUND).ravel())
+def spread(keys: NDArray[np.int64], layers: Layers, settings: Settings) -> NDArray[np.int64]:
+    """The blocks whose field may move by more than a hundredth of a voxel with the sums of these."""
+    return around(keys, layers, 1 + settings.coarser)
 
 
 @dataclass
@@ -164,11 +162,7 @@ class _Batch:
         self, wanted: NDArray[np.int64], layers: Layers, min_weight: float, settings: Settings
     ) -> None:
         self.wanted, self.settings = wanted, settings
-        keys = wanted
-        for _ in range(1 + settings.coarser):
-            keys = spread(keys)
-            keys = keys[_slots(keys, layers) >= 0]
-        self.keys = keys
+        self.keys = keys = around(wanted, layers, 2 + settings.coarser)
         self.values = values_of(keys, layers, min_weight)
         self.levels = self._list(layers)
 
@@ -195,12 +189,12 @@ class _Batch:
     def _list(self, layers: Layers) -> list[_Level]:
         """The voxels near the surface, and their coarser cells."""
         blocks = len(self.keys)
-        around = _index(self.keys, self.keys[:, None] + _SIDES)
+        sides = _index(self.keys, self.keys[:, None] + _SIDES)
         number, counts = np.empty((blocks, CUBE), np.int32), np.empty(blocks, np.int32)
         kernels.number_voxels(self.values, self.settings.reach * QUANTA_PER_VOXEL, number, counts)
         fine = _Level.make(3, number, counts)
         kernels.list_voxels(
-            self.values, _slots(self.keys, layers), layers.sums, around,
+            self.values, _slots(self.keys, layers), layers.sums, sides,
             fine.number, fine.starts, fine.links, fine.y, fine.weight, fine.x,
         )  # fmt: skip
         levels = [fine]
@@ -209,7 +203,7 @@ class _Batch:
             kernels.number_parents(fine.bits, fine.number, number, counts)
             coarse = _Level.make(fine.bits - 1, number, counts)
             kernels.list_parents(
-                fine.bits, around, fine.number, fine.starts, fine.links, fine.y, fine.weight,
+                fine.bits, sides, fine.number, fine.starts, fine.links, fine.y, fine.weight,
                 coarse.number, coarse.starts, coarse.links, coarse.y, coarse.weight, coarse.x,
             )  # fmt: skip
             levels.append(coarse)
@@ -225,6 +219,14 @@ def _chebyshev() -> Iterator[tuple[float, float]]:
     for _ in range(ITERATIONS - 1):
         last, rho = rho, 1 / (2 * middle / half - rho)
         yield rho * last, 2 * rho / half
+
+
+def around(keys: NDArray[np.int64], layers: Layers, rings: int = 1) -> NDArray[np.int64]:
+    """The blocks of the map up to so many blocks away, these among them; sorted."""
+    for _ in range(rings):
+        keys = np.unique((keys[:, None] + _AROUND).ravel())
+        keys = keys[_slots(keys, layers) >= 0]
+    return keys
 
 
 def _index(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int32]:

@@ -107,10 +107,10 @@ class Volume:
     def cells_to_mesh(self, dirty: NDArray[np.int32]) -> NDArray[np.int32]:
         """The blocks whose mesh the changes to these blocks reach: (m, 3) int32.
 
-        They and their neighbours towards −x, −y, −z; the field carries a change into all blocks around first.
+        They and their neighbours towards −x, −y, −z; the field carries a change into the blocks around first.
         """
         if self.model.surface == "field":
-            dirty = unpack_keys(field.spread(pack_keys(dirty)))
+            dirty = unpack_keys(field.spread(pack_keys(dirty), self._layers(), self._field))
         return cells_of(dirty)
 
     def extract_mesh(self, min_weight: float | None = None, blocks: NDArray[np.int32] | None = None) -> Mesh:
@@ -133,15 +133,7 @@ class Volume:
                 raise InvalidConfig(f"blocks must be (n, 3) integers, got {np.asarray(blocks)!r}")
             slots = store.slots_of(pack_keys(blocks))
             chosen = np.unique(chosen[slots[slots >= 0]])
-        layers = Layers(
-            sums=store.sums,
-            color_rgn=store.color_rgn if self.config.color else None,
-            color_b=store.color_b,
-            regularised=store.regularised if self._smooths else None,
-            hash_keys=store.hash_keys,
-            hash_slots=store.hash_slots,
-            voxel_size=self.config.voxel_size,
-        )
+        layers = self._layers()
         chosen = np.sort(chosen)
         if self.model.surface != "raw":
             layers = replace(layers, regularised=self._surface(chosen, layers, min_weight))
@@ -250,14 +242,30 @@ class Volume:
             blocks=touched, new_blocks=new, voxels=voxels,
         )  # fmt: skip
 
+    @property
+    def _field(self) -> field.Settings:
+        model = self.model
+        return field.Settings(model.field_smoothness, model.field_edge, model.field_reweightings)
+
+    def _layers(self) -> Layers:
+        store = self._store
+        return Layers(
+            sums=store.sums,
+            color_rgn=store.color_rgn if self.config.color else None,
+            color_b=store.color_b,
+            regularised=store.regularised if self._smooths else None,
+            hash_keys=store.hash_keys,
+            hash_slots=store.hash_slots,
+            voxel_size=self.config.voxel_size,
+        )
+
     def _surface(self, chosen: NDArray[np.int64], layers: Layers, min_weight: float) -> NDArray[np.float32]:
         """The values to mesh the cells of these blocks from, (slot, 512)."""
-        model = self.model
-        if model.surface == "normal":
-            keys, values = field.along_normals(field.spread(chosen), layers, min_weight, model.smoothness)
+        around = field.around(chosen, layers)  # a normal at a block's far end reads two voxels of the next
+        if self.model.surface == "normal":
+            keys, values = field.along_normals(around, layers, min_weight, self.model.smoothness)
         else:
-            settings = field.Settings(model.field_smoothness, model.field_edge, model.field_reweightings)
-            keys, values = field.solve(field.spread(chosen), layers, min_weight, settings)
+            keys, values = field.solve(around, layers, min_weight, self._field)
         rows = np.zeros((self._store.count, CUBE), np.float32)
         rows[self._store.slots_of(keys)] = values
         return rows

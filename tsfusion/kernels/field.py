@@ -15,8 +15,8 @@ of threads can show.
 import taichi as ti
 
 from tsfusion.kernels.integrate import CUBE, lane_distance, lane_weight
-from tsfusion.kernels.traversal import RUN
 from tsfusion.kernels.rays import WEIGHT_ONE
+from tsfusion.kernels.traversal import RUN
 
 NONE = -1
 
@@ -202,7 +202,14 @@ def list_parents(
                     coarse_weight[i] = 0.0
                     for side in ti.static(range(6)):
                         coarse_links[i, side] = neighbour(
-                            coarse_number, coarse_starts, around, bits - 1, b, c, side // 2, side % 2,
+                            coarse_number,
+                            coarse_starts,
+                            around,
+                            bits - 1,
+                            b,
+                            c,
+                            side // 2,
+                            side % 2,
                             coarse_links.shape[0],
                         )
             for o in range(number.shape[1]):
@@ -293,7 +300,9 @@ def precondition(
     for i in range(links.shape[0]):
         total = ti.f32(0.0)
         for axis in ti.static(range(3)):
-            total += 2.0 * omega[i, axis] + omega[links[i, 2 * axis], axis] + omega[links[i, 2 * axis + 1], axis]
+            total += (
+                2.0 * omega[i, axis] + omega[links[i, 2 * axis], axis] + omega[links[i, 2 * axis + 1], axis]
+            )
         inverse[i] = 1.0 / (weight[i] + 4.0 * smoothness * total)
 
 

@@ -62,7 +62,9 @@ def smooth_along_normals(
                     for a in ti.static(range(3)):
                         step = vec3i(0)
                         step[a] = 1
-                        normal[a] = value_at(values, around, r, p + step) - value_at(values, around, r, p - step)
+                        normal[a] = value_at(values, around, r, p + step) - value_at(
+                            values, around, r, p - step
+                        )
                     length = normal.norm()
                     if length > 0.0:  # never true of NaN
                         sums = ti.Vector([here, here, here, here])  # with 0 … 3 samples a side
