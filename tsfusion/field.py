@@ -43,7 +43,7 @@ class Settings:
     @property
     def reach(self) -> float:
         """Voxels: the length over which the penalty smooths; what lies deeper does not move the surface."""
-        return max(LEAST_REACH, self.smoothness**0.25)
+        return max(LEAST_REACH, float(self.smoothness**0.25))
 
     @property
     def coarser(self) -> int:
