@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
 
 from tsfusion.kernels import mc_tables
 
@@ -276,6 +278,59 @@ def vertex(values: dict[Voxel, float], colors: dict[Voxel, Any], position: Any) 
     total = sum(s for s, _ in votes)
     rgb = sum(s * np.array(c, float) for s, c in votes) / total if votes else np.full(3, 160.0)
     return normal / np.linalg.norm(normal), np.floor(rgb + 0.5)
+
+
+def field(
+    raw: NDArray[np.float64], weight: NDArray[np.float64], settings: Any, quanta: int
+) -> NDArray[np.float64]:
+    """argmin Σ W (x − y)² + λ Σ ω |D2 x|² on a dense array of quanta, NaN = unseen, by sparse direct solves;
+    ω = 1, then 1 / √(1 + (D2 x / ε)²) again and again. Voxels beyond reach stay as they are."""
+    listed = abs(np.nan_to_num(raw, nan=np.inf)) <= settings.reach * quanta
+    number = np.full(raw.shape, -1)
+    number[listed] = np.arange(listed.sum())
+    rows = []
+    for axis in range(3):
+        n = np.moveaxis(number, axis, 0)
+        triples = np.stack([n[:-2], n[1:-1], n[2:]], axis=-1).reshape(-1, 3)
+        rows.append(triples[(triples >= 0).all(axis=1)])
+    triples = np.concatenate(rows)
+    where = (np.repeat(np.arange(len(triples)), 3), triples.ravel())
+    D2 = sparse.csr_matrix((np.tile([1.0, -2.0, 1.0], len(triples)), where), (len(triples), listed.sum()))
+    y, W, omega = raw[listed], weight[listed], np.ones(len(triples))
+    for _ in range(settings.reweightings + 1):
+        A = sparse.diags(W) + settings.smoothness * D2.T @ sparse.diags(omega) @ D2
+        x = spsolve(A.tocsc(), W * y)
+        omega = 1 / np.sqrt(1 + (D2 @ x / (settings.edge * quanta)) ** 2)
+    result = raw.copy()
+    result[listed] = x
+    return result
+
+
+def along_normal(raw: NDArray[np.float64], voxel: Voxel, smoothness: float, reach: float) -> float:
+    """One voxel's value after smoothing up to 3 samples a side along its gradient; NaN = unseen."""
+
+    def value(p: Any) -> float:
+        inside = all(0 <= c < n for c, n in zip(p, raw.shape, strict=True))
+        return float(raw[tuple(p)]) if inside else np.nan
+
+    def sample(p: NDArray[np.float64]) -> float:
+        low = np.floor(p).astype(int)
+        corners = [np.array(c) for c in product((0, 1), repeat=3)]
+        return sum(np.prod(np.where(c, p - low, low + 1 - p)) * value(low + c) for c in corners)
+
+    here = value(voxel)
+    gradient = np.array([value(voxel + e) - value(voxel - e) for e in np.eye(3, dtype=int)])
+    if not abs(here) <= reach or not np.linalg.norm(gradient) > 0:
+        return here
+    signal = [here]
+    for k in (1.0, 2.0, 3.0):
+        step = k * gradient / np.linalg.norm(gradient)
+        before, after = sample(voxel - step), sample(voxel + step)
+        if np.isnan(before + after):
+            break
+        signal = [before, *signal, after]
+    flat = np.zeros(len(signal))
+    return float(solve(signal, flat + 1, flat, smoothness)[len(signal) // 2])
 
 
 def segment_voxels(end: Any, direction: Any, half: float) -> set[Voxel]:

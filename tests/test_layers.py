@@ -19,8 +19,8 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("processes", frozenset({"server", "gateway", "sessions", "ports", "fuser_link", "fuser",
                              "client", "sender", "outbox", "spool", "recording"})),
     ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results"})),
-    ("map and wire", frozenset({"volume", "integration", "surface", "blockstore", "meshing", "scratch",
-                                "storage", "checkpoint", "warmup",
+    ("map and wire", frozenset({"volume", "integration", "surface", "field", "blockstore", "meshing",
+                                "scratch", "storage", "checkpoint", "warmup",
                                 "journal", "transport", "codec"})),
     ("ground", frozenset({"kernels", "runtime", "mesh", "keyframe", "config", "config_toml", "errors",
                           "process"})),
@@ -29,11 +29,12 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
 # All others run where there is no Taichi, and answer while kernels run.
 MAY_REACH_TAICHI = frozenset({
     "__main__", "cli", "pipeline", "fuser", "datasets", "evaluation", "preview",
-    "volume", "integration", "surface", "blockstore", "meshing", "scratch", "storage", "checkpoint",
+    "volume", "integration", "surface", "field", "blockstore", "meshing", "scratch", "storage", "checkpoint",
     "warmup", "kernels", "runtime",
 })  # fmt: skip
 MAY_IMPORT_KERNELS = frozenset({
-    "kernels", "runtime", "volume", "integration", "surface", "blockstore", "meshing", "scratch", "preview",
+    "kernels", "runtime", "volume", "integration", "surface", "field", "blockstore", "meshing", "scratch",
+    "preview",
     "datasets.synthetic", "evaluation.predict",
 })  # fmt: skip
 

@@ -22,6 +22,7 @@ else:  # pragma: no cover
     import tomli as tomllib
 
 Regularizer = Literal["off", "paper", "ray"]
+Surface = Literal["raw", "normal", "field"]
 SensorName = Literal["kinect", "tof", "realsense", "stereo", "lidar", "scanner"]
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
@@ -58,7 +59,11 @@ class SensorModel(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     regularizer: Regularizer = "off"
     smoothness: NonNegative = 1.0
     feedback: bool = False
-    min_weight: NonNegative = 2.0
+    min_weight: NonNegative = 0.5
+    surface: Surface = "field"
+    field_smoothness: NonNegative = 30.0
+    field_edge: Positive = 0.01
+    field_reweightings: Annotated[int, Meta(ge=0, le=16)] = 4
 
 
 # Kinect v1: Nguyen, Izadi and Lovell 2012 (axial noise). Stereo: Δz = z² Δd / (b·f). Streets are seen at
@@ -81,9 +86,10 @@ SENSORS: dict[str, SensorModel] = {
         regularizer="ray",
         smoothness=10.0,
         feedback=True,
+        field_smoothness=1000.0,
     ),
-    "lidar": SensorModel(sigma_floor=0.02, min_range=1.0, max_range=100.0, min_support=4.0, min_weight=0.5),
-    "scanner": SensorModel(sigma_floor=0.0002, min_range=0.0, max_range=100.0, min_weight=0.5),
+    "lidar": SensorModel(sigma_floor=0.02, min_range=1.0, max_range=100.0, min_support=4.0),
+    "scanner": SensorModel(sigma_floor=0.0002, min_range=0.0, max_range=100.0),
 }
 
 
@@ -100,6 +106,10 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     max_range: Positive | None = None  # metres
     min_weight: NonNegative | None = None  # full-confidence samples a voxel needs to be meshed
     feedback: bool | None = None  # smooth the smoothed values again (recursion) or the raw ones
+    surface: Surface | None = None  # what is meshed: values as fused, smoothed along normals, or the field
+    field_smoothness: NonNegative | None = None  # λ of the field, against full-confidence samples
+    field_edge: Positive | None = None  # voxels; a field that bends more than this counts as an edge
+    field_reweightings: Annotated[int, Meta(ge=0, le=16)] | None = None
     bundle: bool = True  # rays of a neighbourhood that end in one voxel become one
     outlier_filter: bool = True  # drop pixels that no neighbour supports: flying pixels, speckle
     space_carving: bool = False  # rays also vote for the free space before their band

@@ -98,19 +98,18 @@ class Fuser:
 
     def mesh(self) -> None:
         """Bring the mesh up to date with the map."""
-        from tsfusion.blockstore import cells_of
-
         started = time.monotonic()
         blocks = self._volume.take_dirty()
-        mesh = self._volume.extract_mesh(blocks=cells_of(blocks))
+        cells = self._volume.cells_to_mesh(blocks)
+        mesh = self._volume.extract_mesh(blocks=cells)
         self._meshed_index = self._fused_index
         pause = max(self._begin.mesh_interval, _FUSING_SHARE * (time.monotonic() - started))
         self._next_mesh = time.monotonic() + pause
         stamp = time.monotonic_ns()
         if self._watched:
             layout, frames = _mesh_frames(mesh)
-            cells = np.ascontiguousarray(cells_of(blocks)).data
-            self._send(work.Meshed(self._meshed_index, stamp, len(blocks), layout), [cells, *frames])
+            tiles = np.ascontiguousarray(cells).data
+            self._send(work.Meshed(self._meshed_index, stamp, len(blocks), layout), [tiles, *frames])
         else:
             self._send(work.Meshed(self._meshed_index, stamp))
 

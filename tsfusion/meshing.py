@@ -11,7 +11,7 @@ from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.values import BANDS
 from tsfusion.mesh import Mesh
 from tsfusion.storage import GrowingArray
-from tsfusion.surface import Layers, values_of
+from tsfusion.surface import Layers, View, values_of
 
 _KEEP = 1 << 14  # blocks whose working memory is kept for the next mesh: 45 MB
 _NO_COLOR = np.zeros((1, CUBE), np.int64)
@@ -82,14 +82,18 @@ class MeshScratch:
 
 
 def extract(
-    wanted: NDArray[np.int64], layers: Layers, min_weight: float, scratch: MeshScratch | None = None
+    wanted: NDArray[np.int64],
+    layers: Layers,
+    min_weight: float,
+    scratch: MeshScratch | None = None,
+    view: View = values_of,
 ) -> Mesh:
     """Mesh of the cells of the map's blocks `wanted` (sorted distinct keys)."""
     scratch = scratch or MeshScratch()
     keys = scratch.keys_around(wanted, layers)
     count = len(keys)
     scratch.reserve(count)
-    values = values_of(keys, layers, min_weight, scratch.values.array)
+    values = view(keys, layers, min_weight, scratch.values.array)
     table, table_rows = scratch.table(count)
     insert_blocks(keys, 0, count, 0, table, table_rows)
     around, inside, active = scratch.around.array, scratch.inside.array, scratch.active.array

@@ -2,6 +2,7 @@
 """What a surface is made from: the map's layers, and the values read from them."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,15 +28,28 @@ class Layers:
     voxel_size: float
 
 
+class View(Protocol):
+    """Reads values from the map: `values_of`, or one of `field` with its settings."""
+
+    def __call__(
+        self,
+        keys: NDArray[np.int64],
+        layers: Layers,
+        min_weight: float,
+        out: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        """(n, 512) values of blocks in quanta, NaN where unseen: below `min_weight` full samples.
+
+        Args:
+            keys: sorted packed keys; a block that the map does not hold is unseen.
+            out: rows to write to, at least n.
+        """
+
+
 def values_of(
     keys: NDArray[np.int64], layers: Layers, min_weight: float, out: NDArray[np.float32] | None = None
 ) -> NDArray[np.float32]:
-    """(n, 512) values of blocks in quanta, NaN where unseen: below `min_weight` full samples.
-
-    Args:
-        keys: packed keys; a block that the map does not hold is unseen.
-        out: rows to write to, at least n.
-    """
+    """The `View` of what was fused, as it is."""
     if out is None:
         out = np.empty((len(keys), CUBE), np.float32)
     correction = layers.correction

@@ -4,6 +4,7 @@
 import hashlib
 import os
 import struct
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion import checkpoint, runtime
-from tsfusion.blockstore import BlockStore, pack_keys, unpack_keys
+from tsfusion import checkpoint, field, runtime
+from tsfusion.blockstore import BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.config import VolumeConfig, make, override
 from tsfusion.errors import InvalidConfig, MapError
 from tsfusion.integration import Integrator
@@ -24,7 +25,7 @@ from tsfusion.keyframe import Keyframe
 from tsfusion.mesh import Mesh
 from tsfusion.meshing import MeshScratch, extract
 from tsfusion.scratch import Scratch
-from tsfusion.surface import Layers
+from tsfusion.surface import Layers, View, values_of
 from tsfusion.warmup import warm_up_keyframes
 
 
@@ -111,13 +112,22 @@ class Volume:
         """Coordinates of the blocks changed since the last call: (n, 3) int32, in units of 8 voxels."""
         return unpack_keys(self._store.keys[self._store.take_dirty()])
 
+    def cells_to_mesh(self, dirty: NDArray[np.int32]) -> NDArray[np.int32]:
+        """The blocks whose mesh the changes to these blocks reach: (m, 3) int32.
+
+        They and their neighbours towards −x, −y, −z; the field carries a change into the blocks around first.
+        """
+        if self.model.surface == "field":
+            dirty = unpack_keys(field.spread(pack_keys(dirty), self._layers(), self._field))
+        return cells_of(dirty)
+
     def extract_mesh(self, min_weight: float | None = None, blocks: NDArray[np.int32] | None = None) -> Mesh:
         """The surface, by marching cubes over the whole map or over the cells of some blocks.
 
         Args:
             min_weight: full-confidence samples a voxel needs to count as seen; default the sensor's.
-            blocks: (n, 3) int32 block coordinates. A mesh of every block that `take_dirty` gave, and of its
-                neighbours towards −x, −y, −z, replaces exactly what changed (`cells_of`).
+            blocks: (n, 3) int32 block coordinates. A mesh of `cells_to_mesh(take_dirty())` replaces what
+                changed.
         """
         if min_weight is None:
             min_weight = self.model.min_weight
@@ -131,17 +141,7 @@ class Volume:
                 raise InvalidConfig(f"blocks must be (n, 3) integers, got {np.asarray(blocks)!r}")
             chosen = np.unique(pack_keys(blocks))
             chosen = chosen[store.slots_of(chosen) >= 0]
-        layers = Layers(
-            sums=store.sums,
-            color_rgn=store.color_rgn if self.config.color else None,
-            color_b=store.color_b,
-            correction=store.correction if self._smooths else None,
-            hash_keys=store.hash_keys,
-            hash_slots=store.hash_slots,
-            count=store.count,
-            voxel_size=self.config.voxel_size,
-        )
-        return extract(np.sort(chosen), layers, min_weight, self._mesh_scratch)
+        return extract(np.sort(chosen), self._layers(), min_weight, self._mesh_scratch, self._view())
 
     def map_hash(self) -> str:
         """Hex digest of the exact sums: equal for the same keyframes in any order, on any number of threads.
@@ -236,6 +236,32 @@ class Volume:
             samples=samples, invalid=total - samples, rays=int(scratch.bands[:, COUNT].sum()),
             blocks=len(scratch.touched_slots), new_blocks=store.count - before, updates=updates,
         )  # fmt: skip
+
+    @property
+    def _field(self) -> field.Settings:
+        model = self.model
+        return field.Settings(model.field_smoothness, model.field_edge, model.field_reweightings)
+
+    def _view(self) -> View:
+        """What the surface is read from."""
+        if self.model.surface == "field":
+            return partial(field.solve, settings=self._field)
+        if self.model.surface == "normal":
+            return partial(field.along_normals, smoothness=self.model.smoothness)
+        return values_of
+
+    def _layers(self) -> Layers:
+        store = self._store
+        return Layers(
+            sums=store.sums,
+            color_rgn=store.color_rgn if self.config.color else None,
+            color_b=store.color_b,
+            correction=store.correction if self._smooths else None,
+            hash_keys=store.hash_keys,
+            hash_slots=store.hash_slots,
+            count=store.count,
+            voxel_size=self.config.voxel_size,
+        )
 
     def _smooth(self, sign: int) -> None:
         """Bring the regularised layer up to date in the blocks just touched."""
