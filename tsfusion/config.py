@@ -59,7 +59,7 @@ class SensorModel(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     regularizer: Regularizer = "off"
     smoothness: NonNegative = 1.0
     feedback: bool = False
-    min_weight: NonNegative = 0.5
+    min_weight: NonNegative = 0.25
     surface: Surface = "field"
     field_smoothness: NonNegative = 30.0
     field_edge: Positive = 0.01
