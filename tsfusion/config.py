@@ -72,9 +72,7 @@ class SensorModel(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 SENSORS: dict[str, SensorModel] = {
     "kinect": SensorModel(sigma_floor=0.0012, sigma_slope=0.0019, sigma_z0=0.4, max_range=5.0),
     "tof": SensorModel(sigma_floor=0.0015, sigma_slope=0.0005, max_range=8.0),
-    "realsense": SensorModel(
-        sigma_floor=0.001, sigma_slope=0.0025, disparity_sigma=0.08, max_range=6.0, regularizer="ray"
-    ),
+    "realsense": SensorModel(sigma_floor=0.001, sigma_slope=0.0025, disparity_sigma=0.08, max_range=6.0),
     "stereo": SensorModel(
         sigma_floor=0.005,
         sigma_slope=0.0026,
@@ -83,10 +81,12 @@ SENSORS: dict[str, SensorModel] = {
         max_range=30.0,
         min_support=6.0,
         max_support=10.0,
-        regularizer="ray",
         smoothness=10.0,
         feedback=True,
+        min_weight=0.5,
         field_smoothness=1000.0,
+        field_edge=0.02,
+        field_reweightings=3,
     ),
     "lidar": SensorModel(sigma_floor=0.02, min_range=1.0, max_range=100.0, min_support=4.0),
     "scanner": SensorModel(sigma_floor=0.0002, min_range=0.0, max_range=100.0),
