@@ -12,7 +12,7 @@ from _peers import DATA, Open3D, VDBFusion, surroundings, timed_keyframes
 from numpy.typing import NDArray
 
 from tsfusion import runtime
-from tsfusion.config import SENSORS, VolumeConfig
+from tsfusion.config import SENSORS
 from tsfusion.datasets import Synthetic, open_dataset
 from tsfusion.evaluation import bunny, metrics, scenes
 from tsfusion.evaluation.predict import compare_views, points_world
@@ -36,13 +36,14 @@ METHODS: dict[str, dict[str, Any]] = {  # what is not said is the sensor preset'
     "field": {**OFF, "surface": "field"},
     "ray+normal": {"regularizer": "ray", "surface": "normal"},
     "ray+field": {"regularizer": "ray", "surface": "field"},
+    "carving": {"regularizer": "off", "space_carving": True},
     "open3d": {},
     "vdbfusion": {},
 }
 PEERS = {"open3d": Open3D, "vdbfusion": VDBFusion}
-SOME = ("default", "off", "paper", "ray", "normal", "field", "ray+field", "open3d")
-FEW = ("default", "off", "ray", "field", "ray+field", "open3d")
-DRIFT = ("default", "off", "paper", "ray", "field", "ray+field")
+SOME = ("default", "off", "paper", "ray", "normal", "carving", "open3d")
+FEW = ("default", "off", "ray", "ray+field", "open3d")
+DRIFT = ("default", "off", "paper", "ray")
 
 
 @dataclass(frozen=True)
@@ -123,12 +124,6 @@ class Material:
     max_range: float | None = None  # metres; None = the sensor preset's
 
 
-def unknown_setting(row: Row) -> str | None:
-    """The first setting of a row that this tree does not have, if any."""
-    missing = set(_settings(row.method)) - set(VolumeConfig.__struct_fields__)
-    return min(missing, default=None)
-
-
 def missing_data(setup: Setup) -> str | None:
     """Why a recorded scene cannot be had, if it cannot."""
     folder = FOLDERS.get(setup.scene)
@@ -181,13 +176,6 @@ def load(setup: Setup) -> Material:
     return loaders.get(setup.scene, _synthetic)(setup)
 
 
-def _settings(method: str) -> dict[str, Any]:
-    settings = dict(METHODS[method])
-    if settings.get("surface") == "raw" and "surface" not in VolumeConfig.__struct_fields__:
-        del settings["surface"]  # the only surface a tree without the setting has
-    return settings
-
-
 def _system(row: Row, material: Material, threads: int) -> Any:
     setup, model = row.setup, SENSORS[material.sensor]
     reach = material.max_range or model.max_range
@@ -199,7 +187,7 @@ def _system(row: Row, material: Material, threads: int) -> Any:
 
     volume = Volume(
         voxel_size=setup.voxel_size, sensor=material.sensor, max_range=reach, color=False,
-        threads=threads, **_settings(row.method),
+        threads=threads, **METHODS[row.method],
     )  # fmt: skip
     volume.warm_up()
     return volume

@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import _report
-from _ablation import PEERS, Row, missing_data, rows, run, unknown_setting
+from _ablation import PEERS, Row, missing_data, rows, run
 from _peers import ROOT, unimportable
 
 
@@ -167,8 +167,6 @@ def runnable(chosen: list[Row]) -> list[Row]:
 
 def left_out(row: Row, peers: dict[str, str | None], scipy: str | None) -> str | None:
     """Why a row cannot run here, if it cannot."""
-    if setting := unknown_setting(row):
-        return f"this version has no setting `{setting}`"
     if row.setup.scene == "bunny" and scipy:
         return f"the bunny needs scipy: {scipy}"
     return peers.get(row.method) or missing_data(row.setup)
