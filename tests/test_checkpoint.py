@@ -3,11 +3,12 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import scenes
 
 from tsfusion import Volume
-from tsfusion.errors import CheckpointError
+from tsfusion.errors import CheckpointError, InvalidConfig, WeightOverflow
 
 VIEWS = scenes.sphere_views(0.4, 4)
 
@@ -83,3 +84,26 @@ def test_a_failed_save_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.Mo
         volume.save(path)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_loaded_map_knows_how_full_its_voxels_are(tmp_path: Path) -> None:
+    volume = Volume(voxel_size=0.02)
+    view = scenes.sphere_views(0.4, 1)[0]
+    volume.integrate(view)
+    slot, voxel = np.argwhere(volume._store.sums != 0)[0]
+    volume._store.sums[slot, voxel] |= (1 << 26) - 1
+    loaded = Volume.load(volume.save(tmp_path / "full.tsf"))
+    with pytest.raises(WeightOverflow):
+        loaded.integrate(view)
+
+
+def test_a_saved_map_can_be_read_with_another_surface_but_not_with_another_voxel_size(tmp_path: Path) -> None:
+    volume = Volume(voxel_size=0.02, surface="raw")
+    volume.integrate(scenes.sphere_views(0.4, 1)[0])
+    path = volume.save(tmp_path / "map.tsf")
+    again, other = Volume.load(path), Volume.load(path, surface="field", min_weight=None)
+    assert (again.config.surface, other.config.surface) == ("raw", "field")
+    assert again.map_hash() == other.map_hash()
+    assert not np.array_equal(again.extract_mesh().vertices, other.extract_mesh().vertices)
+    with pytest.raises(InvalidConfig, match="voxel_size"):
+        Volume.load(path, voxel_size=0.01)

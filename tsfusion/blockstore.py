@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.kernels import blocks
-from tsfusion.kernels.integrate import CUBE
+from tsfusion.kernels.integrate import CUBE, WEIGHT_MASK
 from tsfusion.storage import GrowingArray
 
 _FIRST_CAPACITY = 1024
@@ -106,6 +106,12 @@ class BlockStore:
         slots = np.empty(len(keys), np.int32)
         blocks.find_blocks(keys, self.hash_keys, self.hash_slots, slots)
         return slots
+
+    def measure_bounds(self) -> None:
+        """Set `bounds` from the sums."""
+        for i in range(0, self.count, _CHUNK):
+            chunk = slice(i, min(i + _CHUNK, self.count))
+            self.bounds[chunk] = (self.sums[chunk] & WEIGHT_MASK).max(axis=1)
 
     def take_dirty(self) -> NDArray[np.int64]:
         """Slots changed since the last call."""

@@ -131,6 +131,10 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         return msgspec.structs.replace(SENSORS[name], **chosen)
 
 
+# Settings of a map that change nothing stored in it: a saved one can be read with others.
+VIEW_SETTINGS = ("min_weight", "surface", "field_smoothness", "field_edge", "field_reweightings")
+
+
 class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The server daemon."""
 

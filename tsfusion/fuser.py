@@ -22,7 +22,7 @@ import zmq
 from numpy.typing import NDArray
 
 from tsfusion import codec, journal, process
-from tsfusion.config import VolumeConfig
+from tsfusion.config import VIEW_SETTINGS, VolumeConfig
 from tsfusion.errors import CheckpointError, InvalidConfig, TsfusionError
 from tsfusion.mesh import Mesh
 from tsfusion.transport import sockets, work
@@ -35,7 +35,7 @@ MAP_FILE = "map.tsf"
 JOURNAL_FOLDER = "journal"
 _FUSING_SHARE = 3  # a busy fuser meshes for at most a quarter of its time
 # Settings that may differ between a map and the server that goes on with it: none changes the sums.
-_FREE_SETTINGS = ("threads", "max_blocks", "max_blocks_per_keyframe", "min_weight")
+_FREE_SETTINGS = ("threads", "max_blocks", "max_blocks_per_keyframe", *VIEW_SETTINGS)
 
 log = logging.getLogger(__name__)
 
@@ -184,7 +184,7 @@ def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
     from tsfusion.volume import Volume
 
     try:
-        volume = Volume.load(path, threads=wanted.threads)
+        volume = Volume.load(path, wanted.threads, **{name: getattr(wanted, name) for name in VIEW_SETTINGS})
     except CheckpointError as error:
         aside = path.with_suffix(".damaged")
         log.error("%s; it is kept as %s, and the map is built again from the journal", error, aside)

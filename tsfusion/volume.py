@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tsfusion import checkpoint, field, runtime
 from tsfusion.blockstore import BlockStore, cells_of, pack_keys, unpack_keys
-from tsfusion.config import VolumeConfig, make, override
+from tsfusion.config import VIEW_SETTINGS, VolumeConfig, make, override
 from tsfusion.errors import InvalidConfig, MapError
 from tsfusion.integration import Integrator
 from tsfusion.kernels import integrate, smooth
@@ -206,17 +206,25 @@ class Volume:
         return checkpoint.write(Path(path), header, self._store.keys[used], used, layers)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], threads: int | None = None) -> "Volume":
+    def load(cls, path: str | os.PathLike[str], threads: int | None = None, **view: Any) -> "Volume":
         """Read a checkpoint back, verified against its own hash.
 
+        Args:
+            view: settings of how the surface is read (`config.VIEW_SETTINGS`) instead of the saved ones;
+                None = as saved.
+
         Raises:
+            InvalidConfig: for a setting that the stored sums depend on.
             CheckpointError: when the file is missing, torn, altered or of another version.
         """
         header, keys, stored = checkpoint.read(Path(path))
-        volume = cls(msgspec.structs.replace(header.config, threads=threads))
+        if fixed := view.keys() - set(VIEW_SETTINGS):
+            raise InvalidConfig(f"a saved map cannot change {', '.join(sorted(fixed))}; fuse it anew")
+        volume = cls(override(msgspec.structs.replace(header.config, threads=threads), **view))
         volume._store.insert(keys)
         for name, array in volume._store.layers().items():
             array[: len(keys)] = stored[name]
+        volume._store.measure_bounds()
         volume.keyframes = header.keyframes
         volume.meta = header.meta
         checkpoint.verify(Path(path), header, volume.map_hash())

@@ -74,23 +74,24 @@ def mesh(
 
 def _volume(source: Path, config: "VolumeConfig", *, given: bool, quiet: bool) -> "Volume":
     """The saved map where there is a complete one, else a new one of every keyframe of the journal."""
-    from tsfusion.config import override
+    from tsfusion.config import VIEW_SETTINGS
     from tsfusion.errors import DatasetError
     from tsfusion.volume import Volume
 
+    view = {name: getattr(config, name) for name in VIEW_SETTINGS}
     if not source.exists():
         raise DatasetError(f"{source} does not exist; expected a map (.tsf), a state folder or a journal")
     if source.suffix == ".tsf":
-        return Volume.load(source, threads=config.threads)
+        return Volume.load(source, config.threads, **view)
     from tsfusion.recording import Recording
 
     recording = Recording(source)
     saved = source / MAP_FILE
     if saved.is_file() and not given:
-        volume = Volume.load(saved, threads=config.threads)
+        volume = Volume.load(saved, config.threads, **view)
         if volume.keyframes == len(recording):
             return volume
-        config = override(volume.config, threads=config.threads)  # the server died before it saved the rest
+        config = volume.config  # the server died before it saved the rest
     return _fuse(recording, Volume(config), quiet)
 
 
