@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from wire import wall
 
@@ -87,6 +88,29 @@ def test_watchers_get_the_triangles(tmp_path: Path) -> None:
     assert isinstance(meshed, work.Meshed)
     assert meshed.layout is not None
     assert [memoryview(frame).nbytes % 3 for frame in frames] == [0] * 5
+
+
+def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tsfusion.fuser._REFINED_AT_ONCE", 10)
+    (position,) = fill(tmp_path, 1)
+    fuser, link = opened(tmp_path)
+    fuser.take(work.Publish(True))
+    fuser.take(work.Fuse(0, position))
+    fuser.mesh()
+    before = len(link.sent)
+    while fuser.refine_due:
+        fuser.refine()
+    refined = link.sent[before:]
+    assert len(refined) > 1
+    whole = fuser._volume.extract_mesh()
+    assert sum(meshed.layout.faces for meshed, _ in refined) == len(whole.faces) > 0
+    cells = np.concatenate([np.frombuffer(frames[0], np.int32).reshape(-1, 3) for _, frames in refined])
+    assert len(np.unique(cells, axis=0)) == len(cells)
+    fuser.mesh()
+    fuser.take(work.Publish(False))
+    assert not fuser.refine_due
 
 
 def test_what_cannot_be_fused_is_counted_also_after_a_restart(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 MAP_FILE = "map.tsf"
 JOURNAL_FOLDER = "journal"
+_REFINED_AT_ONCE = 256  # blocks: about 50 ms
 _FUSING_SHARE = 3  # a busy fuser meshes for at most a quarter of its time
 # Settings that may differ between a map and the server that goes on with it: none changes the sums.
 _FREE_SETTINGS = ("threads", "max_blocks", "max_blocks_per_keyframe", *VIEW_SETTINGS)
@@ -53,6 +54,7 @@ class Fuser:
         self._watched = False
         self._fused_index = self._meshed_index = -1
         self._next_mesh = 0.0
+        self._rough = np.zeros((0, 3), np.int32)  # cells that viewers have as fused only
         self._hashes: tuple[int, str, str] | None = None
         self.exit_status: int | None = None
         self._volume = self._open()
@@ -88,6 +90,8 @@ class Fuser:
             self._answer(message)
         elif isinstance(message, work.Publish):
             self._watched = message.wanted
+            if not self._watched:
+                self._rough = self._rough[:0]
         elif isinstance(message, work.Finish):
             self.exit_status = 0 if self._checkpoint() else 1
 
@@ -97,21 +101,40 @@ class Fuser:
         return behind and (idle or time.monotonic() >= self._next_mesh)
 
     def mesh(self) -> None:
-        """Bring the mesh up to date with the map."""
+        """Bring the mesh up to date with the map: as fused, because the next keyframe may be near."""
+        from tsfusion.blockstore import cells_of
+
         started = time.monotonic()
         blocks = self._volume.take_dirty()
-        cells = self._volume.cells_to_mesh(blocks)
-        mesh = self._volume.extract_mesh(blocks=cells)
+        cells = cells_of(blocks)
+        mesh = self._volume.extract_mesh(blocks=cells, surface="raw")
         self._meshed_index = self._fused_index
         pause = max(self._begin.mesh_interval, _FUSING_SHARE * (time.monotonic() - started))
         self._next_mesh = time.monotonic() + pause
         stamp = time.monotonic_ns()
         if self._watched:
-            layout, frames = _mesh_frames(mesh)
-            tiles = np.ascontiguousarray(cells).data
-            self._send(work.Meshed(self._meshed_index, stamp, len(blocks), layout), [tiles, *frames])
+            self._publish(stamp, len(blocks), cells, mesh)
+            if self._volume.model.surface != "raw":
+                rough = np.concatenate([self._rough, self._volume.cells_to_mesh(blocks)])
+                self._rough = np.unique(rough, axis=0)
         else:
             self._send(work.Meshed(self._meshed_index, stamp))
+
+    @property
+    def refine_due(self) -> bool:
+        """Whether what viewers have is not yet the surface that the settings ask for."""
+        return len(self._rough) > 0
+
+    def refine(self) -> None:
+        """Mesh a part of what was meshed as fused again, as the settings ask: only while there is nothing
+        else to do, and little at a time, because a keyframe that comes meanwhile waits."""
+        cells, self._rough = self._rough[:_REFINED_AT_ONCE], self._rough[_REFINED_AT_ONCE:]
+        self._publish(time.monotonic_ns(), 0, cells, self._volume.extract_mesh(blocks=cells))
+
+    def _publish(self, stamp: int, blocks: int, cells: NDArray[np.int32], mesh: Mesh) -> None:
+        layout, frames = _mesh_frames(mesh)
+        tiles = np.ascontiguousarray(cells).data
+        self._send(work.Meshed(self._meshed_index, stamp, blocks, layout), [tiles, *frames])
 
     def _fuse(self, order: work.Fuse) -> None:
         start = time.monotonic_ns()
@@ -244,6 +267,9 @@ def _serve(link: sockets.AnySocket) -> int:
         idle = not poller.poll(0)
         if fuser is not None and fuser.mesh_due(idle):
             fuser.mesh()
+            continue
+        if idle and fuser is not None and fuser.refine_due:
+            fuser.refine()
             continue
         events = dict(poller.poll())
         if sys.stdin.fileno() in events:  # nothing is ever written there: the gateway has gone

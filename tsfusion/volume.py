@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tsfusion import checkpoint, field, runtime
 from tsfusion.blockstore import BlockStore, cells_of, pack_keys, unpack_keys
-from tsfusion.config import VIEW_SETTINGS, VolumeConfig, make, override
+from tsfusion.config import VIEW_SETTINGS, Surface, VolumeConfig, make, override
 from tsfusion.errors import InvalidConfig, MapError
 from tsfusion.integration import Integrator
 from tsfusion.kernels import integrate, smooth
@@ -121,13 +121,19 @@ class Volume:
             dirty = unpack_keys(field.spread(pack_keys(dirty), self._layers(), self._field))
         return cells_of(dirty)
 
-    def extract_mesh(self, min_weight: float | None = None, blocks: NDArray[np.int32] | None = None) -> Mesh:
+    def extract_mesh(
+        self,
+        min_weight: float | None = None,
+        blocks: NDArray[np.int32] | None = None,
+        surface: Surface | None = None,
+    ) -> Mesh:
         """The surface, by marching cubes over the whole map or over the cells of some blocks.
 
         Args:
             min_weight: full-confidence samples a voxel needs to count as seen; default the sensor's.
             blocks: (n, 3) int32 block coordinates. A mesh of `cells_to_mesh(take_dirty())` replaces what
                 changed.
+            surface: what to mesh instead of what the settings say; for `raw`, `cells_of(take_dirty())` do.
         """
         if min_weight is None:
             min_weight = self.model.min_weight
@@ -141,7 +147,7 @@ class Volume:
                 raise InvalidConfig(f"blocks must be (n, 3) integers, got {np.asarray(blocks)!r}")
             chosen = np.unique(pack_keys(blocks))
             chosen = chosen[store.slots_of(chosen) >= 0]
-        return extract(np.sort(chosen), self._layers(), min_weight, self._mesh_scratch, self._view())
+        return extract(np.sort(chosen), self._layers(), min_weight, self._mesh_scratch, self._view(surface))
 
     def map_hash(self) -> str:
         """Hex digest of the exact sums: equal for the same keyframes in any order, on any number of threads.
@@ -250,11 +256,12 @@ class Volume:
         model = self.model
         return field.Settings(model.field_smoothness, model.field_edge, model.field_reweightings)
 
-    def _view(self) -> View:
+    def _view(self, surface: Surface | None) -> View:
         """What the surface is read from."""
-        if self.model.surface == "field":
+        surface = surface or self.model.surface
+        if surface == "field":
             return partial(field.solve, settings=self._field)
-        if self.model.surface == "normal":
+        if surface == "normal":
             return partial(field.along_normals, smoothness=self.model.smoothness)
         return values_of
 

@@ -77,7 +77,10 @@ class Done(Struct, frozen=True, tag="done"):
 
 
 class Meshed(Struct, frozen=True, tag="meshed"):
-    """The mesh has every keyframe up to and with `index`; the changed part may follow as frames."""
+    """The mesh has every keyframe up to and with `index`; the changed part may follow as frames.
+
+    What keyframes changed comes as fused first, and again, with `blocks` = 0, once it is regularised.
+    """
 
     index: int
     meshed_ns: int
