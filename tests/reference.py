@@ -284,7 +284,7 @@ def field(
     raw: NDArray[np.float64], weight: NDArray[np.float64], settings: Any, quanta: int
 ) -> NDArray[np.float64]:
     """argmin Σ W (x − y)² + λ Σ ω |D2 x|² on a dense array of quanta, NaN = unseen, by sparse direct solves;
-    ω = 1, then 1 / √(1 + (D2 x / ε)²) again and again. Voxels beyond reach stay as they are."""
+    ω = 1, then 1 / (1 + (D2 x / ε)²) again and again. Voxels beyond reach stay as they are."""
     listed = abs(np.nan_to_num(raw, nan=np.inf)) <= settings.reach * quanta
     number = np.full(raw.shape, -1)
     number[listed] = np.arange(listed.sum())
@@ -300,7 +300,7 @@ def field(
     for _ in range(settings.reweightings + 1):
         A = sparse.diags(W) + settings.smoothness * D2.T @ sparse.diags(omega) @ D2
         x = spsolve(A.tocsc(), W * y)
-        omega = 1 / np.sqrt(1 + (D2 @ x / (settings.edge * quanta)) ** 2)
+        omega = 1 / (1 + (D2 @ x / (settings.edge * quanta)) ** 2)
     result = raw.copy()
     result[listed] = x
     return result

@@ -84,10 +84,10 @@ def test_the_solver_equals_its_twin(monkeypatch: pytest.MonkeyPatch, seed: int) 
 
 
 def test_a_coarser_start_leads_to_the_same_field(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The objective has one minimum: from wherever it starts, re-weighting often enough leads to it."""
+    """Where nothing bends more than ε there is one minimum: from wherever it starts, steps enough lead to it."""
     distance, weight = noisy_roof(2)
     keys, sums = map_of(distance, weight, (-2, -1, -1))
-    often = Settings(smoothness=500.0, edge=0.1, reweightings=30)
+    often = Settings(smoothness=500.0, edge=4.0, reweightings=30)
     assert often.coarser == 1
     raw = np.where(weight > 0, np.rint(distance * QUANTA), np.nan)
     expected = reference.field(raw, weight / 16, often, QUANTA)
@@ -251,7 +251,7 @@ def test_smoothing_along_normals_equals_its_twin() -> None:
     assert moved > 50
 
 
-@pytest.mark.parametrize(("surface", "share"), [("normal", 0.9), ("field", 0.5)])
+@pytest.mark.parametrize(("surface", "share"), [("normal", 0.9), ("field", 0.7)])
 def test_the_surface_of_a_noisy_plane_improves(surface: str, share: float) -> None:
     normal = np.array([0.3, -0.2, 0.93])
     normal /= np.linalg.norm(normal)

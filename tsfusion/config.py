@@ -62,7 +62,7 @@ class SensorModel(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     min_weight: NonNegative = 0.25
     surface: Surface = "field"
     field_smoothness: NonNegative = 30.0
-    field_edge: Positive = 0.01
+    field_edge: Positive = 0.02
     field_reweightings: Annotated[int, Meta(ge=0, le=16)] = 4
 
 
@@ -85,8 +85,7 @@ SENSORS: dict[str, SensorModel] = {
         feedback=True,
         min_weight=0.5,
         field_smoothness=1000.0,
-        field_edge=0.02,
-        field_reweightings=3,
+        field_edge=0.05,
     ),
     "lidar": SensorModel(sigma_floor=0.02, min_range=1.0, max_range=100.0, min_support=4.0),
     "scanner": SensorModel(sigma_floor=0.0002, min_range=0.0, max_range=100.0),

@@ -4,7 +4,8 @@
     x̂ = argmin Σ W (x − y)² + λ Σ over the three axes of ω |D2 x|²      D2: second differences
 
 y = Σ w·m / Σ w and W = Σ w are read from the map, x near a flat surface is a ramp with D2 x = 0, and
-ω = 1 / √(1 + (D2 x / ε)²), taken anew from x now and then, lets edges bend.
+ω = 1 / (1 + (D2 x / ε)²), taken anew from x now and then, lets edges bend: what bends more than ε hardly
+counts (Geman and McClure; the gentler 1 / √(1 + …) rounds edges by a quarter more, docs/accuracy.md).
 
 The voxels near the surface are numbered into one dense list with the numbers of their neighbours; a missing
 one has the number past the end, where all is 0. An iteration is two sweeps of the list, each writing only
@@ -249,7 +250,7 @@ def reweigh(
     edge: ti.f32,
     omega: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
-    """ω = 1 / √(1 + (D2 x / ε)²); 0 where one of the three cells is missing."""
+    """ω = 1 / (1 + (D2 x / ε)²); 0 where one of the three cells is missing."""
     for i in range(links.shape[0]):
         for axis in ti.static(range(3)):
             m = links[i, 2 * axis]
@@ -259,7 +260,7 @@ def reweigh(
                 weight = 1.0
                 if flat == 0:
                     bent = (x[m] - 2.0 * x[i] + x[p]) / edge
-                    weight = 1.0 / ti.sqrt(1.0 + bent * bent)
+                    weight = 1.0 / (1.0 + bent * bent)
             omega[i, axis] = weight
 
 
