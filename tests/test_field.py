@@ -84,7 +84,7 @@ def test_the_solver_equals_its_twin(monkeypatch: pytest.MonkeyPatch, seed: int) 
 
 
 def test_a_coarser_start_leads_to_the_same_field(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where nothing bends more than ε there is one minimum: from wherever it starts, steps enough lead to it."""
+    """Where nothing bends more than ε there is one minimum: from wherever it starts, steps lead to it."""
     distance, weight = noisy_roof(2)
     keys, sums = map_of(distance, weight, (-2, -1, -1))
     often = Settings(smoothness=500.0, edge=4.0, reweightings=30)
