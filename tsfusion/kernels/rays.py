@@ -27,7 +27,8 @@ TILE = 12  # divided by both sides of every cell
 TILE_SAMPLES = TILE * TILE
 CELLS = ((2, 1), (2, 2), (3, 2), (3, 3), (4, 3), (4, 4), (6, 4), (6, 6), (12, 6), (12, 12))  # wide, high
 CELL_AREA = 1.0  # voxels across the ray
-LEAST_PLANE = 36  # samples for a plane
+PLANE_STEP = 2  # a plane is fitted to every second pixel of every second row
+LEAST_PLANE = 9  # of these, for a plane
 PLANE_NOISE = 2.0  # the most mean squared residual of a plane, in σ² …
 PLANE_ROUGHNESS = 0.1 * 1024.0  # … and, squared, on top of it: 2⁻¹⁰ voxel
 PLANE_SIGMA = 1.0  # voxels: with more noise than that a plane says nothing about voxels
@@ -80,13 +81,15 @@ def load_tile(
 
 @ti.func
 def fit_plane(depths: ti.template(), band, anchor, sigma):
-    """Least squares q = c + x·slope_x + y·slope_y over the tile; depths and `sigma` in 2⁻¹⁰ voxel, `anchor`
-    near the depths. Returns (1, slope_x, slope_y), or zeros where the tile is not flat."""
+    """Least squares q = c + x·slope_x + y·slope_y over a lattice of the tile; depths and `sigma` in 2⁻¹⁰
+    voxel, `anchor` near the depths. Returns (1, slope_x, slope_y), or zeros where the tile is not flat."""
     sx, sy, sxx, sxy, syy, n = 0, 0, 0, 0, 0, 0
     sq, sxq, syq, sqq = ti.i64(0), ti.i64(0), ti.i64(0), ti.i64(0)
-    for y in range(TILE):
+    for row in range(TILE // PLANE_STEP):
+        y = row * PLANE_STEP
         row_n, row_x, row_xx, row_q, row_xq = 0, 0, 0, ti.i64(0), ti.i64(0)
-        for x in range(TILE):
+        for column in range(TILE // PLANE_STEP):
+            x = column * PLANE_STEP
             q = depths[band, y * TILE + x]
             if q > 0:
                 d = ti.cast(ti.min(ti.max(q - anchor, -(1 << 20)), 1 << 20), ti.i64)
