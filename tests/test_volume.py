@@ -252,6 +252,81 @@ def test_a_settled_colour_takes_no_more_votes() -> None:
     assert (volume._store.color_rgn[voted[: len(before)]] == before[voted]).all()
 
 
+def test_settled_colours_do_not_stop_a_retraction() -> None:
+    volume = volume_of(VIEWS[:2])
+    before = volume.map_hash()
+    volume.integrate(VIEWS[2])
+    voted = volume._store.color_rgn[: volume.stats().blocks] != 0
+    volume._store.color_rgn[: len(voted)][voted] |= 1 << 15
+    settled = volume._store.color_rgn[: len(voted)][voted].copy()
+    volume.retract(VIEWS[2])
+    assert volume.map_hash() == before
+    assert (volume._store.color_rgn[: len(voted)][voted] == settled).all()
+
+
+@pytest.mark.parametrize("where", ["_smooth", "reserve_touched", "largest_weights"])
+def test_whatever_fails_leaves_the_map_as_it_was(monkeypatch: pytest.MonkeyPatch, where: str) -> None:
+    volume = volume_of(VIEWS[:2], regularizer="ray")
+    before, stats = bytes_of(volume), volume.stats()
+    volume._store.bounds[:] = (1 << 26) - 1  # so that the weights are looked at
+
+    def fail(*_: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        if where == "_smooth":
+            patched.setattr(volume, "_smooth", fail)
+        elif where == "reserve_touched":
+            first = [True]
+            usual = volume._scratch.reserve_touched
+            patched.setattr(volume._scratch, "reserve_touched", lambda n: usual(n) if first.pop() else fail())
+            first.insert(0, False)
+        else:
+            patched.setattr("tsfusion.kernels.integrate.largest_weights", fail)
+        with pytest.raises(MemoryError):
+            volume.integrate(VIEWS[5])
+    assert bytes_of(volume) == before
+    assert (volume.stats().blocks, volume.keyframes) == (stats.blocks, 2)
+    volume.integrate(VIEWS[5])
+    assert volume.map_hash() == volume_of([*VIEWS[:2], VIEWS[5]]).map_hash()
+
+
+def test_an_interrupt_waits_for_the_keyframe() -> None:
+    import signal
+
+    volume = volume_of(VIEWS[:1])
+    usual = volume._integrator._check
+
+    def interrupted(part: tuple[int, int], sign: int) -> None:
+        signal.raise_signal(signal.SIGINT)
+        usual(part, sign)
+
+    volume._integrator._check = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        volume.integrate(VIEWS[1])
+    assert volume.keyframes == 2
+    assert volume.map_hash() == volume_of(VIEWS[:2]).map_hash()
+
+
+def test_a_still_camera_can_carve_for_long() -> None:
+    T = np.eye(4)
+    wall = scenes.plane_keyframe(T, np.array([0.0, 0.0, 1.0]), 1.5)
+    volume = Volume(voxel_size=0.02, threads=2, space_carving=True)
+    volume.integrate(wall)
+    heaviest = int((volume._store.sums & ((1 << 27) - 1)).max())
+    assert heaviest * 10_000 < 1 << 26
+
+
+def test_a_surface_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(InvalidConfig, match="surface must be one of"):
+        volume_of(VIEWS[:1]).extract_mesh(surface="fild")  # type: ignore[arg-type]
+
+
+def test_blocks_out_of_reach_have_no_mesh() -> None:
+    far = np.array([[-1, -1, (1 << 21) + 1], [1 << 30, 0, 0]], np.int32)
+    assert len(volume_of(VIEWS[:1]).extract_mesh(blocks=far).faces) == 0
+
+
 def test_a_keyframe_too_heavy_for_one_go_gives_the_same_map(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = volume_of(VIEWS[:3])
     monkeypatch.setattr("tsfusion.integration.PART_WEIGHT", 20_000)

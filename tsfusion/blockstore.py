@@ -85,14 +85,16 @@ class BlockStore:
 
     def insert(self, keys: NDArray[np.int64]) -> None:
         """Append blocks with distinct new keys; their voxels are zero."""
-        first, self.count = self.count, self.count + len(keys)
         for array in self._arrays():
-            array.reserve(self.count)
+            array.reserve(self.count + len(keys))
+        first, self.count = self.count, self.count + len(keys)
         self._keys.array[first : self.count] = keys
         if 2 * self.count > len(self.hash_keys):
             self._rebuild_hash(1 << (4 * self.count - 1).bit_length())
         else:
-            self._index(first)
+            blocks.insert_blocks(
+                self._keys.array, first, self.count - first, first, self.hash_keys, self.hash_slots
+            )
 
     def drop(self, count: int) -> None:
         """Take back the newest blocks, so that `count` remain; their voxels must be zero."""
@@ -133,14 +135,9 @@ class BlockStore:
             yield self.keys[chunk], self._layers[layer].array[chunk]
 
     def _rebuild_hash(self, size: int) -> None:
-        self.hash_keys = np.zeros(size, np.int64)
-        self.hash_slots = np.zeros(size, np.int32)
-        self._index(0)
-
-    def _index(self, first: int) -> None:
-        blocks.insert_blocks(
-            self._keys.array, first, self.count - first, first, self.hash_keys, self.hash_slots
-        )
+        keys, slots = np.zeros(size, np.int64), np.zeros(size, np.int32)
+        blocks.insert_blocks(self._keys.array, 0, self.count, 0, keys, slots)
+        self.hash_keys, self.hash_slots = keys, slots
 
     @property
     def bytes_per_block(self) -> int:

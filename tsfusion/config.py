@@ -26,6 +26,7 @@ Surface = Literal["raw", "normal", "field"]
 SensorName = Literal["kinect", "tof", "realsense", "stereo", "lidar", "scanner"]
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
+Smoothness = Annotated[float, Meta(ge=0, le=1e9)]
 Port = Annotated[int, Meta(ge=0, le=65535)]
 
 
@@ -57,11 +58,11 @@ class SensorModel(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     min_support: Annotated[float, Meta(ge=1, le=16)] = 3.0
     max_support: Annotated[float, Meta(ge=1, le=16)] = 6.0
     regularizer: Regularizer = "off"
-    smoothness: NonNegative = 1.0
+    smoothness: Smoothness = 1.0
     feedback: bool = False
     min_weight: NonNegative = 0.25
     surface: Surface = "field"
-    field_smoothness: NonNegative = 30.0
+    field_smoothness: Smoothness = 30.0
     field_edge: Positive = 0.02
     field_reweightings: Annotated[int, Meta(ge=0, le=16)] = 4
 
@@ -98,7 +99,7 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     voxel_size: Positive = 0.02  # metres
     sensor: SensorName = "kinect"
     regularizer: Regularizer | None = None
-    smoothness: NonNegative | None = None  # λ of eq. 3
+    smoothness: Smoothness | None = None  # λ of eq. 3
     min_support: Annotated[float, Meta(ge=1, le=16)] | None = None  # voxels
     max_support: Annotated[float, Meta(ge=1, le=16)] | None = None  # voxels
     min_range: NonNegative | None = None  # metres
@@ -106,7 +107,7 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     min_weight: NonNegative | None = None  # full-confidence samples a voxel needs to be meshed
     feedback: bool | None = None  # smooth the smoothed values again (recursion) or the raw ones
     surface: Surface | None = None  # what is meshed: values as fused, smoothed along normals, or the field
-    field_smoothness: NonNegative | None = None  # λ of the field, against full-confidence samples
+    field_smoothness: Smoothness | None = None  # λ of the field, against full-confidence samples
     field_edge: Positive | None = None  # voxels; a field that bends more than this counts as an edge
     field_reweightings: Annotated[int, Meta(ge=0, le=16)] | None = None
     bundle: bool = True  # rays of a neighbourhood that end in one voxel become one
@@ -130,8 +131,11 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         return msgspec.structs.replace(SENSORS[name], **chosen)
 
 
-# Settings of a map that change nothing stored in it: a saved one can be read with others.
-VIEW_SETTINGS = ("min_weight", "surface", "field_smoothness", "field_edge", "field_reweightings")
+# Settings of a map that change nothing stored in it (smoothness: unless it smooths along rays): a saved one
+# can be read with others.
+VIEW_SETTINGS = (
+    "min_weight", "surface", "smoothness", "field_smoothness", "field_edge", "field_reweightings"
+)  # fmt: skip
 
 
 class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The field regulariser's planning: which blocks, how many iterations; the work is in `kernels/field.py`.
 
-A view of the map's sums: the same sums give the same field, whatever their history and the threads. Blocks
-are solved with a halo of their neighbours, so that some blocks' values are those of the whole map to a
-hundredth of a voxel.
+A view of the map's sums: no order of keyframes or threads can show. Blocks are solved with a halo of their
+neighbours, so that some blocks' values are nearly those of the whole map (docs/method.md says how nearly).
 """
 
 from collections.abc import Iterator

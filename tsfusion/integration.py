@@ -6,7 +6,7 @@ lane that overflows) shows during or after that; the same rays are then added wi
 restores every byte, because the sums are integers.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -38,15 +38,19 @@ class Integrator:
         self._scratch = scratch
         self._config = config
         self._stamp = 0
+        self._admitted = 0  # blocks of the map that deferred rays have been added to
 
-    def apply(self, sign: int) -> int:
+    def apply(self, sign: int, after: Callable[[], None] = lambda: None) -> int:
         """Add (+1) or take away (-1) the scratch's rays; returns the number of voxel updates.
+
+        Args:
+            after: what else belongs to it; when it fails, the rays are taken back as well.
 
         Raises:
             MapFull, WeightOverflow: when adding; MapError: when taking away what is not there. The map is as
                 it was.
         """
-        before = self._store.count
+        before = self._admitted = self._store.count
         self._begin()
         done: list[Part] = []
         updates = 0
@@ -57,7 +61,10 @@ class Integrator:
                 self._admit(part, sign)
                 self._check(part, sign)
                 updates += int(self._scratch.bands[part[0] : part[1], UPDATES].sum())
+            after()
         except BaseException:
+            if self._store.count > self._admitted:  # blocks that nothing was added to yet
+                self._store.drop(self._admitted)
             for part in done:
                 self._launch(part, -sign)
             self._scratch.take_missing()
@@ -109,9 +116,10 @@ class Integrator:
                 f"it has {store.count} and this keyframe needs {len(keys)} more"
             )
         oldest = store.count
+        scratch.reserve_touched(oldest + len(keys))
         store.insert(keys)
-        scratch.reserve_touched(store.count)
         self._launch(part, +1, only_deferred=True, oldest=oldest)
+        self._admitted = store.count
 
     def _limit(self, blocks: int) -> None:
         if blocks > self._config.max_blocks_per_keyframe:

@@ -66,7 +66,9 @@ class Scratch:
         if keyframe.kind == "points":
             self._reserve_rays(len(keyframe.measurement))
             pose = np.ascontiguousarray(T[:3]) / voxel_size
-            origins = keyframe.origins if keyframe.origins is not None else np.zeros(3, np.float32)
+            origins = keyframe.origins
+            if origins is None or not len(origins):
+                origins = np.zeros(3, np.float32)
             points.rays_from_points(
                 keyframe.points, origins.reshape(-1, 3),
                 *_optional(keyframe.color if self.colored else None, 2), *_optional(keyframe.confidence, 1),

@@ -6,13 +6,13 @@ import os
 import struct
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion import checkpoint, field, runtime
+from tsfusion import checkpoint, field, process, runtime
 from tsfusion.blockstore import BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.config import VIEW_SETTINGS, Surface, VolumeConfig, make, override
 from tsfusion.errors import InvalidConfig, MapError
@@ -116,7 +116,10 @@ class Volume:
         """The blocks whose mesh the changes to these blocks reach: (m, 3) int32.
 
         They and their neighbours towards −x, −y, −z; the field carries a change into the blocks around first.
+        Of what is meshed raw, normals at the rim may be a keyframe behind.
         """
+        if self.model.surface == "normal":
+            dirty = unpack_keys(field.around(pack_keys(dirty), self._layers(), 1))
         if self.model.surface == "field":
             dirty = unpack_keys(field.spread(pack_keys(dirty), self._layers(), self._field))
         return cells_of(dirty)
@@ -145,7 +148,8 @@ class Volume:
         if blocks is not None:
             if np.shape(blocks)[1:] != (3,) or np.asarray(blocks).dtype.kind != "i":
                 raise InvalidConfig(f"blocks must be (n, 3) integers, got {np.asarray(blocks)!r}")
-            chosen = np.unique(pack_keys(blocks))
+            reachable = (np.abs(blocks) < 1 << 18).all(axis=1)  # beyond it coordinates have no key
+            chosen = np.unique(pack_keys(blocks[reachable]))
             chosen = chosen[store.slots_of(chosen) >= 0]
         return extract(np.sort(chosen), self._layers(), min_weight, self._mesh_scratch, self._view(surface))
 
@@ -185,7 +189,7 @@ class Volume:
 
     def warm_up(self) -> None:
         """Compile every kernel, so that the first keyframe is not slower than the rest."""
-        throwaway = Volume(override(self.config, max_blocks_per_keyframe=1 << 14))
+        throwaway = Volume(override(self.config, max_blocks=1 << 14, max_blocks_per_keyframe=1 << 14))
         for keyframe in warm_up_keyframes(self.model, self.config.voxel_size):
             throwaway.integrate(keyframe)
             throwaway.retract(keyframe)
@@ -224,9 +228,13 @@ class Volume:
             CheckpointError: when the file is missing, torn, altered or of another version.
         """
         header, keys, stored = checkpoint.read(Path(path))
-        if fixed := view.keys() - set(VIEW_SETTINGS):
+        saved = header.config
+        fixed = {name for name in view if name not in VIEW_SETTINGS}
+        if saved.model().regularizer != "off" and view.get("smoothness") not in (None, saved.smoothness):
+            fixed.add("smoothness")  # it has smoothed along rays already
+        if fixed:
             raise InvalidConfig(f"a saved map cannot change {', '.join(sorted(fixed))}; fuse it anew")
-        volume = cls(override(msgspec.structs.replace(header.config, threads=threads), **view))
+        volume = cls(override(msgspec.structs.replace(saved, threads=threads), **view))
         volume._store.insert(keys)
         for name, array in volume._store.layers().items():
             array[: len(keys)] = stored[name]
@@ -241,10 +249,9 @@ class Volume:
             raise MapError("cannot retract a keyframe from a map that holds none")
         scratch, store, before = self._scratch, self._store, self._store.count
         samples = scratch.make_rays(keyframe, self.config)
-        updates = self._integrator.apply(sign)
-        if self._smooths:
-            self._smooth(sign)
-        self.keyframes += sign
+        with process.uninterrupted():
+            updates = self._integrator.apply(sign, lambda: self._smooth(sign))
+            self.keyframes += sign
         total = int(np.prod(keyframe.shape))
         return IntegrateStats(
             samples=samples, invalid=total - samples, rays=int(scratch.bands[:, COUNT].sum()),
@@ -259,6 +266,8 @@ class Volume:
     def _view(self, surface: Surface | None) -> View:
         """What the surface is read from."""
         surface = surface or self.model.surface
+        if surface not in get_args(Surface):
+            raise InvalidConfig(f"surface must be one of {', '.join(get_args(Surface))}, got {surface!r}")
         if surface == "field":
             return partial(field.solve, settings=self._field)
         if surface == "normal":
@@ -281,6 +290,8 @@ class Volume:
     def _smooth(self, sign: int) -> None:
         """Bring the regularised layer up to date in the blocks just touched."""
         s, store, model = self._scratch, self._store, self.model
+        if not self._smooths:
+            return
         if sign < 0:
             store.correction[s.touched_slots] = 0
             return

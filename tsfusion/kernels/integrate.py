@@ -82,9 +82,13 @@ def touch(
 def vote_color(
     slot, o, sign_, packed, color_rgn: ti.template(), color_b: ti.template(), touched: ti.template()
 ):
-    """One vote for the colour in the low 24 bits of `packed`. A count just below 2¹⁶ has gone below none."""
+    """One vote for the colour in the low 24 bits of `packed`.
+
+    A count just below 2¹⁶ has gone below none. A settled colour stays, whatever is added or taken away: it is
+    no longer a sum.
+    """
     votes = ti.cast(color_rgn[slot, o] & 65535, ti.i32)
-    if sign_ < 0 or votes < COLOR_LIMIT or votes >= COLOR_LIMIT + (COLOR_LIMIT >> 1):
+    if votes < COLOR_LIMIT or votes >= COLOR_LIMIT + (COLOR_LIMIT >> 1):
         red = ti.cast((packed >> 16) & 255, ti.i64)
         green = ti.cast((packed >> 8) & 255, ti.i64)
         before = ti.atomic_add(color_rgn[slot, o], sign_ * ((red << 40) + (green << 16) + 1))

@@ -265,7 +265,9 @@ def rays_from_image(
                             )
                             tolerance = 0
                             if n > 0:
-                                tolerance = ti.cast(layer_depth(model, low * unit) / unit, ti.i32)
+                                tolerance = ti.cast(
+                                    ti.min(layer_depth(model, low * unit) / unit, 1e9), ti.i32
+                                )
                             more = n > 1 and deepest - low > tolerance
                             if more:
                                 low, deepest, n, sum_q, sum_x, sum_y = layer_sums(

@@ -13,8 +13,8 @@ LAYER_SIGMAS = 4.0  # samples this many σ (and a voxel) apart are not one surfa
 # `model`: σ floor, σ slope, σ z0, least and most half-width (voxels), voxel size, σ below which the weight is
 # full, least and most range, whether lone samples are dropped, three σ of 1 m in 2⁻⁸ voxel, whether the space
 # before the band is carved. See config.SensorModel.
-MODEL_FIELDS = 12
 MAX_CARVED = 2048.0  # voxels
+NEVER_CARVED = 16.0  # voxels in front of the sensor, where all rays meet: their lanes would soon be full
 
 vec3 = ti.types.vector(3, ti.f64)
 vec3f = ti.types.vector(3, ti.f32)
@@ -44,10 +44,10 @@ def half_width(model: ti.template(), sigma):
 
 @ti.func
 def before_width(model: ti.template(), half, length):
-    """How far before its end a ray of `length` voxels begins, 2⁻⁸ voxel: its band, or all but a voxel."""
+    """How far before its end a ray of `length` voxels begins, 2⁻⁸ voxel: its band, or nearly all."""
     before = half
     if model[11] > 0.0:
-        before = ti.max(half, ti.cast((ti.min(length, MAX_CARVED) - 1.0) * 256.0, ti.i32))
+        before = ti.max(half, ti.cast((ti.min(length, MAX_CARVED) - NEVER_CARVED) * 256.0, ti.i32))
     return before
 
 

@@ -28,7 +28,6 @@ VOXEL_LIMIT = 1 << 20  # |voxel coordinate| < VOXEL_LIMIT − 64, so that a band
 # (measured: a loop of 512 heavy iterations ran on one thread). One unit of work is therefore one run.
 RUN = 512
 
-POSITION_BITS = 10
 DIRECTION_ONE = 1 << 16
 NEVER = 1 << 30  # a crossing far behind the longest band
 LEAST_DIRECTION = 8  # an axis slower than this is not crossed: 2⁻¹³, one voxel in 8192
