@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tsfusion import Keyframe, Volume
 from tsfusion.blockstore import unpack_keys
+from tsfusion.datasets import Synthetic
 from tsfusion.errors import InvalidConfig
 
 WALL = scenes.plane_keyframe(np.eye(4), np.array([0.0, 0.0, 1.0]), 2.0)
@@ -124,3 +125,23 @@ def test_a_plate_seen_from_both_sides_is_no_worse_than_without_bundling(voxels: 
     assert ours <= 1.1 * plain
     assert ours_both == plain_both
     assert ours_count >= 0.95 * plain_count
+
+
+def test_gross_outliers_do_not_reach_the_surface() -> None:
+    room = Synthetic(world="room", sensor="kinect", count=8)
+    random = np.random.default_rng(6)
+    errors = []
+    keyframes = []
+    for i in range(len(room)):
+        depth = room[i].measurement.copy()
+        wrong = random.random(depth.shape) < 0.03
+        depth[wrong] = random.uniform(0.5 / room[i].depth_scale, 3 / room[i].depth_scale, wrong.sum())
+        keyframes.append(replace(room[i], depth=depth))
+    for chosen in (False, True):
+        volume = Volume(voxel_size=0.03, threads=2, color=False, outlier_filter=chosen)
+        for keyframe in keyframes:
+            volume.integrate(keyframe)
+        vertices = volume.extract_mesh().vertices.astype(np.float64)
+        errors.append(np.abs(room.distance(vertices)).mean() * 1e3)
+    assert errors[0] > 20.0
+    assert errors[1] < 3.0

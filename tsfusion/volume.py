@@ -148,7 +148,9 @@ class Volume:
         if blocks is not None:
             if np.shape(blocks)[1:] != (3,) or np.asarray(blocks).dtype.kind != "i":
                 raise InvalidConfig(f"blocks must be (n, 3) integers, got {np.asarray(blocks)!r}")
-            reachable = (np.abs(blocks) < 1 << 18).all(axis=1)  # beyond it coordinates have no key
+            reachable = (np.abs(np.asarray(blocks, np.int64)) < 1 << 18).all(
+                axis=1
+            )  # beyond it coordinates have no key
             chosen = np.unique(pack_keys(blocks[reachable]))
             chosen = chosen[store.slots_of(chosen) >= 0]
         return extract(np.sort(chosen), self._layers(), min_weight, self._mesh_scratch, self._view(surface))
