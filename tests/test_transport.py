@@ -12,7 +12,7 @@ from tsfusion.errors import DecodeError, InvalidConfig, ServerUnreachable, Trans
 from tsfusion.journal import Position, Scan
 from tsfusion.sessions import Delays, KeyframeIndex, Session, Sessions
 from tsfusion.transport import ClockOffset, Command, control_address, messages, request, sockets
-from tsfusion.transport.messages import Ack, Hello, Nack, Ping, Pong, Stamps, Welcome
+from tsfusion.transport.messages import Ack, Denied, Hello, Hold, Nack, Ping, Pong, Stamps, Welcome
 
 SESSION = bytes(range(16))
 
@@ -63,18 +63,22 @@ def test_a_dead_server_is_one_clear_error() -> None:
 def test_control_messages_keep_their_bytes() -> None:
     """As others implement them: a change here is a new wire version."""
     key = "000102030405060708090a0b0c0d0e0f"
-    golden = {
-        Hello(SESSION, 1): f"83a474797065a568656c6c6fa773657373696f6ec410{key}a776657273696f6e01",
-        Ping(b"", 5, None): (
-            "84a474797065a470696e67a773657373696f6ec400a773656e745f6e7305a96f66667365745f6e73c0"
+    golden = (
+        (Hello(SESSION, 1), f"83a474797065a568656c6c6fa773657373696f6ec410{key}a776657273696f6e01"),
+        (
+            Hello(SESSION, 1, map="yard"),
+            f"84a474797065a568656c6c6fa773657373696f6ec410{key}a776657273696f6e01a36d6170a479617264",
         ),
-    }
-    for message, stored in golden.items():
+        (Ping(b"", 5), "83a474797065a470696e67a773657373696f6ec400a773656e745f6e7305"),
+    )
+    for message, stored in golden:
         assert messages.encode(message).hex() == stored
         assert messages.decode_to_server(bytes.fromhex(stored)) == message
     for answer in (
         Welcome("e", 1, 3, 2, 8, 1, 1),
         Ack(SESSION, 3, 2, (Stamps(3, 1, 2, 3, 4, 5),), resend=True),
+        Denied(SESSION, "map", "no room"),
+        Hold(SESSION, 1.5, "disk", "full"),
         Nack(SESSION, 3, "door", "crc", "damaged"),
         Pong("e", 1, 2, 3),
     ):
@@ -137,7 +141,7 @@ def test_strangers_do_not_grow_the_sessions() -> None:
 
 def index_of(*records: tuple[int, int, bytes, int]) -> tuple[KeyframeIndex, Sessions]:
     index, sessions = KeyframeIndex(), Sessions()
-    index.recover([Scan(Position(a, b), key, seq, 0) for a, b, key, seq in records], sessions)
+    index.recover([Scan(Position(a, b), key, seq, "", 0) for a, b, key, seq in records], sessions)
     return index, sessions
 
 

@@ -27,6 +27,12 @@ SensorName = Literal["kinect", "tof", "realsense", "stereo", "lidar", "scanner"]
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Smoothness = Annotated[float, Meta(ge=0, le=1e9)]
+Policy = Literal["thin", "block", "drop_oldest", "spool_all"]
+DEFAULT_MAP = "default"
+# Becomes a folder's name, so it is no path: \A and \Z, because `$` would let a newline through.
+MapName = Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9_-]{0,31}\Z")]
+ClientName = Annotated[str, Meta(pattern=r"\A[A-Za-z0-9][A-Za-z0-9_.-]{0,31}\Z")]
+Bytes = Annotated[int, Meta(ge=1 << 20)]
 Port = Annotated[int, Meta(ge=0, le=65535)]
 
 
@@ -143,13 +149,26 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     listen: str = "tcp://127.0.0.1:5555"
     control: str | None = None  # None = the port after `listen`'s
-    state: str = "tsfusion-state"  # folder: journal/, map.tsf
+    state: str = "tsfusion-state"  # folder: maps/NAME/journal/, maps/NAME/map.tsf
+    keys: str | None = None  # folder of `tsfusion keys`; None = no keys, reachable from this machine only
+    max_maps: Annotated[int, Meta(ge=1, le=64)] = 4  # open at once; each has a fuser process
+    metrics: str | None = None  # loopback address of Prometheus' page and health checks: 127.0.0.1:9464
     max_frame_bytes: Annotated[int, Meta(ge=1024)] = 32 << 20
     segment_bytes: Annotated[int, Meta(ge=1 << 16)] = 256 << 20
     window_keyframes: Annotated[int, Meta(ge=1, le=1024)] = 8  # credit: unacknowledged keyframes a client
     window_bytes: Annotated[int, Meta(ge=1 << 16)] = 16 << 20
     checkpoint_every: Annotated[int, Meta(ge=0)] = 500  # keyframes; 0 = only at shutdown
     mesh_interval: NonNegative = 0.2  # seconds between incremental meshes while busy
+    journal_bytes: Bytes | None = None  # per map; what a checkpoint has goes first; None = keep all
+    min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left on the disk: below, keyframes have to wait
+    quarantine_bytes: Bytes = 256 << 20  # per map; keyframes that could not be fused, the oldest go first
+    memory_bytes: Bytes = 512 << 20  # of the gateway; above, all connections are dropped and made anew
+    fuser_memory_bytes: Bytes | None = None  # of each fuser; None = three quarters of the machine's
+    fuser_timeout: Positive = 60.0  # seconds on one keyframe before a fuser counts as stuck
+    quota_bytes: Bytes = 256 << 20  # a second, of each client
+    quota_keyframes: Positive = 100.0  # a second, of each client
+    quota_points: Annotated[int, Meta(ge=1)] = 8 << 20  # points or pixels a keyframe
+    quota_extent: Positive = 100_000.0  # metres from the map's origin to a sensor
 
 
 class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -157,6 +176,13 @@ class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     address: str = "tcp://127.0.0.1:5555"
     control: str | None = None
+    map: MapName = DEFAULT_MAP
+    key: str | None = None  # own secret key, a file of `tsfusion keys new`; None = no keys
+    server_key: str | None = None  # the server's public key: a file, or the 40 characters
+    policy: Policy = "thin"  # when keyframes come faster than the server takes them
+    backlog: Annotated[int, Meta(ge=1, le=10_000)] = 8  # waiting keyframes at which the policy begins to act
+    spool_bytes: Bytes = 8 << 30  # more is never kept; what comes then is skipped and counted
+    min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left on the spool's disk
     jpeg_quality: Annotated[int, Meta(ge=1, le=100)] = 90
     segment_bytes: Annotated[int, Meta(ge=1 << 16)] = 64 << 20
     connect_timeout: Positive = 10.0  # seconds

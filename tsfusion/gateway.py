@@ -16,7 +16,7 @@ import msgspec
 import zmq
 
 from tsfusion import codec, process
-from tsfusion.config import ServerConfig
+from tsfusion.config import DEFAULT_MAP, ServerConfig
 from tsfusion.errors import DecodeError, JournalError
 from tsfusion.fuser_link import FuserLink
 from tsfusion.journal import Journal
@@ -281,6 +281,7 @@ class Gateway:
     def _status(self, fuser: work.FuserStatus) -> messages.Status:
         return messages.Status(
             epoch=self.epoch,
+            map=DEFAULT_MAP,
             state=self._server.state,
             fuser="idle" if self.drained else "busy",
             uptime_s=time.monotonic() - self._started,

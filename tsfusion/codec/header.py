@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
+from tsfusion.config import MapName
 from tsfusion.errors import DecodeError
 from tsfusion.keyframe import MAX_SENSOR_NAME, Intrinsics
 
@@ -50,6 +51,7 @@ class Header(Struct, frozen=True, kw_only=True, omit_defaults=True):
         seq: number of the keyframe in its session, rising by one.
         previous: the seq before this one among those the sender still offers, 0 = none: what lies
             between the two was dropped on purpose.
+        map: the map it is for.
         sent_ns: the sender's monotonic clock when this copy was handed to the socket.
         pose: the upper three rows of `T_world_camera`, row by row.
         scale: `depth_scale` or `disparity_scale`.
@@ -60,6 +62,7 @@ class Header(Struct, frozen=True, kw_only=True, omit_defaults=True):
     previous: Natural
     pose: Annotated[tuple[float, ...], Meta(min_length=12, max_length=12)]
     buffers: Annotated[tuple[Buffer, ...], Meta(min_length=1, max_length=4)]
+    map: MapName = "default"
     sent_ns: Natural = 0
     scale: float | None = None
     intrinsics: Intrinsics | None = None

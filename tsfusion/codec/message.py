@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tsfusion.codec import arrays
 from tsfusion.codec.header import ArrayCodec, ArrayName, Buffer, Header, Refused, pack, unpack
+from tsfusion.config import DEFAULT_MAP
 from tsfusion.errors import InvalidKeyframe
 from tsfusion.keyframe import MAX_IMAGE_SIDE, MAX_POINTS, Keyframe, check_intrinsics, check_pose
 
@@ -40,7 +41,13 @@ _POINTS: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 def encode(
-    keyframe: Keyframe, *, session: bytes, seq: int, previous: int | None = None, jpeg_quality: int
+    keyframe: Keyframe,
+    *,
+    session: bytes,
+    seq: int,
+    previous: int | None = None,
+    map_name: str = DEFAULT_MAP,
+    jpeg_quality: int,
 ) -> list[bytes]:
     """A keyframe as frames: the header, then one frame an array.
 
@@ -66,6 +73,7 @@ def encode(
         session=session,
         seq=seq,
         previous=seq - 1 if previous is None else previous,
+        map=map_name,
         pose=tuple(keyframe.T_world_camera[:3].ravel().tolist()),
         buffers=tuple(buffers),
         scale=scales.get(keyframe.kind),

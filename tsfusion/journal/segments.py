@@ -23,8 +23,9 @@ from msgspec import Struct
 from tsfusion.errors import JournalError
 
 LAYOUT = b"""tsfusion journal record, little-endian:
-session: 16 bytes; seq: u64; frame count: u8; length of each frame: u32; the frames of the wire message."""
-_HEAD = struct.Struct("<16sQB")
+session: 16 bytes; seq: u64; client: 32 bytes, the name its key is allowed under, UTF-8, zeros after it;
+frame count: u8; length of each frame: u32; the frames of the wire message."""
+_HEAD = struct.Struct("<16sQ32sB")
 _RECORD = struct.Struct("<BQ")  # MCAP: opcode, length
 _MAX_RECORD_BYTES = 1 << 30
 _MAGIC_BYTES = 8
@@ -45,6 +46,7 @@ class Record(Struct, frozen=True):
     position: Position
     session: bytes
     seq: int
+    client: str  # that the key was allowed under which it came; empty = no keys
     logged_ns: int  # wall clock
     frames: list[memoryview]
 
@@ -60,6 +62,7 @@ class Scan(Struct, frozen=True):
     position: Position
     session: bytes
     seq: int
+    client: str
     nbytes: int
 
 
@@ -119,7 +122,7 @@ def scan(path: Path) -> tuple[list[Scan], int]:
         if record is None:
             damaged += 1
         else:
-            found.append(Scan(record.position, record.session, record.seq, record.nbytes))
+            found.append(Scan(record.position, record.session, record.seq, record.client, record.nbytes))
     if damaged:
         log.error("%s: %d keyframes are damaged and lost", path, damaged)
     return found, damaged
@@ -189,16 +192,16 @@ def _unpack(chunk: bytes, position: Position) -> Record | None:
         return None
 
 
-def pack(frames: Sequence[Any], session: bytes, seq: int) -> bytes:
+def pack(frames: Sequence[Any], session: bytes, seq: int, client: str) -> bytes:
     """What `unpack` reads: the message of one record."""
     views = [memoryview(frame).cast("B") for frame in frames]
     lengths = struct.pack(f"<{len(views)}I", *(view.nbytes for view in views))
-    return b"".join([_HEAD.pack(session, seq, len(views)), lengths, *views])
+    return b"".join([_HEAD.pack(session, seq, client.encode(), len(views)), lengths, *views])
 
 
 def _unpack_message(message: Message, position: Position) -> Record:
     body = memoryview(message.data)
-    session, seq, count = _HEAD.unpack_from(body)
+    session, seq, client, count = _HEAD.unpack_from(body)
     at = _HEAD.size + 4 * count
     frames = []
     for length in struct.unpack_from(f"<{count}I", body, _HEAD.size):
@@ -206,7 +209,8 @@ def _unpack_message(message: Message, position: Position) -> Record:
         at += length
     if at != body.nbytes:
         raise JournalError(f"a record of {body.nbytes} bytes at {position} says it has {at}")
-    return Record(position, session, seq, message.log_time, frames)
+    name = client.rstrip(b"\0").decode()
+    return Record(position, session, seq, name, message.log_time, frames)
 
 
 def failed(verb: str, path: Path, error: OSError) -> JournalError:

@@ -72,13 +72,16 @@ class Journal:
         """The number of the segment that is (or will be) written to."""
         return self._number
 
-    def append(self, frames: Sequence[Any], *, session: bytes, seq: int) -> Position:
+    def append(self, frames: Sequence[Any], *, session: bytes, seq: int, client: str = "") -> Position:
         """Write one message; it is on the disk when this returns.
+
+        Args:
+            client: the name of who sent it, at most 32 bytes of UTF-8.
 
         Raises:
             JournalError: when the disk refuses. Nothing of the message counts then.
         """
-        payload = pack(frames, session, seq)
+        payload = pack(frames, session, seq, client)
         position = Position(self._number, 0)
         try:
             file = self._open()

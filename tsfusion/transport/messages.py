@@ -9,17 +9,20 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
+from tsfusion.config import MapName
 from tsfusion.errors import DecodeError
 
 SessionId = Annotated[bytes, Meta(min_length=16, max_length=16)]
+Counts = dict[Annotated[str, Meta(max_length=32)], Annotated[int, Meta(ge=0)]]  # by reason
 Seq = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
 
 
-class Hello(Struct, frozen=True, tag="hello"):
+class Hello(Struct, frozen=True, tag="hello", omit_defaults=True):
     """A client opens (or re-opens) its session."""
 
     session: SessionId
     version: int  # wire format it speaks
+    map: MapName = "default"
 
 
 class Welcome(Struct, frozen=True, tag="welcome"):
@@ -73,12 +76,46 @@ class Nack(Struct, frozen=True, tag="nack"):
     message: str
 
 
-class Ping(Struct, frozen=True, tag="ping"):
-    """`offset_ns`: what the client takes the server's clock minus its own to be (None = not yet known)."""
+class Hold(Struct, frozen=True, tag="hold"):
+    """Nothing is taken from this session for so long: keep everything, then go on from durable + 1.
+
+    `reason`: `disk` (full or failing), `journal` (at its limit) or `quota`; `message` says it to a person.
+    """
+
+    session: SessionId
+    seconds: float
+    reason: str
+    message: str
+
+
+class Denied(Struct, frozen=True, tag="denied"):
+    """The answer to a Hello that opens no session (yet): ask again, but tell the user why.
+
+    `reason`: `opening` (the map is being opened), `map` (there is no such map, and no room for one, or it
+    cannot be opened), `session` (it is another client's) or `version`.
+    """
+
+    session: SessionId
+    reason: str
+    message: str
+
+
+class Ping(Struct, frozen=True, tag="ping", omit_defaults=True):
+    """A client is alive, and how it is doing.
+
+    Attributes:
+        offset_ns: what the client takes the server's clock minus its own to be (None = not yet known).
+        bound_ns: the most that this can be wrong.
+        waiting: keyframes in its spool.
+        skipped: keyframes that were never spooled or left it unsent, by reason, since the client began.
+    """
 
     session: Annotated[bytes, Meta(max_length=16)]
     sent_ns: int
     offset_ns: int | None = None
+    bound_ns: int = 0
+    waiting: Annotated[int, Meta(ge=0)] = 0
+    skipped: Annotated[Counts, Meta(max_length=16)] = {}
 
 
 class Pong(Struct, frozen=True, tag="pong"):
@@ -93,7 +130,8 @@ class Pong(Struct, frozen=True, tag="pong"):
 class Command(Struct, frozen=True, tag="command", kw_only=True):
     """A request of a person or program; answered by one Reply."""
 
-    name: Literal["ping", "status", "mesh"]
+    name: Literal["ping", "health", "status", "mesh"]
+    map: MapName = "default"
     min_weight: float | None = None
 
 
@@ -102,6 +140,7 @@ class Reply(Struct, frozen=True, tag="reply", kw_only=True):
 
     name: str
     error: str | None = None
+    health: "Health | None" = None
     status: "Status | None" = None
     mesh: "MeshLayout | None" = None
 
@@ -125,11 +164,85 @@ class Spread(Struct, frozen=True, kw_only=True):
     max: float = 0.0
 
 
+MapState = Literal["opening", "idle", "busy", "restarting", "failed"]
+
+
+class MapHealth(Struct, frozen=True, kw_only=True):
+    """How one map is doing, as far as the gateway knows without asking its fuser.
+
+    Attributes:
+        problem: what keeps it from taking or fusing keyframes; empty = nothing.
+        waiting: durable, not yet fused or rejected.
+        rejected: journaled, but not fusable, since the server began: reason → count.
+        quarantined: keyframes kept aside for inspection.
+        last_keyframe_s: seconds since the last one was journaled; None = none since the server began.
+        delay_bound_ms: the delays are right to within so much (half the best round trip, the worst client's).
+    """
+
+    state: MapState
+    problem: str
+    keyframes_durable: int
+    keyframes_fused: int
+    waiting: int
+    rejected: dict[str, int]
+    quarantined: int
+    sessions: int
+    journal_bytes: int
+    journal_damaged: int  # records the recovery scan could not read
+    fuser_restarts: int
+    blocks: int
+    map_bytes: int
+    last_keyframe_s: float | None
+    delay_ms: Spread
+    delay_bound_ms: float
+
+
+class ClientHealth(Struct, frozen=True, kw_only=True):
+    """One session that was heard since the server began.
+
+    Attributes:
+        client: the name its key is allowed under; empty without keys.
+        session: the first 8 hexadecimal digits.
+        heard_s: seconds since its last message.
+        waiting, skipped: as its last Ping said.
+        held: why nothing is taken from it now; empty = it is.
+    """
+
+    client: str
+    session: str
+    map: str
+    heard_s: float
+    durable: int
+    fused: int
+    received_bytes: int
+    waiting: int
+    skipped: dict[str, int]
+    held: str
+
+
+class Health(Struct, frozen=True, kw_only=True):
+    """How a server is doing, answered at once whatever its fusers do. Counts are since it began.
+
+    `ready`: keyframes are accepted, journaled and fused. `problems`: why not, or what needs a person.
+    """
+
+    ready: bool
+    problems: tuple[str, ...]
+    epoch: str
+    uptime_s: float
+    rss_bytes: int  # of the gateway
+    refused: dict[str, int]  # messages never journaled: reason → count
+    duplicates: int
+    maps: dict[str, MapHealth]
+    clients: tuple[ClientHealth, ...]
+
+
 class Status(Struct, frozen=True, kw_only=True):
-    """How a server is doing. Counts are of the whole journal and map; the delay of this process."""
+    """How a map is doing. Counts are of the whole journal and map; the delay of this process."""
 
     epoch: str
-    state: str  # folder
+    map: str
+    state: str  # the map's folder
     fuser: Literal["starting", "idle", "busy"]
     uptime_s: float
     keyframes_durable: int
@@ -171,7 +284,7 @@ class KeyframeTimes(Struct, kw_only=True):
 
 
 ToServer = Hello | Ping | Command
-ToClient = Welcome | Ack | Nack | Pong | Reply
+ToClient = Welcome | Denied | Hold | Ack | Nack | Pong | Reply
 _TO_SERVER = msgspec.msgpack.Decoder(ToServer)
 _TO_CLIENT = msgspec.msgpack.Decoder(ToClient)
 encode = msgspec.msgpack.encode
