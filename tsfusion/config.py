@@ -195,6 +195,21 @@ class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     volume: VolumeConfig = VolumeConfig()
     server: ServerConfig = ServerConfig()
     client: ClientConfig = ClientConfig()
+    maps: dict[MapName, dict[str, Any]] = {}  # [maps.NAME]: what differs there from [volume]
+
+    def volumes(self) -> dict[str, VolumeConfig]:
+        """The settings of the maps that have some of their own.
+
+        Raises:
+            InvalidConfig: for an unknown key or a bad value.
+        """
+        found = {}
+        for name, settings in self.maps.items():
+            try:
+                found[name] = override(self.volume, **settings)
+            except InvalidConfig as error:
+                raise InvalidConfig(f"[maps.{name}]: {error}") from error
+        return found
 
 
 AnyStruct = TypeVar("AnyStruct", bound=Struct)
@@ -260,7 +275,9 @@ def load(path: str | Path | None, **volume: Any) -> Config:
     if isinstance(given := tables.get("volume", {}), dict):
         tables["volume"] = {**volume, **given}
     try:
-        return make(Config, tables)
+        made = make(Config, tables)
+        made.volumes()
+        return made
     except InvalidConfig as error:
         raise InvalidConfig(f"{path}: {error}") from error
 

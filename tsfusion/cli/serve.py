@@ -56,7 +56,7 @@ def serve(
     def on_ready(addresses: "Addresses") -> None:
         _announce(addresses, chosen.server.state, time.monotonic() - started, json)
 
-    return server.run(chosen.server, chosen.volume, on_ready)
+    return server.run(chosen.server, chosen.volume, on_ready, volumes=chosen.volumes())
 
 
 def _announce(addresses: "Addresses", state: str, seconds: float, json: bool) -> None:

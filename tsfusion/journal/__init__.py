@@ -16,7 +16,7 @@ from tsfusion.journal.segments import (
     segment_path,
     segments,
 )
-from tsfusion.journal.writer import Journal
+from tsfusion.journal.writer import Journal, write_file
 
 __all__ = [
     "Journal",
@@ -29,4 +29,5 @@ __all__ = [
     "scan",
     "segment_path",
     "segments",
+    "write_file",
 ]

@@ -86,10 +86,7 @@ class Journal:
         try:
             file = self._open()
             position = Position(self._number, file.tell())
-            now = time.time_ns()
-            self._writer.add_message(
-                _CHANNEL, log_time=now, publish_time=now, data=payload, sequence=seq % 2**32
-            )
+            _add(self._writer, payload, seq)
             file.flush()
             if self._sync:
                 os.fdatasync(file.fileno())
@@ -145,10 +142,7 @@ class Journal:
             path = segment_path(self.folder, self._number)
             self._first = 0
             self._file = path.open("xb")
-            self._writer = Writer(self._file, chunk_size=1, compression=CompressionType.NONE)
-            self._writer.start()
-            schema = self._writer.register_schema("tsfusion.keyframe", "", LAYOUT)
-            self._writer.register_channel(TOPIC, ENCODING, schema)
+            self._writer = _started(self._file)
             if self._sync:
                 _sync_folder(self.folder)
             self._first = self._file.tell()
@@ -171,6 +165,38 @@ class Journal:
                 if end is not None:
                     os.truncate(path, end)
                 self.closed_bytes += path.stat().st_size
+
+
+def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, client: str = "") -> None:
+    """One message as a file of its own, in the form of a segment, whole or not at all.
+
+    Raises:
+        JournalError: when the disk refuses.
+    """
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        with partial.open("wb") as file:
+            writer = _started(file)
+            _add(writer, pack(frames, session, seq, client), seq)
+            writer.finish()
+        partial.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise failed("write", path, error) from error
+
+
+def _started(file: BinaryIO) -> Any:
+    writer: Any = Writer(file, chunk_size=1, compression=CompressionType.NONE)
+    writer.start()
+    schema = writer.register_schema("tsfusion.keyframe", "", LAYOUT)
+    writer.register_channel(TOPIC, ENCODING, schema)
+    return writer
+
+
+def _add(writer: Any, payload: bytes, seq: int) -> None:
+    now = time.time_ns()
+    writer.add_message(_CHANNEL, log_time=now, publish_time=now, data=payload, sequence=seq % 2**32)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -13,13 +13,15 @@ from typing import Any
 import zmq
 from msgspec import Struct
 
+from tsfusion.config import DEFAULT_MAP
 from tsfusion.errors import InvalidConfig, TransportError
 
 CONTROL_MAX_BYTES = 64 << 10
-MESH_TOPIC = b"mesh"
+_MESH_TOPIC = b"mesh/"
 _TCP_OPTIONS: dict[int, int] = {zmq.RECONNECT_IVL: 100, zmq.RECONNECT_IVL_MAX: 1000, zmq.TCP_KEEPALIVE: 1}
 _RANDOM_PORT_TRIES = 32
 LAST_PORT = 65535
+_MAX_TOPIC = 64
 _ADDRESS = re.compile(r"tcp://((?P<host>[\w.*-]+)|\[(?P<host6>[\w:.%]+)\]):(?P<port>[0-9]{1,5}|\*)", re.ASCII)
 
 AnySocket = zmq.Socket[Any]
@@ -58,13 +60,23 @@ def publisher(context: "zmq.Context[Any]") -> AnySocket:
     return _make(context, zmq.XPUB, {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: CONTROL_MAX_BYTES})
 
 
-def subscriber(context: "zmq.Context[Any]") -> AnySocket:
-    """A viewer's socket for mesh updates: topic, `work.Meshed`, cells (n, 3) int32, then a mesh's frames.
+def mesh_topic(map_name: str) -> bytes:
+    """Of a map's mesh updates. No map's is the beginning of another's."""
+    return _MESH_TOPIC + map_name.encode() + b"/"
+
+
+def is_mesh_topic(topic: bytes) -> bool:
+    """Whether it asks for one map's updates, or for all of them. Anything else is nobody's to ask for."""
+    return len(topic) <= _MAX_TOPIC and (topic.startswith(_MESH_TOPIC) or _MESH_TOPIC.startswith(topic))
+
+
+def subscriber(context: "zmq.Context[Any]", map_name: str = DEFAULT_MAP) -> AnySocket:
+    """A viewer's socket for a map's updates: topic, `work.Meshed`, cells (n, 3) int32, then a mesh's frames.
 
     The triangles replace all earlier ones in these cells (blocks of 8³ voxels).
     """
     made = _make(context, zmq.SUB, {**_TCP_OPTIONS, zmq.RCVHWM: 16})
-    made.setsockopt(zmq.SUBSCRIBE, MESH_TOPIC)
+    made.setsockopt(zmq.SUBSCRIBE, mesh_topic(map_name))
     return made
 
 
