@@ -8,7 +8,7 @@ from typing import Any
 
 import zmq
 
-from tsfusion.transport.curve import ServerKeys
+from tsfusion.transport.curve import ServerKeys, server_keys
 from tsfusion.transport.zap import Zap, sender_of
 
 log = logging.getLogger(__name__)
@@ -35,9 +35,9 @@ class Door:
         if folder is not None:
             from tsfusion.keys import AllowList
 
-            self.keys = ServerKeys.load(Path(folder))
+            self.keys = server_keys(folder)
             self._allowed = AllowList(Path(folder))
-            self._zap = Zap(context, self._allowed.name_of)
+            self._zap = Zap(context, self._allowed.name_of, self._allowed.why_not)
         self.poll = [] if self._zap is None else [self._zap.socket]
 
     @property
