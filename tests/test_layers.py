@@ -18,7 +18,7 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("whole runs", frozenset({"pipeline", "child"})),
     ("processes", frozenset({"server", "gateway", "sessions", "ports", "fuser_link", "fuser",
                              "client", "sender", "outbox", "spool", "recording"})),
-    ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results"})),
+    ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results", "metrics"})),
     ("map and wire", frozenset({"volume", "integration", "surface", "field", "blockstore", "meshing",
                                 "scratch", "storage", "checkpoint", "warmup",
                                 "journal", "transport", "codec"})),
