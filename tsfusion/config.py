@@ -28,6 +28,8 @@ Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Smoothness = Annotated[float, Meta(ge=0, le=1e9)]
 Policy = Literal["thin", "block", "drop_oldest", "spool_all"]
+LogFormat = Literal["text", "json"]
+LogLevel = Literal["debug", "info", "warning", "error"]
 DEFAULT_MAP = "default"
 # Becomes a folder's name, so it is no path: \A and \Z, because `$` would let a newline through.
 MapName = Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9_-]{0,31}\Z")]
@@ -169,6 +171,8 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     quota_keyframes: Positive = 100.0  # a second, of each client
     quota_points: Annotated[int, Meta(ge=1)] = 8 << 20  # points or pixels a keyframe
     quota_extent: Positive = 100_000.0  # metres from the map's origin to a sensor
+    log_format: LogFormat = "text"  # of what goes to stderr: lines, or one JSON object a line
+    log_level: LogLevel = "info"  # what is less than that is left out
 
 
 class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
