@@ -23,7 +23,7 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
                                 "scratch", "storage", "checkpoint", "warmup",
                                 "journal", "transport", "codec"})),
     ("ground", frozenset({"kernels", "runtime", "mesh", "keyframe", "config", "config_toml", "errors",
-                          "process"})),
+                          "process", "disk"})),
 )  # fmt: skip
 
 # All others run where there is no Taichi, and answer while kernels run.
