@@ -24,7 +24,11 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
                                 "scratch", "storage", "checkpoint", "warmup",
                                 "journal", "transport", "codec", "maps"})),
     ("ground", frozenset({"kernels", "runtime", "mesh", "keyframe", "config", "config_toml", "errors",
+<<<<<<< HEAD
                           "process", "logs", "watchdog"})),
+=======
+                          "process", "disk"})),
+>>>>>>> journal
 )  # fmt: skip
 
 # All others run where there is no Taichi, and answer while kernels run.
