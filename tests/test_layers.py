@@ -24,11 +24,7 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
                                 "scratch", "storage", "checkpoint", "warmup",
                                 "journal", "transport", "codec", "maps"})),
     ("ground", frozenset({"kernels", "runtime", "mesh", "keyframe", "config", "config_toml", "errors",
-<<<<<<< HEAD
-                          "process", "logs", "watchdog"})),
-=======
-                          "process", "disk"})),
->>>>>>> journal
+                          "process", "disk", "logs", "watchdog"})),
 )  # fmt: skip
 
 # All others run where there is no Taichi, and answer while kernels run.
