@@ -180,8 +180,8 @@ class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     key: str | None = None  # own secret key, a file of `tsfusion keys new`; None = no keys
     server_key: str | None = None  # the server's public key: a file, or the 40 characters
     policy: Policy = "thin"  # when keyframes come faster than the server takes them
-    backlog: Annotated[int, Meta(ge=1, le=10_000)] = 8  # waiting keyframes at which the policy begins to act
-    spool_bytes: Bytes = 8 << 30  # more is never kept; what comes then is skipped and counted
+    backlog: Annotated[int, Meta(ge=1, le=10_000)] = 8  # keyframes behind at which the policy begins to act
+    spool_bytes: Bytes = 8 << 30  # of the disk; what comes then is skipped and counted
     min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left on the spool's disk
     jpeg_quality: Annotated[int, Meta(ge=1, le=100)] = 90
     segment_bytes: Annotated[int, Meta(ge=1 << 16)] = 64 << 20
