@@ -206,6 +206,7 @@ _KINDS = {
     "bool": "true or false",
     "object": "a table",
 }
+_NAME = "1 to 32 of a-z, 0-9, - and _, a letter or digit first"  # MapName, the one pattern in a configuration
 
 
 def make(struct: type[AnyStruct], settings: dict[str, Any]) -> AnyStruct:
@@ -227,14 +228,16 @@ def _explain(struct: type[Struct], settings: dict[str, Any], problem: str) -> st
     *tables, key = place.rstrip("`").split(".")
     if unknown := re.search(r"unknown field `(.+)`", problem):
         return f"unknown setting {'.'.join(filter(None, (place.rstrip('`'), unknown[1])))}"
-    wanted = re.match(r"Expected `(\w+)[^`]*`(?: ([<>]=? \S+?)(?:\.0)?)?(?:,|$)|Invalid enum", problem)
+    wanted = re.match(
+        r"Expected `(\w+)[^`]*`(?: ([<>]=? \S+?)(?:\.0)?)?(?:,|$)|Invalid enum|.* matching regex", problem
+    )
     if wanted is None:
         return problem
     value: Any = settings
     for table in tables:
         struct, value = struct.__annotations__[table], value[table]
     words = ", ".join(re.findall(r"(?<!class )'(\w+)'", str(struct.__annotations__[key])))
-    must_be = f"one of {words}" if words else wanted[2] or _KINDS.get(wanted[1], wanted[1])
+    must_be = f"one of {words}" if words else wanted[2] or _KINDS.get(wanted[1], wanted[1]) or _NAME
     return f"{'.'.join((*tables, key))} must be {must_be}, got {value[key]!r}"
 
 

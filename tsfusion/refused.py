@@ -10,6 +10,7 @@ from tsfusion.spool import Waiting
 
 FOLDER = "refused"  # inside the spool; opens like any journal
 MAX_BYTES = 64 << 20
+_FILE_OVERHEAD = 2048
 
 log = logging.getLogger(__name__)
 
@@ -20,9 +21,8 @@ class RefusedFolder:
     A temporary spool keeps nothing.
     """
 
-    def __init__(self, outbox: Outbox, max_bytes: int = MAX_BYTES) -> None:
+    def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
-        self._max_bytes = max_bytes
         self._folder = outbox.spool.folder / FOLDER
         self._journal: journal.Journal | None = None
         self._kept: set[tuple[bytes, int]] = set()  # by an earlier process, which was then killed
@@ -30,7 +30,7 @@ class RefusedFolder:
     def give_up(self, entry: Waiting, reason: str, message: str, *, readable: bool = True) -> None:
         """Take a keyframe out of the queue for good. Not while holding `changed`: this uses the disk."""
         log.error("keyframe %d is lost (%s): %s", entry.seq, reason, message)
-        if readable and not self._outbox.spool.temporary and entry.nbytes <= self._max_bytes:
+        if readable and not self._outbox.spool.temporary and entry.nbytes + _FILE_OVERHEAD <= MAX_BYTES:
             try:
                 self._keep(entry)
             except (JournalError, OSError) as error:
@@ -48,7 +48,7 @@ class RefusedFolder:
         if (spool.session, entry.seq) in self._kept:
             return
         for number in journal.segments(self._folder):
-            if self._journal.nbytes + entry.nbytes <= self._max_bytes:
+            if self._journal.nbytes + entry.nbytes + _FILE_OVERHEAD <= MAX_BYTES:
                 break
             self._journal.forget(number)
         position = self._journal.append(frames, session=spool.session, seq=entry.seq)
