@@ -17,7 +17,7 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("command line", frozenset({"__main__", "cli"})),
     ("whole runs", frozenset({"pipeline", "child"})),
     ("processes", frozenset({"server", "gateway", "sessions", "ports", "fuser_link", "fuser",
-                             "client", "intake", "room", "sender", "conversation", "refused", "outbox",
+                             "client", "backpressure", "room", "sender", "conversation", "refused", "outbox",
                              "spool", "recording"})),
     ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results"})),
     ("map and wire", frozenset({"volume", "integration", "surface", "field", "blockstore", "meshing",

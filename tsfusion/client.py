@@ -7,7 +7,7 @@
         client.flush(timeout=10.0)
 
 `send` encodes and writes to the spool; a thread of its own does the talking. What happens when keyframes come
-faster than the map takes them is the policy's choice (`tsfusion.intake`). Taichi is never imported.
+faster than the map takes them is the policy's choice (`tsfusion.backpressure`). Taichi is never imported.
 """
 
 import atexit
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from tsfusion.config import ClientConfig, Policy, override
 from tsfusion.errors import FlushTimeout, KeyframeRefused, ServerUnreachable, TransportError
-from tsfusion.intake import Intake
+from tsfusion.backpressure import Backpressure
 from tsfusion.keyframe import Keyframe
 from tsfusion.mesh import Mesh
 from tsfusion.outbox import ClientStats, Outbox
@@ -83,7 +83,7 @@ class Client:
         self._control = sockets.target(control_address(address, control))
         segment_bytes = min(self._config.segment_bytes, self._config.spool_bytes // _SEGMENTS)
         self._outbox = Outbox(Spool(spool, segment_bytes, map_name=self._config.map))
-        self._intake = Intake(self._outbox, self._config)
+        self._pressure = Backpressure(self._outbox, self._config)
         self._sender = Sender(address, self._control, self._outbox, self._config)
         self._sending = threading.Lock()
         self._closed = False
@@ -103,9 +103,9 @@ class Client:
             self._await_turn()
             with self._sending:
                 self._check_running()
-                if self._intake.must_wait:  # another thread took the turn
+                if self._pressure.must_wait:  # another thread took the turn
                     continue
-                seq = self._intake.put(keyframe)
+                seq = self._pressure.put(keyframe)
             if seq is not None:
                 self._sender.wake()
             return seq
@@ -207,7 +207,7 @@ class Client:
 
     def _await_turn(self) -> None:
         with self._outbox.changed:
-            while self._intake.must_wait:
+            while self._pressure.must_wait:
                 self._check_running()
                 self._outbox.changed.wait(0.5)
 

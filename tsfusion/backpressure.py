@@ -21,7 +21,7 @@ from tsfusion.spool import Waiting
 _THINNEST = 4
 
 
-class Intake:
+class Backpressure:
     """The door of the spool, for one thread at a time."""
 
     def __init__(self, outbox: Outbox, config: ClientConfig) -> None:
