@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+import zmq
 
 from tsfusion.errors import DecodeError, InvalidConfig, ServerUnreachable, TransportError
 from tsfusion.journal import Position, Scan
@@ -36,11 +37,29 @@ def test_a_malformed_address_is_one_clear_error(address: str) -> None:
 
 
 @pytest.mark.parametrize("address", ["tcp://0.0.0.0:5555", "tcp://*:5555", "tcp://192.168.1.4:5555"])
-def test_only_this_machine_may_connect(address: str) -> None:
-    with pytest.raises(InvalidConfig, match="ssh"):
-        sockets.check_loopback(address)
-    sockets.check_loopback("tcp://127.0.0.1:5555")
-    sockets.check_loopback("tcp://localhost:5555")
+def test_without_keys_only_this_machine_may_connect(address: str) -> None:
+    for word in ("tsfusion keys new server", "tsfusion keys allow", "--keys", "ssh -L"):
+        with pytest.raises(InvalidConfig, match=word):
+            sockets.check_reachable(address, has_keys=False)
+    sockets.check_reachable(address, has_keys=True)
+    for own in ("tcp://127.0.0.1:5555", "tcp://localhost:5555", "tcp://[::1]:5555"):
+        sockets.check_reachable(own, has_keys=False)
+
+
+@pytest.mark.parametrize("host", ["*", "0.0.0.0", "127.0.0.1"])
+def test_a_server_can_listen_on_every_interface(host: str) -> None:
+    context: zmq.Context[Any] = zmq.Context()
+    made = sockets.pull(context, 1024), sockets.router(context), sockets.publisher(context)
+    try:
+        sockets.check_free(f"tcp://{host}:0")
+        addresses = sockets.bind(*made, f"tcp://{host}:0", None)
+        shown = host.replace("*", "0.0.0.0")
+        assert addresses.data.startswith(f"tcp://{shown}:")
+        assert sockets.control_address(addresses.data) == addresses.control
+    finally:
+        for one in made:
+            one.close()
+        context.term()
 
 
 def test_a_taken_port_is_one_clear_error() -> None:

@@ -109,10 +109,10 @@ def _signals() -> Iterator[list[int]]:
 
 def _check_addresses(server: ServerConfig) -> None:
     """Fail now, not after the kernels are compiled."""
-    sockets.check_loopback(server.listen)
+    sockets.check_reachable(server.listen, has_keys=False)
     sockets.check_free(server.listen)
     if server.control is not None:
-        sockets.check_loopback(server.control)
+        sockets.check_reachable(server.control, has_keys=False)
         sockets.check_free(server.control)
     elif sockets.split(server.listen)[1]:
         sockets.check_free(sockets.control_address(server.listen))
