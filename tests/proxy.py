@@ -150,7 +150,7 @@ class Proxy:
         self._tasks.add(task)
         try:
             await self._join(reader, writer)
-        except OSError:  # either end went away
+        except (OSError, asyncio.CancelledError):  # either end went away, or all is over
             pass
         finally:
             writer.transport.abort()
@@ -178,9 +178,10 @@ class Proxy:
             await asyncio.sleep(self._wait(len(chunk)))
             await self._open.wait()
             if not self._swallows:
-                writer.write(chunk)
+                with contextlib.suppress(RuntimeError):  # half closed: nothing goes that way any more
+                    self.carried += len(chunk)
+                    writer.write(chunk)
                 await writer.drain()
-                self.carried += len(chunk)
         with contextlib.suppress(OSError, RuntimeError):
             writer.write_eof()
 

@@ -3,8 +3,8 @@
 
     python tests/scanner.py '{"address": …, "spool": …}'
 
-Keyframe number i carries i in its `timestamp_ns`. A scanner that comes back decides by looking which ones were
-taken: what is in the spool or in the server's journal was, whatever its predecessor lived to say of it.
+Keyframe number i carries i in its `timestamp_ns`. A scanner that comes back decides by looking which ones
+were taken: what is in the spool or in the server's journal was, whatever its predecessor lived to say of it.
 """
 
 import os
@@ -16,11 +16,11 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from msgspec import Struct
+from wire import NUMBERED_NS, wall
 
 from tsfusion import Client, Intrinsics, Keyframe, codec, journal
 from tsfusion.config import ClientConfig
 from tsfusion.transport.messages import KeyframeTimes
-from wire import NUMBERED_NS, wall
 
 LOST = 3  # exit status
 
@@ -103,7 +103,9 @@ def source(room: str | None) -> Callable[[int], Keyframe]:
     if room is None:
         return wall
     with np.load(room) as file:
-        depth, color, pose, camera, scale = (file[name] for name in ("depth", "color", "pose", "camera", "scale"))
+        depth, color, pose, camera, scale = (
+            file[name] for name in ("depth", "color", "pose", "camera", "scale")
+        )
 
     def view(i: int, captured_ns: int = 0) -> Keyframe:
         at = i % len(depth)
@@ -141,8 +143,10 @@ def _lines(log: str | None) -> list[str]:
 def scan(plan: Plan) -> Report:
     """Send what is left and see it fused."""
     first, keyframe = first_unsent(plan), source(plan.room)
-    log = Path(os.devnull if plan.log is None else plan.log).open("ab", buffering=0)
-    with log, Client(plan.address, spool=plan.spool, control=plan.control, config=plan.client) as client:
+    with (
+        Path(os.devnull if plan.log is None else plan.log).open("ab", buffering=0) as log,
+        Client(plan.address, spool=plan.spool, control=plan.control, config=plan.client) as client,
+    ):
         started = due = time.monotonic()
         for i in range(first, plan.count):
             if plan.rate is None:
