@@ -15,7 +15,7 @@ from proxy import Proxy
 from scanner import LOST, Plan, Report
 from wire import Server, until
 
-_SCANNER = Path(__file__).with_name("scanner.py")
+SCANNER = Path(__file__).with_name("scanner.py")
 PATIENCE = 180.0  # seconds; for everything to be fused after all
 
 
@@ -96,7 +96,7 @@ class Scanner:
         self._thread.start()
 
     def _start(self) -> "subprocess.Popen[str]":
-        command = [sys.executable, str(_SCANNER), msgspec.json.encode(self.plan).decode()]
+        command = [sys.executable, str(SCANNER), msgspec.json.encode(self.plan).decode()]
         return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
 
     def _keep(self) -> None:

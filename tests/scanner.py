@@ -37,6 +37,7 @@ class Plan(Struct, kw_only=True):
         log: a line is on the disk here for each `send` that returned.
         report: where the `Report` goes when all is fused.
         room: a file of `save_room`, seen again and again; None = `wire.wall`s, each elsewhere.
+        until: sends no more once this file is there.
         ahead: without a rate, at most so many keyframes are on their way to the map.
         patience: seconds to wait for the map in the end.
     """
@@ -50,6 +51,7 @@ class Plan(Struct, kw_only=True):
     log: str | None = None
     report: str | None = None
     room: str | None = None
+    until: str | None = None
     ahead: int = 32
     patience: float = 120.0
     client: ClientConfig = ClientConfig()
@@ -149,6 +151,8 @@ def scan(plan: Plan) -> Report:
     ):
         started = due = time.monotonic()
         for i in range(first, plan.count):
+            if plan.until is not None and Path(plan.until).exists():
+                break
             if plan.rate is None:
                 _let_it_follow(client, plan.ahead)
             else:
