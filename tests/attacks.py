@@ -131,7 +131,8 @@ def subscriptions(target: Target) -> int:
     sent = 0
     with connected(xsub, target.publish) as stranger:
         while not target.over and stranger.poll(1000, zmq.POLLOUT):
-            topic = os.urandom(8) + bytes(60_000 if sent % 50 == 0 else 0)
+            more = 60_000 if sent % 500 == 499 else 400 if sent % 5 == 0 else 0
+            topic = os.urandom(8) + bytes(more)
             stranger.send(b"\x01" + topic)
             sent += 1
             time.sleep(_PAUSE / 20)

@@ -16,6 +16,8 @@ from msgspec import Struct
 from tsfusion.errors import InvalidConfig, TransportError
 
 CONTROL_MAX_BYTES = 64 << 10
+# XPUB keeps a subscription at some fifty times its size; a greeting with keys needs about 330 bytes.
+TOPIC_MAX_BYTES = 512
 MESH_TOPIC = b"mesh"
 _TCP_OPTIONS: dict[int, int] = {zmq.RECONNECT_IVL: 100, zmq.RECONNECT_IVL_MAX: 1000, zmq.TCP_KEEPALIVE: 1}
 _RANDOM_PORT_TRIES = 32
@@ -55,7 +57,7 @@ def router(context: "zmq.Context[Any]") -> AnySocket:
 
 def publisher(context: "zmq.Context[Any]") -> AnySocket:
     """The server's mesh updates; a slow viewer loses the oldest, never holds the server up."""
-    return _make(context, zmq.XPUB, {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: CONTROL_MAX_BYTES})
+    return _make(context, zmq.XPUB, {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES})
 
 
 def subscriber(context: "zmq.Context[Any]") -> AnySocket:
