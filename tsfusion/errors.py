@@ -13,6 +13,7 @@
     │   └── CheckpointError                a saved map is missing, torn or of another version
     ├── TransportError
     │   ├── ServerUnreachable              nobody answered on the control socket in time
+    │   ├── NotAllowed                     the server turned this client's keys away, or its lack of them
     │   ├── FlushTimeout                   keyframes were still unacknowledged at the deadline
     │   └── KeyframeRefused                the server will never take this keyframe, and said why
     ├── OutputError                        a result cannot be written
@@ -68,6 +69,10 @@ class TransportError(TsfusionError):
 
 class ServerUnreachable(TransportError):
     """Nobody answered on the control socket in time."""
+
+
+class NotAllowed(TransportError):
+    """The server turned this client's keys away, or its lack of them; the message says what to do."""
 
 
 class FlushTimeout(TransportError):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Every ZeroMQ socket is made here, so that limits (and keys, once there are any) are set in one place.
+"""Every ZeroMQ socket is made here, so that limits and keys are set in one place.
 
 No ZeroMQ heartbeats: a full PULL stops reading them and drops live connections (libzmq #3937). Nothing
 lingers: what must survive is in the spool.
@@ -13,15 +13,21 @@ from typing import Any
 import zmq
 from msgspec import Struct
 
+from tsfusion.config import DEFAULT_MAP
 from tsfusion.errors import InvalidConfig, TransportError
+from tsfusion.transport.curve import ClientKeys, ServerKeys
 
 CONTROL_MAX_BYTES = 64 << 10
 # XPUB keeps a subscription at some fifty times its size; a greeting with keys needs about 330 bytes.
 TOPIC_MAX_BYTES = 512
-MESH_TOPIC = b"mesh"
-_TCP_OPTIONS: dict[int, int] = {zmq.RECONNECT_IVL: 100, zmq.RECONNECT_IVL_MAX: 1000, zmq.TCP_KEEPALIVE: 1}
+_MESH_TOPIC = b"mesh/"
+_ANY: dict[int, int] = {zmq.HANDSHAKE_IVL: 5000}  # ms; then a connection that is not made is closed
+_CONNECTING = {
+    **_ANY, zmq.RECONNECT_IVL: 100, zmq.RECONNECT_IVL_MAX: 1000, zmq.TCP_KEEPALIVE: 1, zmq.IMMEDIATE: 1
+}  # fmt: skip
 _RANDOM_PORT_TRIES = 32
 LAST_PORT = 65535
+_MAX_TOPIC = 64
 _ADDRESS = re.compile(r"tcp://((?P<host>[\w.*-]+)|\[(?P<host6>[\w:.%]+)\]):(?P<port>[0-9]{1,5}|\*)", re.ASCII)
 
 AnySocket = zmq.Socket[Any]
@@ -35,38 +41,52 @@ class Addresses(Struct, frozen=True):
     publish: str  # mesh updates
 
 
-def push(context: "zmq.Context[Any]") -> AnySocket:
+def push(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySocket:
     """The scanner's data socket. IMMEDIATE: nothing is queued for a server that is not there."""
-    return _make(context, zmq.PUSH, {**_TCP_OPTIONS, zmq.SNDHWM: 10, zmq.IMMEDIATE: 1})
+    return _make(context, zmq.PUSH, {**_CONNECTING, zmq.SNDHWM: 10}, keys)
 
 
-def pull(context: "zmq.Context[Any]", max_frame_bytes: int) -> AnySocket:
+def pull(context: "zmq.Context[Any]", max_frame_bytes: int, keys: ServerKeys | None = None) -> AnySocket:
     """The server's data socket; a larger frame is dropped with its connection before it is in memory."""
-    return _make(context, zmq.PULL, {zmq.RCVHWM: 16, zmq.MAXMSGSIZE: max_frame_bytes})
+    return _make(context, zmq.PULL, {**_ANY, zmq.RCVHWM: 16, zmq.MAXMSGSIZE: max_frame_bytes}, keys)
 
 
-def dealer(context: "zmq.Context[Any]") -> AnySocket:
+def dealer(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySocket:
     """The scanner's control socket. IMMEDIATE: greetings do not pile up for a server that is not there."""
-    return _make(context, zmq.DEALER, {**_TCP_OPTIONS, zmq.SNDHWM: 100, zmq.RCVHWM: 1000, zmq.IMMEDIATE: 1})
+    return _make(context, zmq.DEALER, {**_CONNECTING, zmq.SNDHWM: 100, zmq.RCVHWM: 1000}, keys)
 
 
-def router(context: "zmq.Context[Any]") -> AnySocket:
+def router(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySocket:
     """The server's control socket."""
-    return _make(context, zmq.ROUTER, {zmq.SNDHWM: 1000, zmq.RCVHWM: 100, zmq.MAXMSGSIZE: CONTROL_MAX_BYTES})
+    limits: dict[int, int] = {zmq.SNDHWM: 1000, zmq.RCVHWM: 100, zmq.MAXMSGSIZE: CONTROL_MAX_BYTES}
+    return _make(context, zmq.ROUTER, {**_ANY, **limits}, keys)
 
 
-def publisher(context: "zmq.Context[Any]") -> AnySocket:
+def publisher(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySocket:
     """The server's mesh updates; a slow viewer loses the oldest, never holds the server up."""
-    return _make(context, zmq.XPUB, {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES})
+    limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES}
+    return _make(context, zmq.XPUB, {**_ANY, **limits}, keys)
 
 
-def subscriber(context: "zmq.Context[Any]") -> AnySocket:
-    """A viewer's socket for mesh updates: topic, `work.Meshed`, cells (n, 3) int32, then a mesh's frames.
+def mesh_topic(map_name: str) -> bytes:
+    """Of a map's mesh updates. No map's is the beginning of another's."""
+    return _MESH_TOPIC + map_name.encode() + b"/"
+
+
+def is_mesh_topic(topic: bytes) -> bool:
+    """Whether it asks for one map's updates, or for all of them. Anything else is nobody's to ask for."""
+    return len(topic) <= _MAX_TOPIC and (topic.startswith(_MESH_TOPIC) or _MESH_TOPIC.startswith(topic))
+
+
+def subscriber(
+    context: "zmq.Context[Any]", map_name: str = DEFAULT_MAP, keys: ClientKeys | None = None
+) -> AnySocket:
+    """A viewer's socket for a map's updates: topic, `work.Meshed`, cells (n, 3) int32, then a mesh's frames.
 
     The triangles replace all earlier ones in these cells (blocks of 8³ voxels).
     """
-    made = _make(context, zmq.SUB, {**_TCP_OPTIONS, zmq.RCVHWM: 16})
-    made.setsockopt(zmq.SUBSCRIBE, MESH_TOPIC)
+    made = _make(context, zmq.SUB, {**_CONNECTING, zmq.IMMEDIATE: 0, zmq.RCVHWM: 16}, keys)
+    made.setsockopt(zmq.SUBSCRIBE, mesh_topic(map_name))
     return made
 
 
@@ -75,11 +95,18 @@ def pair(context: "zmq.Context[Any]") -> AnySocket:
     return _make(context, zmq.PAIR, {zmq.SNDHWM: 64, zmq.RCVHWM: 64})
 
 
-def _make(context: "zmq.Context[Any]", kind: int, options: dict[int, int]) -> AnySocket:
+def _make(
+    context: "zmq.Context[Any]",
+    kind: int,
+    options: dict[int, int],
+    keys: ServerKeys | ClientKeys | None = None,
+) -> AnySocket:
     made: AnySocket = context.socket(kind)
     made.setsockopt(zmq.LINGER, 0)
     for option, value in options.items():
         made.setsockopt(option, value)
+    if keys is not None:
+        keys.secure(made)
     return made
 
 
@@ -124,18 +151,23 @@ def target(address: str) -> str:
     return join(host, port)
 
 
-def check_loopback(address: str) -> None:
-    """Raise InvalidConfig unless only this machine can reach the address."""
-    host, _ = split(address)
+def check_reachable(address: str, *, has_keys: bool) -> None:
+    """Raise InvalidConfig when others can reach the address and there are no keys to tell them apart by."""
+    if has_keys or _is_loopback(split(address)[0]):
+        return
+    raise InvalidConfig(
+        f"without keys the server listens on tcp://127.0.0.1 only, got {address}; run `tsfusion keys new "
+        "server` here and `tsfusion keys new NAME` on the scanner, let that in by `tsfusion keys allow NAME "
+        "NAME.key`, and serve with `--keys tsfusion-keys`; or have scanners come through "
+        "`ssh -L 5555:127.0.0.1:5555 -L 5556:127.0.0.1:5556 host`"
+    )
+
+
+def _is_loopback(host: str) -> bool:
     try:
-        local = host == "localhost" or ip_address(host).is_loopback
+        return host == "localhost" or ip_address(host).is_loopback
     except ValueError:
-        local = False
-    if not local:
-        raise InvalidConfig(
-            "connections carry no keys, so the server listens on tcp://127.0.0.1 only, got "
-            f"{address}; reach it from elsewhere by `ssh -L 5555:127.0.0.1:5555 -L 5556:127.0.0.1:5556 host`"
-        )
+        return False
 
 
 def check_free(address: str) -> None:
@@ -145,7 +177,7 @@ def check_free(address: str) -> None:
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((host, port))
+            probe.bind((host.replace("*", ""), port))
         except OSError as error:
             raise TransportError(f"cannot listen on {address}: {error.strerror}") from error
 

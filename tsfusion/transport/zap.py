@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: MIT
+"""Who may connect: the answers to libzmq's questions (ZAP 1.0, ZeroMQ RFC 27), from the gateway's own loop.
+
+libzmq asks once a connection, after the handshake has shown that the client holds its secret key. That is not
+enough: a connection outlives a revocation, so the sender of each message is looked up as well.
+"""
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import zmq
+from zmq.utils import z85
+
+from tsfusion.transport.curve import DOMAIN
+
+log = logging.getLogger(__name__)
+
+_ENDPOINT = "inproc://zeromq.zap.01"
+_QUESTIONS_A_STEP = 100
+_LOG_EVERY = 60.0  # seconds; the same refusal is logged once, and few of them: keys cost nothing to make
+_LOGGED_AT_MOST = 20
+_KEY_BYTES = 32
+Allow = Callable[[str], str | None]
+
+
+class Zap:
+    """Answers for one context. Make it before the sockets with keys bind; close it after them.
+
+    Args:
+        allow: the client's name by its public key (40 characters); None = it may not connect.
+        why_not: a word for the refusal, for the log and for `refused`.
+    """
+
+    def __init__(
+        self, context: "zmq.Context[Any]", allow: Allow, why_not: Callable[[str], str] = lambda _: "unknown"
+    ) -> None:
+        self.refused: Counter[str] = Counter()  # connections, by reason
+        self._allow = allow
+        self._why_not = why_not
+        self._logged: set[tuple[str, str]] = set()
+        self._logged_since = 0.0
+        self.socket: zmq.Socket[Any] = context.socket(zmq.ROUTER)
+        self.socket.setsockopt(zmq.LINGER, 0)
+        self.socket.bind(_ENDPOINT)
+
+    def answer_all(self) -> None:
+        """Answer what has been asked, up to a limit: then the other sockets get their turn. Never waits."""
+        for _ in range(_QUESTIONS_A_STEP):
+            try:
+                frames = self.socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            self._answer(frames)
+
+    def close(self) -> None:
+        """Stop answering: nobody can connect any more."""
+        self.socket.close()
+
+    def _answer(self, frames: Sequence[bytes]) -> None:
+        """Frames: asker, nothing, version, request, domain, address, identity, mechanism, credentials."""
+        if len(frames) < 4:  # nothing that an answer could refer to
+            self.refused["malformed"] += 1
+            return
+        asker, delimiter, version, number, *question = frames
+        if delimiter or version != b"1.0" or len(question) < 4:
+            key, reason = "", "malformed"
+        else:
+            key, reason = self._judge(question)
+        if reason:
+            self._note(key, reason, question[1] if len(question) > 1 else b"")
+        verdict = [b"400", reason.encode(), b"", b""] if reason else [b"200", b"OK", key.encode(), b""]
+        try:
+            self.socket.send_multipart([asker, b"", b"1.0", number, *verdict], zmq.NOBLOCK)
+        except zmq.ZMQError as error:  # the connection has gone meanwhile
+            log.debug("an answer about a connection was not sent: %s", error)
+
+    def _judge(self, question: Sequence[bytes]) -> tuple[str, str]:
+        """The key, and why it may not connect; an empty reason = it may."""
+        domain, _address, _identity, mechanism, *credentials = question
+        if domain != DOMAIN:
+            return "", "domain"
+        if mechanism != b"CURVE":
+            return "", "mechanism"
+        if len(credentials) != 1 or len(credentials[0]) != _KEY_BYTES:
+            return "", "malformed"
+        key = z85.encode(credentials[0]).decode("ascii")
+        return key, "" if self._allow(key) is not None else self._why_not(key)
+
+    def _note(self, key: str, reason: str, address: bytes) -> None:
+        self.refused[reason] += 1
+        now = time.monotonic()
+        if now - self._logged_since > _LOG_EVERY:
+            self._logged.clear()
+            self._logged_since = now
+        if (key, reason) not in self._logged and len(self._logged) < _LOGGED_AT_MOST:
+            self._logged.add((key, reason))
+            place = address[:64].decode("ascii", "replace")
+            log.warning("a connection from %s is refused (%s): key %s", place, reason, key or "none")
+
+
+def sender_of(frame: zmq.Frame) -> str | None:
+    """The public key (40 characters) of the client that sent this frame, received with `copy=False`.
+
+    Only of a socket with keys: one without takes whatever the other side claims.
+    """
+    try:
+        return str(frame.get("User-Id"))
+    except (zmq.ZMQError, UnicodeDecodeError):
+        return None
