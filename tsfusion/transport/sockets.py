@@ -18,6 +18,8 @@ from tsfusion.errors import InvalidConfig, TransportError
 from tsfusion.transport.curve import ClientKeys, ServerKeys
 
 CONTROL_MAX_BYTES = 64 << 10
+# XPUB keeps a subscription at some fifty times its size; a greeting with keys needs about 330 bytes.
+TOPIC_MAX_BYTES = 512
 _MESH_TOPIC = b"mesh/"
 _ANY: dict[int, int] = {zmq.HANDSHAKE_IVL: 5000}  # ms; then a connection that is not made is closed
 _CONNECTING = {
@@ -62,7 +64,7 @@ def router(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySo
 
 def publisher(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySocket:
     """The server's mesh updates; a slow viewer loses the oldest, never holds the server up."""
-    limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: CONTROL_MAX_BYTES}
+    limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES}
     return _make(context, zmq.XPUB, {**_ANY, **limits}, keys)
 
 
