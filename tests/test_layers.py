@@ -21,9 +21,9 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results"})),
     ("map and wire", frozenset({"volume", "integration", "surface", "field", "blockstore", "meshing",
                                 "scratch", "storage", "checkpoint", "warmup",
-                                "journal", "transport", "codec"})),
+                                "journal", "transport", "codec", "keys"})),
     ("ground", frozenset({"kernels", "runtime", "mesh", "keyframe", "config", "config_toml", "errors",
-                          "process"})),
+                          "process", "private_folder"})),
 )  # fmt: skip
 
 # All others run where there is no Taichi, and answer while kernels run.
