@@ -25,7 +25,7 @@ from tsfusion.errors import InvalidConfig, OutputError
 Here = Callable[..., "subprocess.CompletedProcess[str]"]
 
 NOBODY = "tcp://127.0.0.1:9"  # the discard port: nobody listens there, and nobody may without being root
-VERBS = ["demo", "replay", "serve", "mesh", "status", "doctor", "config", "datasets"]
+VERBS = ["demo", "replay", "serve", "mesh", "status", "doctor", "keys", "config", "datasets"]
 
 
 def scene(folder: Path, *, pose: str | None = None, depth: bytes | None = None) -> Path:
@@ -178,6 +178,10 @@ def test_doctor_says_what_to_do(here: Here, tmp_path: Path) -> None:
         (["mesh", "nonsense://x", "a.ply"], "an address looks like"),
         (["serve", "--listen", "nonsense"], "an address looks like"),
         (["serve", "--listen", "tcp://0.0.0.0:5555"], "127.0.0.1"),
+        (["replay", "synthetic:room", "--key", "file"], "--key has no effect without --connect"),
+        (["replay", "synthetic:room", "--connect", NOBODY, "--key", "file"], "key needs server_key, too"),
+        (["mesh", NOBODY, "a.ply", "--server-key", "K"], "server_key needs key, too"),
+        (["mesh", "garbage.tsf", "a.ply", "--key", "file"], "--key has no effect on garbage.tsf"),
         (["serve", "--state", "file"], "cannot write the state folder"),
         (["serve", "--threads", "0"], "threads must be >= 1, got 0"),
         (["serve", "--max-range", "0.01"], "min_range"),

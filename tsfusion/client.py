@@ -29,7 +29,16 @@ from tsfusion.mesh import Mesh
 from tsfusion.outbox import ClientStats, Outbox
 from tsfusion.sender import Sender
 from tsfusion.spool import Spool
-from tsfusion.transport import Command, KeyframeTimes, Reply, Status, control_address, request, sockets
+from tsfusion.transport import (
+    ClientKeys,
+    Command,
+    KeyframeTimes,
+    Reply,
+    Status,
+    control_address,
+    request,
+    sockets,
+)  # fmt: skip
 from tsfusion.transport.messages import MeshLayout
 
 __all__ = ["Client", "ClientStats", "fetch_mesh", "fetch_status"]
@@ -210,43 +219,58 @@ class Client:
         return why if self._outbox.spool.temporary else f"{why}; they stay in {self._outbox.spool.folder}"
 
 
-def fetch_status(address: str, *, control: str | None = None, timeout: float = 10.0) -> Status:
+def fetch_status(
+    address: str, *, control: str | None = None, timeout: float = 10.0, keys: ClientKeys | None = None
+) -> Status:
     """How the server at a data address is doing.
 
+    Args:
+        keys: of `curve.client_keys`, for a server with keys.
+
     Raises:
+        NotAllowed: when the server turns the connection away.
         ServerUnreachable: when nobody answers in `timeout` seconds.
         TransportError: when the server cannot say.
     """
-    reply, _ = _ask(address, control, Command(name="status"), timeout)
+    reply, _ = _ask(address, control, Command(name="status"), timeout, keys)
     if reply.status is None:
         raise TransportError(f"the server at {address} answered without a status")
     return reply.status
 
 
 def fetch_mesh(
-    address: str, *, control: str | None = None, min_weight: float | None = None, timeout: float = 60.0
+    address: str,
+    *,
+    control: str | None = None,
+    min_weight: float | None = None,
+    timeout: float = 60.0,
+    keys: ClientKeys | None = None,
 ) -> Mesh:
     """The whole mesh of the server at a data address, as of now.
 
+    Args:
+        keys: of `curve.client_keys`, for a server with keys.
+
     Raises:
+        NotAllowed: when the server turns the connection away.
         ServerUnreachable: when nobody is there (known after a few seconds), or the mesh takes longer than
             `timeout` seconds.
         TransportError: when the server cannot make it.
     """
-    reply, frames = _ask(address, control, Command(name="mesh", min_weight=min_weight), timeout)
+    reply, frames = _ask(address, control, Command(name="mesh", min_weight=min_weight), timeout, keys)
     if reply.mesh is None:
         raise TransportError(f"the server at {address} answered without a mesh")
     return mesh_of(reply.mesh, frames)
 
 
 def _ask(
-    address: str, control: str | None, command: Command, timeout: float
+    address: str, control: str | None, command: Command, timeout: float, keys: ClientKeys | None
 ) -> tuple[Reply, list[memoryview]]:
     """The fuser's answer. That takes its time, so it is asked first whether anybody is there."""
     address = control_address(sockets.target(address), control)
     if timeout > _ANSWER_TIMEOUT:
-        request(address, Command(name="ping"), timeout=_ANSWER_TIMEOUT)
-    return request(address, command, timeout=timeout)
+        request(address, Command(name="ping"), timeout=_ANSWER_TIMEOUT, keys=keys)
+    return request(address, command, timeout=timeout, keys=keys)
 
 
 def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:

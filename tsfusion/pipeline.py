@@ -26,7 +26,7 @@ from tsfusion.errors import FlushTimeout, OutputError, TransportError
 from tsfusion.keyframe import Keyframe
 from tsfusion.mesh import Mesh
 from tsfusion.results import RECORD, building
-from tsfusion.transport import KeyframeTimes, Status
+from tsfusion.transport import KeyframeTimes, Status, client_keys
 from tsfusion.transport.messages import Spread
 
 AHEAD = 3  # keyframes under way when no rate is asked for: fusing, waiting, travelling
@@ -138,6 +138,7 @@ def replay(
             progress.stage(f"connecting to {connect}")
             place = nullcontext((override(client, address=connect), None))
         with place as (link, child):
+            keys = client_keys(link.key, link.server_key)
             with Client(link.address, spool=scratch / "spool", control=link.control, config=link) as scanner:
                 scanner.connect()
                 run = _Run(dataset, first, scanner, child, progress)
@@ -146,8 +147,8 @@ def replay(
                 with suppress(FlushTimeout):  # a stamp less in the ledger is no reason to lose the run
                     scanner.wait_meshed()
                 run.records = scanner.records
-            status = fetch_status(link.address, control=link.control)
-            mesh = fetch_mesh(link.address, control=link.control, min_weight=min_weight)
+            status = fetch_status(link.address, control=link.control, keys=keys)
+            mesh = fetch_mesh(link.address, control=link.control, min_weight=min_weight, keys=keys)
         if not len(mesh.faces):
             raise OutputError(
                 f"the map has no surface to write: {run.stats.fused} of {run.stats.sent} keyframes fused; "

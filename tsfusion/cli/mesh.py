@@ -31,6 +31,8 @@ def mesh(
     *,
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw it, too.")] = None,
     control: options.Control = None,
+    key: options.Key = None,
+    server_key: options.ServerKey = None,
     config: options.ConfigFile = None,
     json: options.Json = False,
     **settings: Any,
@@ -48,12 +50,15 @@ def mesh(
             "has no effect on a live server's map: give it to `tsfusion serve`",
         )  # fmt: skip
         from tsfusion.client import fetch_mesh
+        from tsfusion.transport import client_keys
 
-        made = fetch_mesh(source, control=control, min_weight=settings["min_weight"])
+        keys = client_keys(key, server_key)
+        made = fetch_mesh(source, control=control, min_weight=settings["min_weight"], keys=keys)
     else:
         options.refuse(
-            context, ("control",), f"has no effect on {source}: only a live server (tcp://…) has one"
-        )
+            context, ("control", "key", "server_key"),
+            f"has no effect on {source}: only a live server (tcp://…) has one",
+        )  # fmt: skip
         if source.endswith(".tsf"):
             options.refuse(
                 context, options.MAP_OPTIONS.keys() - options.VIEW_OPTIONS,

@@ -37,6 +37,8 @@ def replay(
     out: Out = Path("out"),
     connect: options.Connect = None,
     control: options.Control = None,
+    key: options.Key = None,
+    server_key: options.ServerKey = None,
     rate: Rate = None,
     max_keyframes: Limit = None,
     start: Annotated[
@@ -71,7 +73,7 @@ def replay(
             "has no effect with --connect: give it to the `tsfusion serve` that listens there",
         )  # fmt: skip
     else:
-        options.refuse(context, ("control",), "has no effect without --connect")
+        options.refuse(context, ("control", "key", "server_key"), "has no effect without --connect")
     dataset = _open(path, sequence=sequence, modality=modality, poses=poses)
     chosen = options.configuration(
         config, preset={"sensor": dataset.sensor}, **settings,
@@ -82,7 +84,7 @@ def replay(
         typer.echo(f"left out {count} frames {reason}", err=True)
     _run(
         dataset, out, chosen, connect=connect, control=control, rate=rate, state=state, json=json,
-        min_weight=settings["min_weight"],
+        min_weight=settings["min_weight"], key=key, server_key=server_key,
     )  # fmt: skip
 
 
@@ -137,19 +139,27 @@ def _run(
     *,
     json: bool,
     state: Path | None = None,
+    connect: str | None = None,
     control: str | None = None,
+    key: str | None = None,
+    server_key: str | None = None,
     **settings: Any,
 ) -> None:
+    from msgspec.structs import replace
+
     from tsfusion import pipeline
     from tsfusion.cli import show
     from tsfusion.config import override
 
     server = override(chosen.server, listen="tcp://127.0.0.1:0", state=str(state)) if state else None
-    client = override(chosen.client, control=control)
+    client = override(chosen.client, control=control, key=key, server_key=server_key)
+    if connect is None:  # an own server, which only this machine reaches: no keys
+        server = replace(server, keys=None) if server else None
+        client = replace(client, key=None, server_key=None)
     with show.progress(quiet=json) as progress:
         run = pipeline.replay(
             dataset, out, volume=chosen.volume, server=server, client=client, progress=progress,
-            **settings,
+            connect=connect, **settings,
         )  # fmt: skip
     if json:
         show.as_json(run)

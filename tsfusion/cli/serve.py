@@ -37,6 +37,14 @@ def serve(
             metavar="DIR", envvar="TSFUSION_STATE", help="Journal and map; what is there is taken up again."
         ),
     ] = None,
+    keys: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DIR",
+            envvar="TSFUSION_KEYS",
+            help="Let in only who `tsfusion keys allow` named; needed to listen beyond this machine.",
+        ),
+    ] = None,
     config: options.ConfigFile = None,
     json: options.Json = False,
     until_eof: Annotated[bool, typer.Option("--until-eof", hidden=True)] = False,
@@ -49,7 +57,7 @@ def serve(
     started = time.monotonic()
     from tsfusion import server
 
-    chosen = options.configuration(config, listen=listen, control=control, state=state, **settings)
+    chosen = options.configuration(config, listen=listen, control=control, state=state, keys=keys, **settings)
     if until_eof:
         threading.Thread(target=_stop_at_eof, daemon=True).start()
 
