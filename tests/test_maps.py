@@ -12,9 +12,9 @@ from wire import DEADLINE, connected, serving, until, wall
 
 import tsfusion
 from tsfusion import Client, codec, config, config_toml, maps
-from tsfusion.client import fetch_health, fetch_mesh, fetch_status
 from tsfusion.config import ServerConfig, VolumeConfig
 from tsfusion.errors import DatasetError, ServerUnreachable, TransportError
+from tsfusion.fetch import fetch_health, fetch_mesh, fetch_status
 from tsfusion.quota import Quotas
 from tsfusion.recording import Recording
 from tsfusion.transport import messages, sockets
