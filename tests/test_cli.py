@@ -202,7 +202,13 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     monkeypatch.setattr("tsfusion.client._ANSWER_TIMEOUT", 0.2)
     done = here(*arguments)
     assert words in one_line(done)
-    left = {path.name for path in tmp_path.rglob("*")} - {"tsfusion-state", "journal", "lock"}
+    left = {path.name for path in tmp_path.rglob("*")} - {
+        "tsfusion-state",
+        "maps",
+        "default",
+        "journal",
+        "lock",
+    }
     assert left == {"empty", "file", "garbage.tsf"}
     assert (tmp_path / "file").read_text() == "here first"
 

@@ -16,15 +16,16 @@ PACKAGE = Path(__file__).parent.parent / "tsfusion"
 ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("command line", frozenset({"__main__", "cli"})),
     ("whole runs", frozenset({"pipeline", "child"})),
-    ("processes", frozenset({"server", "gateway", "sessions", "ports", "fuser_link", "fuser",
+    ("processes", frozenset({"server", "gateway", "intake", "door", "hosted", "retention", "reports",
+                             "questions", "quota", "quarantine", "sessions", "ports", "fuser_link", "fuser",
                              "client", "backpressure", "room", "sender", "connection", "conversation",
                              "refused", "outbox", "spool", "recording"})),
-    ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results"})),
+    ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results", "metrics"})),
     ("map and wire", frozenset({"volume", "integration", "surface", "field", "blockstore", "meshing",
                                 "scratch", "storage", "checkpoint", "warmup",
-                                "journal", "transport", "codec"})),
+                                "journal", "transport", "codec", "maps"})),
     ("ground", frozenset({"kernels", "runtime", "mesh", "keyframe", "config", "config_toml", "errors",
-                          "process"})),
+                          "process", "disk", "logs", "watchdog"})),
 )  # fmt: skip
 
 # All others run where there is no Taichi, and answer while kernels run.

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.backpressure import Backpressure
-from tsfusion.config import ClientConfig, Policy, override
+from tsfusion.config import DEFAULT_MAP, ClientConfig, Policy, override
 from tsfusion.errors import FlushTimeout, KeyframeRefused, NotAllowed, ServerUnreachable, TransportError
 from tsfusion.keyframe import Keyframe
 from tsfusion.mesh import Mesh
@@ -32,9 +32,9 @@ from tsfusion.sender import Sender
 from tsfusion.spool import Spool
 from tsfusion.transport import Command, KeyframeTimes, Reply, Status, control_address, request, sockets
 from tsfusion.transport.curve import client_keys
-from tsfusion.transport.messages import MeshLayout
+from tsfusion.transport.messages import Health, MeshLayout
 
-__all__ = ["Client", "ClientStats", "fetch_mesh", "fetch_status"]
+__all__ = ["Client", "ClientStats", "fetch_health", "fetch_mesh", "fetch_status"]
 
 _ANSWER_TIMEOUT = 5.0  # seconds; the gateway is never busy, so who says nothing for so long is not there
 _SEGMENTS = 8  # at least so many files hold what the spool may hold: it shrinks by whole files
@@ -246,30 +246,49 @@ class Client:
         return why if self._outbox.spool.temporary else f"{why}; they stay in {self._outbox.spool.folder}"
 
 
-def fetch_status(address: str, *, control: str | None = None, timeout: float = 10.0) -> Status:
-    """How the server at a data address is doing.
+def fetch_health(address: str, *, control: str | None = None, timeout: float = 10.0) -> Health:
+    """How the server at a data address is doing; answered at once, whatever its fusers do.
+
+    Raises:
+        ServerUnreachable: when nobody answers in `timeout` seconds.
+    """
+    reply, _ = _ask(address, control, Command(name="health"), timeout)
+    if reply.health is None:
+        raise TransportError(f"the server at {address} answered without its health")
+    return reply.health
+
+
+def fetch_status(
+    address: str, *, control: str | None = None, map_name: str = DEFAULT_MAP, timeout: float = 10.0
+) -> Status:
+    """How a map of the server at a data address is doing.
 
     Raises:
         ServerUnreachable: when nobody answers in `timeout` seconds.
         TransportError: when the server cannot say.
     """
-    reply, _ = _ask(address, control, Command(name="status"), timeout)
+    reply, _ = _ask(address, control, Command(name="status", map=map_name), timeout)
     if reply.status is None:
         raise TransportError(f"the server at {address} answered without a status")
     return reply.status
 
 
 def fetch_mesh(
-    address: str, *, control: str | None = None, min_weight: float | None = None, timeout: float = 60.0
+    address: str,
+    *,
+    control: str | None = None,
+    map_name: str = DEFAULT_MAP,
+    min_weight: float | None = None,
+    timeout: float = 60.0,
 ) -> Mesh:
-    """The whole mesh of the server at a data address, as of now.
+    """The whole mesh of a map of the server at a data address, as of now.
 
     Raises:
         ServerUnreachable: when nobody is there (known after a few seconds), or the mesh takes longer than
             `timeout` seconds.
         TransportError: when the server cannot make it.
     """
-    reply, frames = _ask(address, control, Command(name="mesh", min_weight=min_weight), timeout)
+    reply, frames = _ask(address, control, Command(name="mesh", map=map_name, min_weight=min_weight), timeout)
     if reply.mesh is None:
         raise TransportError(f"the server at {address} answered without a mesh")
     return mesh_of(reply.mesh, frames)

@@ -28,6 +28,8 @@ Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Smoothness = Annotated[float, Meta(ge=0, le=1e9)]
 Policy = Literal["thin", "block", "drop_oldest", "spool_all"]
+LogFormat = Literal["text", "json"]
+LogLevel = Literal["debug", "info", "warning", "error"]
 DEFAULT_MAP = "default"
 # Becomes a folder's name, so it is no path: \A and \Z, because `$` would let a newline through.
 MapName = Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9_-]{0,31}\Z")]
@@ -169,6 +171,8 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     quota_keyframes: Positive = 100.0  # a second, of each client
     quota_points: Annotated[int, Meta(ge=1)] = 8 << 20  # points or pixels a keyframe
     quota_extent: Positive = 100_000.0  # metres from the map's origin to a sensor
+    log_format: LogFormat = "text"  # of what goes to stderr: lines, or one JSON object a line
+    log_level: LogLevel = "info"  # what is less than that is left out
 
 
 class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -195,6 +199,21 @@ class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     volume: VolumeConfig = VolumeConfig()
     server: ServerConfig = ServerConfig()
     client: ClientConfig = ClientConfig()
+    maps: dict[MapName, dict[str, Any]] = {}  # [maps.NAME]: what differs there from [volume]
+
+    def volumes(self) -> dict[str, VolumeConfig]:
+        """The settings of the maps that have some of their own.
+
+        Raises:
+            InvalidConfig: for an unknown key or a bad value.
+        """
+        found = {}
+        for name, settings in self.maps.items():
+            try:
+                found[name] = override(self.volume, **settings)
+            except InvalidConfig as error:
+                raise InvalidConfig(f"[maps.{name}]: {error}") from error
+        return found
 
 
 AnyStruct = TypeVar("AnyStruct", bound=Struct)
@@ -263,7 +282,9 @@ def load(path: str | Path | None, **volume: Any) -> Config:
     if isinstance(given := tables.get("volume", {}), dict):
         tables["volume"] = {**volume, **given}
     try:
-        return make(Config, tables)
+        made = make(Config, tables)
+        made.volumes()
+        return made
     except InvalidConfig as error:
         raise InvalidConfig(f"{path}: {error}") from error
 

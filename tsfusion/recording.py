@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion import codec, journal
+from tsfusion import codec, journal, maps
 from tsfusion.config import VolumeConfig
 from tsfusion.errors import DecodeError, JournalError
 from tsfusion.keyframe import Keyframe
 
 
 class Recording:
-    """The keyframes of a state folder, its `journal` folder, a spool folder or one `.mcap` segment.
+    """The keyframes of a state folder (of one map, or of the one named), a map's folder or its `journal`, a
+    spool folder or one `.mcap` segment.
 
     Each once and in journal order, also when a crash left a second copy. Keyframes the map had to reject
     are among them.
@@ -24,10 +25,10 @@ class Recording:
         JournalError: when there is no keyframe.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        path = Path(path)
-        if (path / "journal").is_dir():
-            path = path / "journal"
+    def __init__(self, path: str | os.PathLike[str], map_name: str | None = None) -> None:
+        path = maps.resolve(Path(path), map_name)
+        if (path / maps.JOURNAL_FOLDER).is_dir():
+            path = path / maps.JOURNAL_FOLDER
         self.name = str(path)
         self._places = _places(path)
         if not self._places:

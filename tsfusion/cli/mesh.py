@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from tsfusion.recording import Recording
     from tsfusion.volume import Volume
 
-MAP_FILE = "map.tsf"
-
 
 @options.takes_map_settings
 def mesh(
@@ -31,6 +29,7 @@ def mesh(
     *,
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw it, too.")] = None,
     control: options.Control = None,
+    map_: options.Map = None,
     config: options.ConfigFile = None,
     json: options.Json = False,
     **settings: Any,
@@ -48,8 +47,11 @@ def mesh(
             "has no effect on a live server's map: give it to `tsfusion serve`",
         )  # fmt: skip
         from tsfusion.client import fetch_mesh
+        from tsfusion.config import DEFAULT_MAP
 
-        made = fetch_mesh(source, control=control, min_weight=settings["min_weight"])
+        made = fetch_mesh(
+            source, control=control, map_name=map_ or DEFAULT_MAP, min_weight=settings["min_weight"]
+        )
     else:
         options.refuse(
             context, ("control",), f"has no effect on {source}: only a live server (tcp://…) has one"
@@ -63,7 +65,7 @@ def mesh(
         given = config is not None or any(
             value is not None for name, value in settings.items() if name not in options.VIEW_OPTIONS
         )
-        made = _volume(Path(source), chosen.volume, given=given, quiet=json).extract_mesh()
+        made = _volume(Path(source), chosen.volume, name=map_, given=given, quiet=json).extract_mesh()
     made.save(out)
     if preview is not None:
         from tsfusion.preview import render
@@ -72,7 +74,7 @@ def mesh(
     _tell(made, out, json)
 
 
-def _volume(source: Path, config: "VolumeConfig", *, given: bool, quiet: bool) -> "Volume":
+def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bool, quiet: bool) -> "Volume":
     """The saved map where there is a complete one, else a new one of every keyframe of the journal."""
     from tsfusion.config import VIEW_SETTINGS
     from tsfusion.errors import DatasetError
@@ -83,10 +85,12 @@ def _volume(source: Path, config: "VolumeConfig", *, given: bool, quiet: bool) -
         raise DatasetError(f"{source} does not exist; expected a map (.tsf), a state folder or a journal")
     if source.suffix == ".tsf":
         return Volume.load(source, config.threads, **view)
+    from tsfusion import maps
     from tsfusion.recording import Recording
 
+    source = maps.resolve(source, name)
     recording = Recording(source)
-    saved = source / MAP_FILE
+    saved = source / maps.MAP_FILE
     if saved.is_file() and not given:
         volume = Volume.load(saved, config.threads, **view)
         if volume.keyframes == len(recording):

@@ -37,6 +37,7 @@ def replay(
     out: Out = Path("out"),
     connect: options.Connect = None,
     control: options.Control = None,
+    map_: options.Map = None,
     rate: Rate = None,
     max_keyframes: Limit = None,
     start: Annotated[
@@ -81,13 +82,20 @@ def replay(
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count} frames {reason}", err=True)
     _run(
-        dataset, out, chosen, connect=connect, control=control, rate=rate, state=state, json=json,
+        dataset, out, chosen, connect=connect, control=control, map_=map_, rate=rate, state=state, json=json,
         min_weight=settings["min_weight"],
     )  # fmt: skip
 
 
 def _open(path: Path, **given: Any) -> "Dataset":
-    if path.suffix == ".mcap" or any(path.glob("*.mcap")) or any(path.glob("journal/*.mcap")):
+    from tsfusion import maps
+
+    if (
+        path.suffix == ".mcap"
+        or any(path.glob("*.mcap"))
+        or any(path.glob("journal/*.mcap"))
+        or maps.is_state(path)
+    ):
         from tsfusion.errors import DatasetError
         from tsfusion.recording import Recording
 
@@ -138,6 +146,7 @@ def _run(
     json: bool,
     state: Path | None = None,
     control: str | None = None,
+    map_: str | None = None,
     **settings: Any,
 ) -> None:
     from tsfusion import pipeline
@@ -145,7 +154,7 @@ def _run(
     from tsfusion.config import override
 
     server = override(chosen.server, listen="tcp://127.0.0.1:0", state=str(state)) if state else None
-    client = override(chosen.client, control=control)
+    client = override(chosen.client, control=control, map=map_)
     with show.progress(quiet=json) as progress:
         run = pipeline.replay(
             dataset, out, volume=chosen.volume, server=server, client=client, progress=progress,
