@@ -259,6 +259,6 @@ def test_a_spool_has_one_user(tmp_path: Path) -> None:
 def test_an_entry_in_the_middle_can_be_removed(tmp_path: Path) -> None:
     spool = Spool(tmp_path, 100_000)
     put(spool, 3)
-    spool.remove(spool.waiting[1])
+    spool.remove(1)
     assert [entry.seq for entry in spool.waiting] == [1, 3]
     spool.close()

@@ -18,17 +18,14 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("whole runs", frozenset({"pipeline", "child"})),
     ("processes", frozenset({"server", "gateway", "intake", "door", "hosted", "retention", "reports",
                              "questions", "quota", "quarantine", "sessions", "ports", "fuser_link", "fuser",
-                             "client", "sender", "outbox", "spool", "recording"})),
+                             "client", "backpressure", "room", "sender", "conversation", "refused",
+                             "outbox", "spool", "recording"})),
     ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results", "metrics"})),
     ("map and wire", frozenset({"volume", "integration", "surface", "field", "blockstore", "meshing",
                                 "scratch", "storage", "checkpoint", "warmup",
                                 "journal", "transport", "codec", "maps"})),
     ("ground", frozenset({"kernels", "runtime", "mesh", "keyframe", "config", "config_toml", "errors",
-<<<<<<< HEAD
-                          "process", "logs", "watchdog"})),
-=======
-                          "process", "disk"})),
->>>>>>> journal
+                          "process", "disk", "logs", "watchdog"})),
 )  # fmt: skip
 
 # All others run where there is no Taichi, and answer while kernels run.

@@ -126,7 +126,7 @@ def test_a_journal_whose_folder_vanishes_is_a_clear_error(tmp_path: Path) -> Non
 
 
 def test_a_client_survives_the_loss_of_its_spool_files(shared: Server, tmp_path: Path) -> None:
-    small = ClientConfig(segment_bytes=1 << 16, stall_timeout=0.5)
+    small = ClientConfig(segment_bytes=1 << 16, stall_timeout=0.5, policy="spool_all")
     with Client("tcp://127.0.0.1:1", spool=tmp_path, config=small) as early:
         for i in range(40):
             early.send(wall(i))

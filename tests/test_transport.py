@@ -2,6 +2,7 @@
 """Addresses, control messages, clocks, and the gateway's bookkeeping."""
 
 import socket
+from typing import Any
 
 import msgspec
 import numpy as np

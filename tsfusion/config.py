@@ -184,8 +184,8 @@ class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     key: str | None = None  # own secret key, a file of `tsfusion keys new`; None = no keys
     server_key: str | None = None  # the server's public key: a file, or the 40 characters
     policy: Policy = "thin"  # when keyframes come faster than the server takes them
-    backlog: Annotated[int, Meta(ge=1, le=10_000)] = 8  # waiting keyframes at which the policy begins to act
-    spool_bytes: Bytes = 8 << 30  # more is never kept; what comes then is skipped and counted
+    backlog: Annotated[int, Meta(ge=1, le=10_000)] = 8  # keyframes behind at which the policy begins to act
+    spool_bytes: Bytes = 8 << 30  # of the disk; what comes then is skipped and counted
     min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left on the spool's disk
     jpeg_quality: Annotated[int, Meta(ge=1, le=100)] = 90
     segment_bytes: Annotated[int, Meta(ge=1 << 16)] = 64 << 20
@@ -225,6 +225,7 @@ _KINDS = {
     "bool": "true or false",
     "object": "a table",
 }
+_NAME = "1 to 32 of a-z, 0-9, - and _, a letter or digit first"  # MapName, the one pattern in a configuration
 
 
 def make(struct: type[AnyStruct], settings: dict[str, Any]) -> AnyStruct:
@@ -246,14 +247,16 @@ def _explain(struct: type[Struct], settings: dict[str, Any], problem: str) -> st
     *tables, key = place.rstrip("`").split(".")
     if unknown := re.search(r"unknown field `(.+)`", problem):
         return f"unknown setting {'.'.join(filter(None, (place.rstrip('`'), unknown[1])))}"
-    wanted = re.match(r"Expected `(\w+)[^`]*`(?: ([<>]=? \S+?)(?:\.0)?)?(?:,|$)|Invalid enum", problem)
+    wanted = re.match(
+        r"Expected `(\w+)[^`]*`(?: ([<>]=? \S+?)(?:\.0)?)?(?:,|$)|Invalid enum|.* matching regex", problem
+    )
     if wanted is None:
         return problem
     value: Any = settings
     for table in tables:
         struct, value = struct.__annotations__[table], value[table]
     words = ", ".join(re.findall(r"(?<!class )'(\w+)'", str(struct.__annotations__[key])))
-    must_be = f"one of {words}" if words else wanted[2] or _KINDS.get(wanted[1], wanted[1])
+    must_be = f"one of {words}" if words else wanted[2] or _KINDS.get(wanted[1], wanted[1]) or _NAME
     return f"{'.'.join((*tables, key))} must be {must_be}, got {value[key]!r}"
 
 

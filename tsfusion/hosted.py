@@ -220,7 +220,7 @@ class HostedMap:
         self._meshed = 0
 
     def _check_begin(self, ready: work.Ready) -> None:
-        if not ready.done and self._journal.pruned:
+        if not ready.done and self._journal.first > 1:
             log.error(
                 "map %s lost its checkpoint, and its journal goes back to segment %d only: what was before "
                 "is lost", self.name, self._journal.first,

@@ -132,7 +132,7 @@ def _check_addresses(server: ServerConfig) -> None:
     """Fail now, not after the kernels are compiled."""
     for address in (server.listen, server.control):
         if address is not None:
-            sockets.check_reachable(address, server.keys is not None)
+            sockets.check_reachable(address, has_keys=server.keys is not None)
             sockets.check_free(address)
     if server.control is None and sockets.split(server.listen)[1]:
         sockets.check_free(sockets.control_address(server.listen))

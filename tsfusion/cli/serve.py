@@ -80,17 +80,13 @@ def serve(
     def on_ready(addresses: "Addresses") -> None:
         _announce(addresses, chosen.server.state, time.monotonic() - started, json)
 
-<<<<<<< HEAD
-    return server.run(chosen.server, chosen.volume, on_ready, volumes=chosen.volumes())
-=======
     try:
-        return server.run(chosen.server, chosen.volume, on_ready)
+        return server.run(chosen.server, chosen.volume, on_ready, volumes=chosen.volumes())
     except TsfusionError as error:
         if chosen.server.log_format == "text":
             raise
         log.critical("%s", error)  # the last line is an object, too
         return 1
->>>>>>> observe
 
 
 def _announce(addresses: "Addresses", state: str, seconds: float, json: bool) -> None:

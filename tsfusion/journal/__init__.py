@@ -16,12 +16,8 @@ from tsfusion.journal.segments import (
     segment_path,
     segments,
 )
-<<<<<<< HEAD
-from tsfusion.journal.writer import Journal, write_file
-=======
 from tsfusion.journal.walk import Damage, walk
-from tsfusion.journal.writer import Journal
->>>>>>> journal
+from tsfusion.journal.writer import Journal, write_file
 
 __all__ = [
     "Damage",
@@ -36,9 +32,6 @@ __all__ = [
     "scan",
     "segment_path",
     "segments",
-<<<<<<< HEAD
-    "write_file",
-=======
     "walk",
->>>>>>> journal
+    "write_file",
 ]

@@ -94,6 +94,11 @@ class Journal:
         return self._room.free_bytes
 
     @property
+    def first(self) -> int:
+        """The number of the oldest segment; more than 1 = older ones were let go."""
+        return next(iter(self._closed), self._number)
+
+    @property
     def segment(self) -> int:
         """The number of the segment that is (or will be) written to."""
         return self._number
@@ -123,15 +128,8 @@ class Journal:
         try:
             file = self._open()
             position = Position(self._number, file.tell())
-<<<<<<< HEAD
-            _add(self._writer, payload, seq)
-            file.flush()
-            if self._sync:
-                os.fdatasync(file.fileno())
-=======
             layout.add(self._writer, layout.pack(frames, self._identity, session, seq, client), seq, now_ns)
             self._flush()
->>>>>>> journal
         except OSError as error:
             self._abandon(position.offset)
             raise failed("write", self.folder, error) from error
@@ -155,11 +153,6 @@ class Journal:
         except OSError as error:
             log.warning("%s", failed("close", segment_path(self.folder, self._number), error))
             self._abandon()
-
-    def begin_after(self, segment: int) -> None:
-        """Number new segments above one that a map remembers, though its file may have been removed."""
-        if self._file is None:
-            self._number = max(self._number, segment + 1)
 
     def rotate(self) -> None:
         """Close the segment with its index; the next append begins another."""
@@ -213,16 +206,11 @@ class Journal:
     def _open(self) -> BinaryIO:
         if self._file is None:
             self._first = 0
-<<<<<<< HEAD
-            self._file = path.open("xb")
-            self._writer = _started(self._file)
-=======
             self._file = segment_path(self.folder, self._number).open("xb")
             self._identity = secrets.token_bytes(layout.IDENTITY_BYTES)
             self._writer = layout.start(self._file, self._identity, time.time_ns())
             # Before the first record: what a reader needs to find its way is never the end that a cut takes.
             self._flush()
->>>>>>> journal
             if self._sync:
                 disk.sync_folder(self.folder)
             self._first = self._file.tell()
@@ -247,7 +235,6 @@ class Journal:
                 self._closed[number] = path.stat().st_size
 
 
-<<<<<<< HEAD
 def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, client: str = "") -> None:
     """One message as a file of its own, in the form of a segment, whole or not at all.
 
@@ -255,10 +242,11 @@ def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, c
         JournalError: when the disk refuses.
     """
     partial = path.with_name(f".{path.name}.partial")
+    identity, now_ns = secrets.token_bytes(layout.IDENTITY_BYTES), time.time_ns()
     try:
         with partial.open("wb") as file:
-            writer = _started(file)
-            _add(writer, pack(frames, session, seq, client), seq)
+            writer = layout.start(file, identity, now_ns)
+            layout.add(writer, layout.pack(frames, identity, session, seq, client), seq, now_ns)
             writer.finish()
         partial.replace(path)
     except OSError as error:
@@ -267,29 +255,8 @@ def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, c
         raise failed("write", path, error) from error
 
 
-def _started(file: BinaryIO) -> Any:
-    writer: Any = Writer(file, chunk_size=1, compression=CompressionType.NONE)
-    writer.start()
-    schema = writer.register_schema("tsfusion.keyframe", "", LAYOUT)
-    writer.register_channel(TOPIC, ENCODING, schema)
-    return writer
-
-
-def _add(writer: Any, payload: bytes, seq: int) -> None:
-    now = time.time_ns()
-    writer.add_message(_CHANNEL, log_time=now, publish_time=now, data=payload, sequence=seq % 2**32)
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-=======
 def _cut(path: Path, end: int) -> None:
     """Shorten a file, for good."""
     with path.open("r+b") as file:
         file.truncate(end)
         os.fsync(file.fileno())
->>>>>>> journal

@@ -79,7 +79,7 @@ def is_mesh_topic(topic: bytes) -> bool:
 
 
 def subscriber(
-    context: "zmq.Context[Any]", map_name: str = DEFAULT_MAP, keys: ClientKeys | None = None
+    context: "zmq.Context[Any]", keys: ClientKeys | None = None, *, map_name: str = DEFAULT_MAP
 ) -> AnySocket:
     """A viewer's socket for a map's updates: topic, `work.Meshed`, cells (n, 3) int32, then a mesh's frames.
 
