@@ -12,12 +12,14 @@ import msgspec
 
 Mutate = Callable[[bytes, random.Random, Sequence[bytes]], bytes]
 
+# fmt: off
 _INTEGERS = [0, 1, 2, 3, 7, 8, 16, 127, 128, 255, 256, 4095, 4096, 8191, 8192, 8193, 65535, 65536, 2_000_000,
              2_000_001, (1 << 31) - 1, 1 << 31, (1 << 32) - 1, 1 << 32, (1 << 63) - 1, (1 << 64) - 1,
-             -1, -2, -(1 << 31), -(1 << 63)]  # fmt: skip
+             -1, -2, -(1 << 31), -(1 << 63)]
 _FLOATS = [0.0, -0.0, 1.0, -1.0, 1e-320, 1e-300, 1e300, float("inf"), float("-inf"), float("nan"), 1e6, 1e-3]
 _WORDS = ["", "depth", "disparity", "points", "origins", "color", "confidence", "dzp+zstd", "mm+dzp+zstd",
-          "jpeg", "png", "uint8", "uint16", "float32", "default", "x" * 40, "../x", "a\0b", "é", "kinect"]  # fmt: skip
+          "jpeg", "png", "uint8", "uint16", "float32", "default", "kinect", "x" * 40, "../x", "a\0b", "é"]
+# fmt: on
 
 
 # --- plain bytes ---
@@ -139,7 +141,7 @@ def split(content: bytes) -> list[bytes]:
 
 
 def message(content: bytes, rng: random.Random, corpus: Sequence[bytes]) -> bytes:
-    """A change of a keyframe message's header, of an array, or of its frames; mostly with true lengths and CRCs."""
+    """A change of a message's header, of an array, or of its frames; mostly with true lengths and CRCs."""
     frames = split(content)
     kind = rng.randrange(10)
     if len(frames) < 2 or kind == 0:

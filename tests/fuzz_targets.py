@@ -11,7 +11,7 @@ import resource
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import fuzz_mutate
@@ -21,6 +21,7 @@ from msgspec import Struct
 from wire import CAMERA, SHAPE, pose, wall
 
 from tsfusion import Keyframe, checkpoint, codec, journal
+from tsfusion.codec.message import measurement
 from tsfusion.config import ServerConfig, VolumeConfig
 from tsfusion.errors import CheckpointError, DecodeError, InvalidKeyframe, JournalError
 from tsfusion.quota import Quotas
@@ -89,7 +90,9 @@ def _keyframes() -> list[Keyframe]:
 def _message_seeds() -> list[bytes]:
     import cv2
 
-    found = [codec.encode(one, session=bytes(16), seq=i + 1, jpeg_quality=90) for i, one in enumerate(_keyframes())]
+    found = [
+        codec.encode(one, session=bytes(16), seq=i + 1, jpeg_quality=90) for i, one in enumerate(_keyframes())
+    ]
     depth = np.arange(SHAPE[0] * SHAPE[1], dtype=np.uint16).reshape(SHAPE)
     png = cv2.imencode(".png", depth)[1].tobytes()
     header = msgspec.msgpack.decode(found[0][0][4:])
@@ -113,8 +116,8 @@ def run_message(content: bytes) -> str:
         keyframe = codec.decode(frames)
     except (DecodeError, InvalidKeyframe) as error:
         return f"{type(error).__name__} {error}"
-    if keyframe.kind != codec.measurement(header):
-        raise Broken(f"a {codec.measurement(header)} came out as {keyframe.kind}")
+    if keyframe.kind != measurement(header):
+        raise Broken(f"a {measurement(header)} came out as {keyframe.kind}")
     again = codec.unpack(codec.stamp(frames[0], previous=1, sent_ns=2))
     if (again.previous, again.sent_ns, again.seq) != (1, 2, header.seq):
         raise Broken("the header did not survive its stamp")
@@ -130,12 +133,12 @@ def _control_seeds() -> list[bytes]:
     health = messages.Health(
         ready=True, problems=("x",), epoch="e", uptime_s=1.0, rss_bytes=1, refused={"gap": 1}, duplicates=0,
         maps={"default": messages.MapHealth(
-            state="idle", problem="", keyframes_durable=1, keyframes_fused=1, waiting=0, rejected={}, quarantined=0,
-            sessions=1, journal_bytes=1, journal_damaged=0, fuser_restarts=0, blocks=1, map_bytes=1,
+            state="idle", problem="", keyframes_durable=1, keyframes_fused=1, waiting=0, rejected={},
+            quarantined=0, sessions=1, journal_bytes=1, journal_damaged=0, fuser_restarts=0, blocks=1, map_bytes=1,
             last_keyframe_s=None, delay_ms=spread, delay_bound_ms=0.1)},
         clients=(messages.ClientHealth(
-            client="c", session="00", map="default", heard_s=0.1, durable=1, fused=1, received_bytes=1, waiting=0,
-            skipped={"thin": 1}, held=""),),
+            client="c", session="00", map="default", heard_s=0.1, durable=1, fused=1, received_bytes=1,
+            waiting=0, skipped={"thin": 1}, held=""),),
     )  # fmt: skip
     layout = messages.MeshLayout(vertices=1, faces=1, colors=True)
     said = [
@@ -205,11 +208,17 @@ def run_journal(content: bytes) -> str:
     path = journal.segment_path(folder, 1)
     path.write_bytes(content)
     try:
-        found, damaged = journal.scan(path)
-        whole = list(journal.records(path))
+        steps = list(journal.walk(path))
+        found, lost = journal.scan(path)
     except JournalError as error:
         return f"JournalError {error}"
-    if [(one.position, one.session, one.seq) for one in found] != [(r.position, r.session, r.seq) for r in whole]:
+    whole = [one for one in steps if isinstance(one, journal.Record)]
+    damages = [one for one in steps if isinstance(one, journal.Damage)]
+    if lost != sum(one.lost for one in damages):
+        raise Broken(f"{lost} keyframes are lost, or {damages}")
+    if [(one.position, one.session, one.seq) for one in found] != [
+        (r.position, r.session, r.seq) for r in whole
+    ]:
         raise Broken("scan and records differ")
     for record in whole:
         again = journal.read_at(path, record.position.offset)
@@ -217,7 +226,7 @@ def run_journal(content: bytes) -> str:
             raise Broken(f"another record is read at {record.position}")
     if len(content) % 16 == 0:
         _go_on(folder, len(whole))
-    return f"{len(whole)} records, {damaged} damaged"
+    return f"{len(whole)} whole; " + "; ".join(one.what for one in damages)
 
 
 def _go_on(folder: Path, count: int) -> None:
@@ -283,7 +292,7 @@ def timed(target: Target, content: bytes) -> tuple[str, float]:
 
 
 def fuzz(name: str, cases: int, seed: int, seconds: float = float("inf")) -> Found:
-    """So many cases, or for so long. What breaks is raised with the case as a note."""
+    """So many cases, or for so long. What breaks a promise is raised, and the case kept in a file."""
     target, rng = TARGETS[name], random.Random(seed)
     corpus, seen = target.seeds(), Counter[str]()
     started, slowest, done = time.monotonic(), 0.0, 0
@@ -292,7 +301,9 @@ def fuzz(name: str, cases: int, seed: int, seconds: float = float("inf")) -> Fou
         try:
             outcome, taken = timed(target, content)
         except Exception as error:
-            raise Broken(f"{name}, seed {seed}, case {done}: {content!r}") from error
+            kept = Path(tempfile.gettempdir()) / f"{name}-{seed}-{done}.case"
+            kept.write_bytes(content)
+            raise Broken(f"{name}: case {done} of seed {seed}, kept in {kept}: {error!r}") from error
         label = _label(outcome)
         if label not in seen and len(corpus) < _MAX_CORPUS:
             corpus.append(content)
@@ -309,9 +320,4 @@ def fuzz(name: str, cases: int, seed: int, seconds: float = float("inf")) -> Fou
 
 
 def _label(outcome: str) -> str:
-    return re.sub(r"\d+|'.*?'|b\".*?\"|\[.*\]|\(.*\)|`.*?`", "#", outcome)[:100]
-
-
-def mutations(name: str) -> Callable[[bytes, random.Random, Sequence[bytes]], bytes]:
-    """A target's mutator."""
-    return TARGETS[name].mutate
+    return re.sub(r"(?<!^)\d+|'.*?'|b\".*?\"|\[.*\]|\(.*\)|`.*?`", "#", outcome)[:100]
