@@ -6,8 +6,9 @@
     python scripts/fuzz.py --corpus FOLDER            go on with what was found there, and add to it
 
 With `atheris` (`pip install '.[fuzz]'`) guided by coverage; without it, and for control messages, by the
-outcomes: what leads to a new one is mutated further. Only the named errors may come out, no case may take a second of processor time, and the
-memory stays under --memory. The exit status is 1 when something broke; the case is kept in --crashes.
+outcomes: what leads to a new one is mutated further. Only the named errors may come out, no case may take a
+second of processor time, and the memory stays under --memory. The exit status is 1 when something broke; the
+case is kept in --crashes.
 """
 
 import argparse
