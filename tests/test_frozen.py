@@ -20,9 +20,9 @@ from verdict import verify
 from wire import DEADLINE, Server, connected, serving, until, wall
 
 from tsfusion import Client, codec, journal
-from tsfusion.client import fetch_status
 from tsfusion.config import ClientConfig
 from tsfusion.errors import FlushTimeout, ServerUnreachable, TransportError
+from tsfusion.fetch import fetch_status
 from tsfusion.transport import messages, sockets
 
 FREEZE = 6.0  # seconds: longer than any timeout of client and server
