@@ -91,6 +91,11 @@ class Gateway:
         """Whether every map has every keyframe of its journal."""
         return all(hosted.drained for hosted in self.maps.values())
 
+    @property
+    def failed(self) -> bool:
+        """Whether a map's fuser cannot be kept alive: it will not be drained."""
+        return any(hosted.fuser.failed for hosted in self.maps.values())
+
     def accept(self) -> None:
         """Take keyframes from here on."""
         self._accepting = self._started_up = True

@@ -97,7 +97,7 @@ def _serve(gateway: Gateway, signals: list[int], watchdog: Watchdog) -> int:
         watchdog.pet()
     watchdog.stopping()
     gateway.stop_accepting()
-    while not gateway.drained and len(signals) == 1:
+    while not gateway.drained and not gateway.failed and len(signals) == 1:
         gateway.step()
     if not gateway.drained:
         return 1
