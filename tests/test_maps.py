@@ -180,16 +180,26 @@ def test_a_full_disk_is_said_and_waited_for(tmp_path: Path) -> None:
 
 def test_a_full_disk_with_room_again(small_disk: Callable[[int], Path]) -> None:
     folder = small_disk(24)
-    with serving(folder, min_free_bytes=4 << 20) as server, Client(server.address) as client:
+    with (
+        serving(folder, min_free_bytes=4 << 20) as server,
+        Client(server.address, policy="spool_all") as client,
+    ):
         scan(server.address, "default", range(3))
         filler = folder / "filler"
         filler.write_bytes(bytes(20 << 20))
-        client.send(wall(3))
-        until(lambda: "must stay so" in " ".join(fetch_health(server.address).problems))
+        sent = 3
+
+        def noticed() -> bool:  # the disk is looked at once a second
+            nonlocal sent
+            client.send(wall(sent))
+            sent += 1
+            return "must stay so" in " ".join(fetch_health(server.address).problems)
+
+        until(noticed)
         filler.unlink()
         client.wait_fused(timeout=DEADLINE)
         assert fetch_health(server.address).ready
-        assert fetch_status(server.address).map_hash == fused_hash(range(4))
+        assert fetch_status(server.address).map_hash == fused_hash(range(sent))
         assert server.terminate() == 0
 
 
