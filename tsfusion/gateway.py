@@ -94,6 +94,7 @@ class Gateway:
     def accept(self) -> None:
         """Take keyframes from here on."""
         self._accepting = self._started_up = True
+        self._next_snapshot = 0.0  # health checks are to know at once
 
     def stop_accepting(self) -> None:
         """Take no more keyframes; clients keep what is not acknowledged."""
