@@ -16,15 +16,15 @@ import time
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from tsfusion import codec, journal, maps, process
-from tsfusion.config import VIEW_SETTINGS, VolumeConfig
+from tsfusion import codec, journal, logs, maps, process
+from tsfusion.config import VIEW_SETTINGS, LogFormat, LogLevel, VolumeConfig
 from tsfusion.errors import CheckpointError, InvalidConfig, TsfusionError
 from tsfusion.mesh import Mesh
 from tsfusion.transport import sockets, work
@@ -355,11 +355,12 @@ def _begin(link: sockets.AnySocket, message: work.Begin) -> Fuser | None:
 
 
 def main() -> int:
-    """`python -m tsfusion.fuser ENDPOINT`, as the gateway starts it."""
-    logging.basicConfig(format="tsfusion fuser: %(levelname)s: %(message)s")
+    """`python -m tsfusion.fuser ENDPOINT FORMAT LEVEL MAP`, as the gateway starts it."""
+    endpoint, format_, level, map_name = sys.argv[1:]
+    logs.configure(cast("LogFormat", format_), cast("LogLevel", level), "fuser", map=map_name)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # a terminal or supervisor signals all; the gateway decides
-    return run(sys.argv[1])
+    return run(endpoint)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from typing import Any
 
 import zmq
 
-from tsfusion import codec, process, reports
+from tsfusion import codec, logs, process, reports
 from tsfusion.config import DEFAULT_MAP, ServerConfig, VolumeConfig
 from tsfusion.door import Door
 from tsfusion.errors import DecodeError, TsfusionError
@@ -99,6 +99,7 @@ class Gateway:
     def accept(self) -> None:
         """Take keyframes from here on."""
         self._accepting = self._started_up = True
+        self._next_snapshot = 0.0  # health checks are to know at once
 
     def stop_accepting(self) -> None:
         """Take no more keyframes; clients keep what is not acknowledged."""
@@ -196,7 +197,7 @@ class Gateway:
             return None
 
     def _give_up(self, name: str, error: TsfusionError) -> None:
-        log.error("map %s cannot be opened: %s", name, error)
+        log.error("the map cannot be opened: %s", error, extra=logs.about(map=name))
         self._unopened[name] = (str(error), time.monotonic())
         hosted = self.maps.pop(name, None)
         if hosted is not None:

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from tsfusion import journal
+from tsfusion import journal, logs
 from tsfusion.errors import JournalError
 
 log = logging.getLogger(__name__)
@@ -36,7 +36,8 @@ class Quarantine:
             journal.write_file(path, frames, session=session, seq=seq, client=client)
             self._prune(path)
         except (JournalError, OSError) as error:
-            log.error("keyframe %d could not be put into quarantine: %s", seq, error)
+            subject = logs.about(session=session, seq=seq, client=client, reason=reason)
+            log.error("a keyframe could not be put into quarantine: %s", error, extra=subject)
             return None
         return path
 
