@@ -5,8 +5,8 @@
     python scripts/hostile.py --seconds 20 --json the same as one JSON line
     python scripts/hostile.py --only unfinished tiny
 
-The exit status is 1 when a keyframe of the well-behaved scanner is not in the map, the server or its fuser died,
-or the gateway held more memory than its bound.
+The exit status is 1 when a keyframe of the well-behaved scanner is not in the map, the server or its fuser
+died, or the gateway held more memory than its bound.
 """
 
 import argparse

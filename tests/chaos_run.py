@@ -20,9 +20,9 @@ from verdict import client_problems, server_problems, verify
 from wire import until, wall
 
 from tsfusion import codec, journal
-from tsfusion.client import fetch_status
 from tsfusion.config import ClientConfig
 from tsfusion.errors import TransportError
+from tsfusion.fetch import fetch_status
 from tsfusion.transport import Status
 
 Kind = Literal["server", "fuser", "scanner"]

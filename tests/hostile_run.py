@@ -160,7 +160,7 @@ def _attack(server: Server, name: str, seconds: float, rss: Rss) -> _Span:
 
 
 def _outcome(folder: Path, server: Server, spans: list[_Span], problems: list[str]) -> Outcome:
-    from tsfusion.client import fetch_status
+    from tsfusion.fetch import fetch_status
 
     report = msgspec.json.decode((folder / "report.json").read_bytes(), type=Report)
     status = fetch_status(server.address)

@@ -15,9 +15,9 @@ from scripted import ScriptedServer, scripted
 from wire import DEADLINE, serving, until, wall
 
 from tsfusion import Client
-from tsfusion.client import fetch_status
 from tsfusion.config import ClientConfig
 from tsfusion.errors import TransportError
+from tsfusion.fetch import fetch_status
 
 NOBODY = "tcp://127.0.0.1:1"
 QUICK = ClientConfig(stall_timeout=0.5)

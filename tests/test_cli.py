@@ -25,7 +25,7 @@ from tsfusion.errors import InvalidConfig, OutputError
 Here = Callable[..., "subprocess.CompletedProcess[str]"]
 
 NOBODY = "tcp://127.0.0.1:9"  # the discard port: nobody listens there, and nobody may without being root
-VERBS = ["demo", "replay", "serve", "mesh", "status", "doctor", "config", "datasets"]
+VERBS = ["demo", "replay", "serve", "mesh", "status", "doctor", "keys", "journal", "config", "datasets"]
 
 
 def scene(folder: Path, *, pose: str | None = None, depth: bytes | None = None) -> Path:
@@ -178,6 +178,10 @@ def test_doctor_says_what_to_do(here: Here, tmp_path: Path) -> None:
         (["mesh", "nonsense://x", "a.ply"], "an address looks like"),
         (["serve", "--listen", "nonsense"], "an address looks like"),
         (["serve", "--listen", "tcp://0.0.0.0:5555"], "127.0.0.1"),
+        (["replay", "synthetic:room", "--key", "file"], "--key has no effect without --connect"),
+        (["replay", "synthetic:room", "--connect", NOBODY, "--key", "file"], "key needs server_key, too"),
+        (["mesh", NOBODY, "a.ply", "--server-key", "K"], "server_key needs key, too"),
+        (["mesh", "garbage.tsf", "a.ply", "--key", "file"], "--key has no effect on garbage.tsf"),
         (["serve", "--state", "file"], "cannot write the state folder"),
         (["serve", "--threads", "0"], "threads must be >= 1, got 0"),
         (["serve", "--max-range", "0.01"], "min_range"),
@@ -199,7 +203,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("here first")
     (tmp_path / "garbage.tsf").write_bytes(bytes(range(200)))
-    monkeypatch.setattr("tsfusion.client._ANSWER_TIMEOUT", 0.2)
+    monkeypatch.setattr("tsfusion.fetch._ANSWER_TIMEOUT", 0.2)
     done = here(*arguments)
     assert words in one_line(done)
     left = {path.name for path in tmp_path.rglob("*")} - {
@@ -305,7 +309,7 @@ def test_a_sensor_chosen_in_the_environment_counts(
 def test_flags_of_the_environment_are_not_refused(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
     """They may be meant for other commands."""
     monkeypatch.setenv("TSFUSION_VOXEL_SIZE", "0.5")
-    monkeypatch.setattr("tsfusion.client._ANSWER_TIMEOUT", 0.2)
+    monkeypatch.setattr("tsfusion.fetch._ANSWER_TIMEOUT", 0.2)
     assert "no server" in one_line(here("mesh", NOBODY, "a.ply"))
 
 

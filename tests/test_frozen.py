@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Peers that stand still, double, speak another version or live in another time: each has a named outcome."""
 
+import contextlib
 import os
 import shutil
 import signal
@@ -16,13 +17,13 @@ import msgspec
 import pytest
 from keepers import SCANNER
 from scanner import Plan, Report, journals, numbers
-from verdict import verify
+from verdict import VOXEL_SIZE, verify
 from wire import DEADLINE, Server, connected, serving, until, wall
 
-from tsfusion import Client, codec, journal
-from tsfusion.client import fetch_status
+from tsfusion import Client, Volume, codec, journal
 from tsfusion.config import ClientConfig
 from tsfusion.errors import FlushTimeout, ServerUnreachable, TransportError
+from tsfusion.fetch import fetch_status
 from tsfusion.transport import messages, sockets
 
 FREEZE = 6.0  # seconds: longer than any timeout of client and server
@@ -131,7 +132,7 @@ def test_a_frozen_fuser_is_waited_for(tmp_path: Path) -> None:
 def test_a_fuser_that_stands_still_is_replaced(tmp_path: Path) -> None:
     state = tmp_path / "state"
     with (
-        serving(state, fuser_timeout=2.0, checkpoint_every=3) as server,
+        serving(state, fuser_timeout=0.5, checkpoint_every=3) as server,
         Client(server.address, config=QUICK) as client,
     ):
         sending = stream(client, range(10), 1.0)
@@ -148,32 +149,54 @@ def test_a_fuser_that_stands_still_is_replaced(tmp_path: Path) -> None:
 
 
 def test_a_copied_spool_is_one_session(tmp_path: Path) -> None:
-    """Nothing is journaled twice, and of two keyframes under one number the first to come counts."""
+    """Its keyframes count once, and who comes second with new ones is told why they are not taken."""
     state, spools = tmp_path / "state", [tmp_path / name for name in ("spool", "copy")]
     with Client("tcp://127.0.0.1:1", spool=spools[0]) as client:
         for i in range(6):
             client.send(wall(i))
     shutil.copytree(*spools)
     with serving(state) as server:
+        with Client(server.address, spool=spools[0], config=QUICK) as first:
+            assert first.send(wall(6)) > 6
+            first.wait_fused(timeout=DEADLINE)
+            with Client(server.address, spool=spools[1], config=QUICK) as second:
+                second.send(wall(7))
+                with pytest.raises(FlushTimeout, match="another scanner works with a copy of"):
+                    second.flush(timeout=2.0)
+                assert second.stats.waiting > 0
+            first.send(wall(7))
+            first.wait_fused(timeout=DEADLINE)
+        assert fetch_status(server.address).sessions == 1
+        assert outcome(server, 8, state) == []
+    assert 7 in numbers(spools[1]), "what was not taken stays in its spool"
+
+
+def test_two_that_share_a_session_at_once_spoil_nothing(tmp_path: Path) -> None:
+    """Whose keyframe comes first under a number is the one that counts; none is journaled twice."""
+    state, spools = tmp_path / "state", [tmp_path / name for name in ("spool", "copy")]
+    with Client("tcp://127.0.0.1:1", spool=spools[0]) as client:
+        client.send(wall(0))
+    shutil.copytree(*spools)
+    with serving(state) as server:
         scanners = [Client(server.address, spool=spool, config=QUICK) for spool in spools]
-        for scanner, i in zip(scanners, (6, 7), strict=True):
-            assert scanner.send(wall(i)) > 6
+        sending = [stream(scanner, range(i, 41, 2), 1.0) for i, scanner in enumerate(scanners, start=1)]
+        for thread in sending:
+            thread.join(DEADLINE)
         for scanner in scanners:
-            scanner.wait_fused(timeout=DEADLINE)
+            with contextlib.suppress(FlushTimeout):
+                scanner.flush(timeout=2.0)
             scanner.close()
-        status = fetch_status(server.address)
+        until(lambda: (status := fetch_status(server.address)).keyframes_fused == status.keyframes_durable)
+        told = fetch_status(server.address)
         assert server.terminate() == 0
     (folder,) = journals(state)
     found = numbers(folder)
-    assert found[:6] == list(range(6))
-    assert found[6:] in ([6], [7])
-    assert (status.sessions, status.keyframes_fused) == (1, 7)
-    records = [
-        record
-        for number in journal.segments(folder)
-        for record in journal.records(journal.segment_path(folder, number))
-    ]
-    assert len({(record.session, record.seq) for record in records}) == len(records)
+    assert found[0] == 0
+    assert len(found) == len(set(found)) == told.keyframes_fused
+    volume = Volume(voxel_size=VOXEL_SIZE, threads=1)
+    for i in found:
+        volume.integrate(wall(i))
+    assert volume.map_hash() == told.map_hash
 
 
 # --- another version ---

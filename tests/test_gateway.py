@@ -13,11 +13,11 @@ from wire import DEADLINE, Server, serving, until
 
 import tsfusion
 from tsfusion import Client, Keyframe, VolumeConfig, fuser_link, journal, maps
-from tsfusion.client import fetch_status
 from tsfusion.config import ServerConfig
 from tsfusion.datasets import open_dataset
 from tsfusion.door import Door
 from tsfusion.errors import InvalidConfig, MapError
+from tsfusion.fetch import fetch_status
 from tsfusion.gateway import Gateway
 from tsfusion.journal import Journal
 from tsfusion.ports import Ports

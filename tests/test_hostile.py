@@ -17,7 +17,6 @@ import zmq
 from wire import DEADLINE, Server, connected, serving, until, wall
 
 from tsfusion import Client, VolumeConfig, codec, config, fuser_link
-from tsfusion.client import fetch_status
 from tsfusion.codec.header import pack
 from tsfusion.config import ServerConfig
 from tsfusion.errors import (
@@ -26,6 +25,7 @@ from tsfusion.errors import (
     ServerUnreachable,
     TransportError,
 )
+from tsfusion.fetch import fetch_status
 from tsfusion.fuser_link import FuserLink
 from tsfusion.journal import Position
 from tsfusion.sessions import Routes

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A server under attack lives, keeps its memory bound, and fuses what others send. Longer: `scripts/hostile.py`."""
+"""A server under attack lives, keeps its memory bound, fuses what others send. Long: `scripts/hostile.py`."""
 
 from pathlib import Path
 

@@ -18,14 +18,15 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("whole runs", frozenset({"pipeline", "child"})),
     ("processes", frozenset({"server", "gateway", "intake", "door", "hosted", "retention", "reports",
                              "questions", "quota", "quarantine", "sessions", "ports", "fuser_link", "fuser",
-                             "client", "backpressure", "room", "sender", "connection", "conversation",
-                             "refused", "outbox", "spool", "gone", "recording"})),
-    ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results", "metrics"})),
+                             "client", "fetch", "backpressure", "room", "sender", "connection",
+                             "conversation", "refused", "outbox", "spool", "gone", "recording"})),
+    ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results", "metrics",
+                                     "inspection", "salvage", "ros"})),
     ("map and wire", frozenset({"volume", "integration", "surface", "field", "blockstore", "meshing",
                                 "scratch", "storage", "checkpoint", "warmup",
-                                "journal", "transport", "codec", "maps"})),
+                                "journal", "transport", "codec", "maps", "keys"})),
     ("ground", frozenset({"kernels", "runtime", "mesh", "keyframe", "config", "config_toml", "errors",
-                          "process", "disk", "logs", "watchdog"})),
+                          "process", "disk", "logs", "watchdog", "private_folder"})),
 )  # fmt: skip
 
 # All others run where there is no Taichi, and answer while kernels run.

@@ -18,9 +18,9 @@ from wire import DEADLINE, Server, alive, pose, serving, until, wall
 
 import tsfusion
 from tsfusion import Client, Keyframe, codec, maps
-from tsfusion.client import fetch_mesh, fetch_status
 from tsfusion.config import ClientConfig
 from tsfusion.errors import FlushTimeout, InvalidKeyframe, KeyframeRefused, ServerUnreachable, TransportError
+from tsfusion.fetch import fetch_mesh, fetch_status
 from tsfusion.recording import read_keyframes
 from tsfusion.transport import Command, messages, request, sockets, work
 

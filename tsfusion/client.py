@@ -17,26 +17,19 @@ import threading
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from tsfusion.backpressure import Backpressure
-from tsfusion.config import DEFAULT_MAP, ClientConfig, Policy, override
+from tsfusion.config import ClientConfig, Policy, override
 from tsfusion.errors import FlushTimeout, KeyframeRefused, NotAllowed, ServerUnreachable, TransportError
 from tsfusion.keyframe import Keyframe
-from tsfusion.mesh import Mesh
 from tsfusion.outbox import ClientStats, Outbox
 from tsfusion.sender import Sender
 from tsfusion.spool import Spool
-from tsfusion.transport import Command, KeyframeTimes, Reply, Status, control_address, request, sockets
+from tsfusion.transport import KeyframeTimes, control_address, sockets
 from tsfusion.transport.curve import client_keys
-from tsfusion.transport.messages import Health, MeshLayout
 
-__all__ = ["Client", "ClientStats", "fetch_health", "fetch_mesh", "fetch_status"]
+__all__ = ["Client", "ClientStats"]
 
-_ANSWER_TIMEOUT = 5.0  # seconds; the gateway is never busy, so who says nothing for so long is not there
 _SEGMENTS = 8  # at least so many files hold what the spool may hold: it shrinks by whole files
 _SILENCE = 1.0  # seconds; the server answers a ping every half second
 
@@ -244,81 +237,3 @@ class Client:
         if silence > _SILENCE:
             why = f"nothing was heard from the server at {self._control} for {silence:.1f} s"
         return why if self._outbox.spool.temporary else f"{why}; they stay in {self._outbox.spool.folder}"
-
-
-def fetch_health(address: str, *, control: str | None = None, timeout: float = 10.0) -> Health:
-    """How the server at a data address is doing; answered at once, whatever its fusers do.
-
-    Raises:
-        ServerUnreachable: when nobody answers in `timeout` seconds.
-    """
-    reply, _ = _ask(address, control, Command(name="health"), timeout)
-    if reply.health is None:
-        raise TransportError(f"the server at {address} answered without its health")
-    return reply.health
-
-
-def fetch_status(
-    address: str, *, control: str | None = None, map_name: str = DEFAULT_MAP, timeout: float = 10.0
-) -> Status:
-    """How a map of the server at a data address is doing.
-
-    Raises:
-        ServerUnreachable: when nobody answers in `timeout` seconds.
-        TransportError: when the server cannot say.
-    """
-    reply, _ = _ask(address, control, Command(name="status", map=map_name), timeout)
-    if reply.status is None:
-        raise TransportError(f"the server at {address} answered without a status")
-    return reply.status
-
-
-def fetch_mesh(
-    address: str,
-    *,
-    control: str | None = None,
-    map_name: str = DEFAULT_MAP,
-    min_weight: float | None = None,
-    timeout: float = 60.0,
-) -> Mesh:
-    """The whole mesh of a map of the server at a data address, as of now.
-
-    Raises:
-        ServerUnreachable: when nobody is there (known after a few seconds), or the mesh takes longer than
-            `timeout` seconds.
-        TransportError: when the server cannot make it.
-    """
-    reply, frames = _ask(address, control, Command(name="mesh", map=map_name, min_weight=min_weight), timeout)
-    if reply.mesh is None:
-        raise TransportError(f"the server at {address} answered without a mesh")
-    return mesh_of(reply.mesh, frames)
-
-
-def _ask(
-    address: str, control: str | None, command: Command, timeout: float
-) -> tuple[Reply, list[memoryview]]:
-    """The fuser's answer. That takes its time, so it is asked first whether anybody is there."""
-    address = control_address(sockets.target(address), control)
-    if timeout > _ANSWER_TIMEOUT:
-        request(address, Command(name="ping"), timeout=_ANSWER_TIMEOUT)
-    return request(address, command, timeout=timeout)
-
-
-def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:
-    """A mesh from its frames (see `MeshLayout`).
-
-    Raises:
-        TransportError: when the frames are not what the layout says.
-    """
-    wanted: list[tuple[int, type]] = [
-        (layout.vertices, np.float32), (layout.faces, np.int32), (layout.vertices, np.float32),
-    ]  # fmt: skip
-    if layout.colors:
-        wanted.append((layout.vertices, np.uint8))
-    sizes = [rows * 3 * np.dtype(dtype).itemsize for rows, dtype in wanted]
-    if sizes != [frame.nbytes for frame in frames]:
-        raise TransportError(f"a mesh of {sizes} bytes was announced, got {[f.nbytes for f in frames]}")
-    arrays: list[NDArray[Any]] = [
-        np.frombuffer(frame, dtype).reshape(-1, 3) for frame, (_, dtype) in zip(frames, wanted, strict=True)
-    ]
-    return Mesh(*arrays)

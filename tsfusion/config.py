@@ -168,7 +168,7 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     fuser_memory_bytes: Bytes | None = None  # of each fuser; None = three quarters of the machine's
     fuser_timeout: Positive = 60.0  # seconds on one keyframe before a fuser counts as stuck
     quota_bytes: Bytes = 256 << 20  # a second, of each client
-    quota_keyframes: Positive = 100.0  # a second, of each client
+    quota_keyframes: Positive = 1000.0  # a second, of each client
     quota_points: Annotated[int, Meta(ge=1)] = 8 << 20  # points or pixels a keyframe
     quota_extent: Positive = 100_000.0  # metres from the map's origin to a sensor
     log_format: LogFormat = "text"  # of what goes to stderr: lines, or one JSON object a line

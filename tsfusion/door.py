@@ -8,6 +8,7 @@ from typing import Any
 
 import zmq
 
+from tsfusion.keys import AllowList
 from tsfusion.transport.curve import ServerKeys, server_keys
 from tsfusion.transport.zap import Zap, sender_of
 
@@ -30,11 +31,9 @@ class Door:
 
     def __init__(self, context: "zmq.Context[Any]", folder: str | None) -> None:
         self.keys: ServerKeys | None = None
-        self._allowed: Any = None
+        self._allowed: AllowList | None = None
         self._zap: Zap | None = None
         if folder is not None:
-            from tsfusion.keys import AllowList
-
             self.keys = server_keys(folder)
             self._allowed = AllowList(Path(folder))
             self._zap = Zap(context, self._allowed.name_of, self._allowed.why_not)

@@ -23,7 +23,7 @@ from tsfusion.transport import messages
 
 log = logging.getLogger(__name__)
 
-_LONGEST_HOLD = 10.0  # seconds
+_HOLDS = (0.25, 10.0)  # seconds, shortest and longest: each costs what was under way
 
 
 class Intake:
@@ -94,7 +94,7 @@ class Intake:
 
     def _hold(self, key: bytes, seconds: float, reason: str, message: str) -> None:
         self.refused["held"] += 1
-        seconds = min(seconds, _LONGEST_HOLD)
+        seconds = min(max(seconds, _HOLDS[0]), _HOLDS[1])
         route = self._clients.route(key)
         if route is not None:
             route.held, route.held_until = reason, time.monotonic() + seconds

@@ -30,6 +30,8 @@ def mesh(
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw it, too.")] = None,
     control: options.Control = None,
     map_: options.Map = None,
+    key: options.Key = None,
+    server_key: options.ServerKey = None,
     config: options.ConfigFile = None,
     json: options.Json = False,
     **settings: Any,
@@ -46,16 +48,19 @@ def mesh(
             context, {*options.MAP_OPTIONS, "config"} - {"min_weight"},
             "has no effect on a live server's map: give it to `tsfusion serve`",
         )  # fmt: skip
-        from tsfusion.client import fetch_mesh
         from tsfusion.config import DEFAULT_MAP
+        from tsfusion.fetch import fetch_mesh
+        from tsfusion.transport import client_keys
 
         made = fetch_mesh(
-            source, control=control, map_name=map_ or DEFAULT_MAP, min_weight=settings["min_weight"]
-        )
+            source, control=control, map_name=map_ or DEFAULT_MAP, min_weight=settings["min_weight"],
+            keys=client_keys(key, server_key),
+        )  # fmt: skip
     else:
         options.refuse(
-            context, ("control",), f"has no effect on {source}: only a live server (tcp://…) has one"
-        )
+            context, ("control", "key", "server_key"),
+            f"has no effect on {source}: only a live server (tcp://…) has one",
+        )  # fmt: skip
         if source.endswith(".tsf"):
             options.refuse(
                 context, options.MAP_OPTIONS.keys() - options.VIEW_OPTIONS,

@@ -94,6 +94,20 @@ Map = Annotated[
         "--map", metavar="NAME", envvar="TSFUSION_MAP", help="Which of a server's maps; else default."
     ),
 ]
+Key = Annotated[
+    str | None,
+    typer.Option(
+        "--key", metavar="FILE", envvar="TSFUSION_KEY",
+        help="This client's secret key, of `tsfusion keys new`, for a server with keys.",
+    ),
+]  # fmt: skip
+ServerKey = Annotated[
+    str | None,
+    typer.Option(
+        "--server-key", metavar="FILE|KEY", envvar="TSFUSION_SERVER_KEY",
+        help="That server's public key: a file, or the 40 characters.",
+    ),
+]  # fmt: skip
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for a program to read.")]
 
 

@@ -38,6 +38,8 @@ def replay(
     connect: options.Connect = None,
     control: options.Control = None,
     map_: options.Map = None,
+    key: options.Key = None,
+    server_key: options.ServerKey = None,
     rate: Rate = None,
     max_keyframes: Limit = None,
     start: Annotated[
@@ -72,7 +74,7 @@ def replay(
             "has no effect with --connect: give it to the `tsfusion serve` that listens there",
         )  # fmt: skip
     else:
-        options.refuse(context, ("control",), "has no effect without --connect")
+        options.refuse(context, ("control", "key", "server_key"), "has no effect without --connect")
     dataset = _open(path, sequence=sequence, modality=modality, poses=poses)
     chosen = options.configuration(
         config, preset={"sensor": dataset.sensor}, **settings,
@@ -83,7 +85,7 @@ def replay(
         typer.echo(f"left out {count} frames {reason}", err=True)
     _run(
         dataset, out, chosen, connect=connect, control=control, map_=map_, rate=rate, state=state, json=json,
-        min_weight=settings["min_weight"],
+        min_weight=settings["min_weight"], key=key, server_key=server_key,
     )  # fmt: skip
 
 
@@ -145,20 +147,28 @@ def _run(
     *,
     json: bool,
     state: Path | None = None,
+    connect: str | None = None,
     control: str | None = None,
     map_: str | None = None,
+    key: str | None = None,
+    server_key: str | None = None,
     **settings: Any,
 ) -> None:
+    from msgspec.structs import replace
+
     from tsfusion import pipeline
     from tsfusion.cli import show
     from tsfusion.config import override
 
     server = override(chosen.server, listen="tcp://127.0.0.1:0", state=str(state)) if state else None
-    client = override(chosen.client, control=control, map=map_)
+    client = override(chosen.client, control=control, map=map_, key=key, server_key=server_key)
+    if connect is None:  # an own server, which only this machine reaches: no keys
+        server = replace(server, keys=None) if server else None
+        client = replace(client, key=None, server_key=None)
     with show.progress(quiet=json) as progress:
         run = pipeline.replay(
             dataset, out, volume=chosen.volume, server=server, client=client, progress=progress,
-            **settings,
+            connect=connect, **settings,
         )  # fmt: skip
     if json:
         show.as_json(run)

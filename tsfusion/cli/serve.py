@@ -56,6 +56,14 @@ def serve(
         str | None,
         typer.Option(metavar="LEVEL", envvar="TSFUSION_LOG_LEVEL", help="debug, info, warning or error."),
     ] = None,
+    keys: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DIR",
+            envvar="TSFUSION_KEYS",
+            help="Let in only who `tsfusion keys allow` named; needed to listen beyond this machine.",
+        ),
+    ] = None,
     config: options.ConfigFile = None,
     json: options.Json = False,
     until_eof: Annotated[bool, typer.Option("--until-eof", hidden=True)] = False,
@@ -70,8 +78,8 @@ def serve(
     from tsfusion.errors import TsfusionError
 
     chosen = options.configuration(
-        config, listen=listen, control=control, state=state, metrics=metrics, log_format=log_format,
-        log_level=log_level, **settings,
+        config, listen=listen, control=control, state=state, keys=keys, metrics=metrics,
+        log_format=log_format, log_level=log_level, **settings,
     )  # fmt: skip
     logs.configure(chosen.server.log_format, chosen.server.log_level)
     if until_eof:

@@ -115,7 +115,12 @@ def public_key(given: str) -> str:
     path = Path(given).expanduser()
     if not os.path.exists(path):
         raise InvalidConfig(f"a public key is a file or 40 characters, got {given!r}")
-    return _read(path, secret=False).get("public") or _none_in(path, "public", f"a file NAME{PUBLIC}")
+    keys = _read(path, secret=False)
+    if "secret" in keys:
+        raise InvalidConfig(
+            f"{path} holds a secret key, which stays on its machine: give the file NAME{PUBLIC} beside it"
+        )
+    return keys.get("public") or _none_in(path, "public", f"a file NAME{PUBLIC}")
 
 
 def read_pair(path: Path) -> tuple[str, str]:

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion keys new|list|allow|revoke`."""
+
+import shlex
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tsfusion.cli import options
+
+app = typer.Typer(
+    help="""Who may connect to a server.
+
+    Three steps let a scanner in, and nobody else:
+
+    1. on the server: `tsfusion keys new server`
+
+    2. on the scanner: `tsfusion keys new robot1`
+
+    3. on the server: `tsfusion keys allow robot1 KEY`, with the key that step 2 printed
+
+    Then `tsfusion serve --keys tsfusion-keys --listen tcp://0.0.0.0:5555` on the server, and on the scanner
+    `--key tsfusion-keys/robot1.key_secret --server-key KEY`, with the key that step 1 printed.
+
+    A secret key never leaves the machine that made it.
+    """,
+)
+Dir = Annotated[
+    Path,
+    typer.Option(
+        "--dir", metavar="DIR", envvar="TSFUSION_KEYS", help="The folder of keys, its owner's alone."
+    ),
+]
+Name = Annotated[str, typer.Argument(metavar="NAME", help="1 to 32 letters, digits and . _ -")]
+_FOLDER = Path("tsfusion-keys")
+
+
+@app.command()
+def new(
+    name: Name,
+    *,
+    folder: Dir = _FOLDER,
+    force: Annotated[bool, typer.Option("--force", help="Replace the pair that is there.")] = False,
+) -> None:
+    """Make a pair of keys: NAME.key_secret stays here, NAME.key is for the other side.
+
+    The name `server` is for the server's own pair.
+    """
+    from tsfusion import keys
+    from tsfusion.transport import curve
+
+    made = keys.create(folder, name, force=force)
+    typer.echo(f"public key of {name}: {made.public}")
+    if name == curve.SERVER:
+        place, at = (
+            shlex.quote(str(folder)),
+            "" if folder == _FOLDER else f" --dir {shlex.quote(str(folder))}",
+        )
+        typer.echo(
+            f"next, for each scanner: tsfusion keys allow NAME KEY{at}\n"
+            f"then: tsfusion serve --keys {place} --listen tcp://0.0.0.0:5555\n"
+            f"scanners connect with: --key NAME{curve.SECRET} --server-key {shlex.quote(made.public)}"
+        )
+    else:
+        typer.echo(f"next, on the server: tsfusion keys allow {name} {shlex.quote(made.public)}")
+
+
+@app.command()
+def allow(
+    name: Name,
+    key: Annotated[
+        str, typer.Argument(metavar="KEY|FILE", help="A public key: 40 characters, or a .key file.")
+    ],
+    *,
+    folder: Dir = _FOLDER,
+) -> None:
+    """Let a scanner in; a running server does so at once.
+
+    A name has one key: allowing another replaces it, and the name keeps its sessions. KEY holds characters
+    that a shell would read: put it in single quotes.
+    """
+    from tsfusion import keys
+
+    earlier = keys.allow(folder, name, key)
+    typer.echo(f"{name} may connect")
+    if earlier is not None:
+        typer.echo(f"its earlier key no longer may: {earlier}")
+
+
+@app.command()
+def revoke(name: Name, *, folder: Dir = _FOLDER) -> None:
+    """Keep a scanner out; a running server cuts its connections at once."""
+    from tsfusion import keys
+
+    key = keys.revoke(folder, name)
+    typer.echo(f"{name} may no longer connect: {key}")
+
+
+@app.command("list")
+def list_(*, folder: Dir = _FOLDER, json: options.Json = False) -> None:
+    """Show the folder's own pairs (public halves), and on a server who is allowed and who was revoked."""
+    from tsfusion import keys
+
+    own = keys.pairs(folder)
+    listed = keys.read_list(folder) if keys.has_list(folder) else None
+    if json:
+        from tsfusion.cli import show
+
+        show.as_json(
+            {
+                "own": {pair.name: pair.public for pair in own},
+                "allowed": listed.allowed if listed else {},
+                "revoked": listed.revoked if listed else {},
+            }
+        )
+        return
+    rows: list[tuple[str, str, str]] = [("own", pair.name, pair.public) for pair in own]
+    if listed is not None:
+        rows += [("allowed", name, key) for name, key in sorted(listed.allowed.items())]
+        rows += [("revoked", name, key) for key, name in listed.revoked.items()]
+    if not rows:
+        typer.echo(f"no keys in {folder}", err=True)
+    width = max((len(name) for _, name, _ in rows), default=0)
+    for state, name, key in rows:
+        typer.echo(f"{state:<8} {name:<{width}}  {key}")

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: MIT
+"""The journal that a person means by a path."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from msgspec import Struct
+
+from tsfusion.errors import JournalError
+from tsfusion.journal.layout import Position, Record
+from tsfusion.journal.segments import segment_path, segments
+from tsfusion.journal.walk import Damage, segment_number, walk
+
+Watcher = Callable[[int, int], None]  # bytes read, bytes of all
+
+
+class Place(Struct, frozen=True):
+    """A journal on the disk.
+
+    Attributes:
+        path: a folder of segments, or one segment file.
+        quarantine: where the server of its map keeps what could not be fused; None = it is no map's.
+    """
+
+    path: Path
+    quarantine: Path | None = None
+
+    def files(self) -> list[Path]:
+        """Its segments, oldest first.
+
+        Raises:
+            JournalError: when the folder cannot be listed.
+        """
+        if not self.path.is_dir():
+            return [self.path]
+        return [segment_path(self.path, number) for number in segments(self.path)]
+
+    def quarantined(self) -> list[Path]:
+        """The files in quarantine, by name."""
+        if self.quarantine is None or not self.quarantine.is_dir():
+            return []
+        return sorted(path for path in self.quarantine.iterdir() if path.suffix == ".mcap")
+
+    def steps(self, watch: Watcher = lambda _done, _all: None) -> Iterator[tuple[Path, Record | Damage]]:
+        """Each record and each damaged place, with its file. A file that cannot be read is one such place."""
+        files = [(path, _size(path)) for path in self.files()]
+        total, before = sum(size for _, size in files), 0
+        for path, size in files:
+            try:
+                for step in walk(path):
+                    yield path, step
+                    watch(before + min(step.position.offset, size), total)
+            except JournalError as error:
+                yield path, Damage(Position(segment_number(path), 0), size, 1, str(error))
+            before += size
+            watch(before, total)
+
+
+def find(path: Path, map_name: str | None = None) -> Place:
+    """The journal at a path: a state folder, a map's folder in it, a folder of segments, or one segment.
+
+    Args:
+        map_name: which map of a state folder with several.
+
+    Raises:
+        JournalError: when there is none, or no single one.
+    """
+    maps = path / "maps"
+    if not path.exists():
+        raise JournalError(
+            f"{path} does not exist; expected a state folder, a map's, a journal or an .mcap file"
+        )
+    if maps.is_dir():
+        path = maps / _choose(path, _maps_in(maps), map_name)
+    elif map_name is not None:
+        raise JournalError(f"--map has no effect on {path}: only a state folder has several maps")
+    if (path / "journal").is_dir():
+        return Place(path / "journal", path / "quarantine")
+    if path.is_dir():
+        quarantine = path.parent / "quarantine"
+        return Place(path, quarantine if path.name == "journal" and quarantine.is_dir() else None)
+    if path.suffix != ".mcap":
+        raise JournalError(f"{path} is no journal; expected a folder or an .mcap file")
+    return Place(path)
+
+
+def _maps_in(folder: Path) -> list[str]:
+    try:
+        return sorted(child.name for child in folder.iterdir() if (child / "journal").is_dir())
+    except OSError as error:
+        raise JournalError(f"cannot list {folder}: {error.strerror}") from error
+
+
+def _choose(state: Path, names: list[str], wanted: str | None) -> str:
+    if wanted is None and len(names) == 1:
+        return names[0]
+    if wanted in names:
+        return str(wanted)
+    there = ", ".join(names) or "none"
+    if wanted is None and names:
+        raise JournalError(f"{state} has several maps ({there}): choose one with --map NAME")
+    raise JournalError(f"{state} has no map{f' {wanted}' if wanted else ''} with a journal; it has: {there}")
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
