@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""What each policy does to the map when the sensor is faster than the server, and the link is down for a while.
+"""What each policy does when the sensor is faster than the server, and the link is down for a while.
 
     python scripts/backpressure.py --seconds 120 --rate 10 --server 6.25 --outage 10
 
-The client's own code on a clock of its own; the server journals at once and fuses one keyframe after the other.
-`fused`: share of the captured keyframes that are in the map in the end. `delay`: captured to fused. `hole`: the
-longest time without a keyframe in the map. `behind`: most keyframes that waited in the spool.
+The client's own code on a clock of its own; the server journals at once and fuses one keyframe after the
+other. `fused`: share of the captured keyframes that are in the map in the end. `delay`: captured to fused.
+`hole`: the longest time without a keyframe in the map. `spool`: the most keyframes that waited there.
 """
 
 import argparse
@@ -38,7 +38,7 @@ class Outcome:
     delay_p50_s: float
     delay_max_s: float
     hole_s: float
-    behind: int
+    spool: int
 
 
 class Run:
@@ -55,7 +55,7 @@ class Run:
         self._journal: deque[int] = deque()
         self._fused = 0
         self._free_at = 0.0
-        self.behind = 0
+        self.spool = 0
         self.captured: dict[int, int] = {}
         self.fused: dict[int, int] = {}
 
@@ -79,7 +79,7 @@ class Run:
         if now not in self._outage_ms:
             with box.changed:
                 self._deliver(box)
-        self.behind = max(self.behind, len(box.spool.waiting))
+        self.spool = max(self.spool, len(box.spool.waiting))
 
     def _deliver(self, box: Outbox) -> None:
         box.progress(0, self._fused)
@@ -122,7 +122,7 @@ def simulate(
         delay_p50_s=round(float(np.median(delays)), 2),
         delay_max_s=round(float(delays.max()), 2),
         hole_s=round(float(np.diff(kept).max()), 2),
-        behind=run.behind,
+        spool=run.spool,
     )
 
 
@@ -144,9 +144,9 @@ def main() -> None:
                 print(json.dumps(asdict(outcome)))
             else:
                 print(
-                    f"{policy:12} backlog {backlog:3}  fused {outcome.fused_percent:5.1f} %  delay p50 "
-                    f"{outcome.delay_p50_s:5.2f} max {outcome.delay_max_s:5.2f} s  hole {outcome.hole_s:5.2f} s"
-                    f"  spool {outcome.behind}"
+                    f"{policy:12} backlog {backlog:3}  fused {outcome.fused_percent:5.1f} %  "
+                    f"delay p50 {outcome.delay_p50_s:5.2f} max {outcome.delay_max_s:5.2f} s  "
+                    f"hole {outcome.hole_s:5.2f} s  spool {outcome.spool:4}"
                 )
     if not given.json:
         print(f"simulated in {time.monotonic() - started:.0f} s")
