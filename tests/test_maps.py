@@ -13,7 +13,7 @@ from wire import DEADLINE, connected, serving, until, wall
 import tsfusion
 from tsfusion import Client, codec, config, config_toml, maps
 from tsfusion.config import ServerConfig, VolumeConfig
-from tsfusion.errors import DatasetError, ServerUnreachable, TransportError
+from tsfusion.errors import JournalError, ServerUnreachable, TransportError
 from tsfusion.fetch import fetch_health, fetch_mesh, fetch_status
 from tsfusion.quota import Quotas
 from tsfusion.recording import Recording
@@ -63,7 +63,7 @@ def test_two_scanners_two_maps(tmp_path: Path) -> None:
             fetch_status(server.address, map_name="attic")
         assert server.terminate() == 0
     assert maps.names(tmp_path) == ["default", "yard-2"]
-    with pytest.raises(DatasetError, match="holds the maps default, yard-2: say which"):
+    with pytest.raises(JournalError, match=r"has several maps \(default, yard-2\): choose one with --map"):
         Recording(tmp_path)
     assert len(Recording(tmp_path, "yard-2")) == len(Recording(tmp_path / "maps/yard-2")) == 8
     with serving(tmp_path) as server:  # both are taken up again, without anybody asking

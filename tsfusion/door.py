@@ -33,6 +33,7 @@ class Door:
         self.keys: ServerKeys | None = None
         self._allowed: AllowList | None = None
         self._zap: Zap | None = None
+        self._revoked = False
         if folder is not None:
             self.keys = server_keys(folder)
             self._allowed = AllowList(Path(folder))
@@ -48,14 +49,16 @@ class Door:
         """Answer who knocks. True when somebody no longer may: all connections have to be made anew."""
         if self._allowed is None or self._zap is None:
             return False
-        revoked = self._allowed.refresh()
+        self._revoked |= self._allowed.refresh()
         self._zap.answer_all()
+        revoked, self._revoked = self._revoked, False
         return revoked
 
     def client_of(self, frame: zmq.Frame) -> str | None:
         """The name its sender's key is allowed under: empty without keys, None when it is (no longer)."""
         if self._allowed is None:
             return ""
+        self._revoked |= self._allowed.refresh()  # it may have been since the last step
         key = sender_of(frame)
         return None if key is None else self._allowed.name_of(key)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
+from tsfusion import maps
 from tsfusion.errors import JournalError
 from tsfusion.journal.layout import Position, Record
 from tsfusion.journal.segments import segment_path, segments
@@ -65,41 +66,19 @@ def find(path: Path, map_name: str | None = None) -> Place:
     Raises:
         JournalError: when there is none, or no single one.
     """
-    maps = path / "maps"
     if not path.exists():
         raise JournalError(
             f"{path} does not exist; expected a state folder, a map's, a journal or an .mcap file"
         )
-    if maps.is_dir():
-        path = maps / _choose(path, _maps_in(maps), map_name)
-    elif map_name is not None:
-        raise JournalError(f"--map has no effect on {path}: only a state folder has several maps")
-    if (path / "journal").is_dir():
-        return Place(path / "journal", path / "quarantine")
+    path = maps.resolve(path, map_name)
+    if (path / maps.JOURNAL_FOLDER).is_dir():
+        return Place(path / maps.JOURNAL_FOLDER, path / maps.QUARANTINE_FOLDER)
     if path.is_dir():
-        quarantine = path.parent / "quarantine"
-        return Place(path, quarantine if path.name == "journal" and quarantine.is_dir() else None)
+        quarantine = path.parent / maps.QUARANTINE_FOLDER
+        return Place(path, quarantine if path.name == maps.JOURNAL_FOLDER and quarantine.is_dir() else None)
     if path.suffix != ".mcap":
         raise JournalError(f"{path} is no journal; expected a folder or an .mcap file")
     return Place(path)
-
-
-def _maps_in(folder: Path) -> list[str]:
-    try:
-        return sorted(child.name for child in folder.iterdir() if (child / "journal").is_dir())
-    except OSError as error:
-        raise JournalError(f"cannot list {folder}: {error.strerror}") from error
-
-
-def _choose(state: Path, names: list[str], wanted: str | None) -> str:
-    if wanted is None and len(names) == 1:
-        return names[0]
-    if wanted in names:
-        return str(wanted)
-    there = ", ".join(names) or "none"
-    if wanted is None and names:
-        raise JournalError(f"{state} has several maps ({there}): choose one with --map NAME")
-    raise JournalError(f"{state} has no map{f' {wanted}' if wanted else ''} with a journal; it has: {there}")
 
 
 def _size(path: Path) -> int:
