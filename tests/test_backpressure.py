@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Keyframes that come faster than the map takes them: what each policy keeps, skips and tells."""
 
+import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 from itertools import pairwise
 from pathlib import Path
@@ -171,6 +174,22 @@ def test_the_server_is_told(tmp_path: Path) -> None:
         server.taking = True
         client.flush(DEADLINE)
         assert (client.stats.waiting, client.stats.waiting_bytes) == (0, 0)
+
+
+def test_what_each_policy_is_for() -> None:
+    """scripts/backpressure.py: a sensor faster than the map, and a link that is down for a while."""
+    script = Path(__file__).parents[1] / "scripts" / "backpressure.py"
+    done = subprocess.run(
+        [sys.executable, script, "--seconds", "60", "--json"], capture_output=True, text=True, check=True
+    )
+    rows = {row["policy"]: row for row in map(json.loads, done.stdout.splitlines())}
+    assert rows["spool_all"]["fused_percent"] == 100.0
+    assert rows["spool_all"]["delay_p50_s"] > 10.0
+    for policy in ("thin", "block", "drop_oldest"):
+        assert rows[policy]["fused_percent"] > 50.0  # what the map can take
+        assert rows[policy]["delay_p50_s"] < 1.5
+    assert rows["thin"]["hole_s"] < 0.5 < 9.0 < rows["drop_oldest"]["hole_s"]
+    assert rows["drop_oldest"]["delay_max_s"] < 2.0
 
 
 # --- with a real map ---

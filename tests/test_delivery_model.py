@@ -48,7 +48,7 @@ class Link:
     def __init__(self, meanwhile: Callable[[], None] = lambda: None) -> None:
         self.meanwhile = meanwhile  # what other threads do while this one sends
         self.socket = self
-        self.problem, self.refused, self.due = "", False, 0.0
+        self.problem, self.refused, self.due, self.made = "", False, 0.0, True
         self.there: deque[Any] = deque()
         self.back: deque[Any] = deque()
         self.old: list[deque[Any]] = []  # what earlier connections still have under way
@@ -93,6 +93,7 @@ class ModelServer:
         self.journal: list[tuple[bytes, int, int]] = []  # session, seq, keyframe
         self.fused: dict[bytes, int] = {}
         self.refused: set[int] = set()
+        self.hasty = rng.random() < 0.5  # refuses before it looks for gaps
         self.hold = 0.0  # how likely it is that a keyframe is not wanted now
         self.deny = 0.0
 
@@ -111,7 +112,7 @@ class ModelServer:
         resend = False
         if header.seq > durable:
             resend = header.previous > durable
-            if not resend and number % 5 == 3:
+            if (self.hasty or not resend) and number % 5 == 3:
                 self.refused.add(number)
                 return [messages.Nack(session, header.seq, "door", "values", "a three")]
             if not resend:

@@ -20,7 +20,7 @@ from scanner import Plan, Report, journals, numbers
 from verdict import VOXEL_SIZE, verify
 from wire import DEADLINE, Server, connected, serving, until, wall
 
-from tsfusion import Client, Volume, codec, journal
+from tsfusion import Client, Volume, codec, journal, spool
 from tsfusion.config import ClientConfig
 from tsfusion.errors import FlushTimeout, ServerUnreachable, TransportError
 from tsfusion.fetch import fetch_status
@@ -148,8 +148,9 @@ def test_a_fuser_that_stands_still_is_replaced(tmp_path: Path) -> None:
 # --- one session, twice ---
 
 
-def test_a_copied_spool_is_one_session(tmp_path: Path) -> None:
-    """Its keyframes count once, and who comes second with new ones is told why they are not taken."""
+def test_a_copied_spool_is_one_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its keyframes count once, and who comes with lower numbers is told why they are not taken."""
+    monkeypatch.setattr(spool, "_RESTART_SPREAD", 1)  # here: who comes second
     state, spools = tmp_path / "state", [tmp_path / name for name in ("spool", "copy")]
     with Client("tcp://127.0.0.1:1", spool=spools[0]) as client:
         for i in range(6):
@@ -172,13 +173,13 @@ def test_a_copied_spool_is_one_session(tmp_path: Path) -> None:
 
 
 def test_two_that_share_a_session_at_once_spoil_nothing(tmp_path: Path) -> None:
-    """Whose keyframe comes first under a number is the one that counts; none is journaled twice."""
+    """They go on with numbers of their own; the lower ones are not taken, which is told: nothing is lost."""
     state, spools = tmp_path / "state", [tmp_path / name for name in ("spool", "copy")]
     with Client("tcp://127.0.0.1:1", spool=spools[0]) as client:
         client.send(wall(0))
     shutil.copytree(*spools)
     with serving(state) as server:
-        scanners = [Client(server.address, spool=spool, config=QUICK) for spool in spools]
+        scanners = [Client(server.address, spool=folder, config=QUICK) for folder in spools]
         sending = [stream(scanner, range(i, 41, 2), 1.0) for i, scanner in enumerate(scanners, start=1)]
         for thread in sending:
             thread.join(DEADLINE)
@@ -193,6 +194,8 @@ def test_two_that_share_a_session_at_once_spoil_nothing(tmp_path: Path) -> None:
     found = numbers(folder)
     assert found[0] == 0
     assert len(found) == len(set(found)) == told.keyframes_fused
+    kept = {number for folder in spools if journal.segments(folder) for number in numbers(folder)}
+    assert {*found, *kept} == set(range(41))
     volume = Volume(voxel_size=VOXEL_SIZE, threads=1)
     for i in found:
         volume.integrate(wall(i))

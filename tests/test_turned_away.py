@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from scripted import number, scripted
 from test_backpressure import NOBODY, joined, send_all
-from wire import DEADLINE, until, wall
+from wire import DEADLINE, pose, serving, until, wall
 
 from tsfusion import Client, codec
 from tsfusion.config import ClientConfig
@@ -18,6 +18,7 @@ from tsfusion.errors import (
     KeyframeRefused,
     ServerUnreachable,
 )
+from tsfusion.fetch import fetch_status
 from tsfusion.recording import Recording
 from tsfusion.spool import Spool
 
@@ -119,6 +120,27 @@ def test_refused_keyframes_are_kept_aside_and_the_rest_arrives(tmp_path: Path) -
         assert server.numbers == [0, 2, 3, 5, 6, 8, 9]
     kept = [keyframe.timestamp_ns - 10**9 for keyframe in Recording(tmp_path / "refused")]
     assert kept == [1, 4, 7]
+
+
+def test_a_real_server_refuses_some_and_fuses_the_rest(tmp_path: Path) -> None:
+    """Those that look from too far away; what is kept aside is not sent again, by nobody."""
+    spool = tmp_path / "spool"
+    with serving(tmp_path / "state", quota_extent=10.0) as server:
+        with Client(server.address, spool=spool, policy="spool_all") as client:
+            for i in range(12):
+                client.send(wall(i, T_world_camera=pose(100.0 if i in (3, 4, 11) else 0.03 * i)))
+            with pytest.raises(KeyframeRefused, match="and 2 more"):
+                client.flush(DEADLINE)
+            client.wait_fused(DEADLINE)
+            assert client.stats.fused == 9
+        with Client(server.address, spool=spool) as client:
+            client.send(wall(12))
+            client.wait_fused(DEADLINE)
+            assert client.stats.durable == 1
+        assert fetch_status(server.address).keyframes_fused == 10
+        assert server.terminate() == 0
+    kept = [keyframe.timestamp_ns - 10**9 for keyframe in Recording(spool / "refused")]
+    assert kept == [3, 4, 11]
 
 
 def test_what_is_kept_aside_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

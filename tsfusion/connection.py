@@ -51,6 +51,11 @@ class Connection:
         return self._monitor.socket
 
     @property
+    def made(self) -> bool:
+        """Whether it stands."""
+        return self._monitor.connected
+
+    @property
     def refused(self) -> bool:
         """Whether the server has certainly turned us away."""
         return self._monitor.refused

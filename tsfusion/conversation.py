@@ -124,11 +124,14 @@ class Conversation:
         self._rewound = self.moved = time.monotonic()
 
     def on_connection(self, problem: str, before: str, *, refused: bool) -> None:
-        """A connection cannot be made, or is (empty), after there was another problem with it."""
+        """A connection cannot be made, or is (empty), after there was another problem with it.
+
+        Who talked to us before is rather slow or gone than somebody else: `heard` says more then.
+        """
         with self._outbox.changed:
             if refused:
                 self._turned_away(problem, "keys")
-            elif problem or self._outbox.problem == before:
+            elif (problem and not self.heard) or (not problem and self._outbox.problem == before):
                 self._outbox.problem, self._outbox.turned_away = problem, ""
 
     # --- hearing ---

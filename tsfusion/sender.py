@@ -123,7 +123,7 @@ class Sender:
         for connection in (self._link, self._data):
             before = connection.problem
             news, ended = connection.look(now)
-            if news is not None and (connection is self._link or not self._link.problem):  # said once
+            if news is not None and (connection is self._link or self._link.made):  # else it is said twice
                 self._talk.on_connection(news, before, refused=connection.refused)
             if ended and connection is self._link:
                 self._talk.greet_again()  # the server does not know the new connection yet

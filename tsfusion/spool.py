@@ -25,8 +25,11 @@ from tsfusion.gone import Gone
 
 log = logging.getLogger(__name__)
 
-# A restarted scanner skips numbers: those of records that a power cut took must never be used again.
+# A restarted scanner skips numbers: those of records that a power cut took must never be used again. How many is
+# drawn, so that two scanners with copies of one spool do not go on with the same: then each would take the
+# answer to the other's keyframe for its own, and lose one in silence.
 _RESTART_GAP = 1024
+_RESTART_SPREAD = 1 << 24
 _SESSION_BYTES = 16
 _MANY_GONE = 65536  # numbers before those of deleted files are forgotten
 _RECORD_OVERHEAD = 512  # what MCAP adds to a keyframe, its share of the index at the end included
@@ -103,7 +106,7 @@ class Spool:
                 self.waiting.append(Waiting(record.seq, record.position, record.nbytes))
         self.waiting_bytes = sum(entry.nbytes for entry in self.waiting)
         last = max([record.seq for record in found] + [*self._gone.numbers], default=0)
-        self.next_seq = last + _RESTART_GAP if last else 1
+        self.next_seq = last + _RESTART_GAP + secrets.randbelow(_RESTART_SPREAD) if last else 1
         self._idle = {number for number, segment in self._segments.items() if not segment.waiting}
         self.used_bytes = sum(segment.nbytes for segment in self._segments.values())
         left_for = self._left_for()
