@@ -21,7 +21,7 @@ def status(**fields: Any) -> Status:
         "keyframes_durable": 6, "keyframes_fused": 5, "keyframes_rejected": {}, "messages_refused": {},
         "duplicates": 0, "sessions": 1, "blocks": 10, "voxels": 100, "map_bytes": 1000, "map_hash": "1f" * 16,
         "color_hash": "2f" * 16, "journal_bytes": 100, "journal_damaged": 0, "fuser_restarts": 0,
-        "peak_rss_bytes": {"server": 1, "fuser": 2}, "delay_ms": Spread(),
+        "peak_rss_bytes": {"server": 1, "fuser": 2}, "delay_ms": Spread(), "delay_bound_ms": 0.1,
         "config": {"volume": {"voxel_size": 0.04, "sensor": "kinect"}}, "versions": {}, **fields,
     })  # fmt: skip
 

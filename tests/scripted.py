@@ -14,6 +14,8 @@ import zmq
 from tsfusion import codec
 from tsfusion.codec import Header
 from tsfusion.transport import messages, sockets
+from tsfusion.transport.curve import ServerKeys
+from tsfusion.transport.zap import Zap
 
 
 def number(header: Header) -> int:
@@ -40,6 +42,8 @@ class ScriptedServer:
         deaf: it answers nothing at all.
         hold: what it answers a keyframe with, once each, instead of taking it.
         denial: what it answers a Hello with.
+        keys, allowed: its own keys, and whom it knows by theirs; None = no keys.
+        same_epoch: a second `start` is the same process: only the connections were cut.
         refuses: whether a keyframe is turned away at the door.
         taken: (session, number) of every journaled keyframe, in order; it outlives `stop`.
         refused, hellos, pings: what came.
@@ -52,6 +56,10 @@ class ScriptedServer:
         self.hold: tuple[float, str, str] | None = None
         self.denial: tuple[str, str] | None = None
         self.refuses: Callable[[Header], bool] = lambda header: False
+        self.keys: ServerKeys | None = None
+        self.allowed: dict[str, str] = {}
+        self.same_epoch = False
+        self.epoch = ""
         self.window = 8
         self.taken: list[tuple[bytes, int]] = []
         self.refused: list[int] = []
@@ -71,10 +79,11 @@ class ScriptedServer:
     def start(self) -> "ScriptedServer":
         """Listen, where the last life listened."""
         self._stopping.clear()
-        self._epoch = secrets.token_hex(4)
+        self.epoch = self.epoch if self.same_epoch and self.epoch else secrets.token_hex(4)
         self._context: zmq.Context[Any] = zmq.Context()
-        self._data = sockets.pull(self._context, 1 << 20)
-        self._router = sockets.router(self._context)
+        self._zap = Zap(self._context, self.allowed.get)
+        self._data = sockets.pull(self._context, 1 << 20, self.keys)
+        self._router = sockets.router(self._context, self.keys)
         for made, address in ((self._data, self.address), (self._router, self.control)):
             _bind(made, address.replace(":0", ":*") if address.endswith(":0") else address)
         self.address = self._data.getsockopt_string(zmq.LAST_ENDPOINT)
@@ -89,12 +98,15 @@ class ScriptedServer:
         self._thread.join()
         self._data.close()
         self._router.close()
+        self._zap.close()
         self._context.term()
 
     def _run(self) -> None:
         while not self._stopping.is_set():
-            polled = [(self._router, zmq.POLLIN)] + [(self._data, zmq.POLLIN)] * self.taking
+            polled = [(self._router, zmq.POLLIN), (self._zap.socket, zmq.POLLIN)]
+            polled += [(self._data, zmq.POLLIN)] * self.taking
             events = dict(zmq.zmq_poll(polled, 5))
+            self._zap.answer_all()
             if self._router in events:
                 self._on_control(*self._router.recv_multipart())
             if self._data in events:
@@ -117,7 +129,7 @@ class ScriptedServer:
             self._say(
                 message.session,
                 messages.Welcome(
-                    self._epoch, codec.VERSION, session.durable, session.fused, self.window, 16 << 20, 1 << 20
+                    self.epoch, codec.VERSION, session.durable, session.fused, self.window, 16 << 20, 1 << 20
                 ),
             )
         elif isinstance(message, messages.Ping):
@@ -125,7 +137,7 @@ class ScriptedServer:
             self._identities[message.session] = identity
             session = self.sessions.get(message.session, Session(message.session))
             now = time.monotonic_ns()
-            pong = messages.Pong(self._epoch, message.sent_ns, now, now, session.durable, session.fused)
+            pong = messages.Pong(self.epoch, message.sent_ns, now, now, session.durable, session.fused)
             self._say(message.session, pong)
 
     def _on_keyframe(self, frames: list[bytes]) -> None:

@@ -294,7 +294,7 @@ def test_a_pinned_keyframe_does_not_keep_the_files_behind_it(tmp_path: Path) -> 
     while len(spool.waiting) > 2:
         spool.remove(1)
     assert journal.segments(tmp_path) == [1, 10]
-    assert spool.used_bytes < 5000
+    assert 2000 < spool.used_bytes < 6000
     spool.drop(10)
     spool.tidy()
     assert (journal.segments(tmp_path), spool.used_bytes, spool.waiting_bytes) == ([], 0, 0)

@@ -13,7 +13,7 @@ from wire import DEADLINE, connected, serving, until, wall
 import tsfusion
 from tsfusion import Client, codec, config, config_toml, maps
 from tsfusion.config import ServerConfig, VolumeConfig
-from tsfusion.errors import DatasetError, ServerUnreachable, TransportError
+from tsfusion.errors import JournalError, ServerUnreachable, TransportError
 from tsfusion.fetch import fetch_health, fetch_mesh, fetch_status
 from tsfusion.quota import Quotas
 from tsfusion.recording import Recording
@@ -63,7 +63,7 @@ def test_two_scanners_two_maps(tmp_path: Path) -> None:
             fetch_status(server.address, map_name="attic")
         assert server.terminate() == 0
     assert maps.names(tmp_path) == ["default", "yard-2"]
-    with pytest.raises(DatasetError, match="holds the maps default, yard-2: say which"):
+    with pytest.raises(JournalError, match=r"has several maps \(default, yard-2\): choose one with --map"):
         Recording(tmp_path)
     assert len(Recording(tmp_path, "yard-2")) == len(Recording(tmp_path / "maps/yard-2")) == 8
     with serving(tmp_path) as server:  # both are taken up again, without anybody asking
@@ -180,16 +180,26 @@ def test_a_full_disk_is_said_and_waited_for(tmp_path: Path) -> None:
 
 def test_a_full_disk_with_room_again(small_disk: Callable[[int], Path]) -> None:
     folder = small_disk(24)
-    with serving(folder, min_free_bytes=4 << 20) as server, Client(server.address) as client:
+    with (
+        serving(folder, min_free_bytes=4 << 20) as server,
+        Client(server.address, policy="spool_all") as client,
+    ):
         scan(server.address, "default", range(3))
         filler = folder / "filler"
         filler.write_bytes(bytes(20 << 20))
-        client.send(wall(3))
-        until(lambda: "must stay so" in " ".join(fetch_health(server.address).problems))
+        sent = 3
+
+        def noticed() -> bool:  # the disk is looked at once a second
+            nonlocal sent
+            client.send(wall(sent))
+            sent += 1
+            return "must stay so" in " ".join(fetch_health(server.address).problems)
+
+        until(noticed)
         filler.unlink()
         client.wait_fused(timeout=DEADLINE)
         assert fetch_health(server.address).ready
-        assert fetch_status(server.address).map_hash == fused_hash(range(4))
+        assert fetch_status(server.address).map_hash == fused_hash(range(sent))
         assert server.terminate() == 0
 
 

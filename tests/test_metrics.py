@@ -64,6 +64,7 @@ def test_a_snapshot_becomes_figures() -> None:
         client("cart", waiting=2, skipped={"thinned": 3}, held="disk", heard_s=7.0),
         client("cart", waiting=1, skipped={"thinned": 1, "spool": 5}),
         client("drone"),
+        client("drone", waiting=50, held="disk", heard_s=families.HEARD + 1),
         refused={"header": 4}, duplicates=9, problems=("disk full",), ready=False,
         maps={
             "yard": map_health(state="busy", waiting=2, fuser_restarts=1),
@@ -87,6 +88,7 @@ def test_a_snapshot_becomes_figures() -> None:
         ("tsfusion_client_sessions", "cart"): 2, ("tsfusion_client_waiting_keyframes", "cart"): 3,
         ("tsfusion_client_skipped_keyframes", "cart", "thinned"): 4,
         ("tsfusion_client_skipped_keyframes", "cart", "spool"): 5,
+        ("tsfusion_client_waiting_keyframes", "drone"): 0,
         ("tsfusion_client_held_sessions", "cart"): 1, ("tsfusion_client_held_sessions", "drone"): 0,
         ("tsfusion_client_received_bytes", "cart"): 6 * MIB,
         ("tsfusion_client_silence_seconds", "cart"): 3.25,

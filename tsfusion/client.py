@@ -20,12 +20,13 @@ from types import TracebackType
 
 from tsfusion.backpressure import Backpressure
 from tsfusion.config import ClientConfig, Policy, override
-from tsfusion.errors import FlushTimeout, KeyframeRefused, ServerUnreachable, TransportError
+from tsfusion.errors import FlushTimeout, KeyframeRefused, NotAllowed, ServerUnreachable, TransportError
 from tsfusion.keyframe import Keyframe
 from tsfusion.outbox import ClientStats, Outbox
 from tsfusion.sender import Sender
 from tsfusion.spool import Spool
 from tsfusion.transport import KeyframeTimes, control_address, sockets
+from tsfusion.transport.curve import client_keys
 
 __all__ = ["Client", "ClientStats"]
 
@@ -50,7 +51,7 @@ class Client:
         config: the rest of the settings; its own addresses are not used.
 
     Raises:
-        InvalidConfig: for a malformed address or setting.
+        InvalidConfig: for a malformed address or setting, or a key file that is of no use.
         JournalError: when the spool cannot be used, another client uses it, or it waits for another map.
     """
 
@@ -72,12 +73,13 @@ class Client:
             if given is not None
         }
         self._config = override(config or ClientConfig(), map=map, policy=policy, **keys)
+        connection_keys = client_keys(self._config.key, self._config.server_key)
         address = sockets.target(address)
         self._control = sockets.target(control_address(address, control))
         segment_bytes = min(self._config.segment_bytes, self._config.spool_bytes // _SEGMENTS)
         self._outbox = Outbox(Spool(spool, segment_bytes, map_name=self._config.map))
         self._pressure = Backpressure(self._outbox, self._config)
-        self._sender = Sender(address, self._control, self._outbox, self._config)
+        self._sender = Sender(address, self._control, self._outbox, self._config, connection_keys)
         self._sending = threading.Lock()
         self._closed = False
         self._thread = threading.Thread(target=self._sender.run, name="tsfusion-client", daemon=True)
@@ -107,14 +109,15 @@ class Client:
         """Wait until the server has answered. Not needed before `send`.
 
         Raises:
+            NotAllowed: as soon as the server turns the keys away, or the lack of them.
             ServerUnreachable: when it has not within `timeout` seconds (default: the config's), or answers
                 that it will not have this client.
         """
         timeout = self._config.connect_timeout if timeout is None else timeout
         box = self._outbox
-        self._wait(lambda: box.connected or box.turned_away, timeout)
+        self._wait(lambda: box.connected or bool(box.turned_away), timeout)
         if box.turned_away:
-            raise ServerUnreachable(self._why())
+            raise (NotAllowed if box.turned_away == "keys" else ServerUnreachable)(self._why())
         if not box.connected:
             raise ServerUnreachable(f"{self._why()} (waited {timeout:g} s)")
 

@@ -5,6 +5,7 @@ import logging
 import math
 import time
 from collections.abc import Callable
+from typing import Literal
 
 from tsfusion import codec
 from tsfusion.errors import DecodeError
@@ -122,6 +123,14 @@ class Conversation:
         self._asked_again = False
         self._rewound = self.moved = time.monotonic()
 
+    def on_connection(self, problem: str, before: str, *, refused: bool) -> None:
+        """A connection cannot be made, or is (empty), after there was another problem with it."""
+        with self._outbox.changed:
+            if refused:
+                self._turned_away(problem, "keys")
+            elif problem or self._outbox.problem == before:
+                self._outbox.problem, self._outbox.turned_away = problem, ""
+
     # --- hearing ---
 
     def hear(self, frames: list[bytes]) -> None:
@@ -166,7 +175,7 @@ class Conversation:
                 f"the server speaks version {welcome.version} of the wire format, this client {codec.VERSION}"
             )
         elif not self._is_foreign(welcome.durable):
-            self._outbox.problem, self._outbox.opening, self._outbox.turned_away = "", False, False
+            self._outbox.problem, self._outbox.opening, self._outbox.turned_away = "", False, ""
             self.welcome = welcome
             self._ping_due = self._held_until = 0.0
             self._outbox.welcomed(welcome.durable, welcome.window_keyframes)
@@ -178,15 +187,15 @@ class Conversation:
         with self._outbox.changed:
             self._outbox.opening = denied.reason == "opening"
             if self._outbox.opening:
-                self._outbox.problem, self._outbox.turned_away = "", False
+                self._outbox.problem = self._outbox.turned_away = ""
                 self.greet_again(_HELLO_INTERVAL[1])
             else:
                 self._turned_away(f"the server at {self._address} refuses this client: {denied.message}")
 
-    def _turned_away(self, problem: str) -> None:
+    def _turned_away(self, problem: str, by: Literal["server", "keys"] = "server") -> None:
         """Keep asking: a person may put it right at the other end."""
         self.greet_again(_HELLO_INTERVAL[1])
-        self._outbox.connected, self._outbox.turned_away = False, True
+        self._outbox.connected, self._outbox.turned_away = False, by
         if problem != self._outbox.problem:
             self._outbox.problem = problem
             self._outbox.changed.notify_all()

@@ -4,7 +4,7 @@
 import re
 from pathlib import Path
 
-from tsfusion.errors import DatasetError
+from tsfusion.errors import JournalError
 
 MAPS_FOLDER = "maps"
 JOURNAL_FOLDER = "journal"
@@ -40,16 +40,21 @@ def resolve(path: Path, name: str | None = None) -> Path:
         name: which of several.
 
     Raises:
-        DatasetError: when it holds no map of that name, or several and none was named.
+        JournalError: when it holds no map of that name, or several and none was named.
     """
     if not is_state(path):
         if name is not None:
-            raise DatasetError(f"{path} is no state folder, so it has no map {name!r}")
+            raise JournalError(f"--map has no effect on {path}: only a state folder has several maps")
         return path
     found = names(path)
     if name is None and len(found) == 1:
-        name = found[0]
-    if name not in found:
-        wanted = f"say which: {path / MAPS_FOLDER}/NAME" if name is None else f"not {name!r}"
-        raise DatasetError(f"{path} holds the maps {', '.join(found) or '(none)'}: {wanted}")
-    return folder(path, name)
+        return folder(path, found[0])
+    if name in found:
+        return folder(path, name)
+    there = ", ".join(found) or "none"
+    if name is None and found:
+        raise JournalError(
+            f"{path} has several maps ({there}): choose one with --map NAME, or give {path / MAPS_FOLDER}/NAME"
+        )
+    missing = f"no map {name}" if name else "no map with a journal"
+    raise JournalError(f"{path} has {missing}; it has: {there}")

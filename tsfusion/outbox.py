@@ -3,6 +3,7 @@
 
 import threading
 from collections import Counter, OrderedDict, deque
+from typing import Literal
 
 import msgspec
 from msgspec import Struct
@@ -51,7 +52,7 @@ class Outbox:
         refusals: how many keyframes the next `flush` has to complain of, and the `first_refusal` in words.
         connected: the server answers.
         problem: why it does so in vain.
-        turned_away: it answers that it will not have us.
+        turned_away: who will not have us: the `server`, or the `keys` on its connection; empty = nobody.
         opening: it answers, but the map is not open yet.
         skipped: see `ClientStats`.
         state: see `ClientStats`.
@@ -67,7 +68,7 @@ class Outbox:
         self.first_refusal = ""
         self.connected = False
         self.problem = ""
-        self.turned_away = False
+        self.turned_away: Literal["", "server", "keys"] = ""
         self.opening = False
         self.skipped: Counter[str] = Counter()
         self.state = "ok"

@@ -25,7 +25,6 @@ class RefusedFolder:
         self._outbox = outbox
         self._folder = outbox.spool.folder / FOLDER
         self._journal: journal.Journal | None = None
-        self._kept: set[tuple[bytes, int]] = set()  # by an earlier process, which was then killed
 
     def give_up(self, entry: Waiting, reason: str, message: str, *, readable: bool = True) -> None:
         """Take a keyframe out of the queue for good. Not while holding `changed`: this uses the disk."""
@@ -43,10 +42,7 @@ class RefusedFolder:
         frames = spool.read(entry)
         if self._journal is None:
             self._journal = journal.Journal(self._folder, 1, sync=False)
-            self._kept = {(found.session, found.seq) for found in self._journal.found}
             self._journal.found = []
-        if (spool.session, entry.seq) in self._kept:
-            return
         for number in journal.segments(self._folder):
             if self._journal.nbytes + entry.nbytes + _FILE_OVERHEAD <= MAX_BYTES:
                 break

@@ -2,9 +2,9 @@
 """Whether the spool's disk takes another keyframe. A scanner goes on without it, and says so once."""
 
 import logging
-import os
 import time
 
+from tsfusion import disk
 from tsfusion.outbox import Outbox
 
 log = logging.getLogger(__name__)
@@ -75,11 +75,9 @@ class Room:
     def _look(self, now: float) -> None:
         self._look_due, self._written = now + _LOOK_INTERVAL, 0
         try:
-            disk = os.statvfs(self._outbox.spool.folder)
+            self._free = disk.free_bytes(self._outbox.spool.folder)
         except OSError:  # the write will say why
             self._free = 1 << 62
-        else:
-            self._free = disk.f_bavail * disk.f_frsize
 
     def _enter(self, state: str, why: str) -> None:
         if self._outbox.state != state:

@@ -17,12 +17,14 @@ import zmq
 
 from tsfusion import codec
 from tsfusion.config import ClientConfig
+from tsfusion.connection import Connection
 from tsfusion.conversation import Conversation
 from tsfusion.errors import DecodeError, JournalError
 from tsfusion.outbox import Outbox
 from tsfusion.refused import RefusedFolder
 from tsfusion.spool import Waiting
 from tsfusion.transport import messages, sockets
+from tsfusion.transport.curve import ClientKeys
 
 log = logging.getLogger(__name__)
 
@@ -34,9 +36,17 @@ _SCARCE = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # what others of this mach
 class Sender:
     """Owns the sockets; `run` is the thread's body."""
 
-    def __init__(self, address: str, control: str, outbox: Outbox, config: ClientConfig) -> None:
+    def __init__(
+        self,
+        address: str,
+        control: str,
+        outbox: Outbox,
+        config: ClientConfig,
+        keys: ClientKeys | None = None,
+    ) -> None:
         self._address = address
         self._control = control
+        self._keys = keys
         self._outbox = outbox
         self._config = config
         self._refused = RefusedFolder(outbox)
@@ -68,56 +78,67 @@ class Sender:
     def run(self) -> None:
         """Talk to the server until stopped."""
         context: zmq.Context[Any] = zmq.Context()
-        self._link = sockets.dealer(context)
-        self._push = sockets.push(context)
+        self._link = Connection(context, sockets.dealer, self._control, self._keys)
+        self._data = Connection(context, sockets.push, self._address, self._keys)
         try:
-            self._link.connect(self._control)
-            self._push.connect(self._address)
             while not self._stopping.is_set():
-                self._step(context)
+                self._step()
         finally:
             self._link.close()
-            self._push.close()
+            self._data.close()
             self._waker.close()
             self._woken.close()
             self._refused.close()
             context.term()
 
-    def _step(self, context: "zmq.Context[Any]") -> None:
+    def _step(self) -> None:
         for _ in range(64):
             try:
-                self._talk.hear(self._link.recv_multipart(zmq.NOBLOCK))
+                self._talk.hear(self._link.socket.recv_multipart(zmq.NOBLOCK))
             except zmq.Again:
                 break
         now = time.monotonic()
+        self._watch_connections(now)
         self._talk.tick(now)
-        self._watch_for_stall(now, context)
+        self._watch_for_stall(now)
         self._pump(now)
         self._wait(now)
 
     def _wait(self, now: float) -> None:
-        polled: list[tuple[Any, int]] = [(self._link, zmq.POLLIN), (self._woken.fileno(), zmq.POLLIN)]
+        sources: list[Any] = [self._link.socket, self._link.events, self._data.events, self._woken.fileno()]
+        polled = [(source, zmq.POLLIN) for source in sources]
         if self._blocked:
-            polled.append((self._push, zmq.POLLOUT))
-        due = min(self._talk.due, self._read_due) if self._unread else self._talk.due
+            polled.append((self._data.socket, zmq.POLLOUT))
+        others = (self._read_due if self._unread else 0.0, self._link.due, self._data.due)
+        due = min([self._talk.due, *filter(None, others)])
         zmq.zmq_poll(polled, max(int((due - now) * 1000), 1))
         with suppress(BlockingIOError):
             self._woken.recv(4096)
 
     def _say(self, message: messages.ToServer) -> None:
         with suppress(zmq.Again):
-            self._link.send(messages.encode(message), zmq.NOBLOCK)
+            self._link.socket.send(messages.encode(message), zmq.NOBLOCK)
 
-    def _watch_for_stall(self, now: float, context: "zmq.Context[Any]") -> None:
+    def _watch_connections(self, now: float) -> None:
+        for connection in (self._link, self._data):
+            before = connection.problem
+            news, ended = connection.look(now)
+            if news is not None and (connection is self._link or not self._link.problem):  # said once
+                self._talk.on_connection(news, before, refused=connection.refused)
+            if ended and connection is self._link:
+                self._talk.greet_again()  # the server does not know the new connection yet
+            elif ended:
+                with self._outbox.changed:
+                    self._talk.rewind()  # what was under way is lost
+
+    def _watch_for_stall(self, now: float) -> None:
         patience = self._config.stall_timeout
         if now - self._talk.heard > patience:
             with self._outbox.changed:
                 self._outbox.connected = False
         if self._outbox.outstanding and not self._talk.held and now - self._talk.moved > patience:
             log.info("nothing moves: connecting to %s again", self._address)
-            self._push.close()
-            self._push = sockets.push(context)
-            self._push.connect(self._address)
+            self._data.reopen()
             self._talk.greet_again()
             with self._outbox.changed:
                 self._talk.rewind()
@@ -169,7 +190,7 @@ class Sender:
             self._refused.give_up(entry, "spool", str(error))
             return
         try:
-            self._push.send_multipart([head, *frames[1:]], zmq.NOBLOCK, copy=False)
+            self._data.socket.send_multipart([head, *frames[1:]], zmq.NOBLOCK, copy=False)
         except zmq.Again:
             self._blocked = True
             with self._outbox.changed:

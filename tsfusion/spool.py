@@ -21,12 +21,14 @@ from msgspec import Struct
 from tsfusion import codec, journal
 from tsfusion.config import DEFAULT_MAP
 from tsfusion.errors import DecodeError, JournalError
+from tsfusion.gone import Gone
 
 log = logging.getLogger(__name__)
 
 # A restarted scanner skips numbers: those of records that a power cut took must never be used again.
 _RESTART_GAP = 1024
 _SESSION_BYTES = 16
+_MANY_GONE = 65536  # numbers before those of deleted files are forgotten
 _RECORD_OVERHEAD = 512  # what MCAP adds to a keyframe, its share of the index at the end included
 
 
@@ -39,10 +41,11 @@ class Waiting(Struct, frozen=True, gc=False):
 
 
 class Segment(Struct):
-    """One file of the spool: its size on the disk, and how many of its keyframes still wait."""
+    """One file of the spool: its size on the disk, how many of its keyframes wait, and which are gone."""
 
     nbytes: int = 0
     waiting: int = 0
+    gone: list[int] = []
 
 
 class Spool:
@@ -87,12 +90,20 @@ class Spool:
         if len(sessions) > 1:
             raise JournalError(f"{self.folder} holds keyframes of {len(sessions)} sessions: not one spool")
         self.session = sessions.pop()
-        self.waiting = deque(Waiting(record.seq, record.position, record.nbytes) for record in found)
-        self.waiting_bytes = sum(entry.nbytes for entry in self.waiting)
-        self.next_seq = self.waiting[-1].seq + _RESTART_GAP if self.waiting else 1
+        self._gone = Gone(self.folder, self.session)
+        self._many_gone = 2 * self._gone.written + _MANY_GONE
         self._segments = {number: Segment(self._size(number)) for number in journal.segments(self.folder)}
-        for entry in self.waiting:
-            self._segments[entry.position.segment].waiting += 1
+        self.waiting: deque[Waiting] = deque()
+        for record in found:
+            segment = self._segments[record.position.segment]
+            if record.seq in self._gone.numbers:
+                segment.gone.append(record.seq)
+            else:
+                segment.waiting += 1
+                self.waiting.append(Waiting(record.seq, record.position, record.nbytes))
+        self.waiting_bytes = sum(entry.nbytes for entry in self.waiting)
+        last = max([record.seq for record in found] + [*self._gone.numbers], default=0)
+        self.next_seq = last + _RESTART_GAP if last else 1
         self._idle = {number for number, segment in self._segments.items() if not segment.waiting}
         self.used_bytes = sum(segment.nbytes for segment in self._segments.values())
         left_for = self._left_for()
@@ -122,11 +133,15 @@ class Spool:
 
         Raises:
             JournalError: when the disk refuses. The number is not used again: where the disk did not even
-                let the failed record be taken back, it must not pass for another keyframe.
+                let the failed record be taken back, it must not be found in the place of another.
         """
         seq = self.next_seq
         self.next_seq += 1
-        position = self._journal.append(frames, session=self.session, seq=seq)
+        try:
+            position = self._journal.append(frames, session=self.session, seq=seq)
+        except JournalError:
+            self._gone.add(seq)
+            raise
         return Waiting(seq, position, sum(map(len, frames)))
 
     def add(self, entry: Waiting) -> None:
@@ -160,15 +175,20 @@ class Spool:
         return dropped
 
     def remove(self, place: int) -> None:
-        """Let go of one keyframe, by its place in the queue."""
-        self._let_go(place)
+        """Let go of one keyframe that the server does not have, by its place in the queue."""
+        entry = self._let_go(place)
+        self._segments[entry.position.segment].gone.append(entry.seq)
+        self._gone.add(entry.seq)
         self._delete_segments()
+        if self._gone.written > self._many_gone:
+            self._gone.keep(seq for segment in self._segments.values() for seq in segment.gone)
+            self._many_gone = 2 * self._gone.written + _MANY_GONE
 
     def tidy(self) -> None:
         """Delete what `drop` had to leave. For the thread that writes, when it does not."""
         self._delete_segments(self._journal.segment)
 
-    def _let_go(self, place: int) -> None:
+    def _let_go(self, place: int) -> Waiting:
         entry = self.waiting[place]
         del self.waiting[place]
         self.waiting_bytes -= entry.nbytes
@@ -176,6 +196,7 @@ class Spool:
         segment.waiting -= 1
         if not segment.waiting:
             self._idle.add(entry.position.segment)
+        return entry
 
     def _delete_segments(self, below: int | None = None) -> None:
         # The newest stays: a keyframe that `write` has just put there may not be queued yet.
@@ -203,6 +224,7 @@ class Spool:
         elif not self.waiting:
             for number in list(self._segments):
                 self._forget(number)
+            self._gone.clear()
         self._lock.close()
 
 

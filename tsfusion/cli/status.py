@@ -21,6 +21,8 @@ def status(
     *,
     connect: options.Connect = None,
     control: options.Control = None,
+    key: options.Key = None,
+    server_key: options.ServerKey = None,
     map_: Annotated[str | None, typer.Option("--map", metavar="NAME", help="Only this map.")] = None,
     watch: Annotated[
         float | None, typer.Option(metavar="SECONDS", min=0.1, help="Ask again and again.")
@@ -47,7 +49,8 @@ def status(
 
     address = connect or ClientConfig().address
     watcher = Watcher(
-        address, _asker(address, control), timeout=timeout, stall_after=stall_after, only=map_ or ""
+        address, _asker(address, control, key, server_key), timeout=timeout, stall_after=stall_after,
+        only=map_ or "",
     )  # fmt: skip
     if watch is None:
         look = watcher.once()
@@ -58,14 +61,14 @@ def status(
     return _repeat(watcher, watch, json=json)
 
 
-def _asker(address: str, control: str | None) -> "Ask":
-    from tsfusion.transport import control_address, request, sockets
+def _asker(address: str, control: str | None, key: str | None, server_key: str | None) -> "Ask":
+    from tsfusion.transport import client_keys, control_address, request, sockets
     from tsfusion.transport.messages import Command, Reply
 
-    to = control_address(sockets.target(address), control)
+    to, keys = control_address(sockets.target(address), control), client_keys(key, server_key)
 
     def ask(command: Command, timeout: float) -> Reply:
-        reply, _ = request(to, command, timeout=timeout)
+        reply, _ = request(to, command, timeout=timeout, keys=keys)
         return reply
 
     return ask

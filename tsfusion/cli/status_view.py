@@ -10,6 +10,7 @@ from tsfusion.cli.show import size
 from tsfusion.logs import printable
 from tsfusion.transport.messages import ClientHealth, Health, MapHealth, Spread, Status
 
+GONE = 30.0  # seconds without a word
 MAX_CLIENTS = 40  # rows; those heard last
 _STATE_STYLES = {"idle": "green", "busy": "green", "failed": "bold red"}
 
@@ -68,6 +69,7 @@ def _clients(clients: list[ClientHealth]) -> list[RenderableType]:
             _plain(one.client or "-"), _plain(one.session), _plain(one.map), f"{one.fused}/{one.durable}",
             size(one.received_bytes), _waiting(one.waiting), _lasting(one.heard_s),
             _plain(one.held, style="yellow"), Text(_reasons(one.skipped), style="yellow"),
+            style="dim" if one.heard_s > GONE else "",
         )  # fmt: skip
     more = len(latest) - MAX_CLIENTS
     return [table, Text(f"and {more} more sessions")] if more > 0 else [table]

@@ -9,6 +9,7 @@ from tsfusion.journal.layout import Position, Record
 from tsfusion.journal.segments import (
     Scan,
     describe,
+    is_closed,
     read,
     read_at,
     records,
@@ -16,7 +17,7 @@ from tsfusion.journal.segments import (
     segment_path,
     segments,
 )
-from tsfusion.journal.walk import Damage, walk
+from tsfusion.journal.walk import Damage, segment_number, walk
 from tsfusion.journal.writer import Journal, write_file
 
 __all__ = [
@@ -26,10 +27,12 @@ __all__ = [
     "Record",
     "Scan",
     "describe",
+    "is_closed",
     "read",
     "read_at",
     "records",
     "scan",
+    "segment_number",
     "segment_path",
     "segments",
     "walk",

@@ -196,7 +196,7 @@ def find_identity(raw: bytes) -> tuple[bytes, int, bytes] | None:
     at = len(OPENING)
     if len(raw) < at + _CHUNK.size:
         return None
-    opcode, length, _, _, size, crc32, compression, stored = _CHUNK.unpack_from(raw, at)
+    opcode, length, first_ns, last_ns, size, crc32, compression, stored = _CHUNK.unpack_from(raw, at)
     end = at + _LENGTH_BYTES + length
     inner, message = at + _CHUNK.size, end - _MESSAGE.size - _IDENTITY.size
     if (opcode, compression, size, end) != (Opcode.CHUNK, 0, stored, inner + stored):
@@ -205,7 +205,7 @@ def find_identity(raw: bytes) -> tuple[bytes, int, bytes] | None:
         return None
     _, _, channel, _, logged_ns, _ = _MESSAGE.unpack_from(raw, message)
     magic, found = _IDENTITY.unpack_from(raw, message + _MESSAGE.size)
-    if (channel, magic) != (_SEGMENT, _SEGMENT_MAGIC):
+    if (channel, magic) != (_SEGMENT, _SEGMENT_MAGIC) or not first_ns == last_ns == logged_ns:
         return None
     return found, end, _index(channel, logged_ns, message - inner)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from tsfusion.errors import JournalError
-from tsfusion.journal import layout
+from tsfusion.journal import layout, seal
 from tsfusion.journal.layout import Position, Record
 from tsfusion.journal.source import Source
 from tsfusion.journal.walk import Damage, failed, segment_number, walk
@@ -103,6 +103,15 @@ def describe(path: Path, damage: Damage) -> str:
     else:
         outcome = f"; {damage.lost} keyframes are lost" if damage.lost else "; no keyframe is lost"
     return f"{path}, byte {damage.position.offset}: {damage.what}{outcome}"
+
+
+def is_closed(path: Path) -> bool:
+    """Whether a segment ends with an index, as normal MCAP readers need it; False when it cannot be read."""
+    try:
+        with Source(path) as source:
+            return seal.read(source).state == "whole"
+    except OSError:
+        return False
 
 
 def records(path: Path) -> Iterator[Record]:

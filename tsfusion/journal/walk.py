@@ -64,6 +64,11 @@ def failed(verb: str, path: Path, error: OSError) -> JournalError:
     return JournalError(f"cannot {verb} {path}: {error.strerror or error}")
 
 
+def _was_index(raw: bytes) -> bool:
+    """Whether these bytes, one of them perhaps damaged, are an index and not the start of a record."""
+    return layout.INDEX_START[:1] == raw[:1] or layout.INDEX_START[1:9] == raw[1:9]
+
+
 class _Walk:
     def __init__(self, source: Source, number: int) -> None:
         self._source = source
@@ -148,22 +153,22 @@ class _Walk:
 
     def _damage(self, at: int) -> Damage:
         """What is wrong at a place where a record should start, and how far it reaches."""
-        head = layout.head(self._source.read(at, layout.HEAD_BYTES, self._end))
+        raw = self._source.read(at, layout.HEAD_BYTES, self._end)
+        head = layout.head(raw)
         end = at + head.nbytes if head is not None else None
         is_open = self._seal.state == "open"
         if is_open and end is not None and end > self._end:
             return self._torn(at)  # no search in there: all its lengths agree, it was cut off
         following = self._search(at + 1)
-        if is_open and following is None and (self._end - at < layout.HEAD_BYTES or self._is_zero(at)):
-            return self._torn(at)
         stop = self._end if following is None else following
+        if stop - at == layout.INDEX_BYTES and (stop < self._source.size or _was_index(raw)):
+            return self._note(at, stop - at, "the index of the keyframe before it is damaged")
+        if is_open and following is None and (stop - at < layout.HEAD_BYTES or self._is_zero(at)):
+            return self._torn(at)
+        what = "nothing can be read here"
         if head is not None and end is not None and end <= stop:
             stop = self._over_index(end)
             what = f"keyframe {head.seq} of session {head.session.hex()[:8]} is damaged"
-        elif stop - at == layout.INDEX_BYTES:
-            return self._note(at, stop - at, "the index of the keyframe before it is damaged")
-        else:
-            what = "nothing can be read here"
         if is_open and stop == self._end:
             what += " (the last write; perhaps it was never acknowledged)"
         return self._note(at, stop - at, what, lost=1)

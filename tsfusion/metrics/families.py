@@ -20,6 +20,7 @@ from tsfusion.transport.messages import ClientHealth, Health, MapHealth, MapStat
 NAMELESS = "-"  # clients without keys; no name looks like this
 OTHERS = "+"  # all that are beyond a limit
 MAX_CLIENTS = 100
+HEARD = 30.0  # seconds; what a session said before that is no news: its client may be gone
 # Why a client leaves keyframes out; it may say anything.
 SKIPPED = frozenset({"thinned", "dropped", "spool", "disk"})
 
@@ -40,9 +41,17 @@ _OF_MAPS: tuple[tuple[str, str, Callable[[MapHealth], float]], ...] = (
 )
 _OF_CLIENTS: tuple[tuple[str, str, Callable[[list[ClientHealth]], float]], ...] = (
     ("sessions", "Sessions heard since the start.", len),
-    ("waiting_keyframes", "Keyframes in its spools, as it said.", lambda own: sum(s.waiting for s in own)),
+    (
+        "waiting_keyframes",
+        "In its spools, as it said lately.",
+        lambda own: sum(s.waiting for s in _lately(own)),
+    ),
     ("received_bytes", "Bytes of keyframes that came.", lambda own: sum(s.received_bytes for s in own)),
-    ("held_sessions", "Sessions nothing is taken from now.", lambda own: sum(bool(s.held) for s in own)),
+    (
+        "held_sessions",
+        "Sessions nothing is taken from now.",
+        lambda own: sum(bool(s.held) for s in _lately(own)),
+    ),
 )
 
 
@@ -111,6 +120,10 @@ def _grouped(clients: Iterable[ClientHealth]) -> dict[str, list[ClientHealth]]:
             name = OTHERS
         found.setdefault(name, []).append(session)
     return found
+
+
+def _lately(sessions: Iterable[ClientHealth]) -> list[ClientHealth]:
+    return [one for one in sessions if one.heard_s <= HEARD]
 
 
 def _skipped(sessions: Iterable[ClientHealth]) -> Counter[str]:
