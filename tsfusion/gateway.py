@@ -20,7 +20,7 @@ from tsfusion.errors import DecodeError, TsfusionError
 from tsfusion.hosted import HostedMap
 from tsfusion.intake import Intake
 from tsfusion.metrics import Metrics
-from tsfusion.ports import Ports, each, send_now
+from tsfusion.ports import MemoryBound, Ports, each, send_now
 from tsfusion.questions import Questions
 from tsfusion.sessions import Route, Routes
 from tsfusion.transport import messages, sockets, work
@@ -63,6 +63,7 @@ class Gateway:
         self._topics: set[bytes] = set()  # that somebody subscribed to
         self._watched: dict[str, bool] = {}  # what each fuser knows of it
         self._unopened: dict[str, tuple[str, float]] = {}  # maps that could not be opened: why, when
+        self._memory = MemoryBound(server.memory_bytes)
         self._accepting = self._started_up = False
         self._started = time.monotonic()
         self._next_snapshot = 0.0
@@ -155,8 +156,8 @@ class Gateway:
             log.warning("a key was revoked: every connection is made anew")
             self._refused["revoked"] += 1
         else:
-            held = process.rss_bytes() - self._questions.nbytes
-            if held <= self._server.memory_bytes:
+            held = self._memory.excess(self._questions.nbytes)
+            if not held:
                 return
             log.error(
                 "the gateway holds %d MB, more than memory_bytes: every connection is made anew", held >> 20
