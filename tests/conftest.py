@@ -2,7 +2,8 @@
 """Fixtures shared by all tests."""
 
 import os
-from collections.abc import Callable
+import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -21,3 +22,23 @@ def data() -> Callable[[str], Path]:
         return folder
 
     return find
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
+    """Mounts a file system of so many MiB; its folder."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+
+    def mount(mib: int) -> Path:
+        if os.geteuid():
+            pytest.skip("mounting a small file system takes root")
+        command = ["mount", "-t", "tmpfs", "-o", f"size={mib}m", "none", folder]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            pytest.skip(f"no small file system can be mounted here: {done.stderr.strip()}")
+        return folder
+
+    yield mount
+    if os.path.ismount(folder):
+        subprocess.run(["umount", "-l", folder], check=True)

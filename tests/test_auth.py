@@ -177,7 +177,7 @@ def test_an_allowed_key_is_the_sender_of_every_part() -> None:
         for frames, senders in (*at.keyframes, *at.control):
             assert senders == [ROBOT.public] * len(frames)
         assert at.keyframes[0][0][0] == b"head"
-        assert at.subscriptions[0][0] == [b"\x01mesh"]
+        assert at.subscriptions[0][0] == [b"\x01mesh/default/"]
 
 
 def test_without_keys_the_link_is_as_before() -> None:

@@ -25,7 +25,7 @@ from tsfusion.errors import InvalidConfig, OutputError
 Here = Callable[..., "subprocess.CompletedProcess[str]"]
 
 NOBODY = "tcp://127.0.0.1:9"  # the discard port: nobody listens there, and nobody may without being root
-VERBS = ["demo", "replay", "serve", "mesh", "status", "doctor", "keys", "config", "datasets"]
+VERBS = ["demo", "replay", "serve", "mesh", "status", "doctor", "keys", "journal", "config", "datasets"]
 
 
 def scene(folder: Path, *, pose: str | None = None, depth: bytes | None = None) -> Path:
@@ -203,10 +203,16 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("here first")
     (tmp_path / "garbage.tsf").write_bytes(bytes(range(200)))
-    monkeypatch.setattr("tsfusion.client._ANSWER_TIMEOUT", 0.2)
+    monkeypatch.setattr("tsfusion.fetch._ANSWER_TIMEOUT", 0.2)
     done = here(*arguments)
     assert words in one_line(done)
-    left = {path.name for path in tmp_path.rglob("*")} - {"tsfusion-state", "journal", "lock"}
+    left = {path.name for path in tmp_path.rglob("*")} - {
+        "tsfusion-state",
+        "maps",
+        "default",
+        "journal",
+        "lock",
+    }
     assert left == {"empty", "file", "garbage.tsf"}
     assert (tmp_path / "file").read_text() == "here first"
 
@@ -303,7 +309,7 @@ def test_a_sensor_chosen_in_the_environment_counts(
 def test_flags_of_the_environment_are_not_refused(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
     """They may be meant for other commands."""
     monkeypatch.setenv("TSFUSION_VOXEL_SIZE", "0.5")
-    monkeypatch.setattr("tsfusion.client._ANSWER_TIMEOUT", 0.2)
+    monkeypatch.setattr("tsfusion.fetch._ANSWER_TIMEOUT", 0.2)
     assert "no server" in one_line(here("mesh", NOBODY, "a.ply"))
 
 

@@ -102,7 +102,7 @@ def test_mesh_of_map_state_and_journal_agree(run_folder: Path, tmp_path: Path) -
     vertices = set()
     state = run_folder / "state"
     for index, source in enumerate(
-        ([state / "map.tsf"], [state], [state / "journal", "--voxel-size", VOXEL])
+        ([state / "maps/default/map.tsf"], [state], [state / "maps/default/journal", "--voxel-size", VOXEL])
     ):
         done = tsfusion("mesh", source[0], tmp_path / f"{index}.ply", *source[1:], "--json")
         assert done.returncode == 0, done.stderr
@@ -115,10 +115,10 @@ def test_mesh_of_map_state_and_journal_agree(run_folder: Path, tmp_path: Path) -
 @pytest.mark.slow
 def test_mesh_fuses_what_the_checkpoint_missed(run_folder: Path, tmp_path: Path) -> None:
     """A state folder whose map is older than its journal, as a killed server leaves it."""
-    shutil.copytree(run_folder / "state" / "journal", tmp_path / "state" / "journal")
+    shutil.copytree(run_folder / "state/maps/default/journal", tmp_path / "state/maps/default/journal")
     volume = Volume(voxel_size=VOXEL)
     volume.integrate(room(1)[0])
-    volume.save(tmp_path / "state" / "map.tsf")
+    volume.save(tmp_path / "state/maps/default/map.tsf")
     done = tsfusion("mesh", tmp_path / "state", tmp_path / "a.glb", "--preview", tmp_path / "a.png")
     assert done.returncode == 0, done.stderr
     run = json.loads((run_folder / "out" / "run.json").read_text())
@@ -133,11 +133,11 @@ def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
                 client.send(keyframe)
             client.flush(timeout=30)
             client.wait_fused(timeout=30)
-        status = json.loads(tsfusion("status", "--connect", address, "--json").stdout)
+        status = json.loads(tsfusion("status", "--connect", address, "--json").stdout)["maps"]["default"]
         assert (status["keyframes_durable"], status["keyframes_fused"]) == (2, 2)
         assert status["blocks"] > 10
         assert len(status["map_hash"]) == 32
-        assert "2 durable, 2 fused" in tsfusion("status", "--connect", address).stdout
+        assert " 2/2 " in tsfusion("status", "--connect", address).stdout
         done = tsfusion("mesh", address, tmp_path / "live.obj", "--min-weight", 0.5)
         assert done.returncode == 0, done.stderr
         done = tsfusion(
@@ -146,7 +146,7 @@ def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
         )  # fmt: skip
         assert json.loads(done.stdout)["keyframes_fused"] == 1, done.stderr
         assert end(process) == 0
-    assert Volume.load(tmp_path / "state" / "map.tsf").keyframes == 3
+    assert Volume.load(tmp_path / "state/maps/default/map.tsf").keyframes == 3
 
 
 def test_a_server_that_fell_silent_is_not_called_slow(tmp_path: Path) -> None:

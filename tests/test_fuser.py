@@ -12,8 +12,9 @@ from wire import wall
 import tsfusion
 from tsfusion import VolumeConfig, codec
 from tsfusion.errors import InvalidConfig
-from tsfusion.fuser import MAP_FILE, Fuser
+from tsfusion.fuser import Fuser
 from tsfusion.journal import Journal, Position
+from tsfusion.maps import MAP_FILE, PREVIOUS_FILE
 from tsfusion.transport import Command, work
 
 VOLUME = VolumeConfig(voxel_size=0.04, threads=1)
@@ -32,10 +33,20 @@ class Link:
     def last(self) -> Any:
         return self.sent[-1][0]
 
+    def done(self) -> work.Done:
+        return [message for message, _ in self.sent if isinstance(message, work.Done)][-1]
+
+
+SESSION = bytes(16)
+
+
+def order(index: int, position: Position, skip: str | None = None) -> work.Fuse:
+    return work.Fuse(index, position, SESSION, index + 1, "robot", skip)
+
 
 def fill(state: Path, count: int) -> list[Position]:
     journal = Journal(state / "journal", 1 << 20)
-    session = bytes(16)
+    session = SESSION
     positions = [
         journal.append(
             codec.encode(wall(i), session=session, seq=i + 1, jpeg_quality=90), session=session, seq=i + 1
@@ -48,7 +59,10 @@ def fill(state: Path, count: int) -> list[Position]:
 
 def opened(state: Path, volume: VolumeConfig = VOLUME, **settings: Any) -> tuple[Fuser, Link]:
     link = Link()
-    begin = work.Begin(str(state), volume, **{"mesh_interval": 0.0, "checkpoint_every": 0, **settings})
+    working = state / "working"
+    working.write_bytes(bytes(8))
+    usual = {"mesh_interval": 0.0, "checkpoint_every": 0, "keep_previous": False, "memory_bytes": 1 << 40}
+    begin = work.Begin(str(state), volume, working=str(working), **{**usual, **settings})
     return Fuser(link, begin), link  # type: ignore[arg-type]
 
 
@@ -62,19 +76,19 @@ def status(fuser: Fuser, link: Link) -> work.FuserStatus:
 def test_keyframes_are_fused_meshed_and_checkpointed(tmp_path: Path) -> None:
     positions = fill(tmp_path, 3)
     fuser, link = opened(tmp_path)
-    assert fuser.ready().position == Position(0, 0)
+    assert fuser.ready().done == {}
     assert not fuser.mesh_due(idle=True)
     for index, position in enumerate(positions):
-        fuser.take(work.Fuse(index, position))
+        fuser.take(order(index, position))
         done = link.last()
         assert (done.index, done.reason, done.fused_ns > done.fuse_start_ns > 0) == (index, None, True)
     assert fuser.mesh_due(idle=True)
     fuser.mesh()
-    assert (link.last().index, link.sent[-1][1]) == (2, [])
+    assert (link.last().count, link.sent[-1][1]) == (3, [])
     fuser.take(work.Finish())
     assert fuser.exit_status == 0
     again, link_again = opened(tmp_path)
-    assert again.ready().position == positions[-1]
+    assert again.ready().done == {SESSION: work.Progress(3, "robot")}
     assert status(again, link_again) == status(fuser, link)
 
 
@@ -82,7 +96,7 @@ def test_watchers_get_the_triangles(tmp_path: Path) -> None:
     (position,) = fill(tmp_path, 1)
     fuser, link = opened(tmp_path)
     fuser.take(work.Publish(True))
-    fuser.take(work.Fuse(0, position))
+    fuser.take(order(0, position))
     fuser.mesh()
     meshed, frames = link.sent[-1]
     assert isinstance(meshed, work.Meshed)
@@ -97,7 +111,7 @@ def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
     (position,) = fill(tmp_path, 1)
     fuser, link = opened(tmp_path)
     fuser.take(work.Publish(True))
-    fuser.take(work.Fuse(0, position))
+    fuser.take(order(0, position))
     fuser.mesh()
     before = len(link.sent)
     while fuser.refine_due:
@@ -116,10 +130,10 @@ def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
 def test_what_cannot_be_fused_is_counted_also_after_a_restart(tmp_path: Path) -> None:
     positions = fill(tmp_path, 2)
     fuser, link = opened(tmp_path, checkpoint_every=1)
-    fuser.take(work.Fuse(0, Position(7, 42)))
-    assert link.last().reason == "JournalError"
-    fuser.take(work.Fuse(1, positions[0], skip="crash"))
-    assert link.last().reason == "crash"
+    fuser.take(order(0, Position(7, 42)))
+    assert link.done().reason == "JournalError"
+    fuser.take(order(1, positions[0], skip="crash"))
+    assert link.done().reason == "crash"
     rejected = {"JournalError": 1, "crash": 1}
     assert status(fuser, link).keyframes_rejected == rejected
     assert status(*opened(tmp_path)).keyframes_rejected == rejected
@@ -128,7 +142,7 @@ def test_what_cannot_be_fused_is_counted_also_after_a_restart(tmp_path: Path) ->
 def saved(state: Path) -> Path:
     volume = tsfusion.Volume(VOLUME)
     volume.integrate(wall())
-    return volume.save(state / MAP_FILE, meta={"position": [1, 42], "rejected": {}})
+    return volume.save(state / MAP_FILE, meta={"done": {SESSION.hex(): [1, ""]}, "rejected": {}})
 
 
 def test_a_map_of_other_settings_is_one_clear_error(tmp_path: Path) -> None:
@@ -146,15 +160,69 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_journal_fused_anew(
     stored[len(stored) // 2] ^= 1
     path.write_bytes(stored)
     fuser, _ = opened(tmp_path)
-    assert fuser.ready().position == Position(0, 0)
+    assert fuser.ready().done == {}
     assert "built again from the journal" in caplog.text
     assert path.with_suffix(".damaged").exists()
+
+
+def test_a_keyframe_that_the_map_has_is_not_fused_again(tmp_path: Path) -> None:
+    positions = fill(tmp_path, 2)
+    fuser, link = opened(tmp_path)
+    for index in (0, 1, 0):
+        fuser.take(order(index, positions[index]))
+    assert (link.last().index, link.last().reason) == (0, None)
+    assert status(fuser, link).keyframes_fused == 2
+
+
+def test_a_checkpoint_on_request_keeps_the_one_before(tmp_path: Path) -> None:
+    """The journal forgets what both hold, so a damaged one is made good by the other."""
+    positions = fill(tmp_path, 3)
+    fuser, link = opened(tmp_path, keep_previous=True)
+    fuser.take(work.Save())
+    assert link.last() == work.Saved(written=False)
+    for index in (0, 1):
+        fuser.take(order(index, positions[index]))
+        fuser.take(work.Save())
+        assert link.last() == work.Saved(written=True)
+    assert (tmp_path / PREVIOUS_FILE).exists()
+    (tmp_path / MAP_FILE).write_bytes(b"")
+    again, _ = opened(tmp_path, keep_previous=True)
+    assert again.ready().done == {SESSION: work.Progress(1, "robot")}
+
+
+def test_what_it_works_at_shows_from_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (position,) = fill(tmp_path, 1)
+    fuser, link = opened(tmp_path)
+
+    def decoder_bug(_: object) -> None:
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(codec, "decode", decoder_bug)
+    with pytest.raises(RuntimeError):
+        fuser.take(order(0, position))
+    assert (tmp_path / "working").read_bytes() == bytes(8)
+    monkeypatch.undo()
+    fuser.take(order(0, position))
+    assert link.last().reason is None
+    assert (tmp_path / "working").read_bytes() == b"\xff" * 8
+
+
+def test_no_memory_for_a_keyframe_is_no_crash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (position,) = fill(tmp_path, 1)
+    fuser, link = opened(tmp_path)
+
+    def too_large(_: object) -> None:
+        raise MemoryError("no room for 9 GB")
+
+    monkeypatch.setattr(codec, "decode", too_large)
+    fuser.take(order(0, position))
+    assert (link.last().reason, link.last().message) == ("memory", "no memory to fuse it: no room for 9 GB")
 
 
 @pytest.mark.parametrize("min_weight", [float("nan"), float("inf"), 1e308, 1e20, -1.0])
 def test_no_question_ends_the_fuser(tmp_path: Path, min_weight: float) -> None:
     (position,) = fill(tmp_path, 1)
     fuser, link = opened(tmp_path)
-    fuser.take(work.Fuse(0, position))
+    fuser.take(order(0, position))
     fuser.take(work.Ask(1, Command(name="mesh", min_weight=min_weight)))
     assert "min_weight must be" in link.last().error

@@ -5,25 +5,26 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zmq
 from wire import DEADLINE, Server, serving, until
 
 import tsfusion
-from tsfusion import Client, Keyframe, VolumeConfig, fuser_link
-from tsfusion.client import fetch_status
+from tsfusion import Client, Keyframe, VolumeConfig, fuser_link, journal, maps
 from tsfusion.config import ServerConfig
 from tsfusion.datasets import open_dataset
+from tsfusion.door import Door
 from tsfusion.errors import InvalidConfig, MapError
-from tsfusion.fuser_link import FuserLink
+from tsfusion.fetch import fetch_status
 from tsfusion.gateway import Gateway
 from tsfusion.journal import Journal
 from tsfusion.ports import Ports
+from tsfusion.transport import messages
 
 _FAKE = """
-import sys, zmq
-from tsfusion.journal import Position
+import os, struct, sys, time, zmq
 from tsfusion.transport import sockets, work
 
 link = sockets.pair(zmq.Context())
@@ -32,33 +33,50 @@ link.connect(sys.argv[1])
 def say(message):
     link.send(work.encode(message))
 
+def at(index):
+    with open(begin.working, "r+b") as file:
+        file.write(struct.pack("<q", index))
+
 say(work.Started())
 while True:
     message = work.to_fuser.decode(link.recv())
+    if isinstance(message, work.Begin):
+        begin = message
     {body}
 """
-_CRASHES_ON_2 = """
+_FUSES = """
     if isinstance(message, work.Begin):
-        say(work.Ready(Position(0, 0)))
+        say(work.Ready({}))
     if isinstance(message, work.Fuse):
-        if message.index == 2 and message.skip is None:
-            sys.exit(7)
-        say(work.Done(message.index, 1, 2, message.skip))
+        reason = message.skip
+        if reason is None:
+            at(message.index)
+            special(message)
+            at(-1)
+        say(work.Done(message.index, 1, 2, reason))
 """
+
+
+def fusing(line: str) -> str:
+    """A fuser that runs this line on each keyframe."""
+    return _FUSES.replace("special(message)", line)
+
+
+_CRASHES_ON_2 = fusing("if message.index == 2: sys.exit(7)")
 _DIES = "sys.exit(9)"
 _FAILS = "say(work.Failed('InvalidConfig', 'no such setting')); link.recv()"
 _CANNOT_COME_BACK = """
     import pathlib
-    mark = pathlib.Path(message.state if isinstance(message, work.Begin) else "/") / "once"
+    mark = pathlib.Path(begin.folder) / "once"
     if mark.exists():
         sys.exit(9)
     mark.touch()
-    say(work.Ready(Position(0, 0)))
+    say(work.Ready({}))
     link.recv()
     sys.exit(7)
 """
 
-Start = Callable[[str], Gateway]
+Start = Callable[..., Gateway]
 
 
 @pytest.fixture
@@ -66,23 +84,24 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
     """A gateway over five journaled records, with a fuser that runs the given lines on each message."""
     with ExitStack() as stack:
 
-        def begin(body: str) -> Gateway:
-            command = (sys.executable, "-c", _FAKE.format(body=body))
+        def begin(body: str, **settings: Any) -> Gateway:
+            command = (sys.executable, "-c", _FAKE.replace("{body}", body))
             monkeypatch.setattr(fuser_link, "COMMAND", command)
             monkeypatch.setattr(fuser_link, "_END_DEADLINE", 0.1)
-            journal = Journal(tmp_path / "journal", 1 << 20)
+            writer = Journal(maps.folder(tmp_path, "default") / "journal", 1 << 20)
             for i in range(5):
-                journal.append([b"head", b"body"], session=bytes(16), seq=i + 1)
-            journal.close()
-            journal = Journal(tmp_path / "journal", 1 << 20)
-            server = ServerConfig(state=str(tmp_path))
+                writer.append([b"head", b"body"], session=bytes(16), seq=i + 1)
+            writer.close()
+            server = ServerConfig(state=str(tmp_path), **settings)
             context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
             stack.callback(context.term)
+            door = Door(context, None)
             ports = Ports(context, server)
             stack.callback(ports.close)
-            fuser = FuserLink(context, server, VolumeConfig())
-            stack.callback(fuser.close)
-            return Gateway(server, ports, journal, fuser)
+            gateway = Gateway(context, server, ports, door)
+            stack.callback(gateway.close)
+            gateway.open({"default": VolumeConfig()})
+            return gateway
 
         yield begin
 
@@ -95,13 +114,62 @@ def stepped(gateway: Gateway, reached: Callable[[], bool]) -> None:
     until(step)
 
 
-def test_a_keyframe_that_kills_the_fuser_twice_is_skipped(
-    start: Start, caplog: pytest.LogCaptureFixture
+def default(gateway: Gateway) -> messages.MapHealth:
+    return gateway.health().maps["default"]
+
+
+def test_a_keyframe_that_kills_the_fuser_twice_is_quarantined(
+    start: Start, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     gateway = start(_CRASHES_ON_2)
     stepped(gateway, lambda: gateway.drained)
-    assert gateway.fuser.restarts == 2
-    assert "keyframe 2 is not in the map (crash)" in caplog.text
+    health = default(gateway)
+    assert (health.fuser_restarts, health.rejected, health.quarantined) == (2, {"crash": 1}, 1)
+    assert (health.keyframes_fused, health.keyframes_durable) == (4, 5)
+    said = caplog.records[-1]
+    assert said.getMessage() == "a keyframe is not in the map: crash"
+    assert {"map": "default", "seq": 3, "reason": "crash"}.items() <= vars(said)["about"].items()
+    (kept,) = (maps.folder(tmp_path, "default") / "quarantine").iterdir()
+    assert kept.name == "00000000-3-crash.mcap"
+    (record,) = journal.records(kept)
+    assert (record.seq, [bytes(frame) for frame in record.frames]) == (3, [b"head", b"body"])
+
+
+def test_a_fuser_that_is_killed_is_not_the_keyframes_fault(start: Start, tmp_path: Path) -> None:
+    """Somebody kills it three times at the same keyframe: that says nothing about the keyframe."""
+    body = fusing(
+        f"""
+            with open({str(tmp_path / "kills")!r}, "a+") as kills:
+                kills.seek(0)
+                if message.index == 2 and len(kills.read()) < 3:
+                    kills.write("x")
+                    kills.close()
+                    os.kill(os.getpid(), 9)
+        """.strip()
+    )
+    gateway = start(body)
+    stepped(gateway, lambda: gateway.drained)
+    health = default(gateway)
+    assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (3, {}, 5)
+
+
+def test_a_death_between_keyframes_is_nobodys_fault(start: Start, tmp_path: Path) -> None:
+    died = tmp_path / "died"
+    body = f"""{fusing("pass")}
+        if message.index == 2 and not os.path.exists({str(died)!r}):
+            open({str(died)!r}, "w").close()
+            sys.exit(3)
+"""
+    gateway = start(body)
+    stepped(gateway, lambda: gateway.drained)
+    assert default(gateway).rejected == {}
+
+
+def test_a_fuser_that_hangs_at_a_keyframe_is_replaced(start: Start) -> None:
+    gateway = start(fusing("if message.index == 1: time.sleep(3600)"), fuser_timeout=0.3)
+    stepped(gateway, lambda: gateway.drained)
+    health = default(gateway)
+    assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (2, {"crash": 1}, 4)
 
 
 def test_a_fuser_that_cannot_start_is_one_clear_error(start: Start) -> None:
@@ -116,10 +184,21 @@ def test_why_the_map_cannot_be_opened_is_passed_on(start: Start) -> None:
         stepped(gateway, lambda: gateway.warm)
 
 
-def test_a_fuser_that_does_not_come_back_ends_the_server(start: Start) -> None:
+def test_a_fuser_that_does_not_come_back_is_tried_ever_more_rarely(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The gateway goes on receiving: what is in the journal is fused when the fuser can be mended."""
+    monkeypatch.setattr(fuser_link, "_LONGEST_PAUSE", 0.05)
     gateway = start(_CANNOT_COME_BACK)
-    with pytest.raises(MapError, match="before it was ready"):
-        stepped(gateway, lambda: gateway.fuser.restarts > 5)
+    stepped(gateway, lambda: default(gateway).state == "failed")
+    assert default(gateway).fuser_restarts >= 2
+    assert "its fuser process ended" in default(gateway).problem
+    assert not gateway.health().ready
+    monkeypatch.setattr(
+        fuser_link, "COMMAND", (sys.executable, "-c", _FAKE.replace("{body}", fusing("pass")))
+    )
+    stepped(gateway, lambda: gateway.drained)
+    assert default(gateway).problem == ""
 
 
 # --- real scans ---

@@ -17,7 +17,6 @@ import zmq
 from wire import DEADLINE, Server, connected, serving, until, wall
 
 from tsfusion import Client, VolumeConfig, codec, config, fuser_link
-from tsfusion.client import fetch_status
 from tsfusion.codec.header import pack
 from tsfusion.config import ServerConfig
 from tsfusion.errors import (
@@ -26,9 +25,10 @@ from tsfusion.errors import (
     ServerUnreachable,
     TransportError,
 )
+from tsfusion.fetch import fetch_status
 from tsfusion.fuser_link import FuserLink
 from tsfusion.journal import Position
-from tsfusion.sessions import Sessions
+from tsfusion.sessions import Routes
 from tsfusion.spool import Spool
 from tsfusion.transport import Command, messages, request, sockets, work
 
@@ -64,14 +64,14 @@ def test_a_stranger_cannot_unsubscribe_a_viewer(shared: Server) -> None:
 
 
 def test_strangers_do_not_push_out_a_client_that_is_heard() -> None:
-    sessions = Sessions()
-    sessions.connect(b"client", b"1")
+    routes = Routes()
+    client = routes.connect(b"client", "default", b"1")
+    assert client is not None
     for number in range(3000):
-        sessions.connect(number.to_bytes(16, "big"), b"2")
+        routes.connect(number.to_bytes(16, "big"), "default", b"2")
         if number % 500 == 0:
-            sessions.heard(b"client")
-    assert sessions.route(b"client") is not None
-    assert sessions.heard(b"nobody") is None
+            routes.heard(client)
+    assert routes.get(b"client") is client
 
 
 def test_a_client_goes_on_after_a_flood_of_greetings(shared: Server) -> None:
@@ -135,7 +135,7 @@ link.send(work.encode(work.Started()))
 while True:
     message = work.to_fuser.decode(link.recv())
     if isinstance(message, work.Begin):
-        link.send(work.encode(work.Ready(Position(0, 0))))
+        link.send(work.encode(work.Ready({})))
         time.sleep(1)
     if isinstance(message, work.Fuse):
         link.send(work.encode(work.Done(message.index, 1, 2)))
@@ -149,7 +149,7 @@ while True:
 def test_orders_that_find_no_room_are_given_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fuser_link, "COMMAND", (sys.executable, "-c", _SLOW))
     context: zmq.Context[Any] = zmq.Context()
-    link = FuserLink(context, ServerConfig(state=str(tmp_path)), VolumeConfig())
+    link = FuserLink(context, tmp_path, ServerConfig(state=str(tmp_path)), VolumeConfig())
     try:
 
         def heard() -> bool:
@@ -159,10 +159,11 @@ def test_orders_that_find_no_room_are_given_again(tmp_path: Path, monkeypatch: p
         until(heard)
         while link.send(work.Publish(True)):
             pass
-        assert not link.fuse(Position(1, 8))
-        assert (link.next_index, list(link.in_flight)) == (0, [])
-        until(lambda: link.fuse(Position(1, 8)))
-        assert (link.next_index, list(link.in_flight)) == (1, [0])
+        order = work.Fuse(0, Position(1, 8), bytes(16), 1)
+        assert not link.fuse(order)
+        assert list(link.in_flight) == []
+        until(lambda: link.fuse(order))
+        assert list(link.in_flight) == [0]
         link.finish()
         while link.send(work.Publish(True)):
             pass

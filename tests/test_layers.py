@@ -16,14 +16,17 @@ PACKAGE = Path(__file__).parent.parent / "tsfusion"
 ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("command line", frozenset({"__main__", "cli"})),
     ("whole runs", frozenset({"pipeline", "child"})),
-    ("processes", frozenset({"server", "gateway", "sessions", "ports", "fuser_link", "fuser",
-                             "client", "sender", "outbox", "spool", "recording"})),
-    ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results"})),
+    ("processes", frozenset({"server", "gateway", "intake", "door", "hosted", "retention", "reports",
+                             "questions", "quota", "quarantine", "sessions", "ports", "fuser_link", "fuser",
+                             "client", "fetch", "backpressure", "room", "sender", "connection",
+                             "conversation", "refused", "outbox", "spool", "gone", "recording"})),
+    ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results", "metrics",
+                                     "inspection", "salvage", "ros"})),
     ("map and wire", frozenset({"volume", "integration", "surface", "field", "blockstore", "meshing",
                                 "scratch", "storage", "checkpoint", "warmup",
-                                "journal", "transport", "codec", "keys"})),
+                                "journal", "transport", "codec", "maps", "keys"})),
     ("ground", frozenset({"kernels", "runtime", "mesh", "keyframe", "config", "config_toml", "errors",
-                          "process", "private_folder"})),
+                          "process", "disk", "logs", "watchdog", "private_folder"})),
 )  # fmt: skip
 
 # All others run where there is no Taichi, and answer while kernels run.

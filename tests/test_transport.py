@@ -11,7 +11,7 @@ import zmq
 
 from tsfusion.errors import DecodeError, InvalidConfig, ServerUnreachable, TransportError
 from tsfusion.journal import Position, Scan
-from tsfusion.sessions import Delays, KeyframeIndex, Session, Sessions
+from tsfusion.sessions import Delays, KeyframeIndex, Routes, Session, Sessions, Turns
 from tsfusion.transport import ClockOffset, Command, control_address, messages, request, sockets
 from tsfusion.transport.messages import Ack, Denied, Hello, Hold, Nack, Ping, Pong, Stamps, Welcome
 
@@ -149,13 +149,45 @@ def test_each_keyframe_is_admitted_once_and_in_order() -> None:
 
 
 def test_strangers_do_not_grow_the_sessions() -> None:
-    sessions = Sessions()
+    sessions, routes = Sessions(), Routes()
     for i in range(3000):
-        sessions.connect(i.to_bytes(16, "big"), b"id")
+        routes.connect(i.to_bytes(16, "big"), "default", b"id")
         assert sessions.admit(i.to_bytes(16, "big"), 1, 0) == "next"
     assert len(sessions) == 0
-    assert sessions.route((0).to_bytes(16, "big")) is None
-    assert sessions.route((2999).to_bytes(16, "big")) is not None
+    assert routes.get((0).to_bytes(16, "big")) is None
+    assert routes.get((2999).to_bytes(16, "big")) is not None
+
+
+def test_a_live_session_is_not_taken_over() -> None:
+    routes = Routes()
+    route = routes.connect(SESSION, "default", b"1", "robot")
+    assert route is not None
+    assert routes.connect(SESSION, "default", b"2", "thief") is None
+    assert routes.connect(SESSION, "default", b"3", "robot") is route
+    assert route.identity == b"3"
+    route.heard -= 3600
+    assert routes.connect(SESSION, "default", b"4", "heir") is not route
+
+
+def test_the_fuser_takes_from_each_client_in_turn() -> None:
+    """One that floods holds nobody up; each session keeps its order."""
+    turns, sessions, index = Turns(), Sessions(), KeyframeIndex()
+    flood, more, small = (sessions.open(bytes([i]) * 16, client) for i, client in enumerate("aab"))
+    for seq in range(1, 7):
+        for session in (flood, more):
+            index.add(Position(1, seq), session, seq)
+    for seq in (1, 2):
+        index.add(Position(2, seq), small, seq)
+    for session in (flood, more, small, flood):
+        turns.add(session)
+    served = []
+    while (session := turns.next()) is not None:
+        served.append((session.client, index[session.entries[session.handed]].stamps.seq))
+        session.handed += 1
+        turns.served()
+    assert served[:4] == [("a", 1), ("b", 1), ("a", 1), ("b", 2)]
+    assert len(served) == 14
+    assert turns.next() is None
 
 
 def index_of(*records: tuple[int, int, bytes, int]) -> tuple[KeyframeIndex, Sessions]:
@@ -172,11 +204,8 @@ def test_recovery_counts_a_keyframe_once() -> None:
     entries = [index[i] for i in range(len(index))]
     assert [(entry.position.segment, entry.stamps.seq) for entry in entries] == [(1, 1), (1, 1), (1, 2)]
     assert sessions.open(SESSION).durable == 2
-    assert (index.after(Position(0, 0)), index.after(Position(1, 90)), index.after(Position(2, 42))) == (
-        0,
-        2,
-        3,
-    )
+    assert [index.after(sessions.open(SESSION), seq) for seq in (0, 1, 2, 9)] == [0, 1, 2, 2]
+    assert index.segment(2) == 1
 
 
 def test_the_index_keeps_stamps() -> None:
@@ -187,12 +216,9 @@ def test_the_index_keeps_stamps() -> None:
     assert index[0].captured_ns == 5
 
 
-def test_delays_are_of_the_clients_clock() -> None:
+def test_delays_are_published_with_their_bound() -> None:
     delays = Delays()
-    assert delays.summary().count == 0
-    delays.add(0, 5_000_000, 0)
-    delays.add(5, 5_000_000, None)
-    for ms in (10, 20, 30):
-        delays.add(1_000_000_000, 1_000_000_000 + 7_000_000 + ms * 1_000_000, 7_000_000)
-    summary: Any = delays.summary()
-    assert (summary.count, summary.mean, summary.p50, summary.max) == (3, 20.0, 20.0, 30.0)
+    assert (delays.summary().count, delays.bound_ms) == (0, 0.0)
+    for delay_ns, bound_ns in ((5_000_000, 100_000), (7_000_000, 300_000)):
+        delays.add(delay_ns, bound_ns)
+    assert (delays.summary().mean, delays.bound_ms) == (6.0, 0.3)

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,6 +23,7 @@ from tsfusion.transport import sockets
 DEADLINE = 60.0
 CAMERA = Intrinsics(40.0, 40.0, 31.5, 23.5)
 SHAPE = (48, 64)
+NUMBERED_NS = 10**9  # `timestamp_ns` of `wall(0)`; that of `wall(i)` is i more
 _SERVE = """
 import sys, msgspec
 from tsfusion import server
@@ -48,7 +50,7 @@ def wall(i: int = 0, **fields: Any) -> Keyframe:
     depth = (1200 + 40 * np.sin(u / 9 + i) + 3 * v).astype(np.uint16)
     depth[:2] = 0
     color = np.dstack([u * 3, v * 4, np.full(SHAPE, (37 * i) % 256)]).astype(np.uint8)
-    given = {"T_world_camera": pose(0.03 * i), "timestamp_ns": 10**9 + i, **fields}
+    given = {"T_world_camera": pose(0.03 * i), "timestamp_ns": NUMBERED_NS + i, **fields}
     return Keyframe(depth=depth, color=color, intrinsics=CAMERA, **given)
 
 
@@ -61,20 +63,41 @@ def until(reached: Callable[[], bool], deadline: float = DEADLINE) -> None:
 
 
 class Server:
-    """`server.run` in a process of its own."""
+    """`server.run` in a process of its own.
 
-    def __init__(self, state: Path, volume: VolumeConfig | None = None, **settings: Any) -> None:
+    Args:
+        wait: until it is ready; else call `wait_ready` before anything that needs its addresses.
+        code: run before it, in its process.
+    """
+
+    def __init__(
+        self,
+        state: Path,
+        volume: VolumeConfig | None = None,
+        *,
+        wait: bool = True,
+        code: str = "",
+        **settings: Any,
+    ) -> None:
         config = ServerConfig(**{"listen": "tcp://127.0.0.1:0", "state": str(state), **settings})
         volume = volume or VolumeConfig(voxel_size=0.04, threads=1)
         arguments = [msgspec.json.encode(one).decode() for one in (config, volume)]
+        self._words = tempfile.TemporaryFile("w+")  # noqa: SIM115  a pipe that nobody reads would fill up
         self.process = subprocess.Popen(
-            [sys.executable, "-c", _SERVE, *arguments],
+            [sys.executable, "-c", code + _SERVE, *arguments],
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=self._words,
             text=True,
         )
+        self.address = self.control = self.publish = ""
+        if wait:
+            self.wait_ready()
+
+    def wait_ready(self) -> bool:
+        """Wait until it has said where it listens; False when it ended instead."""
         assert self.process.stdout is not None
         self.address, self.control, self.publish = (self.process.stdout.readline().split() or [""] * 3)[:3]
+        return bool(self.address)
 
     def terminate(self) -> int:
         """SIGTERM; the exit status."""
@@ -88,13 +111,28 @@ class Server:
 
     def said(self) -> str:
         """Its last words, once it has ended."""
-        return self.process.communicate(timeout=DEADLINE)[1].strip()
+        self.process.wait(DEADLINE)
+        self._words.seek(0)
+        return self._words.read().strip()
+
+    def close(self) -> None:
+        """End it, if need be, and let go of its files."""
+        if self.process.poll() is None:
+            self.kill()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        self._words.close()
 
     def fuser_pid(self) -> int:
         """The fuser, its only child."""
-        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        children = self.children()
         assert len(children) == 1, children
-        return int(children[0])
+        return children[0]
+
+    def children(self) -> list[int]:
+        """The fusers, one for each map that is open."""
+        pids = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        return [int(pid) for pid in pids]
 
 
 @contextmanager
@@ -106,11 +144,7 @@ def serving(state: Path, volume: VolumeConfig | None = None, **settings: Any) ->
             raise RuntimeError(server.said())
         yield server
     finally:
-        if server.process.poll() is None:
-            server.kill()
-        for pipe in (server.process.stdout, server.process.stderr):
-            if pipe is not None:
-                pipe.close()
+        server.close()
 
 
 def alive(pid: int) -> bool:

@@ -20,6 +20,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from tsfusion import disk
 from tsfusion.config import VolumeConfig
 from tsfusion.errors import CheckpointError
 
@@ -47,7 +48,14 @@ def write(
     slots: NDArray[np.int64],
     layers: dict[str, NDArray[Any]],
 ) -> Path:
-    """Write blocks `slots` of each layer (…, 512) under their keys. Raises CheckpointError."""
+    """Write blocks `slots` of each layer (…, 512) under their keys.
+
+    What was at `path` stays as it was until the new file is whole and on the disk. A part that a killed
+    writer left is overwritten.
+
+    Raises:
+        CheckpointError: when the disk refuses.
+    """
     header.blocks = len(keys)
     partial = path.with_name(f".{path.name}.partial")
     try:
@@ -56,18 +64,26 @@ def write(
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
-        _sync_folder(path.parent)
-    except OSError as error:
+        disk.sync_folder(path.parent)
+    except BaseException as error:  # an interrupted one leaves no part either
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
-        raise CheckpointError(f"cannot write the map {path}: {error.strerror}") from error
+        if isinstance(error, OSError):
+            raise CheckpointError(f"cannot write the map {path}: {error.strerror}") from error
+        raise
     return path
 
 
 def read(path: Path) -> tuple[Header, NDArray[np.int64], dict[str, NDArray[Any]]]:
-    """Header, keys and layers of a checkpoint. Raises CheckpointError."""
+    """Header, keys and layers of a checkpoint.
+
+    Raises:
+        CheckpointError: when it is not there, of another version, or not to the byte what was written.
+    """
     try:
         with path.open("rb") as file:
+            _check_magic(file, path)
+            _check_digest(file, path)
             header = _read_header(file, path)
             keys = np.empty(header.blocks, np.int64)
             layers = {name: np.empty((header.blocks, CUBE), DTYPES[name]) for name in header.layers}
@@ -79,6 +95,8 @@ def read(path: Path) -> tuple[Header, NDArray[np.int64], dict[str, NDArray[Any]]
                     at += part.nbytes
     except OSError as error:
         raise CheckpointError(f"cannot read the map {path}: {error.strerror}") from error
+    except MemoryError as error:
+        raise CheckpointError(f"the map {path} does not fit into this machine's memory") from error
     return header, keys, layers
 
 
@@ -119,16 +137,19 @@ def _payloads(
         yield compressor.compress(raw)
 
 
-def _read_header(file: BinaryIO, path: Path) -> Header:
+def _check_magic(file: BinaryIO, path: Path) -> None:
     magic = file.read(len(MAGIC))
     if magic != MAGIC:
         raise CheckpointError(f"{path} is not a tsfusion map of version 1 (it starts with {magic!r})")
+
+
+def _read_header(file: BinaryIO, path: Path) -> Header:
     (length,) = struct.unpack("<I", _exactly(file, 4, path))
     if length > 1 << 20:
         raise CheckpointError(f"{path} is damaged: its header claims {length} bytes")
     try:
         header = msgspec.msgpack.decode(_exactly(file, length, path), type=Header)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise CheckpointError(f"{path} is damaged or of another version: {error}") from error
     if not 0 <= header.blocks <= header.config.max_blocks or not set(header.layers) <= set(DTYPES):
         raise CheckpointError(f"{path} is damaged: {header.blocks} blocks of layers {header.layers}")
@@ -136,19 +157,24 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
 
 
 def _read_chunks(file: BinaryIO, path: Path, header: Header) -> Iterator[tuple[int, bytes]]:
-    _check_digest(file, path)
     per_block = 8 + sum(CUBE * np.dtype(DTYPES[name]).itemsize for name in header.layers)
     for first in range(0, header.blocks, CHUNK):
         size = min(CHUNK, header.blocks - first) * per_block
         (length,) = struct.unpack("<I", _exactly(file, 4, path))
         frame = _exactly(file, length, path)
-        if zstandard.get_frame_parameters(frame).content_size != size:
-            raise CheckpointError(f"{path} is damaged: a chunk is not of the {size} bytes expected")
-        yield first, zstandard.ZstdDecompressor().decompress(frame)
+        try:
+            if zstandard.get_frame_parameters(frame).content_size != size:
+                raise CheckpointError(f"{path} is damaged: a chunk is not of the {size} bytes expected")
+            yield first, zstandard.ZstdDecompressor().decompress(frame)
+        except zstandard.ZstdError as error:
+            raise CheckpointError(f"{path} is damaged: {error}") from error
 
 
 def _check_digest(file: BinaryIO, path: Path) -> None:
-    """Compare the digest of the whole file before any of it is believed; leaves `file` where it was."""
+    """Compare the digest of the whole file before any of it is believed; leaves `file` where it was.
+
+    Before anything is allocated, too: a header with one flipped bit may ask for all memory there is.
+    """
     here = file.tell()
     remaining = file.seek(0, os.SEEK_END) - 16
     file.seek(0)
@@ -163,18 +189,6 @@ def _check_digest(file: BinaryIO, path: Path) -> None:
 
 
 def _exactly(file: BinaryIO, size: int, path: Path) -> bytes:
-    content = file.read(size)
-    if len(content) != size:
+    if size > os.fstat(file.fileno()).st_size or len(content := file.read(size)) != size:
         raise CheckpointError(f"{path} is cut short")
     return content
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make a rename durable (POSIX; elsewhere the rename itself is all there is)."""
-    if os.name != "posix":
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

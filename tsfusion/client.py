@@ -6,7 +6,8 @@
             client.send(keyframe)
         client.flush(timeout=10.0)
 
-`send` encodes and writes to the spool; a thread of its own does the talking. Taichi is never imported.
+`send` encodes and writes to the spool; a thread of its own does the talking. What happens when keyframes come
+faster than the map takes them is the policy's choice (`tsfusion.backpressure`). Taichi is never imported.
 """
 
 import atexit
@@ -16,34 +17,20 @@ import threading
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from tsfusion import codec
-from tsfusion.config import ClientConfig
-from tsfusion.errors import FlushTimeout, KeyframeRefused, ServerUnreachable, TransportError
+from tsfusion.backpressure import Backpressure
+from tsfusion.config import ClientConfig, Policy, override
+from tsfusion.errors import FlushTimeout, KeyframeRefused, NotAllowed, ServerUnreachable, TransportError
 from tsfusion.keyframe import Keyframe
-from tsfusion.mesh import Mesh
 from tsfusion.outbox import ClientStats, Outbox
 from tsfusion.sender import Sender
 from tsfusion.spool import Spool
-from tsfusion.transport import (
-    ClientKeys,
-    Command,
-    KeyframeTimes,
-    Reply,
-    Status,
-    control_address,
-    request,
-    sockets,
-)  # fmt: skip
-from tsfusion.transport.messages import MeshLayout
+from tsfusion.transport import KeyframeTimes, control_address, sockets
+from tsfusion.transport.curve import client_keys
 
-__all__ = ["Client", "ClientStats", "fetch_mesh", "fetch_status"]
+__all__ = ["Client", "ClientStats"]
 
-_ANSWER_TIMEOUT = 5.0  # seconds; the gateway is never busy, so who says nothing for so long is not there
+_SEGMENTS = 8  # at least so many files hold what the spool may hold: it shrinks by whole files
 _SILENCE = 1.0  # seconds; the server answers a ping every half second
 
 log = logging.getLogger(__name__)
@@ -57,11 +44,15 @@ class Client:
         spool: a folder for keyframes that are not acknowledged yet; what a dead client left there is sent
             first. None = a temporary one, gone with `close`.
         control: the server's control address; default the port after `address`.
+        map: the map to scan into; default the config's, as with the following.
+        policy: what happens to keyframes that the map has no time for.
+        key: the file of this client's secret key.
+        server_key: the server's public key, or its file.
         config: the rest of the settings; its own addresses are not used.
 
     Raises:
-        InvalidConfig: for a malformed address.
-        JournalError: when the spool cannot be used, or another client uses it.
+        InvalidConfig: for a malformed address or setting, or a key file that is of no use.
+        JournalError: when the spool cannot be used, another client uses it, or it waits for another map.
     """
 
     def __init__(
@@ -70,50 +61,64 @@ class Client:
         *,
         spool: str | os.PathLike[str] | None = None,
         control: str | None = None,
+        map: str | None = None,
+        policy: Policy | None = None,
+        key: str | os.PathLike[str] | None = None,
+        server_key: str | os.PathLike[str] | None = None,
         config: ClientConfig | None = None,
     ) -> None:
-        self._config = config or ClientConfig()
+        keys = {
+            name: os.fspath(given)
+            for name, given in (("key", key), ("server_key", server_key))
+            if given is not None
+        }
+        self._config = override(config or ClientConfig(), map=map, policy=policy, **keys)
+        connection_keys = client_keys(self._config.key, self._config.server_key)
         address = sockets.target(address)
         self._control = sockets.target(control_address(address, control))
-        self._outbox = Outbox(Spool(spool, self._config.segment_bytes))
-        self._sender = Sender(address, self._control, self._outbox, self._config.stall_timeout)
+        segment_bytes = min(self._config.segment_bytes, self._config.spool_bytes // _SEGMENTS)
+        self._outbox = Outbox(Spool(spool, segment_bytes, map_name=self._config.map))
+        self._pressure = Backpressure(self._outbox, self._config)
+        self._sender = Sender(address, self._control, self._outbox, self._config, connection_keys)
         self._sending = threading.Lock()
         self._closed = False
         self._thread = threading.Thread(target=self._sender.run, name="tsfusion-client", daemon=True)
         self._thread.start()
         atexit.register(self.close)  # also who forgets to leaves no temporary spool behind
 
-    def send(self, keyframe: Keyframe) -> int:
-        """Take a keyframe; returns its number once it is in the spool. Never waits for the network.
+    def send(self, keyframe: Keyframe) -> int | None:
+        """Take a keyframe; its number once it is in the spool, None when it is skipped (`stats.skipped`).
+
+        Never waits for the network, unless the policy is `block`; never fails because of the disk.
 
         Raises:
-            JournalError: when the spool's disk refuses it.
-            TransportError: after `close`.
+            TransportError: after `close`, also when that happens while this waits.
         """
-        spool = self._outbox.spool
-        with self._sending:
-            if self._closed:
-                raise TransportError("the client is closed")
-            frames = codec.encode(
-                keyframe,
-                session=spool.session,
-                seq=spool.next_seq,
-                jpeg_quality=self._config.jpeg_quality,
-            )
-            entry = spool.write(frames)
-            with self._outbox.changed:
-                self._outbox.add(entry, keyframe)
-        self._sender.wake()
-        return entry.seq
+        while True:
+            self._await_turn()
+            with self._sending:
+                self._check_running()
+                if self._pressure.must_wait:  # another thread took the turn
+                    continue
+                seq = self._pressure.put(keyframe)
+            if seq is not None:
+                self._sender.wake()
+            return seq
 
     def connect(self, timeout: float | None = None) -> None:
         """Wait until the server has answered. Not needed before `send`.
 
         Raises:
-            ServerUnreachable: when it has not within `timeout` seconds (default: the config's).
+            NotAllowed: as soon as the server turns the keys away, or the lack of them.
+            ServerUnreachable: when it has not within `timeout` seconds (default: the config's), or answers
+                that it will not have this client.
         """
         timeout = self._config.connect_timeout if timeout is None else timeout
-        if not self._wait(lambda: self._outbox.connected, timeout):
+        box = self._outbox
+        self._wait(lambda: box.connected or bool(box.turned_away), timeout)
+        if box.turned_away:
+            raise (NotAllowed if box.turned_away == "keys" else ServerUnreachable)(self._why())
+        if not box.connected:
             raise ServerUnreachable(f"{self._why()} (waited {timeout:g} s)")
 
     def flush(self, timeout: float = 10.0) -> None:
@@ -126,10 +131,10 @@ class Client:
         box = self._outbox
         done = self._wait(lambda: not box.spool.waiting, timeout)
         with box.changed:
-            refusals, box.refusals = box.refusals, []
+            refusals, first = box.take_refusals()
         if refusals:
-            more = f" (and {len(refusals) - 1} more)" if len(refusals) > 1 else ""
-            raise KeyframeRefused(f"keyframe {refusals[0]}{more}")
+            more = f" (and {refusals - 1} more)" if refusals > 1 else ""
+            raise KeyframeRefused(f"keyframe {first}{more}")
         if not done:
             raise FlushTimeout(
                 f"{len(box.spool.waiting)} keyframes are not acknowledged after {timeout:g} s: {self._why()}"
@@ -178,6 +183,8 @@ class Client:
             if self._closed:
                 return
             self._closed = True
+            with self._outbox.changed:
+                self._outbox.changed.notify_all()
             atexit.unregister(self.close)
             self._sender.stop()
             self._thread.join()
@@ -194,12 +201,23 @@ class Client:
     ) -> None:
         self.close()
 
+    def _await_turn(self) -> None:
+        with self._outbox.changed:
+            while self._pressure.must_wait:
+                self._check_running()
+                self._outbox.changed.wait(0.5)
+
+    def _check_running(self) -> None:
+        if self._closed:
+            raise TransportError("the client is closed")
+        if not self._thread.is_alive():
+            raise TransportError("the client's sending thread has died")
+
     def _wait(self, reached: Callable[[], bool], timeout: float) -> bool:
         deadline = time.monotonic() + timeout
         with self._outbox.changed:
             while not reached():
-                if not self._thread.is_alive():
-                    raise TransportError("the client is closed, or its sending thread has died")
+                self._check_running()
                 left = deadline - time.monotonic()
                 if left <= 0:
                     return False
@@ -209,6 +227,8 @@ class Client:
     def _why(self) -> str:
         if self._outbox.problem:
             return self._outbox.problem
+        if self._outbox.opening:
+            return f"the server is opening the map {self._config.map}"
         heard = self._sender.heard
         silence = time.monotonic() - heard
         if not heard:
@@ -217,77 +237,3 @@ class Client:
         if silence > _SILENCE:
             why = f"nothing was heard from the server at {self._control} for {silence:.1f} s"
         return why if self._outbox.spool.temporary else f"{why}; they stay in {self._outbox.spool.folder}"
-
-
-def fetch_status(
-    address: str, *, control: str | None = None, timeout: float = 10.0, keys: ClientKeys | None = None
-) -> Status:
-    """How the server at a data address is doing.
-
-    Args:
-        keys: of `curve.client_keys`, for a server with keys.
-
-    Raises:
-        NotAllowed: when the server turns the connection away.
-        ServerUnreachable: when nobody answers in `timeout` seconds.
-        TransportError: when the server cannot say.
-    """
-    reply, _ = _ask(address, control, Command(name="status"), timeout, keys)
-    if reply.status is None:
-        raise TransportError(f"the server at {address} answered without a status")
-    return reply.status
-
-
-def fetch_mesh(
-    address: str,
-    *,
-    control: str | None = None,
-    min_weight: float | None = None,
-    timeout: float = 60.0,
-    keys: ClientKeys | None = None,
-) -> Mesh:
-    """The whole mesh of the server at a data address, as of now.
-
-    Args:
-        keys: of `curve.client_keys`, for a server with keys.
-
-    Raises:
-        NotAllowed: when the server turns the connection away.
-        ServerUnreachable: when nobody is there (known after a few seconds), or the mesh takes longer than
-            `timeout` seconds.
-        TransportError: when the server cannot make it.
-    """
-    reply, frames = _ask(address, control, Command(name="mesh", min_weight=min_weight), timeout, keys)
-    if reply.mesh is None:
-        raise TransportError(f"the server at {address} answered without a mesh")
-    return mesh_of(reply.mesh, frames)
-
-
-def _ask(
-    address: str, control: str | None, command: Command, timeout: float, keys: ClientKeys | None
-) -> tuple[Reply, list[memoryview]]:
-    """The fuser's answer. That takes its time, so it is asked first whether anybody is there."""
-    address = control_address(sockets.target(address), control)
-    if timeout > _ANSWER_TIMEOUT:
-        request(address, Command(name="ping"), timeout=_ANSWER_TIMEOUT, keys=keys)
-    return request(address, command, timeout=timeout, keys=keys)
-
-
-def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:
-    """A mesh from its frames (see `MeshLayout`).
-
-    Raises:
-        TransportError: when the frames are not what the layout says.
-    """
-    wanted: list[tuple[int, type]] = [
-        (layout.vertices, np.float32), (layout.faces, np.int32), (layout.vertices, np.float32),
-    ]  # fmt: skip
-    if layout.colors:
-        wanted.append((layout.vertices, np.uint8))
-    sizes = [rows * 3 * np.dtype(dtype).itemsize for rows, dtype in wanted]
-    if sizes != [frame.nbytes for frame in frames]:
-        raise TransportError(f"a mesh of {sizes} bytes was announced, got {[f.nbytes for f in frames]}")
-    arrays: list[NDArray[Any]] = [
-        np.frombuffer(frame, dtype).reshape(-1, 3) for frame, (_, dtype) in zip(frames, wanted, strict=True)
-    ]
-    return Mesh(*arrays)

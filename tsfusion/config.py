@@ -28,6 +28,8 @@ Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Smoothness = Annotated[float, Meta(ge=0, le=1e9)]
 Policy = Literal["thin", "block", "drop_oldest", "spool_all"]
+LogFormat = Literal["text", "json"]
+LogLevel = Literal["debug", "info", "warning", "error"]
 DEFAULT_MAP = "default"
 # Becomes a folder's name, so it is no path: \A and \Z, because `$` would let a newline through.
 MapName = Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9_-]{0,31}\Z")]
@@ -163,12 +165,16 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left on the disk: below, keyframes have to wait
     quarantine_bytes: Bytes = 256 << 20  # per map; keyframes that could not be fused, the oldest go first
     memory_bytes: Bytes = 512 << 20  # of the gateway; above, all connections are dropped and made anew
-    fuser_memory_bytes: Bytes | None = None  # of each fuser; None = three quarters of the machine's
+    fuser_memory_bytes: Annotated[int, Meta(ge=1 << 28)] | None = (
+        None  # of each fuser; None = three quarters of the machine's
+    )
     fuser_timeout: Positive = 60.0  # seconds on one keyframe before a fuser counts as stuck
     quota_bytes: Bytes = 256 << 20  # a second, of each client
-    quota_keyframes: Positive = 100.0  # a second, of each client
+    quota_keyframes: Positive = 1000.0  # a second, of each client
     quota_points: Annotated[int, Meta(ge=1)] = 8 << 20  # points or pixels a keyframe
     quota_extent: Positive = 100_000.0  # metres from the map's origin to a sensor
+    log_format: LogFormat = "text"  # of what goes to stderr: lines, or one JSON object a line
+    log_level: LogLevel = "info"  # what is less than that is left out
 
 
 class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -180,8 +186,8 @@ class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     key: str | None = None  # own secret key, a file of `tsfusion keys new`; None = no keys
     server_key: str | None = None  # the server's public key: a file, or the 40 characters
     policy: Policy = "thin"  # when keyframes come faster than the server takes them
-    backlog: Annotated[int, Meta(ge=1, le=10_000)] = 8  # waiting keyframes at which the policy begins to act
-    spool_bytes: Bytes = 8 << 30  # more is never kept; what comes then is skipped and counted
+    backlog: Annotated[int, Meta(ge=1, le=10_000)] = 8  # keyframes behind at which the policy begins to act
+    spool_bytes: Bytes = 8 << 30  # of the disk; what comes then is skipped and counted
     min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left on the spool's disk
     jpeg_quality: Annotated[int, Meta(ge=1, le=100)] = 90
     segment_bytes: Annotated[int, Meta(ge=1 << 16)] = 64 << 20
@@ -195,6 +201,21 @@ class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     volume: VolumeConfig = VolumeConfig()
     server: ServerConfig = ServerConfig()
     client: ClientConfig = ClientConfig()
+    maps: dict[MapName, dict[str, Any]] = {}  # [maps.NAME]: what differs there from [volume]
+
+    def volumes(self) -> dict[str, VolumeConfig]:
+        """The settings of the maps that have some of their own.
+
+        Raises:
+            InvalidConfig: for an unknown key or a bad value.
+        """
+        found = {}
+        for name, settings in self.maps.items():
+            try:
+                found[name] = override(self.volume, **settings)
+            except InvalidConfig as error:
+                raise InvalidConfig(f"[maps.{name}]: {error}") from error
+        return found
 
 
 AnyStruct = TypeVar("AnyStruct", bound=Struct)
@@ -206,6 +227,7 @@ _KINDS = {
     "bool": "true or false",
     "object": "a table",
 }
+_NAME = "1 to 32 of a-z, 0-9, - and _, a letter or digit first"  # MapName, the one pattern in a configuration
 
 
 def make(struct: type[AnyStruct], settings: dict[str, Any]) -> AnyStruct:
@@ -227,14 +249,16 @@ def _explain(struct: type[Struct], settings: dict[str, Any], problem: str) -> st
     *tables, key = place.rstrip("`").split(".")
     if unknown := re.search(r"unknown field `(.+)`", problem):
         return f"unknown setting {'.'.join(filter(None, (place.rstrip('`'), unknown[1])))}"
-    wanted = re.match(r"Expected `(\w+)[^`]*`(?: ([<>]=? \S+?)(?:\.0)?)?(?:,|$)|Invalid enum", problem)
+    wanted = re.match(
+        r"Expected `(\w+)[^`]*`(?: ([<>]=? \S+?)(?:\.0)?)?(?:,|$)|Invalid enum|.* matching regex", problem
+    )
     if wanted is None:
         return problem
     value: Any = settings
     for table in tables:
         struct, value = struct.__annotations__[table], value[table]
     words = ", ".join(re.findall(r"(?<!class )'(\w+)'", str(struct.__annotations__[key])))
-    must_be = f"one of {words}" if words else wanted[2] or _KINDS.get(wanted[1], wanted[1])
+    must_be = f"one of {words}" if words else wanted[2] or _KINDS.get(wanted[1], wanted[1]) or _NAME
     return f"{'.'.join((*tables, key))} must be {must_be}, got {value[key]!r}"
 
 
@@ -260,7 +284,9 @@ def load(path: str | Path | None, **volume: Any) -> Config:
     if isinstance(given := tables.get("volume", {}), dict):
         tables["volume"] = {**volume, **given}
     try:
-        return make(Config, tables)
+        made = make(Config, tables)
+        made.volumes()
+        return made
     except InvalidConfig as error:
         raise InvalidConfig(f"{path}: {error}") from error
 

@@ -6,23 +6,25 @@ journal are enough to begin again.
 """
 
 import logging
+import mmap
 import platform
 import select
 import signal
+import struct
 import sys
 import time
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from tsfusion import codec, journal, process
-from tsfusion.config import VIEW_SETTINGS, VolumeConfig
+from tsfusion import codec, journal, logs, maps, process
+from tsfusion.config import VIEW_SETTINGS, LogFormat, LogLevel, VolumeConfig
 from tsfusion.errors import CheckpointError, InvalidConfig, TsfusionError
 from tsfusion.mesh import Mesh
 from tsfusion.transport import sockets, work
@@ -31,8 +33,8 @@ from tsfusion.transport.messages import MeshLayout
 if TYPE_CHECKING:
     from tsfusion.volume import Volume
 
-MAP_FILE = "map.tsf"
-JOURNAL_FOLDER = "journal"
+_SET_ASIDE = 2 << 30  # bytes that Taichi asks for and hardly uses
+_KEPT_FREE = 256 << 20  # bytes that keyframes leave to meshes and checkpoints
 _REFINED_AT_ONCE = 256  # blocks: about 50 ms
 _FUSING_SHARE = 3  # a busy fuser meshes for at most a quarter of its time
 # Settings that may differ between a map and the server that goes on with it: none changes the sums.
@@ -47,40 +49,47 @@ class Fuser:
     def __init__(self, link: sockets.AnySocket, begin: work.Begin) -> None:
         self._link = link
         self._begin = begin
-        self._state = Path(begin.state)
-        self._position = journal.Position(0, 0)
+        self._folder = Path(begin.folder)
+        self._done: dict[bytes, work.Progress] = {}
         self._rejected: dict[str, int] = {}
         self._since_checkpoint = 0
         self._watched = False
-        self._fused_index = self._meshed_index = -1
+        self._answered = self._meshed = 0  # keyframes, by this process
         self._next_mesh = 0.0
         self._rough = np.zeros((0, 3), np.int32)  # cells that viewers have as fused only
         self._hashes: tuple[int, str, str] | None = None
+        self._working = Working(begin.working)
+        self._most = process.data_bytes() + _SET_ASIDE + begin.memory_bytes
+        process.limit_memory(self._most)
         self.exit_status: int | None = None
         self._volume = self._open()
 
     def _open(self) -> "Volume":
         from tsfusion.volume import Volume
 
-        path = self._state / MAP_FILE
         volume = None
-        if path.exists():
-            volume = _resume(path, self._begin.volume)
+        for path in (self._folder / maps.MAP_FILE, self._folder / maps.PREVIOUS_FILE):
+            if volume is None and path.exists():
+                volume = _resume(path, self._begin.volume)
         if volume is None:
             volume = Volume(self._begin.volume)
-        elif "position" not in volume.meta:
+        elif "done" not in volume.meta:
             raise CheckpointError(
-                f"{path} was not saved by a server: it does not say where the journal goes on"
+                f"the map in {self._folder} was not saved by a server: it does not say what it holds"
             )
         else:
-            self._position = journal.Position(*volume.meta["position"])
+            self._done = {
+                bytes.fromhex(session): work.Progress(*progress)
+                for session, progress in volume.meta["done"].items()
+            }
             self._rejected = dict(volume.meta["rejected"])
         volume.warm_up()
         return volume
 
     def ready(self) -> work.Ready:
-        """Where the map stands in the journal."""
-        return work.Ready(self._position)
+        """How far the map is."""
+        stats = self._volume.stats()
+        return work.Ready(self._done, self._volume.keyframes, self._rejected, stats.blocks, stats.bytes)
 
     def take(self, message: work.ToFuser) -> None:
         """Do what the gateway says."""
@@ -92,23 +101,36 @@ class Fuser:
             self._watched = message.wanted
             if not self._watched:
                 self._rough = self._rough[:0]
+        elif isinstance(message, work.Save):
+            self._checkpoint()
         elif isinstance(message, work.Finish):
             self.exit_status = 0 if self._checkpoint() else 1
 
     def mesh_due(self, idle: bool) -> bool:
         """Whether the mesh is behind and it is time: at once when idle, else so that fusing comes first."""
-        behind = self._fused_index > self._meshed_index
+        behind = self._answered > self._meshed
         return behind and (idle or time.monotonic() >= self._next_mesh)
 
     def mesh(self) -> None:
-        """Bring the mesh up to date with the map: as fused, because the next keyframe may be near."""
+        """Bring the mesh up to date with the map: as fused, because the next keyframe may be near.
+
+        Without the memory for it, viewers miss a part; a mesh on request is whole, once there is.
+        """
+        try:
+            self._mesh()
+        except MemoryError as error:
+            log.error("no memory to mesh the changed part of the map: %s", error)
+            self._meshed = self._answered
+            self._send(self._meshed_message(time.monotonic_ns()))
+
+    def _mesh(self) -> None:
         from tsfusion.blockstore import cells_of
 
         started = time.monotonic()
         blocks = self._volume.take_dirty()
         cells = cells_of(blocks)
         mesh = self._volume.extract_mesh(blocks=cells, surface="raw")
-        self._meshed_index = self._fused_index
+        self._meshed = self._answered
         pause = max(self._begin.mesh_interval, _FUSING_SHARE * (time.monotonic() - started))
         self._next_mesh = time.monotonic() + pause
         stamp = time.monotonic_ns()
@@ -118,7 +140,7 @@ class Fuser:
                 rough = np.concatenate([self._rough, self._volume.cells_to_mesh(blocks)])
                 self._rough = np.unique(rough, axis=0)
         else:
-            self._send(work.Meshed(self._meshed_index, stamp))
+            self._send(self._meshed_message(stamp))
 
     @property
     def refine_due(self) -> bool:
@@ -129,26 +151,41 @@ class Fuser:
         """Mesh a part of what was meshed as fused again, as the settings ask: only while there is nothing
         else to do, and little at a time, because a keyframe that comes meanwhile waits."""
         cells, self._rough = self._rough[:_REFINED_AT_ONCE], self._rough[_REFINED_AT_ONCE:]
-        self._publish(time.monotonic_ns(), 0, cells, self._volume.extract_mesh(blocks=cells))
+        with suppress(MemoryError):  # it stays as fused
+            self._publish(time.monotonic_ns(), 0, cells, self._volume.extract_mesh(blocks=cells))
 
     def _publish(self, stamp: int, blocks: int, cells: NDArray[np.int32], mesh: Mesh) -> None:
         layout, frames = _mesh_frames(mesh)
         tiles = np.ascontiguousarray(cells).data
-        self._send(work.Meshed(self._meshed_index, stamp, blocks, layout), [tiles, *frames])
+        self._send(self._meshed_message(stamp, blocks, layout), [tiles, *frames])
+
+    def _meshed_message(self, stamp: int, blocks: int = 0, layout: MeshLayout | None = None) -> work.Meshed:
+        stats = self._volume.stats()
+        return work.Meshed(self._meshed, stamp, blocks, stats.blocks, stats.bytes, layout)
 
     def _fuse(self, order: work.Fuse) -> None:
         start = time.monotonic_ns()
-        self._position = order.position
+        self._answered += 1
+        before = self._done.get(order.session)
+        if before is not None and order.seq <= before.seq:
+            self._send(work.Done(order.index, start, start))
+            return
         reason, message = order.skip, ""
         if reason is None:
+            self._working.at(order.index)
+            process.limit_memory(self._most - min(_KEPT_FREE, self._begin.memory_bytes // 4))
             try:
-                record = journal.read(self._state / JOURNAL_FOLDER, self._position)
+                record = journal.read(self._folder / maps.JOURNAL_FOLDER, order.position)
                 self._volume.integrate(codec.decode(record.frames))
             except TsfusionError as error:
                 reason, message = _reason(error), str(error)
+            except MemoryError as error:
+                reason, message = "memory", f"no memory to fuse it: {error}"
+            process.limit_memory(self._most)
+            self._working.at(work.NOT_WORKING)  # not if it ended the process, however it did
         if reason is not None:
             self._rejected[reason] = self._rejected.get(reason, 0) + 1
-        self._fused_index = order.index
+        self._done[order.session] = work.Progress(order.seq, order.client)
         self._send(work.Done(order.index, start, time.monotonic_ns(), reason, message))
         self._since_checkpoint += 1
         if self._begin.checkpoint_every and self._since_checkpoint >= self._begin.checkpoint_every:
@@ -156,16 +193,24 @@ class Fuser:
 
     def _checkpoint(self) -> bool:
         if self._since_checkpoint == 0:
+            self._send(work.Saved(written=False))
             return True
-        meta = {"position": [self._position.segment, self._position.offset], "rejected": self._rejected}
+        meta = {
+            "done": {session.hex(): [done.seq, done.client] for session, done in self._done.items()},
+            "rejected": self._rejected,
+        }
+        path = self._folder / maps.MAP_FILE
         try:
-            self._volume.save(self._state / MAP_FILE, meta=meta)
-        except TsfusionError as error:
+            if self._begin.keep_previous and path.exists():
+                path.replace(self._folder / maps.PREVIOUS_FILE)
+            self._volume.save(path, meta=meta)
+        except (TsfusionError, OSError, MemoryError) as error:
             # Nothing is lost: the next start fuses the journal from the checkpoint before this one.
             log.error("no checkpoint: %s", error)
             self._since_checkpoint = 1
             return False
         self._since_checkpoint = 0
+        self._send(work.Saved(written=True))
         return True
 
     def _answer(self, ask: work.Ask) -> None:
@@ -181,8 +226,8 @@ class Fuser:
 
     def _status(self) -> work.FuserStatus:
         stats = self._volume.stats()
-        if self._hashes is None or self._hashes[0] != self._fused_index:
-            self._hashes = (self._fused_index, self._volume.map_hash(), self._volume.color_hash())
+        if self._hashes is None or self._hashes[0] != self._answered:
+            self._hashes = (self._answered, self._volume.map_hash(), self._volume.color_hash())
         return work.FuserStatus(
             keyframes_fused=self._volume.keyframes,
             keyframes_rejected=self._rejected,
@@ -201,6 +246,18 @@ class Fuser:
 
     def _send(self, message: Any, frames: list[Any] | None = None) -> None:
         self._link.send_multipart([work.encode(message), *(frames or [])], copy=False)
+
+
+class Working:
+    """A word of memory that outlives the process: which keyframe it is at."""
+
+    def __init__(self, path: str) -> None:
+        with Path(path).open("r+b") as file:
+            self._word = mmap.mmap(file.fileno(), 8)
+
+    def at(self, index: int) -> None:
+        """It is this one; `work.NOT_WORKING` = none."""
+        struct.pack_into("<q", self._word, 0, index)
 
 
 def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
@@ -254,7 +311,8 @@ def _remove(endpoint: str) -> None:
     if select.select([sys.stdin], [], [], 0)[0]:
         file = Path(endpoint.removeprefix("ipc://"))
         with suppress(OSError):
-            file.unlink(missing_ok=True)
+            for left in (file, file.parent / work.WORKING_FILE):
+                left.unlink(missing_ok=True)
             file.parent.rmdir()
 
 
@@ -286,6 +344,7 @@ def _serve(link: sockets.AnySocket) -> int:
 
 def _begin(link: sockets.AnySocket, message: work.Begin) -> Fuser | None:
     try:
+        process.end_first()
         fuser = Fuser(link, message)
     except TsfusionError as error:
         name = next(kind.__name__ for kind in type(error).__mro__ if kind.__module__ == "tsfusion.errors")
@@ -296,11 +355,12 @@ def _begin(link: sockets.AnySocket, message: work.Begin) -> Fuser | None:
 
 
 def main() -> int:
-    """`python -m tsfusion.fuser ENDPOINT`, as the gateway starts it."""
-    logging.basicConfig(format="tsfusion fuser: %(levelname)s: %(message)s")
+    """`python -m tsfusion.fuser ENDPOINT FORMAT LEVEL MAP`, as the gateway starts it."""
+    endpoint, format_, level, map_name = sys.argv[1:]
+    logs.configure(cast("LogFormat", format_), cast("LogLevel", level), "fuser", map=map_name)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # a terminal or supervisor signals all; the gateway decides
-    return run(sys.argv[1])
+    return run(endpoint)
 
 
 if __name__ == "__main__":

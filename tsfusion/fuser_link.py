@@ -1,64 +1,87 @@
 # SPDX-License-Identifier: MIT
-"""The gateway's end of the fuser: start it, feed it journal positions, notice when it dies."""
+"""The gateway's end of the fuser: start it, feed it journal positions, notice when it dies or hangs."""
 
 import logging
 import shutil
+import signal
+import struct
 import subprocess
 import sys
 import tempfile
 import time
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import zmq
 
-from tsfusion import errors
+from tsfusion import errors, logs, process
 from tsfusion.config import ServerConfig, VolumeConfig
 from tsfusion.errors import MapError, TsfusionError
-from tsfusion.journal import Position
 from tsfusion.transport import sockets, work
 
 log = logging.getLogger(__name__)
 
 COMMAND = (sys.executable, "-m", "tsfusion.fuser")
 _AHEAD = 4  # positions handed out before their answers: hides the gateway's disk waits
-_MAX_STARTS = 3  # in a row, without getting ready
-_MAX_CRASHES = 2  # on one keyframe, before it is skipped
+_MAX_STARTS = 3  # in a row, without getting ready, before the map counts as failed
+_LONGEST_PAUSE = 60.0  # seconds between one start and the next
 _END_DEADLINE = 5.0
+# A keyframe is given up when the deaths put down to it weigh so much: two of its own making, or as many
+# kills from outside as no chance can aim at one keyframe.
+_ENOUGH, _OWN_DEATH, _KILLED = 6, 3, 1
+_PATIENCE = 10  # times as long, when it is no keyframe that takes so long: a mesh, a checkpoint
 
 
 class FuserLink:
-    """One fuser process after another, all working through the same journal.
+    """One fuser process after another, all at work on the same map.
 
     Attributes:
         socket: poll it for `receive`.
         ready: the process has opened the map and compiled the kernels.
-        next_index: the first keyframe not handed to it yet.
-        in_flight: those it has not answered, oldest first.
+        in_flight: the keyframes it has not answered, oldest first.
         restarts: how often a new process had to take over.
+        failed: why it cannot be kept alive; empty = it can. It is still tried again, ever more rarely.
     """
 
-    def __init__(self, context: "zmq.Context[Any]", server: ServerConfig, volume: VolumeConfig) -> None:
+    def __init__(
+        self, context: "zmq.Context[Any]", folder: Path, server: ServerConfig, volume: VolumeConfig
+    ) -> None:
         self._context = context
-        self._begin = work.Begin(server.state, volume, server.mesh_interval, server.checkpoint_every)
-        self._folder = Path(tempfile.mkdtemp(prefix="tsfusion-"))  # a socket's path has to be short
-        self._failed_starts = 0
-        self._crashes: dict[int, int] = {}
+        self._scratch = Path(tempfile.mkdtemp(prefix="tsfusion-"))  # a socket's path has to be short
+        self._begin = work.Begin(
+            str(folder),
+            volume,
+            server.mesh_interval,
+            server.checkpoint_every,
+            str(self._scratch / work.WORKING_FILE),
+            server.journal_bytes is not None,
+            server.fuser_memory_bytes or process.physical_memory_bytes() * 3 // 4,
+        )
+        self._map = folder.name
+        self._logs = (server.log_format, server.log_level, self._map)
+        self._timeout = server.fuser_timeout
+        self._ended_early = 0  # processes in a row that got nothing done
+        self._blame: dict[int, int] = {}
         self._finishing = self._finish_sent = False
         self.restarts = 0
+        self.failed = ""
         self._start()
 
     def _start(self) -> None:
         self.ready = False
-        self.next_index = 0
+        self._restart_at = 0.0
+        self._heard = time.monotonic()
+        self._oom_kills = process.oom_kills()
         self.in_flight: deque[int] = deque()
-        endpoint = f"ipc://{self._folder}/{self.restarts}"
+        Path(self._begin.working).write_bytes(struct.pack("<q", work.NOT_WORKING))
+        endpoint = f"ipc://{self._scratch}/{self.restarts}"
         self.socket = sockets.pair(self._context)
         self.socket.bind(endpoint)
         self._process = subprocess.Popen(
-            [*COMMAND, endpoint],
+            [*COMMAND, endpoint, *self._logs],
             stdin=subprocess.PIPE,  # closes when the gateway dies, however it dies
             stdout=subprocess.DEVNULL,
             start_new_session=True,  # a Ctrl-C is for the gateway
@@ -87,14 +110,15 @@ class FuserLink:
             return False
         return True
 
-    def fuse(self, position: Position) -> bool:
-        """Hand out the keyframe `next_index`, which lies there; False when it has to be tried again."""
-        index = self.next_index
-        skip = "crash" if self._crashes.get(index, 0) >= _MAX_CRASHES else None
-        if not self.send(work.Fuse(index, position, skip)):
+    def fuse(self, order: work.Fuse) -> bool:
+        """Hand out a keyframe; False when it has to be tried again."""
+        if self._blame.get(order.index, 0) >= _ENOUGH:
+            order = work.Fuse(order.index, order.position, order.session, order.seq, order.client, "crash")
+        if not self.send(order):
             return False
-        self.in_flight.append(index)
-        self.next_index += 1
+        if not self.in_flight:
+            self._heard = time.monotonic()
+        self.in_flight.append(order.index)
         return True
 
     def receive(self) -> tuple[work.ToGateway, Sequence[zmq.Frame]] | None:
@@ -107,6 +131,7 @@ class FuserLink:
             head, *frames = self.socket.recv_multipart(zmq.NOBLOCK, copy=False)
         except zmq.Again:
             return None
+        self._heard = time.monotonic()
         message = work.to_gateway.decode(head.buffer)
         if isinstance(message, work.Failed):
             kind = getattr(errors, message.error, TsfusionError)
@@ -115,38 +140,82 @@ class FuserLink:
             self.send(self._begin)
         elif isinstance(message, work.Ready):
             self.ready = True
-            self._failed_starts = 0
         elif isinstance(message, work.Done):
             self.in_flight.popleft()
+            self._blame.pop(message.index, None)
+            self._ended_early = 0
+            self.failed = ""
         return message, frames
 
     def ended(self) -> bool:
-        """Whether the process is gone."""
-        return self._process.poll() is not None
+        """Whether the process is gone; one that hangs is ended here."""
+        if self._process.poll() is not None:
+            return True
+        busy = bool(self.in_flight) or self._finish_sent
+        patience = self._timeout * (1 if self._working() != work.NOT_WORKING else _PATIENCE)
+        if busy and self.ready and time.monotonic() - self._heard > patience:
+            subject = logs.about(map=self._map)
+            log.error("the fuser process has been silent for %.0f s: it is killed", patience, extra=subject)
+            self._put_down(_OWN_DEATH)
+            self._process.kill()
+            self._process.wait()
+            return True
+        return False
 
     def restart(self) -> None:
-        """Put a new process in the place of one that died. It begins at the last checkpoint.
+        """Put a new process in the place of one that died: at once, or after a pause when that happens again
+        and again. It begins at the last checkpoint. Call it until `ended` is no longer true.
 
         Raises:
-            MapError: when one after another died before it was ready.
+            MapError: when the first of all died before it was ready.
         """
+        if not self._restart_at:
+            self._bury()
+        if time.monotonic() >= self._restart_at:
+            self._release()
+            self.restarts += 1
+            self._start()
+
+    def _bury(self) -> None:
         status = self._process.returncode
-        if self.in_flight:
-            suspect = self.in_flight[0]
-            self._crashes[suspect] = self._crashes.get(suspect, 0) + 1
-        if not self.ready:
-            self._failed_starts += 1
-            if self._failed_starts >= _MAX_STARTS or self.restarts == 0:
-                raise MapError(f"the fuser process ended with status {status} before it was ready")
-        log.error("the fuser process ended with status %s; another takes over from the checkpoint", status)
-        self._release()
-        self.restarts += 1
-        self._start()
+        self.in_flight.clear()
+        killed = status == -signal.SIGKILL and process.oom_kills() == self._oom_kills
+        if not self.ready and self.restarts == 0 and not killed:
+            raise MapError(f"the fuser process ended with status {status} before it was ready")
+        self._put_down(_KILLED if killed else _OWN_DEATH)
+        if self._ended_early >= _MAX_STARTS:
+            self.failed = f"its fuser process ended {self._ended_early} times, last with status {status}"
+        pause = min(2.0**self._ended_early - 1, _LONGEST_PAUSE)
+        self._ended_early += 1
+        self._restart_at = time.monotonic() + pause
+        self.ready = False
+        log.error(
+            "the fuser process ended with status %s; another takes over from the checkpoint%s",
+            status,
+            f" in {pause:.0f} s" if pause else "",
+            extra=logs.about(map=self._map),
+        )
+
+    def _put_down(self, weight: int) -> None:
+        """A death to the keyframe it happened at, if it was at one."""
+        index = self._working()
+        if index != work.NOT_WORKING:
+            self._blame[index] = self._blame.get(index, 0) + weight
+            with suppress(OSError):
+                Path(self._begin.working).write_bytes(struct.pack("<q", work.NOT_WORKING))
+
+    def _working(self) -> int:
+        try:
+            (index,) = struct.unpack("<q", Path(self._begin.working).read_bytes())
+        except (OSError, struct.error):
+            return work.NOT_WORKING
+        return int(index)
 
     def finish(self) -> None:
         """Ask for a checkpoint and the end of the process. Call it until `ended`: there may be no room."""
         if not self._finish_sent:
             self._finish_sent = self.send(work.Finish())
+            self._heard = time.monotonic()
         self._finishing = True
 
     @property
@@ -170,7 +239,7 @@ class FuserLink:
             self._process.kill()
             self._process.wait()
         self._release()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        shutil.rmtree(self._scratch, ignore_errors=True)
 
     def _release(self) -> None:
         assert self._process.stdin is not None

@@ -2,151 +2,246 @@
 """The gateway: everything that must answer while a kernel runs.
 
 A Taichi kernel holds its process for as long as it takes, so this is another one. Each message is checked,
-journaled and acknowledged in one step; the fuser is told only where it lies in the journal.
+journaled and acknowledged in one step; a map's fuser is told only where it lies in the journal.
 """
 
 import logging
-import secrets
 import time
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
-import msgspec
 import zmq
 
-from tsfusion import codec, process
-from tsfusion.config import DEFAULT_MAP, ServerConfig
-from tsfusion.errors import DecodeError, JournalError
-from tsfusion.fuser_link import FuserLink
-from tsfusion.journal import Journal
-from tsfusion.ports import Departures, Ports, each, send_now
-from tsfusion.sessions import Delays, KeyframeIndex, Sessions
+from tsfusion import codec, logs, process, reports
+from tsfusion.config import DEFAULT_MAP, ServerConfig, VolumeConfig
+from tsfusion.door import Door
+from tsfusion.errors import DecodeError, TsfusionError
+from tsfusion.hosted import HostedMap
+from tsfusion.intake import Intake
+from tsfusion.metrics import Metrics
+from tsfusion.ports import MemoryBound, Ports, each, send_now
+from tsfusion.questions import Questions
+from tsfusion.sessions import Route, Routes
 from tsfusion.transport import messages, sockets, work
-from tsfusion.transport.sockets import MESH_TOPIC
+from tsfusion.transport.sockets import mesh_topic
 
 log = logging.getLogger(__name__)
 
 _TICK_MS = 100  # how long a signal or a fuser's death may go unnoticed
-_MAX_QUESTIONS = 32
+_SNAPSHOT_INTERVAL = 1.0  # seconds
+_RETRY_INTERVAL = 10.0  # seconds before a map that could not be opened is tried again
 
 
 class Gateway:
-    """One server's state between clients, journal and fuser. Call `step` for ever."""
+    """One server's state between clients, journals and fusers. Call `step` for ever.
 
-    def __init__(self, server: ServerConfig, ports: Ports, journal: Journal, fuser: FuserLink) -> None:
+    Attributes:
+        epoch: a new one tells clients that what was under way is lost.
+        maps: those that are open, by name.
+    """
+
+    def __init__(
+        self,
+        context: "zmq.Context[Any]",
+        server: ServerConfig,
+        ports: Ports,
+        door: Door,
+        metrics: Metrics | None = None,
+    ) -> None:
         self.ports = ports
-        self.fuser = fuser
-        self.epoch = secrets.token_hex(8)
-        self.warm = False  # the fuser has been ready once
+        self.maps: dict[str, HostedMap] = {}
+        self._context = context
         self._server = server
-        self._journal = journal
-        self._sessions = Sessions()
-        self._index = KeyframeIndex()
-        self._index.recover(journal.found, self._sessions)
-        journal.found = []
-        self._delays = Delays()
-        self._meshed = -1
-        self._refused: Counter[str] = Counter()
-        self._duplicates = 0
-        self._questions: dict[int, tuple[bytes, str]] = {}
-        self._question_count = 0
-        self._meshes = Departures()
+        self._volumes: Mapping[str, VolumeConfig] = {}
+        self._door = door
+        self._metrics = metrics
+        self._routes = Routes()
+        self._intake = Intake(server, self.maps, door, self)
+        self._refused = self._intake.refused
+        self._questions = Questions(self._answer)
         self._topics: set[bytes] = set()  # that somebody subscribed to
-        self._watched: bool | None = None  # what the fuser knows of it
-        self._accepting = True
+        self._watched: dict[str, bool] = {}  # what each fuser knows of it
+        self._unopened: dict[str, tuple[str, float]] = {}  # maps that could not be opened: why, when
+        self._memory = MemoryBound(server.memory_bytes)
+        self._accepting = self._started_up = False
         self._started = time.monotonic()
+        self._next_snapshot = 0.0
+        self._new_epoch()
+
+    def open(self, volumes: Mapping[str, VolumeConfig]) -> None:
+        """Open these maps with these settings; one that a client asks for gets those of the default map.
+
+        Raises:
+            TsfusionError: when a journal cannot be opened.
+        """
+        self._volumes = volumes
+        for name in volumes:
+            self._open(name)
+
+    def _new_epoch(self) -> None:
+        self.epoch = f"{time.monotonic_ns():x}"
+
+    @property
+    def warm(self) -> bool:
+        """Whether every map that is open can take keyframes."""
+        return all(hosted.warm for hosted in self.maps.values())
 
     @property
     def drained(self) -> bool:
-        """Whether the map has every keyframe of the journal."""
-        return self.fuser.idle and self.fuser.next_index == len(self._index)
+        """Whether every map has every keyframe of its journal."""
+        return all(hosted.drained for hosted in self.maps.values())
+
+    @property
+    def failed(self) -> bool:
+        """Whether a map's fuser cannot be kept alive: it will not be drained."""
+        return any(hosted.fuser.failed for hosted in self.maps.values())
+
+    def accept(self) -> None:
+        """Take keyframes from here on."""
+        self._accepting = self._started_up = True
+        self._next_snapshot = 0.0  # health checks are to know at once
 
     def stop_accepting(self) -> None:
         """Take no more keyframes; clients keep what is not acknowledged."""
         self._accepting = False
         self.ports.keyframes.close()
 
+    def finish(self) -> bool:
+        """Have every fuser write its checkpoint and end; whether all have. Call it until then."""
+        for hosted in self.maps.values():
+            hosted.fuser.finish()
+        return all(hosted.fuser.ended() for hosted in self.maps.values())
+
+    @property
+    def finished_well(self) -> bool:
+        """Whether every checkpoint is on the disk."""
+        return all(hosted.fuser.finished_well for hosted in self.maps.values())
+
+    def close(self) -> None:
+        """End the fusers and finish the journals."""
+        for hosted in self.maps.values():
+            hosted.close()
+
     def step(self) -> None:
         """Wait for something to happen (a moment at most) and deal with it.
 
         Raises:
-            TsfusionError: when the fuser cannot be kept alive.
+            TsfusionError: when a map that was to be opened at the start cannot be.
         """
         handlers: dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]] = {
             self.ports.control: self._on_control,
             self.ports.publish: self._on_subscription,
         }
         if self._accepting:
-            handlers[self.ports.keyframes] = self._on_keyframe
-        polled = [(socket, zmq.POLLIN) for socket in (self.fuser.socket, *handlers)]
+            handlers[self.ports.keyframes] = self._intake.take
+        fusers = [hosted.fuser.socket for hosted in self.maps.values()]
+        polled = [(socket, zmq.POLLIN) for socket in (*self._door.poll, *fusers, *handlers)]
         events = dict(zmq.zmq_poll(polled, _TICK_MS))
-        for socket, handle in handlers.items():
-            if socket in events:
-                each(socket, handle)
-        self._hear_fuser()
-        watched = bool(self._topics)
-        if self.fuser.ready and watched != self._watched and self.fuser.send(work.Publish(watched)):
-            self._watched = watched
-        while self.fuser.wants_work and self.fuser.next_index < len(self._index):
-            if not self.fuser.fuse(self._index[self.fuser.next_index].position):
-                break
+        self._guard()
+        if self.ports.control in handlers:  # else they were made anew
+            for socket, handle in handlers.items():
+                if socket in events:
+                    each(socket, handle)
+        for hosted in list(self.maps.values()):
+            self._step(hosted)
+        self._snapshot()
 
-    # --- keyframes ---
+    def _guard(self) -> None:
+        """Drop all connections when a key was revoked, or when they hold too much memory.
 
-    def _on_keyframe(self, frames: list[zmq.Frame]) -> None:
-        received_ns = time.monotonic_ns()
-        buffers = [frame.buffer for frame in frames]
-        try:
-            header = codec.check(buffers, self._server.max_frame_bytes)
-        except codec.Refused as error:
-            self._refuse(buffers, error)
-            return
-        verdict = self._sessions.admit(header.session, header.seq, header.previous)
-        if verdict != "next":
-            self._duplicates += verdict == "duplicate"
-            self._refused["gap"] += verdict == "gap"
-            self._ack(header.session, resend=verdict == "gap")
-            return
-        try:
-            position = self._journal.append(buffers, session=header.session, seq=header.seq)
-        except JournalError as error:
-            log.error("keyframe %d is not accepted: %s", header.seq, error)
-            self._refused["journal"] += 1
-            return
-        session = self._sessions.open(header.session)
-        session.durable = header.seq
-        durable_ns = time.monotonic_ns()
-        self._index.add(
-            position,
-            session,
-            header.seq,
-            captured_ns=header.captured_ns,
-            received_ns=received_ns,
-            durable_ns=durable_ns,
-        )
-        self._ack(header.session, [messages.Stamps(header.seq, received_ns, durable_ns)])
+        ZeroMQ limits a frame and a queue of whole messages, not a message that never ends.
+        """
+        if self._door.step():
+            log.warning("a key was revoked: every connection is made anew")
+            self._refused["revoked"] += 1
+        else:
+            held = self._memory.excess(self._questions.nbytes)
+            if not held:
+                return
+            log.error(
+                "the gateway holds %d MB, more than memory_bytes: every connection is made anew", held >> 20
+            )
+            self._refused["memory"] += 1
+        self.ports.renew()
+        self._routes.clear()
+        self._topics.clear()
+        self._new_epoch()
 
-    def _refuse(self, frames: Sequence[Any], error: codec.Refused) -> None:
-        """Count a bad message; answer it when it says whose it is, so that it is not sent for ever."""
-        self._refused[error.reason] += 1
-        log.warning("a message is refused (%s): %s", error.reason, error)
+    def _snapshot(self) -> None:
+        now = time.monotonic()
+        if self._metrics is not None and now >= self._next_snapshot:
+            self._next_snapshot = now + _SNAPSHOT_INTERVAL
+            self._metrics.health = self.health()
+
+    # --- maps ---
+
+    def _open(self, name: str) -> HostedMap | None:
+        """A map by name, opened when need be; None when it cannot be."""
+        hosted = self.maps.get(name)
+        if hosted is not None:
+            return hosted
+        _, failed = self._unopened.get(name, ("", -_RETRY_INTERVAL))
+        if len(self.maps) >= self._server.max_maps or time.monotonic() - failed < _RETRY_INTERVAL:
+            return None
+        volume = self._volumes.get(name) or self._volumes[DEFAULT_MAP]
+        hosted = self.maps[name] = HostedMap(self._context, name, self._server, volume, self)
+        self._watched.pop(name, None)
+        self._unopened.pop(name, None)
+        return hosted
+
+    def _open_for_a_client(self, name: str) -> HostedMap | None:
         try:
-            header = codec.unpack(frames[0])
-        except (codec.Refused, IndexError):
+            return self._open(name)
+        except TsfusionError as error:
+            self._give_up(name, error)
+            return None
+
+    def _give_up(self, name: str, error: TsfusionError) -> None:
+        log.error("the map cannot be opened: %s", error, extra=logs.about(map=name))
+        self._unopened[name] = (str(error), time.monotonic())
+        hosted = self.maps.pop(name, None)
+        if hosted is not None:
+            hosted.close()
+
+    def _step(self, hosted: HostedMap) -> None:
+        if not hosted.fuser.ready:
+            self._watched.pop(hosted.name, None)
+            self._questions.give_up(hosted.name)
+        try:
+            hosted.step(partial(self._on_other, hosted))
+        except TsfusionError as error:
+            if not self._started_up or hosted.warm:
+                raise
+            self._give_up(hosted.name, error)
             return
-        session = self._sessions.get(header.session)
-        if session is not None and session.admit(header.seq, header.previous) == "next":
-            session.durable = header.seq
-        self._send(
-            header.session,
-            messages.Nack(header.session, header.seq, "door", error.reason, str(error)),
-        )
+        topic = mesh_topic(hosted.name)
+        watched = any(topic.startswith(wanted) for wanted in self._topics)
+        news = hosted.fuser.ready and watched != self._watched.get(hosted.name)
+        if news and hosted.fuser.send(work.Publish(watched)):
+            self._watched[hosted.name] = watched
+
+    def _on_other(
+        self, hosted: HostedMap, message: work.Meshed | work.Answer, frames: Sequence[zmq.Frame]
+    ) -> None:
+        if isinstance(message, work.Answer):
+            status = (
+                None
+                if message.status is None
+                else reports.status(hosted, message.status, self.health(), self._server)
+            )
+            self._questions.answered(message, status, frames)
+        elif frames:
+            send_now(self.ports.publish, [mesh_topic(hosted.name), work.encode(message), *frames])
 
     # --- control ---
 
     def _on_control(self, frames: list[zmq.Frame]) -> None:
+        client = self._door.client_of(frames[0])
         identity, *rest = (frame.bytes for frame in frames)
+        if client is None:
+            self._refused["key"] += 1
+            return
         try:
             message = messages.decode_to_server(b"".join(rest))
         except DecodeError as error:
@@ -156,169 +251,115 @@ class Gateway:
         if isinstance(message, messages.Command):
             self._on_command(identity, message)
         elif isinstance(message, messages.Hello):
-            self._sessions.connect(message.session, identity)
-            self._answer(identity, self._welcome(message.session))
+            self._on_hello(identity, message, client)
         else:
-            self._on_ping(identity, message)
+            self._on_ping(identity, message, client)
 
-    def _welcome(self, key: bytes) -> messages.Welcome:
-        session = self._sessions.get(key)
-        return messages.Welcome(
+    def _on_hello(self, identity: bytes, hello: messages.Hello, client: str) -> None:
+        if denied := self._denial(identity, hello, client):
+            self._answer(identity, messages.Denied(hello.session, *denied))
+            return
+        durable, fused = self.maps[hello.map].progress(hello.session)
+        welcome = messages.Welcome(
             epoch=self.epoch,
             version=codec.VERSION,
-            durable=session.durable if session else 0,
-            fused=session.fused if session else 0,
+            durable=durable,
+            fused=fused,
             window_keyframes=self._server.window_keyframes,
             window_bytes=self._server.window_bytes,
             max_frame_bytes=self._server.max_frame_bytes,
         )
+        self._answer(identity, welcome)
 
-    def _on_ping(self, identity: bytes, ping: messages.Ping) -> None:
+    def _denial(self, identity: bytes, hello: messages.Hello, client: str) -> tuple[str, str] | None:
+        """Why a session is not opened, or None."""
+        if hello.version != codec.VERSION:
+            speaks = f"the server speaks version {codec.VERSION} of the wire format"
+            return "version", f"{speaks}, this client {hello.version}"
+        hosted = self._open_for_a_client(hello.map)
+        if hosted is None:
+            why, _ = self._unopened.get(hello.map, (f"{self._server.max_maps} are open (max_maps)", 0.0))
+            return "map", f"map {hello.map} cannot be opened: {why}"
+        if not hosted.warm:
+            return "opening", f"map {hello.map} is being opened"
+        taken = not self._intake.owns(hosted, hello.session, client)
+        if taken or self._routes.connect(hello.session, hello.map, identity, client) is None:
+            return "session", "the session of this spool is another client's: use another spool folder"
+        return None
+
+    def _on_ping(self, identity: bytes, ping: messages.Ping, client: str) -> None:
         received_ns = time.monotonic_ns()
-        route = self._sessions.heard(ping.session) or self._sessions.connect(ping.session, identity)
-        route.offset_ns = ping.offset_ns
-        session = self._sessions.get(ping.session)
-        durable, fused = (session.durable, session.fused) if session else (0, 0)
-        pong = messages.Pong(self.epoch, ping.sent_ns, received_ns, time.monotonic_ns(), durable, fused)
+        progress = (0, 0)
+        route = self._routes.get(ping.session)
+        if route is not None and route.client == client:
+            self._routes.heard(route)
+            route.offset_ns, route.bound_ns = ping.offset_ns, ping.bound_ns
+            route.waiting, route.skipped = ping.waiting, ping.skipped
+            hosted = self.maps.get(route.map)
+            progress = hosted.progress(ping.session) if hosted else progress
+        pong = messages.Pong(self.epoch, ping.sent_ns, received_ns, time.monotonic_ns(), *progress)
         self._answer(identity, pong)
 
     def _on_command(self, identity: bytes, command: messages.Command) -> None:
         if command.name == "ping":
             self._answer(identity, messages.Reply(name="ping"))
-        elif busy := self._ask(identity, command):
-            self._answer(identity, messages.Reply(name=command.name, error=busy))
-
-    def _ask(self, identity: bytes, command: messages.Command) -> str:
-        """Pass a question to the fuser; or say why not."""
-        question = (identity, command.name)
-        if not self.fuser.ready:
-            return "the fuser restarts; ask again"
-        if command.name == "mesh" and (
-            question in self._questions.values() or self._meshes.pending(identity)
-        ):
-            return "the mesh that was asked for before is still on its way"
-        self._question_count += 1
-        if len(self._questions) >= _MAX_QUESTIONS or not self.fuser.send(
-            work.Ask(self._question_count, command)
-        ):
-            return "too many questions at once"
-        self._questions[self._question_count] = question
-        return ""
+        elif command.name == "health":
+            self._answer(identity, messages.Reply(name="health", health=self.health()))
+        else:
+            hosted = self.maps.get(command.map)
+            self._questions.ask(identity, command, None if hosted is None else hosted.fuser)
 
     def _on_subscription(self, frames: list[zmq.Frame]) -> None:
         change, topic = frames[0].bytes[:1], frames[0].bytes[1:]
-        if change == b"\x01" and MESH_TOPIC.startswith(topic):
+        if change == b"\x01" and self._door.client_of(frames[0]) is None:
+            self._refused["key"] += 1
+        elif change == b"\x01" and sockets.is_mesh_topic(topic):
             self._topics.add(topic)
         elif change == b"\x00":
             self._topics.discard(topic)
-        elif change != b"\x01":
+        else:
             self._refused["subscription"] += 1
 
-    # --- fuser ---
+    # --- what is known ---
 
-    def _hear_fuser(self) -> None:
-        ended = self.fuser.ended()  # before its last words are read
-        while (heard := self.fuser.receive()) is not None:
-            message, frames = heard
-            if isinstance(message, work.Done):
-                self._on_done(message)
-            elif isinstance(message, work.Meshed):
-                self._on_meshed(message, frames)
-            elif isinstance(message, work.Answer):
-                self._on_answer(message, frames)
-            elif isinstance(message, work.Ready):
-                self._on_ready(message)
-        if ended and not self.fuser.finishing:
-            for identity, name in self._questions.values():
-                self._answer(identity, messages.Reply(name=name, error="the fuser restarts; ask again"))
-            self._questions.clear()
-            self.fuser.restart()
-
-    def _on_ready(self, ready: work.Ready) -> None:
-        self.fuser.next_index = self._index.after(ready.position)
-        if not self.warm:
-            self.warm = True
-            self._journal.begin_after(ready.position.segment)
-            self._meshed = self.fuser.next_index - 1
-            for index in range(self.fuser.next_index):
-                entry = self._index[index]
-                self._sessions.numbered(entry.session).fused = entry.stamps.seq
-        self._watched = None
-
-    def _on_done(self, done: work.Done) -> None:
-        again = self._index[done.index].stamps.fused_ns  # by a fuser that died before its checkpoint
-        if again:
-            return
-        self._index.fused(done.index, done.fuse_start_ns, done.fused_ns)
-        entry = self._index[done.index]
-        session = self._sessions.numbered(entry.session)
-        session.fused = entry.stamps.seq
-        if done.reason is not None:
-            log.warning("keyframe %d is not in the map (%s): %s", done.index, done.reason, done.message)
-            self._send(
-                session.key, messages.Nack(session.key, session.fused, "map", done.reason, done.message)
-            )
-        else:
-            route = self._sessions.route(session.key)
-            self._delays.add(entry.captured_ns, done.fused_ns, route.offset_ns if route else None)
-        self._ack(session.key, [entry.stamps])
-
-    def _on_meshed(self, meshed: work.Meshed, frames: Sequence[zmq.Frame]) -> None:
-        for index in range(self._meshed + 1, meshed.index + 1):
-            entry = self._index[index]
-            stamps = msgspec.structs.replace(entry.stamps, meshed_ns=meshed.meshed_ns)
-            self._ack(self._sessions.numbered(entry.session).key, [stamps])
-        self._meshed = max(self._meshed, meshed.index)
-        if frames:
-            self._publish([MESH_TOPIC, work.encode(meshed), *frames])
-
-    def _on_answer(self, answer: work.Answer, frames: Sequence[zmq.Frame]) -> None:
-        identity, name = self._questions.pop(answer.number, (b"", ""))
-        status = self._status(answer.status) if answer.status is not None else None
-        reply = messages.Reply(name=name, error=answer.error, status=status, mesh=answer.layout)
-        self._answer(identity, reply, self._meshes.wrap(identity, frames) if frames else ())
-
-    def _status(self, fuser: work.FuserStatus) -> messages.Status:
-        return messages.Status(
+    def health(self) -> messages.Health:
+        """How the server is doing."""
+        now = time.monotonic()
+        found = {name: hosted.health() for name, hosted in self.maps.items()}
+        problems = [f"map {name}: {one.problem}" for name, one in found.items() if one.problem]
+        problems += [f"map {name} cannot be opened: {why}" for name, (why, _) in self._unopened.items()]
+        return messages.Health(
+            ready=self._accepting and not any(one.problem for one in found.values()),
+            problems=tuple(problems),
             epoch=self.epoch,
-            map=DEFAULT_MAP,
-            state=self._server.state,
-            fuser="idle" if self.drained else "busy",
-            uptime_s=time.monotonic() - self._started,
-            keyframes_durable=len(self._index),
-            keyframes_fused=fuser.keyframes_fused,
-            keyframes_rejected=fuser.keyframes_rejected,
-            messages_refused=dict(self._refused),
-            duplicates=self._duplicates,
-            sessions=len(self._sessions),
-            blocks=fuser.blocks,
-            voxels=fuser.voxels,
-            map_bytes=fuser.map_bytes,
-            map_hash=fuser.map_hash,
-            color_hash=fuser.color_hash,
-            journal_bytes=self._journal.nbytes,
-            journal_damaged=self._journal.damaged,
-            fuser_restarts=self.fuser.restarts,
-            peak_rss_bytes={"server": process.peak_rss_bytes(), "fuser": fuser.peak_rss_bytes},
-            delay_ms=self._delays.summary(),
-            config={"server": msgspec.to_builtins(self._server), "volume": fuser.config},
-            versions=fuser.versions,
+            uptime_s=now - self._started,
+            rss_bytes=process.rss_bytes(),
+            refused=dict(self._refused + self._door.refused),
+            duplicates=self._intake.duplicates,
+            maps=found,
+            clients=tuple(self._client_health(route, now) for route in self._routes),
         )
+
+    def _client_health(self, route: Route, now: float) -> messages.ClientHealth:
+        hosted = self.maps.get(route.map)
+        return route.health(now, hosted.progress(route.session) if hosted else (0, 0))
 
     # --- sending: an answer that cannot leave at once is dropped, the asker will ask again ---
 
-    def _ack(self, key: bytes, stamps: Sequence[messages.Stamps] = (), *, resend: bool = False) -> None:
-        session = self._sessions.get(key)
-        durable, fused = (session.durable, session.fused) if session else (0, 0)
-        self._send(key, messages.Ack(key, durable, fused, tuple(stamps), resend))
-
-    def _send(self, key: bytes, message: messages.ToClient) -> None:
-        route = self._sessions.route(key)
+    def send(self, session: bytes, message: messages.ToClient) -> None:
+        """Pass it to the session's client, if that is connected."""
+        route = self._routes.get(session)
         if route is not None:
             self._answer(route.identity, message)
 
+    def route(self, session: bytes) -> Route | None:
+        """The connection of a session's client."""
+        return self._routes.get(session)
+
+    def observe(self, map_name: str, stage: str, seconds: float) -> None:
+        """A keyframe took so long for a stage."""
+        if self._metrics is not None:
+            self._metrics.observe(map_name, stage, seconds)
+
     def _answer(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
         send_now(self.ports.control, [identity, messages.encode(message), *frames])
-
-    def _publish(self, frames: list[Any]) -> None:
-        send_now(self.ports.publish, frames)

@@ -3,13 +3,14 @@
 
 import threading
 from collections import Counter, OrderedDict, deque
+from typing import Literal
 
 import msgspec
 from msgspec import Struct
 
 from tsfusion.keyframe import Keyframe
 from tsfusion.spool import Spool, Waiting
-from tsfusion.transport.messages import KeyframeTimes, Nack, Stamps
+from tsfusion.transport.messages import KeyframeTimes, Stamps
 
 _MAX_RECORDS = 65536
 
@@ -23,6 +24,11 @@ class ClientStats(Struct, frozen=True):
         fused: in the server's map.
         refused: turned away by the server (or unreadable here) for good: reason → count.
         rejected: on the server's disk, but the map could not take it: reason → count.
+        skipped: never sent: reason → count. `thinned` and `dropped` by the policy (a dropped one was taken
+            before), `spool` (it has reached `spool_bytes`), `disk` (full, failing or read-only).
+        waiting: in the spool.
+        waiting_bytes: the bytes of those.
+        state: of the spool: `ok`, or the reason why it cannot keep all that comes: `spool` or `disk`.
     """
 
     sent: int
@@ -30,6 +36,10 @@ class ClientStats(Struct, frozen=True):
     fused: int
     refused: dict[str, int]
     rejected: dict[str, int]
+    skipped: dict[str, int]
+    waiting: int
+    waiting_bytes: int
+    state: str
 
 
 class Outbox:
@@ -39,9 +49,13 @@ class Outbox:
         outstanding: how many of the spool's oldest keyframes are on their way.
         unfused: durable keyframes the map has not answered for.
         unmeshed: those the mesh does not show yet.
-        refusals: what the next `flush` has to complain of.
+        refusals: how many keyframes the next `flush` has to complain of, and the `first_refusal` in words.
         connected: the server answers.
         problem: why it does so in vain.
+        turned_away: who will not have us: the `server`, or the `keys` on its connection; empty = nobody.
+        opening: it answers, but the map is not open yet.
+        skipped: see `ClientStats`.
+        state: see `ClientStats`.
     """
 
     def __init__(self, spool: Spool) -> None:
@@ -50,14 +64,31 @@ class Outbox:
         self.outstanding = 0
         self.unfused: deque[int] = deque()
         self.unmeshed: deque[int] = deque()
-        self.refusals: list[str] = []
+        self.refusals = 0
+        self.first_refusal = ""
         self.connected = False
         self.problem = ""
+        self.turned_away: Literal["", "server", "keys"] = ""
+        self.opening = False
+        self.skipped: Counter[str] = Counter()
+        self.state = "ok"
         self._sent = self._durable = self._fused = 0
         self._refused: Counter[str] = Counter()
         self._rejected: Counter[str] = Counter()
-        self._rejected_seqs: set[int] = set()
+        self._rejected_seqs: OrderedDict[int, None] = OrderedDict()
         self._times: OrderedDict[int, KeyframeTimes] = OrderedDict()
+        # Of what a dead scanner left, any may have been sent; and what a power cut took of it, too.
+        self._perhaps_sent = spool.waiting[-1].seq if spool.waiting else 0
+        self._used_before = spool.next_seq - 1
+        self._claimed = 0
+        self._welcomed = False
+
+    # --- into the spool ---
+
+    @property
+    def behind(self) -> int:
+        """How many keyframes the map has yet to get: those in the spool and the server's unfused ones."""
+        return len(self.spool.waiting) + len(self.unfused)
 
     def add(self, entry: Waiting, keyframe: Keyframe) -> None:
         """A keyframe is in the spool."""
@@ -69,14 +100,51 @@ class Outbox:
         if len(self._times) > _MAX_RECORDS:
             self._times.popitem(last=False)
 
-    def next_entry(self, window_keyframes: int, window_bytes: int) -> Waiting | None:
-        """The next keyframe to send, if the credit allows it (one is always allowed)."""
+    def drop_oldest_unsent(self, newest: int | None = None) -> bool:
+        """Take the oldest keyframe that was never sent out of the spool; False = there is none.
+
+        One that was sent may be in the server's journal by now, whatever was heard of it: it stays.
+
+        Args:
+            newest: this one stays too.
+        """
+        sent = max(self._perhaps_sent, self._claimed)
+        for place, entry in enumerate(self.spool.waiting):
+            if entry.seq > sent:
+                if entry.seq == newest:
+                    return False
+                self.spool.remove(place)
+                self._times.pop(entry.seq, None)
+                self.skipped["dropped"] += 1
+                self.changed.notify_all()
+                return True
+        return False
+
+    # --- on their way ---
+
+    def claim(self, window_keyframes: int, window_bytes: int, ahead: int | None = None) -> Waiting | None:
+        """The next keyframe to send, if the credit allows it (one is always allowed).
+
+        It stays in the spool until `sent`, `unclaim` or `refuse` says what became of it.
+
+        Args:
+            ahead: so many keyframes may be on their way or unfused; None = any number.
+        """
         waiting, count = self.spool.waiting, self.outstanding
-        if count >= min(window_keyframes, len(waiting)):
+        if count >= min(max(window_keyframes, 1), len(waiting)):
+            return None
+        if ahead is not None and count + len(self.unfused) >= ahead:
             return None
         entry = waiting[count]
         under_way = sum(waiting[i].nbytes for i in range(count))
-        return entry if count == 0 or under_way + entry.nbytes <= window_bytes else None
+        if count and under_way + entry.nbytes > window_bytes:
+            return None
+        self._claimed = entry.seq
+        return entry
+
+    def unclaim(self) -> None:
+        """The claimed keyframe was not sent after all."""
+        self._claimed = 0
 
     @property
     def last_on_its_way(self) -> int:
@@ -84,11 +152,30 @@ class Outbox:
         return self.spool.waiting[self.outstanding - 1].seq if self.outstanding else 0
 
     def sent(self, entry: Waiting, sent_ns: int) -> None:
-        """The oldest keyframe that was not on its way is now."""
+        """The claimed keyframe is on its way."""
         self.outstanding += 1
+        self._perhaps_sent = max(self._perhaps_sent, entry.seq)
+        self._claimed = 0
         times = self._times.get(entry.seq)
         if times is not None:
             times.sent_ns = sent_ns
+
+    # --- at the server ---
+
+    def welcomed(self, durable: int, window_keyframes: int) -> None:
+        """Of what a dead scanner left, only a window's worth can have been sent and not be durable yet.
+
+        (Were that server's window larger, one that is dropped now might be in the journal all the same.)
+        """
+        if not self._welcomed and self.spool.waiting:
+            left = [entry.seq for entry in self.spool.waiting if entry.seq > durable]
+            window = left[: max(window_keyframes, 1)]
+            self._perhaps_sent = min(self._perhaps_sent, window[-1] if window else durable)
+        self._welcomed = True
+
+    def foreign(self, durable: int) -> bool:
+        """Whether the server has keyframes of this session that were never sent from here."""
+        return durable > max(self._perhaps_sent, self._used_before)
 
     def progress(self, durable: int, fused: int) -> bool:
         """The server has these; whether anything left the spool."""
@@ -120,24 +207,43 @@ class Outbox:
         if stamps.meshed_ns:
             self.meshed(stamps.seq)
 
-    def nack(self, nack: Nack) -> None:
-        """The server will never have this one in its map."""
-        if nack.stage == "map":
-            self._rejected[nack.reason] += 1
-            self._rejected_seqs.add(nack.seq)
+    # --- turned away ---
+
+    def reject(self, seq: int, reason: str) -> None:
+        """The server has it, the map will not."""
+        if seq in self._rejected_seqs:
             return
-        for place, entry in enumerate(self.spool.waiting):
-            if entry.seq == nack.seq:
-                self.outstanding -= place < self.outstanding
-                self.refuse(entry, nack.reason, nack.message)
-                return
+        self._rejected[reason] += 1
+        self._rejected_seqs[seq] = None
+        if len(self._rejected_seqs) > _MAX_RECORDS:
+            self._rejected_seqs.popitem(last=False)
+
+    def find(self, seq: int) -> Waiting | None:
+        """The keyframe of this number, if it waits and was sent."""
+        if seq <= self._perhaps_sent:
+            for entry in self.spool.waiting:
+                if entry.seq >= seq:
+                    return entry if entry.seq == seq else None
+        return None
 
     def refuse(self, entry: Waiting, reason: str, message: str) -> None:
-        """Give a keyframe up."""
-        self.spool.remove(entry)
+        """Give a keyframe up. What was sent behind it has to be sent again: the server saw a gap there."""
+        place = self.spool.waiting.index(entry)
+        self.outstanding = min(self.outstanding, place)
+        self.spool.remove(place)
+        self._claimed = 0
         self._refused[reason] += 1
-        self.refusals.append(f"{entry.seq} was refused ({reason}): {message}")
+        self.refusals += 1
+        if self.refusals == 1:
+            self.first_refusal = f"{entry.seq} was refused ({reason}): {message}"
         self.changed.notify_all()
+
+    # --- told ---
+
+    def take_refusals(self) -> tuple[int, str]:
+        """How many keyframes were given up since this was asked last, and the first of them in words."""
+        refusals, self.refusals = self.refusals, 0
+        return refusals, self.first_refusal
 
     def times(self) -> list[KeyframeTimes]:
         """A copy of the ledger."""
@@ -145,4 +251,14 @@ class Outbox:
 
     def stats(self) -> ClientStats:
         """A copy of the counts."""
-        return ClientStats(self._sent, self._durable, self._fused, dict(self._refused), dict(self._rejected))
+        return ClientStats(
+            sent=self._sent,
+            durable=self._durable,
+            fused=self._fused,
+            refused=dict(self._refused),
+            rejected=dict(self._rejected),
+            skipped=dict(self.skipped),
+            waiting=len(self.spool.waiting),
+            waiting_bytes=self.spool.waiting_bytes,
+            state=self.state,
+        )

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from tsfusion import __version__, ledger, preview, process
 from tsfusion.child import ServerChild, serving
-from tsfusion.client import Client, fetch_mesh, fetch_status
+from tsfusion.client import Client
 from tsfusion.config import ClientConfig, ServerConfig, VolumeConfig, override
 from tsfusion.datasets import Dataset
 from tsfusion.errors import FlushTimeout, OutputError, TransportError
+from tsfusion.fetch import fetch_mesh, fetch_status
 from tsfusion.keyframe import Keyframe
 from tsfusion.mesh import Mesh
 from tsfusion.results import RECORD, building
@@ -139,7 +140,10 @@ def replay(
             place = nullcontext((override(client, address=connect), None))
         with place as (link, child):
             keys = client_keys(link.key, link.server_key)
-            with Client(link.address, spool=scratch / "spool", control=link.control, config=link) as scanner:
+            # a recording leaves nothing out, however slow the map is
+            with Client(
+                link.address, spool=scratch / "spool", control=link.control, policy="block", config=link
+            ) as scanner:
                 scanner.connect()
                 run = _Run(dataset, first, scanner, child, progress)
                 run.feed(rate)
@@ -147,8 +151,10 @@ def replay(
                 with suppress(FlushTimeout):  # a stamp less in the ledger is no reason to lose the run
                     scanner.wait_meshed()
                 run.records = scanner.records
-            status = fetch_status(link.address, control=link.control, keys=keys)
-            mesh = fetch_mesh(link.address, control=link.control, min_weight=min_weight, keys=keys)
+            status = fetch_status(link.address, control=link.control, map_name=link.map, keys=keys)
+            mesh = fetch_mesh(
+                link.address, control=link.control, map_name=link.map, min_weight=min_weight, keys=keys
+            )
         if not len(mesh.faces):
             raise OutputError(
                 f"the map has no surface to write: {run.stats.fused} of {run.stats.sent} keyframes fused; "
@@ -227,12 +233,16 @@ class _Run:
 
     def _look(self) -> None:
         stats = self.stats = self._scanner.stats
-        done = stats.fused + sum(stats.refused.values()) + sum(stats.rejected.values())
+        done = stats.fused + sum(map(_total, (stats.refused, stats.rejected, stats.skipped)))
         if done != self._done:
             self._done, self._moved = done, time.monotonic()
         self._progress.count(stats.sent, stats.fused, len(self.dataset))
         if self._child is not None:
             self._child.check()
+
+
+def _total(counts: dict[str, int]) -> int:
+    return sum(counts.values())
 
 
 def _is_time(due: float) -> bool:
@@ -258,7 +268,7 @@ def _summarise(run: _Run, mesh: Mesh, status: Status, child: ServerChild | None)
         dataset=dataset.name,
         keyframes_sent=run.stats.sent,
         keyframes_fused=run.stats.fused,
-        keyframes_rejected={**run.stats.refused, **run.stats.rejected},
+        keyframes_rejected={**run.stats.skipped, **run.stats.refused, **run.stats.rejected},
         seconds=round(run.seconds, 3),
         server_start_seconds=round(child.start_seconds, 3) if child else None,
         map_hash=status.map_hash,

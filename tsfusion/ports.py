@@ -2,35 +2,72 @@
 """The server's three sockets, and how the gateway reads and writes them without ever waiting."""
 
 import logging
+import time
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import zmq
 
+from tsfusion import process
 from tsfusion.config import ServerConfig
+from tsfusion.errors import TransportError
 from tsfusion.transport import Addresses, sockets
+from tsfusion.transport.curve import ServerKeys
 
 log = logging.getLogger(__name__)
 
 _MESSAGES_A_STEP = 16
+_REBIND_DEADLINE = 10.0  # seconds; ports are freed by a thread of ZeroMQ's
 Handler: TypeAlias = Callable[[list[zmq.Frame]], None]
 
 
 class Ports:
     """Keyframes in, control both ways, mesh updates out."""
 
-    def __init__(self, context: "zmq.Context[Any]", server: ServerConfig) -> None:
-        self.keyframes = sockets.pull(context, server.max_frame_bytes)
-        self.control = sockets.router(context)
-        self.publish = sockets.publisher(context)
+    def __init__(
+        self, context: "zmq.Context[Any]", server: ServerConfig, keys: ServerKeys | None = None
+    ) -> None:
+        self._context = context
+        self._server = server
+        self._keys = keys
+        self._addresses: Addresses | None = None
+        self._open()
 
-    def bind(self, server: ServerConfig) -> Addresses:
+    def _open(self) -> None:
+        self.keyframes = sockets.pull(self._context, self._server.max_frame_bytes, keys=self._keys)
+        self.control = sockets.router(self._context, keys=self._keys)
+        self.publish = sockets.publisher(self._context, keys=self._keys)
+
+    def bind(self) -> Addresses:
         """Open them to clients.
 
         Raises:
             TransportError: when a port is taken.
         """
-        return sockets.bind(self.keyframes, self.control, self.publish, server.listen, server.control)
+        listen, control = self._server.listen, self._server.control
+        self._addresses = sockets.bind(self.keyframes, self.control, self.publish, listen, control)
+        return self._addresses
+
+    def renew(self) -> None:
+        """Drop every connection, with all that it holds in memory, and listen at the same addresses again.
+
+        Raises:
+            TransportError: when somebody else took a port meanwhile.
+        """
+        self.close()
+        self._open()
+        if self._addresses is None:
+            return
+        data, control = self._addresses.data, self._addresses.control
+        deadline = time.monotonic() + _REBIND_DEADLINE
+        while True:
+            try:
+                sockets.bind(self.keyframes, self.control, self.publish, data, control)
+                return
+            except TransportError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.005)
 
     def close(self) -> None:
         """Close them; nothing lingers."""
@@ -56,20 +93,56 @@ def send_now(socket: sockets.AnySocket, frames: list[Any]) -> None:
         log.warning("an answer was dropped: its connection is full")
 
 
+class MemoryBound:
+    """When what connections hold in memory is too much, so that they have to be dropped.
+
+    That frees it, but not at once (threads of ZeroMQ's do it) and perhaps not all (this process may need
+    it): who was told counts from what is held then, or would be told for ever.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = self._bound = most
+
+    def excess(self, elsewhere: int) -> int:
+        """What this process holds, bytes, when that is too much; else 0.
+
+        Args:
+            elsewhere: bytes that do not count.
+        """
+        held = process.rss_bytes() - elsewhere
+        if held > self._bound:  # perhaps freed already, and only kept for later
+            process.give_back_memory()
+            held = process.rss_bytes() - elsewhere
+        told = held if held > self._bound else 0
+        reached = held + self._most // 8
+        self._bound = max(self._most, reached if told else min(self._bound, reached))
+        return told
+
+
 class Departures:
     """Large answers that have not left yet, one a connection: who does not read must not fill our memory."""
 
     def __init__(self) -> None:
-        self._trackers: dict[bytes, zmq.MessageTracker] = {}
+        self._trackers: dict[bytes, tuple[zmq.MessageTracker, int]] = {}
 
     def pending(self, identity: bytes) -> bool:
         """Whether an earlier one still waits for its reader. One whose reader is gone does not."""
-        self._trackers = {key: tracker for key, tracker in self._trackers.items() if not tracker.done}
+        self._forget()
         return identity in self._trackers
+
+    @property
+    def nbytes(self) -> int:
+        """What waits for readers."""
+        self._forget()
+        return sum(nbytes for _, nbytes in self._trackers.values())
+
+    def _forget(self) -> None:
+        self._trackers = {key: kept for key, kept in self._trackers.items() if not kept[0].done}
 
     def wrap(self, identity: bytes, frames: Sequence[zmq.Frame]) -> list[zmq.Frame]:
         """The frames anew, so that it shows when the last has left."""
         *others, last = (frame.buffer for frame in frames)
         tracked = zmq.Frame(last, track=True, copy=False, copy_threshold=0)
-        self._trackers[identity] = tracked.tracker
+        nbytes = sum(other.nbytes for other in others) + last.nbytes
+        self._trackers[identity] = (tracked.tracker, nbytes)
         return [*(zmq.Frame(other, copy=False) for other in others), tracked]

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from tsfusion import codec, journal
 from tsfusion.config import VolumeConfig
 from tsfusion.errors import DecodeError, JournalError
+from tsfusion.journal import places
 from tsfusion.keyframe import Keyframe
 
 
 class Recording:
-    """The keyframes of a state folder, its `journal` folder, a spool folder or one `.mcap` segment.
+    """The keyframes of a state folder (of one map, or of the one named), a map's folder or its `journal`, a
+    spool folder or one `.mcap` segment.
 
     Each once and in journal order, also when a crash left a second copy. Keyframes the map had to reject
     are among them.
@@ -24,14 +26,14 @@ class Recording:
         JournalError: when there is no keyframe.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        path = Path(path)
-        if (path / "journal").is_dir():
-            path = path / "journal"
-        self.name = str(path)
-        self._places = _places(path)
+    def __init__(self, path: str | os.PathLike[str], map_name: str | None = None) -> None:
+        place = places.find(Path(path), map_name)
+        self.name = str(place.path)
+        self._places = _places(place)
         if not self._places:
-            raise JournalError(f"no keyframes in {path} (a state folder, a spool folder or an .mcap file)")
+            raise JournalError(
+                f"no keyframes in {place.path} (a state folder, a spool folder or an .mcap file)"
+            )
         first = self[0]
         self.sensor = first.sensor or VolumeConfig().sensor
         self.timestamps_ns: NDArray[np.int64] | None = None
@@ -57,16 +59,12 @@ def read_keyframes(path: str | os.PathLike[str]) -> Iterator[Keyframe]:
     return iter(Recording(path))
 
 
-def _places(path: Path) -> list[tuple[Path, int]]:
+def _places(place: places.Place) -> list[tuple[Path, int]]:
     """Segment file and offset of each keyframe."""
-    if path.is_dir():
-        files = [journal.segment_path(path, number) for number in journal.segments(path)]
-    else:
-        files = [path]
-    places, last = [], dict[bytes, int]()
-    for file in files:
-        for found in journal.scan(file)[0]:
-            if found.seq > last.get(found.session, 0):
-                last[found.session] = found.seq
-                places.append((file, found.position.offset))
-    return places
+    found, last = [], dict[bytes, int]()
+    for file in place.files():
+        for record in journal.scan(file)[0]:
+            if record.seq > last.get(record.session, 0):
+                last[record.session] = record.seq
+                found.append((file, record.position.offset))
+    return found

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The server: a gateway that journals and acknowledges keyframes, and the fuser it keeps at work."""
+"""The server: a gateway that journals and acknowledges keyframes, and the fusers it keeps at work."""
 
+import logging
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
@@ -11,78 +12,101 @@ from typing import Any
 
 import zmq
 
-from tsfusion.config import ServerConfig, VolumeConfig
-from tsfusion.fuser_link import FuserLink
+from tsfusion import maps, process
+from tsfusion.config import DEFAULT_MAP, ServerConfig, VolumeConfig
+from tsfusion.door import Door
 from tsfusion.gateway import Gateway
-from tsfusion.journal import Journal
+from tsfusion.metrics import Metrics
 from tsfusion.ports import Ports
 from tsfusion.spool import lock_folder
 from tsfusion.transport import Addresses, sockets
+from tsfusion.watchdog import Watchdog
 
-JOURNAL_FOLDER = "journal"
+log = logging.getLogger(__name__)
+
 _SECOND_SIGNAL = 1.0  # seconds after the first
 
 
 def run(
-    server: ServerConfig, volume: VolumeConfig, on_ready: Callable[[Addresses], None] | None = None
+    server: ServerConfig,
+    volume: VolumeConfig,
+    on_ready: Callable[[Addresses], None] | None = None,
+    *,
+    volumes: Mapping[str, VolumeConfig] | None = None,
 ) -> int:
-    """Serve until SIGTERM or SIGINT, then drain the journal into the map and write a checkpoint.
+    """Serve until SIGTERM or SIGINT, then drain the journals into the maps and write checkpoints.
 
     A second signal, a second or more after the first, skips the drain: the next start makes up for it.
     Call it from the main thread.
 
     Args:
         server: `listen` with port 0 draws a random one.
+        volume: the settings of every map that has none of its own.
         on_ready: called once with the real addresses, when keyframes are accepted and kernels are warm.
+        volumes: maps with settings of their own, opened at the start; so are those in the state folder.
 
     Returns:
-        The exit status: 0, or 1 when the checkpoint was not written.
+        The exit status: 0, or 1 when a checkpoint was not written.
 
     Raises:
         TsfusionError: when it cannot start (port taken, state folder unwritable or in use, a map of other
-            settings, an address that others can reach) or the fuser cannot be kept alive.
+            settings, an address that others can reach without keys).
     """
     _check_addresses(server)
     with ExitStack() as stack:
         signals = stack.enter_context(_signals())
-        gateway = _open(stack, server, volume)
+        gateway, watchdog = _open(stack, server, {DEFAULT_MAP: volume, **(volumes or {})})
         while not gateway.warm:
             gateway.step()
             if signals:
                 return 0
-        addresses = gateway.ports.bind(server)
+        addresses = gateway.ports.bind()
+        gateway.accept()
+        watchdog.ready(f"listening at {addresses.data}")
         if on_ready is not None:
             on_ready(addresses)
-        return _serve(gateway, signals)
+        return _serve(gateway, signals, watchdog)
 
 
-def _open(stack: ExitStack, server: ServerConfig, volume: VolumeConfig) -> Gateway:
+def _open(
+    stack: ExitStack, server: ServerConfig, volumes: dict[str, VolumeConfig]
+) -> tuple[Gateway, Watchdog]:
+    process.raise_file_limit()
     state = Path(server.state)
     stack.enter_context(lock_folder(state, "state", "server"))
-    journal = Journal(state / JOURNAL_FOLDER, server.segment_bytes)
-    stack.callback(journal.close)
+    for name in maps.names(state):
+        if len(volumes) < server.max_maps:
+            volumes.setdefault(name, volumes[DEFAULT_MAP])
     context: zmq.Context[Any] = zmq.Context()
     stack.callback(context.term)
-    ports = Ports(context, server)
+    door = Door(context, server.keys)
+    stack.callback(door.close)
+    ports = Ports(context, server, door.keys)
     stack.callback(ports.close)
-    fuser = FuserLink(context, server, volume)
-    stack.callback(fuser.close)
-    return Gateway(server, ports, journal, fuser)
+    metrics = None
+    if server.metrics is not None:
+        metrics = Metrics(server)
+        stack.callback(metrics.close)
+        log.info("figures and health checks are at http://%s", metrics.serve(server.metrics))
+    gateway = Gateway(context, server, ports, door, metrics)
+    stack.callback(gateway.close)
+    gateway.open(volumes)
+    return gateway, Watchdog()
 
 
-def _serve(gateway: Gateway, signals: list[int]) -> int:
+def _serve(gateway: Gateway, signals: list[int], watchdog: Watchdog) -> int:
     while not signals:
         gateway.step()
+        watchdog.pet()
+    watchdog.stopping()
     gateway.stop_accepting()
-    while not gateway.drained and len(signals) == 1:
+    while not gateway.drained and not gateway.failed and len(signals) == 1:
         gateway.step()
     if not gateway.drained:
         return 1
-    gateway.fuser.finish()
-    while not gateway.fuser.ended() and len(signals) == 1:
+    while not gateway.finish() and len(signals) == 1:
         gateway.step()
-        gateway.fuser.finish()
-    return 0 if gateway.fuser.finished_well else 1
+    return 0 if gateway.finished_well else 1
 
 
 @contextmanager
@@ -109,10 +133,9 @@ def _signals() -> Iterator[list[int]]:
 
 def _check_addresses(server: ServerConfig) -> None:
     """Fail now, not after the kernels are compiled."""
-    sockets.check_reachable(server.listen, has_keys=False)
-    sockets.check_free(server.listen)
-    if server.control is not None:
-        sockets.check_reachable(server.control, has_keys=False)
-        sockets.check_free(server.control)
-    elif sockets.split(server.listen)[1]:
+    for address in (server.listen, server.control):
+        if address is not None:
+            sockets.check_reachable(address, has_keys=server.keys is not None)
+            sockets.check_free(address)
+    if server.control is None and sockets.split(server.listen)[1]:
         sockets.check_free(sockets.control_address(server.listen))

@@ -1,37 +1,54 @@
 # SPDX-License-Identifier: MIT
 """What the gateway knows of clients and keyframes: policy and bookkeeping, no sockets."""
 
+import time
 from array import array
 from bisect import bisect_right
 from collections import OrderedDict, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Literal
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, field
 
 from tsfusion import ledger
 from tsfusion.journal import Position, Scan
-from tsfusion.transport.messages import Spread, Stamps
+from tsfusion.transport.messages import ClientHealth, Spread, Stamps
 
 _MAX_ROUTES = 1024
+_TAKEN = 30.0  # seconds of silence after which another client may take a session that nothing came of
 _DELAYS = 1024
 Verdict = Literal["next", "duplicate", "gap"]
 
 
-class Session(Struct):
+class Session(Struct, eq=False):
     """One client's stream of keyframes.
 
     Attributes:
         number: its place in `Sessions`.
-        durable: the highest seq that is journaled, or refused for good.
+        client: whose it is: the name that its key is allowed under; empty = it came without keys.
+        durable: the highest seq that is journaled.
         fused: the highest that the map has taken or refused.
+        entries: the indices of its keyframes.
+        handed: how many of these the fuser was given.
     """
 
     key: bytes
     number: int
+    client: str = ""
     durable: int = 0
     fused: int = 0
+    entries: "array[int]" = field(default_factory=lambda: array("q"))
+    handed: int = 0
+
+    @property
+    def owner(self) -> str:
+        """Whom to be fair to: the client, or where there are no keys the session."""
+        return self.client or self.key.hex()
+
+    def belongs_to(self, client: str) -> bool:
+        """Whether this client may go on with it. What came without keys is anyone's."""
+        return not self.client or not client or self.client == client
 
     def admit(self, seq: int, previous: int) -> Verdict:
         """What to do with keyframe `seq` of a client that offers none between `previous` and it.
@@ -44,25 +61,95 @@ class Session(Struct):
         return "next" if previous <= self.durable else "gap"
 
 
-class Route(Struct):
+class Route(Struct, eq=False):
     """A live client.
 
     Attributes:
+        session: its key.
+        map: where the keyframes go.
         identity: of its connection to the control socket.
-        offset_ns: server clock minus client clock, as the client measured it.
+        client: the name its key is allowed under; empty = no keys.
+        offset_ns: server clock minus client clock, as the client measured it; true to within `bound_ns`.
+        waiting, skipped: as its last Ping said.
+        heard: `time.monotonic()` of its last message.
+        held_until: nothing is taken from it until then, because of `held`.
     """
 
+    session: bytes
+    map: str
     identity: bytes
+    client: str = ""
     offset_ns: int | None = None
+    bound_ns: int = 0
+    waiting: int = 0
+    skipped: dict[str, int] = field(default_factory=dict)
+    received_bytes: int = 0
+    heard: float = 0.0
+    held_until: float = 0.0
+    held: str = ""
+
+    def health(self, now: float, progress: tuple[int, int]) -> ClientHealth:
+        """How the client is doing. `progress`: the highest seq that is durable, and that is fused."""
+        durable, fused = progress
+        return ClientHealth(
+            client=self.client,
+            session=self.session.hex()[:8],
+            map=self.map,
+            heard_s=now - self.heard,
+            durable=durable,
+            fused=fused,
+            received_bytes=self.received_bytes,
+            waiting=self.waiting,
+            skipped=self.skipped,
+            held=self.held if now < self.held_until else "",
+        )
+
+
+class Routes:
+    """The live clients, by session. Strangers push out the longest unheard only."""
+
+    def __init__(self) -> None:
+        self._by_session: OrderedDict[bytes, Route] = OrderedDict()
+
+    def __iter__(self) -> Iterator[Route]:
+        return iter(self._by_session.values())
+
+    def connect(self, session: bytes, map_name: str, identity: bytes, client: str = "") -> Route | None:
+        """Answers for this session go to this connection from now on; None when it is another's."""
+        route = self._by_session.get(session)
+        if route is not None and route.client != client and time.monotonic() - route.heard < _TAKEN:
+            return None
+        if route is None or route.client != client or route.map != map_name:
+            route = self._by_session[session] = Route(session, map_name, identity, client)
+        route.identity = identity
+        self.heard(route)
+        while len(self._by_session) > _MAX_ROUTES:
+            self._by_session.popitem(last=False)
+        return route
+
+    def heard(self, route: Route) -> None:
+        """It is alive: now the last of those that strangers could push out."""
+        route.heard = time.monotonic()
+        self._by_session.move_to_end(route.session)
+
+    def get(self, session: bytes) -> Route | None:
+        """The connection of a session's client, if it said hello here."""
+        return self._by_session.get(session)
+
+    def clear(self) -> None:
+        """All connections are gone."""
+        self._by_session.clear()
 
 
 class Sessions:
-    """All sessions of the journal, and the live connections of some."""
+    """All sessions of a map's journal."""
 
     def __init__(self) -> None:
         self._by_key: dict[bytes, Session] = {}
         self._all: list[Session] = []
-        self._routes: OrderedDict[bytes, Route] = OrderedDict()  # by session key
+
+    def __iter__(self) -> Iterator[Session]:
+        return iter(self._all)
 
     def __len__(self) -> int:
         return len(self._all)
@@ -71,11 +158,11 @@ class Sessions:
         """A session that has something in the journal, or None."""
         return self._by_key.get(key)
 
-    def open(self, key: bytes) -> Session:
+    def open(self, key: bytes, client: str = "") -> Session:
         """The session of a key, made when new."""
         session = self._by_key.get(key)
         if session is None:
-            session = self._by_key[key] = Session(key, len(self._all))
+            session = self._by_key[key] = Session(key, len(self._all), client)
             self._all.append(session)
         return session
 
@@ -87,23 +174,37 @@ class Sessions:
         """A session by its number."""
         return self._all[number]
 
-    def connect(self, key: bytes, identity: bytes) -> Route:
-        """Answers for this session go to this connection. Strangers push out the longest unheard only."""
-        route = self._routes[key] = Route(identity)
-        self._routes.move_to_end(key)
-        while len(self._routes) > _MAX_ROUTES:
-            self._routes.popitem(last=False)
-        return route
 
-    def heard(self, key: bytes) -> Route | None:
-        """The connection of a session that is alive, now the last of those that strangers could push out."""
-        if key in self._routes:
-            self._routes.move_to_end(key)
-        return self._routes.get(key)
+class Turns:
+    """Whose keyframe the fuser gets next: one of each client in turn, and of its sessions in turn."""
 
-    def route(self, key: bytes) -> Route | None:
-        """The connection of a session's client, if it ever said hello here."""
-        return self._routes.get(key)
+    def __init__(self) -> None:
+        self._owners: OrderedDict[str, deque[Session]] = OrderedDict()
+
+    def add(self, session: Session) -> None:
+        """It has something to hand out (again)."""
+        queue = self._owners.setdefault(session.owner, deque())
+        if session not in queue:
+            queue.append(session)
+
+    def next(self) -> Session | None:
+        """The one whose turn it is; it stays so until `served`."""
+        for queue in self._owners.values():
+            return queue[0]
+        return None
+
+    def served(self) -> None:
+        """The next one got its turn; if it has more, it gets another when the others had theirs."""
+        owner, queue = self._owners.popitem(last=False)
+        session = queue.popleft()
+        if session.handed < len(session.entries):
+            queue.append(session)
+        if queue:
+            self._owners[owner] = queue
+
+    def clear(self) -> None:
+        """Nothing is to be handed out."""
+        self._owners.clear()
 
 
 class Entry(Struct, frozen=True):
@@ -137,7 +238,7 @@ class KeyframeIndex:
         (The disk refused, the client sent it again, and the first copy had been written after all.)
         """
         for record in found:
-            session = sessions.open(record.session)
+            session = sessions.open(record.session, record.client)
             if record.seq > session.durable:
                 session.durable = record.seq
                 self.add(record.position, session, record.seq)
@@ -157,6 +258,7 @@ class KeyframeIndex:
         values = (*place, received_ns, durable_ns, 0, 0)
         for column, value in zip(self._columns.values(), values, strict=True):
             column.append(value)
+        session.entries.append(len(self) - 1)
         return len(self) - 1
 
     def fused(self, index: int, fuse_start_ns: int, fused_ns: int) -> None:
@@ -170,22 +272,30 @@ class KeyframeIndex:
         )
         return Entry(index, Position(segment, offset), session, Stamps(seq, *stamps), captured)
 
-    def after(self, position: Position) -> int:
-        """The index of the first keyframe behind a journal position."""
-        return bisect_right(range(len(self)), position, key=lambda i: self[i].position)
+    def after(self, session: Session, seq: int) -> int:
+        """How many keyframes of a session have a number up to `seq`."""
+        return bisect_right(session.entries, seq, key=lambda index: self._columns["seq"][index])
+
+    def segment(self, index: int) -> int:
+        """The segment that holds a keyframe."""
+        return self._columns["segment"][index]
 
 
 class Delays:
     """Capture to fused of the last keyframes."""
 
     def __init__(self) -> None:
-        self._recent_ms: deque[float] = deque(maxlen=_DELAYS)
+        self._recent_ms: deque[tuple[float, float]] = deque(maxlen=_DELAYS)
 
-    def add(self, captured_ns: int, fused_ns: int, offset_ns: int | None) -> None:
-        """A keyframe captured at a client's time and fused at ours; skipped while either is unknown."""
-        if captured_ns and offset_ns is not None:
-            self._recent_ms.append((fused_ns - captured_ns - offset_ns) / 1e6)
+    def add(self, delay_ns: int, bound_ns: int) -> None:
+        """A keyframe took so long, give or take the bound."""
+        self._recent_ms.append((delay_ns / 1e6, bound_ns / 1e6))
+
+    @property
+    def bound_ms(self) -> float:
+        """The most that any of them can be wrong."""
+        return max((bound for _, bound in self._recent_ms), default=0.0)
 
     def summary(self) -> Spread:
         """Mean, percentiles and maximum."""
-        return ledger.spread(np.array(self._recent_ms))
+        return ledger.spread(np.array([delay for delay, _ in self._recent_ms]))

@@ -12,7 +12,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from tsfusion.cli import config, datasets, doctor, keys, mesh, replay, serve, status
+from tsfusion.cli import config, datasets, doctor, journal, keys, mesh, replay, serve, status
 from tsfusion.errors import TsfusionError
 
 INTERRUPTED = 128 + signal.SIGINT
@@ -33,6 +33,7 @@ app.command()(mesh.mesh)
 app.command()(status.status)
 app.command()(doctor.doctor)
 app.add_typer(keys.app, name="keys")
+app.add_typer(journal.app, name="journal")
 app.add_typer(config.app, name="config")
 app.add_typer(datasets.app, name="datasets")
 

@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 PYTHONS = ((3, 10), (3, 13))
 DISK_BYTES = 2_000_000_000
 # `tsfusion.kernels` imports taichi without its banner.
-_MODULES = {"opencv-python-headless": "cv2", "pyzmq": "zmq", "taichi": "tsfusion.kernels"}
+_MODULES = {
+    "opencv-python-headless": "cv2", "prometheus-client": "prometheus_client", "pyzmq": "zmq",
+    "taichi": "tsfusion.kernels",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

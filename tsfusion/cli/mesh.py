@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from tsfusion.recording import Recording
     from tsfusion.volume import Volume
 
-MAP_FILE = "map.tsf"
-
 
 @options.takes_map_settings
 def mesh(
@@ -31,6 +29,7 @@ def mesh(
     *,
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw it, too.")] = None,
     control: options.Control = None,
+    map_: options.Map = None,
     key: options.Key = None,
     server_key: options.ServerKey = None,
     config: options.ConfigFile = None,
@@ -49,11 +48,14 @@ def mesh(
             context, {*options.MAP_OPTIONS, "config"} - {"min_weight"},
             "has no effect on a live server's map: give it to `tsfusion serve`",
         )  # fmt: skip
-        from tsfusion.client import fetch_mesh
+        from tsfusion.config import DEFAULT_MAP
+        from tsfusion.fetch import fetch_mesh
         from tsfusion.transport import client_keys
 
-        keys = client_keys(key, server_key)
-        made = fetch_mesh(source, control=control, min_weight=settings["min_weight"], keys=keys)
+        made = fetch_mesh(
+            source, control=control, map_name=map_ or DEFAULT_MAP, min_weight=settings["min_weight"],
+            keys=client_keys(key, server_key),
+        )  # fmt: skip
     else:
         options.refuse(
             context, ("control", "key", "server_key"),
@@ -68,7 +70,7 @@ def mesh(
         given = config is not None or any(
             value is not None for name, value in settings.items() if name not in options.VIEW_OPTIONS
         )
-        made = _volume(Path(source), chosen.volume, given=given, quiet=json).extract_mesh()
+        made = _volume(Path(source), chosen.volume, name=map_, given=given, quiet=json).extract_mesh()
     made.save(out)
     if preview is not None:
         from tsfusion.preview import render
@@ -77,7 +79,7 @@ def mesh(
     _tell(made, out, json)
 
 
-def _volume(source: Path, config: "VolumeConfig", *, given: bool, quiet: bool) -> "Volume":
+def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bool, quiet: bool) -> "Volume":
     """The saved map where there is a complete one, else a new one of every keyframe of the journal."""
     from tsfusion.config import VIEW_SETTINGS
     from tsfusion.errors import DatasetError
@@ -88,10 +90,12 @@ def _volume(source: Path, config: "VolumeConfig", *, given: bool, quiet: bool) -
         raise DatasetError(f"{source} does not exist; expected a map (.tsf), a state folder or a journal")
     if source.suffix == ".tsf":
         return Volume.load(source, config.threads, **view)
+    from tsfusion import maps
     from tsfusion.recording import Recording
 
+    source = maps.resolve(source, name)
     recording = Recording(source)
-    saved = source / MAP_FILE
+    saved = source / maps.MAP_FILE
     if saved.is_file() and not given:
         volume = Volume.load(saved, config.threads, **view)
         if volume.keyframes == len(recording):

@@ -88,6 +88,12 @@ Control = Annotated[
         help="Its control address; else the port after the other.",
     ),
 ]  # fmt: skip
+Map = Annotated[
+    str | None,
+    typer.Option(
+        "--map", metavar="NAME", envvar="TSFUSION_MAP", help="Which of a server's maps; else default."
+    ),
+]
 Key = Annotated[
     str | None,
     typer.Option(

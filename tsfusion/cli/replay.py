@@ -37,6 +37,7 @@ def replay(
     out: Out = Path("out"),
     connect: options.Connect = None,
     control: options.Control = None,
+    map_: options.Map = None,
     key: options.Key = None,
     server_key: options.ServerKey = None,
     rate: Rate = None,
@@ -83,13 +84,20 @@ def replay(
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count} frames {reason}", err=True)
     _run(
-        dataset, out, chosen, connect=connect, control=control, rate=rate, state=state, json=json,
+        dataset, out, chosen, connect=connect, control=control, map_=map_, rate=rate, state=state, json=json,
         min_weight=settings["min_weight"], key=key, server_key=server_key,
     )  # fmt: skip
 
 
 def _open(path: Path, **given: Any) -> "Dataset":
-    if path.suffix == ".mcap" or any(path.glob("*.mcap")) or any(path.glob("journal/*.mcap")):
+    from tsfusion import maps
+
+    if (
+        path.suffix == ".mcap"
+        or any(path.glob("*.mcap"))
+        or any(path.glob("journal/*.mcap"))
+        or maps.is_state(path)
+    ):
         from tsfusion.errors import DatasetError
         from tsfusion.recording import Recording
 
@@ -141,6 +149,7 @@ def _run(
     state: Path | None = None,
     connect: str | None = None,
     control: str | None = None,
+    map_: str | None = None,
     key: str | None = None,
     server_key: str | None = None,
     **settings: Any,
@@ -152,9 +161,9 @@ def _run(
     from tsfusion.config import override
 
     server = override(chosen.server, listen="tcp://127.0.0.1:0", state=str(state)) if state else None
-    client = override(chosen.client, control=control, key=key, server_key=server_key)
-    if connect is None:  # an own server, which only this machine reaches: no keys
-        server = replace(server, keys=None) if server else None
+    client = override(chosen.client, control=control, map=map_, key=key, server_key=server_key)
+    if connect is None:  # a server of its own: only this machine reaches it, its errors are told here
+        server = replace(server, keys=None, metrics=None, log_format="text") if server else None
         client = replace(client, key=None, server_key=None)
     with show.progress(quiet=json) as progress:
         run = pipeline.replay(

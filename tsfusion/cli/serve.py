@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """`tsfusion serve`."""
 
+import logging
 import os
 import signal
 import sys
@@ -14,6 +15,8 @@ from tsfusion.cli import options
 
 if TYPE_CHECKING:
     from tsfusion.transport import Addresses
+
+log = logging.getLogger(__name__)
 
 
 @options.takes_map_settings
@@ -37,6 +40,22 @@ def serve(
             metavar="DIR", envvar="TSFUSION_STATE", help="Journal and map; what is there is taken up again."
         ),
     ] = None,
+    metrics: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT",
+            envvar="TSFUSION_METRICS",
+            help="Where Prometheus and health checks ask, such as 127.0.0.1:9464; this machine only.",
+        ),
+    ] = None,
+    log_format: Annotated[
+        str | None,
+        typer.Option(metavar="FORMAT", envvar="TSFUSION_LOG_FORMAT", help="Of stderr: text or json."),
+    ] = None,
+    log_level: Annotated[
+        str | None,
+        typer.Option(metavar="LEVEL", envvar="TSFUSION_LOG_LEVEL", help="debug, info, warning or error."),
+    ] = None,
     keys: Annotated[
         str | None,
         typer.Option(
@@ -55,16 +74,27 @@ def serve(
     Prints one line with `ready` once keyframes are welcome: every kernel is compiled by then.
     """
     started = time.monotonic()
-    from tsfusion import server
+    from tsfusion import logs, server
+    from tsfusion.errors import TsfusionError
 
-    chosen = options.configuration(config, listen=listen, control=control, state=state, keys=keys, **settings)
+    chosen = options.configuration(
+        config, listen=listen, control=control, state=state, keys=keys, metrics=metrics,
+        log_format=log_format, log_level=log_level, **settings,
+    )  # fmt: skip
+    logs.configure(chosen.server.log_format, chosen.server.log_level)
     if until_eof:
         threading.Thread(target=_stop_at_eof, daemon=True).start()
 
     def on_ready(addresses: "Addresses") -> None:
         _announce(addresses, chosen.server.state, time.monotonic() - started, json)
 
-    return server.run(chosen.server, chosen.volume, on_ready)
+    try:
+        return server.run(chosen.server, chosen.volume, on_ready, volumes=chosen.volumes())
+    except TsfusionError as error:
+        if chosen.server.log_format == "text":
+            raise
+        log.critical("%s", error)  # the last line is an object, too
+        return 1
 
 
 def _announce(addresses: "Addresses", state: str, seconds: float, json: bool) -> None:

@@ -4,7 +4,7 @@
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -119,6 +119,40 @@ class Bars:
         elapsed = max(time.monotonic() - self._started, 1e-3)
         for task, done in zip(self._tasks, (sent, fused), strict=True):
             self._bars.update(task, completed=done, rate=f"{done / elapsed:.1f}/s")
+
+
+@contextmanager
+def reading(text: str, *, quiet: bool) -> "Iterator[Callable[[int, int], None]]":
+    """What to call with the bytes read and the bytes of all: a bar on a terminal, plain lines elsewhere."""
+    if quiet:
+        yield lambda _done, _all: None
+    elif sys.stderr.isatty():
+        from rich import progress as rp
+        from rich.console import Console
+
+        columns = (
+            rp.TextColumn("{task.description}"), rp.BarColumn(bar_width=32), rp.DownloadColumn(),
+            rp.TransferSpeedColumn(), rp.TimeRemainingColumn(),
+        )  # fmt: skip
+        with rp.Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+            task = bars.add_task(text, total=None)
+            yield lambda done, total: bars.update(task, completed=done, total=total)
+    else:
+        yield _ByteLines(text).count
+
+
+class _ByteLines:
+    """A line every few seconds: short jobs say nothing."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+        self._last = time.monotonic()
+
+    def count(self, done: int, total: int) -> None:
+        now = time.monotonic()
+        if now - self._last >= _PLAIN_INTERVAL:
+            self._last = now
+            typer.echo(f"{self._text}: {size(done)} of {size(total)}", err=True)
 
 
 def summary(run: "RunSummary", out: Any) -> None:

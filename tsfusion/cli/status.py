@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """`tsfusion status`."""
 
+import sys
 import time
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,57 +10,116 @@ import typer
 from tsfusion.cli import options
 
 if TYPE_CHECKING:
-    from tsfusion.transport import Status
+    from rich.console import RenderableType
+
+    from tsfusion.cli.looking import Ask, Look, Watcher
+
+PLAIN_WIDTH = 160  # columns where there is no terminal
 
 
 def status(
+    *,
     connect: options.Connect = None,
     control: options.Control = None,
+    key: options.Key = None,
+    server_key: options.ServerKey = None,
+    map_: Annotated[str | None, typer.Option("--map", metavar="NAME", help="Only this map.")] = None,
     watch: Annotated[
         float | None, typer.Option(metavar="SECONDS", min=0.1, help="Ask again and again.")
     ] = None,
+    stall_after: Annotated[
+        float,
+        typer.Option(metavar="SECONDS", min=0.1, help="So long without a keyframe fused, while some wait."),
+    ] = 10.0,
     timeout: Annotated[
         float, typer.Option(metavar="SECONDS", min=0.1, help="Wait so long for an answer.")
     ] = 5.0,
     json: options.Json = False,
-) -> None:
-    """Ask a running server how it is; status 1 when it does not answer."""
-    from tsfusion.cli import show
-    from tsfusion.client import fetch_status
+) -> int:
+    """Ask a running server how it is: its maps, its clients, and what is wrong.
+
+    Exit status, for health checks: 0 = ready; 1 = nobody answers; 2 = wrong usage; 3 = it answers, but is not
+    ready, or keyframes wait and nothing is fused (it takes --stall-after seconds to be sure of that).
+
+    With --watch, a terminal is redrawn until Ctrl-C. Elsewhere a block of lines (with --json: a line) is
+    printed each time, until nobody answers (1) or nothing was well for --stall-after seconds (3).
+    """
+    from tsfusion.cli.looking import Watcher
     from tsfusion.config import ClientConfig
 
     address = connect or ClientConfig().address
+    watcher = Watcher(
+        address, _asker(address, control, key, server_key), timeout=timeout, stall_after=stall_after,
+        only=map_ or "",
+    )  # fmt: skip
+    if watch is None:
+        look = watcher.once()
+        _print(look, json=json, line=False)
+        return look.exit_status
+    if sys.stdout.isatty() and not json:
+        _redraw(watcher, address, watch)
+    return _repeat(watcher, watch, json=json)
+
+
+def _asker(address: str, control: str | None, key: str | None, server_key: str | None) -> "Ask":
+    from tsfusion.transport import client_keys, control_address, request, sockets
+    from tsfusion.transport.messages import Command, Reply
+
+    to, keys = control_address(sockets.target(address), control), client_keys(key, server_key)
+
+    def ask(command: Command, timeout: float) -> Reply:
+        reply, _ = request(to, command, timeout=timeout, keys=keys)
+        return reply
+
+    return ask
+
+
+def _repeat(watcher: "Watcher", seconds: float, *, json: bool) -> int:
     while True:
-        answer = fetch_status(address, control=control, timeout=timeout)
-        if not json:
-            typer.echo(describe(answer))
-        elif watch is None:
-            show.as_json(answer)
-        else:
-            show.as_json_line(answer)
-        if watch is None:
-            return
-        time.sleep(watch)
+        look = watcher.again()
+        _print(look, json=json, line=True)
+        if watcher.unwell:
+            return look.exit_status
+        time.sleep(seconds)
 
 
-def describe(answer: "Status") -> str:
-    """A server's status in a few lines."""
-    from tsfusion.cli.show import grouped, size
+def _redraw(watcher: "Watcher", address: str, seconds: float) -> None:
+    """Until Ctrl-C, whatever becomes of the server."""
+    from rich.console import Console
+    from rich.live import Live
 
-    delay = answer.delay_ms
-    waiting = answer.keyframes_durable - answer.keyframes_fused - sum(answer.keyframes_rejected.values())
-    lines = [
-        f"fuser      {answer.fuser}, up {answer.uptime_s:.0f} s, {answer.fuser_restarts} restarts",
-        f"keyframes  {answer.keyframes_durable} durable, {answer.keyframes_fused} fused, {waiting} waiting, "
-        f"{answer.sessions} sessions",
-        f"delay      mean {delay.mean:.0f} ms, p95 {delay.p95:.0f}, max {delay.max:.0f} (last {delay.count})",
-        f"map        {grouped(answer.blocks)} blocks, {size(answer.map_bytes)}, hash {answer.map_hash}",
-        f"journal    {size(answer.journal_bytes)} in {answer.state}",
-        "memory     " + ", ".join(f"{name} {size(peak)}" for name, peak in answer.peak_rss_bytes.items()),
-    ]
-    for title, reasons in (("rejected", answer.keyframes_rejected), ("refused", answer.messages_refused)):
-        if reasons:
-            lines.append(
-                f"{title:<10} " + "; ".join(f"{count} × {reason}" for reason, count in reasons.items())
-            )
-    return "\n".join(lines)
+    from tsfusion.cli.looking import Look
+    from tsfusion.cli.status_view import render
+    from tsfusion.errors import TransportError
+
+    with Live(console=Console(highlight=False), auto_refresh=False) as live:
+        while True:
+            try:
+                look = watcher.again()
+            except TransportError as error:
+                look = Look(address=address, error=str(error))
+            live.update(render(look), refresh=True)
+            time.sleep(seconds)
+
+
+def _print(look: "Look", *, json: bool, line: bool) -> None:
+    from tsfusion.cli import show
+    from tsfusion.cli.status_view import render
+
+    if not json:
+        typer.echo(_text(render(look)))
+    elif line:
+        show.as_json_line(look.as_json())
+    else:
+        show.as_json(look.as_json())
+    sys.stdout.flush()
+
+
+def _text(shown: "RenderableType") -> str:
+    """As it looks on this terminal; without colours and wide where there is none."""
+    from rich.console import Console
+
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else PLAIN_WIDTH)
+    with console.capture() as captured:
+        console.print(shown)
+    return "\n".join(line.rstrip() for line in captured.get().splitlines())

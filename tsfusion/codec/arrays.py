@@ -6,7 +6,6 @@ planes → zstd level 1. Neighbours in a depth image are alike, so the high plan
 `mm+dzp+zstd`: float32 metres that are whole millimetres, as int32.
 """
 
-import struct
 from typing import Any
 
 import cv2
@@ -19,7 +18,6 @@ from tsfusion.codec.header import Refused
 _ZSTD_LEVEL = 1
 _MAX_WINDOW_BYTES = 1 << 24
 _SAMPLE = 512
-_MAX_JPEG_SEGMENTS = 1024  # before the frame header; a colour profile is the longest, with 255
 _MM_LIMIT = 2**31 - 1
 
 
@@ -67,7 +65,7 @@ def pack_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
 
 
 def unpack_image(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """A JPEG or PNG whose file header was checked to announce `shape` (see `image_size`).
+    """A JPEG or PNG whose file header was checked to announce `shape` (see `images.size`).
 
     Raises:
         Refused: `payload` unless it decodes to exactly that array.
@@ -94,35 +92,6 @@ def check_zstd(frame: Any, size: int) -> None:
         raise Refused("payload", f"not a zstd frame: {error}") from error
     if stated != size:
         raise Refused("limits", f"an array of {size} bytes was announced, the zstd frame states {stated}")
-
-
-def image_size(frame: Any) -> tuple[int, int]:
-    """(height, width) that a PNG or JPEG announces, without decoding it.
-
-    Raises:
-        Refused: `payload` when it is neither.
-    """
-    view = memoryview(frame)
-    head = bytes(view[:24])
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 24:
-        width, height = struct.unpack(">II", head[16:24])
-        return height, width
-    if head[:2] == b"\xff\xd8":
-        return _jpeg_size(view)
-    raise Refused("payload", "neither a PNG nor a JPEG")
-
-
-def _jpeg_size(view: memoryview) -> tuple[int, int]:
-    at = 2
-    for _ in range(_MAX_JPEG_SEGMENTS):  # 32 MB of tiny ones would take seconds
-        if at + 9 > view.nbytes or view[at] != 0xFF:
-            break
-        marker, length = view[at + 1], int.from_bytes(view[at + 2 : at + 4], "big")
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start-of-frame segment
-            height, width = struct.unpack(">HH", view[at + 5 : at + 9])
-            return height, width
-        at += 2 + max(length, 2)
-    raise Refused("payload", "a JPEG without a frame header")
 
 
 def _bits(array: NDArray[Any]) -> NDArray[Any]:

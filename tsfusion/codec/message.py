@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.codec import arrays
+from tsfusion.codec import arrays, images
 from tsfusion.codec.header import ArrayCodec, ArrayName, Buffer, Header, Refused, pack, unpack
 from tsfusion.config import DEFAULT_MAP
 from tsfusion.errors import InvalidKeyframe
@@ -178,7 +178,7 @@ def _check_sizes(header: Header, frames: Sequence[Any], max_frame_bytes: int) ->
     for buffer, frame in zip(header.buffers, frames[1:], strict=True):
         if buffer.codec in _ZSTD:
             arrays.check_zstd(frame, _decoded_bytes(buffer))
-        elif arrays.image_size(frame) != buffer.shape[:2]:
+        elif images.size(frame) != buffer.shape[:2]:
             raise Refused("limits", f"the image of {buffer.name} is not {buffer.shape} as announced")
 
 

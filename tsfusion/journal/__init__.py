@@ -5,10 +5,11 @@ A keyframe is on the disk when `Journal.append` returns. MCAP cannot be appended
 new segment. One chunk a keyframe, uncompressed: the arrays are compressed already, and a chunk has a CRC.
 """
 
+from tsfusion.journal.layout import Position, Record
 from tsfusion.journal.segments import (
-    Position,
-    Record,
     Scan,
+    describe,
+    is_closed,
     read,
     read_at,
     records,
@@ -16,17 +17,24 @@ from tsfusion.journal.segments import (
     segment_path,
     segments,
 )
-from tsfusion.journal.writer import Journal
+from tsfusion.journal.walk import Damage, segment_number, walk
+from tsfusion.journal.writer import Journal, write_file
 
 __all__ = [
+    "Damage",
     "Journal",
     "Position",
     "Record",
     "Scan",
+    "describe",
+    "is_closed",
     "read",
     "read_at",
     "records",
     "scan",
+    "segment_number",
     "segment_path",
     "segments",
+    "walk",
+    "write_file",
 ]

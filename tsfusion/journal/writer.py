@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""Writing the log: append, wait for the disk, begin the next segment."""
+"""Writing the log: append, wait for the disk, begin the next segment, let old ones go."""
 
 import contextlib
 import logging
 import os
+import secrets
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from mcap.writer import CompressionType, Writer
-
-from tsfusion.journal.segments import LAYOUT, Position, Scan, failed, pack, scan, segment_path, segments
-
-TOPIC = "/keyframes"
-ENCODING = "x-tsfusion"
-_CHANNEL = 1
+from tsfusion import disk
+from tsfusion.errors import JournalError
+from tsfusion.journal import layout
+from tsfusion.journal.layout import Position
+from tsfusion.journal.room import Room
+from tsfusion.journal.segments import Scan, scan, segment_path, segments
+from tsfusion.journal.walk import failed
 
 log = logging.getLogger(__name__)
 
@@ -27,27 +28,38 @@ class Journal:
         folder: made when absent.
         segment_bytes: a segment that has grown past this is closed and the next begun.
         sync: wait for the disk at each append (fdatasync); without it a power cut may lose the tail.
+        min_free_bytes: what `append` leaves free on the disk.
 
     Attributes:
         found: what the segments of earlier runs hold, in journal order; the caller may empty it.
-        damaged: how many of their records could not be read.
+        damaged: how many of their records could not be read. A segment that cannot be read at all counts
+            as one.
 
     Raises:
-        JournalError: when the folder cannot be read or written.
+        JournalError: when the folder cannot be made or listed.
     """
 
-    def __init__(self, folder: str | os.PathLike[str], segment_bytes: int, *, sync: bool = True) -> None:
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        segment_bytes: int,
+        *,
+        sync: bool = True,
+        min_free_bytes: int = 0,
+    ) -> None:
         self.folder = Path(folder)
         self._segment_bytes = segment_bytes
         self._sync = sync
+        self._room = Room(self.folder, min_free_bytes)
         self._file: BinaryIO | None = None
         self._writer: Any = None
+        self._identity = b""
         self._first = 0  # where the open segment's first record starts
+        self._closed: dict[int, int] = {}  # bytes by number, oldest first
         self.found: list[Scan] = []
         self.damaged = 0
-        self.closed_bytes = 0
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            disk.make_folder(self.folder)
         except OSError as error:
             raise failed("create the journal", self.folder, error) from error
         self._recover()
@@ -56,49 +68,83 @@ class Journal:
         numbers = segments(self.folder)
         for number in numbers:
             path = segment_path(self.folder, number)
-            found, damaged = scan(path)
+            self._closed[number] = 0
+            try:
+                found, damaged = scan(path)
+                self._closed[number] = path.stat().st_size
+            except (JournalError, OSError) as error:
+                log.error("%s: its keyframes are lost to this run", error)
+                found, damaged = [], 1
             self.found += found
             self.damaged += damaged
-            self.closed_bytes += path.stat().st_size
         self._number = numbers[-1] + 1 if numbers else 1
 
     @property
     def nbytes(self) -> int:
         """Bytes of all segments."""
-        return self.closed_bytes + (self._file.tell() if self._file else 0)
+        return sum(self._closed.values()) + (self._file.tell() if self._file else 0)
+
+    @property
+    def free_bytes(self) -> int:
+        """Room on the disk.
+
+        Raises:
+            JournalError: when the disk does not say.
+        """
+        return self._room.free_bytes
+
+    @property
+    def first(self) -> int:
+        """The number of the oldest segment; more than 1 = older ones were let go."""
+        return next(iter(self._closed), self._number)
 
     @property
     def segment(self) -> int:
         """The number of the segment that is (or will be) written to."""
         return self._number
 
-    def append(self, frames: Sequence[Any], *, session: bytes, seq: int, client: str = "") -> Position:
+    def append(
+        self,
+        frames: Sequence[Any],
+        *,
+        session: bytes,
+        seq: int,
+        client: str = "",
+        logged_ns: int | None = None,
+    ) -> Position:
         """Write one message; it is on the disk when this returns.
 
         Args:
             client: the name of who sent it, at most 32 bytes of UTF-8.
+            logged_ns: wall clock; None = now.
 
         Raises:
-            JournalError: when the disk refuses. Nothing of the message counts then.
+            JournalError: when the disk refuses, or too little would stay free. Nothing of the message
+                counts then.
         """
-        payload = pack(frames, session, seq, client)
+        self._room.take(sum(memoryview(frame).nbytes for frame in frames))
+        now_ns = time.time_ns() if logged_ns is None else logged_ns
         position = Position(self._number, 0)
         try:
             file = self._open()
             position = Position(self._number, file.tell())
-            now = time.time_ns()
-            self._writer.add_message(
-                _CHANNEL, log_time=now, publish_time=now, data=payload, sequence=seq % 2**32
-            )
-            file.flush()
-            if self._sync:
-                os.fdatasync(file.fileno())
+            layout.add(self._writer, layout.pack(frames, self._identity, session, seq, client), seq, now_ns)
+            self._flush()
         except OSError as error:
             self._abandon(position.offset)
             raise failed("write", self.folder, error) from error
+        except BaseException:  # interrupted in between
+            self._abandon(position.offset)
+            raise
         if file.tell() >= self._segment_bytes:
             self._rotate_or_abandon()
         return position
+
+    def _flush(self) -> None:
+        assert self._file is not None
+        self._file.flush()
+        if self._sync:
+            os.fdatasync(self._file.fileno())
 
     def _rotate_or_abandon(self) -> None:
         """The keyframe is on the disk, whatever becomes of the index that readers can do without."""
@@ -108,19 +154,12 @@ class Journal:
             log.warning("%s", failed("close", segment_path(self.folder, self._number), error))
             self._abandon()
 
-    def begin_after(self, segment: int) -> None:
-        """Number new segments above one that a map remembers, though its file may have been removed."""
-        if self._file is None:
-            self._number = max(self._number, segment + 1)
-
     def rotate(self) -> None:
         """Close the segment with its index; the next append begins another."""
         if self._file is None:
             return
         self._writer.finish()
-        self._file.flush()
-        if self._sync:
-            os.fdatasync(self._file.fileno())
+        self._flush()
         self._abandon()
 
     def close(self) -> None:
@@ -132,25 +171,48 @@ class Journal:
             raise failed("close", self.folder, error) from error
 
     def forget(self, number: int) -> None:
-        """Delete a closed segment whose keyframes are safe elsewhere."""
+        """Delete a closed segment whose keyframes are safe elsewhere.
+
+        Raises:
+            JournalError: when the disk refuses.
+        """
         path = segment_path(self.folder, number)
         try:
-            self.closed_bytes -= path.stat().st_size
             path.unlink()
         except OSError as error:
             raise failed("delete", path, error) from error
+        self._closed.pop(number, None)
+
+    def retire(self, below: int, limit: int) -> int:
+        """Delete the oldest closed segments until the journal is no larger than `limit`.
+
+        Args:
+            below: segments from this number on stay: their keyframes are nowhere else.
+            limit: bytes of all segments.
+
+        Returns:
+            The bytes that this freed. A segment that cannot be deleted is logged and passed over.
+        """
+        before = self.nbytes
+        for number in sorted(self._closed):
+            if number >= below or self.nbytes <= limit:
+                break
+            try:
+                self.forget(number)
+            except JournalError as error:
+                log.warning("%s", error)
+        return before - self.nbytes
 
     def _open(self) -> BinaryIO:
         if self._file is None:
-            path = segment_path(self.folder, self._number)
             self._first = 0
-            self._file = path.open("xb")
-            self._writer = Writer(self._file, chunk_size=1, compression=CompressionType.NONE)
-            self._writer.start()
-            schema = self._writer.register_schema("tsfusion.keyframe", "", LAYOUT)
-            self._writer.register_channel(TOPIC, ENCODING, schema)
+            self._file = segment_path(self.folder, self._number).open("xb")
+            self._identity = secrets.token_bytes(layout.IDENTITY_BYTES)
+            self._writer = layout.start(self._file, self._identity, time.time_ns())
+            # Before the first record: what a reader needs to find its way is never the end that a cut takes.
+            self._flush()
             if self._sync:
-                _sync_folder(self.folder)
+                disk.sync_folder(self.folder)
             self._first = self._file.tell()
         return self._file
 
@@ -169,13 +231,32 @@ class Journal:
                 self._number = number
             else:
                 if end is not None:
-                    os.truncate(path, end)
-                self.closed_bytes += path.stat().st_size
+                    _cut(path, end)
+                self._closed[number] = path.stat().st_size
 
 
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
+def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, client: str = "") -> None:
+    """One message as a file of its own, in the form of a segment, whole or not at all.
+
+    Raises:
+        JournalError: when the disk refuses.
+    """
+    partial = path.with_name(f".{path.name}.partial")
+    identity, now_ns = secrets.token_bytes(layout.IDENTITY_BYTES), time.time_ns()
     try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        with partial.open("wb") as file:
+            writer = layout.start(file, identity, now_ns)
+            layout.add(writer, layout.pack(frames, identity, session, seq, client), seq, now_ns)
+            writer.finish()
+        partial.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise failed("write", path, error) from error
+
+
+def _cut(path: Path, end: int) -> None:
+    """Shorten a file, for good."""
+    with path.open("r+b") as file:
+        file.truncate(end)
+        os.fsync(file.fileno())

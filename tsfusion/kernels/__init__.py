@@ -7,10 +7,16 @@ from tsfusion.errors import MissingDependency
 
 os.environ.setdefault("HOME", os.path.expanduser("~"))  # without it (a daemon's environment) taichi aborts
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # the banner goes to stdout
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # it would tell its makers that and where we run
 try:
     import taichi as taichi
-except ImportError as error:
+except ModuleNotFoundError as error:
     raise MissingDependency(
         "fusing needs taichi, which has no build for this platform; "
         "run `tsfusion serve` on an x86-64 machine and send keyframes to it from here"
+    ) from error
+except ImportError as error:  # a library of the system, which small containers do not have
+    raise MissingDependency(
+        f"taichi does not load ({error}); where there is no desktop, install libx11-6 (Debian, Ubuntu) or "
+        "libX11 (Fedora)"
     ) from error

@@ -261,6 +261,7 @@ class Status(Struct, frozen=True, kw_only=True):
     fuser_restarts: int
     peak_rss_bytes: dict[str, int]  # server (gateway), fuser
     delay_ms: Spread  # capture to fused, of the last 1024 keyframes
+    delay_bound_ms: float  # that is right to within so much
     config: dict[str, Any]  # server and volume settings
     versions: dict[str, str]
 

@@ -14,11 +14,14 @@ from typing import Any
 import zmq
 from msgspec import Struct
 
+from tsfusion.config import DEFAULT_MAP
 from tsfusion.errors import InvalidConfig, TransportError
 from tsfusion.transport.curve import ClientKeys, ServerKeys
 
 CONTROL_MAX_BYTES = 64 << 10
-MESH_TOPIC = b"mesh"
+# XPUB keeps a subscription at some fifty times its size; a greeting with keys needs about 330 bytes.
+TOPIC_MAX_BYTES = 512
+_MESH_TOPIC = b"mesh/"
 _ANY: dict[int, int] = {zmq.HANDSHAKE_IVL: 5000}  # ms; then a connection that is not made is closed
 _CONNECTING = {
     **_ANY, zmq.RECONNECT_IVL: 100, zmq.RECONNECT_IVL_MAX: 1000, zmq.TCP_KEEPALIVE: 1, zmq.IMMEDIATE: 1
@@ -26,6 +29,7 @@ _CONNECTING = {
 _RANDOM_PORT_TRIES = 32
 _FREED_WITHIN = 5.0  # seconds
 LAST_PORT = 65535
+_MAX_TOPIC = 64
 _ADDRESS = re.compile(r"tcp://((?P<host>[\w.*-]+)|\[(?P<host6>[\w:.%]+)\]):(?P<port>[0-9]{1,5}|\*)", re.ASCII)
 
 AnySocket = zmq.Socket[Any]
@@ -62,17 +66,29 @@ def router(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySo
 
 def publisher(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySocket:
     """The server's mesh updates; a slow viewer loses the oldest, never holds the server up."""
-    limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: CONTROL_MAX_BYTES}
+    limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES}
     return _make(context, zmq.XPUB, {**_ANY, **limits}, keys)
 
 
-def subscriber(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySocket:
-    """A viewer's socket for mesh updates: topic, `work.Meshed`, cells (n, 3) int32, then a mesh's frames.
+def mesh_topic(map_name: str) -> bytes:
+    """Of a map's mesh updates. No map's is the beginning of another's."""
+    return _MESH_TOPIC + map_name.encode() + b"/"
+
+
+def is_mesh_topic(topic: bytes) -> bool:
+    """Whether it asks for one map's updates, or for all of them. Anything else is nobody's to ask for."""
+    return len(topic) <= _MAX_TOPIC and (topic.startswith(_MESH_TOPIC) or _MESH_TOPIC.startswith(topic))
+
+
+def subscriber(
+    context: "zmq.Context[Any]", keys: ClientKeys | None = None, *, map_name: str = DEFAULT_MAP
+) -> AnySocket:
+    """A viewer's socket for a map's updates: topic, `work.Meshed`, cells (n, 3) int32, then a mesh's frames.
 
     The triangles replace all earlier ones in these cells (blocks of 8³ voxels).
     """
     made = _make(context, zmq.SUB, {**_CONNECTING, zmq.IMMEDIATE: 0, zmq.RCVHWM: 16}, keys)
-    made.setsockopt(zmq.SUBSCRIBE, MESH_TOPIC)
+    made.setsockopt(zmq.SUBSCRIBE, mesh_topic(map_name))
     return made
 
 

@@ -14,21 +14,47 @@ from tsfusion.config import VolumeConfig
 from tsfusion.journal import Position
 from tsfusion.transport.messages import Command, MeshLayout
 
+NOT_WORKING = -1
+WORKING_FILE = "working"  # in the folder of the socket
+
 
 class Begin(Struct, frozen=True, tag="begin"):
-    """Open the map in `state` and compile the kernels."""
+    """Open the map in `folder` and compile the kernels.
 
-    state: str
+    Attributes:
+        working: a file of 8 bytes: the index of the keyframe that is being fused, little-endian, or
+            `NOT_WORKING`. Read when the process has died, so that the death is put down to the right one.
+        keep_previous: also keep the checkpoint before the last: the journal will not go back to the start.
+        memory_bytes: what the process may allocate.
+    """
+
+    folder: str
     volume: VolumeConfig
     mesh_interval: float  # seconds
     checkpoint_every: int  # keyframes
+    working: str
+    keep_previous: bool
+    memory_bytes: int
+
+
+class Progress(Struct, frozen=True, array_like=True):
+    """How far the map is with a session: fused or rejected up to `seq`; `client` owns the session."""
+
+    seq: int
+    client: str
 
 
 class Fuse(Struct, frozen=True, tag="fuse"):
-    """Fuse the keyframe at a journal position. `skip`: count it as rejected for this reason instead."""
+    """Fuse the keyframe at a journal position, unless the map has it already.
+
+    `skip`: count it as rejected for this reason instead.
+    """
 
     index: int
     position: Position
+    session: bytes
+    seq: int
+    client: str = ""
     skip: str | None = None
 
 
@@ -45,6 +71,10 @@ class Publish(Struct, frozen=True, tag="publish"):
     wanted: bool
 
 
+class Save(Struct, frozen=True, tag="save"):
+    """Write a checkpoint: the journal wants room."""
+
+
 class Finish(Struct, frozen=True, tag="finish"):
     """Write a checkpoint and end."""
 
@@ -54,9 +84,22 @@ class Started(Struct, frozen=True, tag="started"):
 
 
 class Ready(Struct, frozen=True, tag="ready"):
-    """Kernels are warm; the map holds the journal up to and with `position`; (0, 0) = nothing."""
+    """Kernels are warm. `done`: how far the map is, by session. `rejected`: reason → count."""
 
-    position: Position
+    done: dict[bytes, Progress]
+    keyframes: int = 0
+    rejected: dict[str, int] = {}
+    blocks: int = 0
+    map_bytes: int = 0
+
+
+class Saved(Struct, frozen=True, tag="saved"):
+    """The checkpoint holds everything that was answered with `Done` before this.
+
+    `written`: it is a new one; else the one before held all of it already.
+    """
+
+    written: bool
 
 
 class Failed(Struct, frozen=True, tag="failed"):
@@ -77,14 +120,16 @@ class Done(Struct, frozen=True, tag="done"):
 
 
 class Meshed(Struct, frozen=True, tag="meshed"):
-    """The mesh has every keyframe up to and with `index`; the changed part may follow as frames.
+    """The mesh has the first `count` keyframes that this process answered; the changed part may follow.
 
     What keyframes changed comes as fused first, and again, with `blocks` = 0, once it is regularised.
     """
 
-    index: int
+    count: int
     meshed_ns: int
     blocks: int = 0
+    map_blocks: int = 0
+    map_bytes: int = 0
     layout: MeshLayout | None = None
 
 
@@ -112,8 +157,8 @@ class Answer(Struct, frozen=True, tag="answer"):
     layout: MeshLayout | None = None
 
 
-ToFuser = Begin | Fuse | Ask | Publish | Finish
-ToGateway = Started | Ready | Failed | Done | Meshed | Answer
+ToFuser = Begin | Fuse | Ask | Publish | Save | Finish
+ToGateway = Started | Ready | Failed | Done | Saved | Meshed | Answer
 to_fuser: "msgspec.msgpack.Decoder[ToFuser]" = msgspec.msgpack.Decoder(ToFuser)
 to_gateway: "msgspec.msgpack.Decoder[ToGateway]" = msgspec.msgpack.Decoder(ToGateway)
 encode = msgspec.msgpack.encode

@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: MIT
+"""Scanner, gateway and fuser killed at seeded moments over a bad network; and what must be true afterwards.
+
+The plan depends on the seed alone. What meets what depends on the machine: that is the point.
+"""
+
+import contextlib
+import functools
+import random
+import threading
+import time
+from pathlib import Path
+from typing import Literal
+
+from keepers import PATIENCE, Daemon, Scanner
+from msgspec import Struct
+from proxy import Proxy
+from scanner import Plan, journals
+from verdict import client_problems, server_problems, verify
+from wire import until, wall
+
+from tsfusion import codec, journal
+from tsfusion.config import ClientConfig
+from tsfusion.errors import TransportError
+from tsfusion.fetch import fetch_status
+from tsfusion.transport import Status
+
+Kind = Literal["server", "fuser", "scanner"]
+_RECORD_OVERHEAD = 300  # bytes of MCAP a keyframe
+KINDS: tuple[Kind, ...] = ("server", "fuser", "scanner")
+
+# Small files and frequent checkpoints: more moments at which a kill can hurt. What piled up comes faster than
+# the quota, so clients are held, too.
+SERVER = {"checkpoint_every": 20, "segment_bytes": 1 << 18, "quota_keyframes": 60.0}
+CLIENT = ClientConfig(policy="spool_all", stall_timeout=0.5, segment_bytes=1 << 16)
+
+
+class Attack(Struct, frozen=True):
+    """A process to be killed.
+
+    Attributes:
+        journaled: not before the journal has so many keyframes.
+        ready: not before the server is ready.
+        wait: seconds from then.
+    """
+
+    kind: Kind
+    journaled: int
+    ready: bool
+    wait: float
+
+
+class Fault(Struct, frozen=True):
+    """A method of `Proxy`, what it is called with, and for how long; then comes a `pause`."""
+
+    what: str
+    value: float | bool | None
+    lasts: float
+    pause: float
+
+
+class Kill(Struct, frozen=True):
+    at: float
+    kind: Kind
+    ready: bool  # the server had been
+    journaled: int  # keyframes, about
+
+
+class Result(Struct, kw_only=True):
+    """One seed's outcome. `problems` is empty when every promise was kept."""
+
+    seed: int
+    problems: list[str]
+    keyframes: int
+    rate: float
+    seconds: float
+    kills: dict[str, int]
+    before_ready: int  # kills of server or fuser while it started
+    kill_times: list[Kill]
+    link_faults: list[str]
+    server_exits: list[str]  # of its own accord; it was started again
+    sessions: int
+    segments: int
+    duplicates: int  # of the last server's life
+    carried_per_journaled: float  # bytes over the link / bytes in the journal
+
+
+def attacks(rng: random.Random, keyframes: int, kills: int) -> list[Attack]:
+    """Who is killed when: mostly in full flow, sometimes while what was killed before is on its way up."""
+    kinds = [KINDS[i % len(KINDS)] for i in range(kills)]
+    rng.shuffle(kinds)
+    moments = sorted(rng.randrange(keyframes) for _ in kinds)
+    planned: list[Attack] = []
+    for kind, journaled in zip(kinds, moments, strict=True):
+        if planned and rng.random() < 0.25:
+            planned.append(Attack(kind, planned[-1].journaled, False, rng.uniform(0.05, 2.5)))
+        else:
+            planned.append(Attack(kind, journaled, True, rng.uniform(0.0, 0.5)))
+    return planned
+
+
+def fault(rng: random.Random) -> Fault:
+    """Something that networks do."""
+    what = rng.choice(["cut", "half_close", "refuse", "throttle", "delay", "freeze", "swallow"])
+    value: float | bool | None = True
+    lasts, pause = rng.uniform(0.2, 2.0), rng.uniform(0.3, 2.0)
+    if what in ("cut", "half_close"):
+        value, lasts = None, 0.0
+    elif what == "throttle":
+        value = rng.uniform(20e3, 80e3)
+    elif what == "delay":
+        value = rng.uniform(0.01, 0.08)
+    return Fault(what, value, lasts, pause)
+
+
+class Weather:
+    """One fault after the other, in a thread of its own."""
+
+    def __init__(self, rng: random.Random, proxy: Proxy) -> None:
+        self.faults: list[str] = []
+        self._rng, self._proxy = rng, proxy
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._blow)
+        self._thread.start()
+
+    def _blow(self) -> None:
+        while not self._over.is_set():
+            one = fault(self._rng)
+            self.faults.append(one.what)
+            method = getattr(self._proxy, one.what)
+            method(*([] if one.value is None else [one.value]))
+            self._over.wait(one.lasts)
+            self._proxy.heal()
+            self._over.wait(one.pause)
+
+    def end(self) -> None:
+        """A good network from here on."""
+        self._over.set()
+        self._thread.join()
+
+
+def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Result:
+    """One seed in an empty folder."""
+    rng = random.Random(seed)
+    rate, planned = rng.uniform(20, 40), attacks(rng, keyframes, kills)
+    started = time.monotonic()
+    state = folder / "state"
+    killed: list[Kill] = []
+    with contextlib.ExitStack() as stack:
+        proxy = stack.enter_context(Proxy())
+        daemon = Daemon(state, proxy, **SERVER)
+        stack.callback(daemon.close)
+        scanner = Scanner(_plan(folder, proxy.address, keyframes, rate))
+        stack.callback(scanner.close)
+        weather = Weather(random.Random(-seed - 1), proxy)
+        stack.callback(weather.end)
+        for attack in planned:
+            until(lambda attack=attack: scanner.finished or _is_time(attack, state, daemon), PATIENCE)
+            time.sleep(attack.wait)
+            ready, at = daemon.ready, round(time.monotonic() - started, 2)
+            if _kill(attack.kind, daemon, scanner):
+                killed.append(Kill(at, attack.kind, ready, _journaled(state)))
+        weather.end()
+        scanner.wait()
+        problems = [scanner.problem] if scanner.problem else []
+        status = _status(daemon)
+        problems += [] if status else ["the server says nothing of itself"]
+        if not problems and (code := daemon.stop()):
+            problems.append(f"the server ended with status {code} when told to")
+    seconds = time.monotonic() - started
+    if status and not problems:
+        problems += server_problems(status, keyframes) + client_problems(scanner.report())
+        problems += verify(state, keyframes, status.map_hash)
+    return Result(
+        seed=seed,
+        problems=problems,
+        keyframes=keyframes,
+        rate=round(rate, 1),
+        seconds=round(seconds, 1),
+        kills={kind: sum(kill.kind == kind for kill in killed) for kind in KINDS},
+        before_ready=sum(not kill.ready and kill.kind != "scanner" for kill in killed),
+        kill_times=killed,
+        link_faults=weather.faults,
+        server_exits=daemon.exits,
+        sessions=status.sessions if status else 0,
+        segments=sum(len(journal.segments(one)) for one in journals(state)),
+        duplicates=status.duplicates if status else 0,
+        carried_per_journaled=round(proxy.carried / max(_bytes(state), 1), 2),
+    )
+
+
+def _is_time(attack: Attack, state: Path, daemon: Daemon) -> bool:
+    return _journaled(state) >= attack.journaled and (daemon.ready or not attack.ready)
+
+
+@functools.cache
+def _keyframe_bytes() -> int:
+    sizes = [
+        sum(map(len, codec.encode(wall(i), session=bytes(16), seq=1, jpeg_quality=CLIENT.jpeg_quality)))
+        for i in range(0, 300, 15)
+    ]
+    return sum(sizes) // len(sizes) + _RECORD_OVERHEAD
+
+
+def _bytes(state: Path) -> int:
+    return sum(path.stat().st_size for folder in journals(state) for path in folder.glob("*.mcap"))
+
+
+def _journaled(state: Path) -> int:
+    """About how many keyframes the journal has: looked at often, so by its size."""
+    with contextlib.suppress(OSError):
+        return _bytes(state) // _keyframe_bytes()
+    return 0
+
+
+def _plan(folder: Path, address: str, keyframes: int, rate: float) -> Plan:
+    return Plan(
+        address=address,
+        spool=str(folder / "spool"),
+        state=str(folder / "state"),
+        count=keyframes,
+        rate=rate,
+        log=str(folder / "taken"),
+        report=str(folder / "report.json"),
+        patience=PATIENCE,
+        client=CLIENT,
+    )
+
+
+def _kill(kind: Kind, daemon: Daemon, scanner: Scanner) -> bool:
+    """Whether there was somebody to kill."""
+    if kind == "scanner":
+        if scanner.finished:
+            return False
+        scanner.kill()
+    elif kind == "server":
+        daemon.kill()
+    else:
+        daemon.kill_fuser()
+    return True
+
+
+def _status(daemon: Daemon) -> Status | None:
+    found: list[Status] = []
+
+    def answered() -> bool:
+        with contextlib.suppress(TransportError):
+            found.append(fetch_status(daemon.server.address, timeout=5.0))
+        return bool(found)
+
+    with contextlib.suppress(AssertionError):
+        until(lambda: daemon.ready and answered())
+    return found[0] if found else None

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: MIT
+"""A bad network between scanner and server: a TCP proxy that cuts, refuses, throttles, delays and swallows.
+
+It runs in a thread of its own; every method may be called from any other.
+"""
+
+import asyncio
+import contextlib
+import socket
+import struct
+import threading
+from collections.abc import Coroutine
+from types import TracebackType
+from typing import Any, TypeVar
+
+_CHUNK = 16 << 10  # bytes taken at once: what a throttled link holds beyond the kernel's buffers
+_BUFFER = 64 << 10  # of each socket, so that a slow link is felt at its other end
+_PATIENCE = 10.0
+_PORT_TRIES = 32
+
+T = TypeVar("T")
+
+
+class Proxy:
+    """Two neighbouring ports in front of a server's data and control port.
+
+    The server may come back on other ports: `target` says where it is.
+
+    Attributes:
+        address: connect a client here; its control socket is the next port, as with a server.
+        carried: bytes passed on, both ways.
+    """
+
+    def __init__(self) -> None:
+        self.carried = 0
+        self._upstream: dict[int, int | None] = {}
+        self._listeners: list[asyncio.Server] = []
+        self._connections: set[tuple[asyncio.StreamWriter, asyncio.StreamWriter]] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._rate: float | None = None
+        self._delay = 0.0
+        self._swallows = False
+        self._free_at = 0.0  # when the throttled link has carried what it was given
+        self._loop = asyncio.new_event_loop()
+        self._open: asyncio.Event = asyncio.Event()
+        self._open.set()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="proxy", daemon=True)
+        self._thread.start()
+        self._ports = _neighbours()
+        self.address = f"tcp://127.0.0.1:{self._ports[0]}"
+        self._run(self._listen())
+
+    def target(self, data: str | None, control: str | None = None) -> None:
+        """Where the server is from now on; None = nowhere: connections are closed at once."""
+        ports = [None if one is None else int(one.rpartition(":")[2]) for one in (data, control)]
+        self._upstream = dict(zip(self._ports, ports, strict=True))
+
+    def cut(self) -> None:
+        """Reset every connection; new ones are let in."""
+        self._run(self._cut())
+
+    def refuse(self, refused: bool) -> None:
+        """Stop (or begin again) to listen. What is connected stays."""
+        self._run(self._deafen() if refused else self._listen())
+
+    def throttle(self, bytes_per_second: float | None) -> None:
+        """Carry so much and no more, all connections and both ways together; None = all there is."""
+        self._rate = bytes_per_second
+
+    def delay(self, seconds: float) -> None:
+        """Each way takes so long, and no connection carries more than 16 kB in that time."""
+        self._delay = seconds
+
+    def freeze(self, frozen: bool) -> None:
+        """Carry nothing, lose nothing: as when packets are lost and sent again later."""
+        self._loop.call_soon_threadsafe(self._open.clear if frozen else self._open.set)
+
+    def swallow(self, swallows: bool) -> None:
+        """Accept connections and bytes, and let all of it vanish. Those connections end with it."""
+        self._swallows = swallows
+        if not swallows:
+            self.cut()
+
+    def half_close(self) -> None:
+        """Tell every client that the server has said its last, and go on carrying what the client says."""
+        self._run(self._half_close())
+
+    def heal(self) -> None:
+        """A good network again."""
+        self.throttle(None)
+        self.delay(0.0)
+        self.freeze(False)
+        if self._swallows:
+            self.swallow(False)
+        if not self._listeners:
+            self.refuse(False)
+
+    def close(self) -> None:
+        """End everything."""
+        self._run(self._end())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(_PATIENCE)
+        self._loop.close()
+
+    def __enter__(self) -> "Proxy":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # --- in the loop's thread ---
+
+    def _run(self, coroutine: Coroutine[Any, Any, T]) -> T:
+        return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result(_PATIENCE)
+
+    async def _listen(self) -> None:
+        for port in self._ports:
+            listening = _socket()
+            listening.bind(("127.0.0.1", port))
+            server = await asyncio.start_server(self._accept, sock=listening, limit=_CHUNK)
+            self._listeners.append(server)
+
+    async def _deafen(self) -> None:
+        for listener in self._listeners:
+            listener.close()
+        self._listeners.clear()
+
+    async def _cut(self) -> None:
+        for pair in list(self._connections):
+            for writer in pair:
+                _reset(writer)
+
+    async def _half_close(self) -> None:
+        for client, _ in list(self._connections):
+            with contextlib.suppress(OSError, RuntimeError):
+                client.write_eof()
+
+    async def _end(self) -> None:
+        await self._deafen()
+        await self._cut()
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._tasks.add(task)
+        try:
+            await self._join(reader, writer)
+        except (OSError, asyncio.CancelledError):  # either end went away, or all is over
+            pass
+        finally:
+            writer.transport.abort()
+            self._tasks.discard(task)
+
+    async def _join(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        port = self._upstream.get(writer.get_extra_info("sockname")[1])
+        if port is None:
+            return
+        away = _socket()
+        away.setblocking(False)
+        await self._loop.sock_connect(away, ("127.0.0.1", port))
+        far_reader, far_writer = await asyncio.open_connection(sock=away, limit=_CHUNK)
+        pair = (writer, far_writer)
+        self._connections.add(pair)
+        try:
+            await asyncio.gather(self._pump(reader, far_writer), self._pump(far_reader, writer))
+        finally:
+            self._connections.discard(pair)
+            far_writer.transport.abort()
+
+    async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """One way of one connection, to its end."""
+        while chunk := await reader.read(_CHUNK):
+            await asyncio.sleep(self._wait(len(chunk)))
+            await self._open.wait()
+            if not self._swallows:
+                with contextlib.suppress(RuntimeError):  # half closed: nothing goes that way any more
+                    self.carried += len(chunk)
+                    writer.write(chunk)
+                await writer.drain()
+        with contextlib.suppress(OSError, RuntimeError):
+            writer.write_eof()
+
+    def _wait(self, size: int) -> float:
+        now = self._loop.time()
+        if self._rate is None:
+            return self._delay
+        self._free_at = max(self._free_at, now) + size / self._rate
+        return self._delay + self._free_at - now
+
+
+def _reset(writer: asyncio.StreamWriter) -> None:
+    """End a connection without a farewell (RST): as when a router forgets it."""
+    made = writer.get_extra_info("socket")
+    if made is not None and made.fileno() >= 0:
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    writer.transport.abort()
+
+
+def _socket() -> socket.socket:
+    made = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):  # an accepted one inherits them
+        made.setsockopt(socket.SOL_SOCKET, option, _BUFFER)
+    return made
+
+
+def _neighbours() -> tuple[int, int]:
+    """Two free ports, one after the other."""
+    for _ in range(_PORT_TRIES):
+        with _socket() as first, _socket() as second:
+            first.bind(("127.0.0.1", 0))
+            port = first.getsockname()[1]
+            with contextlib.suppress(OSError, OverflowError):
+                second.bind(("127.0.0.1", port + 1))
+                return port, port + 1
+    raise OSError("no two neighbouring ports are free")

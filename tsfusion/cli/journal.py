@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion journal`: look into a journal, check it, save what is whole, hand it to other tools."""
+
+import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tsfusion.cli import options
+
+if TYPE_CHECKING:
+    from tsfusion.inspection import Info, Problem, SessionInfo, Verdict
+    from tsfusion.journal.places import Place
+
+_MOST_LINES = 20  # of one kind, for a person; --json has all
+
+app = typer.Typer(
+    help="Look into a journal, check it, save what is whole, hand it to other tools. "
+    "None of this changes a journal, and all of it works beside a running server."
+)
+
+Where = Annotated[
+    Path,
+    typer.Argument(
+        metavar="PATH",
+        help="A server's state folder, the folder of one of its maps, a journal or spool folder, an .mcap.",
+    ),
+]
+Map = Annotated[
+    str | None, typer.Option("--map", metavar="NAME", help="Which map of a state folder with several.")
+]
+
+
+@app.command()
+def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
+    """Say what a journal holds: segments, sessions, keyframes, damage, quarantine.
+
+    Checks the CRC of each keyframe and decodes none: as fast as the disk.
+
+    A session is what one scanner sent from one spool. Its keyframes are
+    numbered; the numbers may have gaps, as a scanner leaves out what comes
+    too fast. A segment is closed, with an index, or open: being written, or
+    cut short by a crash, which costs nothing.
+
+    Exit status 0 also for a damaged journal: `verify` is the judge.
+    """
+    from tsfusion.cli import show
+    from tsfusion.inspection import summarize
+
+    place = _find(path, map_)
+    with show.reading(f"reading {place.path}", quiet=json) as watch:
+        found = summarize(place, watch)
+    if json:
+        show.as_json(found)
+    else:
+        typer.echo(_describe_info(found))
+
+
+@app.command()
+def verify(path: Where, map_: Map = None, json: options.Json = False) -> None:
+    """Read and decode every keyframe; exit status 1 when anything is damaged.
+
+    Each bad place is named by segment and byte. `damage`: bytes are not
+    what was written. `torn`: the end of a write that a crash or a power cut
+    took; it was never acknowledged, and its scanner sends it again. `note`:
+    odd, but nothing is wrong with what is there.
+    """
+    from tsfusion.cli import show
+    from tsfusion.inspection import verify as check
+
+    place = _find(path, map_)
+    with show.reading(f"checking {place.path}", quiet=json) as watch:
+        verdict = check(place, watch)
+    if json:
+        show.as_json(verdict)
+    else:
+        typer.echo(_describe_verdict(verdict))
+    if not verdict.intact:
+        raise typer.Exit(1)
+
+
+@app.command()
+def recover(
+    path: Where,
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", help="A folder that does not exist yet, or is empty.")
+    ],
+    map_: Map = None,
+    json: options.Json = False,
+) -> None:
+    """Write every whole keyframe of a damaged or unfinished journal into a new one.
+
+    OUT holds closed segments with an index, which any MCAP reader opens;
+    `replay` and `mesh` take it too. So does a server, as the `journal` folder
+    of a map: move the map.tsf beside it away, for it counts in the bytes of
+    the old journal, and it is built again. PATH is only read. OUT appears
+    when all of it is on the disk.
+
+    Exit status 1: OUT is there, but some keyframes could not be saved; the
+    damaged places are named.
+    """
+    from tsfusion.cli import show
+    from tsfusion.config import ServerConfig
+    from tsfusion.salvage import recover as save
+
+    place = _find(path, map_)
+    with show.reading(f"saving {place.path}", quiet=json) as watch:
+        done = save(place, out, ServerConfig().segment_bytes, watch)
+    if json:
+        show.as_json(done)
+    else:
+        typer.echo(
+            f"{out}: {_count(done.keyframes, 'keyframe')} in {_count(done.segments, 'segment')}, "
+            f"{show.size(done.nbytes)}"
+        )
+        if done.copies:
+            typer.echo(f"{_count(done.copies, 'keyframe')} stood there twice and is saved once")
+        typer.echo("\n".join([*_problem_lines(done.problems), _loss(done.lost)]))
+    if done.lost:
+        raise typer.Exit(1)
+
+
+@app.command()
+def export(
+    path: Where,
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT.mcap", help="The file to write; replaced if it exists.")
+    ],
+    map_: Map = None,
+    json: options.Json = False,
+) -> None:
+    """Write the keyframes as ROS 2 messages into one MCAP file: Foxglove, RViz and `ros2 bag play` read it.
+
+    NAME is a scanner's, from its key, else `scanner`; further sessions are
+    numbered. Frames: world → NAME, a camera's with z forward. Topics:
+
+    /tf, /NAME/pose                where it was
+    /NAME/depth/image              16UC1 mm as sent; stereo: 32FC1 m
+    /NAME/depth/camera_info        also for the colour image
+    /NAME/color/image/compressed   the JPEG as sent
+    /NAME/points                   LiDAR, with rgb where there is colour
+
+    A message's time is its sensor's clock, or its arrival without one.
+    Needs rosbags, the extra `ros` of tsfusion.
+
+    Exit status 1: OUT is there, but without the damaged keyframes.
+    """
+    from tsfusion.cli import show
+    from tsfusion.ros import export as write
+
+    place = _find(path, map_)
+    with show.reading(f"exporting {place.path}", quiet=json) as watch:
+        done = write(place, out, watch)
+    if json:
+        show.as_json(done)
+    else:
+        typer.echo(f"{out}: {_count(done.keyframes, 'keyframe')}, {show.size(done.nbytes)}")
+        typer.echo("\n".join(f"  {topic}  {count}" for topic, count in done.messages.items()))
+        typer.echo("\n".join([*_problem_lines(done.problems), _loss(done.lost)]))
+    if done.lost:
+        raise typer.Exit(1)
+
+
+def _find(path: Path, map_name: str | None) -> "Place":
+    from tsfusion.journal.places import find
+
+    return find(path, map_name)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _loss(lost: int) -> str:
+    return f"{_count(lost, 'keyframe')} lost, at least" if lost else "no keyframe is lost"
+
+
+def _describe_info(found: "Info") -> str:
+    from tsfusion.cli.show import size
+
+    lines = [
+        f"journal    {found.path}",
+        f"keyframes  {found.keyframes}, {size(found.nbytes)}",
+        f"damage     {_loss(found.lost)}",
+    ]
+    kept = sum(one["bytes"] for one in found.quarantined)
+    if found.quarantined:
+        names = ", ".join(one["name"] for one in found.quarantined[:_MOST_LINES])
+        lines.append(f"quarantine {_count(len(found.quarantined), 'file')}, {size(kept)}: {names}")
+    rows = [
+        f"  {one.name:<12} {one.state:<8} {one.keyframes:>7} keyframes  {size(one.nbytes):>8}"
+        + (f"  {one.lost} lost" if one.lost else "")
+        for one in found.segments
+    ]
+    lines += [f"segments   {len(found.segments)}", *_shortened(rows)]
+    lines += [f"sessions   {len(found.sessions)}", *_shortened([_session(one) for one in found.sessions])]
+    return "\n".join([*lines, *_problem_lines(found.problems)])
+
+
+def _session(one: "SessionInfo") -> str:
+    first, last = _clock(one.first_logged_ns), _clock(one.last_logged_ns)
+    return (
+        f"  {one.session[:8]}  {one.client or 'no key':<12} {one.keyframes:>7} keyframes  "
+        f"{one.first_seq}…{one.last_seq}  {first} – {last}"
+    )
+
+
+def _clock(stamp_ns: int) -> str:
+    try:
+        moment = datetime.datetime.fromtimestamp(stamp_ns / 1e9, tz=datetime.timezone.utc)
+    except (OverflowError, OSError, ValueError):
+        return f"{stamp_ns} ns"
+    return moment.strftime("%Y-%m-%d %H:%M:%SZ")
+
+
+def _describe_verdict(verdict: "Verdict") -> str:
+    from tsfusion.cli.show import size
+
+    read = f"{_count(verdict.keyframes, 'keyframe')} in {_count(verdict.segments, 'segment')}"
+    judged = "intact" if verdict.intact else f"damaged; {_loss(verdict.lost)}"
+    return "\n".join(
+        [*_problem_lines(verdict.problems), f"{verdict.path}: {read}, {size(verdict.nbytes)}: {judged}"]
+    )
+
+
+def _problem_lines(problems: "list[Problem]") -> list[str]:
+    return _shortened(
+        [
+            f"{one.kind:<7} {one.segment}, byte {one.offset}: {one.what}"
+            + (f" ({_count(one.lost, 'keyframe')} lost)" if one.lost else "")
+            for one in problems
+        ]
+    )
+
+
+def _shortened(lines: list[str]) -> list[str]:
+    if len(lines) <= _MOST_LINES:
+        return lines
+    return [*lines[:_MOST_LINES], f"  … and {len(lines) - _MOST_LINES} more: --json lists all"]

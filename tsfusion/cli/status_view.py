@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: MIT
+"""A server's health on one screen."""
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from tsfusion.cli.looking import Look
+from tsfusion.cli.show import size
+from tsfusion.logs import printable
+from tsfusion.transport.messages import ClientHealth, Health, MapHealth, Spread, Status
+
+GONE = 30.0  # seconds without a word
+MAX_CLIENTS = 40  # rows; those heard last
+_STATE_STYLES = {"idle": "green", "busy": "green", "failed": "bold red"}
+
+
+def render(look: Look) -> RenderableType:
+    """Problems first, then the server, its maps, its clients, and what it refused."""
+    parts: list[RenderableType] = [Text(f"✗ {printable(one)}", style="bold red") for one in look.problems]
+    if look.health is None:
+        return Group(*parts)
+    maps = {name: one for name, one in look.health.maps.items() if look.only in ("", name)}
+    parts += [_server(look.address, look.health), _maps(maps)]
+    parts += [note for name, one in maps.items() for note in _notes(name, one)]
+    parts += [_details(name, status) for name, status in look.maps.items()]
+    parts += [
+        Text(printable(f"map {name}: hash and settings are not known now: {why}"), style="yellow")
+        for name, why in look.unavailable.items()
+    ]
+    if clients := [one for one in look.health.clients if look.only in ("", one.map)]:
+        parts += _clients(clients)
+    if look.health.refused:
+        parts.append(Text(f"refused messages: {_reasons(look.health.refused)}", style="yellow"))
+    return Group(*parts)
+
+
+def _server(address: str, health: Health) -> Text:
+    line = Text(f"{printable(address)}  ")
+    line.append(*("ready", "bold green") if health.ready else ("not ready", "bold red"))
+    line.append(f"  up {_lasting(health.uptime_s)}, gateway {size(health.rss_bytes)}")
+    if health.duplicates:
+        line.append(f", {health.duplicates} duplicates")
+    return line
+
+
+def _maps(maps: dict[str, MapHealth]) -> RenderableType:
+    table = _table(
+        "map", "state", ">fused", ">waiting", ">delay, ms:\nmean/p95/max", ">blocks", ">memory", ">journal",
+        ">last",
+    )  # fmt: skip
+    for name, one in maps.items():
+        table.add_row(
+            _plain(name), _plain(one.state, style=_STATE_STYLES.get(one.state, "yellow")),
+            f"{one.keyframes_fused}/{one.keyframes_durable}", _waiting(one.waiting),
+            _delay(one.delay_ms, one.delay_bound_ms), str(one.blocks), size(one.map_bytes),
+            size(one.journal_bytes), _lasting(one.last_keyframe_s),
+        )  # fmt: skip
+    return table
+
+
+def _clients(clients: list[ClientHealth]) -> list[RenderableType]:
+    table = _table(
+        "client", "session", "map", ">fused", ">received", ">waiting", ">heard", "held", "skipped"
+    )  # fmt: skip
+    latest = sorted(clients, key=lambda one: one.heard_s)
+    for one in latest[:MAX_CLIENTS]:
+        table.add_row(
+            _plain(one.client or "-"), _plain(one.session), _plain(one.map), f"{one.fused}/{one.durable}",
+            size(one.received_bytes), _waiting(one.waiting), _lasting(one.heard_s),
+            _plain(one.held, style="yellow"), Text(_reasons(one.skipped), style="yellow"),
+            style="dim" if one.heard_s > GONE else "",
+        )  # fmt: skip
+    more = len(latest) - MAX_CLIENTS
+    return [table, Text(f"and {more} more sessions")] if more > 0 else [table]
+
+
+def _details(name: str, status: Status) -> Text:
+    """What only the fuser knows."""
+    volume = status.config.get("volume", {})
+    settings = ", ".join(f"{key} {volume[key]}" for key in ("voxel_size", "sensor") if key in volume)
+    peak = status.peak_rss_bytes.get("fuser", 0)
+    return _plain(
+        f"map {name}: hash {status.map_hash}, {settings}, fuser {size(peak)} at most, {status.state}"
+    )
+
+
+def _delay(delay: Spread, bound_ms: float) -> str:
+    if not delay.count:
+        return "–"
+    return f"{delay.mean:.0f}/{delay.p95:.0f}/{delay.max:.0f} ±{bound_ms:.1g}"
+
+
+def _notes(name: str, one: MapHealth) -> list[Text]:
+    """What does not happen to a map that is well."""
+    counts = {
+        "quarantined": one.quarantined, "× the fuser restarted": one.fuser_restarts,
+        "damaged records": one.journal_damaged,
+    }  # fmt: skip
+    notes = [f"{count} {what}" for what, count in counts.items() if count]
+    if one.rejected:
+        notes.append(f"rejected: {_reasons(one.rejected)}")
+    return [Text(f"map {printable(name)}: {', '.join(notes)}", style="yellow")] if notes else []
+
+
+def _reasons(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count} × {printable(reason)}" for reason, count in sorted(counts.items()))
+
+
+def _waiting(count: int) -> Text:
+    return Text(str(count), style="yellow" if count else "")
+
+
+def _lasting(seconds: float | None) -> str:
+    """3725 → 1 h 2 min."""
+    if seconds is None:
+        return "–"
+    minutes, hours, days = int(seconds // 60), int(seconds // 3600), int(seconds // 86400)
+    if days:
+        return f"{days} d {hours % 24} h"
+    if hours:
+        return f"{hours} h {minutes % 60} min"
+    return f"{minutes} min {int(seconds % 60)} s" if minutes else f"{seconds:.1f} s"
+
+
+def _table(*titles: str) -> Table:
+    """Titles that begin with `>` are of numbers."""
+    table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 1, 0, 0))
+    for title in titles:
+        table.add_column(
+            title.removeprefix(">"), overflow="fold", justify="right" if title.startswith(">") else "left"
+        )
+    return table
+
+
+def _plain(text: str, *, style: str = "") -> Text:
+    """Clients and files have a say in this: no terminal commands, and no markup."""
+    return Text(printable(text), style=style)

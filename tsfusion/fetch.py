@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: MIT
+"""What a running server can be asked: its health, a map's status, a map's mesh."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.config import DEFAULT_MAP
+from tsfusion.errors import TransportError
+from tsfusion.mesh import Mesh
+from tsfusion.transport import ClientKeys, Command, Reply, Status, control_address, request, sockets
+from tsfusion.transport.messages import Health, MeshLayout
+
+_ANSWER_TIMEOUT = 5.0  # seconds; the gateway is never busy, so who says nothing for so long is not there
+
+
+def fetch_health(
+    address: str, *, control: str | None = None, timeout: float = 10.0, keys: ClientKeys | None = None
+) -> Health:
+    """How the server at a data address is doing; answered at once, whatever its fusers do.
+
+    Args:
+        keys: of `curve.client_keys`, for a server with keys.
+
+    Raises:
+        NotAllowed: when the server turns the connection away.
+        ServerUnreachable: when nobody answers in `timeout` seconds.
+    """
+    reply, _ = _ask(address, control, Command(name="health"), timeout, keys)
+    if reply.health is None:
+        raise TransportError(f"the server at {address} answered without its health")
+    return reply.health
+
+
+def fetch_status(
+    address: str,
+    *,
+    control: str | None = None,
+    map_name: str = DEFAULT_MAP,
+    timeout: float = 10.0,
+    keys: ClientKeys | None = None,
+) -> Status:
+    """How a map of the server at a data address is doing. See `fetch_health`.
+
+    Raises:
+        TransportError: when the server cannot say.
+    """
+    reply, _ = _ask(address, control, Command(name="status", map=map_name), timeout, keys)
+    if reply.status is None:
+        raise TransportError(f"the server at {address} answered without a status")
+    return reply.status
+
+
+def fetch_mesh(
+    address: str,
+    *,
+    control: str | None = None,
+    map_name: str = DEFAULT_MAP,
+    min_weight: float | None = None,
+    timeout: float = 60.0,
+    keys: ClientKeys | None = None,
+) -> Mesh:
+    """The whole mesh of a map of the server at a data address, as of now. See `fetch_health`.
+
+    Raises:
+        ServerUnreachable: when nobody is there (known after a few seconds), or the mesh takes longer than
+            `timeout` seconds.
+        TransportError: when the server cannot make it.
+    """
+    command = Command(name="mesh", map=map_name, min_weight=min_weight)
+    reply, frames = _ask(address, control, command, timeout, keys)
+    if reply.mesh is None:
+        raise TransportError(f"the server at {address} answered without a mesh")
+    return mesh_of(reply.mesh, frames)
+
+
+def _ask(
+    address: str, control: str | None, command: Command, timeout: float, keys: ClientKeys | None
+) -> tuple[Reply, list[memoryview]]:
+    """The fuser's answer. That takes its time, so it is asked first whether anybody is there."""
+    address = control_address(sockets.target(address), control)
+    if timeout > _ANSWER_TIMEOUT:
+        request(address, Command(name="ping"), timeout=_ANSWER_TIMEOUT, keys=keys)
+    return request(address, command, timeout=timeout, keys=keys)
+
+
+def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:
+    """A mesh from its frames (see `MeshLayout`).
+
+    Raises:
+        TransportError: when the frames are not what the layout says.
+    """
+    wanted: list[tuple[int, type]] = [
+        (layout.vertices, np.float32), (layout.faces, np.int32), (layout.vertices, np.float32),
+    ]  # fmt: skip
+    if layout.colors:
+        wanted.append((layout.vertices, np.uint8))
+    sizes = [rows * 3 * np.dtype(dtype).itemsize for rows, dtype in wanted]
+    if sizes != [frame.nbytes for frame in frames]:
+        raise TransportError(f"a mesh of {sizes} bytes was announced, got {[f.nbytes for f in frames]}")
+    arrays: list[NDArray[Any]] = [
+        np.frombuffer(frame, dtype).reshape(-1, 3) for frame, (_, dtype) in zip(frames, wanted, strict=True)
+    ]
+    return Mesh(*arrays)

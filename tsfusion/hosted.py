@@ -1,0 +1,321 @@
+# SPDX-License-Identifier: MIT
+"""One map of a server: its journal, its sessions, and the fuser that works through them."""
+
+import logging
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import msgspec
+import zmq
+
+from tsfusion import logs, maps
+from tsfusion.codec import Header
+from tsfusion.config import ServerConfig, VolumeConfig
+from tsfusion.errors import JournalError
+from tsfusion.fuser_link import FuserLink
+from tsfusion.journal import Journal, read
+from tsfusion.quarantine import Quarantine
+from tsfusion.retention import Retention
+from tsfusion.sessions import Delays, Entry, KeyframeIndex, Route, Session, Sessions, Turns
+from tsfusion.transport import messages, work
+
+log = logging.getLogger(__name__)
+
+_SEGMENTS_KEPT = 4  # a journal with a limit goes in pieces of a quarter of it
+
+
+class Clients(Protocol):
+    """What a map needs of the gateway to talk to those who send."""
+
+    def send(self, session: bytes, message: messages.ToClient) -> None:
+        """Pass it to the session's client, if that is connected."""
+
+    def route(self, session: bytes) -> Route | None:
+        """Its connection."""
+
+    def observe(self, map_name: str, stage: str, seconds: float) -> None:
+        """A keyframe took so long for a stage."""
+
+
+Other = Callable[[work.Meshed | work.Answer, Sequence[zmq.Frame]], None]
+
+
+class HostedMap:
+    """Call `step` for ever, and `accept` for each keyframe.
+
+    Attributes:
+        warm: the fuser has been ready once: what the map has of each session is known.
+        problem: why keyframes are not taken now; empty = they are.
+    """
+
+    def __init__(
+        self,
+        context: "zmq.Context[Any]",
+        name: str,
+        server: ServerConfig,
+        volume: VolumeConfig,
+        clients: Clients,
+    ) -> None:
+        self.name = name
+        self.folder = maps.folder(server.state, name)
+        self.warm = False
+        self.problem = ""
+        self._server = server
+        self._clients = clients
+        most = server.journal_bytes
+        segment = server.segment_bytes if most is None else min(server.segment_bytes, most // _SEGMENTS_KEPT)
+        self._journal = Journal(
+            self.folder / maps.JOURNAL_FOLDER, segment, min_free_bytes=server.min_free_bytes
+        )
+        self._quarantine = Quarantine(self.folder / maps.QUARANTINE_FOLDER, server.quarantine_bytes)
+        self.quarantined = len(self._quarantine)
+        self.sessions = Sessions()
+        self._index = KeyframeIndex()
+        self._index.recover(self._journal.found, self.sessions)
+        self._journal.found = []
+        self._turns = Turns()
+        self._waiting = len(self._index)
+        self._delays = Delays()
+        self._fused = 0
+        self._rejected: Counter[str] = Counter()
+        self._unmeshed: deque[int] = deque()  # answered by the fuser that lives, in its order
+        self._meshed = 0  # how many of its answers went from there
+        self._blocks = self._map_bytes = 0
+        self._last: float | None = None
+        self._held_until = 0.0
+        self._retention = Retention(self._journal, self._index, self.sessions, most)
+        self.fuser = FuserLink(context, self.folder, server, volume)
+
+    @property
+    def drained(self) -> bool:
+        """Whether the map has every keyframe of the journal."""
+        return self.fuser.idle and not self._waiting
+
+    def close(self) -> None:
+        """End the fuser and finish the journal."""
+        self.fuser.close()
+        self._journal.close()
+
+    # --- keyframes ---
+
+    def held(self, now: float) -> float:
+        """Seconds for which nothing is taken because the disk refused."""
+        return max(self._held_until - now, 0.0)
+
+    def accept(self, header: Header, frames: Sequence[Any], client: str, received_ns: int) -> None:
+        """Write the session's next keyframe to the journal, and say so.
+
+        Raises:
+            JournalError: when the disk refuses; `held` says for how long nothing is tried.
+        """
+        try:
+            position = self._journal.append(frames, session=header.session, seq=header.seq, client=client)
+        except JournalError as error:
+            if str(error) != self.problem:
+                log.error("no keyframes are taken: %s", error, extra=logs.about(map=self.name))
+            self.problem = str(error)
+            self._held_until = time.monotonic() + 1.0
+            raise
+        if self.problem:
+            log.warning("keyframes are taken again", extra=logs.about(map=self.name))
+            self.problem = ""
+        session = self.sessions.open(header.session, client)
+        session.durable = header.seq
+        durable_ns = time.monotonic_ns()
+        self._index.add(
+            position,
+            session,
+            header.seq,
+            captured_ns=header.captured_ns,
+            received_ns=received_ns,
+            durable_ns=durable_ns,
+        )
+        self._waiting += 1
+        self._last = durable_ns / 1e9
+        self._turns.add(session)
+        self._clients.observe(self.name, "journal", (durable_ns - received_ns) / 1e9)
+        self.acknowledge(header.session, [messages.Stamps(header.seq, received_ns, durable_ns)])
+
+    def progress(self, key: bytes) -> tuple[int, int]:
+        """The highest seq of a session that is durable, and that is fused."""
+        session = self.sessions.get(key)
+        return (session.durable, session.fused) if session else (0, 0)
+
+    def acknowledge(
+        self, key: bytes, stamps: Sequence[messages.Stamps] = (), *, resend: bool = False
+    ) -> None:
+        """Tell a client how far its session is."""
+        self._clients.send(key, messages.Ack(key, *self.progress(key), tuple(stamps), resend))
+
+    # --- fuser ---
+
+    def step(self, other: Other) -> None:
+        """Hear the fuser, bring it back if it died, give it work, keep the journal to its limit.
+
+        Args:
+            other: takes what the fuser says to people.
+
+        Raises:
+            TsfusionError: when the map cannot be opened.
+        """
+        ended = self.fuser.ended()  # before its last words are read
+        while (heard := self.fuser.receive()) is not None:
+            message, frames = heard
+            if isinstance(message, work.Done):
+                self._on_done(message)
+            elif isinstance(message, work.Ready):
+                self._on_ready(message)
+            elif isinstance(message, work.Saved):
+                self._retention.on_saved(message)
+            elif isinstance(message, work.Meshed):
+                self._on_meshed(message)
+                other(message, frames)
+            elif isinstance(message, work.Answer):
+                other(message, frames)
+        if ended and not self.fuser.finishing:
+            self.fuser.restart()
+        self._hand_out()
+        self._retention.step(self.fuser)
+
+    def _hand_out(self) -> None:
+        while self.fuser.wants_work and (session := self._turns.next()) is not None:
+            entry = self._index[session.entries[session.handed]]
+            order = work.Fuse(entry.index, entry.position, session.key, entry.stamps.seq, session.client)
+            if not self.fuser.fuse(order):
+                return
+            session.handed += 1
+            self._turns.served()
+
+    def _on_ready(self, ready: work.Ready) -> None:
+        for key, progress in ready.done.items():
+            session = self.sessions.open(key, progress.client)
+            session.durable = max(session.durable, progress.seq)
+            session.fused = max(session.fused, progress.seq)
+        self._turns.clear()
+        self._waiting = 0
+        for session in self.sessions:
+            done = ready.done.get(session.key)
+            session.handed = self._index.after(session, done.seq) if done else 0
+            self._waiting += len(session.entries) - session.handed
+            if session.handed < len(session.entries):
+                self._turns.add(session)
+        self._fused, self._rejected = ready.keyframes, Counter(ready.rejected)
+        self._blocks, self._map_bytes = ready.blocks, ready.map_bytes
+        self._leave_unmeshed()
+        self._retention.on_ready()
+        if not self.warm:
+            self.warm = True
+            self._check_begin(ready)
+
+    def _leave_unmeshed(self) -> None:
+        """What an earlier fuser answered and did not mesh: the checkpoint has it, or it comes again."""
+        now = time.monotonic_ns()
+        for index in self._unmeshed:
+            session = self.sessions.numbered(self._index[index].session)
+            if self._index.after(session, self._index[index].stamps.seq) <= session.handed:
+                self._stamp_meshed(index, now)
+        self._unmeshed.clear()
+        self._meshed = 0
+
+    def _check_begin(self, ready: work.Ready) -> None:
+        if not ready.done and self._journal.first > 1:
+            log.error(
+                "the checkpoint is lost, and the journal goes back to segment %d only: the rest is lost",
+                self._journal.first, extra=logs.about(map=self.name),
+            )  # fmt: skip
+
+    def _on_done(self, done: work.Done) -> None:
+        entry = self._index[done.index]
+        session = self.sessions.numbered(entry.session)
+        self._waiting -= 1
+        self._unmeshed.append(done.index)
+        if done.reason is None:
+            self._fused += 1
+        else:
+            self._rejected[done.reason] += 1
+        if entry.stamps.fused_ns:
+            return  # a fuser that died before its checkpoint had said so
+        self._index.fused(done.index, done.fuse_start_ns, done.fused_ns)
+        entry = self._index[done.index]
+        session.fused = max(session.fused, entry.stamps.seq)
+        if done.reason is None:
+            self._on_fused(session, entry)
+        else:
+            self._on_rejected(session, entry, done)
+        self.acknowledge(session.key, [entry.stamps])
+
+    def _on_fused(self, session: Session, entry: Entry) -> None:
+        route, stamps = self._clients.route(session.key), entry.stamps
+        if stamps.durable_ns:  # 0: journaled by an earlier server
+            waited, fused = stamps.fuse_start_ns - stamps.durable_ns, stamps.fused_ns - stamps.fuse_start_ns
+            self._clients.observe(self.name, "queue", waited / 1e9)
+            self._clients.observe(self.name, "fuse", fused / 1e9)
+        if entry.captured_ns and route is not None and route.offset_ns is not None:
+            delay_ns = stamps.fused_ns - entry.captured_ns - route.offset_ns
+            self._delays.add(delay_ns, route.bound_ns)
+            self._clients.observe(self.name, "total", delay_ns / 1e9)
+
+    def _on_rejected(self, session: Session, entry: Entry, done: work.Done) -> None:
+        assert done.reason is not None
+        seq = entry.stamps.seq
+        subject = logs.about(
+            map=self.name, session=session.key, seq=seq, client=session.client, reason=done.reason
+        )  # fmt: skip
+        log.error("a keyframe is not in the map: %s", done.message or done.reason, extra=subject)
+        self._clients.send(session.key, messages.Nack(session.key, seq, "map", done.reason, done.message))
+        try:
+            frames = read(self._journal.folder, entry.position).frames
+        except JournalError:  # that is why it was rejected
+            return
+        kept = self._quarantine.keep(
+            frames, session=session.key, seq=seq, client=session.client, reason=done.reason
+        )
+        self.quarantined += kept is not None
+
+    def _on_meshed(self, meshed: work.Meshed) -> None:
+        self._blocks, self._map_bytes = meshed.map_blocks, meshed.map_bytes
+        for _ in range(meshed.count - self._meshed):
+            self._stamp_meshed(self._unmeshed.popleft(), meshed.meshed_ns)
+        self._meshed = meshed.count
+
+    def _stamp_meshed(self, index: int, meshed_ns: int) -> None:
+        entry = self._index[index]
+        stamps = msgspec.structs.replace(entry.stamps, meshed_ns=meshed_ns)
+        self.acknowledge(self.sessions.numbered(entry.session).key, [stamps])
+
+    # --- what people ask ---
+
+    @property
+    def state(self) -> messages.MapState:
+        """In a word."""
+        if self.fuser.failed:
+            return "failed"
+        if not self.warm:
+            return "opening"
+        if not self.fuser.ready:
+            return "restarting"
+        return "idle" if self.drained else "busy"
+
+    def health(self) -> messages.MapHealth:
+        """As far as it is known without the fuser."""
+        now = time.monotonic()
+        return messages.MapHealth(
+            state=self.state,
+            problem=self.problem or self.fuser.failed,
+            keyframes_durable=self._fused + self._rejected.total() + self._waiting,
+            keyframes_fused=self._fused,
+            waiting=self._waiting,
+            rejected=dict(self._rejected),
+            quarantined=self.quarantined,
+            sessions=len(self.sessions),
+            journal_bytes=self._journal.nbytes,
+            journal_damaged=self._journal.damaged,
+            fuser_restarts=self.fuser.restarts,
+            blocks=self._blocks,
+            map_bytes=self._map_bytes,
+            last_keyframe_s=None if self._last is None else max(now - self._last, 0.0),
+            delay_ms=self._delays.summary(),
+            delay_bound_ms=self._delays.bound_ms,
+        )

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: MIT
+"""Keeps a map's journal to its limit: what two checkpoints hold may go, oldest first."""
+
+import logging
+import time
+
+from tsfusion.errors import JournalError
+from tsfusion.fuser_link import FuserLink
+from tsfusion.journal import Journal
+from tsfusion.sessions import KeyframeIndex, Sessions
+from tsfusion.transport import work
+
+log = logging.getLogger(__name__)
+
+_SAVE_INTERVAL = 10.0  # seconds between checkpoints that are made only for the journal's sake
+
+
+class Retention:
+    """Call `step` for ever. The limit is passed only by what came since the checkpoint before the last."""
+
+    def __init__(
+        self, journal: Journal, index: KeyframeIndex, sessions: Sessions, max_bytes: int | None
+    ) -> None:
+        self._journal = journal
+        self._index = index
+        self._sessions = sessions
+        self._max_bytes = max_bytes
+        self._covered = self._covering = 0  # segments below: in the checkpoint before the last, in the last
+        self._saving = False
+        self._saved = float("-inf")
+
+    def on_ready(self) -> None:
+        """A fuser has begun, at the last checkpoint."""
+        self._saving = False
+        self._covering = self._coverage()
+
+    def on_saved(self, saved: work.Saved) -> None:
+        """The fuser wrote a checkpoint, or did not have to."""
+        self._saving = False
+        self._saved = time.monotonic()
+        if saved.written:
+            self._covered, self._covering = self._covering, self._coverage()
+
+    def _coverage(self) -> int:
+        """The segments below this one hold only keyframes that the map has."""
+        unfused = (
+            self._index.segment(session.entries[done])
+            for session in self._sessions
+            if (done := self._index.after(session, session.fused)) < len(session.entries)
+        )
+        return min(unfused, default=self._journal.segment)
+
+    def step(self, fuser: FuserLink) -> None:
+        """Make room where there is need and it can be made."""
+        if self._max_bytes is None or self._journal.nbytes <= self._max_bytes:
+            return
+        try:
+            self._journal.retire(self._covered, self._max_bytes)
+        except JournalError as error:
+            log.warning("%s", error)
+        due = not self._saving and time.monotonic() - self._saved > _SAVE_INTERVAL
+        if due and fuser.ready and self._journal.nbytes > self._max_bytes:
+            self._saving = fuser.send(work.Save())
