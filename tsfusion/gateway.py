@@ -170,8 +170,11 @@ class Gateway:
 
     def _snapshot(self) -> None:
         now = time.monotonic()
-        if self._metrics is not None and now >= self._next_snapshot:
-            self._next_snapshot = now + _SNAPSHOT_INTERVAL
+        if now < self._next_snapshot:
+            return
+        self._next_snapshot = now + _SNAPSHOT_INTERVAL
+        logs.tell_left_out()
+        if self._metrics is not None:
             self._metrics.health = self.health()
 
     # --- maps ---
@@ -188,6 +191,7 @@ class Gateway:
         hosted = self.maps[name] = HostedMap(self._context, name, self._server, volume, self)
         self._watched.pop(name, None)
         self._unopened.pop(name, None)
+        log.info("the map is being opened", extra=logs.about(map=name))
         return hosted
 
     def _open_for_a_client(self, name: str) -> HostedMap | None:

@@ -98,14 +98,17 @@ def _serve(gateway: Gateway, signals: list[int], watchdog: Watchdog) -> int:
     while not signals:
         gateway.step()
         watchdog.pet()
+    log.info("ending: what is in the journals is fused and saved first")
     watchdog.stopping()
     gateway.stop_accepting()
     while not gateway.drained and not gateway.failed and len(signals) == 1:
         gateway.step()
+        watchdog.pet()
     if not gateway.drained:
         return 1
     while not gateway.finish() and len(signals) == 1:
         gateway.step()
+        watchdog.pet()
     return 0 if gateway.finished_well else 1
 
 
