@@ -19,7 +19,7 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("processes", frozenset({"server", "gateway", "intake", "door", "hosted", "retention", "reports",
                              "questions", "quota", "quarantine", "sessions", "ports", "fuser_link", "fuser",
                              "client", "fetch", "backpressure", "room", "sender", "connection",
-                             "conversation", "refused", "outbox", "spool", "gone", "recording"})),
+                             "conversation", "refused", "outbox", "spool", "gone", "times", "recording"})),
     ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results", "metrics",
                                      "inspection", "salvage", "ros"})),
     ("map and wire", frozenset({"volume", "integration", "surface", "field", "blockstore", "meshing",
