@@ -100,7 +100,7 @@ class Run:
 
 
 def simulate(
-    policy: Policy, backlog: int, *, seconds: float, rate: float, server: float, outage: float
+    policy: Policy, *, backlog: int, seconds: float, rate: float, server: float, outage: float
 ) -> Outcome:
     """Run one policy; the outage is in the middle."""
     config = ClientConfig(policy=policy, backlog=backlog, min_free_bytes=0)
@@ -141,7 +141,7 @@ def main() -> None:
         for policy in get_args(Policy):
             outcome = simulate(
                 policy,
-                backlog,
+                backlog=backlog,
                 seconds=given.seconds,
                 rate=given.rate,
                 server=given.server,

@@ -25,7 +25,7 @@ from tsfusion import codec
 from tsfusion.transport import Command, messages, sockets
 
 _HALF_OPEN = 1000
-_UNFINISHED = 400  # parts of
+_UNFINISHED = 400  # parts
 _PART_BYTES = 900_000
 _LORISES = 50
 _PAUSE = 0.002  # between hostile messages: they shall be checked, not only queued
@@ -168,39 +168,34 @@ def part(content: bytes) -> bytes:
     return b"\x03" + struct.pack(">Q", len(content)) + content
 
 
-def unfinished(target: Target) -> int:
-    """Messages that go on and on: ZeroMQ keeps their parts until the last one comes."""
-    parts, content, links = 0, part(bytes(_PART_BYTES)), list[socket.socket]()
-    while not target.over and parts < _UNFINISHED:
+def _parts(target: Target, address: str, kind: bytes, *, most: int, size: int, links: int) -> int:
+    """So many parts of that many messages that never end; who is cut off begins anew."""
+    sent, content, open_links = 0, part(bytes(size)), list[socket.socket]()
+    while not target.over and sent < most:
         try:
-            if parts % 100 == 0 or not links:
-                links.append(raw(target.data, b"PUSH"))
-            links[-1].sendall(content)
-            parts += 1
-        except OSError:  # cut off: begin anew
-            links.append(raw(target.data, b"PUSH"))
-        time.sleep(_PAUSE)
+            if len(open_links) < links:
+                open_links.append(raw(address, kind))
+            open_links[sent % len(open_links)].sendall(content)
+            sent += 1
+        except OSError:
+            while open_links:
+                open_links.pop().close()
+        time.sleep(_PAUSE / 4)
     while not target.over:
         time.sleep(0.05)
-    for link in links:
+    for link in open_links:
         link.close()
-    return parts
+    return sent
+
+
+def unfinished(target: Target) -> int:
+    """Messages that go on and on: ZeroMQ keeps their parts until the last one comes."""
+    return _parts(target, target.data, b"PUSH", most=_UNFINISHED, size=_PART_BYTES, links=4)
 
 
 def unfinished_control(target: Target) -> int:
     """The same on the control port, whose frames are small."""
-    parts, content = 0, part(bytes(60_000))
-    link = raw(target.control, b"DEALER")
-    while not target.over and parts < 4000:
-        try:
-            link.sendall(content)
-            parts += 1
-        except OSError:
-            link.close()
-            link = raw(target.control, b"DEALER")
-        time.sleep(_PAUSE / 4)
-    link.close()
-    return parts
+    return _parts(target, target.control, b"DEALER", most=10 * _UNFINISHED, size=60_000, links=1)
 
 
 def half_open(target: Target) -> int:

@@ -29,8 +29,9 @@ Kind = Literal["server", "fuser", "scanner"]
 _RECORD_OVERHEAD = 300  # bytes of MCAP a keyframe
 KINDS: tuple[Kind, ...] = ("server", "fuser", "scanner")
 
-# Small files and frequent checkpoints: more moments at which a kill can hurt.
-SERVER = {"checkpoint_every": 20, "segment_bytes": 1 << 18}
+# Small files and frequent checkpoints: more moments at which a kill can hurt. What piled up comes faster than
+# the quota, so clients are held, too.
+SERVER = {"checkpoint_every": 20, "segment_bytes": 1 << 18, "quota_keyframes": 60.0}
 CLIENT = ClientConfig(policy="spool_all", stall_timeout=0.5, segment_bytes=1 << 16)
 
 
@@ -39,11 +40,13 @@ class Attack(Struct, frozen=True):
 
     Attributes:
         journaled: not before the journal has so many keyframes.
+        ready: not before the server is ready.
         wait: seconds from then.
     """
 
     kind: Kind
     journaled: int
+    ready: bool
     wait: float
 
 
@@ -90,9 +93,9 @@ def attacks(rng: random.Random, keyframes: int, kills: int) -> list[Attack]:
     planned: list[Attack] = []
     for kind, journaled in zip(kinds, moments, strict=True):
         if planned and rng.random() < 0.25:
-            planned.append(Attack(kind, planned[-1].journaled, rng.uniform(0.05, 2.5)))
+            planned.append(Attack(kind, planned[-1].journaled, False, rng.uniform(0.05, 2.5)))
         else:
-            planned.append(Attack(kind, journaled, rng.uniform(0.0, 0.3)))
+            planned.append(Attack(kind, journaled, True, rng.uniform(0.0, 0.5)))
     return planned
 
 
@@ -152,7 +155,7 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
         weather = Weather(random.Random(-seed - 1), proxy)
         stack.callback(weather.end)
         for attack in planned:
-            until(lambda attack=attack: scanner.finished or _journaled(state) >= attack.journaled, PATIENCE)
+            until(lambda attack=attack: scanner.finished or _is_time(attack, state, daemon), PATIENCE)
             time.sleep(attack.wait)
             ready, at = daemon.ready, round(time.monotonic() - started, 2)
             if _kill(attack.kind, daemon, scanner):
@@ -184,6 +187,10 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
         duplicates=status.duplicates if status else 0,
         carried_per_journaled=round(proxy.carried / max(_bytes(state), 1), 2),
     )
+
+
+def _is_time(attack: Attack, state: Path, daemon: Daemon) -> bool:
+    return _journaled(state) >= attack.journaled and (daemon.ready or not attack.ready)
 
 
 @functools.cache

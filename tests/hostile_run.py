@@ -52,7 +52,7 @@ class Outcome(Struct, kw_only=True):
 
 
 class Rss:
-    """The highest RSS of server and fuser since last asked, looked at all the time."""
+    """The highest RSS of server and largest fuser since last asked, looked at all the time."""
 
     def __init__(self, server: Server) -> None:
         self._server = server
@@ -63,11 +63,10 @@ class Rss:
 
     def _look(self) -> None:
         while not self._over.wait(0.02):
-            pids = [self._server.process.pid]
-            with contextlib.suppress(OSError, AssertionError):
-                pids.append(self._server.fuser_pid())
-            for at, pid in enumerate(pids):
-                self._highest[at] = max(self._highest[at], rss_bytes(pid))
+            with contextlib.suppress(OSError):
+                held = [[self._server.process.pid], self._server.children()]
+                for at, pids in enumerate(held):
+                    self._highest[at] = max(self._highest[at], *map(rss_bytes, pids), 0)
 
     def highest(self) -> list[int]:
         """Of gateway and fuser, bytes."""

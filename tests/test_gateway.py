@@ -126,7 +126,9 @@ def test_a_keyframe_that_kills_the_fuser_twice_is_quarantined(
     health = default(gateway)
     assert (health.fuser_restarts, health.rejected, health.quarantined) == (2, {"crash": 1}, 1)
     assert (health.keyframes_fused, health.keyframes_durable) == (4, 5)
-    assert "keyframe 3 is not in map default (crash)" in caplog.text
+    said = caplog.records[-1]
+    assert said.getMessage() == "a keyframe is not in the map: crash"
+    assert {"map": "default", "seq": 3, "reason": "crash"}.items() <= vars(said)["about"].items()
     (kept,) = (maps.folder(tmp_path, "default") / "quarantine").iterdir()
     assert kept.name == "00000000-3-crash.mcap"
     (record,) = journal.records(kept)

@@ -6,6 +6,28 @@ from pathlib import Path
 import pytest
 from hostile_run import run, table
 
+from tsfusion import process
+from tsfusion.ports import MemoryBound
+
+
+def test_memory_that_does_not_come_back_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else every connection would be dropped for ever."""
+    held = 0
+    monkeypatch.setattr(process, "rss_bytes", lambda: held)
+    bound = MemoryBound(800)
+    told = []
+    for held in (700, 800, 850, 900, 950, 960, 980, 1080, 1090, 400, 790, 810):  # noqa: B007
+        told.append(bound.excess(elsewhere=0))
+    assert told == [0, 0, 850, 0, 0, 960, 0, 1080, 0, 0, 0, 810]
+    assert bound.excess(elsewhere=100) == 0
+
+
+def test_memory_that_was_freed_counts_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    held = [900]
+    monkeypatch.setattr(process, "rss_bytes", lambda: held[0])
+    monkeypatch.setattr(process, "give_back_memory", lambda: held.__setitem__(0, 500))
+    assert MemoryBound(800).excess(elsewhere=0) == 0
+
 
 def test_attacks_harm_nobody(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     outcome = run(tmp_path, seconds=1.0)

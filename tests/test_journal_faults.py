@@ -141,6 +141,21 @@ def test_a_keyframe_cannot_pass_off_its_own_bytes_as_records(tmp_path: Path) -> 
         assert [found.seq for found in journal.scan(path)[0]] in ([1], [1, 2])
 
 
+def test_a_segment_of_another_version_is_not_taken_for_a_damaged_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(layout, "_SEGMENT_MAGIC", b"TSFSEG2\0")
+        log = Journal(tmp_path, BIG, sync=False)
+        fill(log)
+        log.close()
+    with pytest.raises(JournalError, match="another version of tsfusion wrote it"):
+        journal.scan(segment_path(tmp_path, 1))
+    log = Journal(tmp_path, BIG, sync=False)
+    assert (log.found, log.damaged) == ([], 1)
+    assert "another version" in caplog.text
+
+
 # --- cuts ---
 
 
@@ -281,7 +296,7 @@ def test_whatever_happens_to_a_segment_no_wrong_record_comes_back(kept: Segment,
 @EXAMPLES
 @given(st.binary(max_size=3000))
 def test_bytes_of_any_kind_are_read_without_a_complaint(kept: Segment, content: bytes) -> None:
-    layout.find_identity(content)
+    layout.find_intro(content)
     layout.head(content)
     assert layout.unpack(content, Position(1, 0)) is None
     for prefix in (b"", layout.OPENING, kept.whole[: layout.intro_bytes()]):

@@ -63,6 +63,13 @@ def test_text_is_a_line_that_says_what_it_is_about(said: Said) -> None:
     logs.configure("text", "info", "fuser")
     log.error("no checkpoint")
     assert said() == ["tsfusion fuser: ERROR: no checkpoint"]
+    logs.configure("text", "info", "fuser", map="yard")
+    log.error("no checkpoint")
+    log.error("another's", extra=logs.about(map="shed"))
+    assert said() == [
+        "tsfusion fuser: ERROR: no checkpoint (map yard)",
+        "tsfusion fuser: ERROR: another's (map shed)",
+    ]
 
 
 def test_json_is_an_object_a_line(said: Said) -> None:

@@ -125,9 +125,14 @@ class Server:
 
     def fuser_pid(self) -> int:
         """The fuser, its only child."""
-        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        children = self.children()
         assert len(children) == 1, children
-        return int(children[0])
+        return children[0]
+
+    def children(self) -> list[int]:
+        """The fusers, one for each map that is open."""
+        pids = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        return [int(pid) for pid in pids]
 
 
 @contextmanager

@@ -84,24 +84,29 @@ class BlockStore:
         return {name: self._layers[name].array for name in self._present}
 
     def insert(self, keys: NDArray[np.int64]) -> None:
-        """Append blocks with distinct new keys; their voxels are zero."""
+        """Append blocks with distinct new keys; their voxels are zero.
+
+        Raises:
+            MemoryError: when there is none for them; the map is as it was.
+        """
+        first, count = self.count, self.count + len(keys)
         for array in self._arrays():
-            array.reserve(self.count + len(keys))
-        first, self.count = self.count, self.count + len(keys)
-        self._keys.array[first : self.count] = keys
-        if 2 * self.count > len(self.hash_keys):
-            self._rebuild_hash(1 << (4 * self.count - 1).bit_length())
-        else:
-            blocks.insert_blocks(
-                self._keys.array, first, self.count - first, first, self.hash_keys, self.hash_slots
-            )
+            array.reserve(count)
+        grown = 2 * count > len(self.hash_keys)
+        if grown:
+            size = 1 << (4 * count - 1).bit_length()
+            self.hash_keys, self.hash_slots = np.zeros(size, np.int64), np.zeros(size, np.int32)
+        self._keys.array[first:count] = keys
+        self.count = count
+        self._hash(0 if grown else first)
 
     def drop(self, count: int) -> None:
         """Take back the newest blocks, so that `count` remain; their voxels must be zero."""
         for array in (self._keys, self._dirty, self._stamps, self._places, self._bounds):
             array.array[count : self.count] = 0
         self.count = count
-        self._rebuild_hash(len(self.hash_keys))
+        self.hash_keys[:] = self.hash_slots[:] = 0
+        self._hash(0)
 
     def slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
         """(n,) slots of keys, -1 where there is no such block."""
@@ -134,10 +139,11 @@ class BlockStore:
             chunk = used[i : i + _CHUNK]
             yield self.keys[chunk], self._layers[layer].array[chunk]
 
-    def _rebuild_hash(self, size: int) -> None:
-        keys, slots = np.zeros(size, np.int64), np.zeros(size, np.int32)
-        blocks.insert_blocks(self._keys.array, 0, self.count, 0, keys, slots)
-        self.hash_keys, self.hash_slots = keys, slots
+    def _hash(self, first: int) -> None:
+        """Put the blocks from `first` on into the hash."""
+        blocks.insert_blocks(
+            self._keys.array, first, self.count - first, first, self.hash_keys, self.hash_slots
+        )
 
     @property
     def bytes_per_block(self) -> int:

@@ -165,7 +165,9 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left on the disk: below, keyframes have to wait
     quarantine_bytes: Bytes = 256 << 20  # per map; keyframes that could not be fused, the oldest go first
     memory_bytes: Bytes = 512 << 20  # of the gateway; above, all connections are dropped and made anew
-    fuser_memory_bytes: Bytes | None = None  # of each fuser; None = three quarters of the machine's
+    fuser_memory_bytes: Annotated[int, Meta(ge=1 << 28)] | None = (
+        None  # of each fuser; None = three quarters of the machine's
+    )
     fuser_timeout: Positive = 60.0  # seconds on one keyframe before a fuser counts as stuck
     quota_bytes: Bytes = 256 << 20  # a second, of each client
     quota_keyframes: Positive = 1000.0  # a second, of each client

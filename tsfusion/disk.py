@@ -8,7 +8,7 @@ from pathlib import Path
 def make_folder(folder: Path) -> None:
     """Make a folder and those above it, so that they are still there after a power cut; raises OSError."""
     missing = [folder, *folder.parents]
-    missing = missing[: next(i for i, one in enumerate(missing) if one.exists())]
+    missing = missing[: next((i for i, one in enumerate(missing) if one.exists()), None)]
     folder.mkdir(parents=True, exist_ok=True)
     for made in reversed(missing):
         sync_folder(made.parent)

@@ -16,15 +16,15 @@ import time
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from tsfusion import codec, journal, maps, process
-from tsfusion.config import VIEW_SETTINGS, VolumeConfig
+from tsfusion import codec, journal, logs, maps, process
+from tsfusion.config import VIEW_SETTINGS, LogFormat, LogLevel, VolumeConfig
 from tsfusion.errors import CheckpointError, InvalidConfig, TsfusionError
 from tsfusion.mesh import Mesh
 from tsfusion.transport import sockets, work
@@ -33,7 +33,8 @@ from tsfusion.transport.messages import MeshLayout
 if TYPE_CHECKING:
     from tsfusion.volume import Volume
 
-_RESERVED = 2 << 30  # bytes of address space that Taichi sets aside and hardly uses
+_SET_ASIDE = 2 << 30  # bytes that Taichi asks for and hardly uses
+_KEPT_FREE = 256 << 20  # bytes that keyframes leave to meshes and checkpoints
 _REFINED_AT_ONCE = 256  # blocks: about 50 ms
 _FUSING_SHARE = 3  # a busy fuser meshes for at most a quarter of its time
 # Settings that may differ between a map and the server that goes on with it: none changes the sums.
@@ -58,6 +59,8 @@ class Fuser:
         self._rough = np.zeros((0, 3), np.int32)  # cells that viewers have as fused only
         self._hashes: tuple[int, str, str] | None = None
         self._working = Working(begin.working)
+        self._most = process.data_bytes() + _SET_ASIDE + begin.memory_bytes
+        process.limit_memory(self._most)
         self.exit_status: int | None = None
         self._volume = self._open()
 
@@ -109,7 +112,18 @@ class Fuser:
         return behind and (idle or time.monotonic() >= self._next_mesh)
 
     def mesh(self) -> None:
-        """Bring the mesh up to date with the map: as fused, because the next keyframe may be near."""
+        """Bring the mesh up to date with the map: as fused, because the next keyframe may be near.
+
+        Without the memory for it, viewers miss a part; a mesh on request is whole, once there is.
+        """
+        try:
+            self._mesh()
+        except MemoryError as error:
+            log.error("no memory to mesh the changed part of the map: %s", error)
+            self._meshed = self._answered
+            self._send(self._meshed_message(time.monotonic_ns()))
+
+    def _mesh(self) -> None:
         from tsfusion.blockstore import cells_of
 
         started = time.monotonic()
@@ -137,7 +151,8 @@ class Fuser:
         """Mesh a part of what was meshed as fused again, as the settings ask: only while there is nothing
         else to do, and little at a time, because a keyframe that comes meanwhile waits."""
         cells, self._rough = self._rough[:_REFINED_AT_ONCE], self._rough[_REFINED_AT_ONCE:]
-        self._publish(time.monotonic_ns(), 0, cells, self._volume.extract_mesh(blocks=cells))
+        with suppress(MemoryError):  # it stays as fused
+            self._publish(time.monotonic_ns(), 0, cells, self._volume.extract_mesh(blocks=cells))
 
     def _publish(self, stamp: int, blocks: int, cells: NDArray[np.int32], mesh: Mesh) -> None:
         layout, frames = _mesh_frames(mesh)
@@ -158,6 +173,7 @@ class Fuser:
         reason, message = order.skip, ""
         if reason is None:
             self._working.at(order.index)
+            process.limit_memory(self._most - min(_KEPT_FREE, self._begin.memory_bytes // 4))
             try:
                 record = journal.read(self._folder / maps.JOURNAL_FOLDER, order.position)
                 self._volume.integrate(codec.decode(record.frames))
@@ -165,6 +181,7 @@ class Fuser:
                 reason, message = _reason(error), str(error)
             except MemoryError as error:
                 reason, message = "memory", f"no memory to fuse it: {error}"
+            process.limit_memory(self._most)
             self._working.at(work.NOT_WORKING)  # not if it ended the process, however it did
         if reason is not None:
             self._rejected[reason] = self._rejected.get(reason, 0) + 1
@@ -187,7 +204,7 @@ class Fuser:
             if self._begin.keep_previous and path.exists():
                 path.replace(self._folder / maps.PREVIOUS_FILE)
             self._volume.save(path, meta=meta)
-        except (TsfusionError, OSError) as error:
+        except (TsfusionError, OSError, MemoryError) as error:
             # Nothing is lost: the next start fuses the journal from the checkpoint before this one.
             log.error("no checkpoint: %s", error)
             self._since_checkpoint = 1
@@ -327,7 +344,6 @@ def _serve(link: sockets.AnySocket) -> int:
 
 def _begin(link: sockets.AnySocket, message: work.Begin) -> Fuser | None:
     try:
-        process.limit_memory(process.data_bytes() + _RESERVED + message.memory_bytes)
         process.end_first()
         fuser = Fuser(link, message)
     except TsfusionError as error:
@@ -339,11 +355,12 @@ def _begin(link: sockets.AnySocket, message: work.Begin) -> Fuser | None:
 
 
 def main() -> int:
-    """`python -m tsfusion.fuser ENDPOINT`, as the gateway starts it."""
-    logging.basicConfig(format="tsfusion fuser: %(levelname)s: %(message)s")
+    """`python -m tsfusion.fuser ENDPOINT FORMAT LEVEL MAP`, as the gateway starts it."""
+    endpoint, format_, level, map_name = sys.argv[1:]
+    logs.configure(cast("LogFormat", format_), cast("LogLevel", level), "fuser", map=map_name)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # a terminal or supervisor signals all; the gateway decides
-    return run(sys.argv[1])
+    return run(endpoint)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from typing import Any
 
 import zmq
 
-from tsfusion import errors, process
+from tsfusion import errors, logs, process
 from tsfusion.config import ServerConfig, VolumeConfig
 from tsfusion.errors import MapError, TsfusionError
 from tsfusion.transport import sockets, work
@@ -60,6 +60,8 @@ class FuserLink:
             server.journal_bytes is not None,
             server.fuser_memory_bytes or process.physical_memory_bytes() * 3 // 4,
         )
+        self._map = folder.name
+        self._logs = (server.log_format, server.log_level, self._map)
         self._timeout = server.fuser_timeout
         self._ended_early = 0  # processes in a row that got nothing done
         self._blame: dict[int, int] = {}
@@ -79,7 +81,7 @@ class FuserLink:
         self.socket = sockets.pair(self._context)
         self.socket.bind(endpoint)
         self._process = subprocess.Popen(
-            [*COMMAND, endpoint],
+            [*COMMAND, endpoint, *self._logs],
             stdin=subprocess.PIPE,  # closes when the gateway dies, however it dies
             stdout=subprocess.DEVNULL,
             start_new_session=True,  # a Ctrl-C is for the gateway
@@ -152,7 +154,8 @@ class FuserLink:
         busy = bool(self.in_flight) or self._finish_sent
         patience = self._timeout * (1 if self._working() != work.NOT_WORKING else _PATIENCE)
         if busy and self.ready and time.monotonic() - self._heard > patience:
-            log.error("the fuser process has been silent for %.0f s: it is killed", patience)
+            subject = logs.about(map=self._map)
+            log.error("the fuser process has been silent for %.0f s: it is killed", patience, extra=subject)
             self._put_down(_OWN_DEATH)
             self._process.kill()
             self._process.wait()
@@ -190,6 +193,7 @@ class FuserLink:
             "the fuser process ended with status %s; another takes over from the checkpoint%s",
             status,
             f" in {pause:.0f} s" if pause else "",
+            extra=logs.about(map=self._map),
         )
 
     def _put_down(self, weight: int) -> None:

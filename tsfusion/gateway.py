@@ -13,14 +13,14 @@ from typing import Any
 
 import zmq
 
-from tsfusion import codec, process, reports
+from tsfusion import codec, logs, process, reports
 from tsfusion.config import DEFAULT_MAP, ServerConfig, VolumeConfig
 from tsfusion.door import Door
 from tsfusion.errors import DecodeError, TsfusionError
 from tsfusion.hosted import HostedMap
 from tsfusion.intake import Intake
 from tsfusion.metrics import Metrics
-from tsfusion.ports import Ports, each, send_now
+from tsfusion.ports import MemoryBound, Ports, each, send_now
 from tsfusion.questions import Questions
 from tsfusion.sessions import Route, Routes
 from tsfusion.transport import messages, sockets, work
@@ -63,6 +63,7 @@ class Gateway:
         self._topics: set[bytes] = set()  # that somebody subscribed to
         self._watched: dict[str, bool] = {}  # what each fuser knows of it
         self._unopened: dict[str, tuple[str, float]] = {}  # maps that could not be opened: why, when
+        self._memory = MemoryBound(server.memory_bytes)
         self._accepting = self._started_up = False
         self._started = time.monotonic()
         self._next_snapshot = 0.0
@@ -91,9 +92,15 @@ class Gateway:
         """Whether every map has every keyframe of its journal."""
         return all(hosted.drained for hosted in self.maps.values())
 
+    @property
+    def failed(self) -> bool:
+        """Whether a map's fuser cannot be kept alive: it will not be drained."""
+        return any(hosted.fuser.failed for hosted in self.maps.values())
+
     def accept(self) -> None:
         """Take keyframes from here on."""
         self._accepting = self._started_up = True
+        self._next_snapshot = 0.0  # health checks are to know at once
 
     def stop_accepting(self) -> None:
         """Take no more keyframes; clients keep what is not acknowledged."""
@@ -149,8 +156,8 @@ class Gateway:
             log.warning("a key was revoked: every connection is made anew")
             self._refused["revoked"] += 1
         else:
-            held = process.rss_bytes() - self._questions.nbytes
-            if held <= self._server.memory_bytes:
+            held = self._memory.excess(self._questions.nbytes)
+            if not held:
                 return
             log.error(
                 "the gateway holds %d MB, more than memory_bytes: every connection is made anew", held >> 20
@@ -163,8 +170,11 @@ class Gateway:
 
     def _snapshot(self) -> None:
         now = time.monotonic()
-        if self._metrics is not None and now >= self._next_snapshot:
-            self._next_snapshot = now + _SNAPSHOT_INTERVAL
+        if now < self._next_snapshot:
+            return
+        self._next_snapshot = now + _SNAPSHOT_INTERVAL
+        logs.tell_left_out()
+        if self._metrics is not None:
             self._metrics.health = self.health()
 
     # --- maps ---
@@ -181,6 +191,7 @@ class Gateway:
         hosted = self.maps[name] = HostedMap(self._context, name, self._server, volume, self)
         self._watched.pop(name, None)
         self._unopened.pop(name, None)
+        log.info("the map is being opened", extra=logs.about(map=name))
         return hosted
 
     def _open_for_a_client(self, name: str) -> HostedMap | None:
@@ -191,7 +202,7 @@ class Gateway:
             return None
 
     def _give_up(self, name: str, error: TsfusionError) -> None:
-        log.error("map %s cannot be opened: %s", name, error)
+        log.error("the map cannot be opened: %s", error, extra=logs.about(map=name))
         self._unopened[name] = (str(error), time.monotonic())
         hosted = self.maps.pop(name, None)
         if hosted is not None:

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import msgspec
 import zmq
 
-from tsfusion import maps
+from tsfusion import logs, maps
 from tsfusion.codec import Header
 from tsfusion.config import ServerConfig, VolumeConfig
 from tsfusion.errors import JournalError
@@ -114,12 +114,12 @@ class HostedMap:
             position = self._journal.append(frames, session=header.session, seq=header.seq, client=client)
         except JournalError as error:
             if str(error) != self.problem:
-                log.error("map %s takes no keyframes: %s", self.name, error)
+                log.error("no keyframes are taken: %s", error, extra=logs.about(map=self.name))
             self.problem = str(error)
             self._held_until = time.monotonic() + 1.0
             raise
         if self.problem:
-            log.warning("map %s takes keyframes again", self.name)
+            log.warning("keyframes are taken again", extra=logs.about(map=self.name))
             self.problem = ""
         session = self.sessions.open(header.session, client)
         session.durable = header.seq
@@ -207,6 +207,7 @@ class HostedMap:
         self._retention.on_ready()
         if not self.warm:
             self.warm = True
+            log.info("the map is open", extra=logs.about(map=self.name))
             self._check_begin(ready)
 
     def _leave_unmeshed(self) -> None:
@@ -222,8 +223,8 @@ class HostedMap:
     def _check_begin(self, ready: work.Ready) -> None:
         if not ready.done and self._journal.first > 1:
             log.error(
-                "map %s lost its checkpoint, and its journal goes back to segment %d only: what was before "
-                "is lost", self.name, self._journal.first,
+                "the checkpoint is lost, and the journal goes back to segment %d only: the rest is lost",
+                self._journal.first, extra=logs.about(map=self.name),
             )  # fmt: skip
 
     def _on_done(self, done: work.Done) -> None:
@@ -260,7 +261,10 @@ class HostedMap:
     def _on_rejected(self, session: Session, entry: Entry, done: work.Done) -> None:
         assert done.reason is not None
         seq = entry.stamps.seq
-        log.error("keyframe %d is not in map %s (%s): %s", seq, self.name, done.reason, done.message)
+        subject = logs.about(
+            map=self.name, session=session.key, seq=seq, client=session.client, reason=done.reason
+        )  # fmt: skip
+        log.error("a keyframe is not in the map: %s", done.message or done.reason, extra=subject)
         self._clients.send(session.key, messages.Nack(session.key, seq, "map", done.reason, done.message))
         try:
             frames = read(self._journal.folder, entry.position).frames
@@ -279,6 +283,8 @@ class HostedMap:
 
     def _stamp_meshed(self, index: int, meshed_ns: int) -> None:
         entry = self._index[index]
+        if entry.stamps.fused_ns:
+            self._clients.observe(self.name, "mesh", (meshed_ns - entry.stamps.fused_ns) / 1e9)
         stamps = msgspec.structs.replace(entry.stamps, meshed_ns=meshed_ns)
         self.acknowledge(self.sessions.numbered(entry.session).key, [stamps])
 

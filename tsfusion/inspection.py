@@ -101,7 +101,7 @@ def summarize(place: Place, watch: Watcher) -> Info:
         segments=list(segments.values()),
         sessions=list(sessions.values()),
         problems=problems,
-        quarantined=[{"name": path.name, "bytes": path.stat().st_size} for path in place.quarantined()],
+        quarantined=[{"name": path.name, "bytes": _segment(path).nbytes} for path in place.quarantined()],
     )
 
 

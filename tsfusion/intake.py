@@ -13,7 +13,7 @@ from typing import Any
 
 import zmq
 
-from tsfusion import codec
+from tsfusion import codec, logs
 from tsfusion.config import ServerConfig
 from tsfusion.door import Door
 from tsfusion.errors import JournalError
@@ -57,14 +57,15 @@ class Intake:
         try:
             header = codec.unpack(buffers[0])
         except codec.Refused as error:
-            self._refuse(error)
+            self._refuse(error, client)
             return
         hosted = self._maps.get(header.map)
         if hosted is None or not hosted.warm:  # its client will say hello, and send it again
             self.refused["map"] += 1
         elif not self.owns(hosted, header.session, client):
             self.refused["session"] += 1
-            log.error("client %s sent a keyframe of a session that is another's", client)
+            subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
+            log.warning("a keyframe is refused: its session is another client's", extra=subject)
         elif not self._has_to_wait(hosted, header.session, client, nbytes):
             self._on_checked(hosted, header, buffers, client, received_ns)
 
@@ -107,7 +108,7 @@ class Intake:
             codec.check(buffers, self._server.max_frame_bytes)
             self._quotas.check(header)
         except codec.Refused as error:
-            self._refuse(error, header)
+            self._refuse(error, client, header)
             return
         verdict = hosted.sessions.admit(header.session, header.seq, header.previous)
         if verdict == "next":
@@ -120,10 +121,15 @@ class Intake:
             self.refused["gap"] += verdict == "gap"
             hosted.acknowledge(header.session, resend=verdict == "gap")
 
-    def _refuse(self, error: codec.Refused, header: codec.Header | None = None) -> None:
+    def _refuse(self, error: codec.Refused, client: str, header: codec.Header | None = None) -> None:
         """Count a bad message; answer it when it says whose it is, so that it is not sent for ever."""
         self.refused[error.reason] += 1
-        log.warning("a message is refused (%s): %s", error.reason, error)
-        if header is not None:
-            key, seq = header.session, header.seq
-            self._clients.send(key, messages.Nack(key, seq, "door", error.reason, str(error)))
+        if header is None:
+            log.warning(
+                "a message is refused: %s", error, extra=logs.about(client=client, reason=error.reason)
+            )  # fmt: skip
+            return
+        key, seq = header.session, header.seq
+        subject = logs.about(map=header.map, session=key, seq=seq, client=client, reason=error.reason)
+        log.warning("a keyframe is refused: %s", error, extra=subject)
+        self._clients.send(key, messages.Nack(key, seq, "door", error.reason, str(error)))

@@ -20,12 +20,15 @@ MOST, PERIOD = 20, 60.0  # lines from one place in the code, in so many seconds
 log = logging.getLogger(__name__)
 
 
-def configure(format: LogFormat, level: LogLevel, process: str = "server") -> None:
+def configure(format: LogFormat, level: LogLevel, process: str = "server", *, map: str | None = None) -> None:
     """Log to stderr from now on; `process` (server or fuser) stands in every line.
+
+    Args:
+        map: what every line is about that does not say otherwise.
 
     Only tsfusion's own loggers are set to `level`; other packages log warnings and errors.
     """
-    formatter = JsonFormatter(process) if format == "json" else TextFormatter(process)
+    formatter = (JsonFormatter if format == "json" else TextFormatter)(process, map)
     for handler in logging.root.handlers[:]:
         if isinstance(handler, Stderr):
             logging.root.removeHandler(handler)
@@ -72,13 +75,14 @@ def printable(text: str, most: int = MESSAGE_CHARACTERS) -> str:
 class TextFormatter(logging.Formatter):
     """`tsfusion: WARNING: a message is refused (map yard, session 1a2b3c4d, seq 7)`."""
 
-    def __init__(self, process: str) -> None:
+    def __init__(self, process: str, map: str | None = None) -> None:
         super().__init__()
+        self._map = map
         self._name = "tsfusion" if process == "server" else f"tsfusion {process}"
 
     def format(self, record: logging.LogRecord) -> str:
         """One line; a traceback follows on lines of its own."""
-        subject = ", ".join(f"{key} {value}" for key, value in _about(record).items())
+        subject = ", ".join(f"{key} {value}" for key, value in _about(record, self._map).items())
         line = f"{self._name}: {record.levelname}: {printable(record.getMessage())}"
         trace = _trace(record)
         return line + (f" ({subject})" if subject else "") + (f"\n{trace}" if trace else "")
@@ -87,8 +91,9 @@ class TextFormatter(logging.Formatter):
 class JsonFormatter(logging.Formatter):
     """An object a line: time (UTC), level, process, logger, message, what it is about, exception."""
 
-    def __init__(self, process: str) -> None:
+    def __init__(self, process: str, map: str | None = None) -> None:
         super().__init__()
+        self._map = map
         self._process = process
 
     def format(self, record: logging.LogRecord) -> str:
@@ -100,15 +105,15 @@ class JsonFormatter(logging.Formatter):
             "process": self._process,
             "logger": record.name,
             "message": printable(record.getMessage()),
-            **_about(record),
+            **_about(record, self._map),
         }
         if trace := _trace(record):
             fields["exception"] = trace
         return json.dumps(fields)
 
 
-def _about(record: logging.LogRecord) -> dict[str, Any]:
-    given = getattr(record, "about", {})
+def _about(record: logging.LogRecord, map: str | None) -> dict[str, Any]:
+    given = about(map=map)["about"] | getattr(record, "about", {})
     shown = {key: given[key] for key in ABOUT if key in given}
     return {key: value if isinstance(value, int) else printable(str(value)) for key, value in shown.items()}
 

@@ -12,7 +12,7 @@ from tsfusion.spool import Spool, Waiting
 from tsfusion.times import Times
 from tsfusion.transport.messages import Stamps
 
-_MAX_REJECTED = 65536  # numbers, of which the map's answer may still be under way
+_MOST = 65536  # numbers that are remembered: rejected ones, and fused ones that no mesh shows yet
 
 
 class ClientStats(Struct, frozen=True):
@@ -64,7 +64,7 @@ class Outbox:
         self.spool = spool
         self.outstanding = 0
         self.unfused: deque[int] = deque()
-        self.unmeshed: deque[int] = deque()
+        self.unmeshed: deque[int] = deque(maxlen=_MOST)
         self.refusals = 0
         self.first_refusal = ""
         self.connected = False
@@ -206,7 +206,7 @@ class Outbox:
             return
         self._rejected[reason] += 1
         self._rejected_seqs[seq] = None
-        if len(self._rejected_seqs) > _MAX_REJECTED:
+        if len(self._rejected_seqs) > _MOST:
             self._rejected_seqs.popitem(last=False)
 
     def find(self, seq: int) -> Waiting | None:

@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 
 import zmq
 
+from tsfusion import process
 from tsfusion.config import ServerConfig
 from tsfusion.errors import TransportError
 from tsfusion.transport import Addresses, sockets
@@ -90,6 +91,32 @@ def send_now(socket: sockets.AnySocket, frames: list[Any]) -> None:
         socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
     except zmq.Again:
         log.warning("an answer was dropped: its connection is full")
+
+
+class MemoryBound:
+    """When what connections hold in memory is too much, so that they have to be dropped.
+
+    That frees it, but not at once (threads of ZeroMQ's do it) and perhaps not all (this process may need
+    it): who was told counts from what is held then, or would be told for ever.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = self._bound = most
+
+    def excess(self, elsewhere: int) -> int:
+        """What this process holds, bytes, when that is too much; else 0.
+
+        Args:
+            elsewhere: bytes that do not count.
+        """
+        held = process.rss_bytes() - elsewhere
+        if held > self._bound:  # perhaps freed already, and only kept for later
+            process.give_back_memory()
+            held = process.rss_bytes() - elsewhere
+        told = held if held > self._bound else 0
+        reached = held + self._most // 8
+        self._bound = max(self._most, reached if told else min(self._bound, reached))
+        return told
 
 
 class Departures:

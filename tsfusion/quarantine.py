@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from tsfusion import journal
+from tsfusion import disk, journal, logs
 from tsfusion.errors import JournalError
 
 log = logging.getLogger(__name__)
@@ -32,11 +32,12 @@ class Quarantine:
         """Put a keyframe message aside; its file, or None when the disk refuses (which is logged)."""
         path = self.folder / f"{session[:4].hex()}-{seq}-{reason}.mcap"
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            disk.make_folder(self.folder)
             journal.write_file(path, frames, session=session, seq=seq, client=client)
             self._prune(path)
         except (JournalError, OSError) as error:
-            log.error("keyframe %d could not be put into quarantine: %s", seq, error)
+            subject = logs.about(session=session, seq=seq, client=client, reason=reason)
+            log.error("a keyframe could not be put into quarantine: %s", error, extra=subject)
             return None
         return path
 

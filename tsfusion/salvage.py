@@ -72,7 +72,11 @@ def recover(place: Place, out: Path, segment_bytes: int, watch: Watcher) -> Reco
 
 
 def _check(place: Place, out: Path) -> None:
-    if out.is_dir() and any(out.iterdir()):
+    try:
+        is_used = out.is_dir() and any(out.iterdir())
+    except OSError as error:
+        raise OutputError(f"cannot write to {out}: {error.strerror}") from error
+    if is_used:
         raise OutputError(f"cannot write to {out}: it is not empty; give a folder that does not exist yet")
     source = place.path.resolve()
     if out.resolve().is_relative_to(source if source.is_dir() else source / out.name):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The server: a gateway that journals and acknowledges keyframes, and the fusers it keeps at work."""
 
+import logging
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -20,6 +21,8 @@ from tsfusion.ports import Ports
 from tsfusion.spool import lock_folder
 from tsfusion.transport import Addresses, sockets
 from tsfusion.watchdog import Watchdog
+
+log = logging.getLogger(__name__)
 
 _SECOND_SIGNAL = 1.0  # seconds after the first
 
@@ -82,9 +85,9 @@ def _open(
     stack.callback(ports.close)
     metrics = None
     if server.metrics is not None:
-        metrics = Metrics()
+        metrics = Metrics(server)
         stack.callback(metrics.close)
-        metrics.serve(server.metrics)
+        log.info("figures and health checks are at http://%s", metrics.serve(server.metrics))
     gateway = Gateway(context, server, ports, door, metrics)
     stack.callback(gateway.close)
     gateway.open(volumes)
@@ -95,14 +98,17 @@ def _serve(gateway: Gateway, signals: list[int], watchdog: Watchdog) -> int:
     while not signals:
         gateway.step()
         watchdog.pet()
+    log.info("ending: what is in the journals is fused and saved first")
     watchdog.stopping()
     gateway.stop_accepting()
-    while not gateway.drained and len(signals) == 1:
+    while not gateway.drained and not gateway.failed and len(signals) == 1:
         gateway.step()
+        watchdog.pet()
     if not gateway.drained:
         return 1
     while not gateway.finish() and len(signals) == 1:
         gateway.step()
+        watchdog.pet()
     return 0 if gateway.finished_well else 1
 
 

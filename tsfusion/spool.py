@@ -18,7 +18,7 @@ from typing import BinaryIO
 
 from msgspec import Struct
 
-from tsfusion import codec, journal
+from tsfusion import codec, disk, journal
 from tsfusion.config import DEFAULT_MAP
 from tsfusion.errors import DecodeError, JournalError
 from tsfusion.gone import Gone
@@ -245,7 +245,7 @@ def lock_folder(folder: Path, kind: str, owner: str) -> BinaryIO:
         JournalError: when it cannot be written, or another process holds it.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        disk.make_folder(folder)
         file = (folder / "lock").open("ab")
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL
         raise JournalError(

@@ -37,20 +37,32 @@ class GrowingArray:
         return int(np.prod(self._item, dtype=np.int64)) * self._dtype.itemsize
 
     def reserve(self, capacity: int) -> None:
-        """Make room for `capacity` items; new items are zero."""
+        """Make room for `capacity` items; new items are zero.
+
+        Raises:
+            MemoryError: when there is none; what there was stays.
+        """
         if capacity <= self.capacity:
             return
-        capacity = max(capacity, min(2 * self.capacity, MAX_ITEMS))
+        try:
+            self._grow(max(capacity, min(2 * self.capacity, MAX_ITEMS)))
+        except MemoryError:
+            self._grow(capacity)  # near the limit, no more than is needed
+
+    def _grow(self, capacity: int) -> None:
         if sys.platform != "linux":
             grown = np.zeros((capacity, *self._item), self._dtype)
             grown[: self.capacity] = self.array
             self.array = grown
             return
         size = capacity * self.item_bytes
-        if self._map is None:
-            self._map = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-        else:
-            self._map.resize(size)
+        try:
+            if self._map is None:
+                self._map = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+            else:
+                self._map.resize(size)
+        except OSError as error:
+            raise MemoryError(f"no memory for {size >> 20} MB: {error.strerror}") from error
         # By address, not as a buffer of the map: Taichi's launches leave reference cycles around their
         # arguments, and a map with a buffer still exported refuses to be resized.
         address = ctypes.addressof(ctypes.c_char.from_buffer(self._map))

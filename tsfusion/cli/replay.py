@@ -162,8 +162,8 @@ def _run(
 
     server = override(chosen.server, listen="tcp://127.0.0.1:0", state=str(state)) if state else None
     client = override(chosen.client, control=control, map=map_, key=key, server_key=server_key)
-    if connect is None:  # an own server, which only this machine reaches: no keys
-        server = replace(server, keys=None) if server else None
+    if connect is None:  # a server of its own: only this machine reaches it, its errors are told here
+        server = replace(server, keys=None, metrics=None, log_format="text") if server else None
         client = replace(client, key=None, server_key=None)
     with show.progress(quiet=json) as progress:
         run = pipeline.replay(

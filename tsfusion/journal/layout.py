@@ -188,11 +188,22 @@ def unpack(raw: bytes, position: Position) -> Record | None:
     return Record(position, parsed.session, parsed.seq, client, parsed.logged_ns, frames)
 
 
-def find_identity(raw: bytes) -> tuple[bytes, int, bytes] | None:
-    """From the start of a file: the segment's identity, where its chunk ends, and what must follow there.
+class Intro(NamedTuple):
+    """The first chunk of a segment."""
 
-    None when that chunk is not there or damaged.
-    """
+    layout: bytes
+    identity: bytes
+    end: int
+    message_index: bytes  # what the writer puts behind the chunk
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether this module can read the rest."""
+        return self.layout == _SEGMENT_MAGIC
+
+
+def find_intro(raw: bytes) -> Intro | None:
+    """The segment's own chunk, from the start of a file; None when it is not there or damaged."""
     at = len(OPENING)
     if len(raw) < at + _CHUNK.size:
         return None
@@ -204,10 +215,10 @@ def find_identity(raw: bytes) -> tuple[bytes, int, bytes] | None:
     if not inner <= message or end > len(raw) or zlib.crc32(raw[inner:end]) != crc32:
         return None
     _, _, channel, _, logged_ns, _ = _MESSAGE.unpack_from(raw, message)
-    magic, found = _IDENTITY.unpack_from(raw, message + _MESSAGE.size)
-    if (channel, magic) != (_SEGMENT, _SEGMENT_MAGIC) or not first_ns == last_ns == logged_ns:
+    magic, identity = _IDENTITY.unpack_from(raw, message + _MESSAGE.size)
+    if (channel, magic[:6]) != (_SEGMENT, _SEGMENT_MAGIC[:6]) or not first_ns == last_ns == logged_ns:
         return None
-    return found, end, _index(channel, logged_ns, message - inner)
+    return Intro(magic, identity, end, _index(channel, logged_ns, message - inner))
 
 
 @cache

@@ -10,7 +10,7 @@ from tsfusion import maps
 from tsfusion.errors import JournalError
 from tsfusion.journal.layout import Position, Record
 from tsfusion.journal.segments import segment_path, segments
-from tsfusion.journal.walk import Damage, segment_number, walk
+from tsfusion.journal.walk import Damage, failed, segment_number, walk
 
 Watcher = Callable[[int, int], None]  # bytes read, bytes of all
 
@@ -37,10 +37,17 @@ class Place(Struct, frozen=True):
         return [segment_path(self.path, number) for number in segments(self.path)]
 
     def quarantined(self) -> list[Path]:
-        """The files in quarantine, by name."""
+        """The files in quarantine, by name.
+
+        Raises:
+            JournalError: when the folder cannot be listed.
+        """
         if self.quarantine is None or not self.quarantine.is_dir():
             return []
-        return sorted(path for path in self.quarantine.iterdir() if path.suffix == ".mcap")
+        try:
+            return sorted(path for path in self.quarantine.iterdir() if path.suffix == ".mcap")
+        except OSError as error:
+            raise failed("list", self.quarantine, error) from error
 
     def steps(self, watch: Watcher = lambda _done, _all: None) -> Iterator[tuple[Path, Record | Damage]]:
         """Each record and each damaged place, with its file. A file that cannot be read is one such place."""

@@ -23,7 +23,7 @@ class Source:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.path = path
         self._file = path.open("rb", buffering=0)
         self.size = os.fstat(self._file.fileno()).st_size
         self.failed = False
@@ -49,7 +49,7 @@ class Source:
                 raise
         if not self.failed:
             self.failed = True
-            log.error("%s: the disk cannot read all of it", self._path)
+            log.error("%s: the disk cannot read all of it", self.path)
         return b"".join(self._sector(one, at + count) for one in range(at, at + count, _SECTOR_BYTES))
 
     def _sector(self, at: int, end: int) -> bytes:

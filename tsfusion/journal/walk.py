@@ -17,6 +17,7 @@ from tsfusion.journal.layout import Position, Record
 from tsfusion.journal.source import Source
 
 _WINDOW_BYTES = 1 << 20
+_MAX_INTRO_BYTES = 1 << 16
 # Bytes that a search may spend on chunks whose CRC then differs, in sizes of the file: a made-up file could
 # have each byte begin a chunk that ends with the file.
 _PATIENCE = 64
@@ -132,7 +133,9 @@ class _Walk:
             if size:
                 yield self._note(0, size, "its first write was cut off", torn=True)
             return size
-        known = layout.find_identity(self._source.read(0, layout.intro_bytes(), self._end))
+        known = layout.find_intro(self._source.read(0, _MAX_INTRO_BYTES, self._end))
+        if known is not None and not known.is_ours:
+            raise JournalError(f"cannot read {self._source.path}: another version of tsfusion wrote it")
         first = self._search(len(expected)) if known is None else None
         if opening != expected and known is None and first is None:
             self._lost += 1
@@ -141,8 +144,8 @@ class _Walk:
         if opening != expected:
             yield self._note(0, len(expected), "its opening is damaged")
         if known is not None:
-            self._identity, end, index = known
-            return self._behind(end, index)
+            self._identity = known.identity
+            return self._behind(known.end, known.message_index)
         end = self._end if first is None else first
         lost = int(end != layout.intro_bytes())
         self._lost += lost
