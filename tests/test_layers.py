@@ -20,7 +20,7 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
                              "atlas", "questions", "quota", "quarantine", "sessions", "ports", "fuser_link",
                              "fuser", "saved_map",
                              "client", "fetch", "backpressure", "room", "sender", "connection",
-                             "conversation", "refused", "outbox", "spool", "gone", "recording"})),
+                             "conversation", "refused", "outbox", "spool", "gone", "times", "recording"})),
     ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results", "metrics",
                                      "inspection", "salvage", "ros"})),
     ("map and wire", frozenset({"volume", "integration", "surface", "field", "blockstore", "meshing",
