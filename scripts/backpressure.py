@@ -100,7 +100,7 @@ class Run:
 
 
 def simulate(
-    policy: Policy, backlog: int, seconds: float, rate: float, server: float, outage: float
+    policy: Policy, *, backlog: int, seconds: float, rate: float, server: float, outage: float
 ) -> Outcome:
     """Run one policy; the outage is in the middle."""
     config = ClientConfig(policy=policy, backlog=backlog, min_free_bytes=0)
@@ -139,7 +139,14 @@ def main() -> None:
     started = time.monotonic()
     for backlog in given.backlog:
         for policy in get_args(Policy):
-            outcome = simulate(policy, backlog, given.seconds, given.rate, given.server, given.outage)
+            outcome = simulate(
+                policy,
+                backlog=backlog,
+                seconds=given.seconds,
+                rate=given.rate,
+                server=given.server,
+                outage=given.outage,
+            )
             if given.json:
                 print(json.dumps(asdict(outcome)))
             else:

@@ -207,6 +207,7 @@ class HostedMap:
         self._retention.on_ready()
         if not self.warm:
             self.warm = True
+            log.info("the map is open", extra=logs.about(map=self.name))
             self._check_begin(ready)
 
     def _leave_unmeshed(self) -> None:
@@ -282,6 +283,8 @@ class HostedMap:
 
     def _stamp_meshed(self, index: int, meshed_ns: int) -> None:
         entry = self._index[index]
+        if entry.stamps.fused_ns:
+            self._clients.observe(self.name, "mesh", (meshed_ns - entry.stamps.fused_ns) / 1e9)
         stamps = msgspec.structs.replace(entry.stamps, meshed_ns=meshed_ns)
         self.acknowledge(self.sessions.numbered(entry.session).key, [stamps])
 

@@ -70,11 +70,16 @@ def raise_file_limit() -> None:
 
 
 def physical_memory_bytes() -> int:
-    """The machine's memory, or what the container may have of it."""
-    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    with suppress(OSError, ValueError):  # no container, or "max"
-        return min(whole, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
-    return whole
+    """The machine's memory, or what its container or service may have of it."""
+    limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    group = "/"
+    with suppress(OSError):
+        group = Path("/proc/self/cgroup").read_text(encoding="utf-8").rpartition("0::")[2].strip()
+    for name in {group, "/"}:
+        with suppress(OSError, ValueError):  # no such group, or no limit: "max"
+            path = Path("/sys/fs/cgroup") / name.lstrip("/") / "memory.max"
+            limits.append(int(path.read_text(encoding="ascii")))
+    return min(limits)
 
 
 def oom_kills() -> int:

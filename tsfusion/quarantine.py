@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from tsfusion import journal, logs
+from tsfusion import disk, journal, logs
 from tsfusion.errors import JournalError
 
 log = logging.getLogger(__name__)
@@ -32,7 +32,7 @@ class Quarantine:
         """Put a keyframe message aside; its file, or None when the disk refuses (which is logged)."""
         path = self.folder / f"{session[:4].hex()}-{seq}-{reason}.mcap"
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            disk.make_folder(self.folder)
             journal.write_file(path, frames, session=session, seq=seq, client=client)
             self._prune(path)
         except (JournalError, OSError) as error:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A journal, spool or segment as a dataset of keyframes: what was scanned live can be replayed offline."""
 
+import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,8 @@ from tsfusion.config import VolumeConfig
 from tsfusion.errors import DecodeError, JournalError
 from tsfusion.journal import places
 from tsfusion.keyframe import Keyframe
+
+log = logging.getLogger(__name__)
 
 
 class Recording:
@@ -62,9 +65,10 @@ def read_keyframes(path: str | os.PathLike[str]) -> Iterator[Keyframe]:
 def _places(place: places.Place) -> list[tuple[Path, int]]:
     """Segment file and offset of each keyframe."""
     found, last = [], dict[bytes, int]()
-    for file in place.files():
-        for record in journal.scan(file)[0]:
-            if record.seq > last.get(record.session, 0):
-                last[record.session] = record.seq
-                found.append((file, record.position.offset))
+    for file, step in place.steps():
+        if isinstance(step, journal.Damage):
+            log.log(logging.WARNING if step.torn else logging.ERROR, "%s: %s", file, step.what)
+        elif step.seq > last.get(step.session, 0):
+            last[step.session] = step.seq
+            found.append((file, step.position.offset))
     return found

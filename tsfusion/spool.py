@@ -25,8 +25,8 @@ from tsfusion.gone import Gone
 
 log = logging.getLogger(__name__)
 
-# A restarted scanner skips numbers: those of records that a power cut took must never be used again. How many is
-# drawn, so that two scanners with copies of one spool do not go on with the same: then each would take the
+# A restarted scanner skips numbers: those of records that a power cut took must never be used again. How many
+# is drawn, so that two scanners with copies of one spool do not go on with the same: then each would take the
 # answer to the other's keyframe for its own, and lose one in silence.
 _RESTART_GAP = 1024
 _RESTART_SPREAD = 1 << 24

@@ -11,6 +11,8 @@ Measured with libzmq 4.3.5:
 | another server key than the server's | HANDSHAKE_FAILED_NO_DETAIL, again and again |
 | nobody listens behind a tunnel | HANDSHAKE_FAILED_NO_DETAIL, again and again |
 | a frozen server | HANDSHAKE_FAILED_NO_DETAIL after HANDSHAKE_IVL, again and again |
+| what answers is no ZeroMQ | DISCONNECTED and no further try, or HANDSHAKE_FAILED_NO_DETAIL again and again |
+| bytes that are no message, after the handshake | DISCONNECTED, and no further try |
 | nobody listens | CONNECT_RETRIED alone |
 """
 
@@ -26,6 +28,7 @@ from tsfusion.transport.curve import ClientKeys
 
 _EVENTS = (
     zmq.EVENT_CONNECTED
+    | zmq.EVENT_CONNECT_RETRIED
     | zmq.EVENT_DISCONNECTED
     | zmq.EVENT_HANDSHAKE_SUCCEEDED
     | zmq.EVENT_HANDSHAKE_FAILED_AUTH
@@ -35,6 +38,7 @@ _EVENTS = (
 _MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
 _TURNED_AWAY = 1.0  # seconds: who closes the connection later than this has not judged it, but is stuck
 _IN_A_ROW = 2  # one may be a server that ends
+_RETRIED_WITHIN = 0.5  # seconds: libzmq says at once when it is going to try again
 _numbers = itertools.count()
 
 
@@ -42,15 +46,18 @@ class Monitor:
     """Watches one connecting socket; make it before `connect`, close it before the socket.
 
     Attributes:
-        socket: becomes readable when something has happened; then call `problem`.
+        socket: becomes readable when something has happened. Call `problem` then, and every now and then.
         connected: whether the handshake is done and the connection stands.
-        lost: how often a connection that stood has ended.
+        made: connections that stood, this one included. What was sent on an earlier one may be lost: send it
+            again when this rises, not before, or it goes where the last one went.
+        lost: connections that stood and have ended.
         gave_up: libzmq will not try again, whatever the server does: close the socket and make another.
         refused: the server has certainly turned us away.
     """
 
     def __init__(self, socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = None) -> None:
         self.connected = False
+        self.made = 0
         self.lost = 0
         self.gave_up = False
         self.refused = False
@@ -58,6 +65,7 @@ class Monitor:
         self._watched = socket
         self._key = keys.public if keys else ""
         self._connected_at = 0.0
+        self._ended_at = 0.0  # 0 = it stands, or is being tried
         self._failures = 0
         # A name of its own: pyzmq names the endpoint by a file descriptor, which may be in use again.
         endpoint = f"inproc://tsfusion-monitor-{next(_numbers)}"
@@ -80,20 +88,28 @@ class Monitor:
             try:
                 head, _endpoint = self.socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
-                return news
+                break
             event, value = struct.unpack("=HI", head)
             said = self._on(event, value)
             news = news if said is None else said
+        if self._ended_at and not self.gave_up and time.monotonic() - self._ended_at > _RETRIED_WITHIN:
+            self.gave_up = True
+            news = f"what answers at {self.address} is no tsfusion server, or was garbled on the way"
+        return news
 
     def _on(self, event: int, value: int) -> str | None:
         if event == zmq.EVENT_CONNECTED:
-            self._connected_at = time.monotonic()
+            self._connected_at, self._ended_at = time.monotonic(), 0.0
+        elif event == zmq.EVENT_CONNECT_RETRIED:
+            self._ended_at = 0.0
         elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
             self.connected, self.refused, self._failures = True, False, 0
+            self.made += 1
             return ""
         elif event == zmq.EVENT_DISCONNECTED:
             self.lost += self.connected
             self.connected = False
+            self._ended_at = time.monotonic()
         elif event == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
             self.refused = self.gave_up = True
             return self._unknown()

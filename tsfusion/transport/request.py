@@ -12,6 +12,7 @@ from tsfusion.transport import messages, sockets
 from tsfusion.transport.curve import ClientKeys
 from tsfusion.transport.monitor import Monitor
 
+_LOOK_EVERY = 0.2  # seconds
 _LONGEST = 1e6  # seconds; a poll takes no more than 2³¹ ms
 
 
@@ -54,23 +55,22 @@ def request(
 def _ask(
     link: sockets.AnySocket, monitor: Monitor, command: messages.Command, timeout: float
 ) -> list[zmq.Frame]:
-    """Send the question once there is a connection; the answer's frames."""
+    """Send the question on each connection that is made, until there is an answer; its frames."""
     deadline = time.monotonic() + timeout
-    wanted, why, lost = zmq.POLLOUT, "", 0
+    why, asked = "", 0  # on which connection
     while (left := deadline - time.monotonic()) > 0:
-        events = dict(zmq.zmq_poll([(link, wanted), (monitor.socket, zmq.POLLIN)], int(left * 1000) + 1))
-        if monitor.socket in events:
-            news = monitor.problem()
-            why = why if news is None else news
-            if monitor.gave_up:
-                raise (NotAllowed if monitor.refused else TransportError)(why)
-            if monitor.lost > lost:  # and the question or its answer with it
-                wanted, lost = zmq.POLLOUT, monitor.lost
-        if events.get(link, 0) & zmq.POLLIN:
+        wanted = zmq.POLLIN | (zmq.POLLOUT if monitor.made > asked else 0)
+        polled = [(link, wanted), (monitor.socket, zmq.POLLIN)]
+        events = dict(zmq.zmq_poll(polled, int(min(left, _LOOK_EVERY) * 1000) + 1)).get(link, 0)
+        if events & zmq.POLLIN:
             return link.recv_multipart(copy=False)
-        if events.get(link, 0) & zmq.POLLOUT:
-            with suppress(zmq.Again):  # gone again already: no answer will come
+        if events & zmq.POLLOUT:
+            asked = monitor.made
+            with suppress(zmq.Again):  # gone again already: it is asked again on the next connection
                 link.send(messages.encode(command), zmq.NOBLOCK)
-                wanted = zmq.POLLIN
+        news = monitor.problem()
+        why = why if news is None else news
+        if monitor.gave_up:
+            raise (NotAllowed if monitor.refused else TransportError)(why)
     reason = f": {why}" if why else ""
     raise ServerUnreachable(f"no server answered at {monitor.address} within {timeout:g} s{reason}")
