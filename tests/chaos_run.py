@@ -9,6 +9,7 @@ import functools
 import random
 import threading
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Literal
 
@@ -21,8 +22,8 @@ from wire import UNSECURED, Secured, secured, until, wall
 
 from tsfusion import codec, journal
 from tsfusion.config import ClientConfig, override
-from tsfusion.errors import TransportError
-from tsfusion.fetch import fetch_status
+from tsfusion.errors import TransportError, TsfusionError
+from tsfusion.fetch import fetch_health, fetch_status
 from tsfusion.transport import Status
 
 Kind = Literal["server", "fuser", "scanner"]
@@ -32,7 +33,7 @@ KINDS: tuple[Kind, ...] = ("server", "fuser", "scanner")
 # Small files and frequent checkpoints: more moments at which a kill can hurt. What piled up comes faster than
 # the quota, so clients are held, too.
 SERVER = {"checkpoint_every": 20, "segment_bytes": 1 << 18, "quota_keyframes": 60.0}
-CLIENT = ClientConfig(policy="spool_all", stall_timeout=0.5, segment_bytes=1 << 16)
+CLIENT = ClientConfig(policy="spool_all", stall_timeout=0.4, segment_bytes=1 << 16)
 
 
 class Attack(Struct, frozen=True):
@@ -83,7 +84,8 @@ class Result(Struct, kw_only=True):
     server_exits: list[str]  # of its own accord; it was started again
     sessions: int
     segments: int
-    duplicates: int  # of the last server's life
+    duplicates: int  # keyframes that came again, and were known
+    refused: dict[str, int]  # messages that were not journaled
     carried_per_journaled: float  # bytes over the link / bytes in the journal
 
 
@@ -97,19 +99,23 @@ def attacks(rng: random.Random, keyframes: int, kills: int) -> list[Attack]:
         if planned and rng.random() < 0.25:
             planned.append(Attack(kind, planned[-1].journaled, False, rng.uniform(0.05, 2.5)))
         else:
-            planned.append(Attack(kind, journaled, True, rng.uniform(0.0, 0.5)))
+            planned.append(Attack(kind, journaled, True, rng.uniform(0.0, 1.5)))
     return planned
 
 
 def fault(rng: random.Random) -> Fault:
     """Something that networks do."""
-    what = rng.choice(["cut", "half_close", "refuse", "throttle", "delay", "freeze", "swallow"])
+    what = rng.choice(
+        ["cut", "half_close", "refuse", "throttle", "delay", "freeze", "swallow", "mute", *3 * ["jam"]]
+    )
     value: float | bool | None = True
     lasts, pause = rng.uniform(0.2, 2.0), rng.uniform(0.3, 2.0)
     if what in ("cut", "half_close"):
         value, lasts = None, 0.0
     elif what == "throttle":
         value = rng.uniform(20e3, 80e3)
+    elif what == "jam":
+        lasts += 0.8  # longer than a scanner waits before it sends again
     elif what == "delay":
         value = rng.uniform(0.01, 0.08)
     return Fault(what, value, lasts, pause)
@@ -141,6 +147,43 @@ class Weather:
         self._thread.join()
 
 
+class Watch:
+    """Asks the server all the time how it is doing, past the bad network: its counts die with it."""
+
+    def __init__(self, daemon: Daemon, keys: Secured) -> None:
+        self._daemon, self._keys = daemon, keys
+        self._seen: dict[str, tuple[int, dict[str, int]]] = {}  # by server process
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._look)
+        self._thread.start()
+
+    def _look(self) -> None:
+        while not self._over.wait(0.1):
+            server = self._daemon.server
+            with contextlib.suppress(TsfusionError):
+                if server.address:
+                    health = fetch_health(server.address, keys=self._keys.keys, timeout=0.5)
+                    self._seen[server.address] = (health.duplicates, health.refused)
+
+    @property
+    def duplicates(self) -> int:
+        """Of all servers so far."""
+        return sum(duplicates for duplicates, _ in self._seen.values())
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Of all servers so far, by reason."""
+        found = Counter[str]()
+        for _, refused in self._seen.values():
+            found.update(refused)
+        return dict(found)
+
+    def end(self) -> None:
+        """What it has seen stays."""
+        self._over.set()
+        self._thread.join()
+
+
 def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Result:
     """One seed in an empty folder; every other one with keys, and every other two with two scanners."""
     keys = secured(folder / "keys") if seed % 2 == 0 else UNSECURED
@@ -160,6 +203,8 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
         ]
         for scanner in scanners:
             stack.callback(scanner.close)
+        watch = Watch(daemon, keys)
+        stack.callback(watch.end)
         weather = Weather(random.Random(-seed - 1), proxy)
         stack.callback(weather.end)
         for attack in planned:
@@ -172,6 +217,7 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
         for scanner in scanners:
             scanner.wait()
         problems = [scanner.problem for scanner in scanners if scanner.problem]
+        watch.end()
         status = _status(daemon, keys)
         problems += [] if status else ["the server says nothing of itself"]
         if not problems and (code := daemon.stop()):
@@ -196,7 +242,8 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
         server_exits=daemon.exits,
         sessions=status.sessions if status else 0,
         segments=sum(len(journal.segments(one)) for one in journals(state)),
-        duplicates=status.duplicates if status else 0,
+        duplicates=watch.duplicates,
+        refused=watch.refused,
         carried_per_journaled=round(proxy.carried / max(_bytes(state), 1), 2),
     )
 
@@ -262,8 +309,8 @@ def _status(daemon: Daemon, keys: Secured) -> Status | None:
     def answered() -> bool:
         with contextlib.suppress(TransportError):
             found.append(fetch_status(daemon.server.address, timeout=5.0, keys=keys.keys))
-        return bool(found)
+        return bool(found) and found[-1].fuser == "idle"  # the last one may have been killed in the end
 
     with contextlib.suppress(AssertionError):
         until(lambda: daemon.ready and answered())
-    return found[0] if found else None
+    return found[-1] if found else None

@@ -36,17 +36,18 @@ class Proxy:
         self._upstream: dict[int, int | None] = {}
         self._listeners: list[asyncio.Server] = []
         self._connections: set[tuple[asyncio.StreamWriter, asyncio.StreamWriter]] = set()
+        self._streams: set[asyncio.Event] = set()  # whether a data connection's content comes
         self._tasks: set[asyncio.Task[None]] = set()
         self._rate: float | None = None
         self._delay = 0.0
         self._swallows = False
         self._free_at = 0.0  # when the throttled link has carried what it was given
         self._loop = asyncio.new_event_loop()
-        self._open: asyncio.Event = asyncio.Event()
-        self._open.set()
         self._thread = threading.Thread(target=self._loop.run_forever, name="proxy", daemon=True)
         self._thread.start()
         self._ports = _neighbours()
+        self._ways = {(port, way): asyncio.Event() for port in self._ports for way in ("forth", "back")}
+        self._shut(False, *self._ways)
         self.address = f"tcp://127.0.0.1:{self._ports[0]}"
         self._run(self._listen())
 
@@ -73,7 +74,27 @@ class Proxy:
 
     def freeze(self, frozen: bool) -> None:
         """Carry nothing, lose nothing: as when packets are lost and sent again later."""
-        self._loop.call_soon_threadsafe(self._open.clear if frozen else self._open.set)
+        self._shut(frozen, *self._ways)
+
+    def mute(self, muted: bool) -> None:
+        """Carry nothing back, lose nothing: what the server answers comes late."""
+        self._shut(muted, *((port, "back") for port in self._ports))
+
+    def jam(self, jammed: bool) -> None:
+        """Let data that are under way come late, after what is sent over new connections meanwhile."""
+        self._loop.call_soon_threadsafe(self._jam, jammed)
+
+    def _jam(self, jammed: bool) -> None:
+        for stream in self._streams:
+            if jammed:
+                stream.clear()
+            else:
+                stream.set()
+
+    def _shut(self, shut: bool, *ways: tuple[int, str]) -> None:
+        for way in ways:
+            event = self._ways[way]
+            self._loop.call_soon_threadsafe(event.clear if shut else event.set)
 
     def swallow(self, swallows: bool) -> None:
         """Accept connections and bytes, and let all of it vanish. Those connections end with it."""
@@ -90,6 +111,7 @@ class Proxy:
         self.throttle(None)
         self.delay(0.0)
         self.freeze(False)
+        self.jam(False)
         if self._swallows:
             self.swallow(False)
         if not self._listeners:
@@ -157,7 +179,8 @@ class Proxy:
             self._tasks.discard(task)
 
     async def _join(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        port = self._upstream.get(writer.get_extra_info("sockname")[1])
+        entered = writer.get_extra_info("sockname")[1]
+        port = self._upstream.get(entered)
         if port is None:
             return
         away = _socket()
@@ -165,18 +188,29 @@ class Proxy:
         await self._loop.sock_connect(away, ("127.0.0.1", port))
         far_reader, far_writer = await asyncio.open_connection(sock=away, limit=_CHUNK)
         pair = (writer, far_writer)
+        stream = asyncio.Event()
+        stream.set()
         self._connections.add(pair)
+        if entered == self._ports[0]:
+            self._streams.add(stream)
         try:
-            await asyncio.gather(self._pump(reader, far_writer), self._pump(far_reader, writer))
+            await asyncio.gather(
+                self._pump(reader, far_writer, self._ways[entered, "forth"], stream),
+                self._pump(far_reader, writer, self._ways[entered, "back"]),
+            )
         finally:
             self._connections.discard(pair)
+            self._streams.discard(stream)
             far_writer.transport.abort()
 
-    async def _pump(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _pump(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *ways: asyncio.Event
+    ) -> None:
         """One way of one connection, to its end."""
         while chunk := await reader.read(_CHUNK):
             await asyncio.sleep(self._wait(len(chunk)))
-            await self._open.wait()
+            for way in ways:
+                await way.wait()
             if not self._swallows:
                 with contextlib.suppress(RuntimeError):  # half closed: nothing goes that way any more
                     self.carried += len(chunk)

@@ -145,6 +145,34 @@ def test_a_frozen_link_loses_nothing(proxy: Proxy) -> None:
         assert heard(link, 5) == b"later"
 
 
+def test_a_muted_server_is_heard_later(proxy: Proxy) -> None:
+    with connected(proxy) as link:
+        assert said(link, b"a") == b"a"
+        proxy.mute(True)
+        before = proxy.carried
+        link.sendall(b"late")
+        end = time.monotonic() + PATIENCE
+        while proxy.carried < before + len(b"late"):
+            assert time.monotonic() < end
+        link.settimeout(0.2)
+        with pytest.raises(TimeoutError):
+            link.recv(1)
+        proxy.heal()
+        link.settimeout(PATIENCE)
+        assert heard(link, 4) == b"late"
+
+
+def test_what_is_jammed_comes_after_what_came_later(proxy: Proxy) -> None:
+    with connected(proxy) as link:
+        assert said(link, b"a") == b"a"
+        proxy.jam(True)
+        link.sendall(b"late")
+        with connected(proxy) as other:
+            assert said(other, b"sooner") == b"sooner"
+        proxy.heal()
+        assert heard(link, 4) == b"late"
+
+
 def test_what_is_swallowed_never_comes(proxy: Proxy) -> None:
     proxy.swallow(True)
     with connected(proxy) as link:
