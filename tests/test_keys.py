@@ -143,6 +143,13 @@ def test_the_same_key_has_one_name(server: Path) -> None:
     assert keys.read_list(server) == keys.Allowed({"robot2": one}, {})
 
 
+def test_a_lost_list_is_begun_anew(server: Path) -> None:
+    one = key()
+    (server / keys.ALLOWED).unlink()
+    keys.allow(server, "robot1", one)
+    assert keys.read_list(server) == keys.Allowed({"robot1": one})
+
+
 def test_revoke(run: Run) -> None:
     run("new", "server")
     one = key()

@@ -98,7 +98,7 @@ def allow(folder: Folder, name: str, key: str) -> str | None:
     place = _existing(folder)
     with private_folder.locked(place):
         own = curve.server_keys(place).public
-        listed = read_list(place)
+        listed = read_list(place) if has_list(place) else Allowed()
         earlier = listed.allowed.get(name)
         _check_free(name, public, own, listed)
         if earlier == public:
