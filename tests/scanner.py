@@ -33,12 +33,11 @@ class Plan(Struct, kw_only=True):
         spool: its folder.
         state: the server's folder, to see what was taken before.
         count: keyframes to send, all lives together.
-        rate: of sending, a second; None = as fast as `send` returns and the map follows.
+        rate: of sending, a second; None = as fast as `send` returns (`block`: as the map follows).
         log: a line is on the disk here for each `send` that returned.
         report: where the `Report` goes when all is fused.
         room: a file of `save_room`, seen again and again; None = `wire.wall`s, each elsewhere.
         until: sends no more once this file is there.
-        ahead: without a rate, at most so many keyframes are on their way to the map.
         patience: seconds to wait for the map in the end.
     """
 
@@ -52,7 +51,6 @@ class Plan(Struct, kw_only=True):
     report: str | None = None
     room: str | None = None
     until: str | None = None
-    ahead: int = 32
     patience: float = 120.0
     client: ClientConfig = ClientConfig()
 
@@ -153,12 +151,11 @@ def scan(plan: Plan) -> Report:
         for i in range(first, plan.count):
             if plan.until is not None and Path(plan.until).exists():
                 break
-            if plan.rate is None:
-                _let_it_follow(client, plan.ahead)
-            else:
+            if plan.rate is not None:
                 due = max(due + 1 / plan.rate, time.monotonic())
                 time.sleep(max(due - time.monotonic(), 0))
-            client.send(keyframe(i, captured_ns=time.monotonic_ns()))
+            if client.send(keyframe(i, captured_ns=time.monotonic_ns())) is None:
+                continue  # skipped, by its policy: the report counts it
             log.write(f"\n{i}\n".encode())  # a torn line ends at the next one's beginning
             if plan.log is not None:
                 os.fdatasync(log.fileno())
@@ -171,20 +168,11 @@ def scan(plan: Plan) -> Report:
         fused=stats.fused,
         refused=stats.refused,
         rejected=stats.rejected,
-        skipped=getattr(stats, "skipped", {}),
+        skipped=stats.skipped,
         seconds=seconds,
         cpu_seconds=time.process_time(),
         times=times,
     )
-
-
-def _let_it_follow(client: Client, ahead: int) -> None:
-    while True:
-        stats = client.stats
-        done = stats.fused + sum(stats.refused.values()) + sum(stats.rejected.values())
-        if stats.sent - done < ahead:
-            return
-        time.sleep(0.002)
 
 
 def main() -> None:

@@ -44,6 +44,7 @@ class ScriptedServer:
         denial: what it answers a Hello with.
         keys, allowed: its own keys, and whom it knows by theirs; None = no keys.
         same_epoch: a second `start` is the same process: only the connections were cut.
+        clock: its own, nanoseconds.
         refuses: whether a keyframe is turned away at the door.
         taken: (session, number) of every journaled keyframe, in order; it outlives `stop`.
         refused, hellos, pings: what came.
@@ -60,6 +61,7 @@ class ScriptedServer:
         self.allowed: dict[str, str] = {}
         self.same_epoch = False
         self.epoch = ""
+        self.clock = time.monotonic_ns
         self.window = 8
         self.taken: list[tuple[bytes, int]] = []
         self.refused: list[int] = []
@@ -136,7 +138,7 @@ class ScriptedServer:
             self.pings.append(message)
             self._identities[message.session] = identity
             session = self.sessions.get(message.session, Session(message.session))
-            now = time.monotonic_ns()
+            now = self.clock()
             pong = messages.Pong(self.epoch, message.sent_ns, now, now, session.durable, session.fused)
             self._say(message.session, pong)
 

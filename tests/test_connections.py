@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A client's connections: cut, made anew, turned away by their keys, and what it says of that."""
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -70,6 +71,18 @@ def test_a_server_that_comes_and_goes_gets_everything_once() -> None:
             server.start()
         client.flush(DEADLINE)
         assert server.numbers == [*range(40)]
+
+
+@pytest.mark.parametrize("shown", [-(1 << 63), (1 << 64) - 1, 1 << 62])
+def test_a_server_with_an_impossible_clock_does_no_harm(shown: int) -> None:
+    with scripted(clock=lambda: shown) as server, joined(server, config=PATIENT) as client:
+        client.send(wall())
+        until(lambda: len(server.pings) > 2)
+        with pytest.raises(ServerUnreachable, match="the server is behind"):
+            client.connect(0.1)
+        server.clock = time.monotonic_ns
+        client.flush(DEADLINE)
+        assert server.numbers == [0]
 
 
 # --- keys ---

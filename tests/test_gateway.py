@@ -99,8 +99,8 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
             ports = Ports(context, server)
             stack.callback(ports.close)
             gateway = Gateway(context, server, ports, door)
-            stack.callback(gateway.close)
-            gateway.open({"default": VolumeConfig()})
+            stack.callback(gateway.maps.close)
+            gateway.maps.begin({"default": VolumeConfig()})
             return gateway
 
         yield begin
@@ -122,7 +122,7 @@ def test_a_keyframe_that_kills_the_fuser_twice_is_quarantined(
     start: Start, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     gateway = start(_CRASHES_ON_2)
-    stepped(gateway, lambda: gateway.drained)
+    stepped(gateway, lambda: gateway.maps.drained)
     health = default(gateway)
     assert (health.fuser_restarts, health.rejected, health.quarantined) == (2, {"crash": 1}, 1)
     assert (health.keyframes_fused, health.keyframes_durable) == (4, 5)
@@ -148,7 +148,7 @@ def test_a_fuser_that_is_killed_is_not_the_keyframes_fault(start: Start, tmp_pat
         """.strip()
     )
     gateway = start(body)
-    stepped(gateway, lambda: gateway.drained)
+    stepped(gateway, lambda: gateway.maps.drained)
     health = default(gateway)
     assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (3, {}, 5)
 
@@ -161,13 +161,13 @@ def test_a_death_between_keyframes_is_nobodys_fault(start: Start, tmp_path: Path
             sys.exit(3)
 """
     gateway = start(body)
-    stepped(gateway, lambda: gateway.drained)
+    stepped(gateway, lambda: gateway.maps.drained)
     assert default(gateway).rejected == {}
 
 
 def test_a_fuser_that_hangs_at_a_keyframe_is_replaced(start: Start) -> None:
     gateway = start(fusing("if message.index == 1: time.sleep(3600)"), fuser_timeout=0.3)
-    stepped(gateway, lambda: gateway.drained)
+    stepped(gateway, lambda: gateway.maps.drained)
     health = default(gateway)
     assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (2, {"crash": 1}, 4)
 
@@ -175,13 +175,13 @@ def test_a_fuser_that_hangs_at_a_keyframe_is_replaced(start: Start) -> None:
 def test_a_fuser_that_cannot_start_is_one_clear_error(start: Start) -> None:
     gateway = start(_DIES)
     with pytest.raises(MapError, match="ended with status 9 before it was ready"):
-        stepped(gateway, lambda: gateway.warm)
+        stepped(gateway, lambda: gateway.maps.warm)
 
 
 def test_why_the_map_cannot_be_opened_is_passed_on(start: Start) -> None:
     gateway = start(_FAILS)
     with pytest.raises(InvalidConfig, match="no such setting"):
-        stepped(gateway, lambda: gateway.warm)
+        stepped(gateway, lambda: gateway.maps.warm)
 
 
 def test_a_fuser_that_does_not_come_back_is_tried_ever_more_rarely(
@@ -197,7 +197,7 @@ def test_a_fuser_that_does_not_come_back_is_tried_ever_more_rarely(
     monkeypatch.setattr(
         fuser_link, "COMMAND", (sys.executable, "-c", _FAKE.replace("{body}", fusing("pass")))
     )
-    stepped(gateway, lambda: gateway.drained)
+    stepped(gateway, lambda: gateway.maps.drained)
     assert default(gateway).problem == ""
 
 

@@ -17,9 +17,10 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("command line", frozenset({"__main__", "cli"})),
     ("whole runs", frozenset({"pipeline", "child"})),
     ("processes", frozenset({"server", "gateway", "intake", "door", "hosted", "retention", "reports",
-                             "questions", "quota", "quarantine", "sessions", "ports", "fuser_link", "fuser",
+                             "atlas", "questions", "quota", "quarantine", "sessions", "ports", "fuser_link",
+                             "fuser", "saved_map",
                              "client", "fetch", "backpressure", "room", "sender", "connection",
-                             "conversation", "refused", "outbox", "spool", "gone", "recording"})),
+                             "conversation", "refused", "outbox", "spool", "gone", "times", "recording"})),
     ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results", "metrics",
                                      "inspection", "salvage", "ros"})),
     ("map and wire", frozenset({"volume", "integration", "surface", "field", "blockstore", "meshing",
@@ -31,7 +32,7 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
 
 # All others run where there is no Taichi, and answer while kernels run.
 MAY_REACH_TAICHI = frozenset({
-    "__main__", "cli", "pipeline", "fuser", "datasets", "evaluation", "preview",
+    "__main__", "cli", "pipeline", "fuser", "saved_map", "datasets", "evaluation", "preview",
     "volume", "integration", "surface", "field", "blockstore", "meshing", "scratch", "storage", "checkpoint",
     "warmup", "kernels", "runtime",
 })  # fmt: skip

@@ -164,7 +164,7 @@ class Client:
     def records(self) -> list[KeyframeTimes]:
         """When each keyframe passed each stage, on this process's monotonic clock (the last 65536)."""
         with self._outbox.changed:
-            return self._outbox.times()
+            return self._outbox.times.copy()
 
     @property
     def stats(self) -> ClientStats:

@@ -20,6 +20,7 @@ _HELLO_INTERVAL = (0.02, 0.5)  # seconds: first and longest, doubling until ther
 _PING_INTERVAL = 0.5
 _FIRST_PINGS_INTERVAL = 0.02  # until the clock estimate stands on all its samples
 _REWIND_INTERVAL = 0.2  # one gap is reported by every keyframe behind it
+_LATEST = 1 << 62  # nanoseconds; no clock shows more than a century
 _HOLD = (0.05, 60.0)  # seconds: no server may hold a client for less or longer at a time
 
 
@@ -210,6 +211,10 @@ class Conversation:
                 log.info("the server at %s is a new one", self._address)
                 self.clock.clear()
                 self.greet_again()
+            return
+        stamps = (pong.ping_sent_ns, pong.received_ns, pong.sent_ns)
+        if not all(0 <= stamp < _LATEST for stamp in stamps):
+            log.debug("the server's clock is none: %s", pong)
             return
         self._outbox.connected = True
         if not self.clock.count:

@@ -16,7 +16,7 @@ import time
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -24,21 +24,17 @@ import zmq
 from numpy.typing import NDArray
 
 from tsfusion import codec, journal, logs, maps, process
-from tsfusion.config import VIEW_SETTINGS, LogFormat, LogLevel, VolumeConfig
-from tsfusion.errors import CheckpointError, InvalidConfig, TsfusionError
+from tsfusion.config import LogFormat, LogLevel
+from tsfusion.errors import TsfusionError
 from tsfusion.mesh import Mesh
+from tsfusion.saved_map import SavedMap
 from tsfusion.transport import sockets, work
 from tsfusion.transport.messages import MeshLayout
-
-if TYPE_CHECKING:
-    from tsfusion.volume import Volume
 
 _SET_ASIDE = 2 << 30  # bytes that Taichi asks for and hardly uses
 _KEPT_FREE = 256 << 20  # bytes that keyframes leave to meshes and checkpoints
 _REFINED_AT_ONCE = 256  # blocks: about 50 ms
 _FUSING_SHARE = 3  # a busy fuser meshes for at most a quarter of its time
-# Settings that may differ between a map and the server that goes on with it: none changes the sums.
-_FREE_SETTINGS = ("threads", "max_blocks", "max_blocks_per_keyframe", *VIEW_SETTINGS)
 
 log = logging.getLogger(__name__)
 
@@ -50,8 +46,6 @@ class Fuser:
         self._link = link
         self._begin = begin
         self._folder = Path(begin.folder)
-        self._done: dict[bytes, work.Progress] = {}
-        self._rejected: dict[str, int] = {}
         self._since_checkpoint = 0
         self._watched = False
         self._answered = self._meshed = 0  # keyframes, by this process
@@ -62,34 +56,16 @@ class Fuser:
         self._most = process.data_bytes() + _SET_ASIDE + begin.memory_bytes
         process.limit_memory(self._most)
         self.exit_status: int | None = None
-        self._volume = self._open()
-
-    def _open(self) -> "Volume":
-        from tsfusion.volume import Volume
-
-        volume = None
-        for path in (self._folder / maps.MAP_FILE, self._folder / maps.PREVIOUS_FILE):
-            if volume is None and path.exists():
-                volume = _resume(path, self._begin.volume)
-        if volume is None:
-            volume = Volume(self._begin.volume)
-        elif "done" not in volume.meta:
-            raise CheckpointError(
-                f"the map in {self._folder} was not saved by a server: it does not say what it holds"
-            )
-        else:
-            self._done = {
-                bytes.fromhex(session): work.Progress(*progress)
-                for session, progress in volume.meta["done"].items()
-            }
-            self._rejected = dict(volume.meta["rejected"])
-        volume.warm_up()
-        return volume
+        self._map = SavedMap(self._folder, begin.volume, keep_previous=begin.keep_previous)
+        self._volume = self._map.volume
+        self._volume.warm_up()
 
     def ready(self) -> work.Ready:
         """How far the map is."""
         stats = self._volume.stats()
-        return work.Ready(self._done, self._volume.keyframes, self._rejected, stats.blocks, stats.bytes)
+        return work.Ready(
+            self._map.done, self._volume.keyframes, self._map.rejected, stats.blocks, stats.bytes
+        )
 
     def take(self, message: work.ToFuser) -> None:
         """Do what the gateway says."""
@@ -166,7 +142,7 @@ class Fuser:
     def _fuse(self, order: work.Fuse) -> None:
         start = time.monotonic_ns()
         self._answered += 1
-        before = self._done.get(order.session)
+        before = self._map.done.get(order.session)
         if before is not None and order.seq <= before.seq:
             self._send(work.Done(order.index, start, start))
             return
@@ -184,34 +160,20 @@ class Fuser:
             process.limit_memory(self._most)
             self._working.at(work.NOT_WORKING)  # not if it ended the process, however it did
         if reason is not None:
-            self._rejected[reason] = self._rejected.get(reason, 0) + 1
-        self._done[order.session] = work.Progress(order.seq, order.client)
+            self._map.rejected[reason] = self._map.rejected.get(reason, 0) + 1
+        self._map.done[order.session] = work.Progress(order.seq, order.client)
         self._send(work.Done(order.index, start, time.monotonic_ns(), reason, message))
         self._since_checkpoint += 1
         if self._begin.checkpoint_every and self._since_checkpoint >= self._begin.checkpoint_every:
             self._checkpoint()
 
     def _checkpoint(self) -> bool:
-        if self._since_checkpoint == 0:
-            self._send(work.Saved(written=False))
-            return True
-        meta = {
-            "done": {session.hex(): [done.seq, done.client] for session, done in self._done.items()},
-            "rejected": self._rejected,
-        }
-        path = self._folder / maps.MAP_FILE
-        try:
-            if self._begin.keep_previous and path.exists():
-                path.replace(self._folder / maps.PREVIOUS_FILE)
-            self._volume.save(path, meta=meta)
-        except (TsfusionError, OSError, MemoryError) as error:
-            # Nothing is lost: the next start fuses the journal from the checkpoint before this one.
-            log.error("no checkpoint: %s", error)
-            self._since_checkpoint = 1
-            return False
-        self._since_checkpoint = 0
-        self._send(work.Saved(written=True))
-        return True
+        written = False
+        if self._since_checkpoint:
+            written = self._map.save()
+            self._since_checkpoint = 0 if written else 1
+        self._send(work.Saved(written))
+        return not self._since_checkpoint
 
     def _answer(self, ask: work.Ask) -> None:
         try:
@@ -230,7 +192,7 @@ class Fuser:
             self._hashes = (self._answered, self._volume.map_hash(), self._volume.color_hash())
         return work.FuserStatus(
             keyframes_fused=self._volume.keyframes,
-            keyframes_rejected=self._rejected,
+            keyframes_rejected=self._map.rejected,
             blocks=stats.blocks,
             voxels=stats.voxels,
             map_bytes=stats.bytes,
@@ -258,26 +220,6 @@ class Working:
     def at(self, index: int) -> None:
         """It is this one; `work.NOT_WORKING` = none."""
         struct.pack_into("<q", self._word, 0, index)
-
-
-def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
-    from tsfusion.volume import Volume
-
-    try:
-        volume = Volume.load(path, wanted.threads, **{name: getattr(wanted, name) for name in VIEW_SETTINGS})
-    except CheckpointError as error:
-        aside = path.with_suffix(".damaged")
-        log.error("%s; it is kept as %s, and the map is built again from the journal", error, aside)
-        path.replace(aside)
-        return None
-    for name in VolumeConfig.__struct_fields__:
-        here, there = getattr(wanted, name), getattr(volume.config, name)
-        if name not in _FREE_SETTINGS and here != there:
-            raise InvalidConfig(
-                f"the map in {path.parent} was made with {name} = {there}, got {here}: use another state "
-                f"folder, or remove {path.name} to build the map again from the journal"
-            )
-    return volume
 
 
 def _mesh_frames(mesh: Mesh) -> tuple[MeshLayout, list[Any]]:

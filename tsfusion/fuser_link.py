@@ -68,6 +68,7 @@ class FuserLink:
         self._finishing = self._finish_sent = False
         self.restarts = 0
         self.failed = ""
+        self._was_ready = False
         self._start()
 
     def _start(self) -> None:
@@ -133,13 +134,15 @@ class FuserLink:
             return None
         self._heard = time.monotonic()
         message = work.to_gateway.decode(head.buffer)
-        if isinstance(message, work.Failed):
+        if isinstance(message, work.Failed) and self._was_ready:
+            log.error("the fuser cannot open the map: %s", message.message)
+        elif isinstance(message, work.Failed):
             kind = getattr(errors, message.error, TsfusionError)
             raise kind(message.message)
         if isinstance(message, work.Started):
             self.send(self._begin)
         elif isinstance(message, work.Ready):
-            self.ready = True
+            self.ready = self._was_ready = True
         elif isinstance(message, work.Done):
             self.in_flight.popleft()
             self._blame.pop(message.index, None)

@@ -7,16 +7,16 @@ journaled and acknowledged in one step; a map's fuser is told only where it lies
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import zmq
 
 from tsfusion import codec, logs, process, reports
-from tsfusion.config import DEFAULT_MAP, ServerConfig, VolumeConfig
+from tsfusion.atlas import Atlas
+from tsfusion.config import ServerConfig
 from tsfusion.door import Door
-from tsfusion.errors import DecodeError, TsfusionError
+from tsfusion.errors import DecodeError
 from tsfusion.hosted import HostedMap
 from tsfusion.intake import Intake
 from tsfusion.metrics import Metrics
@@ -30,7 +30,6 @@ log = logging.getLogger(__name__)
 
 _TICK_MS = 100  # how long a signal or a fuser's death may go unnoticed
 _SNAPSHOT_INTERVAL = 1.0  # seconds
-_RETRY_INTERVAL = 10.0  # seconds before a map that could not be opened is tried again
 
 
 class Gateway:
@@ -38,7 +37,7 @@ class Gateway:
 
     Attributes:
         epoch: a new one tells clients that what was under way is lost.
-        maps: those that are open, by name.
+        maps: those of the server.
     """
 
     def __init__(
@@ -50,10 +49,8 @@ class Gateway:
         metrics: Metrics | None = None,
     ) -> None:
         self.ports = ports
-        self.maps: dict[str, HostedMap] = {}
-        self._context = context
+        self.maps = Atlas(context, server, self)
         self._server = server
-        self._volumes: Mapping[str, VolumeConfig] = {}
         self._door = door
         self._metrics = metrics
         self._routes = Routes()
@@ -62,66 +59,25 @@ class Gateway:
         self._questions = Questions(self._answer)
         self._topics: set[bytes] = set()  # that somebody subscribed to
         self._watched: dict[str, bool] = {}  # what each fuser knows of it
-        self._unopened: dict[str, tuple[str, float]] = {}  # maps that could not be opened: why, when
         self._memory = MemoryBound(server.memory_bytes)
-        self._accepting = self._started_up = False
+        self._accepting = False
         self._started = time.monotonic()
         self._next_snapshot = 0.0
         self._new_epoch()
 
-    def open(self, volumes: Mapping[str, VolumeConfig]) -> None:
-        """Open these maps with these settings; one that a client asks for gets those of the default map.
-
-        Raises:
-            TsfusionError: when a journal cannot be opened.
-        """
-        self._volumes = volumes
-        for name in volumes:
-            self._open(name)
-
     def _new_epoch(self) -> None:
         self.epoch = f"{time.monotonic_ns():x}"
 
-    @property
-    def warm(self) -> bool:
-        """Whether every map that is open can take keyframes."""
-        return all(hosted.warm for hosted in self.maps.values())
-
-    @property
-    def drained(self) -> bool:
-        """Whether every map has every keyframe of its journal."""
-        return all(hosted.drained for hosted in self.maps.values())
-
-    @property
-    def failed(self) -> bool:
-        """Whether a map's fuser cannot be kept alive: it will not be drained."""
-        return any(hosted.fuser.failed for hosted in self.maps.values())
-
     def accept(self) -> None:
         """Take keyframes from here on."""
-        self._accepting = self._started_up = True
+        self._accepting = True
+        self.maps.begun()
         self._next_snapshot = 0.0  # health checks are to know at once
 
     def stop_accepting(self) -> None:
         """Take no more keyframes; clients keep what is not acknowledged."""
         self._accepting = False
         self.ports.keyframes.close()
-
-    def finish(self) -> bool:
-        """Have every fuser write its checkpoint and end; whether all have. Call it until then."""
-        for hosted in self.maps.values():
-            hosted.fuser.finish()
-        return all(hosted.fuser.ended() for hosted in self.maps.values())
-
-    @property
-    def finished_well(self) -> bool:
-        """Whether every checkpoint is on the disk."""
-        return all(hosted.fuser.finished_well for hosted in self.maps.values())
-
-    def close(self) -> None:
-        """End the fusers and finish the journals."""
-        for hosted in self.maps.values():
-            hosted.close()
 
     def step(self) -> None:
         """Wait for something to happen (a moment at most) and deal with it.
@@ -135,7 +91,7 @@ class Gateway:
         }
         if self._accepting:
             handlers[self.ports.keyframes] = self._intake.take
-        fusers = [hosted.fuser.socket for hosted in self.maps.values()]
+        fusers = [hosted.fuser.socket for hosted in self.maps]
         polled = [(socket, zmq.POLLIN) for socket in (*self._door.poll, *fusers, *handlers)]
         events = dict(zmq.zmq_poll(polled, _TICK_MS))
         self._guard()
@@ -143,8 +99,8 @@ class Gateway:
             for socket, handle in handlers.items():
                 if socket in events:
                     each(socket, handle)
-        for hosted in list(self.maps.values()):
-            self._step(hosted)
+        self.maps.step(self._on_other)
+        self._tell_fusers()
         self._snapshot()
 
     def _guard(self) -> None:
@@ -179,51 +135,17 @@ class Gateway:
 
     # --- maps ---
 
-    def _open(self, name: str) -> HostedMap | None:
-        """A map by name, opened when need be; None when it cannot be."""
-        hosted = self.maps.get(name)
-        if hosted is not None:
-            return hosted
-        _, failed = self._unopened.get(name, ("", -_RETRY_INTERVAL))
-        if len(self.maps) >= self._server.max_maps or time.monotonic() - failed < _RETRY_INTERVAL:
-            return None
-        volume = self._volumes.get(name) or self._volumes[DEFAULT_MAP]
-        hosted = self.maps[name] = HostedMap(self._context, name, self._server, volume, self)
-        self._watched.pop(name, None)
-        self._unopened.pop(name, None)
-        log.info("the map is being opened", extra=logs.about(map=name))
-        return hosted
-
-    def _open_for_a_client(self, name: str) -> HostedMap | None:
-        try:
-            return self._open(name)
-        except TsfusionError as error:
-            self._give_up(name, error)
-            return None
-
-    def _give_up(self, name: str, error: TsfusionError) -> None:
-        log.error("the map cannot be opened: %s", error, extra=logs.about(map=name))
-        self._unopened[name] = (str(error), time.monotonic())
-        hosted = self.maps.pop(name, None)
-        if hosted is not None:
-            hosted.close()
-
-    def _step(self, hosted: HostedMap) -> None:
-        if not hosted.fuser.ready:
-            self._watched.pop(hosted.name, None)
-            self._questions.give_up(hosted.name)
-        try:
-            hosted.step(partial(self._on_other, hosted))
-        except TsfusionError as error:
-            if not self._started_up or hosted.warm:
-                raise
-            self._give_up(hosted.name, error)
-            return
-        topic = mesh_topic(hosted.name)
-        watched = any(topic.startswith(wanted) for wanted in self._topics)
-        news = hosted.fuser.ready and watched != self._watched.get(hosted.name)
-        if news and hosted.fuser.send(work.Publish(watched)):
-            self._watched[hosted.name] = watched
+    def _tell_fusers(self) -> None:
+        """Whether anybody watches their maps; and that nobody will answer where one has died."""
+        for hosted in self.maps:
+            if not hosted.fuser.ready:
+                self._watched.pop(hosted.name, None)
+                self._questions.give_up(hosted.name)
+                continue
+            topic = mesh_topic(hosted.name)
+            watched = any(topic.startswith(wanted) for wanted in self._topics)
+            if watched != self._watched.get(hosted.name) and hosted.fuser.send(work.Publish(watched)):
+                self._watched[hosted.name] = watched
 
     def _on_other(
         self, hosted: HostedMap, message: work.Meshed | work.Answer, frames: Sequence[zmq.Frame]
@@ -263,7 +185,7 @@ class Gateway:
         if denied := self._denial(identity, hello, client):
             self._answer(identity, messages.Denied(hello.session, *denied))
             return
-        durable, fused = self.maps[hello.map].progress(hello.session)
+        durable, fused = self._progress(hello.map, hello.session)
         welcome = messages.Welcome(
             epoch=self.epoch,
             version=codec.VERSION,
@@ -280,10 +202,9 @@ class Gateway:
         if hello.version != codec.VERSION:
             speaks = f"the server speaks version {codec.VERSION} of the wire format"
             return "version", f"{speaks}, this client {hello.version}"
-        hosted = self._open_for_a_client(hello.map)
+        hosted = self.maps.open_for_client(hello.map)
         if hosted is None:
-            why, _ = self._unopened.get(hello.map, (f"{self._server.max_maps} are open (max_maps)", 0.0))
-            return "map", f"map {hello.map} cannot be opened: {why}"
+            return "map", f"map {hello.map} cannot be opened: {self.maps.why_not(hello.map)}"
         if not hosted.warm:
             return "opening", f"map {hello.map} is being opened"
         taken = not self._intake.owns(hosted, hello.session, client)
@@ -299,10 +220,13 @@ class Gateway:
             self._routes.heard(route)
             route.offset_ns, route.bound_ns = ping.offset_ns, ping.bound_ns
             route.waiting, route.skipped = ping.waiting, ping.skipped
-            hosted = self.maps.get(route.map)
-            progress = hosted.progress(ping.session) if hosted else progress
+            progress = self._progress(route.map, ping.session)
         pong = messages.Pong(self.epoch, ping.sent_ns, received_ns, time.monotonic_ns(), *progress)
         self._answer(identity, pong)
+
+    def _progress(self, map_name: str, session: bytes) -> tuple[int, int]:
+        hosted = self.maps.get(map_name)
+        return hosted.progress(session) if hosted else (0, 0)
 
     def _on_command(self, identity: bytes, command: messages.Command) -> None:
         if command.name == "ping":
@@ -329,9 +253,7 @@ class Gateway:
     def health(self) -> messages.Health:
         """How the server is doing."""
         now = time.monotonic()
-        found = {name: hosted.health() for name, hosted in self.maps.items()}
-        problems = [f"map {name}: {one.problem}" for name, one in found.items() if one.problem]
-        problems += [f"map {name} cannot be opened: {why}" for name, (why, _) in self._unopened.items()]
+        found, problems = self.maps.health()
         return messages.Health(
             ready=self._accepting and not any(one.problem for one in found.values()),
             problems=tuple(problems),
@@ -341,12 +263,10 @@ class Gateway:
             refused=dict(self._refused + self._door.refused),
             duplicates=self._intake.duplicates,
             maps=found,
-            clients=tuple(self._client_health(route, now) for route in self._routes),
+            clients=tuple(
+                route.health(now, self._progress(route.map, route.session)) for route in self._routes
+            ),
         )
-
-    def _client_health(self, route: Route, now: float) -> messages.ClientHealth:
-        hosted = self.maps.get(route.map)
-        return route.health(now, hosted.progress(route.session) if hosted else (0, 0))
 
     # --- sending: an answer that cannot leave at once is dropped, the asker will ask again ---
 

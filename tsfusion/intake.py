@@ -8,12 +8,12 @@ forged message must not have a good keyframe given up.
 import logging
 import time
 from collections import Counter
-from collections.abc import Mapping
 from typing import Any
 
 import zmq
 
 from tsfusion import codec, logs
+from tsfusion.atlas import Atlas
 from tsfusion.config import ServerConfig
 from tsfusion.door import Door
 from tsfusion.errors import JournalError
@@ -34,9 +34,7 @@ class Intake:
         duplicates: those that were journaled before.
     """
 
-    def __init__(
-        self, server: ServerConfig, maps: Mapping[str, HostedMap], door: Door, clients: Clients
-    ) -> None:
+    def __init__(self, server: ServerConfig, maps: Atlas, door: Door, clients: Clients) -> None:
         self.refused: Counter[str] = Counter()
         self.duplicates = 0
         self._server = server

@@ -5,14 +5,14 @@ import threading
 from collections import Counter, OrderedDict, deque
 from typing import Literal
 
-import msgspec
 from msgspec import Struct
 
 from tsfusion.keyframe import Keyframe
 from tsfusion.spool import Spool, Waiting
-from tsfusion.transport.messages import KeyframeTimes, Stamps
+from tsfusion.times import Times
+from tsfusion.transport.messages import Stamps
 
-_MAX_RECORDS = 65536
+_MOST = 65536  # numbers that are remembered: rejected ones, and fused ones that no mesh shows yet
 
 
 class ClientStats(Struct, frozen=True):
@@ -56,6 +56,7 @@ class Outbox:
         opening: it answers, but the map is not open yet.
         skipped: see `ClientStats`.
         state: see `ClientStats`.
+        times: of the keyframes, as far as they are known.
     """
 
     def __init__(self, spool: Spool) -> None:
@@ -63,7 +64,7 @@ class Outbox:
         self.spool = spool
         self.outstanding = 0
         self.unfused: deque[int] = deque()
-        self.unmeshed: deque[int] = deque()
+        self.unmeshed: deque[int] = deque(maxlen=_MOST)
         self.refusals = 0
         self.first_refusal = ""
         self.connected = False
@@ -72,11 +73,11 @@ class Outbox:
         self.opening = False
         self.skipped: Counter[str] = Counter()
         self.state = "ok"
+        self.times = Times()
         self._sent = self._durable = self._fused = 0
         self._refused: Counter[str] = Counter()
         self._rejected: Counter[str] = Counter()
         self._rejected_seqs: OrderedDict[int, None] = OrderedDict()
-        self._times: OrderedDict[int, KeyframeTimes] = OrderedDict()
         # Of what a dead scanner left, any may have been sent; and what a power cut took of it, too.
         self._perhaps_sent = spool.waiting[-1].seq if spool.waiting else 0
         self._used_before = spool.next_seq - 1
@@ -94,11 +95,7 @@ class Outbox:
         """A keyframe is in the spool."""
         self.spool.add(entry)
         self._sent += 1
-        self._times[entry.seq] = KeyframeTimes(
-            seq=entry.seq, timestamp_ns=keyframe.timestamp_ns, captured_ns=keyframe.captured_ns
-        )
-        if len(self._times) > _MAX_RECORDS:
-            self._times.popitem(last=False)
+        self.times.add(entry.seq, timestamp_ns=keyframe.timestamp_ns, captured_ns=keyframe.captured_ns)
 
     def drop_oldest_unsent(self, newest: int | None = None) -> bool:
         """Take the oldest keyframe that was never sent out of the spool; False = there is none.
@@ -114,7 +111,7 @@ class Outbox:
                 if entry.seq == newest:
                     return False
                 self.spool.remove(place)
-                self._times.pop(entry.seq, None)
+                self.times.remove(entry.seq)
                 self.skipped["dropped"] += 1
                 self.changed.notify_all()
                 return True
@@ -156,9 +153,7 @@ class Outbox:
         self.outstanding += 1
         self._perhaps_sent = max(self._perhaps_sent, entry.seq)
         self._claimed = 0
-        times = self._times.get(entry.seq)
-        if times is not None:
-            times.sent_ns = sent_ns
+        self.times.sent(entry.seq, sent_ns)
 
     # --- at the server ---
 
@@ -198,12 +193,8 @@ class Outbox:
 
     def stamp(self, stamps: Stamps, offset_ns: int, bound_ns: int) -> None:
         """Note the server's stamps, on our clock."""
-        times = self._times.get(stamps.seq)
-        if times is not None and stamps.seq not in self._rejected_seqs:
-            times.clock_bound_ns = bound_ns
-            for name in ("received_ns", "durable_ns", "fuse_start_ns", "fused_ns", "meshed_ns"):
-                if (value := getattr(stamps, name)) and not getattr(times, name):
-                    setattr(times, name, value - offset_ns)
+        if stamps.seq not in self._rejected_seqs:
+            self.times.stamp(stamps, offset_ns, bound_ns)
         if stamps.meshed_ns:
             self.meshed(stamps.seq)
 
@@ -215,7 +206,7 @@ class Outbox:
             return
         self._rejected[reason] += 1
         self._rejected_seqs[seq] = None
-        if len(self._rejected_seqs) > _MAX_RECORDS:
+        if len(self._rejected_seqs) > _MOST:
             self._rejected_seqs.popitem(last=False)
 
     def find(self, seq: int) -> Waiting | None:
@@ -244,10 +235,6 @@ class Outbox:
         """How many keyframes were given up since this was asked last, and the first of them in words."""
         refusals, self.refusals = self.refusals, 0
         return refusals, self.first_refusal
-
-    def times(self) -> list[KeyframeTimes]:
-        """A copy of the ledger."""
-        return [msgspec.structs.replace(times) for times in self._times.values()]
 
     def stats(self) -> ClientStats:
         """A copy of the counts."""

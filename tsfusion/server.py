@@ -56,7 +56,7 @@ def run(
     with ExitStack() as stack:
         signals = stack.enter_context(_signals())
         gateway, watchdog = _open(stack, server, {DEFAULT_MAP: volume, **(volumes or {})})
-        while not gateway.warm:
+        while not gateway.maps.warm:
             gateway.step()
             if signals:
                 return 0
@@ -89,8 +89,8 @@ def _open(
         stack.callback(metrics.close)
         log.info("figures and health checks are at http://%s", metrics.serve(server.metrics))
     gateway = Gateway(context, server, ports, door, metrics)
-    stack.callback(gateway.close)
-    gateway.open(volumes)
+    stack.callback(gateway.maps.close)
+    gateway.maps.begin(volumes)
     return gateway, Watchdog()
 
 
@@ -101,15 +101,15 @@ def _serve(gateway: Gateway, signals: list[int], watchdog: Watchdog) -> int:
     log.info("ending: what is in the journals is fused and saved first")
     watchdog.stopping()
     gateway.stop_accepting()
-    while not gateway.drained and not gateway.failed and len(signals) == 1:
+    while not gateway.maps.drained and not gateway.maps.failed and len(signals) == 1:
         gateway.step()
         watchdog.pet()
-    if not gateway.drained:
+    if not gateway.maps.drained:
         return 1
-    while not gateway.finish() and len(signals) == 1:
+    while not gateway.maps.finish() and len(signals) == 1:
         gateway.step()
         watchdog.pet()
-    return 0 if gateway.finished_well else 1
+    return 0 if gateway.maps.finished_well else 1
 
 
 @contextmanager

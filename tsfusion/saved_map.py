@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: MIT
+"""A map on a server's disk: its last checkpoint, the one before, and how far each session was in it."""
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tsfusion import maps
+from tsfusion.config import VIEW_SETTINGS, VolumeConfig
+from tsfusion.errors import CheckpointError, InvalidConfig, TsfusionError
+from tsfusion.transport.work import Progress
+
+if TYPE_CHECKING:
+    from tsfusion.volume import Volume
+
+# Settings that may differ between a map and the server that goes on with it: none changes the sums.
+_FREE_SETTINGS = ("threads", "max_blocks", "max_blocks_per_keyframe", *VIEW_SETTINGS)
+
+log = logging.getLogger(__name__)
+
+
+class SavedMap:
+    """The checkpoints in a map's folder.
+
+    Args:
+        keep_previous: the journal may not go back to the start, so keep the checkpoint before the last, too.
+
+    Attributes:
+        volume: the map; as of the last checkpoint when it was opened.
+        done: how far it is, by session.
+        rejected: keyframes that it could not take: reason → count.
+
+    Raises:
+        InvalidConfig: when the map was made with other settings.
+        CheckpointError: when it is not a server's.
+    """
+
+    def __init__(self, folder: Path, config: VolumeConfig, *, keep_previous: bool) -> None:
+        from tsfusion.volume import Volume
+
+        self._path, self._previous = folder / maps.MAP_FILE, folder / maps.PREVIOUS_FILE
+        self._keep_previous = keep_previous
+        self.done: dict[bytes, Progress] = {}
+        self.rejected: dict[str, int] = {}
+        self.volume = _resume(self._path, config) or _resume(self._previous, config) or Volume(config)
+        if meta := self.volume.meta:
+            self.done = {bytes.fromhex(key): Progress(*progress) for key, progress in meta["done"].items()}
+            self.rejected = dict(meta["rejected"])
+
+    def save(self) -> bool:
+        """Write a checkpoint; False when that failed, which is logged.
+
+        Nothing is lost then: the next start fuses the journal from the checkpoint before this one.
+        """
+        done = {key.hex(): [progress.seq, progress.client] for key, progress in self.done.items()}
+        try:
+            if self._keep_previous and self._path.exists():
+                self._path.replace(self._previous)
+            self.volume.save(self._path, meta={"done": done, "rejected": self.rejected})
+        except (TsfusionError, OSError, MemoryError) as error:
+            log.error("no checkpoint: %s", error)
+            return False
+        return True
+
+
+def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
+    """The volume that was saved there; None when there is none, or it is damaged."""
+    from tsfusion.volume import Volume
+
+    if not path.exists():
+        return None
+    try:
+        volume = Volume.load(path, wanted.threads, **{name: getattr(wanted, name) for name in VIEW_SETTINGS})
+    except CheckpointError as error:
+        aside = path.with_suffix(".damaged")
+        log.error("%s; it is kept as %s, and the map is built again from the journal", error, aside)
+        path.replace(aside)
+        return None
+    if "done" not in volume.meta:
+        raise CheckpointError(f"{path} was not saved by a server: it does not say which keyframes it holds")
+    for name in VolumeConfig.__struct_fields__:
+        here, there = getattr(wanted, name), getattr(volume.config, name)
+        if name not in _FREE_SETTINGS and here != there:
+            raise InvalidConfig(
+                f"the map in {path.parent} was made with {name} = {there}, got {here}: use another state "
+                f"folder, or remove {path.name} to build the map again from the journal"
+            )
+    return volume

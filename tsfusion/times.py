@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: MIT
+"""When each of the last keyframes passed each stage, in memory of one size."""
+
+import numpy as np
+
+from tsfusion.transport.messages import KeyframeTimes, Stamps
+
+CAPACITY = 65536
+_LARGEST = (1 << 63) - 1
+_FIELDS = KeyframeTimes.__struct_fields__
+_COLUMN = {name: place for place, name in enumerate(_FIELDS)}
+_OF_THE_SERVER = ("received_ns", "durable_ns", "fuse_start_ns", "fused_ns", "meshed_ns")
+
+
+class Times:
+    """A row a keyframe; a new one takes the place of the one that came `CAPACITY` numbers before."""
+
+    def __init__(self) -> None:
+        self._rows = np.zeros((CAPACITY, len(_FIELDS)), np.int64)  # pages are taken when they are written to
+
+    def add(self, seq: int, *, timestamp_ns: int, captured_ns: int) -> None:
+        """A keyframe begins."""
+        row = self._rows[seq % CAPACITY]
+        row[:] = 0
+        row[:3] = seq, timestamp_ns, captured_ns
+
+    def remove(self, seq: int) -> None:
+        """It was never sent."""
+        if self._has(seq):
+            self._rows[seq % CAPACITY] = 0
+
+    def sent(self, seq: int, sent_ns: int) -> None:
+        """It was handed to the socket."""
+        if self._has(seq):
+            self._rows[seq % CAPACITY, _COLUMN["sent_ns"]] = sent_ns
+
+    def stamp(self, stamps: Stamps, offset_ns: int, bound_ns: int) -> None:
+        """Note the server's stamps, on our clock; the first of each counts."""
+        if self._has(stamps.seq):
+            row = self._rows[stamps.seq % CAPACITY]
+            row[_COLUMN["clock_bound_ns"]] = min(bound_ns, _LARGEST)
+            for name in _OF_THE_SERVER:
+                if (value := getattr(stamps, name)) and not row[_COLUMN[name]]:
+                    row[_COLUMN[name]] = min(max(value - offset_ns, -_LARGEST), _LARGEST)
+
+    def copy(self) -> list[KeyframeTimes]:
+        """All rows, oldest first."""
+        rows = self._rows[self._rows[:, 0] > 0]
+        ordered = rows[np.argsort(rows[:, 0])].tolist()
+        return [KeyframeTimes(**dict(zip(_FIELDS, row, strict=True))) for row in ordered]
+
+    def _has(self, seq: int) -> bool:
+        return bool(self._rows[seq % CAPACITY, 0] == seq)
