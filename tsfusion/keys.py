@@ -210,7 +210,7 @@ class AllowList:
             self._revoked = dict(listed.revoked)
             log.log(
                 logging.INFO if self._names else logging.WARNING,
-                "%d clients may connect, %d keys are revoked", len(self._names), len(self._revoked),
+                "clients that may connect: %d, keys revoked: %d", len(self._names), len(self._revoked),
             )  # fmt: skip
         return any(self._names.get(key) != name for key, name in before.items())
 
