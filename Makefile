@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 PYTHON ?= $(firstword $(wildcard .venv/bin/python) python3)
 
-.PHONY: check test bench accuracy
+.PHONY: check test bench accuracy nightly
 
 check:  ## style and types
 	$(PYTHON) -m ruff check .
@@ -16,3 +16,11 @@ bench:  ## one JSON line a case
 
 accuracy:  ## every row, then the tables and plots of docs/accuracy.md
 	$(PYTHON) scripts/accuracy.py --output out/accuracy --write-docs $(ARGS)
+
+nightly:  ## the long forms of what the tests try: about an hour; a JSON line each
+	$(PYTHON) scripts/chaos.py --seeds 20
+	$(PYTHON) scripts/hostile.py --seconds 10
+	$(PYTHON) scripts/hostile.py --seconds 10 --keys
+	$(PYTHON) scripts/fuzz.py --cases 1000000
+	$(PYTHON) scripts/soak.py --keyframes 10000
+	$(PYTHON) scripts/delivery.py

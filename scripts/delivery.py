@@ -24,18 +24,16 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from _peers import DATA, surroundings
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from wire import Server, serving
+from wire import UNSECURED, Server, secured, serving
 
-from tsfusion import Client, Keyframe, VolumeConfig, keys
-from tsfusion.config import ClientConfig
+from tsfusion import Client, Keyframe, VolumeConfig
+from tsfusion.config import ClientConfig, override
 from tsfusion.datasets import open_dataset
 from tsfusion.fetch import fetch_health
-from tsfusion.transport.curve import client_keys
 
 BLOCK = 30  # keyframes to one server before it is the other's turn
 DISTINCT = 60  # keyframes; then they come again
@@ -98,19 +96,11 @@ class _Side:
     def __init__(self, stack: ExitStack, folder: Path, with_keys: bool) -> None:
         self.with_keys = with_keys
         folder.mkdir()
-        settings: dict[str, Any] = {}
-        self.config = ClientConfig(policy="spool_all")
-        if with_keys:
-            settings["keys"] = str(folder / "server")
-            keys.create(folder / "server", "server")
-            pair = keys.create(folder / "robot", "robot")
-            keys.allow(folder / "server", "robot", pair.public)
-            self.config = msgspec.structs.replace(
-                self.config,
-                key=str(folder / "robot" / "robot.key_secret"),
-                server_key=str(folder / "server" / "server.key"),
-            )
-        self.server: Server = stack.enter_context(serving(folder / "state", VolumeConfig(), **settings))
+        self.keys = secured(folder) if with_keys else UNSECURED
+        self.config = override(ClientConfig(policy="spool_all"), **self.keys.client)
+        self.server: Server = stack.enter_context(
+            serving(folder / "state", VolumeConfig(), **self.keys.server)
+        )
         self.spool = folder / "spool"
         self.forget()
 
@@ -137,8 +127,7 @@ class _Side:
 
     def result(self) -> dict[str, Any]:
         """Of all that was sent."""
-        given = client_keys(self.config.key, self.config.server_key)
-        health = fetch_health(self.server.address, keys=given).maps["default"]
+        health = fetch_health(self.server.address, keys=self.keys.keys).maps["default"]
         p50, p95, p99 = np.percentile(self.durable_ms, (50, 95, 99))
         return {
             "keys": self.with_keys,

@@ -107,8 +107,10 @@ def _atheris_figures(words: str) -> dict[str, Any]:
 
 def _work(options: argparse.Namespace) -> int:
     import logging
+    import warnings
 
     logging.disable(logging.CRITICAL)  # damage is logged; here it is the rule
+    warnings.simplefilter("error", RuntimeWarning)  # of NumPy, about numbers that nobody expected
     sys.path.insert(0, str(TESTS))
     options.crashes.mkdir(parents=True, exist_ok=True)
     if options.engine == "atheris":

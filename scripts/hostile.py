@@ -29,10 +29,11 @@ def main() -> int:
         "--seconds", type=float, default=5.0, help="of each attack, and of peace before and after"
     )
     parser.add_argument("--only", nargs="+", choices=list(ATTACKS), default=list(ATTACKS), metavar="ATTACK")
+    parser.add_argument("--keys", action="store_true", help="the server asks for them; attackers have none")
     parser.add_argument("--json", action="store_true", help="one line instead of a table")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="tsfusion-hostile-") as folder:
-        outcome = run(Path(folder), options.seconds, tuple(options.only))
+        outcome = run(Path(folder), options.seconds, tuple(options.only), keys=options.keys)
     print(msgspec.json.encode(outcome).decode() if options.json else table(outcome))
     for problem in outcome.problems:
         print(problem, file=sys.stderr)

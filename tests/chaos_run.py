@@ -17,10 +17,10 @@ from msgspec import Struct
 from proxy import Proxy
 from scanner import Plan, journals
 from verdict import client_problems, server_problems, verify
-from wire import until, wall
+from wire import UNSECURED, Secured, secured, until, wall
 
 from tsfusion import codec, journal
-from tsfusion.config import ClientConfig
+from tsfusion.config import ClientConfig, override
 from tsfusion.errors import TransportError
 from tsfusion.fetch import fetch_status
 from tsfusion.transport import Status
@@ -70,6 +70,7 @@ class Result(Struct, kw_only=True):
     """One seed's outcome. `problems` is empty when every promise was kept."""
 
     seed: int
+    keys: bool
     problems: list[str]
     keyframes: int
     rate: float
@@ -140,7 +141,8 @@ class Weather:
 
 
 def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Result:
-    """One seed in an empty folder."""
+    """One seed in an empty folder; every other one with keys."""
+    keys = secured(folder / "keys") if seed % 2 == 0 else UNSECURED
     rng = random.Random(seed)
     rate, planned = rng.uniform(20, 40), attacks(rng, keyframes, kills)
     started = time.monotonic()
@@ -148,9 +150,9 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
     killed: list[Kill] = []
     with contextlib.ExitStack() as stack:
         proxy = stack.enter_context(Proxy())
-        daemon = Daemon(state, proxy, **SERVER)
+        daemon = Daemon(state, proxy, **SERVER, **keys.server)
         stack.callback(daemon.close)
-        scanner = Scanner(_plan(folder, proxy.address, keyframes, rate))
+        scanner = Scanner(_plan(folder, proxy.address, keyframes, rate, keys))
         stack.callback(scanner.close)
         weather = Weather(random.Random(-seed - 1), proxy)
         stack.callback(weather.end)
@@ -163,7 +165,7 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
         weather.end()
         scanner.wait()
         problems = [scanner.problem] if scanner.problem else []
-        status = _status(daemon)
+        status = _status(daemon, keys)
         problems += [] if status else ["the server says nothing of itself"]
         if not problems and (code := daemon.stop()):
             problems.append(f"the server ended with status {code} when told to")
@@ -173,6 +175,7 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
         problems += verify(state, keyframes, status.map_hash)
     return Result(
         seed=seed,
+        keys=keys is not UNSECURED,
         problems=problems,
         keyframes=keyframes,
         rate=round(rate, 1),
@@ -213,7 +216,7 @@ def _journaled(state: Path) -> int:
     return 0
 
 
-def _plan(folder: Path, address: str, keyframes: int, rate: float) -> Plan:
+def _plan(folder: Path, address: str, keyframes: int, rate: float, keys: Secured) -> Plan:
     return Plan(
         address=address,
         spool=str(folder / "spool"),
@@ -223,7 +226,7 @@ def _plan(folder: Path, address: str, keyframes: int, rate: float) -> Plan:
         log=str(folder / "taken"),
         report=str(folder / "report.json"),
         patience=PATIENCE,
-        client=CLIENT,
+        client=override(CLIENT, **keys.client),
     )
 
 
@@ -240,12 +243,12 @@ def _kill(kind: Kind, daemon: Daemon, scanner: Scanner) -> bool:
     return True
 
 
-def _status(daemon: Daemon) -> Status | None:
+def _status(daemon: Daemon, keys: Secured) -> Status | None:
     found: list[Status] = []
 
     def answered() -> bool:
         with contextlib.suppress(TransportError):
-            found.append(fetch_status(daemon.server.address, timeout=5.0))
+            found.append(fetch_status(daemon.server.address, timeout=5.0, keys=keys.keys))
         return bool(found)
 
     with contextlib.suppress(AssertionError):

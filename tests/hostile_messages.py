@@ -65,6 +65,10 @@ def bombs() -> Iterator[Frames]:
     yield with_depth(png_header(0, 0), (48, 64), "png")
     yield with_depth(b"\xff\xd8" + b"\xff\xe0\x00\x02" * 200_000, (48, 64), "png")
     yield with_depth(b"\x28\xb5\x2f\xfd", (48, 64))
+    yield with_depth(png_header(64, 48) + struct.pack(">I", (1 << 31) - 1) + b"IDAT", (48, 64), "png")
+    text = b"k\0\0" + zlib.compress(bytes(7_000_000))
+    chunk = struct.pack(">I", len(text)) + b"zTXt" + text + struct.pack(">I", zlib.crc32(b"zTXt" + text))
+    yield with_depth(png_header(64, 48) + 100 * chunk, (48, 64), "png")
 
 
 def bad_values() -> Iterator[Frames]:

@@ -14,10 +14,10 @@ from attacks import ATTACKS
 from keepers import PATIENCE, SCANNER
 from msgspec import Struct
 from scanner import Plan, Report
-from wire import Server, serving, until
+from wire import UNSECURED, Secured, Server, secured, serving, until
 
 from tsfusion import ledger
-from tsfusion.config import ClientConfig
+from tsfusion.config import ClientConfig, override
 from tsfusion.transport import KeyframeTimes
 from tsfusion.transport.messages import Spread
 
@@ -87,13 +87,20 @@ def rss_bytes(pid: int) -> int:
     return 0
 
 
-def run(folder: Path, seconds: float, attacks: tuple[str, ...] = tuple(ATTACKS)) -> Outcome:
-    """`seconds` of peace, so many of each attack, and the same of peace again."""
+def run(
+    folder: Path, seconds: float, attacks: tuple[str, ...] = tuple(ATTACKS), *, keys: bool = False
+) -> Outcome:
+    """`seconds` of peace, so many of each attack, and the same of peace again.
+
+    Args:
+        keys: the server asks for them, and the attackers have none.
+    """
+    given = secured(folder / "keys") if keys else UNSECURED
     names = ("", *attacks, "")
     _raise_file_limit()
     with contextlib.ExitStack() as stack:
-        server = stack.enter_context(serving(folder / "state", memory_bytes=MEMORY_BYTES))
-        plan = _plan(folder, server)
+        server = stack.enter_context(serving(folder / "state", memory_bytes=MEMORY_BYTES, **given.server))
+        plan = _plan(folder, server, given)
         scanner = subprocess.Popen([sys.executable, str(SCANNER), msgspec.json.encode(plan).decode()])
         stack.callback(scanner.kill)
         rss = Rss(server)
@@ -107,7 +114,7 @@ def run(folder: Path, seconds: float, attacks: tuple[str, ...] = tuple(ATTACKS))
         if server.process.poll() is not None:
             problems.append(f"the server died: {server.said()[-1000:]}")
             return Outcome(problems=problems, phases=[], keyframes=0, refused={}, rejected={})
-        return _outcome(folder, server, spans, problems)
+        return _outcome(folder, server, spans, problems, given)
 
 
 def _raise_file_limit() -> None:
@@ -116,7 +123,7 @@ def _raise_file_limit() -> None:
     resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-def _plan(folder: Path, server: Server) -> Plan:
+def _plan(folder: Path, server: Server, given: Secured) -> Plan:
     return Plan(
         address=server.address,
         spool=str(folder / "spool"),
@@ -126,7 +133,7 @@ def _plan(folder: Path, server: Server) -> Plan:
         until=str(folder / "enough"),
         report=str(folder / "report.json"),
         patience=PATIENCE,
-        client=ClientConfig(policy="spool_all"),
+        client=override(ClientConfig(policy="spool_all"), **given.client),
     )
 
 
@@ -158,13 +165,17 @@ def _attack(server: Server, name: str, seconds: float, rss: Rss) -> _Span:
     return _Span(name or "none", hostile, started, time.monotonic(), rss.highest())
 
 
-def _outcome(folder: Path, server: Server, spans: list[_Span], problems: list[str]) -> Outcome:
+def _outcome(
+    folder: Path, server: Server, spans: list[_Span], problems: list[str], given: Secured
+) -> Outcome:
     from tsfusion.fetch import fetch_status
 
     report = msgspec.json.decode((folder / "report.json").read_bytes(), type=Report)
-    status = fetch_status(server.address)
+    status = fetch_status(server.address, keys=given.keys)
     if (report.durable, report.fused, report.refused, report.rejected) != (report.sent, report.sent, {}, {}):
         problems.append(f"of {report.sent} keyframes {report.fused} are in the map")
+    if given is not UNSECURED and status.keyframes_durable != report.sent:
+        problems.append(f"{status.keyframes_durable - report.sent} keyframes of strangers are in the journal")
     if status.fuser_restarts:
         problems.append(f"the fuser was restarted {status.fuser_restarts} times")
     phases = [_phase(span, report.times) for span in spans]

@@ -4,6 +4,7 @@
 from pathlib import Path
 
 import pytest
+from attacks import ATTACKS
 from hostile_run import run, table
 
 from tsfusion import process
@@ -29,8 +30,16 @@ def test_memory_that_was_freed_counts_no_more(monkeypatch: pytest.MonkeyPatch) -
     assert MemoryBound(800).excess(elsewhere=0) == 0
 
 
-def test_attacks_harm_nobody(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    outcome = run(tmp_path, seconds=1.0)
+WITHOUT_KEYS = ("lies", "tiny", "unfinished", "half open", "slow loris")  # what gets as far as that
+
+
+@pytest.mark.parametrize(
+    ("attacks", "keys"), [(tuple(ATTACKS), False), (WITHOUT_KEYS, True)], ids=["open", "keys"]
+)
+def test_attacks_harm_nobody(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], attacks: tuple[str, ...], keys: bool
+) -> None:
+    outcome = run(tmp_path, 1.0, attacks, keys=keys)
     with capsys.disabled():
         print(f"\n{table(outcome)}")
     assert not outcome.problems, outcome

@@ -15,6 +15,10 @@ DEPTH = np.ones((4, 5), np.uint16)
 POINTS = np.zeros((3, 3), np.float32)
 
 
+TINY = np.eye(4)  # numbers so small that NumPy divides by zero in its determinant
+TINY[:3, :3] = [[1.0, 0.0, 0.5], [1e-310, 0.0, 1e-310], [1e-310, 1e-310, 1e-310]]
+
+
 def turned(angle: float, scale: float = 1.0) -> np.ndarray:
     T = np.eye(4)
     T[:2, :2] = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -80,6 +84,7 @@ def test_each_measurement_is_accepted_and_normalised() -> None:
         ({"depth": DEPTH, "T_world_camera": np.full((4, 4), np.nan)}, "must be finite"),
         ({"depth": DEPTH, "T_world_camera": turned(0.3, 1.01)}, "must hold a rotation"),
         ({"depth": DEPTH, "T_world_camera": np.diag([1.0, 1.0, -1.0, 1.0])}, "det > 0"),
+        ({"depth": DEPTH, "T_world_camera": TINY}, "must hold a rotation"),
         ({"depth": DEPTH, "T_world_camera": np.eye(4) + np.diag([2e6] * 3, 1)}, "T_world_camera"),
         ({"depth": DEPTH, "T_world_camera": np.eye(4).T + np.eye(4)[::-1] * 0.5}, "T_world_camera"),
     ],

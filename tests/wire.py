@@ -10,15 +10,16 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import zmq
 
-from tsfusion import Intrinsics, Keyframe
+from tsfusion import Intrinsics, Keyframe, keys
 from tsfusion.config import ServerConfig, VolumeConfig
 from tsfusion.transport import sockets
+from tsfusion.transport.curve import ClientKeys, client_keys
 
 DEADLINE = 60.0
 CAMERA = Intrinsics(40.0, 40.0, 31.5, 23.5)
@@ -60,6 +61,32 @@ def until(reached: Callable[[], bool], deadline: float = DEADLINE) -> None:
     while not reached():
         assert time.monotonic() < end, "deadline"
         time.sleep(0.005)
+
+
+class Secured(NamedTuple):
+    """What makes a server ask for keys, and a client show them."""
+
+    server: dict[str, str]  # settings
+    client: dict[str, str]
+
+    @property
+    def keys(self) -> ClientKeys | None:
+        """For who asks questions."""
+        return client_keys(self.client.get("key"), self.client.get("server_key"))
+
+
+UNSECURED = Secured({}, {})
+
+
+def secured(folder: Path) -> Secured:
+    """A server's keys, and those of a robot that it lets in."""
+    keys.create(folder / "server", "server")
+    keys.allow(folder / "server", "robot", keys.create(folder / "robot", "robot").public)
+    public = folder / "server" / "server.key"
+    return Secured(
+        {"keys": str(folder / "server")},
+        {"key": str(folder / "robot" / "robot.key_secret"), "server_key": str(public)},
+    )
 
 
 class Server:

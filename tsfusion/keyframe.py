@@ -215,10 +215,12 @@ def check_pose(pose: Any) -> NDArray[np.float64]:
     if np.abs(R).max() > 2:  # so far off that RᵀR could overflow
         raise InvalidKeyframe(f"T_world_camera must hold a rotation, got entries up to {np.abs(R).max():.3g}")
     deviation = float(np.abs(R.T @ R - np.eye(3)).max())
-    if deviation > _ROTATION_TOLERANCE or np.linalg.det(R) <= 0:
+    with np.errstate(divide="ignore"):  # entries too small to divide by
+        det = float(np.linalg.det(R))
+    if deviation > _ROTATION_TOLERANCE or det <= 0:
         raise InvalidKeyframe(
             f"T_world_camera must hold a rotation (RᵀR = I within {_ROTATION_TOLERANCE}, det > 0), "
-            f"got |RᵀR - I| = {deviation:.3g}, det = {np.linalg.det(R):.3g}"
+            f"got |RᵀR - I| = {deviation:.3g}, det = {det:.3g}"
         )
     if np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-9:
         raise InvalidKeyframe(f"T_world_camera must end with the row 0 0 0 1, got {T[3].tolist()}")
