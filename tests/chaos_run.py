@@ -71,6 +71,7 @@ class Result(Struct, kw_only=True):
 
     seed: int
     keys: bool
+    scanners: int
     problems: list[str]
     keyframes: int
     rate: float
@@ -141,8 +142,9 @@ class Weather:
 
 
 def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Result:
-    """One seed in an empty folder; every other one with keys."""
+    """One seed in an empty folder; every other one with keys, and every other two with two scanners."""
     keys = secured(folder / "keys") if seed % 2 == 0 else UNSECURED
+    count = 1 + seed // 2 % 2
     rng = random.Random(seed)
     rate, planned = rng.uniform(20, 40), attacks(rng, keyframes, kills)
     started = time.monotonic()
@@ -152,30 +154,37 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
         proxy = stack.enter_context(Proxy())
         daemon = Daemon(state, proxy, **SERVER, **keys.server)
         stack.callback(daemon.close)
-        scanner = Scanner(_plan(folder, proxy.address, keyframes, rate, keys))
-        stack.callback(scanner.close)
+        scanners = [
+            Scanner(_plan(folder, proxy.address, range(first, keyframes, count), rate / count, keys))
+            for first in range(count)
+        ]
+        for scanner in scanners:
+            stack.callback(scanner.close)
         weather = Weather(random.Random(-seed - 1), proxy)
         stack.callback(weather.end)
         for attack in planned:
-            until(lambda attack=attack: scanner.finished or _is_time(attack, state, daemon), PATIENCE)
+            until(lambda attack=attack: _is_time(attack, state, daemon, scanners), PATIENCE)
             time.sleep(attack.wait)
             ready, at = daemon.ready, round(time.monotonic() - started, 2)
-            if _kill(attack.kind, daemon, scanner):
+            if _kill(attack.kind, daemon, rng.choice(scanners)):
                 killed.append(Kill(at, attack.kind, ready, _journaled(state)))
         weather.end()
-        scanner.wait()
-        problems = [scanner.problem] if scanner.problem else []
+        for scanner in scanners:
+            scanner.wait()
+        problems = [scanner.problem for scanner in scanners if scanner.problem]
         status = _status(daemon, keys)
         problems += [] if status else ["the server says nothing of itself"]
         if not problems and (code := daemon.stop()):
             problems.append(f"the server ended with status {code} when told to")
     seconds = time.monotonic() - started
     if status and not problems:
-        problems += server_problems(status, keyframes) + client_problems(scanner.report())
+        problems += server_problems(status, keyframes)
+        problems += [problem for scanner in scanners for problem in client_problems(scanner.report())]
         problems += verify(state, keyframes, status.map_hash)
     return Result(
         seed=seed,
         keys=keys is not UNSECURED,
+        scanners=count,
         problems=problems,
         keyframes=keyframes,
         rate=round(rate, 1),
@@ -192,7 +201,9 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
     )
 
 
-def _is_time(attack: Attack, state: Path, daemon: Daemon) -> bool:
+def _is_time(attack: Attack, state: Path, daemon: Daemon, scanners: list[Scanner]) -> bool:
+    if all(scanner.finished for scanner in scanners):
+        return True
     return _journaled(state) >= attack.journaled and (daemon.ready or not attack.ready)
 
 
@@ -216,15 +227,17 @@ def _journaled(state: Path) -> int:
     return 0
 
 
-def _plan(folder: Path, address: str, keyframes: int, rate: float, keys: Secured) -> Plan:
+def _plan(folder: Path, address: str, numbers: range, rate: float, keys: Secured) -> Plan:
     return Plan(
         address=address,
-        spool=str(folder / "spool"),
+        spool=str(folder / f"spool-{numbers.start}"),
         state=str(folder / "state"),
-        count=keyframes,
+        count=numbers.stop,
+        first=numbers.start,
+        step=numbers.step,
         rate=rate,
-        log=str(folder / "taken"),
-        report=str(folder / "report.json"),
+        log=str(folder / f"taken-{numbers.start}"),
+        report=str(folder / f"report-{numbers.start}.json"),
         patience=PATIENCE,
         client=override(CLIENT, **keys.client),
     )

@@ -33,6 +33,7 @@ class Plan(Struct, kw_only=True):
         spool: its folder.
         state: the server's folder, to see what was taken before.
         count: keyframes to send, all lives together.
+        first, step: which numbers below `count` are this scanner's; the others have others.
         rate: of sending, a second; None = as fast as `send` returns (`block`: as the map follows).
         log: a line is on the disk here for each `send` that returned.
         report: where the `Report` goes when all is fused.
@@ -45,6 +46,8 @@ class Plan(Struct, kw_only=True):
     spool: str
     state: str
     count: int
+    first: int = 0
+    step: int = 1
     control: str | None = None
     rate: float | None = None
     log: str | None = None
@@ -122,16 +125,18 @@ def source(room: str | None) -> Callable[[int], Keyframe]:
     return view
 
 
-def first_unsent(plan: Plan) -> int:
-    """The number to go on with; ends the process when something that was taken is nowhere any more."""
+def unsent(plan: Plan) -> range:
+    """The numbers to go on with; ends the process when something that was taken is nowhere any more."""
+    own = range(plan.first, plan.count, plan.step)
     taken = set(numbers(Path(plan.spool))) if Path(plan.spool).is_dir() else set()
     for folder in journals(Path(plan.state)):
         taken.update(numbers(folder))
+    taken &= set(own)
     said = {int(line) for line in _lines(plan.log)}
-    if said - taken or taken != set(range(len(taken))):
+    if said - taken or taken != set(own[: len(taken)]):
         sys.stderr.write(f"taken {sorted(taken)}, but said {sorted(said)}\n")
         sys.exit(LOST)
-    return len(taken)
+    return own[len(taken) :]
 
 
 def _lines(log: str | None) -> list[str]:
@@ -142,13 +147,13 @@ def _lines(log: str | None) -> list[str]:
 
 def scan(plan: Plan) -> Report:
     """Send what is left and see it fused."""
-    first, keyframe = first_unsent(plan), source(plan.room)
+    left, keyframe = unsent(plan), source(plan.room)
     with (
         Path(os.devnull if plan.log is None else plan.log).open("ab", buffering=0) as log,
         Client(plan.address, spool=plan.spool, control=plan.control, config=plan.client) as client,
     ):
         started = due = time.monotonic()
-        for i in range(first, plan.count):
+        for i in left:
             if plan.until is not None and Path(plan.until).exists():
                 break
             if plan.rate is not None:
