@@ -1,14 +1,31 @@
 # SPDX-License-Identifier: MIT
 """Fixtures shared by all tests."""
 
+import logging
 import os
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from tsfusion import logs
+
 DATA = Path(os.environ.get("TSFUSION_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+@pytest.fixture(autouse=True)
+def logging_as_it_was() -> Iterator[None]:
+    """A command that runs in this process logs to a stderr that is gone afterwards."""
+    level, hook = logging.getLogger("tsfusion").level, sys.excepthook
+    yield
+    for handler in logging.root.handlers[:]:
+        if isinstance(handler, logs.Stderr):
+            handler.close()
+            logging.root.removeHandler(handler)
+    logging.getLogger("tsfusion").setLevel(level)
+    sys.excepthook = hook
 
 
 @pytest.fixture(scope="session")

@@ -91,7 +91,16 @@ class Door:
         """Cut every connection, as after a revocation."""
         self._shut()
         self._open()
-        sockets.bind_again(self._pull, self._router, self._publish, self.addresses)
+        until(self._bound)
+
+    def _bound(self) -> bool:
+        """Ports are freed by a thread of ZeroMQ's."""
+        at = self.addresses
+        try:
+            sockets.bind(self._pull, self._router, self._publish, at.data, at.control)
+        except TransportError:
+            return False
+        return True
 
     def _shut(self) -> None:
         for one in (self._pull, self._router, self._publish):
@@ -177,7 +186,7 @@ def test_an_allowed_key_is_the_sender_of_every_part() -> None:
         for frames, senders in (*at.keyframes, *at.control):
             assert senders == [ROBOT.public] * len(frames)
         assert at.keyframes[0][0][0] == b"head"
-        assert at.subscriptions[0][0] == [b"\x01mesh/default/"]
+        assert at.subscriptions[0] == ([b"\x01mesh/default/"], [ROBOT.public])
 
 
 def test_without_keys_the_link_is_as_before() -> None:

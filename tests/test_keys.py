@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 import stat
+import string
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -30,8 +31,12 @@ def mode(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
 
 
-def key() -> str:
-    return zmq.curve_keypair()[0].decode()
+def key(first: str = "") -> str:
+    """A public key; one that begins with a dash looks like an option."""
+    while True:
+        made = zmq.curve_keypair()[0].decode()
+        if made.startswith(first or tuple(string.ascii_letters)):
+            return made
 
 
 @pytest.fixture
@@ -141,6 +146,21 @@ def test_the_same_key_has_one_name(server: Path) -> None:
     keys.revoke(server, "robot1")
     keys.allow(server, "robot2", one)
     assert keys.read_list(server) == keys.Allowed({"robot2": one}, {})
+
+
+def test_a_lost_list_is_begun_anew(server: Path) -> None:
+    one = key()
+    (server / keys.ALLOWED).unlink()
+    keys.allow(server, "robot1", one)
+    assert keys.read_list(server) == keys.Allowed({"robot1": one})
+
+
+def test_a_key_that_looks_like_an_option(run: Run) -> None:
+    """Ours do not; other tools make them."""
+    run("new", "server")
+    foreign = key("-")
+    assert run("allow", "robot1", "--", foreign) == "robot1 may connect\n"
+    assert json.loads(run("list", "--json"))["allowed"] == {"robot1": foreign}
 
 
 def test_revoke(run: Run) -> None:

@@ -20,7 +20,7 @@ import tsfusion
 from tsfusion import Client, Keyframe, codec, maps
 from tsfusion.config import ClientConfig
 from tsfusion.errors import FlushTimeout, InvalidKeyframe, KeyframeRefused, ServerUnreachable, TransportError
-from tsfusion.fetch import fetch_mesh, fetch_status
+from tsfusion.fetch import fetch_health, fetch_mesh, fetch_status
 from tsfusion.recording import read_keyframes
 from tsfusion.transport import Command, messages, request, sockets, work
 
@@ -190,6 +190,17 @@ def test_the_same_keyframe_counts_once(shared: Server) -> None:
             push.send_multipart(frames)
         until(lambda: fetch_status(shared.address).duplicates == before.duplicates + 4)
     until(lambda: fused(shared.address) == before.keyframes_fused + 1)
+
+
+def test_what_is_journaled_is_not_refused_when_it_comes_again(shared: Server) -> None:
+    """Damaged on its second way, or after a limit was lowered: it is a duplicate before all else."""
+    before = fetch_health(shared.address)
+    frames = codec.encode(wall(), session=os.urandom(16), seq=1, jpeg_quality=90)
+    with raw_push(shared.address) as push:
+        push.send_multipart(frames)
+        push.send_multipart([frames[0], frames[1][:-1] + b"x", frames[2]])
+        until(lambda: fetch_health(shared.address).duplicates == before.duplicates + 1)
+    assert fetch_health(shared.address).refused == before.refused
 
 
 def test_a_refused_keyframe_is_told_and_the_rest_goes_on(shared: Server) -> None:

@@ -7,7 +7,7 @@ import re
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,20 +20,6 @@ SESSION = bytes(range(0xA0, 0xB0))
 LINE = {"time", "level", "process", "logger", "message"}
 log = logging.getLogger("tsfusion.test")
 Said = Callable[[], list[str]]
-
-
-@pytest.fixture(autouse=True)
-def restored() -> Iterator[None]:
-    """Logging as it was."""
-    handlers, level, hook = logging.root.handlers[:], logging.getLogger("tsfusion").level, sys.excepthook
-    yield
-    for handler in logging.root.handlers[:]:
-        if isinstance(handler, logs.Stderr):
-            handler.close()
-            logging.root.removeHandler(handler)
-    assert logging.root.handlers == handlers
-    logging.getLogger("tsfusion").setLevel(level)
-    sys.excepthook = hook
 
 
 @pytest.fixture

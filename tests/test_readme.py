@@ -37,7 +37,11 @@ def test_there_is_python_to_run() -> None:
 
 def test_every_flag_shown_exists() -> None:
     """Each `tsfusion VERB …` line of the README names a verb and flags that its help knows."""
-    lines = [line for block in blocks("sh") for line in re.split(r"&&|>|\n", block)]
+    lines = [
+        re.sub(r"^\w+\$\s+", "", line)  # the prompt says on which machine
+        for block in blocks("sh")
+        for line in re.split(r"&&|>|\n", block)
+    ]
     commands = [
         shlex.split(line, comments=True)[1:]
         for line in lines

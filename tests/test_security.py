@@ -2,12 +2,14 @@
 """Nothing of a stranger reaches journal or map: a real server with keys, and those it should not let in."""
 
 import os
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import zmq
+from web import get
 from wire import DEADLINE, Server, serving, until, wall
 
 import tsfusion
@@ -248,3 +250,23 @@ def test_with_keys_every_interface_may_be_served(tmp_path: Path) -> None:
         assert fetch_health(address, keys=site.of("robot")).ready
         with pytest.raises(TransportError):
             fetch_health(address, timeout=1.0)
+
+
+def test_a_damaged_allow_list_lets_nobody_in_until_it_is_mended(tmp_path: Path) -> None:
+    site = Site(tmp_path)
+    listed = site.keys / keys.ALLOWED
+    good = listed.read_bytes()
+    with socket.create_server(("127.0.0.1", 0)) as drawn:
+        page = f"127.0.0.1:{drawn.getsockname()[1]}"
+    with serving(site.state, keys=str(site.keys), metrics=page) as server:
+        fetch_health(server.address, keys=site.of("robot"))
+        listed.write_bytes(good + b"[")
+        with pytest.raises(NotAllowed):
+            fetch_health(server.address, keys=site.of("robot"))
+        until(lambda: "nobody may connect: the allow-list" in get(page, "/readyz")[1])
+        assert get(page, "/readyz")[0] == 503
+        listed.write_bytes(good)
+        assert fetch_health(server.address, keys=site.of("robot")).ready
+    listed.write_bytes(good + b"[")
+    with pytest.raises(RuntimeError, match=r"InvalidConfig: the allow-list .* is damaged"):
+        serving(site.state, keys=str(site.keys)).__enter__()

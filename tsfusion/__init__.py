@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from tsfusion.errors import MapError as MapError
     from tsfusion.errors import MapFull as MapFull
     from tsfusion.errors import MissingDependency as MissingDependency
+    from tsfusion.errors import NotAllowed as NotAllowed
     from tsfusion.errors import OutputError as OutputError
     from tsfusion.errors import ServerUnreachable as ServerUnreachable
     from tsfusion.errors import TransportError as TransportError
@@ -38,8 +39,8 @@ __version__ = "0.1.0"
 
 _ERRORS = (
     "CheckpointError", "DatasetError", "DecodeError", "FlushTimeout", "InvalidConfig", "InvalidKeyframe",
-    "JournalError", "KeyframeRefused", "MapError", "MapFull", "MissingDependency", "OutputError",
-    "ServerUnreachable", "TransportError", "TsfusionError", "WeightOverflow",
+    "JournalError", "KeyframeRefused", "MapError", "MapFull", "MissingDependency", "NotAllowed",
+    "OutputError", "ServerUnreachable", "TransportError", "TsfusionError", "WeightOverflow",
 )  # fmt: skip
 _HOME = {
     "Client": "client",

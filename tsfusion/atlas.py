@@ -77,7 +77,6 @@ class Atlas:
         volume = self._volumes.get(name) or self._volumes[DEFAULT_MAP]
         hosted = self._open[name] = HostedMap(self._context, name, self._server, volume, self._clients)
         self._unopened.pop(name, None)
-        log.info("the map is being opened", extra=logs.about(map=name))
         return hosted
 
     def _give_up(self, name: str, error: TsfusionError) -> None:

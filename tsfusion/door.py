@@ -8,6 +8,7 @@ from typing import Any
 
 import zmq
 
+from tsfusion.errors import InvalidConfig
 from tsfusion.keys import AllowList
 from tsfusion.transport.curve import ServerKeys, server_keys
 from tsfusion.transport.zap import Zap, sender_of
@@ -26,7 +27,7 @@ class Door:
         poll: the sockets that `step` wants to be called for.
 
     Raises:
-        InvalidConfig: when the folder has no usable keys.
+        InvalidConfig: when the folder has no usable keys or allow-list.
     """
 
     def __init__(self, context: "zmq.Context[Any]", folder: str | None) -> None:
@@ -37,8 +38,15 @@ class Door:
         if folder is not None:
             self.keys = server_keys(folder)
             self._allowed = AllowList(Path(folder))
+            if self._allowed.problem:  # who starts a server is there to mend it; later, nobody is let in
+                raise InvalidConfig(self._allowed.problem)
             self._zap = Zap(context, self._allowed.name_of, self._allowed.why_not)
         self.poll = [] if self._zap is None else [self._zap.socket]
+
+    @property
+    def problem(self) -> str:
+        """Why nobody at all is let in; empty = the allow-list can be read."""
+        return "" if self._allowed is None else self._allowed.problem
 
     @property
     def refused(self) -> Counter[str]:

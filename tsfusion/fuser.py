@@ -149,7 +149,7 @@ class Fuser:
         reason, message = order.skip, ""
         if reason is None:
             self._working.at(order.index)
-            process.limit_memory(self._most - min(_KEPT_FREE, self._begin.memory_bytes // 4))
+            process.limit_memory(self._most - min(_KEPT_FREE, self._begin.memory_bytes // 2))
             try:
                 record = journal.read(self._folder / maps.JOURNAL_FOLDER, order.position)
                 self._volume.integrate(codec.decode(record.frames))

@@ -254,8 +254,12 @@ class Gateway:
         """How the server is doing."""
         now = time.monotonic()
         found, problems = self.maps.health()
+        if self._door.problem:
+            problems.insert(0, f"nobody may connect: {self._door.problem}")
         return messages.Health(
-            ready=self._accepting and not any(one.problem for one in found.values()),
+            ready=self._accepting
+            and not self._door.problem
+            and not any(one.problem for one in found.values()),
             problems=tuple(problems),
             epoch=self.epoch,
             uptime_s=now - self._started,

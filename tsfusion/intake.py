@@ -102,22 +102,21 @@ class Intake:
     def _on_checked(
         self, hosted: HostedMap, header: codec.Header, buffers: list[Any], client: str, received_ns: int
     ) -> None:
-        try:
-            codec.check(buffers, self._server.max_frame_bytes)
-            self._quotas.check(header)
-        except codec.Refused as error:
-            self._refuse(error, client, header)
-            return
+        # before all else: what is journaled must not be refused when it comes again
         verdict = hosted.sessions.admit(header.session, header.seq, header.previous)
-        if verdict == "next":
-            try:
-                hosted.accept(header, buffers, client, received_ns)
-            except JournalError:
-                self._hold(header.session, hosted.held(time.monotonic()), "disk", hosted.problem)
-        else:
+        if verdict != "next":
             self.duplicates += verdict == "duplicate"
             self.refused["gap"] += verdict == "gap"
             hosted.acknowledge(header.session, resend=verdict == "gap")
+            return
+        try:
+            codec.check(buffers, self._server.max_frame_bytes)
+            self._quotas.check(header)
+            hosted.accept(header, buffers, client, received_ns)
+        except codec.Refused as error:
+            self._refuse(error, client, header)
+        except JournalError:
+            self._hold(header.session, hosted.held(time.monotonic()), "disk", hosted.problem)
 
     def _refuse(self, error: codec.Refused, client: str, header: codec.Header | None = None) -> None:
         """Count a bad message; answer it when it says whose it is, so that it is not sent for ever."""

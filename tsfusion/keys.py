@@ -98,7 +98,7 @@ def allow(folder: Folder, name: str, key: str) -> str | None:
     place = _existing(folder)
     with private_folder.locked(place):
         own = curve.server_keys(place).public
-        listed = read_list(place)
+        listed = read_list(place) if has_list(place) else Allowed()
         earlier = listed.allowed.get(name)
         _check_free(name, public, own, listed)
         if earlier == public:
@@ -210,7 +210,7 @@ class AllowList:
             self._revoked = dict(listed.revoked)
             log.log(
                 logging.INFO if self._names else logging.WARNING,
-                "%d clients may connect, %d keys are revoked", len(self._names), len(self._revoked),
+                "clients that may connect: %d, keys revoked: %d", len(self._names), len(self._revoked),
             )  # fmt: skip
         return any(self._names.get(key) != name for key, name in before.items())
 

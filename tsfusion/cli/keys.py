@@ -78,7 +78,7 @@ def allow(
     """Let a scanner in; a running server does so at once.
 
     A name has one key: allowing another replaces it, and the name keeps its sessions. KEY holds characters
-    that a shell would read: put it in single quotes.
+    that a shell would read: put it in single quotes, and -- before it if it begins with a dash.
     """
     from tsfusion import keys
 

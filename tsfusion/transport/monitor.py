@@ -141,6 +141,7 @@ class Monitor:
 
     def _unknown(self) -> str:
         key = shlex.quote(self._key)
+        key = f"-- {key}" if self._key.startswith("-") else key  # no option
         return (
             f"the server at {self.address} does not know this client's key {self._key} (or it was revoked): "
             f"on the server, run `tsfusion keys allow NAME {key}`"

@@ -7,7 +7,6 @@ lingers: what must survive is in the spool.
 
 import re
 import socket
-import time
 from ipaddress import ip_address
 from typing import Any
 
@@ -27,7 +26,6 @@ _CONNECTING = {
     **_ANY, zmq.RECONNECT_IVL: 100, zmq.RECONNECT_IVL_MAX: 1000, zmq.TCP_KEEPALIVE: 1, zmq.IMMEDIATE: 1
 }  # fmt: skip
 _RANDOM_PORT_TRIES = 32
-_FREED_WITHIN = 5.0  # seconds
 LAST_PORT = 65535
 _MAX_TOPIC = 64
 _ADDRESS = re.compile(r"tcp://((?P<host>[\w.*-]+)|\[(?P<host6>[\w:.%]+)\]):(?P<port>[0-9]{1,5}|\*)", re.ASCII)
@@ -205,24 +203,6 @@ def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, t
             if not last:
                 raise
     raise AssertionError("the last try returns or raises")
-
-
-def bind_again(data: AnySocket, control: AnySocket, publish: AnySocket, addresses: Addresses) -> None:
-    """Bind new sockets where a server's old ones were closed just now, which drops every connection.
-
-    Raises:
-        TransportError: when a port stays taken.
-    """
-    deadline = time.monotonic() + _FREED_WITHIN
-    for made, address in ((data, addresses.data), (control, addresses.control), (publish, addresses.publish)):
-        while True:
-            try:
-                _bind(made, address)
-                break
-            except TransportError:  # libzmq closes in the background: mostly within a millisecond
-                if time.monotonic() > deadline:
-                    raise
-                time.sleep(0.001)
 
 
 def _bind(made: AnySocket, address: str) -> str:
