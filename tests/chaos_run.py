@@ -184,7 +184,7 @@ class Watch:
         self._thread.join()
 
 
-def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Result:
+def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 16) -> Result:
     """One seed in an empty folder; every other one with keys, and every other two with two scanners."""
     keys = secured(folder / "keys") if seed % 2 == 0 else UNSECURED
     count = 1 + seed // 2 % 2
