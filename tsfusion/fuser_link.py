@@ -145,7 +145,8 @@ class FuserLink:
             self.ready = self._was_ready = True
         elif isinstance(message, work.Done):
             self.in_flight.popleft()
-            self._blame.pop(message.index, None)
+            if self._blame.get(message.index, 0) < _ENOUGH:  # a verdict stays: it may come again
+                self._blame.pop(message.index, None)
             self._ended_early = 0
             self.failed = ""
         return message, frames

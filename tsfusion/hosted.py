@@ -197,6 +197,7 @@ class HostedMap:
         self._waiting = 0
         for session in self.sessions:
             done = ready.done.get(session.key)
+            session.in_map = done.seq if done else 0
             session.handed = self._index.after(session, done.seq) if done else 0
             self._waiting += len(session.entries) - session.handed
             if session.handed < len(session.entries):
@@ -230,6 +231,7 @@ class HostedMap:
     def _on_done(self, done: work.Done) -> None:
         entry = self._index[done.index]
         session = self.sessions.numbered(entry.session)
+        session.in_map = entry.stamps.seq
         self._waiting -= 1
         self._unmeshed.append(done.index)
         if done.reason is None:

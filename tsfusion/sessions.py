@@ -29,6 +29,7 @@ class Session(Struct, eq=False):
         client: whose it is: the name that its key is allowed under; empty = it came without keys.
         durable: the highest seq that is journaled.
         fused: the highest that the map has taken or refused.
+        in_map: the same of the fuser that lives: after a death it begins at the checkpoint again.
         entries: the indices of its keyframes.
         handed: how many of these the fuser was given.
     """
@@ -38,6 +39,7 @@ class Session(Struct, eq=False):
     client: str = ""
     durable: int = 0
     fused: int = 0
+    in_map: int = 0
     entries: "array[int]" = field(default_factory=lambda: array("q"))
     handed: int = 0
 
