@@ -16,7 +16,7 @@ import pytest
 import zmq
 from wire import DEADLINE, Server, connected, serving, until, wall
 
-from tsfusion import Client, VolumeConfig, codec, config, fuser_link
+from tsfusion import Client, VolumeConfig, codec, config, fuser_process
 from tsfusion.codec.header import pack
 from tsfusion.config import ServerConfig
 from tsfusion.errors import (
@@ -147,7 +147,7 @@ while True:
 
 
 def test_orders_that_find_no_room_are_given_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fuser_link, "COMMAND", (sys.executable, "-c", _SLOW))
+    monkeypatch.setattr(fuser_process, "COMMAND", (sys.executable, "-c", _SLOW))
     context: zmq.Context[Any] = zmq.Context()
     link = FuserLink(context, tmp_path, ServerConfig(state=str(tmp_path)), VolumeConfig())
     try:
