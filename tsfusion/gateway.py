@@ -28,8 +28,10 @@ from tsfusion.transport.sockets import mesh_topic
 
 log = logging.getLogger(__name__)
 
+_LISTEN_TICK_MS = 10
 _TICK_MS = 100  # how long a signal or a fuser's death may go unnoticed
 _SNAPSHOT_INTERVAL = 1.0  # seconds
+Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
 
 class Gateway:
@@ -60,7 +62,7 @@ class Gateway:
         self._topics: set[bytes] = set()  # that somebody subscribed to
         self._watched: dict[str, bool] = {}  # what each fuser knows of it
         self._memory = MemoryBound(server.memory_bytes)
-        self._accepting = False
+        self._accepting = self._stopped = False
         self._started = time.monotonic()
         self._next_snapshot = 0.0
         self._new_epoch()
@@ -76,8 +78,7 @@ class Gateway:
 
     def stop_accepting(self) -> None:
         """Take no more keyframes; clients keep what is not acknowledged."""
-        self._accepting = False
-        self.ports.keyframes.close()
+        self._accepting, self._stopped = False, True
 
     def step(self) -> None:
         """Wait for something to happen (a moment at most) and deal with it.
@@ -85,26 +86,35 @@ class Gateway:
         Raises:
             TsfusionError: when a map that was to be opened at the start cannot be.
         """
-        handlers: dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]] = {
+        handlers = self._handlers()
+        fusers = [hosted.fuser.socket for hosted in self.maps]
+        polled = [(socket, zmq.POLLIN) for socket in (*self._door.poll, *fusers, *handlers)]
+        events = dict(zmq.zmq_poll(polled, _TICK_MS if handlers else _LISTEN_TICK_MS))
+        if not self._guard():
+            for socket, handle in handlers.items():
+                if socket in events:
+                    each(socket, handle)
+        self.ports.step()
+        self.maps.step(self._on_other)
+        self._tell_fusers()
+        self._snapshot()
+
+    def _handlers(self) -> Handlers:
+        """What to do with messages, by socket; nothing while these are made anew."""
+        if self.ports.problem:
+            return {}
+        handlers: Handlers = {
             self.ports.control: self._on_control,
             self.ports.publish: self._on_subscription,
         }
         if self._accepting:
             handlers[self.ports.keyframes] = self._intake.take
-        fusers = [hosted.fuser.socket for hosted in self.maps]
-        polled = [(socket, zmq.POLLIN) for socket in (*self._door.poll, *fusers, *handlers)]
-        events = dict(zmq.zmq_poll(polled, _TICK_MS))
-        self._guard()
-        if self.ports.control in handlers:  # else they were made anew
-            for socket, handle in handlers.items():
-                if socket in events:
-                    each(socket, handle)
-        self.maps.step(self._on_other)
-        self._tell_fusers()
-        self._snapshot()
+        elif self._stopped:
+            self.ports.keyframes.close()
+        return handlers
 
-    def _guard(self) -> None:
-        """Drop all connections when a key was revoked, or when they hold too much memory.
+    def _guard(self) -> bool:
+        """Drop all connections when a key was revoked, or when they hold too much memory; whether it did.
 
         ZeroMQ limits a frame and a queue of whole messages, not a message that never ends.
         """
@@ -114,7 +124,7 @@ class Gateway:
         else:
             held = self._memory.excess(self._questions.nbytes)
             if not held:
-                return
+                return False
             log.error(
                 "the gateway holds %d MB, more than memory_bytes: every connection is made anew", held >> 20
             )
@@ -123,6 +133,7 @@ class Gateway:
         self._routes.clear()
         self._topics.clear()
         self._new_epoch()
+        return True
 
     def _snapshot(self) -> None:
         now = time.monotonic()
@@ -256,10 +267,11 @@ class Gateway:
         found, problems = self.maps.health()
         if self._door.problem:
             problems.insert(0, f"nobody may connect: {self._door.problem}")
+        if self.ports.problem:
+            problems.insert(0, self.ports.problem)
+        blocked = self.ports.problem or self._door.problem or any(one.problem for one in found.values())
         return messages.Health(
-            ready=self._accepting
-            and not self._door.problem
-            and not any(one.problem for one in found.values()),
+            ready=self._accepting and not blocked,
             problems=tuple(problems),
             epoch=self.epoch,
             uptime_s=now - self._started,

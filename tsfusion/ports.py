@@ -17,12 +17,16 @@ from tsfusion.transport.curve import ServerKeys
 log = logging.getLogger(__name__)
 
 _MESSAGES_A_STEP = 16
-_REBIND_DEADLINE = 10.0  # seconds; ports are freed by a thread of ZeroMQ's
+_REBIND_INTERVAL = 0.01  # seconds
 Handler: TypeAlias = Callable[[list[zmq.Frame]], None]
 
 
 class Ports:
-    """Keyframes in, control both ways, mesh updates out."""
+    """Keyframes in, control both ways, mesh updates out.
+
+    Attributes:
+        problem: why nobody can connect; empty = they can.
+    """
 
     def __init__(
         self, context: "zmq.Context[Any]", server: ServerConfig, keys: ServerKeys | None = None
@@ -31,6 +35,8 @@ class Ports:
         self._server = server
         self._keys = keys
         self._addresses: Addresses | None = None
+        self._again = 0.0  # when it is tried again to listen
+        self.problem = ""
         self._open()
 
     def _open(self) -> None:
@@ -49,25 +55,29 @@ class Ports:
         return self._addresses
 
     def renew(self) -> None:
-        """Drop every connection, with all that it holds in memory, and listen at the same addresses again.
-
-        Raises:
-            TransportError: when somebody else took a port meanwhile.
-        """
+        """Drop every connection, with all that it holds in memory; `step` listens at the same places again."""
         self.close()
-        self._open()
-        if self._addresses is None:
+        self.problem = "every connection is made anew"
+        self.step()
+
+    def step(self) -> None:
+        """Listen again, as soon as ZeroMQ's threads have given the ports back. Never waits."""
+        now = time.monotonic()
+        if not self.problem or now < self._again:
             return
-        data, control = self._addresses.data, self._addresses.control
-        deadline = time.monotonic() + _REBIND_DEADLINE
-        while True:
-            try:
-                sockets.bind(self.keyframes, self.control, self.publish, data, control)
-                return
-            except TransportError:
-                if time.monotonic() > deadline:
-                    raise
-                time.sleep(0.005)
+        self._again = now + _REBIND_INTERVAL
+        try:
+            if self.control.closed:
+                self._open()
+            if self._addresses is not None:
+                addresses = self._addresses
+                sockets.bind(self.keyframes, self.control, self.publish, addresses.data, addresses.control)
+        except (TransportError, zmq.ZMQError) as error:
+            if self.control.closed:
+                self.close()  # no room for all three
+            self.problem = f"cannot listen any more, and will try again: {error}"
+        else:
+            self.problem = ""
 
     def close(self) -> None:
         """Close them; nothing lingers."""
@@ -89,8 +99,8 @@ def send_now(socket: sockets.AnySocket, frames: list[Any]) -> None:
     """Send, or drop what cannot leave at once: the asker will ask again."""
     try:
         socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
-    except zmq.Again:
-        log.warning("an answer was dropped: its connection is full")
+    except zmq.ZMQError as error:  # zmq.Again: it is full; or it is being made anew
+        log.warning("an answer was dropped: %s", error)
 
 
 class MemoryBound:
