@@ -55,7 +55,7 @@ class Ports:
         return self._addresses
 
     def renew(self) -> None:
-        """Drop every connection, with all that it holds in memory; `step` listens at the same places again."""
+        """Drop every connection, with all that it holds in memory; `step` listens at the same ports again."""
         self.close()
         self.problem = "every connection is made anew"
         self.step()
