@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """What the fuser does with each message, in this process; its link is a list."""
 
+import errno
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ from wire import wall
 
 import tsfusion
 from tsfusion import VolumeConfig, codec
-from tsfusion.errors import InvalidConfig
+from tsfusion.errors import CheckpointError, InvalidConfig
 from tsfusion.fuser import Fuser
 from tsfusion.journal import Journal, Position
 from tsfusion.maps import MAP_FILE, PREVIOUS_FILE
@@ -158,11 +160,44 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_journal_fused_anew(
     path = saved(tmp_path)
     stored = bytearray(path.read_bytes())
     stored[len(stored) // 2] ^= 1
-    path.write_bytes(stored)
-    fuser, _ = opened(tmp_path)
-    assert fuser.ready().done == {}
-    assert "built again from the journal" in caplog.text
-    assert path.with_suffix(".damaged").exists()
+    for name in ("map.damaged", "map.damaged2"):  # nothing that was set aside is overwritten
+        path.write_bytes(stored)
+        fuser, _ = opened(tmp_path)
+        assert fuser.ready().done == {}
+        assert "built again from the journal" in caplog.text
+        assert (tmp_path / name).read_bytes() == stored
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("code", [errno.EMFILE, errno.EIO, errno.EACCES, errno.ENOMEM])
+def test_a_checkpoint_that_cannot_be_read_now_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    path = saved(tmp_path)
+    real = Path.open
+
+    def refused(self: Path, *arguments: Any, **more: Any) -> Any:
+        if self == path:
+            raise OSError(code, os.strerror(code))
+        return real(self, *arguments, **more)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "open", refused)
+        with pytest.raises(CheckpointError, match=os.strerror(code)):
+            opened(tmp_path)
+    assert opened(tmp_path)[0].ready().done == {SESSION: work.Progress(1, "")}
+
+
+def test_a_checkpoint_without_memory_for_it_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(tmp_path)
+
+    def none_left(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("tsfusion.volume.Volume.load", none_left)
+    with pytest.raises(CheckpointError, match="does not fit"):
+        opened(tmp_path)
+    assert path.exists()
 
 
 def test_a_keyframe_that_the_map_has_is_not_fused_again(tmp_path: Path) -> None:

@@ -2,12 +2,13 @@
 """A map on a server's disk: its last checkpoint, the one before, and how far each session was in it."""
 
 import logging
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tsfusion import maps
 from tsfusion.config import VIEW_SETTINGS, VolumeConfig
-from tsfusion.errors import CheckpointError, InvalidConfig, TsfusionError
+from tsfusion.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
 from tsfusion.transport.work import Progress
 
 if TYPE_CHECKING:
@@ -32,7 +33,8 @@ class SavedMap:
 
     Raises:
         InvalidConfig: when the map was made with other settings.
-        CheckpointError: when it is not a server's.
+        CheckpointError: when it is not a server's, cannot be read now or is of another version. What is
+            damaged is set aside.
     """
 
     def __init__(self, folder: Path, config: VolumeConfig, *, keep_previous: bool) -> None:
@@ -64,18 +66,23 @@ class SavedMap:
 
 
 def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
-    """The volume that was saved there; None when there is none, or it is damaged."""
+    """The volume that was saved there; None when there is none, or it is damaged.
+
+    Nothing else is None: what cannot be read now is good when it can be, and must not be begun anew.
+    """
     from tsfusion.volume import Volume
 
-    if not path.exists():
-        return None
     try:
         volume = Volume.load(path, wanted.threads, **{name: getattr(wanted, name) for name in VIEW_SETTINGS})
-    except CheckpointError as error:
-        aside = path.with_suffix(".damaged")
-        log.error("%s; it is kept as %s, and the map is built again from the journal", error, aside)
-        path.replace(aside)
+    except DamagedCheckpoint as error:
+        _set_aside(path, error)
         return None
+    except CheckpointError as error:
+        if isinstance(error.__cause__, FileNotFoundError):
+            return None
+        raise
+    except MemoryError as error:
+        raise CheckpointError(f"the map {path} does not fit into this machine's memory") from error
     if "done" not in volume.meta:
         raise CheckpointError(f"{path} was not saved by a server: it does not say which keyframes it holds")
     for name in VolumeConfig.__struct_fields__:
@@ -86,3 +93,17 @@ def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
                 f"folder, or remove {path.name} to build the map again from the journal"
             )
     return volume
+
+
+def _set_aside(path: Path, error: DamagedCheckpoint) -> None:
+    """Out of the way, beside what was set aside before."""
+    names = (path.with_name(f"{path.stem}.damaged{number}") for number in ("", *range(2, 1_000_000)))
+    try:
+        aside = next(name for name in names if not os.path.lexists(name))
+        path.rename(aside)
+    except OSError as refusal:
+        raise CheckpointError(f"{error}, and it cannot be set aside: {refusal.strerror}") from refusal
+    log.error(
+        "%s; it is kept as %s, and the map is built again from the journal, or goes on from the checkpoint "
+        "before it", error, aside,
+    )  # fmt: skip
