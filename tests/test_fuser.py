@@ -17,6 +17,7 @@ from tsfusion.errors import CheckpointError, InvalidConfig
 from tsfusion.fuser import Fuser
 from tsfusion.journal import Journal, Position
 from tsfusion.maps import MAP_FILE, PREVIOUS_FILE
+from tsfusion.saved_map import SavedMap
 from tsfusion.transport import Command, work
 
 VOLUME = VolumeConfig(voxel_size=0.04, threads=1)
@@ -223,6 +224,13 @@ def test_a_checkpoint_on_request_keeps_the_one_before(tmp_path: Path) -> None:
     (tmp_path / MAP_FILE).write_bytes(b"")
     again, _ = opened(tmp_path, keep_previous=True)
     assert again.ready().done == {SESSION: work.Progress(1, "robot")}
+
+
+def test_a_map_of_many_sessions_comes_back(tmp_path: Path) -> None:
+    written = SavedMap(tmp_path, VOLUME, keep_previous=False)
+    written.done = {number.to_bytes(16): work.Progress(number, "robot") for number in range(1, 40_001)}
+    assert written.save()
+    assert opened(tmp_path)[0].ready().done == written.done
 
 
 def test_what_it_works_at_shows_from_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -149,8 +149,6 @@ def _check_magic(file: BinaryIO, path: Path) -> None:
 
 def _read_header(file: BinaryIO, path: Path) -> Header:
     (length,) = struct.unpack("<I", _exactly(file, 4, path))
-    if length > 1 << 20:
-        raise DamagedCheckpoint(f"{path} is damaged: its header claims {length} bytes")
     try:
         header = msgspec.msgpack.decode(_exactly(file, length, path), type=Header)
     except msgspec.ValidationError as error:  # the digest agrees: it is as its writer meant it
