@@ -250,6 +250,26 @@ def test_what_it_works_at_shows_from_outside(tmp_path: Path, monkeypatch: pytest
     assert (tmp_path / "working").read_bytes() == b"\xff" * 8
 
 
+@pytest.mark.parametrize("code", [errno.EIO, errno.EMFILE, errno.ENOMEM])
+def test_a_record_that_cannot_be_read_now_is_left_to_another_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    (position,) = fill(tmp_path, 1)
+    fuser, link = opened(tmp_path)
+
+    def refused(*_: object) -> bytes:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "pread", refused)
+    fuser.take(order(0, position))
+    assert (fuser.exit_status, link.sent, fuser.ready().done) == (1, [], {})
+    assert (tmp_path / "working").read_bytes() == bytes(8)  # it was at this one
+    monkeypatch.undo()
+    again, link = opened(tmp_path)
+    again.take(order(0, position))
+    assert link.done().reason is None
+
+
 def test_no_memory_for_a_keyframe_is_no_crash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (position,) = fill(tmp_path, 1)
     fuser, link = opened(tmp_path)
