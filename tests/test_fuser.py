@@ -226,6 +226,32 @@ def test_a_checkpoint_on_request_keeps_the_one_before(tmp_path: Path) -> None:
     assert again.ready().done == {SESSION: work.Progress(1, "robot")}
 
 
+@pytest.mark.parametrize("keep_previous", [False, True])
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_checkpoint_that_fails_leaves_the_old_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str, keep_previous: bool
+) -> None:
+    folder = tmp_path / "map"
+    folder.mkdir()
+    written = SavedMap(folder, VOLUME, keep_previous=keep_previous)
+    for seq in (1, 2):
+        written.done = {SESSION: work.Progress(seq, "robot")}
+        assert written.save()
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert sorted(before) == ([PREVIOUS_FILE] if keep_previous else []) + [MAP_FILE]
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, call, full)
+        assert not written.save()
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    (folder / "map.new.tsf").write_bytes(b"by one that was killed")
+    assert SavedMap(folder, VOLUME, keep_previous=keep_previous).done == written.done
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
 def test_a_map_of_many_sessions_comes_back(tmp_path: Path) -> None:
     written = SavedMap(tmp_path, VOLUME, keep_previous=False)
     written.done = {number.to_bytes(16): work.Progress(number, "robot") for number in range(1, 40_001)}

@@ -3,10 +3,11 @@
 
 import logging
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tsfusion import maps
+from tsfusion import disk, maps
 from tsfusion.config import VIEW_SETTINGS, VolumeConfig
 from tsfusion.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
 from tsfusion.transport.work import Progress
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 # Settings that may differ between a map and the server that goes on with it: none changes the sums.
 _FREE_SETTINGS = ("threads", "max_blocks", "max_blocks_per_keyframe", *VIEW_SETTINGS)
+_NEW_FILE = "map.new.tsf"
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +43,9 @@ class SavedMap:
         from tsfusion.volume import Volume
 
         self._path, self._previous = folder / maps.MAP_FILE, folder / maps.PREVIOUS_FILE
+        self._new = folder / _NEW_FILE
+        with suppress(OSError):  # of a process that was killed
+            self._new.unlink()
         self._keep_previous = keep_previous
         self.done: dict[bytes, Progress] = {}
         self.rejected: dict[str, int] = {}
@@ -52,13 +57,17 @@ class SavedMap:
     def save(self) -> bool:
         """Write a checkpoint; False when that failed, which is logged.
 
-        Nothing is lost then: the next start fuses the journal from the checkpoint before this one.
+        Nothing is lost then: the next start fuses the journal from the checkpoint before this one. Until the
+        new one is on the disk, the old ones keep their names.
         """
         done = {key.hex(): [progress.seq, progress.client] for key, progress in self.done.items()}
         try:
-            if self._keep_previous and self._path.exists():
-                self._path.replace(self._previous)
-            self.volume.save(self._path, meta={"done": done, "rejected": self.rejected})
+            self.volume.save(self._new, meta={"done": done, "rejected": self.rejected})
+            if self._keep_previous:
+                with suppress(FileNotFoundError):
+                    self._path.replace(self._previous)
+            self._new.replace(self._path)
+            disk.sync_folder(self._path.parent)
         except (TsfusionError, OSError, MemoryError) as error:
             log.error("no checkpoint: %s", error)
             return False
