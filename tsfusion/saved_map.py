@@ -99,7 +99,7 @@ def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
         if name not in _FREE_SETTINGS and here != there:
             raise InvalidConfig(
                 f"the map in {path.parent} was made with {name} = {there}, got {here}: use another state "
-                f"folder, or remove {path.name} to build the map again from the journal"
+                f"folder or map (only a journal that is whole can build this one anew)"
             )
     return volume
 
