@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 _TICK_MS = 100  # how long a signal or a fuser's death may go unnoticed
 _SNAPSHOT_INTERVAL = 1.0  # seconds
+_MESHES_SHARE = 4  # a quarter of the memory is for meshes that wait to be read
 
 
 class Gateway:
@@ -56,7 +57,7 @@ class Gateway:
         self._routes = Routes()
         self._intake = Intake(server, self.maps, door, self)
         self._refused = self._intake.refused
-        self._questions = Questions(self._answer)
+        self._questions = Questions(self._answer, server.memory_bytes // _MESHES_SHARE)
         self._topics: set[bytes] = set()  # that somebody subscribed to
         self._watched: dict[str, bool] = {}  # what each fuser knows of it
         self._memory = MemoryBound(server.memory_bytes)
@@ -175,7 +176,7 @@ class Gateway:
             log.debug("%s", error)
             return
         if isinstance(message, messages.Command):
-            self._on_command(identity, message)
+            self._on_command(identity, message, client)
         elif isinstance(message, messages.Hello):
             self._on_hello(identity, message, client)
         else:
@@ -228,14 +229,13 @@ class Gateway:
         hosted = self.maps.get(map_name)
         return hosted.progress(session) if hosted else (0, 0)
 
-    def _on_command(self, identity: bytes, command: messages.Command) -> None:
+    def _on_command(self, identity: bytes, command: messages.Command, client: str) -> None:
         if command.name == "ping":
             self._answer(identity, messages.Reply(name="ping"))
         elif command.name == "health":
             self._answer(identity, messages.Reply(name="health", health=self.health()))
         else:
-            hosted = self.maps.get(command.map)
-            self._questions.ask(identity, command, None if hosted is None else hosted.fuser)
+            self._questions.ask(identity, command, self.maps.get(command.map), client)
 
     def _on_subscription(self, frames: list[zmq.Frame]) -> None:
         change, topic = frames[0].bytes[:1], frames[0].bytes[1:]

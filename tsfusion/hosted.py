@@ -93,6 +93,10 @@ class HostedMap:
         """Whether the map has every keyframe of the journal."""
         return self.fuser.idle and not self._waiting
 
+    def calm(self, since: float) -> bool:
+        """Whether no keyframe waits, nor came since then (`time.monotonic()`)."""
+        return self.drained and (self._last is None or self._last < since)
+
     def close(self) -> None:
         """End the fuser and finish the journal."""
         self.fuser.close()
