@@ -109,6 +109,18 @@ def greetings(target: Target) -> int:
     return sent
 
 
+def sessions(target: Target) -> int:
+    """Sessions without end for the map that is open: each would be told how it is doing."""
+    sent = 0
+    with connected(sockets.dealer, target.control) as link:
+        while not target.over and link.poll(1000, zmq.POLLOUT):
+            link.send(messages.encode(messages.Hello(os.urandom(16), codec.VERSION)))
+            while link.poll(0):
+                link.recv()
+            sent += 1
+    return sent
+
+
 def mesh_flood(target: Target) -> int:
     """Meshes asked for over many connections: some read theirs and ask again, some never read."""
     question = messages.encode(Command(name="mesh", min_weight=0.0))
@@ -266,6 +278,7 @@ ATTACKS: dict[str, Callable[[Target], int]] = {
     "oversized": oversized,
     "rubbish": rubbish,
     "greetings": greetings,
+    "sessions": sessions,
     "mesh flood": mesh_flood,
     "tiny": tiny,
     "subscriptions": subscriptions,

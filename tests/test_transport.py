@@ -161,12 +161,54 @@ def test_strangers_do_not_grow_the_sessions() -> None:
 def test_a_live_session_is_not_taken_over() -> None:
     routes = Routes()
     route = routes.connect(SESSION, "default", b"1", "robot")
-    assert route is not None
-    assert routes.connect(SESSION, "default", b"2", "thief") is None
+    assert not route.open_to("thief")
     assert routes.connect(SESSION, "default", b"3", "robot") is route
     assert route.identity == b"3"
     route.heard -= 3600
+    assert route.open_to("heir")
     assert routes.connect(SESSION, "default", b"4", "heir") is not route
+    assert len(list(routes)) == 1
+
+
+def key_of(number: int) -> bytes:
+    return number.to_bytes(16, "big")
+
+
+def test_a_flood_of_greetings_pushes_out_those_of_its_own_name_only() -> None:
+    routes = Routes()
+    routes.connect(SESSION, "default", b"1", "cart")
+    for number in range(3000):
+        routes.connect(key_of(number), "default", b"2", "robot")
+    assert routes.get(SESSION) is not None
+    assert sum(route.client == "robot" for route in routes) == 64
+
+
+def test_many_names_share_the_routes_fairly() -> None:
+    routes = Routes()
+    routes.connect(SESSION, "default", b"1", "cart")
+    for number in range(6000):
+        routes.connect(key_of(number), "default", b"2", f"robot{number % 40}")
+    assert routes.get(SESSION) is not None
+    assert len(list(routes)) == 1024
+
+
+def test_who_scans_is_not_pushed_out_by_who_only_greets() -> None:
+    routes = Routes()
+    routes.heard(routes.connect(SESSION, "default", b"1"), scans=True)
+    routes.connect(b"known".ljust(16), "default", b"1", scans=True)
+    for number in range(3000):
+        routes.connect(key_of(number), "default", b"2")
+    assert routes.get(SESSION) is not None
+    assert routes.get(b"known".ljust(16)) is not None
+
+
+def test_who_scanned_once_shuts_nobody_out() -> None:
+    routes = Routes()
+    for number in range(2000):
+        routes.connect(key_of(number), "default", b"2", scans=True)
+    route = routes.connect(SESSION, "default", b"1")
+    assert routes.get(SESSION) is route
+    assert len(list(routes)) == 1024
 
 
 def test_the_fuser_takes_from_each_client_in_turn() -> None:

@@ -208,9 +208,10 @@ class Gateway:
             return "map", f"map {hello.map} cannot be opened: {self.maps.why_not(hello.map)}"
         if not hosted.warm:
             return "opening", f"map {hello.map} is being opened"
-        taken = not self._intake.owns(hosted, hello.session, client)
-        if taken or self._routes.connect(hello.session, hello.map, identity, client) is None:
+        if not self._intake.owns(hosted, hello.session, client):
             return "session", "the session of this spool is another client's: use another spool folder"
+        scans = hosted.sessions.get(hello.session) is not None
+        self._routes.connect(hello.session, hello.map, identity, client, scans=scans)
         return None
 
     def _on_ping(self, identity: bytes, ping: messages.Ping, client: str) -> None:
@@ -279,6 +280,12 @@ class Gateway:
         route = self._routes.get(session)
         if route is not None:
             self._answer(route.identity, message)
+
+    def heard(self, session: bytes, client: str, *, scans: bool) -> None:
+        """A keyframe message of the session came."""
+        route = self._routes.get(session)
+        if route is not None and route.client == client:
+            self._routes.heard(route, scans=scans)
 
     def route(self, session: bytes) -> Route | None:
         """The connection of a session's client."""

@@ -35,6 +35,9 @@ class Clients(Protocol):
     def route(self, session: bytes) -> Route | None:
         """Its connection."""
 
+    def heard(self, session: bytes, client: str, *, scans: bool) -> None:
+        """A keyframe message came. `scans`: it is a good one."""
+
     def observe(self, map_name: str, stage: str, seconds: float) -> None:
         """A keyframe took so long for a stage."""
 
