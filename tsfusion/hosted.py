@@ -73,7 +73,6 @@ class HostedMap:
             self.folder / maps.JOURNAL_FOLDER, segment, min_free_bytes=server.min_free_bytes
         )
         self._quarantine = Quarantine(self.folder / maps.QUARANTINE_FOLDER, server.quarantine_bytes)
-        self.quarantined = len(self._quarantine)
         self.sessions = Sessions()
         self._index = KeyframeIndex()
         self._index.recover(self._journal.found, self.sessions)
@@ -279,10 +278,7 @@ class HostedMap:
             frames = read(self._journal.folder, entry.position).frames
         except JournalError:  # that is why it was rejected
             return
-        kept = self._quarantine.keep(
-            frames, session=session.key, seq=seq, client=session.client, reason=done.reason
-        )
-        self.quarantined += kept is not None
+        self._quarantine.keep(frames, session=session.key, seq=seq, client=session.client, reason=done.reason)
 
     def _on_meshed(self, meshed: work.Meshed) -> None:
         self._blocks, self._map_bytes = meshed.map_blocks, meshed.map_bytes
@@ -320,7 +316,7 @@ class HostedMap:
             keyframes_fused=self._fused,
             waiting=self._waiting,
             rejected=dict(self._rejected),
-            quarantined=self.quarantined,
+            quarantined=len(self._quarantine),
             sessions=len(self.sessions),
             journal_bytes=self._journal.nbytes,
             journal_damaged=self._journal.damaged,
