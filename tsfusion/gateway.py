@@ -31,6 +31,7 @@ log = logging.getLogger(__name__)
 _LISTEN_TICK_MS = 10
 _TICK_MS = 100  # how long a signal or a fuser's death may go unnoticed
 _SNAPSHOT_INTERVAL = 1.0  # seconds
+_MESHES_SHARE = 4  # a quarter of the memory is for meshes that wait to be read
 Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
 
@@ -58,7 +59,7 @@ class Gateway:
         self._routes = Routes()
         self._intake = Intake(server, self.maps, door, self)
         self._refused = self._intake.refused
-        self._questions = Questions(self._answer)
+        self._questions = Questions(self._answer, server.memory_bytes // _MESHES_SHARE)
         self._topics: set[bytes] = set()  # that somebody subscribed to
         self._watched: dict[str, bool] = {}  # what each fuser knows of it
         self._memory = MemoryBound(server.memory_bytes)
@@ -186,7 +187,7 @@ class Gateway:
             log.debug("%s", error)
             return
         if isinstance(message, messages.Command):
-            self._on_command(identity, message)
+            self._on_command(identity, message, client)
         elif isinstance(message, messages.Hello):
             self._on_hello(identity, message, client)
         else:
@@ -218,9 +219,10 @@ class Gateway:
             return "map", f"map {hello.map} cannot be opened: {self.maps.why_not(hello.map)}"
         if not hosted.warm:
             return "opening", f"map {hello.map} is being opened"
-        taken = not self._intake.owns(hosted, hello.session, client)
-        if taken or self._routes.connect(hello.session, hello.map, identity, client) is None:
+        if not self._intake.owns(hosted, hello.session, client):
             return "session", "the session of this spool is another client's: use another spool folder"
+        scans = hosted.sessions.get(hello.session) is not None
+        self._routes.connect(hello.session, hello.map, identity, client, scans=scans)
         return None
 
     def _on_ping(self, identity: bytes, ping: messages.Ping, client: str) -> None:
@@ -239,14 +241,13 @@ class Gateway:
         hosted = self.maps.get(map_name)
         return hosted.progress(session) if hosted else (0, 0)
 
-    def _on_command(self, identity: bytes, command: messages.Command) -> None:
+    def _on_command(self, identity: bytes, command: messages.Command, client: str) -> None:
         if command.name == "ping":
             self._answer(identity, messages.Reply(name="ping"))
         elif command.name == "health":
             self._answer(identity, messages.Reply(name="health", health=self.health()))
         else:
-            hosted = self.maps.get(command.map)
-            self._questions.ask(identity, command, None if hosted is None else hosted.fuser)
+            self._questions.ask(identity, command, self.maps.get(command.map), client)
 
     def _on_subscription(self, frames: list[zmq.Frame]) -> None:
         change, topic = frames[0].bytes[:1], frames[0].bytes[1:]
@@ -291,6 +292,12 @@ class Gateway:
         route = self._routes.get(session)
         if route is not None:
             self._answer(route.identity, message)
+
+    def heard(self, session: bytes, client: str, *, scans: bool) -> None:
+        """A keyframe message of the session came."""
+        route = self._routes.get(session)
+        if route is not None and route.client == client:
+            self._routes.heard(route, scans=scans)
 
     def route(self, session: bytes) -> Route | None:
         """The connection of a session's client."""

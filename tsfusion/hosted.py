@@ -35,6 +35,9 @@ class Clients(Protocol):
     def route(self, session: bytes) -> Route | None:
         """Its connection."""
 
+    def heard(self, session: bytes, client: str, *, scans: bool) -> None:
+        """A keyframe message came. `scans`: it is a good one."""
+
     def observe(self, map_name: str, stage: str, seconds: float) -> None:
         """A keyframe took so long for a stage."""
 
@@ -70,7 +73,6 @@ class HostedMap:
             self.folder / maps.JOURNAL_FOLDER, segment, min_free_bytes=server.min_free_bytes
         )
         self._quarantine = Quarantine(self.folder / maps.QUARANTINE_FOLDER, server.quarantine_bytes)
-        self.quarantined = len(self._quarantine)
         self.sessions = Sessions()
         self._index = KeyframeIndex()
         self._index.recover(self._journal.found, self.sessions)
@@ -99,6 +101,10 @@ class HostedMap:
     def settled(self) -> bool:
         """Drained, or never to be: its fuser cannot be kept alive."""
         return self.drained or bool(self.fuser.failed)
+
+    def calm(self, since: float) -> bool:
+        """Whether no keyframe waits, nor came since then (`time.monotonic()`)."""
+        return self.drained and (self._last is None or self._last < since)
 
     def close(self) -> None:
         """End the fuser and finish the journal; what the disk refuses of that is logged."""
@@ -302,10 +308,7 @@ class HostedMap:
             frames = read(self._journal.folder, entry.position).frames
         except JournalError:  # that is why it was rejected
             return
-        kept = self._quarantine.keep(
-            frames, session=session.key, seq=seq, client=session.client, reason=done.reason
-        )
-        self.quarantined += kept is not None
+        self._quarantine.keep(frames, session=session.key, seq=seq, client=session.client, reason=done.reason)
 
     def _on_meshed(self, meshed: work.Meshed) -> None:
         self._blocks, self._map_bytes = meshed.map_blocks, meshed.map_bytes
@@ -350,7 +353,7 @@ class HostedMap:
             keyframes_fused=self._fused,
             waiting=self._waiting,
             rejected=dict(self._rejected),
-            quarantined=self.quarantined,
+            quarantined=len(self._quarantine),
             sessions=len(self.sessions),
             journal_bytes=self._journal.nbytes,
             journal_damaged=self._journal.damaged,

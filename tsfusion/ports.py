@@ -130,15 +130,15 @@ class MemoryBound:
 
 
 class Departures:
-    """Large answers that have not left yet, one a connection: who does not read must not fill our memory."""
+    """Large answers that have not left yet, one a reader: who does not read must not fill our memory."""
 
     def __init__(self) -> None:
         self._trackers: dict[bytes, tuple[zmq.MessageTracker, int]] = {}
 
-    def pending(self, identity: bytes) -> bool:
+    def pending(self, reader: bytes) -> bool:
         """Whether an earlier one still waits for its reader. One whose reader is gone does not."""
         self._forget()
-        return identity in self._trackers
+        return reader in self._trackers
 
     @property
     def nbytes(self) -> int:
@@ -146,13 +146,19 @@ class Departures:
         self._forget()
         return sum(nbytes for _, nbytes in self._trackers.values())
 
+    @property
+    def largest(self) -> int:
+        """The largest of them."""
+        self._forget()
+        return max((nbytes for _, nbytes in self._trackers.values()), default=0)
+
     def _forget(self) -> None:
         self._trackers = {key: kept for key, kept in self._trackers.items() if not kept[0].done}
 
-    def wrap(self, identity: bytes, frames: Sequence[zmq.Frame]) -> list[zmq.Frame]:
+    def wrap(self, reader: bytes, frames: Sequence[zmq.Frame]) -> list[zmq.Frame]:
         """The frames anew, so that it shows when the last has left."""
         *others, last = (frame.buffer for frame in frames)
         tracked = zmq.Frame(last, track=True, copy=False, copy_threshold=0)
         nbytes = sum(other.nbytes for other in others) + last.nbytes
-        self._trackers[identity] = (tracked.tracker, nbytes)
+        self._trackers[reader] = (tracked.tracker, nbytes)
         return [*(zmq.Frame(other, copy=False) for other in others), tracked]

@@ -127,6 +127,9 @@ class Pong(Struct, frozen=True, tag="pong"):
     fused: Seq = 0
 
 
+ASK_AGAIN = "ask again"  # so ends the error of a Reply when the same question may be answered soon
+
+
 class Command(Struct, frozen=True, tag="command", kw_only=True):
     """A request of a person or program; answered by one Reply."""
 
