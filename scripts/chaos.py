@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Kill scanner, gateway and fuser at seeded moments over a bad network, and see that no keyframe is lost.
 
-    python scripts/chaos.py --seeds 20                20 runs of 300 keyframes and 16 kills, a JSON line each
+    python scripts/chaos.py --seeds 20                20 runs of 300 keyframes and 12 kills, a JSON line each
     python scripts/chaos.py --first 7 --seeds 1       one of them again; --keep FOLDER leaves its files there
 
 A run is good when the journal has every keyframe exactly once and in order, and the map's hash is that of an
@@ -27,7 +27,7 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=20, help="how many runs")
     parser.add_argument("--first", type=int, default=1, help="the first seed")
     parser.add_argument("--keyframes", type=int, default=300)
-    parser.add_argument("--kills", type=int, default=16)
+    parser.add_argument("--kills", type=int, default=12)
     parser.add_argument("--keep", type=Path, help="leave the files of each run here")
     options = parser.parse_args()
     good = 0

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What strangers might do to a server, for some seconds, in a process of its own; bounded, loopback only.
 
-python tests/attacks.py NAME DATA CONTROL PUBLISH SECONDS
+python tests/attacks.py NAME DATA CONTROL PUBLISH SERVER_KEY SECONDS
 
 It prints `begun`, and in the end how many messages, connections or bytes it came to.
 """
@@ -24,6 +24,7 @@ from wire import connected
 
 from tsfusion import codec
 from tsfusion.transport import Command, messages, sockets
+from tsfusion.transport.curve import ClientKeys
 
 _HALF_OPEN = 1000
 _UNFINISHED = 400  # parts
@@ -39,6 +40,7 @@ class Target(msgspec.Struct, frozen=True):
     data: str
     control: str
     publish: str
+    server_key: str  # its public one; empty = it asks for none
     end: float
 
     @property
@@ -176,6 +178,28 @@ def subscriptions(target: Target) -> int:
     return sent
 
 
+def knocking(target: Target) -> int:
+    """Connections made and left at once, with keys that nobody knows where keys are asked for."""
+    knocks = 0
+    context: zmq.Context[Any] = zmq.Context()
+    while not target.over:
+        links = []
+        for address, kind in ((target.data, sockets.push), (target.control, sockets.dealer)):
+            keys = None
+            if target.server_key:
+                public, secret = (half.decode() for half in zmq.curve_keypair())
+                keys = ClientKeys(public, secret, target.server_key)
+            link = kind(context, keys)
+            link.connect(address)
+            links.append(link)
+        time.sleep(10 * _PAUSE)  # long enough to be turned away
+        for link in links:
+            link.close()
+            knocks += 1
+    context.term()
+    return knocks
+
+
 # --- below the messages: ZMTP 3.1 by hand ---
 
 _GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"NULL".ljust(20, b"\0") + bytes(32)
@@ -284,12 +308,13 @@ ATTACKS: dict[str, Callable[[Target], int]] = {
     "subscriptions": subscriptions,
     "unfinished": unfinished,
     "unfinished control": unfinished_control,
+    "knocking": knocking,
     "half open": half_open,
     "slow loris": slow_loris,
 }
 
 
 if __name__ == "__main__":
-    name, data, control, publish, seconds = sys.argv[1:]
+    name, *where, seconds = sys.argv[1:]
     print("begun", flush=True)
-    print(ATTACKS[name](Target(data, control, publish, time.monotonic() + float(seconds))))
+    print(ATTACKS[name](Target(*where, time.monotonic() + float(seconds))))

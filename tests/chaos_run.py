@@ -11,8 +11,8 @@ import threading
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Literal
 
+from chaos_plan import KINDS, Attack, Kind, fault, on_scanners, on_server
 from keepers import PATIENCE, Daemon, Scanner
 from msgspec import Struct
 from proxy import Proxy
@@ -26,38 +26,12 @@ from tsfusion.errors import TransportError, TsfusionError
 from tsfusion.fetch import fetch_health, fetch_status
 from tsfusion.transport import Status
 
-Kind = Literal["server", "fuser", "scanner"]
 _RECORD_OVERHEAD = 300  # bytes of MCAP a keyframe
-KINDS: tuple[Kind, ...] = ("server", "fuser", "scanner")
 
 # Small files and frequent checkpoints: more moments at which a kill can hurt. What piled up comes faster than
 # the quota, so clients are held, too.
 SERVER = {"checkpoint_every": 20, "segment_bytes": 1 << 18, "quota_keyframes": 60.0}
 CLIENT = ClientConfig(policy="spool_all", stall_timeout=0.4, segment_bytes=1 << 16)
-
-
-class Attack(Struct, frozen=True):
-    """A process to be killed.
-
-    Attributes:
-        journaled: not before the journal has so many keyframes.
-        ready: not before the server is ready.
-        wait: seconds from then.
-    """
-
-    kind: Kind
-    journaled: int
-    ready: bool
-    wait: float
-
-
-class Fault(Struct, frozen=True):
-    """A method of `Proxy`, what it is called with, and for how long; then comes a `pause`."""
-
-    what: str
-    value: float | bool | None
-    lasts: float
-    pause: float
 
 
 class Kill(Struct, frozen=True):
@@ -87,38 +61,6 @@ class Result(Struct, kw_only=True):
     duplicates: int  # keyframes that came again, and were known
     refused: dict[str, int]  # messages that were not journaled
     carried_per_journaled: float  # bytes over the link / bytes in the journal
-
-
-def attacks(rng: random.Random, keyframes: int, kills: int) -> list[Attack]:
-    """Who is killed when: mostly in full flow, sometimes while what was killed before is on its way up."""
-    kinds = [KINDS[i % len(KINDS)] for i in range(kills)]
-    rng.shuffle(kinds)
-    moments = sorted(rng.randrange(keyframes) for _ in kinds)
-    planned: list[Attack] = []
-    for kind, journaled in zip(kinds, moments, strict=True):
-        if planned and rng.random() < 0.25:
-            planned.append(Attack(kind, planned[-1].journaled, False, rng.uniform(0.05, 2.5)))
-        else:
-            planned.append(Attack(kind, journaled, True, rng.uniform(0.0, 1.5)))
-    return planned
-
-
-def fault(rng: random.Random) -> Fault:
-    """Something that networks do."""
-    what = rng.choice(
-        ["cut", "half_close", "refuse", "throttle", "delay", "freeze", "swallow", "mute", *3 * ["jam"]]
-    )
-    value: float | bool | None = True
-    lasts, pause = rng.uniform(0.2, 2.0), rng.uniform(0.3, 2.0)
-    if what in ("cut", "half_close"):
-        value, lasts = None, 0.0
-    elif what == "throttle":
-        value = rng.uniform(20e3, 80e3)
-    elif what == "jam":
-        lasts += 0.8  # longer than a scanner waits before it sends again
-    elif what == "delay":
-        value = rng.uniform(0.01, 0.08)
-    return Fault(what, value, lasts, pause)
 
 
 class Weather:
@@ -184,15 +126,55 @@ class Watch:
         self._thread.join()
 
 
-def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 16) -> Result:
+class Killer:
+    """Works through attacks, and notes what it did. Call `work` in any thread."""
+
+    def __init__(self, daemon: Daemon, scanners: list[Scanner], started: float) -> None:
+        self.kills: list[Kill] = []
+        self._daemon = daemon
+        self._scanners = scanners
+        self._started = started
+
+    def work(self, attacks: list[Attack]) -> None:
+        """One after the other."""
+        for number, attack in enumerate(attacks):
+            scanner = self._scanners[number % len(self._scanners)]
+            until(lambda attack=attack, scanner=scanner: self._is_time(attack, scanner), PATIENCE)
+            time.sleep(attack.wait)
+            ready, at = self._daemon.ready, round(time.monotonic() - self._started, 2)
+            if self._kill(attack.kind, scanner):
+                self.kills.append(Kill(at, attack.kind, ready, journaled(self._daemon.state)))
+
+    def _is_time(self, attack: Attack, scanner: Scanner) -> bool:
+        if attack.kind == "scanner":
+            return scanner.finished or scanner.taken * len(self._scanners) >= attack.keyframes
+        if all(scanner.finished for scanner in self._scanners):
+            return self._daemon.ready or not attack.ready
+        return journaled(self._daemon.state) >= attack.keyframes and (self._daemon.ready or not attack.ready)
+
+    def _kill(self, kind: Kind, scanner: Scanner) -> bool:
+        """Whether there was somebody to kill."""
+        if kind == "server":
+            self._daemon.kill()
+        elif kind == "fuser":
+            self._daemon.kill_fuser()
+        elif scanner.finished:
+            return False
+        else:
+            scanner.kill()
+        return True
+
+
+def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Result:
     """One seed in an empty folder; every other one with keys, and every other two with two scanners."""
     keys = secured(folder / "keys") if seed % 2 == 0 else UNSECURED
     count = 1 + seed // 2 % 2
     rng = random.Random(seed)
-    rate, planned = rng.uniform(20, 40), attacks(rng, keyframes, kills)
+    rate = rng.uniform(20, 40)
+    third = kills // 3
+    early, late = on_scanners(rng, keyframes, third), on_server(rng, keyframes, kills - third)
     started = time.monotonic()
     state = folder / "state"
-    killed: list[Kill] = []
     with contextlib.ExitStack() as stack:
         proxy = stack.enter_context(Proxy())
         daemon = Daemon(state, proxy, **SERVER, **keys.server)
@@ -207,12 +189,11 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 16) -> Re
         stack.callback(watch.end)
         weather = Weather(random.Random(-seed - 1), proxy)
         stack.callback(weather.end)
-        for attack in planned:
-            until(lambda attack=attack: _is_time(attack, state, daemon, scanners), PATIENCE)
-            time.sleep(attack.wait)
-            ready, at = daemon.ready, round(time.monotonic() - started, 2)
-            if _kill(attack.kind, daemon, rng.choice(scanners)):
-                killed.append(Kill(at, attack.kind, ready, _journaled(state)))
+        killer = Killer(daemon, scanners, started)
+        other = threading.Thread(target=killer.work, args=(early,))
+        other.start()
+        killer.work(late)
+        other.join()
         weather.end()
         for scanner in scanners:
             scanner.wait()
@@ -223,6 +204,8 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 16) -> Re
         if not problems and (code := daemon.stop()):
             problems.append(f"the server ended with status {code} when told to")
     seconds = time.monotonic() - started
+    if len(killer.kills) < kills - 2:  # a scanner that has finished cannot be killed
+        problems.append(f"only {len(killer.kills)} of {kills} were killed")
     if status and not problems:
         problems += server_problems(status, keyframes)
         problems += [problem for scanner in scanners for problem in client_problems(scanner.report())]
@@ -235,9 +218,9 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 16) -> Re
         keyframes=keyframes,
         rate=round(rate, 1),
         seconds=round(seconds, 1),
-        kills={kind: sum(kill.kind == kind for kill in killed) for kind in KINDS},
-        before_ready=sum(not kill.ready and kill.kind != "scanner" for kill in killed),
-        kill_times=killed,
+        kills={kind: sum(kill.kind == kind for kill in killer.kills) for kind in KINDS},
+        before_ready=sum(not kill.ready and kill.kind != "scanner" for kill in killer.kills),
+        kill_times=killer.kills,
         link_faults=weather.faults,
         server_exits=daemon.exits,
         sessions=status.sessions if status else 0,
@@ -246,12 +229,6 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 16) -> Re
         refused=watch.refused,
         carried_per_journaled=round(proxy.carried / max(_bytes(state), 1), 2),
     )
-
-
-def _is_time(attack: Attack, state: Path, daemon: Daemon, scanners: list[Scanner]) -> bool:
-    if all(scanner.finished for scanner in scanners):
-        return True
-    return _journaled(state) >= attack.journaled and (daemon.ready or not attack.ready)
 
 
 @functools.cache
@@ -267,7 +244,7 @@ def _bytes(state: Path) -> int:
     return sum(path.stat().st_size for folder in journals(state) for path in folder.glob("*.mcap"))
 
 
-def _journaled(state: Path) -> int:
+def journaled(state: Path) -> int:
     """About how many keyframes the journal has: looked at often, so by its size."""
     with contextlib.suppress(OSError):
         return _bytes(state) // _keyframe_bytes()
@@ -288,19 +265,6 @@ def _plan(folder: Path, address: str, numbers: range, rate: float, keys: Secured
         patience=PATIENCE,
         client=override(CLIENT, **keys.client),
     )
-
-
-def _kill(kind: Kind, daemon: Daemon, scanner: Scanner) -> bool:
-    """Whether there was somebody to kill."""
-    if kind == "scanner":
-        if scanner.finished:
-            return False
-        scanner.kill()
-    elif kind == "server":
-        daemon.kill()
-    else:
-        daemon.kill_fuser()
-    return True
 
 
 def _status(daemon: Daemon, keys: Secured) -> Status | None:

@@ -2,6 +2,7 @@
 """A server under attack, one kind after the other, and what a well-behaved scanner notices of it."""
 
 import contextlib
+import os
 import resource
 import subprocess
 import sys
@@ -27,6 +28,7 @@ MEMORY_BYTES = 192 << 20  # the bound on the gateway
 MEMORY_SLACK = 128 << 20
 _ATTACK = Path(__file__).with_name("attacks.py")
 _FILES = 8192
+_MORE_FILES = 30  # of maps that were opened meanwhile
 
 
 class Phase(Struct, kw_only=True):
@@ -106,7 +108,9 @@ def run(
         rss = Rss(server)
         stack.callback(rss.close)
         until(lambda: len(list((folder / "spool").glob("*.mcap"))) > 0)  # it sends
-        spans = [_attack(server, name, seconds, rss) for name in names]
+        files = _files(server)
+        public = given.keys.server if given.keys else ""
+        spans = [_attack(server, public, name, seconds, rss) for name in names]
         (folder / "enough").touch()
         problems = []
         if scanner.wait(PATIENCE):
@@ -114,7 +118,15 @@ def run(
         if server.process.poll() is not None:
             problems.append(f"the server died: {server.said()[-1000:]}")
             return Outcome(problems=problems, phases=[], keyframes=0, refused={}, rejected={})
+        with contextlib.suppress(AssertionError):  # who never greets is cut off after five seconds
+            until(lambda: _files(server) <= files + _MORE_FILES, 15.0)
+        if (left := _files(server)) > files + _MORE_FILES:
+            problems.append(f"{left - files} connections were left behind")
         return _outcome(folder, server, spans, problems, given)
+
+
+def _files(server: Server) -> int:
+    return len(os.listdir(f"/proc/{server.process.pid}/fd"))
 
 
 def _raise_file_limit() -> None:
@@ -145,10 +157,10 @@ class _Span(Struct):
     rss: list[int]
 
 
-def _attack(server: Server, name: str, seconds: float, rss: Rss) -> _Span:
+def _attack(server: Server, public: str, name: str, seconds: float, rss: Rss) -> _Span:
     hostile = 0
     if name:
-        at = [server.address, server.control, server.publish]
+        at = [server.address, server.control, server.publish, public]
         command = [sys.executable, str(_ATTACK), name, *at, str(seconds)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout is not None

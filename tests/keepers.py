@@ -25,7 +25,7 @@ class Daemon:
     def __init__(self, state: Path, proxy: Proxy, **settings: Any) -> None:
         self.exits: list[str] = []
         self.ready = False
-        self._state, self._proxy, self._settings = state, proxy, settings
+        self.state, self._proxy, self._settings = state, proxy, settings
         self._ended = False
         self._killed = False
         self.server = self._start()
@@ -33,7 +33,7 @@ class Daemon:
         self._thread.start()
 
     def _start(self) -> Server:
-        return Server(self._state, wait=False, **self._settings)
+        return Server(self.state, wait=False, **self._settings)
 
     def _keep(self) -> None:
         while True:
@@ -117,6 +117,13 @@ class Scanner:
         self._killed = True
         process.kill()
         until(lambda: self._process is not process or self._done.is_set())
+
+    @property
+    def taken(self) -> int:
+        """How many keyframes it said it took, in all its lives."""
+        assert self.plan.log is not None
+        log = Path(self.plan.log)
+        return len(log.read_bytes().split()) if log.exists() else 0
 
     @property
     def finished(self) -> bool:

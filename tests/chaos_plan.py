@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: MIT
+"""What goes wrong in a chaos run, and when: drawn from its seed."""
+
+import random
+from typing import Literal
+
+from msgspec import Struct
+
+Kind = Literal["server", "fuser", "scanner"]
+KINDS: tuple[Kind, ...] = ("server", "fuser", "scanner")
+
+
+class Attack(Struct, frozen=True):
+    """A process to be killed.
+
+    Attributes:
+        keyframes: not before so many are in the journal (a scanner: not before it took so many).
+        ready: not before the server is ready.
+        wait: seconds from then.
+    """
+
+    kind: Kind
+    keyframes: int
+    ready: bool
+    wait: float
+
+
+class Fault(Struct, frozen=True):
+    """A method of `Proxy`, what it is called with, and for how long; then comes a `pause`."""
+
+    what: str
+    value: float | bool | None
+    lasts: float
+    pause: float
+
+
+def on_scanners(rng: random.Random, keyframes: int, kills: int) -> list[Attack]:
+    """While they send, whatever becomes of the server meanwhile."""
+    moments = sorted(rng.randrange(keyframes) for _ in range(kills))
+    return [Attack("scanner", at, False, rng.uniform(0.0, 0.3)) for at in moments]
+
+
+def on_server(rng: random.Random, keyframes: int, kills: int) -> list[Attack]:
+    """Gateway and fuser: mostly in full flow, sometimes while what was killed before is on its way up."""
+    kinds: list[Kind] = ["server" if i % 2 else "fuser" for i in range(kills)]
+    rng.shuffle(kinds)
+    moments = sorted(rng.randrange(keyframes) for _ in kinds)
+    planned: list[Attack] = []
+    for kind, at in zip(kinds, moments, strict=True):
+        if planned and rng.random() < 0.25:
+            planned.append(Attack(kind, planned[-1].keyframes, False, rng.uniform(0.05, 2.5)))
+        else:
+            planned.append(Attack(kind, at, True, rng.uniform(0.0, 1.5)))
+    return planned
+
+
+def fault(rng: random.Random) -> Fault:
+    """Something that networks do."""
+    what = rng.choice(
+        ["cut", "half_close", "refuse", "throttle", "delay", "freeze", "swallow", "mute", *3 * ["jam"]]
+    )
+    value: float | bool | None = True
+    lasts, pause = rng.uniform(0.2, 2.0), rng.uniform(0.3, 2.0)
+    if what in ("cut", "half_close"):
+        value, lasts = None, 0.0
+    elif what == "throttle":
+        value = rng.uniform(20e3, 80e3)
+    elif what == "jam":
+        lasts += 0.8  # longer than a scanner waits before it sends again
+    elif what == "delay":
+        value = rng.uniform(0.01, 0.08)
+    return Fault(what, value, lasts, pause)
