@@ -6,6 +6,7 @@ python tests/attacks.py NAME DATA CONTROL PUBLISH SERVER_KEY SECONDS
 It prints `begun`, and in the end how many messages, connections or bytes it came to.
 """
 
+import contextlib
 import itertools
 import os
 import socket
@@ -13,7 +14,7 @@ import struct
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from typing import Any
 
 import msgspec
@@ -29,6 +30,7 @@ _HALF_OPEN = 1000
 _UNFINISHED = 400  # parts
 _PART_BYTES = 900_000
 _LORISES = 50
+_READERS, _DEAF = 16, 16
 _PAUSE = 0.002  # between hostile messages: they shall be checked, not only queued
 
 
@@ -109,13 +111,48 @@ def greetings(target: Target) -> int:
     return sent
 
 
+def sessions(target: Target) -> int:
+    """Sessions without end for the map that is open: each would be told how it is doing."""
+    sent = 0
+    with connected(sockets.dealer, target.control) as link:
+        while not target.over and link.poll(1000, zmq.POLLOUT):
+            link.send(messages.encode(messages.Hello(os.urandom(16), codec.VERSION)))
+            while link.poll(0):
+                link.recv()
+            sent += 1
+    return sent
+
+
+def mesh_flood(target: Target) -> int:
+    """Meshes asked for over many connections: some read theirs and ask again, some never read."""
+    question = messages.encode(Command(name="mesh", min_weight=0.0))
+    asked = 0
+    with ExitStack() as stack:
+        readers = [stack.enter_context(connected(sockets.dealer, target.control)) for _ in range(_READERS)]
+        deaf = [stack.enter_context(contextlib.closing(raw(target.control, b"DEALER"))) for _ in range(_DEAF)]
+        while not target.over:
+            for one in deaf:
+                with contextlib.suppress(OSError):
+                    one.setblocking(False)
+                    one.send(b"\x00" + bytes([len(question)]) + question)
+                    asked += 1
+            for link in readers:
+                while link.poll(0):
+                    link.recv_multipart()
+                with contextlib.suppress(zmq.Again):
+                    link.send(question, zmq.NOBLOCK)
+                    asked += 1
+            time.sleep(0.02)
+    return asked
+
+
 def tiny(target: Target) -> int:
     """As many small messages as go through, on both ports."""
     sent = 0
     with connected(sockets.push, target.data) as push, connected(sockets.dealer, target.control) as link:
         while not target.over and sent < 2_000_000:
             for one in (push, link):
-                with suppress(zmq.Again):
+                with contextlib.suppress(zmq.Again):
                     for _ in range(100):
                         one.send(b"x", zmq.NOBLOCK)
                         sent += 1
@@ -229,7 +266,7 @@ def half_open(target: Target) -> int:
         addresses = itertools.cycle((target.data, target.control, target.publish))
         while not target.over and made < _HALF_OPEN:
             host, _, port = next(addresses).removeprefix("tcp://").rpartition(":")
-            with suppress(OSError):
+            with contextlib.suppress(OSError):
                 link = stack.enter_context(socket.create_connection((host, int(port)), timeout=5.0))
                 link.sendall(_GREETING[: made % 12])
                 made += 1
@@ -251,7 +288,7 @@ def slow_loris(target: Target) -> int:
             if target.over:
                 break
             for link in links:
-                with suppress(OSError):
+                with contextlib.suppress(OSError):
                     link.send(bytes([byte]))
                     said += 1
             time.sleep(min(1.0, max(target.end - time.monotonic(), 0)))
@@ -265,6 +302,8 @@ ATTACKS: dict[str, Callable[[Target], int]] = {
     "oversized": oversized,
     "rubbish": rubbish,
     "greetings": greetings,
+    "sessions": sessions,
+    "mesh flood": mesh_flood,
     "tiny": tiny,
     "subscriptions": subscriptions,
     "unfinished": unfinished,

@@ -5,7 +5,9 @@ import errno
 import hashlib
 import os
 import struct
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -14,7 +16,7 @@ import scenes
 import small_disk
 
 from tsfusion import Volume, checkpoint
-from tsfusion.errors import CheckpointError, InvalidConfig, WeightOverflow
+from tsfusion.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, WeightOverflow
 
 VIEWS = scenes.sphere_views(0.4, 4)
 
@@ -65,7 +67,7 @@ def test_a_file_cut_anywhere_is_refused(saved: Path, tmp_path: Path) -> None:
     whole, path = saved.read_bytes(), tmp_path / "map.tsf"
     for cut in [*range(40), *(len(whole) * i // 200 for i in range(200)), len(whole) - 1]:
         path.write_bytes(whole[:cut])
-        with pytest.raises(CheckpointError):
+        with pytest.raises(DamagedCheckpoint):
             Volume.load(path)
 
 
@@ -83,7 +85,7 @@ def test_a_file_that_goes_on_behind_its_end_is_refused(saved: Path, tmp_path: Pa
     path = tmp_path / "map.tsf"
     for more in (b"\0", bytes(4096), saved.read_bytes()):
         path.write_bytes(saved.read_bytes() + more)
-        with pytest.raises(CheckpointError):
+        with pytest.raises(DamagedCheckpoint):
             Volume.load(path)
 
 
@@ -111,6 +113,33 @@ def test_a_forged_file_is_refused_before_it_asks_for_memory(saved: Path, tmp_pat
     forge(path, whole[: 16 + size] + bytes(len(whole) - 16 - size))
     with pytest.raises(CheckpointError):
         checkpoint.read(path)
+
+
+def test_a_map_of_another_version_or_that_cannot_be_read_now_is_not_damaged(
+    saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, path = saved.read_bytes()[:-16], tmp_path / "map.tsf"
+    forge(path, b"TSFMAP2\n" + whole[8:])
+    with pytest.raises(CheckpointError, match="not a tsfusion map of version 1") as raised:
+        Volume.load(path)
+    assert raised.type is CheckpointError
+    altered = msgspec.msgpack.encode({"blocks": 3})
+    forge(path, whole[:8] + struct.pack("<I", len(altered)) + altered)
+    with pytest.raises(CheckpointError, match="of another version") as raised:
+        Volume.load(path)
+    assert raised.type is CheckpointError
+    for error in (OSError(errno.EMFILE, "Too many open files"), OSError(errno.EIO, "bad"), MemoryError()):
+        monkeypatch.setattr(checkpoint, "_check_digest", failing(error))
+        with pytest.raises(CheckpointError) as raised:
+            Volume.load(saved)
+        assert raised.type is CheckpointError
+
+
+def failing(error: Exception) -> Callable[..., Any]:
+    def fail(*_: object) -> None:
+        raise error
+
+    return fail
 
 
 def test_a_missing_file_and_an_unwritable_place_are_named(tmp_path: Path) -> None:

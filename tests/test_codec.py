@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Keyframes survive the wire to the bit, the format stays, and strangers' bytes are turned away."""
 
+import inspect
 import struct
 import zlib
 from contextlib import suppress
@@ -18,7 +19,8 @@ from wire import CAMERA, SHAPE, pose, wall
 from tsfusion import Keyframe, codec
 from tsfusion.codec import arrays
 from tsfusion.codec.header import pack, unpack
-from tsfusion.errors import DecodeError, InvalidKeyframe
+from tsfusion.config import ServerConfig, override
+from tsfusion.errors import DecodeError, InvalidConfig, InvalidKeyframe
 
 GOLDEN = Path(__file__).parent / "golden"
 SESSION = bytes(range(16))
@@ -244,6 +246,13 @@ def test_limits_are_the_servers() -> None:
     codec.check(frames, max_frame_bytes=total)
     with pytest.raises(codec.Refused, match=f"at most {total - 1} bytes"):
         codec.check(frames, max_frame_bytes=total - 1)
+
+
+def test_no_server_takes_a_message_that_no_fuser_decodes() -> None:
+    most = ServerConfig().max_frame_bytes
+    assert inspect.signature(codec.check).parameters["max_frame_bytes"].default == most
+    with pytest.raises(InvalidConfig, match="max_frame_bytes"):
+        override(ServerConfig(), max_frame_bytes=most + 1)
 
 
 def test_what_passes_the_door_may_still_fail_in_decode() -> None:

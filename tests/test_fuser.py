@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """What the fuser does with each message, in this process; its link is a list."""
 
+import errno
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,11 @@ from wire import wall
 
 import tsfusion
 from tsfusion import VolumeConfig, codec
-from tsfusion.errors import InvalidConfig
+from tsfusion.errors import CheckpointError, InvalidConfig
 from tsfusion.fuser import Fuser
 from tsfusion.journal import Journal, Position
 from tsfusion.maps import MAP_FILE, PREVIOUS_FILE
+from tsfusion.saved_map import SavedMap
 from tsfusion.transport import Command, work
 
 VOLUME = VolumeConfig(voxel_size=0.04, threads=1)
@@ -147,8 +150,11 @@ def saved(state: Path) -> Path:
 
 def test_a_map_of_other_settings_is_one_clear_error(tmp_path: Path) -> None:
     saved(tmp_path)
-    with pytest.raises(InvalidConfig, match=r"was made with voxel_size = 0\.04, got 0\.05: use another"):
+    with pytest.raises(
+        InvalidConfig, match=r"was made with voxel_size = 0\.04, got 0\.05: use another"
+    ) as raised:
         opened(tmp_path, VolumeConfig(voxel_size=0.05))
+    assert "remove" not in str(raised.value)  # the journal may not go back to the start
     opened(tmp_path, VolumeConfig(voxel_size=0.04, threads=2, max_blocks=10_000))
 
 
@@ -158,11 +164,44 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_journal_fused_anew(
     path = saved(tmp_path)
     stored = bytearray(path.read_bytes())
     stored[len(stored) // 2] ^= 1
-    path.write_bytes(stored)
-    fuser, _ = opened(tmp_path)
-    assert fuser.ready().done == {}
-    assert "built again from the journal" in caplog.text
-    assert path.with_suffix(".damaged").exists()
+    for name in ("map.damaged", "map.damaged2"):  # nothing that was set aside is overwritten
+        path.write_bytes(stored)
+        fuser, _ = opened(tmp_path)
+        assert fuser.ready().done == {}
+        assert "built again from the journal" in caplog.text
+        assert (tmp_path / name).read_bytes() == stored
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("code", [errno.EMFILE, errno.EIO, errno.EACCES, errno.ENOMEM])
+def test_a_checkpoint_that_cannot_be_read_now_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    path = saved(tmp_path)
+    real = Path.open
+
+    def refused(self: Path, *arguments: Any, **more: Any) -> Any:
+        if self == path:
+            raise OSError(code, os.strerror(code))
+        return real(self, *arguments, **more)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "open", refused)
+        with pytest.raises(CheckpointError, match=os.strerror(code)):
+            opened(tmp_path)
+    assert opened(tmp_path)[0].ready().done == {SESSION: work.Progress(1, "")}
+
+
+def test_a_checkpoint_without_memory_for_it_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(tmp_path)
+
+    def none_left(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("tsfusion.volume.Volume.load", none_left)
+    with pytest.raises(CheckpointError, match="does not fit"):
+        opened(tmp_path)
+    assert path.exists()
 
 
 def test_a_keyframe_that_the_map_has_is_not_fused_again(tmp_path: Path) -> None:
@@ -190,6 +229,39 @@ def test_a_checkpoint_on_request_keeps_the_one_before(tmp_path: Path) -> None:
     assert again.ready().done == {SESSION: work.Progress(1, "robot")}
 
 
+@pytest.mark.parametrize("keep_previous", [False, True])
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_checkpoint_that_fails_leaves_the_old_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str, keep_previous: bool
+) -> None:
+    folder = tmp_path / "map"
+    folder.mkdir()
+    written = SavedMap(folder, VOLUME, keep_previous=keep_previous)
+    for seq in (1, 2):
+        written.done = {SESSION: work.Progress(seq, "robot")}
+        assert written.save()
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert sorted(before) == ([PREVIOUS_FILE] if keep_previous else []) + [MAP_FILE]
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, call, full)
+        assert not written.save()
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    (folder / "map.new.tsf").write_bytes(b"by one that was killed")
+    assert SavedMap(folder, VOLUME, keep_previous=keep_previous).done == written.done
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_map_of_many_sessions_comes_back(tmp_path: Path) -> None:
+    written = SavedMap(tmp_path, VOLUME, keep_previous=False)
+    written.done = {number.to_bytes(16): work.Progress(number, "robot") for number in range(1, 40_001)}
+    assert written.save()
+    assert opened(tmp_path)[0].ready().done == written.done
+
+
 def test_what_it_works_at_shows_from_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (position,) = fill(tmp_path, 1)
     fuser, link = opened(tmp_path)
@@ -205,6 +277,26 @@ def test_what_it_works_at_shows_from_outside(tmp_path: Path, monkeypatch: pytest
     fuser.take(order(0, position))
     assert link.last().reason is None
     assert (tmp_path / "working").read_bytes() == b"\xff" * 8
+
+
+@pytest.mark.parametrize("code", [errno.EIO, errno.EMFILE, errno.ENOMEM])
+def test_a_record_that_cannot_be_read_now_is_left_to_another_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    (position,) = fill(tmp_path, 1)
+    fuser, link = opened(tmp_path)
+
+    def refused(*_: object) -> bytes:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "pread", refused)
+    fuser.take(order(0, position))
+    assert (fuser.exit_status, link.sent, fuser.ready().done) == (1, [], {})
+    assert (tmp_path / "working").read_bytes() == bytes(8)  # it was at this one
+    monkeypatch.undo()
+    again, link = opened(tmp_path)
+    again.take(order(0, position))
+    assert link.done().reason is None
 
 
 def test_no_memory_for_a_keyframe_is_no_crash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,12 @@
 # SPDX-License-Identifier: MIT
 """The gateway with fusers that misbehave, in this process; and real scans by file and by socket."""
 
+import errno
+import shutil
+import subprocess
 import sys
+import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,7 +17,7 @@ import zmq
 from wire import DEADLINE, Server, serving, until
 
 import tsfusion
-from tsfusion import Client, Keyframe, VolumeConfig, fuser_link, journal, maps
+from tsfusion import Client, Keyframe, VolumeConfig, fuser_link, fuser_process, journal, maps
 from tsfusion.config import ServerConfig
 from tsfusion.datasets import open_dataset
 from tsfusion.door import Door
@@ -21,7 +26,7 @@ from tsfusion.fetch import fetch_status
 from tsfusion.gateway import Gateway
 from tsfusion.journal import Journal
 from tsfusion.ports import Ports
-from tsfusion.transport import messages
+from tsfusion.transport import messages, work
 
 _FAKE = """
 import os, struct, sys, time, zmq
@@ -86,7 +91,7 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
 
         def begin(body: str, **settings: Any) -> Gateway:
             command = (sys.executable, "-c", _FAKE.replace("{body}", body))
-            monkeypatch.setattr(fuser_link, "COMMAND", command)
+            monkeypatch.setattr(fuser_process, "COMMAND", command)
             monkeypatch.setattr(fuser_link, "_END_DEADLINE", 0.1)
             writer = Journal(maps.folder(tmp_path, "default") / "journal", 1 << 20)
             for i in range(5):
@@ -195,10 +200,60 @@ def test_a_fuser_that_does_not_come_back_is_tried_ever_more_rarely(
     assert "its fuser process ended" in default(gateway).problem
     assert not gateway.health().ready
     monkeypatch.setattr(
-        fuser_link, "COMMAND", (sys.executable, "-c", _FAKE.replace("{body}", fusing("pass")))
+        fuser_process, "COMMAND", (sys.executable, "-c", _FAKE.replace("{body}", fusing("pass")))
     )
     stepped(gateway, lambda: gateway.maps.drained)
     assert default(gateway).problem == ""
+
+
+def test_poison_costs_two_deaths_each(start: Start) -> None:
+    gateway = start(fusing("if message.index in (1, 2, 3): sys.exit(7)"))
+    stepped(gateway, lambda: gateway.maps.drained)
+    health = default(gateway)
+    assert (health.fuser_restarts, health.rejected, health.quarantined) == (6, {"crash": 3}, 3)
+
+
+def test_no_room_for_a_new_fuser_is_waited_out(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    gateway = start(_CRASHES_ON_2)
+    real = subprocess.Popen
+
+    def refused(*_: object, **__: object) -> None:
+        raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(subprocess, "Popen", refused)
+    stepped(gateway, lambda: "cannot be started" in default(gateway).problem)
+    gateway.step()
+    monkeypatch.setattr(subprocess, "Popen", real)
+    stepped(gateway, lambda: gateway.maps.drained)
+    assert default(gateway).problem == ""
+
+
+def test_a_vanished_scratch_folder_is_made_anew(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "scratch"))
+    (tmp_path / "scratch").mkdir()
+    gateway = start(_CRASHES_ON_2)
+    stepped(gateway, lambda: gateway.maps.warm)
+    shutil.rmtree(next((tmp_path / "scratch").iterdir()))
+    stepped(gateway, lambda: gateway.maps.drained)
+
+
+def test_the_last_words_of_a_dead_fuser_are_not_heard(start: Start) -> None:
+    """ZeroMQ may deliver them late, when its keyframes are handed out anew."""
+    gateway = start(_CANNOT_COME_BACK)
+    (hosted,) = gateway.maps
+    stepped(gateway, lambda: hosted.fuser._restart_at > time.monotonic() + 0.5)
+    late = zmq.Context.instance().socket(zmq.PAIR)
+    try:
+        endpoint = hosted.fuser.socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        late.connect(endpoint)
+        late.send(work.encode(work.Done(0, 1, 2)))
+        until(lambda: hosted.fuser.socket.poll(10) > 0)
+        assert hosted.fuser.receive() is None
+        gateway.step()
+    finally:
+        late.close(linger=0)
 
 
 # --- real scans ---

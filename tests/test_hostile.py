@@ -16,7 +16,7 @@ import pytest
 import zmq
 from wire import DEADLINE, Server, connected, serving, until, wall
 
-from tsfusion import Client, VolumeConfig, codec, config, fuser_link
+from tsfusion import Client, VolumeConfig, codec, config, fuser_process
 from tsfusion.codec.header import pack
 from tsfusion.config import ServerConfig
 from tsfusion.errors import (
@@ -28,6 +28,7 @@ from tsfusion.errors import (
 from tsfusion.fetch import fetch_status
 from tsfusion.fuser_link import FuserLink
 from tsfusion.journal import Position
+from tsfusion.questions import Questions
 from tsfusion.sessions import Routes
 from tsfusion.spool import Spool
 from tsfusion.transport import Command, messages, request, sockets, work
@@ -122,6 +123,106 @@ def test_who_does_not_fetch_a_mesh_gets_no_second_one(shared: Server) -> None:
     assert any("still on its way" in error for error in errors)
 
 
+class Map:
+    """As `Questions` sees one: what its fuser was asked, and whether keyframes come."""
+
+    ready, failed = True, ""
+
+    def __init__(self) -> None:
+        self.fuser: Any = self
+        self.asked: list[work.Ask] = []
+        self.is_calm = True
+
+    def send(self, ask: work.Ask) -> bool:
+        self.asked.append(ask)
+        return True
+
+    def calm(self, since: float) -> bool:
+        return self.is_calm
+
+
+class Asking:
+    """Questions about a map, and the errors that they were answered with."""
+
+    def __init__(self, most_bytes: int = 1 << 30) -> None:
+        self.map = Map()
+        self.errors: list[str | None] = []
+        self.frames: list[Any] = []
+        self.questions = Questions(self._on_answer, most_bytes)
+
+    def _on_answer(self, identity: bytes, message: messages.ToClient, frames: Any = ()) -> None:
+        assert isinstance(message, messages.Reply)
+        self.errors.append(message.error)
+        self.frames += frames  # which nobody reads
+
+    def ask(self, identity: bytes, client: str = "", map_name: str = "default") -> bool:
+        """Whether the mesh was passed on."""
+        before = len(self.map.asked)
+        self.questions.ask(identity, Command(name="mesh", map=map_name), self.map, client)
+        return len(self.map.asked) > before
+
+    def make(self, nbytes: int) -> None:
+        """The one that was asked for last."""
+        layout = messages.MeshLayout(vertices=0, faces=0, colors=False)
+        frames = [zmq.Frame(bytes(nbytes // 2)), zmq.Frame(bytes(nbytes // 2))]
+        self.questions.answered(work.Answer(self.map.asked[-1].number, layout=layout), None, frames)
+
+
+def test_a_fuser_makes_one_mesh_at_a_time() -> None:
+    asking = Asking()
+    assert asking.ask(b"1")
+    assert not asking.ask(b"2")
+    assert asking.errors == ["another mesh is being made; ask again"]
+    assert asking.ask(b"3", map_name="yard")
+    asking.questions.give_up("default")
+    assert asking.ask(b"2")
+
+
+def test_a_client_gets_one_mesh_at_a_time_over_all_its_connections() -> None:
+    asking = Asking()
+    assert asking.ask(b"1", "robot")
+    assert not asking.ask(b"2", "robot", "yard")
+    asking.make(100)
+    assert not asking.ask(b"3", "robot", "yard")  # not read yet
+    assert asking.ask(b"4", "cart", "yard")
+    assert all(error is None or "still on its way" in error for error in asking.errors)
+
+
+def test_after_a_mesh_it_is_the_keyframes_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    asking = Asking()
+    asking.map.is_calm = False
+    assert asking.ask(b"1")
+    now[0] = 102.0
+    asking.make(100)
+    now[0] = 107.9
+    assert not asking.ask(b"2")
+    assert asking.errors[-1] == "a mesh was just made, now it is the keyframes' turn; ask again"
+    asking.map.is_calm = True  # nobody scans: nobody has to wait
+    assert asking.ask(b"2")
+    asking.make(100)
+    asking.map.is_calm = False
+    now[0] = 108.0
+    assert asking.ask(b"3")
+
+
+def test_meshes_that_nobody_reads_are_few() -> None:
+    asking = Asking(most_bytes=1000)
+    for identity in (b"1", b"2", b"3"):
+        assert asking.ask(identity)
+        asking.make(300)
+    assert not asking.ask(b"4")
+    assert "do not read" in (asking.errors[-1] or "")
+    assert asking.questions.nbytes == 900
+    asking.frames.clear()
+    until(lambda: asking.questions.nbytes == 0)
+    assert asking.ask(b"5")
+    asking.make(5000)  # one may be larger than all should be
+    assert asking.questions.nbytes == 5000
+    assert not asking.ask(b"6")
+
+
 # --- orders to a fuser that has no room for them ---
 
 _SLOW = """
@@ -147,7 +248,7 @@ while True:
 
 
 def test_orders_that_find_no_room_are_given_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fuser_link, "COMMAND", (sys.executable, "-c", _SLOW))
+    monkeypatch.setattr(fuser_process, "COMMAND", (sys.executable, "-c", _SLOW))
     context: zmq.Context[Any] = zmq.Context()
     link = FuserLink(context, tmp_path, ServerConfig(state=str(tmp_path)), VolumeConfig())
     try:

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 import small_disk
 
-from tsfusion import disk, journal
+from tsfusion import disk, inspection, journal
 from tsfusion.errors import JournalError
-from tsfusion.journal import Journal, Position, layout, segment_path
+from tsfusion.journal import Journal, Position, layout, places, segment_path
 
 BIG = 1 << 30
 SESSION = bytes(range(16))
@@ -243,9 +243,9 @@ def test_a_segment_that_cannot_be_deleted_is_passed_over(
     log = Journal(tmp_path, 4000)
     fill(log, 10)
     log.close()
+    log = Journal(tmp_path, 4000)
     segment_path(tmp_path, 1).unlink()
     segment_path(tmp_path, 1).mkdir()
-    log = Journal(tmp_path, 4000)
     assert log.retire(10**9, 0) > 0
     assert journal.segments(tmp_path) == [1]
     assert "cannot delete" in caplog.text
@@ -287,21 +287,39 @@ def test_a_segment_that_was_just_begun_holds_nothing(tmp_path: Path, content: by
     assert seqs(tmp_path) == [1, 2, 3]
 
 
-@pytest.mark.parametrize("what", ["folder", "EACCES", "EIO", "dangling", "rubbish"])
-def test_a_segment_that_cannot_be_read_costs_itself_alone(
-    tmp_path: Path, what: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_segment_of_rubbish_costs_itself_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     log = Journal(tmp_path, 4000)
     fill(log, 12)
     log.close()
     per_segment = Counter(found.position.segment for found in Journal(tmp_path, BIG).found)
-    bad = segment_path(tmp_path, 2)
-    if what == "EACCES":
+    segment_path(tmp_path, 2).write_bytes(os.urandom(9000))
+    log = Journal(tmp_path, BIG)
+    del per_segment[2]
+    assert Counter(found.position.segment for found in log.found) == per_segment
+    assert log.damaged >= 1
+    assert [one for one in caplog.records if one.levelno == logging.ERROR]
+    fill(log, 1, first=100)
+    log.close()
+
+
+@pytest.mark.parametrize("what", ["folder", "EACCES", "EMFILE", "EIO", "dangling"])
+def test_a_segment_that_cannot_be_read_is_not_passed_over(
+    tmp_path: Path, what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its keyframes may be there at the next start, when those behind them are in the map."""
+    log = Journal(tmp_path, 4000)
+    fill(log, 12)
+    log.close()
+    before = Journal(tmp_path, BIG).found
+    readable = sum(found.position.segment != 2 for found in before)
+    bad, aside = segment_path(tmp_path, 2), tmp_path / "aside"
+    if what in ("EACCES", "EMFILE"):
+        code = getattr(errno, what)
         real = Path.open
 
         def guarded(path: Path, *arguments: Any, **more: Any) -> Any:
             if path == bad:
-                raise PermissionError(errno.EACCES, "Permission denied")
+                raise OSError(code, os.strerror(code))
             return real(path, *arguments, **more)
 
         monkeypatch.setattr(Path, "open", guarded)
@@ -315,20 +333,24 @@ def test_a_segment_that_cannot_be_read_costs_itself_alone(
 
         monkeypatch.setattr(os, "pread", failing)
     else:
-        bad.unlink()
+        bad.rename(aside)
         if what == "folder":
             bad.mkdir()
-        elif what == "dangling":
-            bad.symlink_to("nowhere")
         else:
-            bad.write_bytes(os.urandom(9000))
-    log = Journal(tmp_path, BIG)
-    del per_segment[2]
-    assert Counter(found.position.segment for found in log.found) == per_segment
-    assert log.damaged >= 1
-    assert [one for one in caplog.records if one.levelno == logging.ERROR]
-    fill(log, 1, first=100)
-    log.close()
+            bad.symlink_to("nowhere")
+    with pytest.raises(
+        JournalError, match=r"cannot read .*000002\.mcap: .*; make it readable, or move it away"
+    ):
+        Journal(tmp_path, BIG)
+    place = places.find(tmp_path)
+    info, verdict = inspection.summarize(place, lambda *_: None), inspection.verify(place, lambda *_: None)
+    assert [one.segment for one in info.problems] == ["000002.mcap"]
+    assert (info.keyframes, verdict.intact) == (readable, False)
+    monkeypatch.undo()
+    if aside.exists():
+        bad.unlink() if bad.is_symlink() else bad.rmdir()
+        aside.rename(bad)
+    assert Journal(tmp_path, BIG).found == before
 
 
 def test_a_folder_that_cannot_be_listed_is_one_clear_error(

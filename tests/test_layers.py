@@ -18,7 +18,7 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("whole runs", frozenset({"pipeline", "child"})),
     ("processes", frozenset({"server", "gateway", "intake", "door", "hosted", "retention", "reports",
                              "atlas", "questions", "quota", "quarantine", "sessions", "ports", "fuser_link",
-                             "fuser", "saved_map",
+                             "fuser_process", "fuser", "saved_map",
                              "client", "fetch", "backpressure", "room", "sender", "connection",
                              "conversation", "refused", "outbox", "spool", "gone", "times", "recording"})),
     ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results", "metrics",

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Addresses, control messages, clocks, and the gateway's bookkeeping."""
 
+import os
 import socket
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -9,8 +11,10 @@ import numpy as np
 import pytest
 import zmq
 
+from tsfusion import quarantine
 from tsfusion.errors import DecodeError, InvalidConfig, ServerUnreachable, TransportError
 from tsfusion.journal import Position, Scan
+from tsfusion.quarantine import Quarantine
 from tsfusion.sessions import Delays, KeyframeIndex, Routes, Session, Sessions, Turns
 from tsfusion.transport import ClockOffset, Command, control_address, messages, request, sockets
 from tsfusion.transport.messages import Ack, Denied, Hello, Hold, Nack, Ping, Pong, Stamps, Welcome
@@ -161,12 +165,54 @@ def test_strangers_do_not_grow_the_sessions() -> None:
 def test_a_live_session_is_not_taken_over() -> None:
     routes = Routes()
     route = routes.connect(SESSION, "default", b"1", "robot")
-    assert route is not None
-    assert routes.connect(SESSION, "default", b"2", "thief") is None
+    assert not route.open_to("thief")
     assert routes.connect(SESSION, "default", b"3", "robot") is route
     assert route.identity == b"3"
     route.heard -= 3600
+    assert route.open_to("heir")
     assert routes.connect(SESSION, "default", b"4", "heir") is not route
+    assert len(list(routes)) == 1
+
+
+def key_of(number: int) -> bytes:
+    return number.to_bytes(16, "big")
+
+
+def test_a_flood_of_greetings_pushes_out_those_of_its_own_name_only() -> None:
+    routes = Routes()
+    routes.connect(SESSION, "default", b"1", "cart")
+    for number in range(3000):
+        routes.connect(key_of(number), "default", b"2", "robot")
+    assert routes.get(SESSION) is not None
+    assert sum(route.client == "robot" for route in routes) == 64
+
+
+def test_many_names_share_the_routes_fairly() -> None:
+    routes = Routes()
+    routes.connect(SESSION, "default", b"1", "cart")
+    for number in range(6000):
+        routes.connect(key_of(number), "default", b"2", f"robot{number % 40}")
+    assert routes.get(SESSION) is not None
+    assert len(list(routes)) == 1024
+
+
+def test_who_scans_is_not_pushed_out_by_who_only_greets() -> None:
+    routes = Routes()
+    routes.heard(routes.connect(SESSION, "default", b"1"), scans=True)
+    routes.connect(b"known".ljust(16), "default", b"1", scans=True)
+    for number in range(3000):
+        routes.connect(key_of(number), "default", b"2")
+    assert routes.get(SESSION) is not None
+    assert routes.get(b"known".ljust(16)) is not None
+
+
+def test_who_scanned_once_shuts_nobody_out() -> None:
+    routes = Routes()
+    for number in range(2000):
+        routes.connect(key_of(number), "default", b"2", scans=True)
+    route = routes.connect(SESSION, "default", b"1")
+    assert routes.get(SESSION) is route
+    assert len(list(routes)) == 1024
 
 
 def test_the_fuser_takes_from_each_client_in_turn() -> None:
@@ -222,3 +268,44 @@ def test_delays_are_published_with_their_bound() -> None:
     for delay_ns, bound_ns in ((5_000_000, 100_000), (7_000_000, 300_000)):
         delays.add(delay_ns, bound_ns)
     assert (delays.summary().mean, delays.bound_ms) == (6.0, 0.3)
+
+
+# --- quarantine ---
+
+
+def test_the_quarantine_keeps_to_its_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(quarantine, "_MAX_FILES", 5)
+
+    def keep(kept: Quarantine, seq: int, size: int = 100) -> Path:
+        path = kept.keep([bytes(size)], session=SESSION, seq=seq, reason="crc")
+        assert path is not None
+        os.utime(path, ns=(seq, seq))
+        return path
+
+    def seqs() -> list[int]:
+        return sorted(int(path.name.split("-")[1]) for path in tmp_path.glob("*.mcap"))
+
+    kept = Quarantine(tmp_path, 1 << 20)
+    for seq in range(1, 9):
+        keep(kept, seq)
+    assert (len(kept), seqs()) == (5, [4, 5, 6, 7, 8])
+    keep(kept, 4)  # again: now it is the newest
+    os.utime(keep(kept, 4), ns=(9, 9))
+    assert len(kept) == 5
+    kept = Quarantine(tmp_path, 1 << 20)  # as a new process finds it
+    assert len(kept) == 5
+    keep(kept, 10)
+    assert seqs() == [4, 6, 7, 8, 10]
+    keep(kept, 11, (1 << 20) - 1000)
+    assert seqs()[-1] == 11
+    keep(kept, 12, 2 << 20)  # the newest stays, whatever its size
+    assert (len(kept), seqs()) == (1, [12])
+
+
+def test_the_quarantine_does_not_look_at_every_file_for_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = Quarantine(tmp_path, 1 << 20)
+    monkeypatch.setattr(Path, "glob", None)
+    assert kept.keep([b"x"], session=SESSION, seq=1, reason="crc") is not None
+    assert len(kept) == 1

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from tsfusion.config import VolumeConfig as VolumeConfig
     from tsfusion.datasets import open_dataset as open_dataset
     from tsfusion.errors import CheckpointError as CheckpointError
+    from tsfusion.errors import DamagedCheckpoint as DamagedCheckpoint
     from tsfusion.errors import DatasetError as DatasetError
     from tsfusion.errors import DecodeError as DecodeError
     from tsfusion.errors import FlushTimeout as FlushTimeout
@@ -38,9 +39,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _ERRORS = (
-    "CheckpointError", "DatasetError", "DecodeError", "FlushTimeout", "InvalidConfig", "InvalidKeyframe",
-    "JournalError", "KeyframeRefused", "MapError", "MapFull", "MissingDependency", "NotAllowed",
-    "OutputError", "ServerUnreachable", "TransportError", "TsfusionError", "WeightOverflow",
+    "CheckpointError", "DamagedCheckpoint", "DatasetError", "DecodeError", "FlushTimeout", "InvalidConfig",
+    "InvalidKeyframe", "JournalError", "KeyframeRefused", "MapError", "MapFull", "MissingDependency",
+    "NotAllowed", "OutputError", "ServerUnreachable", "TransportError", "TsfusionError", "WeightOverflow",
 )  # fmt: skip
 _HOME = {
     "Client": "client",

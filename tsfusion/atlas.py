@@ -114,9 +114,9 @@ class Atlas:
         return all(hosted.drained for hosted in self)
 
     @property
-    def failed(self) -> bool:
-        """Whether a map's fuser cannot be kept alive: it will not be drained."""
-        return any(hosted.fuser.failed for hosted in self)
+    def settled(self) -> bool:
+        """Whether every map is drained, or never will be."""
+        return all(hosted.settled for hosted in self)
 
     def finish(self) -> bool:
         """Have every fuser write its checkpoint and end; whether all have. Call it until then."""
@@ -138,5 +138,6 @@ class Atlas:
         """How each map is doing, and what is wrong with any."""
         found = {hosted.name: hosted.health() for hosted in self}
         problems = [f"map {name}: {one.problem}" for name, one in found.items() if one.problem]
+        problems += [f"map {hosted.name}: {notice}" for hosted in self for notice in hosted.notices]
         problems += [f"map {name} cannot be opened: {why}" for name, (why, _) in self._unopened.items()]
         return found, problems

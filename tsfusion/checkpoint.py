@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from tsfusion import disk
 from tsfusion.config import VolumeConfig
-from tsfusion.errors import CheckpointError
+from tsfusion.errors import CheckpointError, DamagedCheckpoint
 
 MAGIC = b"TSFMAP1\n"
 CHUNK = 1024  # blocks
@@ -78,7 +78,8 @@ def read(path: Path) -> tuple[Header, NDArray[np.int64], dict[str, NDArray[Any]]
     """Header, keys and layers of a checkpoint.
 
     Raises:
-        CheckpointError: when it is not there, of another version, or not to the byte what was written.
+        DamagedCheckpoint: when it is not to the byte what was written.
+        CheckpointError: when it is not there, cannot be read now, or is of another version.
     """
     try:
         with path.open("rb") as file:
@@ -101,9 +102,9 @@ def read(path: Path) -> tuple[Header, NDArray[np.int64], dict[str, NDArray[Any]]
 
 
 def verify(path: Path, header: Header, map_hash: str) -> None:
-    """Raise CheckpointError unless the loaded map has the hash that was saved."""
+    """Raise DamagedCheckpoint unless the loaded map has the hash that was saved."""
     if map_hash != header.map_hash:
-        raise CheckpointError(f"{path} says its map hash is {header.map_hash}, but it loads as {map_hash}")
+        raise DamagedCheckpoint(f"{path} says its map hash is {header.map_hash}, but it loads as {map_hash}")
 
 
 def _write_body(
@@ -139,20 +140,25 @@ def _payloads(
 
 def _check_magic(file: BinaryIO, path: Path) -> None:
     magic = file.read(len(MAGIC))
-    if magic != MAGIC:
-        raise CheckpointError(f"{path} is not a tsfusion map of version 1 (it starts with {magic!r})")
+    if magic == MAGIC:
+        return
+    is_of_another_version = len(magic) == len(MAGIC) and magic.startswith(MAGIC[:-2])
+    kind = CheckpointError if is_of_another_version else DamagedCheckpoint
+    raise kind(f"{path} is not a tsfusion map of version 1 (it starts with {magic!r})")
 
 
 def _read_header(file: BinaryIO, path: Path) -> Header:
     (length,) = struct.unpack("<I", _exactly(file, 4, path))
-    if length > 1 << 20:
-        raise CheckpointError(f"{path} is damaged: its header claims {length} bytes")
     try:
         header = msgspec.msgpack.decode(_exactly(file, length, path), type=Header)
+    except msgspec.ValidationError as error:  # the digest agrees: it is as its writer meant it
+        raise CheckpointError(f"{path} is of another version: {error}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise CheckpointError(f"{path} is damaged or of another version: {error}") from error
-    if not 0 <= header.blocks <= header.config.max_blocks or not set(header.layers) <= set(DTYPES):
-        raise CheckpointError(f"{path} is damaged: {header.blocks} blocks of layers {header.layers}")
+        raise DamagedCheckpoint(f"{path} is malformed: {error}") from error
+    if not set(header.layers) <= set(DTYPES):
+        raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
+    if not 0 <= header.blocks <= header.config.max_blocks:
+        raise DamagedCheckpoint(f"{path} is malformed: it claims {header.blocks} blocks")
     return header
 
 
@@ -164,10 +170,10 @@ def _read_chunks(file: BinaryIO, path: Path, header: Header) -> Iterator[tuple[i
         frame = _exactly(file, length, path)
         try:
             if zstandard.get_frame_parameters(frame).content_size != size:
-                raise CheckpointError(f"{path} is damaged: a chunk is not of the {size} bytes expected")
+                raise DamagedCheckpoint(f"{path} is damaged: a chunk is not of the {size} bytes expected")
             yield first, zstandard.ZstdDecompressor().decompress(frame)
         except zstandard.ZstdError as error:
-            raise CheckpointError(f"{path} is damaged: {error}") from error
+            raise DamagedCheckpoint(f"{path} is damaged: {error}") from error
 
 
 def _check_digest(file: BinaryIO, path: Path) -> None:
@@ -184,11 +190,11 @@ def _check_digest(file: BinaryIO, path: Path) -> None:
         digest.update(part)
         remaining -= len(part)
     if file.read() != digest.digest():
-        raise CheckpointError(f"{path} is cut short or altered: its digest does not match")
+        raise DamagedCheckpoint(f"{path} is cut short or altered: its digest does not match")
     file.seek(here)
 
 
 def _exactly(file: BinaryIO, size: int, path: Path) -> bytes:
     if size > os.fstat(file.fileno()).st_size or len(content := file.read(size)) != size:
-        raise CheckpointError(f"{path} is cut short")
+        raise DamagedCheckpoint(f"{path} is cut short")
     return content

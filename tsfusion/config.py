@@ -155,7 +155,7 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     keys: str | None = None  # folder of `tsfusion keys`; None = no keys, reachable from this machine only
     max_maps: Annotated[int, Meta(ge=1, le=64)] = 4  # open at once; each has a fuser process
     metrics: str | None = None  # loopback address of Prometheus' page and health checks: 127.0.0.1:9464
-    max_frame_bytes: Annotated[int, Meta(ge=1024)] = 32 << 20
+    max_frame_bytes: Annotated[int, Meta(ge=1024, le=32 << 20)] = 32 << 20  # the fuser takes no larger one
     segment_bytes: Annotated[int, Meta(ge=1 << 16)] = 256 << 20
     window_keyframes: Annotated[int, Meta(ge=1, le=1024)] = 8  # credit: unacknowledged keyframes a client
     window_bytes: Annotated[int, Meta(ge=1 << 16)] = 16 << 20

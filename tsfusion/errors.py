@@ -10,7 +10,8 @@
     ├── MapError
     │   ├── MapFull                        a keyframe needs more blocks than the limits allow
     │   ├── WeightOverflow                 a voxel has taken as many votes as its integers hold
-    │   └── CheckpointError                a saved map is missing, torn or of another version
+    │   └── CheckpointError                a saved map is missing, unreadable or of another version
+    │       └── DamagedCheckpoint          its bytes are not those that were written
     ├── TransportError
     │   ├── ServerUnreachable              nobody answered on the control socket in time
     │   ├── NotAllowed                     the server turned this client's keys away, or its lack of them
@@ -60,7 +61,11 @@ class WeightOverflow(MapError):
 
 
 class CheckpointError(MapError):
-    """A saved map is missing, torn or of another version."""
+    """A saved map is missing, unreadable or of another version."""
+
+
+class DamagedCheckpoint(CheckpointError):
+    """A saved map is cut short, altered or malformed: its bytes are not those that were written."""
 
 
 class TransportError(TsfusionError):

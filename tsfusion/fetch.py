@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What a running server can be asked: its health, a map's status, a map's mesh."""
 
+import time
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,9 @@ from tsfusion.config import DEFAULT_MAP
 from tsfusion.errors import TransportError
 from tsfusion.mesh import Mesh
 from tsfusion.transport import ClientKeys, Command, Reply, Status, control_address, request, sockets
-from tsfusion.transport.messages import Health, MeshLayout
+from tsfusion.transport.messages import ASK_AGAIN, Health, MeshLayout
 
+_AGAIN_INTERVAL = 0.25  # seconds
 _ANSWER_TIMEOUT = 5.0  # seconds; the gateway is never busy, so who says nothing for so long is not there
 
 
@@ -63,13 +65,24 @@ def fetch_mesh(
 ) -> Mesh:
     """The whole mesh of a map of the server at a data address, as of now. See `fetch_health`.
 
+    A server makes one at a time, and none while keyframes have to come first: it is asked again.
+
     Raises:
         ServerUnreachable: when nobody is there (known after a few seconds), or the mesh takes longer than
             `timeout` seconds.
-        TransportError: when the server cannot make it.
+        TransportError: when the server cannot make it, or not within `timeout` seconds.
     """
     command = Command(name="mesh", map=map_name, min_weight=min_weight)
-    reply, frames = _ask(address, control, command, timeout, keys)
+    deadline = time.monotonic() + timeout
+    while True:
+        try:
+            left = max(deadline - time.monotonic(), 0.0)
+            reply, frames = _ask(address, control, command, left, keys)
+            break
+        except TransportError as error:
+            if not str(error).endswith(ASK_AGAIN) or time.monotonic() + _AGAIN_INTERVAL > deadline:
+                raise
+        time.sleep(_AGAIN_INTERVAL)
     if reply.mesh is None:
         raise TransportError(f"the server at {address} answered without a mesh")
     return mesh_of(reply.mesh, frames)

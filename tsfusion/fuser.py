@@ -154,6 +154,10 @@ class Fuser:
                 record = journal.read(self._folder / maps.JOURNAL_FOLDER, order.position)
                 self._volume.integrate(codec.decode(record.frames))
             except TsfusionError as error:
+                if _may_pass(error):
+                    log.error("%s: another process tries again, from the checkpoint", error)
+                    self.exit_status = 1
+                    return  # still marked as at work on it: the gateway bears with a keyframe only so often
                 reason, message = _reason(error), str(error)
             except MemoryError as error:
                 reason, message = "memory", f"no memory to fuse it: {error}"
@@ -228,6 +232,12 @@ def _mesh_frames(mesh: Mesh) -> tuple[MeshLayout, list[Any]]:
         arrays.append(mesh.colors)
     layout = MeshLayout(vertices=len(mesh.vertices), faces=len(mesh.faces), colors=mesh.colors is not None)
     return layout, [np.ascontiguousarray(array).data for array in arrays]
+
+
+def _may_pass(error: TsfusionError) -> bool:
+    """Whether the system refused to read what is there: no fault of the keyframe's."""
+    cause = error.__cause__
+    return isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError)
 
 
 def _reason(error: TsfusionError) -> str:

@@ -2,12 +2,7 @@
 """The gateway's end of the fuser: start it, feed it journal positions, notice when it dies or hangs."""
 
 import logging
-import shutil
 import signal
-import struct
-import subprocess
-import sys
-import tempfile
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -15,16 +10,17 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import zmq
 
 from tsfusion import errors, logs, process
 from tsfusion.config import ServerConfig, VolumeConfig
 from tsfusion.errors import MapError, TsfusionError
+from tsfusion.fuser_process import FuserProcess
 from tsfusion.transport import sockets, work
 
 log = logging.getLogger(__name__)
 
-COMMAND = (sys.executable, "-m", "tsfusion.fuser")
 _AHEAD = 4  # positions handed out before their answers: hides the gateway's disk waits
 _MAX_STARTS = 3  # in a row, without getting ready, before the map counts as failed
 _LONGEST_PAUSE = 60.0  # seconds between one start and the next
@@ -32,6 +28,7 @@ _END_DEADLINE = 5.0
 # A keyframe is given up when the deaths put down to it weigh so much: two of its own making, or as many
 # kills from outside as no chance can aim at one keyframe.
 _ENOUGH, _OWN_DEATH, _KILLED = 6, 3, 1
+_WELL = 60.0  # seconds after which a process that goes on fusing is no reason to pause
 _PATIENCE = 10  # times as long, when it is no keyframe that takes so long: a mesh, a checkpoint
 
 
@@ -39,7 +36,6 @@ class FuserLink:
     """One fuser process after another, all at work on the same map.
 
     Attributes:
-        socket: poll it for `receive`.
         ready: the process has opened the map and compiled the kernels.
         in_flight: the keyframes it has not answered, oldest first.
         restarts: how often a new process had to take over.
@@ -50,43 +46,42 @@ class FuserLink:
         self, context: "zmq.Context[Any]", folder: Path, server: ServerConfig, volume: VolumeConfig
     ) -> None:
         self._context = context
-        self._scratch = Path(tempfile.mkdtemp(prefix="tsfusion-"))  # a socket's path has to be short
+        self._map = folder.name
+        self._server = server
         self._begin = work.Begin(
             str(folder),
             volume,
             server.mesh_interval,
             server.checkpoint_every,
-            str(self._scratch / work.WORKING_FILE),
+            "",  # each process has its own
             server.journal_bytes is not None,
             server.fuser_memory_bytes or process.physical_memory_bytes() * 3 // 4,
         )
-        self._map = folder.name
-        self._logs = (server.log_format, server.log_level, self._map)
-        self._timeout = server.fuser_timeout
-        self._ended_early = 0  # processes in a row that got nothing done
+        self._ended_early = 0  # processes in a row that died of nothing that a keyframe did
         self._blame: dict[int, int] = {}
         self._finishing = self._finish_sent = False
         self.restarts = 0
         self.failed = ""
         self._was_ready = False
-        self._start()
+        try:
+            self._start()
+        except (OSError, zmq.ZMQError) as error:
+            raise MapError(f"the fuser process of map {self._map} cannot be started: {error}") from error
 
     def _start(self) -> None:
+        self._process = FuserProcess(
+            self._context, self._map, self._server.log_format, self._server.log_level
+        )
         self.ready = False
         self._restart_at = 0.0
-        self._heard = time.monotonic()
+        self._heard = self._ready_since = time.monotonic()
         self._oom_kills = process.oom_kills()
         self.in_flight: deque[int] = deque()
-        Path(self._begin.working).write_bytes(struct.pack("<q", work.NOT_WORKING))
-        endpoint = f"ipc://{self._scratch}/{self.restarts}"
-        self.socket = sockets.pair(self._context)
-        self.socket.bind(endpoint)
-        self._process = subprocess.Popen(
-            [*COMMAND, endpoint, *self._logs],
-            stdin=subprocess.PIPE,  # closes when the gateway dies, however it dies
-            stdout=subprocess.DEVNULL,
-            start_new_session=True,  # a Ctrl-C is for the gateway
-        )
+
+    @property
+    def socket(self) -> sockets.AnySocket:
+        """Poll it for `receive`."""
+        return self._process.socket
 
     @property
     def pid(self) -> int:
@@ -128,6 +123,8 @@ class FuserLink:
         Raises:
             TsfusionError: when the fuser says it cannot open the map.
         """
+        if self._restart_at:  # its process is dead and buried: what that did comes again
+            return None
         try:
             head, *frames = self.socket.recv_multipart(zmq.NOBLOCK, copy=False)
         except zmq.Again:
@@ -140,28 +137,34 @@ class FuserLink:
             kind = getattr(errors, message.error, TsfusionError)
             raise kind(message.message)
         if isinstance(message, work.Started):
-            self.send(self._begin)
+            self.send(msgspec.structs.replace(self._begin, working=str(self._process.working_file)))
         elif isinstance(message, work.Ready):
             self.ready = self._was_ready = True
+            self._ready_since = self._heard
         elif isinstance(message, work.Done):
             self.in_flight.popleft()
-            self._blame.pop(message.index, None)
-            self._ended_early = 0
+            if self._blame.get(message.index, 0) < _ENOUGH:  # a verdict stays: it may come again
+                self._blame.pop(message.index, None)
             self.failed = ""
+            if self._heard - self._ready_since > _WELL:
+                self._ended_early = 0
+        elif isinstance(message, work.Saved) and message.written:
+            self._ended_early = 0
         return message, frames
 
     def ended(self) -> bool:
         """Whether the process is gone; one that hangs is ended here."""
-        if self._process.poll() is not None:
+        if self._process.status is not None:
             return True
         busy = bool(self.in_flight) or self._finish_sent
-        patience = self._timeout * (1 if self._working() != work.NOT_WORKING else _PATIENCE)
+        patience = self._server.fuser_timeout
+        if self._process.at == work.NOT_WORKING:
+            patience *= _PATIENCE
         if busy and self.ready and time.monotonic() - self._heard > patience:
             subject = logs.about(map=self._map)
             log.error("the fuser process has been silent for %.0f s: it is killed", patience, extra=subject)
             self._put_down(_OWN_DEATH)
             self._process.kill()
-            self._process.wait()
             return True
         return False
 
@@ -174,24 +177,33 @@ class FuserLink:
         """
         if not self._restart_at:
             self._bury()
-        if time.monotonic() >= self._restart_at:
-            self._release()
-            self.restarts += 1
+        if time.monotonic() < self._restart_at:
+            return
+        dead = self._process
+        try:
             self._start()
+        except (OSError, zmq.ZMQError) as error:
+            self.failed = f"its fuser process cannot be started: {error}"
+            self._restart_at = time.monotonic() + 1.0
+            return
+        dead.close()
+        self.restarts += 1
 
     def _bury(self) -> None:
-        status = self._process.returncode
-        self.in_flight.clear()
+        status = self._process.status
         killed = status == -signal.SIGKILL and process.oom_kills() == self._oom_kills
         if not self.ready and self.restarts == 0 and not killed:
             raise MapError(f"the fuser process ended with status {status} before it was ready")
-        self._put_down(_KILLED if killed else _OWN_DEATH)
-        if self._ended_early >= _MAX_STARTS:
-            self.failed = f"its fuser process ended {self._ended_early} times, last with status {status}"
-        pause = min(2.0**self._ended_early - 1, _LONGEST_PAUSE)
-        self._ended_early += 1
-        self._restart_at = time.monotonic() + pause
+        blamed = self._put_down(_KILLED if killed else _OWN_DEATH)
+        pause = 0.0
+        if not blamed and not killed:
+            if self._ended_early >= _MAX_STARTS:
+                self.failed = f"its fuser process ended {self._ended_early} times, last with status {status}"
+            pause = min(2.0**self._ended_early - 1, _LONGEST_PAUSE)
+            self._ended_early += 1
+        self.in_flight.clear()
         self.ready = False
+        self._restart_at = time.monotonic() + pause
         log.error(
             "the fuser process ended with status %s; another takes over from the checkpoint%s",
             status,
@@ -199,20 +211,15 @@ class FuserLink:
             extra=logs.about(map=self._map),
         )
 
-    def _put_down(self, weight: int) -> None:
-        """A death to the keyframe it happened at, if it was at one."""
-        index = self._working()
-        if index != work.NOT_WORKING:
-            self._blame[index] = self._blame.get(index, 0) + weight
-            with suppress(OSError):
-                Path(self._begin.working).write_bytes(struct.pack("<q", work.NOT_WORKING))
-
-    def _working(self) -> int:
-        try:
-            (index,) = struct.unpack("<q", Path(self._begin.working).read_bytes())
-        except (OSError, struct.error):
-            return work.NOT_WORKING
-        return int(index)
+    def _put_down(self, weight: int) -> bool:
+        """A death to the keyframe it happened at; whether it was at one."""
+        index = self._process.at
+        if index == work.NOT_WORKING:
+            return False
+        self._blame[index] = self._blame.get(index, 0) + weight
+        with suppress(OSError):
+            self._process.at_nothing()
+        return True
 
     def finish(self) -> None:
         """Ask for a checkpoint and the end of the process. Call it until `ended`: there may be no room."""
@@ -224,7 +231,7 @@ class FuserLink:
     @property
     def finished_well(self) -> bool:
         """Whether the process has ended with its checkpoint on the disk."""
-        return self._finishing and self._process.returncode == 0
+        return self._finishing and self._process.status == 0
 
     @property
     def finishing(self) -> bool:
@@ -233,18 +240,4 @@ class FuserLink:
 
     def close(self) -> None:
         """End the process, at once if need be. The journal makes up for what it had not saved."""
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        deadline = time.monotonic() + (_END_DEADLINE if self.ready else 0.0)
-        try:
-            self._process.wait(max(deadline - time.monotonic(), 0.0))
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._release()
-        shutil.rmtree(self._scratch, ignore_errors=True)
-
-    def _release(self) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self.socket.close()
+        self._process.close(_END_DEADLINE if self.ready else 0.0)

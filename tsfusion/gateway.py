@@ -28,8 +28,11 @@ from tsfusion.transport.sockets import mesh_topic
 
 log = logging.getLogger(__name__)
 
+_LISTEN_TICK_MS = 10
 _TICK_MS = 100  # how long a signal or a fuser's death may go unnoticed
 _SNAPSHOT_INTERVAL = 1.0  # seconds
+_MESHES_SHARE = 4  # a quarter of the memory is for meshes that wait to be read
+Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
 
 class Gateway:
@@ -56,11 +59,11 @@ class Gateway:
         self._routes = Routes()
         self._intake = Intake(server, self.maps, door, self)
         self._refused = self._intake.refused
-        self._questions = Questions(self._answer)
+        self._questions = Questions(self._answer, server.memory_bytes // _MESHES_SHARE)
         self._topics: set[bytes] = set()  # that somebody subscribed to
         self._watched: dict[str, bool] = {}  # what each fuser knows of it
         self._memory = MemoryBound(server.memory_bytes)
-        self._accepting = False
+        self._accepting = self._stopped = False
         self._started = time.monotonic()
         self._next_snapshot = 0.0
         self._new_epoch()
@@ -76,8 +79,7 @@ class Gateway:
 
     def stop_accepting(self) -> None:
         """Take no more keyframes; clients keep what is not acknowledged."""
-        self._accepting = False
-        self.ports.keyframes.close()
+        self._accepting, self._stopped = False, True
 
     def step(self) -> None:
         """Wait for something to happen (a moment at most) and deal with it.
@@ -85,26 +87,35 @@ class Gateway:
         Raises:
             TsfusionError: when a map that was to be opened at the start cannot be.
         """
-        handlers: dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]] = {
+        handlers = self._handlers()
+        fusers = [hosted.fuser.socket for hosted in self.maps]
+        polled = [(socket, zmq.POLLIN) for socket in (*self._door.poll, *fusers, *handlers)]
+        events = dict(zmq.zmq_poll(polled, _TICK_MS if handlers else _LISTEN_TICK_MS))
+        if not self._guard():
+            for socket, handle in handlers.items():
+                if socket in events:
+                    each(socket, handle)
+        self.ports.step()
+        self.maps.step(self._on_other)
+        self._tell_fusers()
+        self._snapshot()
+
+    def _handlers(self) -> Handlers:
+        """What to do with messages, by socket; nothing while these are made anew."""
+        if self.ports.problem:
+            return {}
+        handlers: Handlers = {
             self.ports.control: self._on_control,
             self.ports.publish: self._on_subscription,
         }
         if self._accepting:
             handlers[self.ports.keyframes] = self._intake.take
-        fusers = [hosted.fuser.socket for hosted in self.maps]
-        polled = [(socket, zmq.POLLIN) for socket in (*self._door.poll, *fusers, *handlers)]
-        events = dict(zmq.zmq_poll(polled, _TICK_MS))
-        self._guard()
-        if self.ports.control in handlers:  # else they were made anew
-            for socket, handle in handlers.items():
-                if socket in events:
-                    each(socket, handle)
-        self.maps.step(self._on_other)
-        self._tell_fusers()
-        self._snapshot()
+        elif self._stopped:
+            self.ports.keyframes.close()
+        return handlers
 
-    def _guard(self) -> None:
-        """Drop all connections when a key was revoked, or when they hold too much memory.
+    def _guard(self) -> bool:
+        """Drop all connections when a key was revoked, or when they hold too much memory; whether it did.
 
         ZeroMQ limits a frame and a queue of whole messages, not a message that never ends.
         """
@@ -114,7 +125,7 @@ class Gateway:
         else:
             held = self._memory.excess(self._questions.nbytes)
             if not held:
-                return
+                return False
             log.error(
                 "the gateway holds %d MB, more than memory_bytes: every connection is made anew", held >> 20
             )
@@ -123,6 +134,7 @@ class Gateway:
         self._routes.clear()
         self._topics.clear()
         self._new_epoch()
+        return True
 
     def _snapshot(self) -> None:
         now = time.monotonic()
@@ -175,7 +187,7 @@ class Gateway:
             log.debug("%s", error)
             return
         if isinstance(message, messages.Command):
-            self._on_command(identity, message)
+            self._on_command(identity, message, client)
         elif isinstance(message, messages.Hello):
             self._on_hello(identity, message, client)
         else:
@@ -207,9 +219,10 @@ class Gateway:
             return "map", f"map {hello.map} cannot be opened: {self.maps.why_not(hello.map)}"
         if not hosted.warm:
             return "opening", f"map {hello.map} is being opened"
-        taken = not self._intake.owns(hosted, hello.session, client)
-        if taken or self._routes.connect(hello.session, hello.map, identity, client) is None:
+        if not self._intake.owns(hosted, hello.session, client):
             return "session", "the session of this spool is another client's: use another spool folder"
+        scans = hosted.sessions.get(hello.session) is not None
+        self._routes.connect(hello.session, hello.map, identity, client, scans=scans)
         return None
 
     def _on_ping(self, identity: bytes, ping: messages.Ping, client: str) -> None:
@@ -228,14 +241,13 @@ class Gateway:
         hosted = self.maps.get(map_name)
         return hosted.progress(session) if hosted else (0, 0)
 
-    def _on_command(self, identity: bytes, command: messages.Command) -> None:
+    def _on_command(self, identity: bytes, command: messages.Command, client: str) -> None:
         if command.name == "ping":
             self._answer(identity, messages.Reply(name="ping"))
         elif command.name == "health":
             self._answer(identity, messages.Reply(name="health", health=self.health()))
         else:
-            hosted = self.maps.get(command.map)
-            self._questions.ask(identity, command, None if hosted is None else hosted.fuser)
+            self._questions.ask(identity, command, self.maps.get(command.map), client)
 
     def _on_subscription(self, frames: list[zmq.Frame]) -> None:
         change, topic = frames[0].bytes[:1], frames[0].bytes[1:]
@@ -256,10 +268,11 @@ class Gateway:
         found, problems = self.maps.health()
         if self._door.problem:
             problems.insert(0, f"nobody may connect: {self._door.problem}")
+        if self.ports.problem:
+            problems.insert(0, self.ports.problem)
+        blocked = self.ports.problem or self._door.problem or any(one.problem for one in found.values())
         return messages.Health(
-            ready=self._accepting
-            and not self._door.problem
-            and not any(one.problem for one in found.values()),
+            ready=self._accepting and not blocked,
             problems=tuple(problems),
             epoch=self.epoch,
             uptime_s=now - self._started,
@@ -279,6 +292,12 @@ class Gateway:
         route = self._routes.get(session)
         if route is not None:
             self._answer(route.identity, message)
+
+    def heard(self, session: bytes, client: str, *, scans: bool) -> None:
+        """A keyframe message of the session came."""
+        route = self._routes.get(session)
+        if route is not None and route.client == client:
+            self._routes.heard(route, scans=scans)
 
     def route(self, session: bytes) -> Route | None:
         """The connection of a session's client."""

@@ -35,6 +35,9 @@ class Clients(Protocol):
     def route(self, session: bytes) -> Route | None:
         """Its connection."""
 
+    def heard(self, session: bytes, client: str, *, scans: bool) -> None:
+        """A keyframe message came. `scans`: it is a good one."""
+
     def observe(self, map_name: str, stage: str, seconds: float) -> None:
         """A keyframe took so long for a stage."""
 
@@ -70,7 +73,6 @@ class HostedMap:
             self.folder / maps.JOURNAL_FOLDER, segment, min_free_bytes=server.min_free_bytes
         )
         self._quarantine = Quarantine(self.folder / maps.QUARANTINE_FOLDER, server.quarantine_bytes)
-        self.quarantined = len(self._quarantine)
         self.sessions = Sessions()
         self._index = KeyframeIndex()
         self._index.recover(self._journal.found, self.sessions)
@@ -80,11 +82,13 @@ class HostedMap:
         self._delays = Delays()
         self._fused = 0
         self._rejected: Counter[str] = Counter()
+        self._told_rejected: set[int] = set()
         self._unmeshed: deque[int] = deque()  # answered by the fuser that lives, in its order
         self._meshed = 0  # how many of its answers went from there
         self._blocks = self._map_bytes = 0
         self._last: float | None = None
         self._held_until = 0.0
+        self._lost = ""
         self._retention = Retention(self._journal, self._index, self.sessions, most)
         self.fuser = FuserLink(context, self.folder, server, volume)
 
@@ -93,10 +97,22 @@ class HostedMap:
         """Whether the map has every keyframe of the journal."""
         return self.fuser.idle and not self._waiting
 
+    @property
+    def settled(self) -> bool:
+        """Drained, or never to be: its fuser cannot be kept alive."""
+        return self.drained or bool(self.fuser.failed)
+
+    def calm(self, since: float) -> bool:
+        """Whether no keyframe waits, nor came since then (`time.monotonic()`)."""
+        return self.drained and (self._last is None or self._last < since)
+
     def close(self) -> None:
-        """End the fuser and finish the journal."""
+        """End the fuser and finish the journal; what the disk refuses of that is logged."""
         self.fuser.close()
-        self._journal.close()
+        try:
+            self._journal.close()
+        except JournalError as error:  # its index only: every keyframe is on the disk
+            log.error("%s", error, extra=logs.about(map=self.name))
 
     # --- keyframes ---
 
@@ -119,8 +135,7 @@ class HostedMap:
             self._held_until = time.monotonic() + 1.0
             raise
         if self.problem:
-            log.warning("keyframes are taken again", extra=logs.about(map=self.name))
-            self.problem = ""
+            self._recovered()
         session = self.sessions.open(header.session, client)
         session.durable = header.seq
         durable_ns = time.monotonic_ns()
@@ -177,7 +192,26 @@ class HostedMap:
         if ended and not self.fuser.finishing:
             self.fuser.restart()
         self._hand_out()
+        self._look_for_room()
         self._retention.step(self.fuser)
+
+    def _look_for_room(self) -> None:
+        """Who waits for this server to be ready again may be who would send the next keyframe."""
+        now = time.monotonic()
+        if self.problem and now > self._held_until:
+            self._held_until = now + 1.0 if self._is_full() else 0.0
+            if not self._held_until:
+                self._recovered()
+
+    def _is_full(self) -> bool:
+        try:
+            return self._journal.free_bytes < self._server.min_free_bytes
+        except JournalError:
+            return True
+
+    def _recovered(self) -> None:
+        log.warning("keyframes are taken again", extra=logs.about(map=self.name))
+        self.problem = ""
 
     def _hand_out(self) -> None:
         while self.fuser.wants_work and (session := self._turns.next()) is not None:
@@ -197,6 +231,7 @@ class HostedMap:
         self._waiting = 0
         for session in self.sessions:
             done = ready.done.get(session.key)
+            session.in_map = done.seq if done else 0
             session.handed = self._index.after(session, done.seq) if done else 0
             self._waiting += len(session.entries) - session.handed
             if session.handed < len(session.entries):
@@ -208,7 +243,7 @@ class HostedMap:
         if not self.warm:
             self.warm = True
             log.info("the map is open", extra=logs.about(map=self.name))
-            self._check_begin(ready)
+        self._check_begin(ready)
 
     def _leave_unmeshed(self) -> None:
         """What an earlier fuser answered and did not mesh: the checkpoint has it, or it comes again."""
@@ -221,22 +256,24 @@ class HostedMap:
         self._meshed = 0
 
     def _check_begin(self, ready: work.Ready) -> None:
+        self._lost = ""
         if not ready.done and self._journal.first > 1:
-            log.error(
-                "the checkpoint is lost, and the journal goes back to segment %d only: the rest is lost",
-                self._journal.first, extra=logs.about(map=self.name),
-            )  # fmt: skip
+            first = self._journal.first
+            self._lost = f"its checkpoints are lost, and with them what was journaled before segment {first}"
+            log.error("%s", self._lost, extra=logs.about(map=self.name))
 
     def _on_done(self, done: work.Done) -> None:
         entry = self._index[done.index]
         session = self.sessions.numbered(entry.session)
+        session.in_map = entry.stamps.seq
         self._waiting -= 1
         self._unmeshed.append(done.index)
         if done.reason is None:
             self._fused += 1
         else:
             self._rejected[done.reason] += 1
-        if entry.stamps.fused_ns:
+        told = done.index in self._told_rejected if done.reason else entry.stamps.fused_ns > 0
+        if told:
             return  # a fuser that died before its checkpoint had said so
         self._index.fused(done.index, done.fuse_start_ns, done.fused_ns)
         entry = self._index[done.index]
@@ -260,6 +297,7 @@ class HostedMap:
 
     def _on_rejected(self, session: Session, entry: Entry, done: work.Done) -> None:
         assert done.reason is not None
+        self._told_rejected.add(done.index)
         seq = entry.stamps.seq
         subject = logs.about(
             map=self.name, session=session.key, seq=seq, client=session.client, reason=done.reason
@@ -270,10 +308,7 @@ class HostedMap:
             frames = read(self._journal.folder, entry.position).frames
         except JournalError:  # that is why it was rejected
             return
-        kept = self._quarantine.keep(
-            frames, session=session.key, seq=seq, client=session.client, reason=done.reason
-        )
-        self.quarantined += kept is not None
+        self._quarantine.keep(frames, session=session.key, seq=seq, client=session.client, reason=done.reason)
 
     def _on_meshed(self, meshed: work.Meshed) -> None:
         self._blocks, self._map_bytes = meshed.map_blocks, meshed.map_bytes
@@ -301,6 +336,13 @@ class HostedMap:
             return "restarting"
         return "idle" if self.drained else "busy"
 
+    @property
+    def notices(self) -> list[str]:
+        """What a person should know, though keyframes are taken and fused."""
+        damaged = self._journal.damaged
+        told = [f"{damaged} keyframes of its journal are damaged and lost"] if damaged else []
+        return [*told, self._lost] if self._lost else told
+
     def health(self) -> messages.MapHealth:
         """As far as it is known without the fuser."""
         now = time.monotonic()
@@ -311,7 +353,7 @@ class HostedMap:
             keyframes_fused=self._fused,
             waiting=self._waiting,
             rejected=dict(self._rejected),
-            quarantined=self.quarantined,
+            quarantined=len(self._quarantine),
             sessions=len(self.sessions),
             journal_bytes=self._journal.nbytes,
             journal_damaged=self._journal.damaged,

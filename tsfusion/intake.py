@@ -68,11 +68,9 @@ class Intake:
             self._on_checked(hosted, header, buffers, client, received_ns)
 
     def owns(self, hosted: HostedMap, key: bytes, client: str) -> bool:
-        """Whether a session is this client's to go on with."""
+        """Whether a session is this client's to go on with: it journaled it, or is the one who is heard."""
         session, route = hosted.sessions.get(key), self._clients.route(key)
-        if session is not None:
-            return session.belongs_to(client)
-        return route is None or route.client == client
+        return (session is None or session.belongs_to(client)) and (route is None or route.open_to(client))
 
     def _has_to_wait(self, hosted: HostedMap, key: bytes, client: str, nbytes: int) -> bool:
         route = self._clients.route(key)
@@ -107,11 +105,13 @@ class Intake:
         if verdict != "next":
             self.duplicates += verdict == "duplicate"
             self.refused["gap"] += verdict == "gap"
+            self._clients.heard(header.session, client, scans=verdict == "duplicate")
             hosted.acknowledge(header.session, resend=verdict == "gap")
             return
         try:
             codec.check(buffers, self._server.max_frame_bytes)
             self._quotas.check(header)
+            self._clients.heard(header.session, client, scans=True)
             hosted.accept(header, buffers, client, received_ns)
         except codec.Refused as error:
             self._refuse(error, client, header)

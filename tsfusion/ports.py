@@ -17,12 +17,16 @@ from tsfusion.transport.curve import ServerKeys
 log = logging.getLogger(__name__)
 
 _MESSAGES_A_STEP = 16
-_REBIND_DEADLINE = 10.0  # seconds; ports are freed by a thread of ZeroMQ's
+_REBIND_INTERVAL = 0.01  # seconds
 Handler: TypeAlias = Callable[[list[zmq.Frame]], None]
 
 
 class Ports:
-    """Keyframes in, control both ways, mesh updates out."""
+    """Keyframes in, control both ways, mesh updates out.
+
+    Attributes:
+        problem: why nobody can connect; empty = they can.
+    """
 
     def __init__(
         self, context: "zmq.Context[Any]", server: ServerConfig, keys: ServerKeys | None = None
@@ -31,6 +35,8 @@ class Ports:
         self._server = server
         self._keys = keys
         self._addresses: Addresses | None = None
+        self._again = 0.0  # when it is tried again to listen
+        self.problem = ""
         self._open()
 
     def _open(self) -> None:
@@ -49,25 +55,29 @@ class Ports:
         return self._addresses
 
     def renew(self) -> None:
-        """Drop every connection, with all that it holds in memory, and listen at the same addresses again.
-
-        Raises:
-            TransportError: when somebody else took a port meanwhile.
-        """
+        """Drop every connection, with all that it holds in memory; `step` listens at the same ports again."""
         self.close()
-        self._open()
-        if self._addresses is None:
+        self.problem = "every connection is made anew"
+        self.step()
+
+    def step(self) -> None:
+        """Listen again, as soon as ZeroMQ's threads have given the ports back. Never waits."""
+        now = time.monotonic()
+        if not self.problem or now < self._again:
             return
-        data, control = self._addresses.data, self._addresses.control
-        deadline = time.monotonic() + _REBIND_DEADLINE
-        while True:
-            try:
-                sockets.bind(self.keyframes, self.control, self.publish, data, control)
-                return
-            except TransportError:
-                if time.monotonic() > deadline:
-                    raise
-                time.sleep(0.005)
+        self._again = now + _REBIND_INTERVAL
+        try:
+            if self.control.closed:
+                self._open()
+            if self._addresses is not None:
+                addresses = self._addresses
+                sockets.bind(self.keyframes, self.control, self.publish, addresses.data, addresses.control)
+        except (TransportError, zmq.ZMQError) as error:
+            if self.control.closed:
+                self.close()  # no room for all three
+            self.problem = f"cannot listen any more, and will try again: {error}"
+        else:
+            self.problem = ""
 
     def close(self) -> None:
         """Close them; nothing lingers."""
@@ -89,8 +99,8 @@ def send_now(socket: sockets.AnySocket, frames: list[Any]) -> None:
     """Send, or drop what cannot leave at once: the asker will ask again."""
     try:
         socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
-    except zmq.Again:
-        log.warning("an answer was dropped: its connection is full")
+    except zmq.ZMQError as error:  # zmq.Again: it is full; or it is being made anew
+        log.warning("an answer was dropped: %s", error)
 
 
 class MemoryBound:
@@ -120,15 +130,15 @@ class MemoryBound:
 
 
 class Departures:
-    """Large answers that have not left yet, one a connection: who does not read must not fill our memory."""
+    """Large answers that have not left yet, one a reader: who does not read must not fill our memory."""
 
     def __init__(self) -> None:
         self._trackers: dict[bytes, tuple[zmq.MessageTracker, int]] = {}
 
-    def pending(self, identity: bytes) -> bool:
+    def pending(self, reader: bytes) -> bool:
         """Whether an earlier one still waits for its reader. One whose reader is gone does not."""
         self._forget()
-        return identity in self._trackers
+        return reader in self._trackers
 
     @property
     def nbytes(self) -> int:
@@ -136,13 +146,19 @@ class Departures:
         self._forget()
         return sum(nbytes for _, nbytes in self._trackers.values())
 
+    @property
+    def largest(self) -> int:
+        """The largest of them."""
+        self._forget()
+        return max((nbytes for _, nbytes in self._trackers.values()), default=0)
+
     def _forget(self) -> None:
         self._trackers = {key: kept for key, kept in self._trackers.items() if not kept[0].done}
 
-    def wrap(self, identity: bytes, frames: Sequence[zmq.Frame]) -> list[zmq.Frame]:
+    def wrap(self, reader: bytes, frames: Sequence[zmq.Frame]) -> list[zmq.Frame]:
         """The frames anew, so that it shows when the last has left."""
         *others, last = (frame.buffer for frame in frames)
         tracked = zmq.Frame(last, track=True, copy=False, copy_threshold=0)
         nbytes = sum(other.nbytes for other in others) + last.nbytes
-        self._trackers[identity] = (tracked.tracker, nbytes)
+        self._trackers[reader] = (tracked.tracker, nbytes)
         return [*(zmq.Frame(other, copy=False) for other in others), tracked]

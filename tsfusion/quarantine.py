@@ -15,16 +15,23 @@ from tsfusion.errors import JournalError
 
 log = logging.getLogger(__name__)
 
+_MAX_FILES = 1000
+
 
 class Quarantine:
-    """A folder of `SESSION-SEQ-REASON.mcap` files; the oldest go when they are more than `max_bytes`."""
+    """A folder of `SESSION-SEQ-REASON.mcap` files; the oldest go beyond `max_bytes`, or a thousand.
+
+    The folder is read once: what a person takes away later counts until it would have gone anyway.
+    """
 
     def __init__(self, folder: Path, max_bytes: int) -> None:
         self.folder = folder
         self._max_bytes = max_bytes
+        self._files = dict(_by_age(folder))  # sizes, oldest first
+        self._nbytes = sum(self._files.values())
 
     def __len__(self) -> int:
-        return sum(1 for _ in self.folder.glob("*.mcap"))
+        return len(self._files)
 
     def keep(
         self, frames: Sequence[Any], *, session: bytes, seq: int, client: str = "", reason: str
@@ -34,20 +41,29 @@ class Quarantine:
         try:
             disk.make_folder(self.folder)
             journal.write_file(path, frames, session=session, seq=seq, client=client)
-            self._prune(path)
+            size = path.stat().st_size
         except (JournalError, OSError) as error:
             subject = logs.about(session=session, seq=seq, client=client, reason=reason)
             log.error("a keyframe could not be put into quarantine: %s", error, extra=subject)
             return None
+        self._nbytes += size - self._files.pop(path, 0)
+        self._files[path] = size
+        self._prune()
         return path
 
-    def _prune(self, newest: Path) -> None:
-        found = sorted((path.stat().st_mtime_ns, path) for path in self.folder.glob("*.mcap"))
-        total = sum(path.stat().st_size for _, path in found)
-        for _, path in found:
-            if total <= self._max_bytes or path == newest:
-                return
-            size = path.stat().st_size
+    def _prune(self) -> None:
+        while len(self) > 1 and (self._nbytes > self._max_bytes or len(self) > _MAX_FILES):
+            path = next(iter(self._files))
+            self._nbytes -= self._files.pop(path)
             with suppress(OSError):
                 path.unlink()
-                total -= size
+
+
+def _by_age(folder: Path) -> list[tuple[Path, int]]:
+    """The files of a folder and their sizes, oldest first."""
+    found = []
+    for path in folder.glob("*.mcap"):
+        with suppress(OSError):  # a person took it away just now
+            stat = path.stat()
+            found.append((stat.st_mtime_ns, path, stat.st_size))
+    return [(path, size) for _, path, size in sorted(found)]

@@ -46,7 +46,7 @@ class Retention:
         unfused = (
             self._index.segment(session.entries[done])
             for session in self._sessions
-            if (done := self._index.after(session, session.fused)) < len(session.entries)
+            if (done := self._index.after(session, session.in_map)) < len(session.entries)
         )
         return min(unfused, default=self._journal.segment)
 

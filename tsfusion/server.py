@@ -101,15 +101,14 @@ def _serve(gateway: Gateway, signals: list[int], watchdog: Watchdog) -> int:
     log.info("ending: what is in the journals is fused and saved first")
     watchdog.stopping()
     gateway.stop_accepting()
-    while not gateway.maps.drained and not gateway.maps.failed and len(signals) == 1:
+    while not gateway.maps.settled and len(signals) == 1:
         gateway.step()
         watchdog.pet()
-    if not gateway.maps.drained:
-        return 1
+    drained = gateway.maps.drained
     while not gateway.maps.finish() and len(signals) == 1:
         gateway.step()
         watchdog.pet()
-    return 0 if gateway.maps.finished_well else 1
+    return 0 if drained and gateway.maps.finished_well else 1
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A folder of segments, and the records in it."""
 
+import errno
 import logging
 import os
 import re
@@ -63,15 +64,17 @@ def read_at(path: Path, offset: int) -> Record:
     """One record of a segment file.
 
     Raises:
-        JournalError: when it is not there or its CRC differs.
+        JournalError: when it is not there or its CRC differs; from an OSError when the system refuses.
     """
     try:
         with Source(path) as source:
             head = layout.head(source.read(offset, layout.HEAD_BYTES))
             raw = b"" if head is None else source.read(offset, head.nbytes)
+            record = layout.unpack(raw, Position(segment_number(path), offset))
+            if record is None and source.failed:
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
     except OSError as error:
         raise failed("read", path, error) from error
-    record = layout.unpack(raw, Position(segment_number(path), offset))
     if record is None:
         raise JournalError(f"{path} holds no whole keyframe at byte {offset}")
     return record

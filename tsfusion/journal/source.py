@@ -17,6 +17,7 @@ class Source:
 
     Attributes:
         failed: whether some of it could not be read.
+        answered: whether any of it could.
 
     Raises:
         OSError: as `open` does.
@@ -26,7 +27,7 @@ class Source:
         self.path = path
         self._file = path.open("rb", buffering=0)
         self.size = os.fstat(self._file.fileno()).st_size
-        self.failed = False
+        self.failed = self.answered = False
 
     def __enter__(self) -> "Source":
         return self
@@ -43,7 +44,7 @@ class Source:
         if count <= 0:
             return b""
         try:
-            return os.pread(self._file.fileno(), count, at)
+            return self._pread(at, count)
         except OSError as error:
             if error.errno != errno.EIO:
                 raise
@@ -55,8 +56,13 @@ class Source:
     def _sector(self, at: int, end: int) -> bytes:
         count = min(_SECTOR_BYTES, end - at)
         try:
-            return os.pread(self._file.fileno(), count, at)
+            return self._pread(at, count)
         except OSError as error:
             if error.errno != errno.EIO:
                 raise
             return bytes(count)
+
+    def _pread(self, at: int, count: int) -> bytes:
+        content = os.pread(self._file.fileno(), count, at)
+        self.answered = True
+        return content

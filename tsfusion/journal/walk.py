@@ -5,6 +5,8 @@ Behind a damaged place the walk searches for the next chunk by its shape, its se
 so damage costs the records it hit and no other.
 """
 
+import errno
+import os
 import re
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -137,6 +139,8 @@ class _Walk:
         if known is not None and not known.is_ours:
             raise JournalError(f"cannot read {self._source.path}: another version of tsfusion wrote it")
         first = self._search(len(expected)) if known is None else None
+        if self._source.failed and not self._source.answered:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))  # the disk is away, rather than bad in places
         if opening != expected and known is None and first is None:
             self._lost += 1
             yield self._note(0, size, "no segment of tsfusion, or damaged from end to end", lost=1)

@@ -32,11 +32,11 @@ class Journal:
 
     Attributes:
         found: what the segments of earlier runs hold, in journal order; the caller may empty it.
-        damaged: how many of their records could not be read. A segment that cannot be read at all counts
-            as one.
+        damaged: how many of their records are damaged. A segment that is so from end to end counts as one.
 
     Raises:
-        JournalError: when the folder cannot be made or listed.
+        JournalError: when the folder cannot be made or listed, or one of its segments cannot be read or is
+            of another version: what it holds would be passed over for ever.
     """
 
     def __init__(
@@ -72,9 +72,10 @@ class Journal:
             try:
                 found, damaged = scan(path)
                 self._closed[number] = path.stat().st_size
-            except (JournalError, OSError) as error:
-                log.error("%s: its keyframes are lost to this run", error)
-                found, damaged = [], 1
+            except OSError as error:
+                raise _unopened(failed("read", path, error)) from error
+            except JournalError as error:
+                raise _unopened(error) from error
             self.found += found
             self.damaged += damaged
         self._number = numbers[-1] + 1 if numbers else 1
@@ -253,6 +254,10 @@ def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, c
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
         raise failed("write", path, error) from error
+
+
+def _unopened(error: JournalError) -> JournalError:
+    return JournalError(f"{error}; make it readable, or move it away to go on without its keyframes")
 
 
 def _cut(path: Path, end: int) -> None:

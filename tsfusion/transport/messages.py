@@ -79,7 +79,7 @@ class Nack(Struct, frozen=True, tag="nack"):
 class Hold(Struct, frozen=True, tag="hold"):
     """Nothing is taken from this session for so long: keep everything, then go on from durable + 1.
 
-    `reason`: `disk` (full or failing), `journal` (at its limit) or `quota`; `message` says it to a person.
+    `reason`: `disk` (full or failing) or `quota`; `message` says it to a person.
     """
 
     session: SessionId
@@ -125,6 +125,9 @@ class Pong(Struct, frozen=True, tag="pong"):
     sent_ns: int
     durable: Seq = 0
     fused: Seq = 0
+
+
+ASK_AGAIN = "ask again"  # so ends the error of a Reply when the same question may be answered soon
 
 
 class Command(Struct, frozen=True, tag="command", kw_only=True):
@@ -173,7 +176,7 @@ class MapHealth(Struct, frozen=True, kw_only=True):
     Attributes:
         problem: what keeps it from taking or fusing keyframes; empty = nothing.
         waiting: durable, not yet fused or rejected.
-        rejected: journaled, but not fusable, since the server began: reason → count.
+        rejected: journaled, but not fusable: reason → count.
         quarantined: keyframes kept aside for inspection.
         last_keyframe_s: seconds since the last one was journaled; None = none since the server began.
         delay_bound_ms: the delays are right to within so much (half the best round trip, the worst client's).

@@ -63,7 +63,7 @@ def router(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySo
 
 
 def publisher(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySocket:
-    """The server's mesh updates; a slow viewer loses the oldest, never holds the server up."""
+    """The server's mesh updates; a slow viewer misses some, never holds the server up."""
     limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES}
     return _make(context, zmq.XPUB, {**_ANY, **limits}, keys)
 
