@@ -116,7 +116,7 @@ def _work(options: argparse.Namespace) -> int:
     if options.engine == "atheris":
         _with_atheris(options)
         return 0  # never: libFuzzer ends the process
-    from fuzz_targets import fuzz
+    from fuzz_engine import fuzz
 
     found = fuzz(options.worker, options.cases, options.seed, crashes=options.crashes)
     if found.peak_rss_mb > options.memory:
@@ -139,6 +139,8 @@ def _with_atheris(options: argparse.Namespace) -> None:
 
     with atheris.instrument_imports(include=INSTRUMENTED):
         import fuzz_targets
+    from fuzz_engine import timed
+
     target = fuzz_targets.TARGETS[options.worker]
     seeds = target.seeds()
 
@@ -149,7 +151,7 @@ def _with_atheris(options: argparse.Namespace) -> None:
         return target.mutate(content, rng, seeds)[:most]
 
     def run(content: bytes) -> None:
-        fuzz_targets.timed(target, content)
+        timed(target, content)
 
     with tempfile.TemporaryDirectory() as folder:
         first = Path(folder) / "seeds"

@@ -7,7 +7,8 @@ import tracemalloc
 
 import fuzz_mutate
 import pytest
-from fuzz_targets import TARGETS, fuzz
+from fuzz_engine import fuzz
+from fuzz_targets import TARGETS
 
 from tsfusion import codec
 
