@@ -18,7 +18,7 @@ _CHECK_BYTES = 1 << 20  # besides the message itself
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_only_named_errors_come_out(name: str) -> None:
-    found = fuzz(name, CASES[name], seed=random.SystemRandom().randrange(1 << 32))
+    found = fuzz(name, CASES[name], seed=1)
     assert found.cases == CASES[name]
     assert len(found.outcomes) > 10, found
 
