@@ -29,7 +29,7 @@ from tsfusion.fetch import fetch_status
 from tsfusion.fuser_link import FuserLink
 from tsfusion.journal import Position
 from tsfusion.questions import Questions
-from tsfusion.sessions import Routes
+from tsfusion.routes import Routes
 from tsfusion.spool import Spool
 from tsfusion.transport import Command, messages, request, sockets, work
 

@@ -5,13 +5,15 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zmq
 from wire import DEADLINE, connected, serving, until, wall
 
 import tsfusion
-from tsfusion import Client, codec, config, config_toml, maps
+from tsfusion import Client, atlas, codec, config, config_toml, maps
+from tsfusion.atlas import Atlas
 from tsfusion.config import ServerConfig, VolumeConfig
 from tsfusion.errors import JournalError, ServerUnreachable, TransportError
 from tsfusion.fetch import fetch_health, fetch_mesh, fetch_status
@@ -79,6 +81,21 @@ def test_a_server_opens_only_so_many_maps(tmp_path: Path) -> None:
     assert maps.names(tmp_path) == ["default"]
 
 
+def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise JournalError("no room")
+
+    monkeypatch.setattr(atlas, "HostedMap", fail)
+    found: Any = Atlas(zmq.Context.instance(), ServerConfig(state=str(tmp_path)), None)  # type: ignore[arg-type]
+    found._volumes = {"default": VolumeConfig()}
+    for i in range(200):
+        assert found.open_for_client(f"map{i}") is None
+    assert len(found.health()[1]) == 64
+    assert found.why_not("map199") == "no room"
+
+
 @pytest.mark.parametrize("name", ["../up", "a/b", "", "A", "a" * 33, "a\n", "a\0", "ä", "."])
 def test_a_name_is_never_a_path(name: str) -> None:
     with pytest.raises(tsfusion.InvalidConfig):
@@ -125,7 +142,8 @@ def test_a_flood_does_not_hold_up_another_scanner(tmp_path: Path) -> None:
 def test_who_sends_too_much_has_to_wait_and_loses_nothing(tmp_path: Path) -> None:
     with serving(tmp_path, quota_keyframes=10.0) as server:
         started = time.monotonic()
-        scan(server.address, "default", range(45))
+        scan(server.address, "default", range(23))
+        scan(server.address, "default", range(23, 45))  # a new session is no way around it
         assert time.monotonic() - started > 2.0  # 20 at once, then ten a second
         health = fetch_health(server.address)
         assert health.refused["held"] > 0

@@ -15,7 +15,8 @@ from tsfusion import quarantine
 from tsfusion.errors import DecodeError, InvalidConfig, ServerUnreachable, TransportError
 from tsfusion.journal import Position, Scan
 from tsfusion.quarantine import Quarantine
-from tsfusion.sessions import Delays, KeyframeIndex, Routes, Session, Sessions, Turns
+from tsfusion.routes import Routes
+from tsfusion.sessions import Delays, KeyframeIndex, Session, Sessions, Turns
 from tsfusion.transport import ClockOffset, Command, control_address, messages, request, sockets
 from tsfusion.transport.messages import Ack, Denied, Hello, Hold, Nack, Ping, Pong, Stamps, Welcome
 
@@ -268,6 +269,24 @@ def test_delays_are_published_with_their_bound() -> None:
     for delay_ns, bound_ns in ((5_000_000, 100_000), (7_000_000, 300_000)):
         delays.add(delay_ns, bound_ns)
     assert (delays.summary().mean, delays.bound_ms) == (6.0, 0.3)
+
+
+def test_a_delay_that_cannot_be_does_not_count() -> None:
+    delays = Delays()
+    day = 86_400 * 10**9
+    assert [delays.add(delay, 1000) for delay in (-1000, day, -1001, day + 1, -(1 << 62))] == [
+        *(True, True, False, False, False)
+    ]
+    assert delays.summary().count == 2
+
+
+@pytest.mark.parametrize("clock", [(1 << 62, 0), (-(1 << 62), 0), (5, -1), (5, 1 << 62), (5, 3601 * 10**9)])
+def test_a_clock_that_cannot_be_is_not_believed(clock: tuple[int, int]) -> None:
+    route = Routes().connect(SESSION, "default", b"1")
+    route.said(Ping(SESSION, 1, 7, 3, waiting=2))
+    assert (route.offset_ns, route.bound_ns, route.waiting) == (7, 3, 2)
+    route.said(Ping(SESSION, 1, *clock, waiting=4))
+    assert (route.offset_ns, route.bound_ns, route.waiting) == (None, 0, 4)
 
 
 # --- quarantine ---

@@ -22,7 +22,7 @@ from tsfusion.intake import Intake
 from tsfusion.metrics import Metrics
 from tsfusion.ports import MemoryBound, Ports, each, send_now
 from tsfusion.questions import Questions
-from tsfusion.sessions import Route, Routes
+from tsfusion.routes import Route, Routes
 from tsfusion.transport import messages, sockets, work
 from tsfusion.transport.sockets import mesh_topic
 
@@ -220,8 +220,7 @@ class Gateway:
         route = self._routes.get(ping.session)
         if route is not None and route.client == client:
             self._routes.heard(route)
-            route.offset_ns, route.bound_ns = ping.offset_ns, ping.bound_ns
-            route.waiting, route.skipped = ping.waiting, ping.skipped
+            route.said(ping)
             progress = self._progress(route.map, ping.session)
         pong = messages.Pong(self.epoch, ping.sent_ns, received_ns, time.monotonic_ns(), *progress)
         self._answer(identity, pong)

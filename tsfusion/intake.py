@@ -83,9 +83,14 @@ class Intake:
         if seconds := hosted.held(now):
             self._hold(key, seconds, "disk", hosted.problem)
             return True
-        if seconds := self._quotas.wait(client or key.hex(), nbytes, now):
+        if seconds := self._quotas.wait(client, nbytes, now):
             rates = f"{self._server.quota_keyframes:g} keyframes and {self._server.quota_bytes >> 20} MB"
-            self._hold(key, seconds, "quota", f"the server takes {rates} a second of each client")
+            self._hold(
+                key,
+                seconds,
+                "quota",
+                f"the server takes {rates} a second of {'each client' if client else 'all clients together'}",
+            )
             return True
         return False
 

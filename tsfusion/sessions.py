@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""What the gateway knows of clients and keyframes: policy and bookkeeping, no sockets."""
+"""What the gateway knows of sessions and keyframes: policy and bookkeeping, no sockets."""
 
-import time
 from array import array
 from bisect import bisect_right
 from collections import OrderedDict, deque
@@ -13,13 +12,10 @@ from msgspec import Struct, field
 
 from tsfusion import ledger
 from tsfusion.journal import Position, Scan
-from tsfusion.transport.messages import ClientHealth, Spread, Stamps
+from tsfusion.transport.messages import Spread, Stamps
 
-_MAX_ROUTES = 1024
-_MAX_ROUTES_OF_A_NAME = 64  # where there are keys
-_NEW_ROUTES = 16  # so many of a name always have a place without having sent anything
-_TAKEN = 30.0  # seconds of silence after which another client may take a session that nothing came of
 _DELAYS = 1024
+_LONGEST_DELAY_NS = 86_400 * 10**9  # a day
 Verdict = Literal["next", "duplicate", "gap"]
 
 
@@ -63,144 +59,6 @@ class Session(Struct, eq=False):
         if seq <= self.durable:
             return "duplicate"
         return "next" if previous <= self.durable else "gap"
-
-
-class Route(Struct, eq=False):
-    """A live client.
-
-    Attributes:
-        session: its key.
-        map: where the keyframes go.
-        identity: of its connection to the control socket.
-        client: the name its key is allowed under; empty = no keys.
-        offset_ns: server clock minus client clock, as the client measured it; true to within `bound_ns`.
-        waiting, skipped: as its last Ping said.
-        scans: a keyframe of it is in the journal.
-        heard: `time.monotonic()` of its last message.
-        held_until: nothing is taken from it until then, because of `held`.
-    """
-
-    session: bytes
-    map: str
-    identity: bytes
-    client: str = ""
-    offset_ns: int | None = None
-    bound_ns: int = 0
-    waiting: int = 0
-    skipped: dict[str, int] = field(default_factory=dict)
-    received_bytes: int = 0
-    scans: bool = False
-    heard: float = 0.0
-    held_until: float = 0.0
-    held: str = ""
-
-    def open_to(self, client: str) -> bool:
-        """Whether this client may go on with the session: it is its own, or its client is silent for long."""
-        return self.client == client or time.monotonic() - self.heard >= _TAKEN
-
-    def health(self, now: float, progress: tuple[int, int]) -> ClientHealth:
-        """How the client is doing. `progress`: the highest seq that is durable, and that is fused."""
-        durable, fused = progress
-        return ClientHealth(
-            client=self.client,
-            session=self.session.hex()[:8],
-            map=self.map,
-            heard_s=now - self.heard,
-            durable=durable,
-            fused=fused,
-            received_bytes=self.received_bytes,
-            waiting=self.waiting,
-            skipped=self.skipped,
-            held=self.held if now < self.held_until else "",
-        )
-
-
-class Routes:
-    """The live clients, by session. When they are too many, the longest unheard of the largest name goes:
-    nobody's greetings push out others. Within a name, those that never sent a keyframe go first."""
-
-    def __init__(self) -> None:
-        self._by_session: dict[bytes, Route] = {}
-        self._names: dict[str, Crowd] = {}
-
-    def __iter__(self) -> Iterator[Route]:
-        return iter(self._by_session.values())
-
-    def connect(
-        self, session: bytes, map_name: str, identity: bytes, client: str = "", *, scans: bool = False
-    ) -> Route:
-        """Answers for this session go to this connection from now on.
-
-        Args:
-            scans: there is something of it in the journal.
-        """
-        route = self._by_session.get(session)
-        if route is None or route.client != client or route.map != map_name:
-            self._drop(route)
-            route = self._by_session[session] = Route(session, map_name, identity, client)
-        route.identity = identity
-        route.scans |= scans
-        self.heard(route)
-        crowd = self._names[client]
-        if client and len(crowd) > _MAX_ROUTES_OF_A_NAME:
-            self._drop(crowd.least())
-        if len(self._by_session) > _MAX_ROUTES:
-            self._drop(max(self._names.values(), key=len).least())
-        return route
-
-    def heard(self, route: Route, *, scans: bool = False) -> None:
-        """It is alive: now the last of those that could be pushed out.
-
-        Args:
-            scans: it sent a keyframe.
-        """
-        route.heard = time.monotonic()
-        crowd = self._names.setdefault(route.client, Crowd())
-        crowd.remove(route)
-        route.scans |= scans
-        crowd.add(route)
-
-    def _drop(self, route: Route | None) -> None:
-        if route is not None:
-            del self._by_session[route.session]
-            crowd = self._names[route.client]
-            crowd.remove(route)
-            if not len(crowd):
-                del self._names[route.client]
-
-    def get(self, session: bytes) -> Route | None:
-        """The connection of a session's client, if it said hello here."""
-        return self._by_session.get(session)
-
-    def clear(self) -> None:
-        """All connections are gone."""
-        self._by_session.clear()
-        self._names.clear()
-
-
-class Crowd:
-    """The routes of one client name, longest unheard first."""
-
-    def __init__(self) -> None:
-        self._new: OrderedDict[bytes, Route] = OrderedDict()
-        self._scan: OrderedDict[bytes, Route] = OrderedDict()
-
-    def __len__(self) -> int:
-        return len(self._new) + len(self._scan)
-
-    def add(self, route: Route) -> None:
-        """The last heard."""
-        (self._scan if route.scans else self._new)[route.session] = route
-
-    def remove(self, route: Route) -> None:
-        """If it is here."""
-        self._new.pop(route.session, None)
-        self._scan.pop(route.session, None)
-
-    def least(self) -> Route:
-        """Which to do without. Some are always new ones: nobody is shut out by all who ever scanned."""
-        crowd = self._new if len(self._new) > _NEW_ROUTES or not self._scan else self._scan
-        return next(iter(crowd.values()))
 
 
 class Sessions:
@@ -349,9 +207,12 @@ class Delays:
     def __init__(self) -> None:
         self._recent_ms: deque[tuple[float, float]] = deque(maxlen=_DELAYS)
 
-    def add(self, delay_ns: int, bound_ns: int) -> None:
-        """A keyframe took so long, give or take the bound."""
+    def add(self, delay_ns: int, bound_ns: int) -> bool:
+        """A keyframe took so long, give or take the bound. False when that cannot be: it does not count."""
+        if not -bound_ns <= delay_ns <= _LONGEST_DELAY_NS:
+            return False
         self._recent_ms.append((delay_ns / 1e6, bound_ns / 1e6))
+        return True
 
     @property
     def bound_ms(self) -> float:
