@@ -17,6 +17,7 @@ from tsfusion.journal import Position, Scan
 from tsfusion.quarantine import Quarantine
 from tsfusion.routes import Routes
 from tsfusion.sessions import Delays, KeyframeIndex, Session, Sessions, Turns
+from tsfusion.subscriptions import Subscriptions
 from tsfusion.transport import ClockOffset, Command, control_address, messages, request, sockets
 from tsfusion.transport.messages import Ack, Denied, Hello, Hold, Nack, Ping, Pong, Stamps, Welcome
 
@@ -287,6 +288,30 @@ def test_a_clock_that_cannot_be_is_not_believed(clock: tuple[int, int]) -> None:
     assert (route.offset_ns, route.bound_ns, route.waiting) == (7, 3, 2)
     route.said(Ping(SESSION, 1, *clock, waiting=4))
     assert (route.offset_ns, route.bound_ns, route.waiting) == (None, 0, 4)
+
+
+# --- subscriptions ---
+
+
+def test_only_what_can_be_a_maps_topic_is_remembered() -> None:
+    topics = Subscriptions()
+    for good in (b"", b"me", b"mesh/", b"mesh/y", b"mesh/yard", b"mesh/yard/", b"mesh/attic/"):
+        assert topics.add(good, ["yard"])
+    for bad in (b"x", b"mesh/Yard", b"mesh/yard/x", b"mesh//", b"mesh/" + b"a" * 33, b"mesh/\n", b"mesh/a\n"):
+        assert not topics.add(bad, ["yard"])
+    assert len(topics) == 7
+
+
+def test_topics_are_few_and_those_of_open_maps_have_room() -> None:
+    topics = Subscriptions()
+    taken = [topics.add(f"mesh/map{i}/".encode(), ["yard"]) for i in range(1000)]
+    assert taken.count(True) == len(topics) == 256
+    assert not topics.watched("yard")
+    assert topics.add(b"mesh/yard/", ["yard"])
+    assert topics.watched("yard")
+    topics.discard(b"mesh/yard/")
+    assert not topics.watched("yard")
+    assert topics.watched("map1")
 
 
 # --- quarantine ---

@@ -23,6 +23,7 @@ from tsfusion.metrics import Metrics
 from tsfusion.ports import MemoryBound, Ports, each, send_now
 from tsfusion.questions import Questions
 from tsfusion.routes import Route, Routes
+from tsfusion.subscriptions import Subscriptions
 from tsfusion.transport import messages, sockets, work
 from tsfusion.transport.sockets import mesh_topic
 
@@ -58,7 +59,7 @@ class Gateway:
         self._intake = Intake(server, self.maps, door, self)
         self._refused = self._intake.refused
         self._questions = Questions(self._answer, server.memory_bytes // _MESHES_SHARE)
-        self._topics: set[bytes] = set()  # that somebody subscribed to
+        self._topics = Subscriptions()
         self._watched: dict[str, bool] = {}  # what each fuser knows of it
         self._memory = MemoryBound(server.memory_bytes)
         self._accepting = False
@@ -143,8 +144,7 @@ class Gateway:
                 self._watched.pop(hosted.name, None)
                 self._questions.give_up(hosted.name)
                 continue
-            topic = mesh_topic(hosted.name)
-            watched = any(topic.startswith(wanted) for wanted in self._topics)
+            watched = self._topics.watched(hosted.name)
             if watched != self._watched.get(hosted.name) and hosted.fuser.send(work.Publish(watched)):
                 self._watched[hosted.name] = watched
 
@@ -241,11 +241,9 @@ class Gateway:
         change, topic = frames[0].bytes[:1], frames[0].bytes[1:]
         if change == b"\x01" and self._door.client_of(frames[0]) is None:
             self._refused["key"] += 1
-        elif change == b"\x01" and sockets.is_mesh_topic(topic):
-            self._topics.add(topic)
         elif change == b"\x00":
             self._topics.discard(topic)
-        else:
+        elif change != b"\x01" or not self._topics.add(topic, (hosted.name for hosted in self.maps)):
             self._refused["subscription"] += 1
 
     # --- what is known ---
