@@ -184,7 +184,7 @@ class HostedMap:
         if ended and not self.fuser.finishing:
             self.fuser.restart()
         self._hand_out()
-        self._retention.step(self.fuser)
+        self._retention.step(self.fuser, self._unmeshed)
 
     def _hand_out(self) -> None:
         while self.fuser.wants_work and (session := self._turns.next()) is not None:

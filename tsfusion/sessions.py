@@ -2,7 +2,7 @@
 """What the gateway knows of sessions and keyframes: policy and bookkeeping, no sockets."""
 
 from array import array
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator
 from typing import Literal
@@ -28,7 +28,7 @@ class Session(Struct, eq=False):
         durable: the highest seq that is journaled.
         fused: the highest that the map has taken or refused.
         in_map: the same of the fuser that lives: after a death it begins at the checkpoint again.
-        entries: the indices of its keyframes.
+        entries: the indices of its keyframes that are not forgotten.
         handed: how many of these the fuser was given.
     """
 
@@ -144,10 +144,14 @@ _COLUMNS = (
 
 
 class KeyframeIndex:
-    """Every keyframe of the journal in order: 72 bytes each. Stamps are 0 for those of earlier runs."""
+    """Every keyframe of the journal in order: 72 bytes each. Stamps are 0 for those of earlier runs.
+
+    An index stays what it is when the keyframes before it are forgotten.
+    """
 
     def __init__(self) -> None:
         self._columns = {name: array("q") for name in _COLUMNS}
+        self._first = 0  # index that is not forgotten
 
     def __len__(self) -> int:
         return len(self._columns["seq"])
@@ -178,27 +182,48 @@ class KeyframeIndex:
         values = (*place, received_ns, durable_ns, 0, 0)
         for column, value in zip(self._columns.values(), values, strict=True):
             column.append(value)
-        session.entries.append(len(self) - 1)
-        return len(self) - 1
+        index = self._first + len(self) - 1
+        session.entries.append(index)
+        return index
+
+    def forget(self, before_segment: int, sessions: Sessions, needed: Iterable[int] = ()) -> None:
+        """Let go of the keyframes whose segment is gone, up to the first that is still to be handed out.
+
+        Args:
+            needed: indices that somebody will ask for.
+        """
+        if not bisect_left(self._columns["segment"], before_segment):
+            return
+        stop = self._first + bisect_left(self._columns["segment"], before_segment)
+        waiting = (one.entries[one.handed] for one in sessions if one.handed < len(one.entries))
+        stop = min(stop, min(waiting, default=stop), min(needed, default=stop))
+        for session in sessions:
+            gone = bisect_left(session.entries, stop)
+            del session.entries[:gone]
+            session.handed -= gone
+        for column in self._columns.values():
+            del column[: stop - self._first]
+        self._first = stop
 
     def fused(self, index: int, fuse_start_ns: int, fused_ns: int) -> None:
         """Note when a keyframe entered the map."""
-        self._columns["fuse_start_ns"][index] = fuse_start_ns
-        self._columns["fused_ns"][index] = fused_ns
+        self._columns["fuse_start_ns"][index - self._first] = fuse_start_ns
+        self._columns["fused_ns"][index - self._first] = fused_ns
 
     def __getitem__(self, index: int) -> Entry:
         segment, offset, session, seq, captured, *stamps = (
-            column[index] for column in self._columns.values()
+            column[index - self._first] for column in self._columns.values()
         )
         return Entry(index, Position(segment, offset), session, Stamps(seq, *stamps), captured)
 
     def after(self, session: Session, seq: int) -> int:
-        """How many keyframes of a session have a number up to `seq`."""
-        return bisect_right(session.entries, seq, key=lambda index: self._columns["seq"][index])
+        """How many keyframes of a session, of those not forgotten, have a number up to `seq`."""
+        seqs, first = self._columns["seq"], self._first
+        return bisect_right(session.entries, seq, key=lambda index: seqs[index - first])
 
     def segment(self, index: int) -> int:
         """The segment that holds a keyframe."""
-        return self._columns["segment"][index]
+        return self._columns["segment"][index - self._first]
 
 
 class Delays:
