@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """One server, several maps and several scanners: real processes and sockets."""
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -9,7 +10,7 @@ from typing import Any
 
 import pytest
 import zmq
-from wire import DEADLINE, connected, serving, until, wall
+from wire import DEADLINE, Server, connected, serving, until, wall
 
 import tsfusion
 from tsfusion import Client, atlas, codec, config, config_toml, maps
@@ -94,6 +95,21 @@ def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
         assert found.open_for_client(f"map{i}") is None
     assert len(found.health()[1]) == 64
     assert found.why_not("map199") == "no room"
+
+
+def test_a_map_takes_only_so_many_sessions(tmp_path: Path) -> None:
+    code = "import tsfusion.sessions; tsfusion.sessions._MAX_SESSIONS = 2\n"
+    with contextlib.closing(Server(tmp_path, code=code)) as server:
+        for i in range(2):
+            scan(server.address, "default", range(i, i + 1))
+        refused = pytest.raises(ServerUnreachable, match="map default has 2 sessions and takes no new one")
+        with Client(server.address) as client, refused:
+            client.connect(timeout=5)
+        with connected(sockets.push, server.address) as push:  # without a greeting neither
+            push.send_multipart(codec.encode(wall(), session=b"s" * 16, seq=1, jpeg_quality=90))
+            until(lambda: fetch_health(server.address).refused.get("session", 0) == 1)
+        assert fetch_health(server.address).maps["default"].sessions == 2
+        assert server.terminate() == 0
 
 
 @pytest.mark.parametrize("name", ["../up", "a/b", "", "A", "a" * 33, "a\n", "a\0", "ä", "."])

@@ -154,6 +154,16 @@ def test_each_keyframe_is_admitted_once_and_in_order() -> None:
     assert session.admit(9, 6) == "gap"
 
 
+def test_sessions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tsfusion.sessions._MAX_SESSIONS", 2)
+    sessions = Sessions()
+    for key in (SESSION, bytes(16)):
+        assert sessions.room_for(key)
+        sessions.open(key)
+    assert not sessions.room_for(b"s" * 16)
+    assert sessions.room_for(SESSION)
+
+
 def test_strangers_do_not_grow_the_sessions() -> None:
     sessions, routes = Sessions(), Routes()
     for i in range(3000):

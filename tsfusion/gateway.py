@@ -210,6 +210,8 @@ class Gateway:
             return "opening", f"map {hello.map} is being opened"
         if not self._intake.owns(hosted, hello.session, client):
             return "session", "the session of this spool is another client's: use another spool folder"
+        if not hosted.sessions.room_for(hello.session):
+            return "session", f"map {hello.map} has {len(hosted.sessions)} sessions and takes no new one"
         scans = hosted.sessions.get(hello.session) is not None
         self._routes.connect(hello.session, hello.map, identity, client, scans=scans)
         return None

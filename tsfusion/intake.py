@@ -60,6 +60,8 @@ class Intake:
         hosted = self._maps.get(header.map)
         if hosted is None or not hosted.warm:  # its client will say hello, and send it again
             self.refused["map"] += 1
+        elif not hosted.sessions.room_for(header.session):  # its client is told when it says hello
+            self.refused["session"] += 1
         elif not self.owns(hosted, header.session, client):
             self.refused["session"] += 1
             subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)

@@ -15,6 +15,7 @@ from tsfusion.journal import Position, Scan
 from tsfusion.transport.messages import Spread, Stamps
 
 _DELAYS = 1024
+_MAX_SESSIONS = 100_000  # of a map; each takes some 60 bytes of every checkpoint, for ever
 _LONGEST_DELAY_NS = 86_400 * 10**9  # a day
 Verdict = Literal["next", "duplicate", "gap"]
 
@@ -77,6 +78,10 @@ class Sessions:
     def get(self, key: bytes) -> Session | None:
         """A session that has something in the journal, or None."""
         return self._by_key.get(key)
+
+    def room_for(self, key: bytes) -> bool:
+        """Whether it is one of them, or may become one."""
+        return key in self._by_key or len(self) < _MAX_SESSIONS
 
     def open(self, key: bytes, client: str = "") -> Session:
         """The session of a key, made when new."""
