@@ -13,7 +13,7 @@ from tsfusion.transport import work
 class Folder:
     """A journal of ten segments that is always too large; notes what may go."""
 
-    nbytes, segment = 1 << 40, 11
+    nbytes, first, segment = 1 << 40, 1, 11
 
     def __init__(self) -> None:
         self.below = 0
@@ -28,6 +28,7 @@ class Fuser:
     """Takes what it is told."""
 
     ready = True
+    in_flight = ()
 
     def __init__(self) -> None:
         self.asked: list[Any] = []
@@ -47,7 +48,7 @@ def ten_segments() -> tuple[Retention, Folder, Session]:
 
 
 def let_go(retention: Retention, folder: Folder, fuser: Fuser) -> int:
-    retention.step(cast(FuserLink, fuser))
+    retention.step(cast(FuserLink, fuser), ())
     return folder.below
 
 

@@ -17,6 +17,7 @@ from tsfusion.transport import messages, work
 
 log = logging.getLogger(__name__)
 
+_MAX_UNOPENED = 64
 _RETRY_INTERVAL = 10.0  # seconds before a map that could not be opened is tried again
 Other = Callable[[HostedMap, work.Meshed | work.Answer, Sequence[zmq.Frame]], None]
 
@@ -82,6 +83,8 @@ class Atlas:
     def _give_up(self, name: str, error: TsfusionError) -> None:
         log.error("the map cannot be opened: %s", error, extra=logs.about(map=name))
         self._unopened[name] = (str(error), time.monotonic())
+        if len(self._unopened) > _MAX_UNOPENED:
+            self._unopened.pop(next(iter(self._unopened)))
         hosted = self._open.pop(name, None)
         if hosted is not None:
             hosted.close()

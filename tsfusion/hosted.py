@@ -18,7 +18,8 @@ from tsfusion.fuser_link import FuserLink
 from tsfusion.journal import Journal, read
 from tsfusion.quarantine import Quarantine
 from tsfusion.retention import Retention
-from tsfusion.sessions import Delays, Entry, KeyframeIndex, Route, Session, Sessions, Turns
+from tsfusion.routes import Route
+from tsfusion.sessions import Delays, Entry, KeyframeIndex, Session, Sessions, Turns
 from tsfusion.transport import messages, work
 
 log = logging.getLogger(__name__)
@@ -193,7 +194,7 @@ class HostedMap:
             self.fuser.restart()
         self._hand_out()
         self._look_for_room()
-        self._retention.step(self.fuser)
+        self._retention.step(self.fuser, self._unmeshed)
 
     def _look_for_room(self) -> None:
         """Who waits for this server to be ready again may be who would send the next keyframe."""
@@ -292,8 +293,8 @@ class HostedMap:
             self._clients.observe(self.name, "fuse", fused / 1e9)
         if entry.captured_ns and route is not None and route.offset_ns is not None:
             delay_ns = stamps.fused_ns - entry.captured_ns - route.offset_ns
-            self._delays.add(delay_ns, route.bound_ns)
-            self._clients.observe(self.name, "total", delay_ns / 1e9)
+            if self._delays.add(delay_ns, route.bound_ns):
+                self._clients.observe(self.name, "total", delay_ns / 1e9)
 
     def _on_rejected(self, session: Session, entry: Entry, done: work.Done) -> None:
         assert done.reason is not None
