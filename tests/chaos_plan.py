@@ -17,12 +17,14 @@ class Attack(Struct, frozen=True):
         keyframes: not before so many are in the journal (a scanner: not before it took so many).
         ready: not before the server is ready.
         wait: seconds from then.
+        hold: before it dies, the link carries nothing for so many seconds: keyframes are under way then.
     """
 
     kind: Kind
     keyframes: int
     ready: bool
     wait: float
+    hold: float = 0.0
 
 
 class Fault(Struct, frozen=True):
@@ -50,7 +52,8 @@ def on_server(rng: random.Random, keyframes: int, kills: int) -> list[Attack]:
         if planned and rng.random() < 0.25:
             planned.append(Attack(kind, planned[-1].keyframes, False, rng.uniform(0.05, 2.5)))
         else:
-            planned.append(Attack(kind, at, True, rng.uniform(0.0, 1.5)))
+            hold = rng.choice([0.0, rng.uniform(0.1, 0.4)])
+            planned.append(Attack(kind, at, True, rng.uniform(0.0, 1.5), hold))
     return planned
 
 

@@ -129,8 +129,9 @@ class Watch:
 class Killer:
     """Works through attacks, and notes what it did. Call `work` in any thread."""
 
-    def __init__(self, daemon: Daemon, scanners: list[Scanner], started: float) -> None:
+    def __init__(self, daemon: Daemon, scanners: list[Scanner], proxy: Proxy, started: float) -> None:
         self.kills: list[Kill] = []
+        self._proxy = proxy
         self._daemon = daemon
         self._scanners = scanners
         self._started = started
@@ -141,9 +142,14 @@ class Killer:
             scanner = self._scanners[number % len(self._scanners)]
             until(lambda attack=attack, scanner=scanner: self._is_time(attack, scanner), PATIENCE)
             time.sleep(attack.wait)
+            if attack.hold:
+                self._proxy.freeze(True)
+                time.sleep(attack.hold)
             ready, at = self._daemon.ready, round(time.monotonic() - self._started, 2)
             if self._kill(attack.kind, scanner):
                 self.kills.append(Kill(at, attack.kind, ready, journaled(self._daemon.state)))
+            if attack.hold:
+                self._proxy.freeze(False)
 
     def _is_time(self, attack: Attack, scanner: Scanner) -> bool:
         if attack.kind == "scanner":
@@ -189,7 +195,7 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
         stack.callback(watch.end)
         weather = Weather(random.Random(-seed - 1), proxy)
         stack.callback(weather.end)
-        killer = Killer(daemon, scanners, started)
+        killer = Killer(daemon, scanners, proxy, started)
         other = threading.Thread(target=killer.work, args=(early,))
         other.start()
         killer.work(late)
