@@ -12,7 +12,8 @@ import zmq
 from tsfusion import logs
 from tsfusion.config import DEFAULT_MAP, ServerConfig, VolumeConfig
 from tsfusion.errors import TsfusionError
-from tsfusion.hosted import Clients, HostedMap
+from tsfusion.hosted import HostedMap
+from tsfusion.outcomes import Clients
 from tsfusion.transport import messages, work
 
 log = logging.getLogger(__name__)

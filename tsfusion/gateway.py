@@ -240,7 +240,7 @@ class Gateway:
 
     def _progress(self, map_name: str, session: bytes) -> tuple[int, int]:
         hosted = self.maps.get(map_name)
-        return hosted.progress(session) if hosted else (0, 0)
+        return hosted.sessions.progress(session) if hosted else (0, 0)
 
     def _on_command(self, identity: bytes, command: messages.Command, client: str) -> None:
         if command.name == "ping":

@@ -17,7 +17,8 @@ from tsfusion.atlas import Atlas
 from tsfusion.config import ServerConfig
 from tsfusion.door import Door
 from tsfusion.errors import JournalError
-from tsfusion.hosted import Clients, HostedMap
+from tsfusion.hosted import HostedMap
+from tsfusion.outcomes import Clients
 from tsfusion.quota import Quotas
 from tsfusion.transport import messages
 

@@ -95,6 +95,11 @@ class Sessions:
         """As `Session.admit`, for a session that may not exist yet."""
         return (self._by_key.get(key) or Session(key, -1)).admit(seq, previous)
 
+    def progress(self, key: bytes) -> tuple[int, int]:
+        """The highest seq of a session that is durable, and that is fused."""
+        session = self._by_key.get(key)
+        return (session.durable, session.fused) if session else (0, 0)
+
     def numbered(self, number: int) -> Session:
         """A session by its number."""
         return self._all[number]
