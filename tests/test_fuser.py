@@ -3,21 +3,25 @@
 
 import errno
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-from wire import wall
+from wire import DEADLINE, alive, serving, until, wall
 
 import tsfusion
 from tsfusion import VolumeConfig, codec
-from tsfusion.errors import CheckpointError, InvalidConfig
+from tsfusion.errors import CheckpointError, InvalidConfig, MapError
+from tsfusion.fetch import fetch_health
 from tsfusion.fuser import Fuser
 from tsfusion.journal import Journal, Position
 from tsfusion.maps import MAP_FILE, PREVIOUS_FILE
-from tsfusion.saved_map import SavedMap
+from tsfusion.saved_map import SavedMap, hold
 from tsfusion.transport import Command, work
 
 VOLUME = VolumeConfig(voxel_size=0.04, threads=1)
@@ -318,3 +322,51 @@ def test_no_question_ends_the_fuser(tmp_path: Path, min_weight: float) -> None:
     fuser.take(order(0, position))
     fuser.take(work.Ask(1, Command(name="mesh", min_weight=min_weight)))
     assert "min_weight must be" in link.last().error
+
+
+# --- one fuser a map ---
+
+
+def started(code: str) -> tuple[subprocess.Popen[str], str]:
+    """A process, and its first word."""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    return process, process.stdout.readline()
+
+
+def test_a_map_has_one_fuser_for_as_long_as_it_lives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tsfusion.saved_map._PATIENCE", 0.1)
+    code = "import time; from pathlib import Path; from tsfusion.saved_map import hold;"
+    code += f"hold(Path({str(tmp_path)!r})); print('held', flush=True); time.sleep(600)"
+    with started(code)[0] as other:
+        with pytest.raises(MapError, match=rf"in use by another fuser \(pid {other.pid}\)"):
+            hold(tmp_path)
+        other.send_signal(signal.SIGSTOP)  # stopped or not
+        with pytest.raises(MapError, match="in use"):
+            hold(tmp_path)
+        other.kill()
+        monkeypatch.setattr("tsfusion.saved_map._PATIENCE", DEADLINE)
+        os.close(hold(tmp_path))
+    with pytest.raises(MapError, match=r"cannot lock .*No such file"):
+        hold(tmp_path / "missing")
+
+
+def test_a_stopped_fuser_does_not_outlive_its_gateway(tmp_path: Path) -> None:
+    with serving(tmp_path) as server:
+        until(lambda: fetch_health(server.address).ready)
+        fuser = server.fuser_pid()
+        os.kill(fuser, signal.SIGSTOP)
+        server.kill()
+        until(lambda: not alive(fuser))
+
+
+def test_a_process_at_work_ends_with_the_one_that_started_it() -> None:
+    child = "from tsfusion import process; import signal, time; process.on_parent_end(signal.SIGKILL); "
+    child += "print(1, flush=True); time.sleep(600)"
+    code = "import subprocess, sys, time; "
+    code += f"p = subprocess.Popen([sys.executable, '-c', {child!r}], stdout=subprocess.PIPE); "
+    code += "p.stdout.readline(); print(p.pid, flush=True); time.sleep(600)"
+    parent, word = started(code)
+    with parent:
+        parent.kill()
+        until(lambda: not alive(int(word)))

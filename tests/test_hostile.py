@@ -16,7 +16,7 @@ import pytest
 import zmq
 from wire import DEADLINE, Server, connected, serving, until, wall
 
-from tsfusion import Client, VolumeConfig, codec, config, fuser_process
+from tsfusion import Client, VolumeConfig, codec, config, fetch, fuser_process
 from tsfusion.codec.header import pack
 from tsfusion.config import ServerConfig
 from tsfusion.errors import (
@@ -25,11 +25,11 @@ from tsfusion.errors import (
     ServerUnreachable,
     TransportError,
 )
-from tsfusion.fetch import fetch_status
+from tsfusion.fetch import fetch_mesh, fetch_status
 from tsfusion.fuser_link import FuserLink
 from tsfusion.journal import Position
 from tsfusion.questions import Questions
-from tsfusion.sessions import Routes
+from tsfusion.routes import Routes
 from tsfusion.spool import Spool
 from tsfusion.transport import Command, messages, request, sockets, work
 
@@ -317,8 +317,9 @@ def test_a_port_that_speaks_something_else(shared: Server) -> None:
 
 
 @contextmanager
-def answering(answer: bytes) -> Iterator[str]:
-    """The data address of a control socket that answers everything so."""
+def answering(*answers: bytes) -> Iterator[str]:
+    """The data address of a control socket that answers one after the other so, the last for ever."""
+    left = list(answers)
     context: zmq.Context[Any] = zmq.Context()
     router = sockets.router(context)
     port = router.bind_to_random_port("tcp://127.0.0.1")
@@ -327,7 +328,7 @@ def answering(answer: bytes) -> Iterator[str]:
     def answer_all() -> None:
         while not stop.is_set():
             if router.poll(20):
-                router.send_multipart([router.recv_multipart()[0], answer])
+                router.send_multipart([router.recv_multipart()[0], left.pop(0) if len(left) > 1 else left[0]])
 
     thread = threading.Thread(target=answer_all)
     thread.start()
@@ -347,3 +348,14 @@ def test_who_answers_with_nonsense_is_named(caplog: pytest.LogCaptureFixture) ->
         with Client(address) as client, pytest.raises(ServerUnreachable, match="is no tsfusion server"):
             client.connect(timeout=0.5)
     assert caplog.text == ""
+
+
+def test_a_mesh_is_asked_for_again_when_the_server_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fetch, "_AGAIN_INTERVAL", 0.01)
+    again, settled = (
+        messages.encode(messages.Reply(name="mesh", error=error)) for error in ("busy; ask again", "no room")
+    )
+    with answering(again, again, settled) as address, pytest.raises(TransportError, match="no room"):
+        fetch_mesh(address, timeout=5.0)
+    with answering(again) as address, pytest.raises(TransportError, match="busy; ask again"):
+        fetch_mesh(address, timeout=0.3)

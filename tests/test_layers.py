@@ -16,9 +16,9 @@ PACKAGE = Path(__file__).parent.parent / "tsfusion"
 ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("command line", frozenset({"__main__", "cli"})),
     ("whole runs", frozenset({"pipeline", "child"})),
-    ("processes", frozenset({"server", "gateway", "intake", "door", "hosted", "retention", "reports",
-                             "atlas", "questions", "quota", "quarantine", "sessions", "ports", "fuser_link",
-                             "fuser_process", "fuser", "saved_map",
+    ("processes", frozenset({"server", "gateway", "intake", "door", "hosted", "outcomes", "retention",
+                             "reports", "atlas", "questions", "quota", "quarantine", "routes", "sessions",
+                             "subscriptions", "ports", "fuser_link", "fuser_process", "fuser", "saved_map",
                              "client", "fetch", "backpressure", "room", "sender", "connection",
                              "conversation", "refused", "outbox", "spool", "gone", "times", "recording"})),
     ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results", "metrics",

@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: MIT
 """One server, several maps and several scanners: real processes and sockets."""
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zmq
-from wire import DEADLINE, connected, serving, until, wall
+from wire import DEADLINE, Server, connected, serving, until, wall
 
 import tsfusion
-from tsfusion import Client, codec, config, config_toml, maps
+from tsfusion import Client, atlas, codec, config, config_toml, maps
+from tsfusion.atlas import Atlas
 from tsfusion.config import ServerConfig, VolumeConfig
 from tsfusion.errors import JournalError, ServerUnreachable, TransportError
 from tsfusion.fetch import fetch_health, fetch_mesh, fetch_status
@@ -79,6 +82,36 @@ def test_a_server_opens_only_so_many_maps(tmp_path: Path) -> None:
     assert maps.names(tmp_path) == ["default"]
 
 
+def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise JournalError("no room")
+
+    monkeypatch.setattr(atlas, "HostedMap", fail)
+    found: Any = Atlas(zmq.Context.instance(), ServerConfig(state=str(tmp_path)), None)  # type: ignore[arg-type]
+    found._volumes = {"default": VolumeConfig()}
+    for i in range(200):
+        assert found.open_for_client(f"map{i}") is None
+    assert len(found.health()[1]) == 64
+    assert found.why_not("map199") == "no room"
+
+
+def test_a_map_takes_only_so_many_sessions(tmp_path: Path) -> None:
+    code = "import tsfusion.sessions; tsfusion.sessions._MAX_SESSIONS = 2\n"
+    with contextlib.closing(Server(tmp_path, code=code)) as server:
+        for i in range(2):
+            scan(server.address, "default", range(i, i + 1))
+        refused = pytest.raises(ServerUnreachable, match="map default has 2 sessions and takes no new one")
+        with Client(server.address) as client, refused:
+            client.connect(timeout=5)
+        with connected(sockets.push, server.address) as push:  # without a greeting neither
+            push.send_multipart(codec.encode(wall(), session=b"s" * 16, seq=1, jpeg_quality=90))
+            until(lambda: fetch_health(server.address).refused.get("session", 0) == 1)
+        assert fetch_health(server.address).maps["default"].sessions == 2
+        assert server.terminate() == 0
+
+
 @pytest.mark.parametrize("name", ["../up", "a/b", "", "A", "a" * 33, "a\n", "a\0", "ä", "."])
 def test_a_name_is_never_a_path(name: str) -> None:
     with pytest.raises(tsfusion.InvalidConfig):
@@ -125,7 +158,8 @@ def test_a_flood_does_not_hold_up_another_scanner(tmp_path: Path) -> None:
 def test_who_sends_too_much_has_to_wait_and_loses_nothing(tmp_path: Path) -> None:
     with serving(tmp_path, quota_keyframes=10.0) as server:
         started = time.monotonic()
-        scan(server.address, "default", range(45))
+        scan(server.address, "default", range(23))
+        scan(server.address, "default", range(23, 45))  # a new session is no way around it
         assert time.monotonic() - started > 2.0  # 20 at once, then ten a second
         health = fetch_health(server.address)
         assert health.refused["held"] > 0
@@ -214,7 +248,8 @@ def test_a_journal_keeps_to_its_limit(tmp_path: Path) -> None:
     assert len(Recording(tmp_path)) < 1200
     with serving(tmp_path, **settings) as server:
         until(lambda: fetch_health(server.address).maps["default"].keyframes_fused == 1200)
-        assert fetch_status(server.address).map_hash == fused_hash(range(1200))
+        scan(server.address, "default", range(1200, 1210))
+        assert fetch_status(server.address).map_hash == fused_hash(range(1210))
         assert server.terminate() == 0
 
 

@@ -15,7 +15,9 @@ from tsfusion import quarantine
 from tsfusion.errors import DecodeError, InvalidConfig, ServerUnreachable, TransportError
 from tsfusion.journal import Position, Scan
 from tsfusion.quarantine import Quarantine
-from tsfusion.sessions import Delays, KeyframeIndex, Routes, Session, Sessions, Turns
+from tsfusion.routes import Routes
+from tsfusion.sessions import Delays, KeyframeIndex, Session, Sessions, Turns
+from tsfusion.subscriptions import Subscriptions
 from tsfusion.transport import ClockOffset, Command, control_address, messages, request, sockets
 from tsfusion.transport.messages import Ack, Denied, Hello, Hold, Nack, Ping, Pong, Stamps, Welcome
 
@@ -152,6 +154,16 @@ def test_each_keyframe_is_admitted_once_and_in_order() -> None:
     assert session.admit(9, 6) == "gap"
 
 
+def test_sessions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tsfusion.sessions._MAX_SESSIONS", 2)
+    sessions = Sessions()
+    for key in (SESSION, bytes(16)):
+        assert sessions.room_for(key)
+        sessions.open(key)
+    assert not sessions.room_for(b"s" * 16)
+    assert sessions.room_for(SESSION)
+
+
 def test_strangers_do_not_grow_the_sessions() -> None:
     sessions, routes = Sessions(), Routes()
     for i in range(3000):
@@ -254,6 +266,32 @@ def test_recovery_counts_a_keyframe_once() -> None:
     assert index.segment(2) == 1
 
 
+def test_keyframes_whose_segments_are_gone_are_forgotten() -> None:
+    other = bytes(16)
+    index, sessions = index_of(
+        *((1, 1, SESSION, 1), (1, 2, other, 5), (2, 1, SESSION, 2), (2, 2, SESSION, 3), (3, 1, other, 6))
+    )
+    first, second = sessions.open(SESSION), sessions.open(other)
+    first.handed, second.handed = 2, 1
+    before = {i: index[i] for i in range(2, 5)}
+    index.forget(1, sessions)
+    assert len(index) == 5
+    index.forget(3, sessions, needed=[4, 1])  # not meshed yet
+    assert (len(index), list(first.entries), first.handed) == (4, [2, 3], 1)
+    index.forget(3, sessions)
+    assert (len(index), list(first.entries), first.handed) == (2, [3], 0)  # 3 is to be handed out
+    assert (list(second.entries), second.handed) == ([4], 0)
+    assert {i: index[i] for i in (3, 4)} == {i: before[i] for i in (3, 4)}
+    assert [index.after(first, seq) for seq in (1, 2, 3)] == [0, 0, 1]
+    assert (index.segment(3), index.segment(4)) == (2, 3)
+    assert index.add(Position(3, 2), second, 7) == 5
+    index.fused(5, 8, 9)
+    assert (index[5].stamps.seq, index[5].stamps.fused_ns, list(second.entries)) == (7, 9, [4, 5])
+    first.handed = second.handed = 1
+    index.forget(9, sessions)
+    assert (len(index), list(first.entries), list(second.entries), second.handed) == (1, [], [5], 0)
+
+
 def test_the_index_keeps_stamps() -> None:
     index, sessions = KeyframeIndex(), Sessions()
     index.add(Position(1, 42), sessions.open(SESSION), 1, captured_ns=5, received_ns=6, durable_ns=7)
@@ -268,6 +306,48 @@ def test_delays_are_published_with_their_bound() -> None:
     for delay_ns, bound_ns in ((5_000_000, 100_000), (7_000_000, 300_000)):
         delays.add(delay_ns, bound_ns)
     assert (delays.summary().mean, delays.bound_ms) == (6.0, 0.3)
+
+
+def test_a_delay_that_cannot_be_does_not_count() -> None:
+    delays = Delays()
+    day = 86_400 * 10**9
+    assert [delays.add(delay, 1000) for delay in (-1000, day, -1001, day + 1, -(1 << 62))] == [
+        *(True, True, False, False, False)
+    ]
+    assert delays.summary().count == 2
+
+
+@pytest.mark.parametrize("clock", [(1 << 62, 0), (-(1 << 62), 0), (5, -1), (5, 1 << 62), (5, 3601 * 10**9)])
+def test_a_clock_that_cannot_be_is_not_believed(clock: tuple[int, int]) -> None:
+    route = Routes().connect(SESSION, "default", b"1")
+    route.said(Ping(SESSION, 1, 7, 3, waiting=2))
+    assert (route.offset_ns, route.bound_ns, route.waiting) == (7, 3, 2)
+    route.said(Ping(SESSION, 1, *clock, waiting=4))
+    assert (route.offset_ns, route.bound_ns, route.waiting) == (None, 0, 4)
+
+
+# --- subscriptions ---
+
+
+def test_only_what_can_be_a_maps_topic_is_remembered() -> None:
+    topics = Subscriptions()
+    for good in (b"", b"me", b"mesh/", b"mesh/y", b"mesh/yard", b"mesh/yard/", b"mesh/attic/"):
+        assert topics.add(good, ["yard"])
+    for bad in (b"x", b"mesh/Yard", b"mesh/yard/x", b"mesh//", b"mesh/" + b"a" * 33, b"mesh/\n", b"mesh/a\n"):
+        assert not topics.add(bad, ["yard"])
+    assert len(topics) == 7
+
+
+def test_topics_are_few_and_those_of_open_maps_have_room() -> None:
+    topics = Subscriptions()
+    taken = [topics.add(f"mesh/map{i}/".encode(), ["yard"]) for i in range(1000)]
+    assert taken.count(True) == len(topics) == 256
+    assert not topics.watched("yard")
+    assert topics.add(b"mesh/yard/", ["yard"])
+    assert topics.watched("yard")
+    topics.discard(b"mesh/yard/")
+    assert not topics.watched("yard")
+    assert topics.watched("map1")
 
 
 # --- quarantine ---

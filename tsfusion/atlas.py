@@ -12,11 +12,13 @@ import zmq
 from tsfusion import logs
 from tsfusion.config import DEFAULT_MAP, ServerConfig, VolumeConfig
 from tsfusion.errors import TsfusionError
-from tsfusion.hosted import Clients, HostedMap
+from tsfusion.hosted import HostedMap
+from tsfusion.outcomes import Clients
 from tsfusion.transport import messages, work
 
 log = logging.getLogger(__name__)
 
+_MAX_UNOPENED = 64
 _RETRY_INTERVAL = 10.0  # seconds before a map that could not be opened is tried again
 Other = Callable[[HostedMap, work.Meshed | work.Answer, Sequence[zmq.Frame]], None]
 
@@ -82,6 +84,8 @@ class Atlas:
     def _give_up(self, name: str, error: TsfusionError) -> None:
         log.error("the map cannot be opened: %s", error, extra=logs.about(map=name))
         self._unopened[name] = (str(error), time.monotonic())
+        if len(self._unopened) > _MAX_UNOPENED:
+            self._unopened.pop(next(iter(self._unopened)))
         hosted = self._open.pop(name, None)
         if hosted is not None:
             hosted.close()

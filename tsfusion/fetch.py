@@ -80,7 +80,7 @@ def fetch_mesh(
             reply, frames = _ask(address, control, command, left, keys)
             break
         except TransportError as error:
-            if not str(error).endswith(ASK_AGAIN) or time.monotonic() + _AGAIN_INTERVAL > deadline:
+            if not str(error).endswith(ASK_AGAIN) or time.monotonic() + 2 * _AGAIN_INTERVAL > deadline:
                 raise
         time.sleep(_AGAIN_INTERVAL)
     if reply.mesh is None:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """The fuser: the one process with Taichi. Reads the journal where the gateway points, and adds to the map.
 
-It ends when the gateway does (its standard input closes), at whatever moment: the last checkpoint and the
-journal are enough to begin again.
+It ends when the gateway does, at whatever moment: the last checkpoint and the journal are enough to begin
+again. Opening the map or waiting, it sees its standard input close and clears up; at work, the system ends it
+(Linux), however long it would take.
 """
 
 import logging
@@ -27,7 +28,7 @@ from tsfusion import codec, journal, logs, maps, process
 from tsfusion.config import LogFormat, LogLevel
 from tsfusion.errors import TsfusionError
 from tsfusion.mesh import Mesh
-from tsfusion.saved_map import SavedMap
+from tsfusion.saved_map import SavedMap, hold
 from tsfusion.transport import sockets, work
 from tsfusion.transport.messages import MeshLayout
 
@@ -281,6 +282,7 @@ def _serve(link: sockets.AnySocket) -> int:
         if idle and fuser is not None and fuser.refine_due:
             fuser.refine()
             continue
+        process.on_parent_end(signal.SIGCONT)  # were it stopped, it could not see the gateway go
         events = dict(poller.poll())
         if sys.stdin.fileno() in events:  # nothing is ever written there: the gateway has gone
             return 1
@@ -290,6 +292,7 @@ def _serve(link: sockets.AnySocket) -> int:
             if fuser is None:
                 return 1
         elif fuser is not None:
+            process.on_parent_end(signal.SIGKILL)
             fuser.take(message)
     return fuser.exit_status
 
@@ -297,6 +300,7 @@ def _serve(link: sockets.AnySocket) -> int:
 def _begin(link: sockets.AnySocket, message: work.Begin) -> Fuser | None:
     try:
         process.end_first()
+        hold(Path(message.folder))
         fuser = Fuser(link, message)
     except TsfusionError as error:
         name = next(kind.__name__ for kind in type(error).__mro__ if kind.__module__ == "tsfusion.errors")

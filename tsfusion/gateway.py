@@ -22,7 +22,8 @@ from tsfusion.intake import Intake
 from tsfusion.metrics import Metrics
 from tsfusion.ports import MemoryBound, Ports, each, send_now
 from tsfusion.questions import Questions
-from tsfusion.sessions import Route, Routes
+from tsfusion.routes import Route, Routes
+from tsfusion.subscriptions import Subscriptions
 from tsfusion.transport import messages, sockets, work
 from tsfusion.transport.sockets import mesh_topic
 
@@ -60,7 +61,7 @@ class Gateway:
         self._intake = Intake(server, self.maps, door, self)
         self._refused = self._intake.refused
         self._questions = Questions(self._answer, server.memory_bytes // _MESHES_SHARE)
-        self._topics: set[bytes] = set()  # that somebody subscribed to
+        self._topics = Subscriptions()
         self._watched: dict[str, bool] = {}  # what each fuser knows of it
         self._memory = MemoryBound(server.memory_bytes)
         self._accepting = self._stopped = False
@@ -154,8 +155,7 @@ class Gateway:
                 self._watched.pop(hosted.name, None)
                 self._questions.give_up(hosted.name)
                 continue
-            topic = mesh_topic(hosted.name)
-            watched = any(topic.startswith(wanted) for wanted in self._topics)
+            watched = self._topics.watched(hosted.name)
             if watched != self._watched.get(hosted.name) and hosted.fuser.send(work.Publish(watched)):
                 self._watched[hosted.name] = watched
 
@@ -221,6 +221,8 @@ class Gateway:
             return "opening", f"map {hello.map} is being opened"
         if not self._intake.owns(hosted, hello.session, client):
             return "session", "the session of this spool is another client's: use another spool folder"
+        if not hosted.sessions.room_for(hello.session):
+            return "session", f"map {hello.map} has {len(hosted.sessions)} sessions and takes no new one"
         scans = hosted.sessions.get(hello.session) is not None
         self._routes.connect(hello.session, hello.map, identity, client, scans=scans)
         return None
@@ -231,15 +233,14 @@ class Gateway:
         route = self._routes.get(ping.session)
         if route is not None and route.client == client:
             self._routes.heard(route)
-            route.offset_ns, route.bound_ns = ping.offset_ns, ping.bound_ns
-            route.waiting, route.skipped = ping.waiting, ping.skipped
+            route.said(ping)
             progress = self._progress(route.map, ping.session)
         pong = messages.Pong(self.epoch, ping.sent_ns, received_ns, time.monotonic_ns(), *progress)
         self._answer(identity, pong)
 
     def _progress(self, map_name: str, session: bytes) -> tuple[int, int]:
         hosted = self.maps.get(map_name)
-        return hosted.progress(session) if hosted else (0, 0)
+        return hosted.sessions.progress(session) if hosted else (0, 0)
 
     def _on_command(self, identity: bytes, command: messages.Command, client: str) -> None:
         if command.name == "ping":
@@ -253,11 +254,9 @@ class Gateway:
         change, topic = frames[0].bytes[:1], frames[0].bytes[1:]
         if change == b"\x01" and self._door.client_of(frames[0]) is None:
             self._refused["key"] += 1
-        elif change == b"\x01" and sockets.is_mesh_topic(topic):
-            self._topics.add(topic)
         elif change == b"\x00":
             self._topics.discard(topic)
-        else:
+        elif change != b"\x01" or not self._topics.add(topic, (hosted.name for hosted in self.maps)):
             self._refused["subscription"] += 1
 
     # --- what is known ---

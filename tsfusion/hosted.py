@@ -3,11 +3,9 @@
 
 import logging
 import time
-from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
-import msgspec
 import zmq
 
 from tsfusion import logs, maps
@@ -15,31 +13,16 @@ from tsfusion.codec import Header
 from tsfusion.config import ServerConfig, VolumeConfig
 from tsfusion.errors import JournalError
 from tsfusion.fuser_link import FuserLink
-from tsfusion.journal import Journal, read
+from tsfusion.journal import Journal
+from tsfusion.outcomes import Clients, Outcomes
 from tsfusion.quarantine import Quarantine
 from tsfusion.retention import Retention
-from tsfusion.sessions import Delays, Entry, KeyframeIndex, Route, Session, Sessions, Turns
+from tsfusion.sessions import KeyframeIndex, Sessions, Turns
 from tsfusion.transport import messages, work
 
 log = logging.getLogger(__name__)
 
 _SEGMENTS_KEPT = 4  # a journal with a limit goes in pieces of a quarter of it
-
-
-class Clients(Protocol):
-    """What a map needs of the gateway to talk to those who send."""
-
-    def send(self, session: bytes, message: messages.ToClient) -> None:
-        """Pass it to the session's client, if that is connected."""
-
-    def route(self, session: bytes) -> Route | None:
-        """Its connection."""
-
-    def heard(self, session: bytes, client: str, *, scans: bool) -> None:
-        """A keyframe message came. `scans`: it is a good one."""
-
-    def observe(self, map_name: str, stage: str, seconds: float) -> None:
-        """A keyframe took so long for a stage."""
 
 
 Other = Callable[[work.Meshed | work.Answer, Sequence[zmq.Frame]], None]
@@ -79,13 +62,14 @@ class HostedMap:
         self._journal.found = []
         self._turns = Turns()
         self._waiting = len(self._index)
-        self._delays = Delays()
-        self._fused = 0
-        self._rejected: Counter[str] = Counter()
-        self._told_rejected: set[int] = set()
-        self._unmeshed: deque[int] = deque()  # answered by the fuser that lives, in its order
-        self._meshed = 0  # how many of its answers went from there
-        self._blocks = self._map_bytes = 0
+        self._outcomes = Outcomes(
+            name,
+            self._index,
+            self.sessions,
+            clients,
+            journal=self._journal.folder,
+            quarantine=self._quarantine,
+        )
         self._last: float | None = None
         self._held_until = 0.0
         self._lost = ""
@@ -151,18 +135,11 @@ class HostedMap:
         self._last = durable_ns / 1e9
         self._turns.add(session)
         self._clients.observe(self.name, "journal", (durable_ns - received_ns) / 1e9)
-        self.acknowledge(header.session, [messages.Stamps(header.seq, received_ns, durable_ns)])
+        self._outcomes.acknowledge(header.session, [messages.Stamps(header.seq, received_ns, durable_ns)])
 
-    def progress(self, key: bytes) -> tuple[int, int]:
-        """The highest seq of a session that is durable, and that is fused."""
-        session = self.sessions.get(key)
-        return (session.durable, session.fused) if session else (0, 0)
-
-    def acknowledge(
-        self, key: bytes, stamps: Sequence[messages.Stamps] = (), *, resend: bool = False
-    ) -> None:
+    def acknowledge(self, key: bytes, *, resend: bool = False) -> None:
         """Tell a client how far its session is."""
-        self._clients.send(key, messages.Ack(key, *self.progress(key), tuple(stamps), resend))
+        self._outcomes.acknowledge(key, resend=resend)
 
     # --- fuser ---
 
@@ -179,13 +156,14 @@ class HostedMap:
         while (heard := self.fuser.receive()) is not None:
             message, frames = heard
             if isinstance(message, work.Done):
-                self._on_done(message)
+                self._waiting -= 1
+                self._outcomes.on_done(message)
             elif isinstance(message, work.Ready):
                 self._on_ready(message)
             elif isinstance(message, work.Saved):
                 self._retention.on_saved(message)
             elif isinstance(message, work.Meshed):
-                self._on_meshed(message)
+                self._outcomes.on_meshed(message)
                 other(message, frames)
             elif isinstance(message, work.Answer):
                 other(message, frames)
@@ -193,7 +171,7 @@ class HostedMap:
             self.fuser.restart()
         self._hand_out()
         self._look_for_room()
-        self._retention.step(self.fuser)
+        self._retention.step(self.fuser, self._outcomes.unmeshed)
 
     def _look_for_room(self) -> None:
         """Who waits for this server to be ready again may be who would send the next keyframe."""
@@ -236,24 +214,12 @@ class HostedMap:
             self._waiting += len(session.entries) - session.handed
             if session.handed < len(session.entries):
                 self._turns.add(session)
-        self._fused, self._rejected = ready.keyframes, Counter(ready.rejected)
-        self._blocks, self._map_bytes = ready.blocks, ready.map_bytes
-        self._leave_unmeshed()
+        self._outcomes.on_ready(ready)
         self._retention.on_ready()
         if not self.warm:
             self.warm = True
             log.info("the map is open", extra=logs.about(map=self.name))
         self._check_begin(ready)
-
-    def _leave_unmeshed(self) -> None:
-        """What an earlier fuser answered and did not mesh: the checkpoint has it, or it comes again."""
-        now = time.monotonic_ns()
-        for index in self._unmeshed:
-            session = self.sessions.numbered(self._index[index].session)
-            if self._index.after(session, self._index[index].stamps.seq) <= session.handed:
-                self._stamp_meshed(index, now)
-        self._unmeshed.clear()
-        self._meshed = 0
 
     def _check_begin(self, ready: work.Ready) -> None:
         self._lost = ""
@@ -261,67 +227,6 @@ class HostedMap:
             first = self._journal.first
             self._lost = f"its checkpoints are lost, and with them what was journaled before segment {first}"
             log.error("%s", self._lost, extra=logs.about(map=self.name))
-
-    def _on_done(self, done: work.Done) -> None:
-        entry = self._index[done.index]
-        session = self.sessions.numbered(entry.session)
-        session.in_map = entry.stamps.seq
-        self._waiting -= 1
-        self._unmeshed.append(done.index)
-        if done.reason is None:
-            self._fused += 1
-        else:
-            self._rejected[done.reason] += 1
-        told = done.index in self._told_rejected if done.reason else entry.stamps.fused_ns > 0
-        if told:
-            return  # a fuser that died before its checkpoint had said so
-        self._index.fused(done.index, done.fuse_start_ns, done.fused_ns)
-        entry = self._index[done.index]
-        session.fused = max(session.fused, entry.stamps.seq)
-        if done.reason is None:
-            self._on_fused(session, entry)
-        else:
-            self._on_rejected(session, entry, done)
-        self.acknowledge(session.key, [entry.stamps])
-
-    def _on_fused(self, session: Session, entry: Entry) -> None:
-        route, stamps = self._clients.route(session.key), entry.stamps
-        if stamps.durable_ns:  # 0: journaled by an earlier server
-            waited, fused = stamps.fuse_start_ns - stamps.durable_ns, stamps.fused_ns - stamps.fuse_start_ns
-            self._clients.observe(self.name, "queue", waited / 1e9)
-            self._clients.observe(self.name, "fuse", fused / 1e9)
-        if entry.captured_ns and route is not None and route.offset_ns is not None:
-            delay_ns = stamps.fused_ns - entry.captured_ns - route.offset_ns
-            self._delays.add(delay_ns, route.bound_ns)
-            self._clients.observe(self.name, "total", delay_ns / 1e9)
-
-    def _on_rejected(self, session: Session, entry: Entry, done: work.Done) -> None:
-        assert done.reason is not None
-        self._told_rejected.add(done.index)
-        seq = entry.stamps.seq
-        subject = logs.about(
-            map=self.name, session=session.key, seq=seq, client=session.client, reason=done.reason
-        )  # fmt: skip
-        log.error("a keyframe is not in the map: %s", done.message or done.reason, extra=subject)
-        self._clients.send(session.key, messages.Nack(session.key, seq, "map", done.reason, done.message))
-        try:
-            frames = read(self._journal.folder, entry.position).frames
-        except JournalError:  # that is why it was rejected
-            return
-        self._quarantine.keep(frames, session=session.key, seq=seq, client=session.client, reason=done.reason)
-
-    def _on_meshed(self, meshed: work.Meshed) -> None:
-        self._blocks, self._map_bytes = meshed.map_blocks, meshed.map_bytes
-        for _ in range(meshed.count - self._meshed):
-            self._stamp_meshed(self._unmeshed.popleft(), meshed.meshed_ns)
-        self._meshed = meshed.count
-
-    def _stamp_meshed(self, index: int, meshed_ns: int) -> None:
-        entry = self._index[index]
-        if entry.stamps.fused_ns:
-            self._clients.observe(self.name, "mesh", (meshed_ns - entry.stamps.fused_ns) / 1e9)
-        stamps = msgspec.structs.replace(entry.stamps, meshed_ns=meshed_ns)
-        self.acknowledge(self.sessions.numbered(entry.session).key, [stamps])
 
     # --- what people ask ---
 
@@ -345,22 +250,22 @@ class HostedMap:
 
     def health(self) -> messages.MapHealth:
         """As far as it is known without the fuser."""
-        now = time.monotonic()
+        now, told = time.monotonic(), self._outcomes
         return messages.MapHealth(
             state=self.state,
             problem=self.problem or self.fuser.failed,
-            keyframes_durable=self._fused + self._rejected.total() + self._waiting,
-            keyframes_fused=self._fused,
+            keyframes_durable=told.fused + told.rejected.total() + self._waiting,
+            keyframes_fused=told.fused,
             waiting=self._waiting,
-            rejected=dict(self._rejected),
+            rejected=dict(told.rejected),
             quarantined=len(self._quarantine),
             sessions=len(self.sessions),
             journal_bytes=self._journal.nbytes,
             journal_damaged=self._journal.damaged,
             fuser_restarts=self.fuser.restarts,
-            blocks=self._blocks,
-            map_bytes=self._map_bytes,
+            blocks=told.blocks,
+            map_bytes=told.map_bytes,
             last_keyframe_s=None if self._last is None else max(now - self._last, 0.0),
-            delay_ms=self._delays.summary(),
-            delay_bound_ms=self._delays.bound_ms,
+            delay_ms=told.delays.summary(),
+            delay_bound_ms=told.delays.bound_ms,
         )

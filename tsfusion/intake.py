@@ -17,7 +17,8 @@ from tsfusion.atlas import Atlas
 from tsfusion.config import ServerConfig
 from tsfusion.door import Door
 from tsfusion.errors import JournalError
-from tsfusion.hosted import Clients, HostedMap
+from tsfusion.hosted import HostedMap
+from tsfusion.outcomes import Clients
 from tsfusion.quota import Quotas
 from tsfusion.transport import messages
 
@@ -60,6 +61,8 @@ class Intake:
         hosted = self._maps.get(header.map)
         if hosted is None or not hosted.warm:  # its client will say hello, and send it again
             self.refused["map"] += 1
+        elif not hosted.sessions.room_for(header.session):  # its client is told when it says hello
+            self.refused["session"] += 1
         elif not self.owns(hosted, header.session, client):
             self.refused["session"] += 1
             subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
@@ -83,9 +86,14 @@ class Intake:
         if seconds := hosted.held(now):
             self._hold(key, seconds, "disk", hosted.problem)
             return True
-        if seconds := self._quotas.wait(client or key.hex(), nbytes, now):
+        if seconds := self._quotas.wait(client, nbytes, now):
             rates = f"{self._server.quota_keyframes:g} keyframes and {self._server.quota_bytes >> 20} MB"
-            self._hold(key, seconds, "quota", f"the server takes {rates} a second of each client")
+            self._hold(
+                key,
+                seconds,
+                "quota",
+                f"the server takes {rates} a second of {'each client' if client else 'all clients together'}",
+            )
             return True
         return False
 

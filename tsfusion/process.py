@@ -12,6 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
+_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
 
 def peak_rss_bytes() -> int:
     """The most memory this process has held, bytes."""
@@ -59,6 +61,13 @@ def end_first() -> None:
     """Should the machine's memory run out, the system ends this process before others (Linux)."""
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
+
+
+def on_parent_end(number: signal.Signals) -> None:
+    """From here on this process gets that signal when the thread that started it ends (Linux)."""
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(number), 0, 0, 0)
 
 
 def raise_file_limit() -> None:

@@ -42,7 +42,10 @@ class Quotas:
         self._clients: OrderedDict[str, tuple[Bucket, Bucket]] = OrderedDict()
 
     def wait(self, owner: str, nbytes: int, now: float) -> float:
-        """Seconds that a client has to wait before a message of so many bytes; 0 = it passes, and counts."""
+        """Seconds that a client has to wait before a message of so many bytes; 0 = it passes, and counts.
+
+        `owner`: its name. Without keys all are one: sessions cost nothing, and would evade it.
+        """
         buckets = self._clients.get(owner)
         if buckets is None:
             server = self._server

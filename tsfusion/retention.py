@@ -3,6 +3,7 @@
 
 import logging
 import time
+from collections.abc import Iterable
 
 from tsfusion.errors import JournalError
 from tsfusion.fuser_link import FuserLink
@@ -50,12 +51,17 @@ class Retention:
         )
         return min(unfused, default=self._journal.segment)
 
-    def step(self, fuser: FuserLink) -> None:
-        """Make room where there is need and it can be made."""
+    def step(self, fuser: FuserLink, needed: Iterable[int]) -> None:
+        """Make room where there is need and it can be made.
+
+        Args:
+            needed: indices of keyframes that somebody will ask for.
+        """
         if self._max_bytes is None or self._journal.nbytes <= self._max_bytes:
             return
         try:
             self._journal.retire(self._covered, self._max_bytes)
+            self._index.forget(self._journal.first, self._sessions, [*needed, *fuser.in_flight])
         except JournalError as error:
             log.warning("%s", error)
         due = not self._saving and time.monotonic() - self._saved > _SAVE_INTERVAL

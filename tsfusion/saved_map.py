@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: MIT
 """A map on a server's disk: its last checkpoint, the one before, and how far each session was in it."""
 
+import fcntl
 import logging
 import os
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tsfusion import disk, maps
 from tsfusion.config import VIEW_SETTINGS, VolumeConfig
-from tsfusion.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
+from tsfusion.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, MapError, TsfusionError
 from tsfusion.transport.work import Progress
 
 if TYPE_CHECKING:
@@ -18,8 +20,48 @@ if TYPE_CHECKING:
 # Settings that may differ between a map and the server that goes on with it: none changes the sums.
 _FREE_SETTINGS = ("threads", "max_blocks", "max_blocks_per_keyframe", *VIEW_SETTINGS)
 _NEW_FILE = "map.new.tsf"
+_LOCK_FILE = "fuser.lock"
+_PATIENCE = 60.0  # seconds for another fuser to end: it may be reading a large map
 
 log = logging.getLogger(__name__)
+
+
+def hold(folder: Path) -> int:
+    """Keep other fusers off a map for as long as this process lives; one that is ending is waited for.
+
+    Returns:
+        A descriptor; closing it lets go.
+
+    Raises:
+        MapError: when another one has the map, or the folder cannot be written.
+    """
+    path, deadline = folder / _LOCK_FILE, time.monotonic() + _PATIENCE
+    held = None
+    try:
+        held = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        while not _lock(held):
+            if time.monotonic() >= deadline:
+                owner = os.pread(held, 32, 0).decode("ascii", "replace").strip()
+                raise MapError(f"the map {folder} is in use by another fuser (pid {owner}): end that first")
+            time.sleep(0.05)
+    except (OSError, MapError) as error:
+        if held is not None:
+            os.close(held)
+        if isinstance(error, OSError):
+            raise MapError(f"cannot lock {path}: {error.strerror}") from error
+        raise
+    with suppress(OSError):  # it only helps whoever has to wait
+        os.truncate(held, 0)
+        os.pwrite(held, b"%d" % os.getpid(), 0)
+    return held
+
+
+def _lock(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 class SavedMap:

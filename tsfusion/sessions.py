@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""What the gateway knows of clients and keyframes: policy and bookkeeping, no sockets."""
+"""What the gateway knows of sessions and keyframes: policy and bookkeeping, no sockets."""
 
-import time
 from array import array
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator
 from typing import Literal
@@ -13,13 +12,11 @@ from msgspec import Struct, field
 
 from tsfusion import ledger
 from tsfusion.journal import Position, Scan
-from tsfusion.transport.messages import ClientHealth, Spread, Stamps
+from tsfusion.transport.messages import Spread, Stamps
 
-_MAX_ROUTES = 1024
-_MAX_ROUTES_OF_A_NAME = 64  # where there are keys
-_NEW_ROUTES = 16  # so many of a name always have a place without having sent anything
-_TAKEN = 30.0  # seconds of silence after which another client may take a session that nothing came of
 _DELAYS = 1024
+_MAX_SESSIONS = 100_000  # of a map; each takes some 60 bytes of every checkpoint, for ever
+_LONGEST_DELAY_NS = 86_400 * 10**9  # a day
 Verdict = Literal["next", "duplicate", "gap"]
 
 
@@ -32,7 +29,7 @@ class Session(Struct, eq=False):
         durable: the highest seq that is journaled.
         fused: the highest that the map has taken or refused.
         in_map: the same of the fuser that lives: after a death it begins at the checkpoint again.
-        entries: the indices of its keyframes.
+        entries: the indices of its keyframes that are not forgotten.
         handed: how many of these the fuser was given.
     """
 
@@ -65,144 +62,6 @@ class Session(Struct, eq=False):
         return "next" if previous <= self.durable else "gap"
 
 
-class Route(Struct, eq=False):
-    """A live client.
-
-    Attributes:
-        session: its key.
-        map: where the keyframes go.
-        identity: of its connection to the control socket.
-        client: the name its key is allowed under; empty = no keys.
-        offset_ns: server clock minus client clock, as the client measured it; true to within `bound_ns`.
-        waiting, skipped: as its last Ping said.
-        scans: a keyframe of it is in the journal.
-        heard: `time.monotonic()` of its last message.
-        held_until: nothing is taken from it until then, because of `held`.
-    """
-
-    session: bytes
-    map: str
-    identity: bytes
-    client: str = ""
-    offset_ns: int | None = None
-    bound_ns: int = 0
-    waiting: int = 0
-    skipped: dict[str, int] = field(default_factory=dict)
-    received_bytes: int = 0
-    scans: bool = False
-    heard: float = 0.0
-    held_until: float = 0.0
-    held: str = ""
-
-    def open_to(self, client: str) -> bool:
-        """Whether this client may go on with the session: it is its own, or its client is silent for long."""
-        return self.client == client or time.monotonic() - self.heard >= _TAKEN
-
-    def health(self, now: float, progress: tuple[int, int]) -> ClientHealth:
-        """How the client is doing. `progress`: the highest seq that is durable, and that is fused."""
-        durable, fused = progress
-        return ClientHealth(
-            client=self.client,
-            session=self.session.hex()[:8],
-            map=self.map,
-            heard_s=now - self.heard,
-            durable=durable,
-            fused=fused,
-            received_bytes=self.received_bytes,
-            waiting=self.waiting,
-            skipped=self.skipped,
-            held=self.held if now < self.held_until else "",
-        )
-
-
-class Routes:
-    """The live clients, by session. When they are too many, the longest unheard of the largest name goes:
-    nobody's greetings push out others. Within a name, those that never sent a keyframe go first."""
-
-    def __init__(self) -> None:
-        self._by_session: dict[bytes, Route] = {}
-        self._names: dict[str, Crowd] = {}
-
-    def __iter__(self) -> Iterator[Route]:
-        return iter(self._by_session.values())
-
-    def connect(
-        self, session: bytes, map_name: str, identity: bytes, client: str = "", *, scans: bool = False
-    ) -> Route:
-        """Answers for this session go to this connection from now on.
-
-        Args:
-            scans: there is something of it in the journal.
-        """
-        route = self._by_session.get(session)
-        if route is None or route.client != client or route.map != map_name:
-            self._drop(route)
-            route = self._by_session[session] = Route(session, map_name, identity, client)
-        route.identity = identity
-        route.scans |= scans
-        self.heard(route)
-        crowd = self._names[client]
-        if client and len(crowd) > _MAX_ROUTES_OF_A_NAME:
-            self._drop(crowd.least())
-        if len(self._by_session) > _MAX_ROUTES:
-            self._drop(max(self._names.values(), key=len).least())
-        return route
-
-    def heard(self, route: Route, *, scans: bool = False) -> None:
-        """It is alive: now the last of those that could be pushed out.
-
-        Args:
-            scans: it sent a keyframe.
-        """
-        route.heard = time.monotonic()
-        crowd = self._names.setdefault(route.client, Crowd())
-        crowd.remove(route)
-        route.scans |= scans
-        crowd.add(route)
-
-    def _drop(self, route: Route | None) -> None:
-        if route is not None:
-            del self._by_session[route.session]
-            crowd = self._names[route.client]
-            crowd.remove(route)
-            if not len(crowd):
-                del self._names[route.client]
-
-    def get(self, session: bytes) -> Route | None:
-        """The connection of a session's client, if it said hello here."""
-        return self._by_session.get(session)
-
-    def clear(self) -> None:
-        """All connections are gone."""
-        self._by_session.clear()
-        self._names.clear()
-
-
-class Crowd:
-    """The routes of one client name, longest unheard first."""
-
-    def __init__(self) -> None:
-        self._new: OrderedDict[bytes, Route] = OrderedDict()
-        self._scan: OrderedDict[bytes, Route] = OrderedDict()
-
-    def __len__(self) -> int:
-        return len(self._new) + len(self._scan)
-
-    def add(self, route: Route) -> None:
-        """The last heard."""
-        (self._scan if route.scans else self._new)[route.session] = route
-
-    def remove(self, route: Route) -> None:
-        """If it is here."""
-        self._new.pop(route.session, None)
-        self._scan.pop(route.session, None)
-
-    def least(self) -> Route:
-        """Which to do without. Some are always new ones: nobody is shut out by all who ever scanned."""
-        crowd = self._new if len(self._new) > _NEW_ROUTES or not self._scan else self._scan
-        return next(iter(crowd.values()))
-
-
 class Sessions:
     """All sessions of a map's journal."""
 
@@ -220,6 +79,10 @@ class Sessions:
         """A session that has something in the journal, or None."""
         return self._by_key.get(key)
 
+    def room_for(self, key: bytes) -> bool:
+        """Whether it is one of them, or may become one."""
+        return key in self._by_key or len(self) < _MAX_SESSIONS
+
     def open(self, key: bytes, client: str = "") -> Session:
         """The session of a key, made when new."""
         session = self._by_key.get(key)
@@ -231,6 +94,11 @@ class Sessions:
     def admit(self, key: bytes, seq: int, previous: int) -> Verdict:
         """As `Session.admit`, for a session that may not exist yet."""
         return (self._by_key.get(key) or Session(key, -1)).admit(seq, previous)
+
+    def progress(self, key: bytes) -> tuple[int, int]:
+        """The highest seq of a session that is durable, and that is fused."""
+        session = self._by_key.get(key)
+        return (session.durable, session.fused) if session else (0, 0)
 
     def numbered(self, number: int) -> Session:
         """A session by its number."""
@@ -286,10 +154,14 @@ _COLUMNS = (
 
 
 class KeyframeIndex:
-    """Every keyframe of the journal in order: 72 bytes each. Stamps are 0 for those of earlier runs."""
+    """Every keyframe of the journal in order: 72 bytes each. Stamps are 0 for those of earlier runs.
+
+    An index stays what it is when the keyframes before it are forgotten.
+    """
 
     def __init__(self) -> None:
         self._columns = {name: array("q") for name in _COLUMNS}
+        self._first = 0  # index that is not forgotten
 
     def __len__(self) -> int:
         return len(self._columns["seq"])
@@ -320,27 +192,48 @@ class KeyframeIndex:
         values = (*place, received_ns, durable_ns, 0, 0)
         for column, value in zip(self._columns.values(), values, strict=True):
             column.append(value)
-        session.entries.append(len(self) - 1)
-        return len(self) - 1
+        index = self._first + len(self) - 1
+        session.entries.append(index)
+        return index
+
+    def forget(self, before_segment: int, sessions: Sessions, needed: Iterable[int] = ()) -> None:
+        """Let go of the keyframes whose segment is gone, up to the first that is still to be handed out.
+
+        Args:
+            needed: indices that somebody will ask for.
+        """
+        if not bisect_left(self._columns["segment"], before_segment):
+            return
+        stop = self._first + bisect_left(self._columns["segment"], before_segment)
+        waiting = (one.entries[one.handed] for one in sessions if one.handed < len(one.entries))
+        stop = min(stop, min(waiting, default=stop), min(needed, default=stop))
+        for session in sessions:
+            gone = bisect_left(session.entries, stop)
+            del session.entries[:gone]
+            session.handed -= gone
+        for column in self._columns.values():
+            del column[: stop - self._first]
+        self._first = stop
 
     def fused(self, index: int, fuse_start_ns: int, fused_ns: int) -> None:
         """Note when a keyframe entered the map."""
-        self._columns["fuse_start_ns"][index] = fuse_start_ns
-        self._columns["fused_ns"][index] = fused_ns
+        self._columns["fuse_start_ns"][index - self._first] = fuse_start_ns
+        self._columns["fused_ns"][index - self._first] = fused_ns
 
     def __getitem__(self, index: int) -> Entry:
         segment, offset, session, seq, captured, *stamps = (
-            column[index] for column in self._columns.values()
+            column[index - self._first] for column in self._columns.values()
         )
         return Entry(index, Position(segment, offset), session, Stamps(seq, *stamps), captured)
 
     def after(self, session: Session, seq: int) -> int:
-        """How many keyframes of a session have a number up to `seq`."""
-        return bisect_right(session.entries, seq, key=lambda index: self._columns["seq"][index])
+        """How many keyframes of a session, of those not forgotten, have a number up to `seq`."""
+        seqs, first = self._columns["seq"], self._first
+        return bisect_right(session.entries, seq, key=lambda index: seqs[index - first])
 
     def segment(self, index: int) -> int:
         """The segment that holds a keyframe."""
-        return self._columns["segment"][index]
+        return self._columns["segment"][index - self._first]
 
 
 class Delays:
@@ -349,9 +242,12 @@ class Delays:
     def __init__(self) -> None:
         self._recent_ms: deque[tuple[float, float]] = deque(maxlen=_DELAYS)
 
-    def add(self, delay_ns: int, bound_ns: int) -> None:
-        """A keyframe took so long, give or take the bound."""
+    def add(self, delay_ns: int, bound_ns: int) -> bool:
+        """A keyframe took so long, give or take the bound. False when that cannot be: it does not count."""
+        if not -bound_ns <= delay_ns <= _LONGEST_DELAY_NS:
+            return False
         self._recent_ms.append((delay_ns / 1e6, bound_ns / 1e6))
+        return True
 
     @property
     def bound_ms(self) -> float:

@@ -27,7 +27,7 @@ _CONNECTING = {
 }  # fmt: skip
 _RANDOM_PORT_TRIES = 32
 LAST_PORT = 65535
-_MAX_TOPIC = 64
+_MAPS_TOPIC = re.compile(rb"mesh/([a-z0-9][a-z0-9_-]{0,31}/?)?")  # or a part; names as config.MapName
 _ADDRESS = re.compile(r"tcp://((?P<host>[\w.*-]+)|\[(?P<host6>[\w:.%]+)\]):(?P<port>[0-9]{1,5}|\*)", re.ASCII)
 
 AnySocket = zmq.Socket[Any]
@@ -75,7 +75,7 @@ def mesh_topic(map_name: str) -> bytes:
 
 def is_mesh_topic(topic: bytes) -> bool:
     """Whether it asks for one map's updates, or for all of them. Anything else is nobody's to ask for."""
-    return len(topic) <= _MAX_TOPIC and (topic.startswith(_MESH_TOPIC) or _MESH_TOPIC.startswith(topic))
+    return _MESH_TOPIC.startswith(topic) or _MAPS_TOPIC.fullmatch(topic) is not None
 
 
 def subscriber(
