@@ -212,6 +212,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
         "default",
         "journal",
         "lock",
+        "fuser.lock",
     }
     assert left == {"empty", "file", "garbage.tsf"}
     assert (tmp_path / "file").read_text() == "here first"
