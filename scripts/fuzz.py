@@ -69,8 +69,12 @@ def _run(name: str, cases: int, options: argparse.Namespace) -> dict[str, Any]:
         *(("--corpus", str(options.corpus)) if options.corpus else ()),
     ]
     started = time.monotonic()
-    environment = {**os.environ, "OPENCV_LOG_LEVEL": "SILENT"}
-    with tempfile.TemporaryFile() as said:  # libjpeg and libpng have a lot to say
+    memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+    with (
+        tempfile.TemporaryFile() as said,  # libjpeg and libpng have a lot to say
+        tempfile.TemporaryDirectory(prefix="tsfusion-fuzz-", dir=memory) as scratch,
+    ):
+        environment = {**os.environ, "OPENCV_LOG_LEVEL": "SILENT", "TMPDIR": scratch}
         done = subprocess.run(command, stdout=subprocess.PIPE, stderr=said, check=False, env=environment)
         said.seek(0)
         words = said.read().decode(errors="replace")
@@ -153,25 +157,25 @@ def _with_atheris(options: argparse.Namespace) -> None:
     def run(content: bytes) -> None:
         timed(target, content)
 
-    with tempfile.TemporaryDirectory() as folder:
-        first = Path(folder) / "seeds"
-        first.mkdir()
-        for number, content in enumerate(seeds):
-            (first / str(number)).write_bytes(content)
-        kept = (options.corpus or Path(folder)) / f"{options.worker}"
-        kept.mkdir(parents=True, exist_ok=True)
-        flags = {
-            "runs": options.cases,
-            "seed": options.seed,
-            "max_len": fuzz_targets.MAX_BYTES,
-            "rss_limit_mb": options.memory,
-            "timeout": 20,
-            "print_final_stats": 1,
-            "artifact_prefix": f"{options.crashes}/{options.worker}-",
-        }
-        arguments = [sys.argv[0], *(f"-{key}={value}" for key, value in flags.items()), str(kept), str(first)]
-        atheris.Setup(arguments, run, custom_mutator=mutate)
-        atheris.Fuzz()
+    folder = Path(tempfile.mkdtemp())
+    first = folder / "seeds"
+    first.mkdir()
+    for number, content in enumerate(seeds):
+        (first / str(number)).write_bytes(content)
+    kept = (options.corpus or folder) / f"{options.worker}"
+    kept.mkdir(parents=True, exist_ok=True)
+    flags = {
+        "runs": options.cases,
+        "seed": options.seed,
+        "max_len": fuzz_targets.MAX_BYTES,
+        "rss_limit_mb": options.memory,
+        "timeout": 20,
+        "print_final_stats": 1,
+        "artifact_prefix": f"{options.crashes}/{options.worker}-",
+    }
+    arguments = [sys.argv[0], *(f"-{key}={value}" for key, value in flags.items()), str(kept), str(first)]
+    atheris.Setup(arguments, run, custom_mutator=mutate)
+    atheris.Fuzz()
 
 
 if __name__ == "__main__":
