@@ -11,9 +11,9 @@ import pytest
 from geometry import warp_residual
 
 from tsfusion.datasets import KITTI, open_dataset
-from tsfusion.datasets.stereo import Matcher
 from tsfusion.errors import DatasetError
 from tsfusion.evaluation.predict import depth_metres, points_world
+from tsfusion.stereo import Matcher
 
 scipy_spatial = pytest.importorskip("scipy.spatial")
 

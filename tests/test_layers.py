@@ -22,12 +22,13 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
                              "client", "fetch", "backpressure", "room", "sender", "connection",
                              "conversation", "refused", "outbox", "spool", "gone", "times", "recording"})),
     ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results", "metrics",
-                                     "inspection", "salvage", "ros"})),
+                                     "inspection", "salvage", "ros", "localizers", "sources"})),
     ("map and wire", frozenset({"volume", "integration", "surface", "field", "blockstore", "meshing",
                                 "scratch", "storage", "checkpoint", "warmup",
                                 "journal", "transport", "codec", "maps", "keys"})),
     ("ground", frozenset({"kernels", "runtime", "mesh", "keyframe", "config", "config_toml", "errors",
-                          "process", "disk", "logs", "watchdog", "private_folder"})),
+                          "process", "disk", "logs", "watchdog", "private_folder", "frame", "stereo",
+                          "se3"})),
 )  # fmt: skip
 
 # All others run where there is no Taichi, and answer while kernels run.

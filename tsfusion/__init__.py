@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from tsfusion.errors import NotAllowed as NotAllowed
     from tsfusion.errors import OutputError as OutputError
     from tsfusion.errors import ServerUnreachable as ServerUnreachable
+    from tsfusion.errors import SourceError as SourceError
     from tsfusion.errors import TransportError as TransportError
     from tsfusion.errors import TsfusionError as TsfusionError
     from tsfusion.errors import WeightOverflow as WeightOverflow
@@ -41,7 +42,8 @@ __version__ = "0.1.0"
 _ERRORS = (
     "CheckpointError", "DamagedCheckpoint", "DatasetError", "DecodeError", "FlushTimeout", "InvalidConfig",
     "InvalidKeyframe", "JournalError", "KeyframeRefused", "MapError", "MapFull", "MissingDependency",
-    "NotAllowed", "OutputError", "ServerUnreachable", "TransportError", "TsfusionError", "WeightOverflow",
+    "NotAllowed", "OutputError", "ServerUnreachable", "SourceError",
+    "TransportError", "TsfusionError", "WeightOverflow",
 )  # fmt: skip
 _HOME = {
     "Client": "client",

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Every setting, its default, its unit and its bounds. Nothing else in the package holds a default.
 
-A TOML file has one table a struct (`[volume]`, `[server]`, `[client]`); unknown keys are errors.
+A TOML file has one table a struct (`[volume]`, `[server]`, `[client]`, `[scan]`); unknown keys are errors.
 """
 
 import math
@@ -27,6 +27,7 @@ SensorName = Literal["kinect", "tof", "realsense", "stereo", "lidar", "scanner"]
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Smoothness = Annotated[float, Meta(ge=0, le=1e9)]
+LocalizerName = Literal["auto", "rgbd", "stereo", "lidar", "given", "trajectory", "feed"]
 Policy = Literal["thin", "block", "drop_oldest", "spool_all"]
 LogFormat = Literal["text", "json"]
 LogLevel = Literal["debug", "info", "warning", "error"]
@@ -195,12 +196,31 @@ class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     stall_timeout: Positive = 2.0  # seconds without progress before everything unacknowledged is resent
 
 
+class ScanConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The scanner: how poses are found, and which frames become keyframes."""
+
+    localizer: LocalizerName = "auto"  # auto: by what the source gives
+    trajectory: str | None = None  # for the localizer `trajectory`: a TUM or KITTI file
+    feed: str | None = None  # for the localizer `feed`: address where another process publishes poses
+    max_gap: Positive = 0.1  # seconds between two given poses; across a longer gap there is none
+    time_offset: float = 0.0  # seconds to add to a frame's time before its pose is looked up
+    loop_closure: bool = True  # look for places seen before, and correct the poses since
+    min_overlap: Annotated[float, Meta(ge=0, le=1)] = (
+        0.8  # of the view with the last keyframe's; below: a new one
+    )
+    distance: Positive | None = None  # metres to the next keyframe; None = 0.1, for stereo and LiDAR 2
+    angle: Positive = 10.0  # degrees to the next keyframe
+    max_rate: Positive | None = None  # keyframes a second, at most
+    patience: NonNegative = 1.0  # seconds lost before a new submap begins
+
+
 class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A whole configuration file."""
 
     volume: VolumeConfig = VolumeConfig()
     server: ServerConfig = ServerConfig()
     client: ClientConfig = ClientConfig()
+    scan: ScanConfig = ScanConfig()
     maps: dict[MapName, dict[str, Any]] = {}  # [maps.NAME]: what differs there from [volume]
 
     def volumes(self) -> dict[str, VolumeConfig]:

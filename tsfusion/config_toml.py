@@ -16,7 +16,7 @@ _FIELD = re.compile(r"^    (\w+): .*?(?:  # (?P<comment>.+))?$")
 
 def dumps(config: Config) -> str:
     """TOML that `config.load` reads back as an equal Config; settings at None are commented out."""
-    tables = [table(name, getattr(config, name)) for name in ("volume", "server", "client")]
+    tables = [table(name, getattr(config, name)) for name in ("volume", "server", "client", "scan")]
     for name, settings in config.maps.items():
         lines = (f"{key} = {_literal(value)}\n" for key, value in settings.items())
         tables.append("".join((f"[maps.{name}]\n", *lines)))

@@ -5,6 +5,7 @@
     ├── InvalidKeyframe      (ValueError)  a keyframe's field is not what it must be
     ├── InvalidConfig        (ValueError)  a setting is unknown, of the wrong type or out of range
     ├── DatasetError                       a recorded dataset is missing, empty or malformed
+    ├── SourceError                        a live sensor cannot be opened, or stopped
     ├── DecodeError                        bytes from a socket or a journal are not a keyframe
     ├── JournalError                       the journal or spool cannot be read or written
     ├── MapError
@@ -38,6 +39,10 @@ class InvalidConfig(TsfusionError, ValueError):
 
 class DatasetError(TsfusionError):
     """A recorded dataset is missing, empty or malformed."""
+
+
+class SourceError(TsfusionError):
+    """A live sensor cannot be opened, or stopped; the message says what to do."""
 
 
 class DecodeError(TsfusionError):

@@ -148,6 +148,7 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
         volume=config.override(loaded.volume, **volume),
         server=config.override(loaded.server, **server),
         client=loaded.client,
+        scan=loaded.scan,
     )
 
 

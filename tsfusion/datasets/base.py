@@ -11,12 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.errors import DatasetError, InvalidKeyframe
+from tsfusion.frame import Frame
 from tsfusion.keyframe import Intrinsics, Keyframe, check_intrinsics
 
 
 @runtime_checkable
 class Dataset(Protocol):
     """Keyframes by index: what `replay` needs, and all it needs.
+
+    One that a localizer can follow has `frame(index)` too, as `Frames` gives it.
 
     Attributes:
         name: what to call it in a report.
@@ -49,20 +52,33 @@ class Frames(ABC):
     def __len__(self) -> int: ...
 
     @abstractmethod
-    def _load(self, index: int) -> Keyframe: ...
+    def _frame(self, index: int) -> Frame: ...
 
-    def __getitem__(self, index: int) -> Keyframe:
-        count = len(self)
-        if not -count <= index < count:
-            raise IndexError(f"{self.name} has {count} keyframes, got index {index}")
-        index %= count
+    def frame(self, index: int) -> Frame:
+        """The measurement alone; `T_world_camera` where the recording has a pose for it."""
+        index = self._checked(index)
         try:
-            return self._load(index)
+            return self._frame(index)
         except InvalidKeyframe as error:
             raise DatasetError(f"keyframe {index} of {self.name}: {error}") from error
 
+    def __getitem__(self, index: int) -> Keyframe:
+        frame = self.frame(index)
+        if frame.T_world_camera is None:
+            raise DatasetError(
+                f"frame {self._checked(index)} of {self.name} has no pose; "
+                "`tsfusion scan --source PATH` finds poses by itself"
+            )
+        return frame.keyframe(frame.T_world_camera)
+
     def __iter__(self) -> Iterator[Keyframe]:
         return (self[index] for index in range(len(self)))
+
+    def _checked(self, index: int) -> int:
+        count = len(self)
+        if not -count <= index < count:
+            raise IndexError(f"{self.name} has {count} keyframes, got index {index}")
+        return index % count
 
     def _stamp(self, index: int) -> int:
         return 0 if self.timestamps_ns is None else int(self.timestamps_ns[index])
@@ -87,8 +103,17 @@ class Selection(Frames):
     def __len__(self) -> int:
         return len(self._indices)
 
-    def _load(self, index: int) -> Keyframe:
-        return self._dataset[self._indices[index]]
+    def _frame(self, index: int) -> Frame:
+        return frame_of(self._dataset, self._indices[index])
+
+    def __getitem__(self, index: int) -> Keyframe:
+        return self._dataset[self._indices[self._checked(index)]]
+
+
+def frame_of(dataset: Dataset, index: int) -> Frame:
+    """Frame `index` of any dataset: without its pose's help where the dataset has frames of its own."""
+    own: Callable[[int], Frame] | None = getattr(dataset, "frame", None)
+    return own(index) if own is not None else Frame.of(dataset[index], dataset.sensor)
 
 
 def select(

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from tsfusion.datasets.base import Frames, checked_intrinsics, folder, read_lines, require_frames
 from tsfusion.datasets.poses import Pose, nanoseconds, read_kitti
-from tsfusion.datasets.stereo import Matcher
 from tsfusion.errors import DatasetError, InvalidKeyframe
-from tsfusion.keyframe import Intrinsics, Keyframe, check_pose
+from tsfusion.frame import Frame
+from tsfusion.keyframe import Intrinsics, check_pose
 
 EXPECTED = "sequences/NN/{calib.txt,times.txt,image_0,image_1,velodyne} and poses/NN.txt"
 _COLUMNS = 12  # numbers of a 3×4 matrix
@@ -91,7 +91,6 @@ class KITTI(Frames):
         self._with_color = color
         if modality == "stereo":
             self.intrinsics, self.baseline_fx = _stereo_camera(calibration, place / "calib.txt")
-            self._matcher = Matcher()
         else:
             T_cam0_velo = _transform(calibration["Tr"], place / "calib.txt")
             self._poses = [np.linalg.inv(T_cam0_velo) @ T @ T_cam0_velo for T in self._poses]
@@ -99,7 +98,7 @@ class KITTI(Frames):
     def __len__(self) -> int:
         return len(self._frames)
 
-    def _load(self, index: int) -> Keyframe:
+    def _frame(self, index: int) -> Frame:
         number = self._frames[index]
         common: dict[str, Any] = {
             "T_world_camera": self._poses[index],
@@ -107,16 +106,16 @@ class KITTI(Frames):
             "timestamp_ns": self._stamp(index),
         }
         if self.sensor == "lidar":
-            return Keyframe(points=_read_scan(self._left[number]), **common)
+            return Frame(points=_read_scan(self._left[number]), **common)
         left, right = _read_grey(self._left[number]), _read_grey(self._right[number])
         if left.shape != right.shape:
             raise DatasetError(
                 f"{self._right[number]} has shape {right.shape}, its left image {left.shape}; "
                 "expected equal sizes"
             )
-        return Keyframe(
-            disparity=self._matcher(left, right),
-            disparity_scale=1 / 16,
+        return Frame(
+            left=left,
+            right=right,
             baseline_fx=self.baseline_fx,
             intrinsics=self.intrinsics,
             color=np.repeat(left[:, :, None], 3, axis=2) if self._with_color else None,

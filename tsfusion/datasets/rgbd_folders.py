@@ -15,7 +15,8 @@ from tsfusion.datasets.base import (
 )
 from tsfusion.datasets.poses import Pose, read_log, read_matrix_rows
 from tsfusion.errors import DatasetError
-from tsfusion.keyframe import Intrinsics, Keyframe
+from tsfusion.frame import Frame
+from tsfusion.keyframe import Intrinsics
 
 IMAGES = (".png", ".jpg", ".jpeg")
 HOLOLENS_EXPECTED = "K.txt, poses.txt, depth/*.png and images/*.png"
@@ -53,10 +54,10 @@ class PosedFolders(Frames):
     def __len__(self) -> int:
         return len(self._depth)
 
-    def _load(self, index: int) -> Keyframe:
+    def _frame(self, index: int) -> Frame:
         depth = read_depth(self._depth[index])
         color = read_color(self._color[index], depth.shape) if self._color else None
-        return Keyframe(
+        return Frame(
             depth=depth,
             depth_scale=0.001,
             color=color,

@@ -18,7 +18,8 @@ from tsfusion.datasets.base import (
 )
 from tsfusion.datasets.poses import read_matrix
 from tsfusion.errors import DatasetError
-from tsfusion.keyframe import Intrinsics, Keyframe
+from tsfusion.frame import Frame
+from tsfusion.keyframe import Intrinsics
 
 EXPECTED = "frame-XXXXXX.{depth.png,pose.txt,color.png|jpg}, in the folder or in its seq-XX folders"
 KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0)  # the release's own figure
@@ -88,13 +89,13 @@ class SevenScenes(Frames):
     def __len__(self) -> int:
         return len(self._stems)
 
-    def _load(self, index: int) -> Keyframe:
+    def _frame(self, index: int) -> Frame:
         stem = self._stems[index]
         depth = read_depth(_file(stem, "depth.png"), invalid=NOT_MEASURED)
         color = None if self._suffix is None else read_color(_file(stem, self._suffix), depth.shape)
         if color is not None and self._register:
             color = registered(color, depth, self.intrinsics)
-        return Keyframe(
+        return Frame(
             depth=depth,
             depth_scale=0.001,
             color=color,

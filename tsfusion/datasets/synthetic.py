@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from tsfusion.datasets import worlds
 from tsfusion.datasets.base import Frames
 from tsfusion.errors import DatasetError
-from tsfusion.keyframe import Intrinsics, Keyframe
+from tsfusion.frame import Frame
+from tsfusion.keyframe import Intrinsics
 
 FRAME_NS = 100_000_000  # nominal: ten keyframes a second
 DEPTH_SCALE = 1e-4  # metres per unit
@@ -124,7 +125,7 @@ class Synthetic(Frames):
         T = self._path(index, self._count)
         return T @ _T_CAMERA_LIDAR if self.sensor == "lidar" else T
 
-    def _load(self, index: int) -> Keyframe:
+    def _frame(self, index: int) -> Frame:
         T = self.pose(index)
         distance, incidence, color = self._render(T)
         rng = np.random.default_rng([self._seed, index])
@@ -134,19 +135,17 @@ class Synthetic(Frames):
             "timestamp_ns": self._stamp(index),
         }
         if self.sensor == "lidar":
-            return Keyframe(**self._scan(distance, incidence, color, rng), **common)
+            return Frame(**self._scan(distance, incidence, color, rng), **common)
         height, width = self.camera.size
         z = distance.reshape(height, width)
         common["intrinsics"] = self.camera.intrinsics
         common["color"] = color.reshape(height, width, 3) if len(color) else None
         if self.sensor == "kinect":
             depth = kinect(z, rng if self._noise else None)
-            return Keyframe(depth=depth, depth_scale=DEPTH_SCALE, **common)
+            return Frame(depth=depth, depth_scale=DEPTH_SCALE, **common)
         baseline_fx = self.camera.baseline * self.camera.intrinsics.fx
         disparity = stereo(z, baseline_fx, rng if self._noise else None)
-        return Keyframe(
-            disparity=disparity, disparity_scale=DISPARITY_SCALE, baseline_fx=baseline_fx, **common
-        )
+        return Frame(disparity=disparity, disparity_scale=DISPARITY_SCALE, baseline_fx=baseline_fx, **common)
 
     def _render(
         self, T: NDArray[np.float64]

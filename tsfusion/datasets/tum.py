@@ -20,7 +20,8 @@ from tsfusion.datasets.base import (
 )
 from tsfusion.datasets.poses import Pose, nanoseconds, read_tum
 from tsfusion.errors import DatasetError
-from tsfusion.keyframe import Intrinsics, Keyframe
+from tsfusion.frame import Frame
+from tsfusion.keyframe import Intrinsics
 
 EXPECTED = "depth.txt, groundtruth.txt and the images that depth.txt and rgb.txt list"
 DEPTH_SCALE = 1 / 5000  # metres per unit
@@ -109,10 +110,10 @@ class TUM(Frames):
     def __len__(self) -> int:
         return len(self._depth)
 
-    def _load(self, index: int) -> Keyframe:
+    def _frame(self, index: int) -> Frame:
         depth = read_depth(self._depth[index])
         color = self._color[index] if self._color else None
-        return Keyframe(
+        return Frame(
             depth=depth,
             depth_scale=self.depth_scale,
             color=None if color is None else read_color(color, depth.shape),
