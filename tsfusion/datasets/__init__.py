@@ -8,9 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from tsfusion.datasets.base import Dataset, Selection, select
+from tsfusion.datasets.euroc import EuRoC
 from tsfusion.datasets.kitti import KITTI
+from tsfusion.datasets.kitti_raw import KITTIRaw
 from tsfusion.datasets.layouts import SYNTHETIC, Found, Layout, describe, find, layouts, opened
+from tsfusion.datasets.lidar_dump import LidarDump
+from tsfusion.datasets.nerfstudio import Nerfstudio
+from tsfusion.datasets.replica import Replica
 from tsfusion.datasets.rgbd_folders import HoloLens, Redwood
+from tsfusion.datasets.scannet import ScanNet
 from tsfusion.datasets.sevenscenes import SevenScenes
 from tsfusion.datasets.synthetic import Synthetic
 from tsfusion.datasets.tum import TUM
@@ -20,10 +26,16 @@ __all__ = [
     "KITTI",
     "TUM",
     "Dataset",
+    "EuRoC",
     "Found",
     "HoloLens",
+    "KITTIRaw",
     "Layout",
+    "LidarDump",
+    "Nerfstudio",
     "Redwood",
+    "Replica",
+    "ScanNet",
     "Selection",
     "SevenScenes",
     "Synthetic",

@@ -237,14 +237,14 @@ def read_depth(path: Path, *, invalid: int | None = None) -> NDArray[np.uint16]:
     return depth
 
 
-def read_color(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 BGR of the depth image's `shape`."""
+def read_color(path: Path, shape: tuple[int, ...] | None) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 BGR of the depth image's `shape`; None: of any."""
     if not path.is_file():
         raise DatasetError(f"{path} is missing; expected a colour image")
     color: NDArray[np.uint8] | None = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if color is None:
         raise DatasetError(f"{path} cannot be decoded; expected a colour image")
-    if color.shape[:2] != shape:
+    if shape is not None and color.shape[:2] != shape:
         raise DatasetError(
             f"{path} is {color.shape[1]}×{color.shape[0]}, its depth image {shape[1]}×{shape[0]}; "
             "expected equal sizes"

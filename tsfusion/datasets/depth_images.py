@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -63,6 +64,36 @@ class DepthImages(Frames):
     def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
         """The colour of each depth pixel."""
         return read_color(color, depth.shape)
+
+
+def seen_by(
+    color: NDArray[np.uint8], own: Intrinsics, other: Intrinsics, shape: tuple[int, ...]
+) -> NDArray[np.uint8]:
+    """An image resampled for another camera in the same place: (h, w, 3) uint8 → (*shape, 3).
+
+    Shrinking averages; beyond the image its border is repeated.
+    """
+    factor = other.fx / own.fx
+    if factor < 1:
+        size = [max(1, round(pixels * factor)) for pixels in (color.shape[1], color.shape[0])]
+        factor_x, factor_y = size[0] / color.shape[1], size[1] / color.shape[0]
+        color = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
+        own = Intrinsics(
+            own.fx * factor_x,
+            own.fy * factor_y,
+            (own.cx + 0.5) * factor_x - 0.5,
+            (own.cy + 0.5) * factor_y - 0.5,
+        )
+    x, y = own.fx / other.fx, own.fy / other.fy
+    affine = np.array([[x, 0, own.cx - x * other.cx], [0, y, own.cy - y * other.cy]])
+    seen: NDArray[np.uint8] = cv2.warpAffine(
+        color,
+        affine,
+        (shape[1], shape[0]),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return seen
 
 
 def images(where: Path, expected: str, pattern: str = "*") -> list[Path]:

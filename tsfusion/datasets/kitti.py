@@ -110,8 +110,8 @@ class KITTI(Frames):
             "timestamp_ns": self._stamp(index),
         }
         if self.sensor == "lidar":
-            return Frame(points=_read_scan(self._left[number]), **common)
-        left, right = _read_grey(self._left[number]), _read_grey(self._right[number])
+            return Frame(points=read_scan(self._left[number]), **common)
+        left, right = read_grey(self._left[number]), read_grey(self._right[number])
         if left.shape != right.shape:
             raise DatasetError(
                 f"{self._right[number]} has shape {right.shape}, its left image {left.shape}; "
@@ -142,7 +142,7 @@ def _only_sequence(root: Path) -> str:
     return found[0]
 
 
-def _numbered(place: Path, suffix: str) -> dict[int, Path]:
+def numbered(place: Path, suffix: str) -> dict[int, Path]:
     """Frame number → file, in order."""
     files = sorted(place.glob(f"*{suffix}"))
     for path in files:
@@ -152,7 +152,7 @@ def _numbered(place: Path, suffix: str) -> dict[int, Path]:
 
 
 def _stereo_files(place: Path) -> tuple[dict[int, Path], dict[int, Path]]:
-    left, right = _numbered(place / "image_0", ".png"), _numbered(place / "image_1", ".png")
+    left, right = numbered(place / "image_0", ".png"), numbered(place / "image_1", ".png")
     if not left or not right:
         raise DatasetError(f"{place} has {len(left)} left and {len(right)} right images; expected {EXPECTED}")
     alone = sorted(left.keys() ^ right.keys())
@@ -167,7 +167,7 @@ def _stereo_files(place: Path) -> tuple[dict[int, Path], dict[int, Path]]:
 
 
 def _scan_files(place: Path) -> dict[int, Path]:
-    scans = _numbered(place / "velodyne", ".bin")
+    scans = numbered(place / "velodyne", ".bin")
     if not scans:
         raise DatasetError(f"{place / 'velodyne'} has no scans (*.bin); expected {EXPECTED}")
     return scans
@@ -234,7 +234,8 @@ def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
     return np.array([stamps[number] for number in frames], dtype=np.int64)
 
 
-def _read_grey(path: Path) -> NDArray[np.uint8]:
+def read_grey(path: Path) -> NDArray[np.uint8]:
+    """(H, W), a colour image's luminance."""
     import pykitti.utils
 
     try:
@@ -243,7 +244,8 @@ def _read_grey(path: Path) -> NDArray[np.uint8]:
         raise DatasetError(f"{path} cannot be decoded; expected a grey image ({error})") from error
 
 
-def _read_scan(path: Path) -> NDArray[np.float32]:
+def read_scan(path: Path) -> NDArray[np.float32]:
+    """(n, 3) metres in the Velodyne's axes, without the reflectance."""
     import pykitti.utils
 
     try:

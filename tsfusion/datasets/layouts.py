@@ -13,8 +13,14 @@ from typing import Any, NamedTuple
 
 from tsfusion.datasets import (
     archives,
+    euroc,
     kitti,
+    kitti_raw,
+    lidar_dump,
+    nerfstudio,
+    replica,
     rgbd_folders,
+    scannet,
     sevenscenes,
     tum,
 )
@@ -66,22 +72,22 @@ class Found(NamedTuple):
 
 # The first that fits is taken: the more specific stand first.
 BUILT_IN = (
-    Layout("7-Scenes", sevenscenes.EXPECTED, sevenscenes.recognises, sevenscenes.SevenScenes),
-    Layout(
-        "HoloLens", rgbd_folders.HOLOLENS_EXPECTED, rgbd_folders.recognises_hololens, rgbd_folders.HoloLens
-    ),
-    Layout("Redwood", rgbd_folders.REDWOOD_EXPECTED, rgbd_folders.recognises_redwood, rgbd_folders.Redwood),
-    Layout("TUM RGB-D", tum.EXPECTED + " (also CoRBS, ICL-NUIM)", tum.recognises, tum.TUM),
+    Layout("EuRoC", euroc.EXPECTED, euroc.recognises, euroc.EuRoC),
     Layout("KITTI odometry", kitti.EXPECTED, kitti.recognises, kitti.open_kitti),
-)
+    Layout("KITTI raw", kitti_raw.EXPECTED, kitti_raw.recognises, kitti_raw.KITTIRaw),
+    Layout("7-Scenes", sevenscenes.EXPECTED, sevenscenes.recognises, sevenscenes.SevenScenes),
+    Layout("ScanNet", scannet.EXPECTED, scannet.recognises, scannet.ScanNet),
+    Layout("Replica", replica.EXPECTED, replica.recognises, replica.Replica),
+    Layout("nerfstudio", nerfstudio.EXPECTED, nerfstudio.recognises, nerfstudio.Nerfstudio),
+    Layout("LiDAR keyframes", lidar_dump.EXPECTED, lidar_dump.recognises, lidar_dump.LidarDump),
+    Layout("TUM RGB-D", f"{tum.EXPECTED} (also CoRBS, ICL-NUIM)", tum.recognises, tum.TUM),
+    Layout("HoloLens", rgbd_folders.HOLOLENS_EXPECTED, rgbd_folders.recognises_hololens,
+           rgbd_folders.HoloLens),
+    Layout("Redwood", rgbd_folders.REDWOOD_EXPECTED, rgbd_folders.recognises_redwood, rgbd_folders.Redwood),
+)  # fmt: skip
 # Asked where none of those fits.
 PLAIN = (
-    Layout(
-        "RGB-D folders",
-        rgbd_folders.PLAIN_EXPECTED,
-        rgbd_folders.recognises_plain,
-        rgbd_folders.Redwood,
-    ),
+    Layout("RGB-D folders", rgbd_folders.PLAIN_EXPECTED, rgbd_folders.recognises_plain, rgbd_folders.Redwood),
 )
 SYNTHETIC = ("synthetic", "no files: synthetic:room or synthetic:street, then :kinect, :stereo or :lidar")
 
