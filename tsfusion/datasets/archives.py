@@ -46,7 +46,7 @@ def unpack(path: Path) -> Path:
             _extract(path, partial)
             partial.rename(into)
     except (OSError, ValueError, tarfile.TarError, zipfile.BadZipFile, EOFError) as error:
-        raise DatasetError(f"cannot unpack {path}: {error}") from error
+        raise DatasetError(f"cannot unpack {path}: {' '.join(str(error).split())}") from error
     return into
 
 
