@@ -65,7 +65,14 @@ class Corrections:
 
 
 class Localizer(Protocol):
-    """Follows a sensor. Frames come in time order, from one thread."""
+    """Follows a sensor. Frames come in time order, from one thread.
+
+    Attributes:
+        absolute: whether its world outlasts `reset`: poses from elsewhere are in one world, however often
+            there is none.
+    """
+
+    absolute: bool
 
     def track(self, frame: Frame) -> Pose | Lost:
         """Where the sensor was; Lost when that is not known (then try the next frame, or `reset`).
