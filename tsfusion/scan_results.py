@@ -9,6 +9,7 @@ import numpy as np
 
 from tsfusion.datasets.poses import write_tum
 from tsfusion.evaluation.trajectory import TrajectoryError, absolute_error
+from tsfusion.localizers import Corrections, corrected
 from tsfusion.mesh import Mesh
 from tsfusion.scanner import Submap
 from tsfusion.transport import KeyframeTimes, Status
@@ -66,11 +67,18 @@ class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def write_trajectory(work: Path, submap: Submap, suffix: str) -> None:
-    """`trajectory.txt`, and `trajectory-corrected.txt` where loops were closed, in the TUM format."""
-    stamps = [at.timestamp_ns for at in submap.located]
-    write_tum(work / f"trajectory{suffix}.txt", stamps, [at.T_world_camera for at in submap.located])
+    """In the TUM format: `trajectory.txt` of all frames, `keyframes.txt` of those in the map.
+
+    Where loops were closed `trajectory-corrected.txt`, too.
+    """
+    stamps = [pose.timestamp_ns for pose in submap.poses]
+    tracked = corrected(submap.poses, None)
+    write_tum(work / f"trajectory{suffix}.txt", stamps, tracked)
+    chosen = [index for index, at in enumerate(submap.located) if at.seq is not None]
+    write_tum(work / f"keyframes{suffix}.txt", [stamps[i] for i in chosen], [tracked[i] for i in chosen])
     if submap.corrections is not None and submap.corrections.loops:
-        write_tum(work / f"trajectory-corrected{suffix}.txt", stamps, submap.corrected)
+        now = corrected(submap.poses, submap.corrections)
+        write_tum(work / f"trajectory-corrected{suffix}.txt", stamps, now)
 
 
 def describe(submap: Submap, status: Status | None, mesh: Mesh | None) -> MapResult:
@@ -87,8 +95,8 @@ def describe(submap: Submap, status: Status | None, mesh: Mesh | None) -> MapRes
         frames=len(submap.located),
         keyframes=sum(at.seq is not None for at in submap.located),
         loops=corrections.loops if corrections else 0,
-        trajectory_error=_error(submap, corrected=False),
-        corrected_error=_error(submap, corrected=True) if corrections else None,
+        trajectory_error=_error(submap, None),
+        corrected_error=_error(submap, corrections) if corrections else None,
         **in_map,
     )
 
@@ -98,9 +106,9 @@ def records(submaps: list[Submap]) -> list[KeyframeTimes]:
     return [record for submap in submaps for record in submap.client.records]
 
 
-def _error(submap: Submap, *, corrected: bool) -> TrajectoryError | None:
+def _error(submap: Submap, corrections: Corrections | None) -> TrajectoryError | None:
     """Against the source's own poses, over the frames that have one."""
-    poses = submap.corrected if corrected else [at.T_world_camera for at in submap.located]
+    poses = corrected(submap.poses, corrections)
     pairs = [
         (T, at.reference) for T, at in zip(poses, submap.located, strict=True) if at.reference is not None
     ]

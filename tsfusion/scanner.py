@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion import localizers
 from tsfusion.client import Client, ClientStats
 from tsfusion.config import MAP_NAME_LENGTH, ScanConfig
 from tsfusion.frame import Frame
@@ -27,21 +28,18 @@ State = Literal["starting", "tracking", "lost"]
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Located:
     """One frame that has a pose.
 
     Attributes:
-        reference: what the source itself said of the pose, None = nothing.
+        reference: (4, 4), what the source itself said of the pose; None = nothing.
         seq: its number as a keyframe; None = it is none, or was left out.
     """
 
-    timestamp_ns: int
-    T_world_camera: Matrix
-    anchor: int
-    T_anchor_camera: Matrix
+    pose: Pose
     reference: Matrix | None
-    seq: int | None = None
+    seq: int | None
 
 
 @dataclass(eq=False)
@@ -61,15 +59,9 @@ class Submap:
     corrections: Corrections | None = None
 
     @property
-    def corrected(self) -> list[Matrix]:
-        """T_world_camera of each of `located`, after loop closure."""
-        if self.corrections is None:
-            return [at.T_world_camera for at in self.located]
-        anchors, T = self.corrections.anchors, self.corrections.T_corrected_world
-        return [
-            anchors[at.anchor] @ at.T_anchor_camera if at.anchor in anchors else T @ at.T_world_camera
-            for at in self.located
-        ]
+    def poses(self) -> list[Pose]:
+        """Of its frames, as they were tracked."""
+        return [at.pose for at in self.located]
 
 
 class ScanState(msgspec.Struct, frozen=True, kw_only=True):
@@ -186,16 +178,7 @@ class Scanner:
             self._selected[reason] += 1
             self._selector.took(frame, T)
             seq = submap.client.send(frame.keyframe(T))
-        submap.located.append(
-            Located(
-                timestamp_ns=frame.timestamp_ns,
-                T_world_camera=T,
-                anchor=pose.anchor,
-                T_anchor_camera=pose.T_anchor_camera,
-                reference=frame.T_world_camera,
-                seq=seq,
-            )
-        )
+        submap.located.append(Located(pose, frame.T_world_camera, seq))
 
     def _missed(self, lost: Lost, frame: Frame) -> None:
         self._lost += 1
@@ -224,9 +207,8 @@ class Scanner:
         submap.corrections = corrections
         if corrections.loops > before:
             log.info("a place was seen again: %d loops closed", corrections.loops)
-        poses = {
-            at.seq: T for at, T in zip(submap.located, submap.corrected, strict=True) if at.seq is not None
-        }
+        now = localizers.corrected(submap.poses, corrections)
+        poses = {at.seq: T for at, T in zip(submap.located, now, strict=True) if at.seq is not None}
         if poses:
             submap.client.correct(poses, T_map_odometry=corrections.T_corrected_world)
 

@@ -69,8 +69,8 @@ def scan(
 ) -> ScanSummary:
     """Take a source's frames to its end, or until it is closed, and leave the results in the folder `out`.
 
-    `trajectory.txt` (and `trajectory-corrected.txt` where loops were closed), `delay.csv`, `delay.png` and
-    `run.json`; with a server of its own also `mesh.ply`, `mesh.glb` and `preview.png`. A second submap's have
+    `trajectory.txt`, `keyframes.txt` (and `trajectory-corrected.txt` where loops were closed), `delay.csv`,
+    `delay.png` and `run.json`; with a server of its own also `mesh.ply`, `mesh.glb` and `preview.png`. A second submap's have
     `-2` before the ending, and so on.
 
     Args:
@@ -253,7 +253,7 @@ def _write(work: Path, place: _Place, submap: Submap, suffix: str, min_weight: f
         link.address, control=link.control, map_name=submap.name, min_weight=min_weight, keys=keys
     )
     if len(mesh.faces):
-        ups = [preview.sensor_up(at.T_world_camera, place.sensor) for at in submap.located]
+        ups = [preview.sensor_up(pose.T_world_camera, place.sensor) for pose in submap.poses]
         summary.write_mesh(work, mesh, ups, suffix)
     elif not suffix:
         raise OutputError(
