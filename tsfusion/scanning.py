@@ -70,8 +70,8 @@ def scan(
     """Take a source's frames to its end, or until it is closed, and leave the results in the folder `out`.
 
     `trajectory.txt`, `keyframes.txt` (and `trajectory-corrected.txt` where loops were closed), `delay.csv`,
-    `delay.png` and `run.json`; with a server of its own also `mesh.ply`, `mesh.glb` and `preview.png`. A second submap's have
-    `-2` before the ending, and so on.
+    `delay.png` and `run.json`; with a server of its own also `mesh.ply`, `mesh.glb` and `preview.png`. A
+    second submap's have `-2` before the ending, and so on.
 
     Args:
         volume: the map of the own server; a server at `connect` has its own.

@@ -28,10 +28,9 @@ def compare_scans(dataset: Dataset, folders: Sequence[Path], *, voxel_size: floa
     Returns:
         `compare_views` of each folder.
     """
-    stamps = {
-        (index + 1) * NOMINAL_NS if dataset.timestamps_ns is None else int(dataset.timestamps_ns[index]): index
-        for index in range(len(dataset))
-    }  # fmt: skip
+    given = dataset.timestamps_ns
+    times = [(i + 1) * NOMINAL_NS if given is None else int(given[i]) for i in range(len(dataset))]
+    stamps = {stamp: index for index, stamp in enumerate(times)}
     tracked = [_poses(folder / "trajectory.txt") for folder in folders]
     fused = set().union(*(_poses(folder / "keyframes.txt") for folder in folders))
     common = sorted(set(stamps).intersection(*tracked) - fused)[::_STEP]
