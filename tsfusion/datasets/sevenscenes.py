@@ -11,12 +11,13 @@ from tsfusion.datasets.base import (
     Frames,
     checked_intrinsics,
     folder,
+    kept,
     read_color,
     read_depth,
     read_intrinsics,
     require_frames,
 )
-from tsfusion.datasets.poses import read_matrix
+from tsfusion.datasets.poses import Pose, read_matrix
 from tsfusion.errors import DatasetError
 from tsfusion.frame import Frame
 from tsfusion.keyframe import Intrinsics
@@ -39,8 +40,7 @@ class SevenScenes(Frames):
     """A scene (every `seq-*` in it, one world) or a single sequence.
 
     Depth is uint16 millimetres. 7-Scenes colour has the depth's size but comes from another camera, up to
-    35 pixels off: it is registered to the depth here. There are no timestamps (nominally 30 Hz). Frames
-    without a pose file are skipped and counted.
+    35 pixels off: it is registered to the depth here. There are no timestamps (nominally 30 Hz).
 
     Args:
         path: the scene's or the sequence's folder.
@@ -49,6 +49,7 @@ class SevenScenes(Frames):
         color: read colour images.
         register: move colour onto depth; default: where the depth camera is 7-Scenes' own (3DMatch's colour
             is registered already).
+        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
 
     Raises:
         DatasetError: no such folder, no frames, a missing image, a malformed pose or camera file.
@@ -62,26 +63,23 @@ class SevenScenes(Frames):
         sensor: str = "kinect",
         color: bool = True,
         register: bool | None = None,
+        posed: bool = True,
     ) -> None:
         root = folder(path, "7-Scenes")
         self.name, self.sensor, self.skipped = f"7-Scenes {root.name}", sensor, {}
-        self._stems: list[Path] = []
-        unposed = 0
+        stems: list[Path] = []
         for sequence in _sequences(root):
             depth = _frames(sequence, "depth.png")
-            posed = _frames(sequence, "pose.txt")
-            if posed - depth:
+            alone = _frames(sequence, "pose.txt") - depth
+            if alone:
                 raise DatasetError(
-                    f"{sequence / min(posed - depth)}.depth.png is missing, but its pose.txt is there; "
+                    f"{sequence / min(alone)}.depth.png is missing, but its pose.txt is there; "
                     f"expected {EXPECTED}"
                 )
-            unposed += len(depth - posed)
-            self._stems += [sequence / stem for stem in sorted(depth & posed)]
-        if unposed:
-            self.skipped["without a pose"] = unposed
+            stems += [sequence / stem for stem in sorted(depth)]
+        self._stems, self._poses = kept(stems, [_pose(s) for s in stems], posed=posed, skipped=self.skipped)
         require_frames(len(self._stems), root, EXPECTED, self.skipped)
         self._suffix = _color_suffix(self._stems[0]) if color else None
-        self._poses = [read_matrix(_file(stem, "pose.txt")) for stem in self._stems]
         self.intrinsics = _intrinsics(root, self._stems[0].parent) if intrinsics is None else intrinsics
         checked_intrinsics(self.intrinsics, "intrinsics")
         self._register = self.intrinsics == KINECT if register is None else register
@@ -131,6 +129,11 @@ def _frames(sequence: Path, suffix: str) -> set[str]:
 
 def _file(stem: Path, suffix: str) -> Path:
     return stem.with_name(f"{stem.name}.{suffix}")
+
+
+def _pose(stem: Path) -> Pose | None:
+    path = _file(stem, "pose.txt")
+    return read_matrix(path) if path.exists() else None
 
 
 def _color_suffix(stem: Path) -> str | None:
