@@ -28,7 +28,7 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
                                 "journal", "transport", "codec", "maps", "keys"})),
     ("ground", frozenset({"kernels", "runtime", "mesh", "keyframe", "config", "config_toml", "errors",
                           "process", "disk", "logs", "watchdog", "private_folder", "frame", "stereo",
-                          "se3", "calibration", "calibration_files"})),
+                          "se3", "calibration", "calibration_files", "registration"})),
 )  # fmt: skip
 
 # All others run where there is no Taichi, and answer while kernels run.
