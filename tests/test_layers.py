@@ -29,7 +29,7 @@ ROWS: tuple[tuple[str, frozenset[str]], ...] = (
                              "codec", "maps", "keys", "corrections"})),
     ("ground", frozenset({"kernels", "runtime", "keyframe", "frame", "stereo", "se3", "calibration",
                              "calibration_files", "config", "config_toml", "mesh", "errors", "process",
-                             "disk", "logs", "watchdog", "private_folder"})),
+                             "disk", "logs", "watchdog", "private_folder", "registration"})),
 )  # fmt: skip
 
 # All others run where there is no Taichi, and answer while kernels run.
