@@ -167,6 +167,12 @@ class Client:
             return self._outbox.times.copy()
 
     @property
+    def newest_fused(self) -> KeyframeTimes | None:
+        """The stamps of the newest keyframe that is in the map; None = none is."""
+        with self._outbox.changed:
+            return self._outbox.times.newest_fused()
+
+    @property
     def stats(self) -> ClientStats:
         """Counts since this client began."""
         with self._outbox.changed:
@@ -176,6 +182,12 @@ class Client:
     def connected(self) -> bool:
         """Whether the server answered and has not fallen silent."""
         return self._outbox.connected
+
+    @property
+    def problem(self) -> str:
+        """Why the server takes nothing at the moment; empty when it does."""
+        box = self._outbox
+        return "" if box.connected and not box.turned_away else self._why()
 
     def close(self) -> None:
         """Stop sending. Call `flush` first: what a temporary spool still holds is lost (and logged)."""

@@ -75,7 +75,7 @@ def replay(
         )  # fmt: skip
     else:
         options.refuse(context, ("control", "key", "server_key"), "has no effect without --connect")
-    dataset = _open(path, sequence=sequence, modality=modality, poses=poses)
+    dataset = open_recording(path, sequence=sequence, modality=modality, poses=poses)
     chosen = options.configuration(
         config, preset={"sensor": dataset.sensor}, **settings,
     )  # fmt: skip
@@ -89,7 +89,8 @@ def replay(
     )  # fmt: skip
 
 
-def _open(path: Path, **given: Any) -> "Dataset":
+def open_recording(path: Path, **given: Any) -> "Dataset":
+    """A dataset, or a journal; `given` are settings of a dataset, None = left out."""
     from tsfusion import maps
 
     if (
@@ -102,7 +103,7 @@ def _open(path: Path, **given: Any) -> "Dataset":
         from tsfusion.recording import Recording
 
         for name, value in given.items():
-            if value is not None:
+            if value is not None and name != "posed":
                 raise DatasetError(f"--{name} has no effect on a journal")
         return Recording(path)
     from tsfusion.datasets import open_dataset
@@ -164,7 +165,7 @@ def _run(
     client = override(chosen.client, control=control, map=map_, key=key, server_key=server_key)
     if connect is None:  # a server of its own: only this machine reaches it, its errors are told here
         server = replace(server, keys=None, metrics=None, log_format="text") if server else None
-        client = replace(client, key=None, server_key=None)
+        client = options.local(client)
     with show.progress(quiet=json) as progress:
         run = pipeline.replay(
             dataset, out, volume=chosen.volume, server=server, client=client, progress=progress,
