@@ -90,14 +90,7 @@ def replay(
 
 
 def _open(path: Path, **given: Any) -> "Dataset":
-    from tsfusion import maps
-
-    if (
-        path.suffix == ".mcap"
-        or any(path.glob("*.mcap"))
-        or any(path.glob("journal/*.mcap"))
-        or maps.is_state(path)
-    ):
+    if _is_journal(path):
         from tsfusion.errors import DatasetError
         from tsfusion.recording import Recording
 
@@ -108,6 +101,16 @@ def _open(path: Path, **given: Any) -> "Dataset":
     from tsfusion.datasets import open_dataset
 
     return open_dataset(path, **given)
+
+
+def _is_journal(path: Path) -> bool:
+    """Whether it is a journal of ours, or a place with one; a ROS recording may be an `.mcap` too."""
+    from tsfusion import maps
+    from tsfusion.datasets import bags
+
+    if maps.is_state(path) or any(path.glob("journal/*.mcap")):
+        return True
+    return (path.suffix == ".mcap" or any(path.glob("*.mcap"))) and not bags.recognises(path)
 
 
 @options.takes_map_settings

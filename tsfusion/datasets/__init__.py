@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tsfusion.datasets import kitti, rgbd_folders, sevenscenes, tum
+from tsfusion.datasets import bags, kitti, rgbd_folders, sevenscenes, tum
 from tsfusion.datasets.base import Dataset, Selection, select
 from tsfusion.datasets.kitti import KITTI
 from tsfusion.datasets.rgbd_folders import HoloLens, Redwood
@@ -46,6 +46,7 @@ _LAYOUTS = (
     _Layout("Redwood", rgbd_folders.REDWOOD_EXPECTED, rgbd_folders.recognises_redwood, Redwood),
     _Layout("TUM RGB-D", tum.EXPECTED + " (also CoRBS, ICL-NUIM)", tum.recognises, TUM),
     _Layout("KITTI odometry", kitti.EXPECTED, kitti.recognises, kitti.open_kitti),
+    _Layout("ROS bag", bags.EXPECTED, bags.recognises, bags.Bag),
 )
 _SYNTHETIC = "synthetic:"
 
@@ -74,7 +75,7 @@ def open_dataset(path: str | Path, **options: Any) -> Dataset:
         given = dict(zip(("world", "sensor"), filter(None, words), strict=False))
         return _open("synthetic", Synthetic, (), {**given, **options})
     root = Path(path).expanduser()
-    if not root.is_dir():
+    if not root.is_dir() and not bags.recognises(root):
         state = "is not a folder" if root.exists() else "does not exist"
         raise DatasetError(f"{root} {state}; expected a dataset folder or synthetic:room, synthetic:street")
     found = _recognise([root]) or _recognise(_folders_in(root))
