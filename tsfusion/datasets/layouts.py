@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from tsfusion.datasets import (
     archives,
+    bags,
     euroc,
     kitti,
     kitti_raw,
@@ -72,6 +73,7 @@ class Found(NamedTuple):
 
 # The first that fits is taken: the more specific stand first.
 BUILT_IN = (
+    Layout("ROS bag", bags.EXPECTED, bags.recognises, bags.Bag),
     Layout("EuRoC", euroc.EXPECTED, euroc.recognises, euroc.EuRoC),
     Layout("KITTI odometry", kitti.EXPECTED, kitti.recognises, kitti.open_kitti),
     Layout("KITTI raw", kitti_raw.EXPECTED, kitti_raw.recognises, kitti_raw.KITTIRaw),
