@@ -174,10 +174,10 @@ def test_a_journal_and_a_ros_recording_are_told_apart(tmp_path: Path) -> None:
     export(place, tmp_path / "out.mcap", lambda _done, _all: None)
     bag = walls(tmp_path)
     for journaled in (tmp_path, place.path, segment):
-        assert isinstance(replay._open(journaled), Recording)
+        assert isinstance(replay.open_recording(journaled), Recording)
         assert not recognises(journaled) or journaled == tmp_path
     for recorded in (tmp_path / "out.mcap", bag, bag / "recorded.mcap"):
-        assert isinstance(replay._open(recorded), Bag)
+        assert isinstance(replay.open_recording(recorded), Bag)
     with pytest.raises(DatasetError, match="is a journal of tsfusion"):
         Bag(segment)
     torn = tmp_path / "torn.mcap"
