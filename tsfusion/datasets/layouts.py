@@ -86,6 +86,7 @@ BUILT_IN = (
     Layout("HoloLens", rgbd_folders.HOLOLENS_EXPECTED, rgbd_folders.recognises_hololens,
            rgbd_folders.HoloLens),
     Layout("Redwood", rgbd_folders.REDWOOD_EXPECTED, rgbd_folders.recognises_redwood, rgbd_folders.Redwood),
+    Layout("ROS bag", bags.EXPECTED, bags.recognises, bags.Bag),
 )  # fmt: skip
 # Asked where none of those fits.
 PLAIN = (
