@@ -338,7 +338,8 @@ def test_ctrl_c_comes_through() -> None:
         "except KeyboardInterrupt:\n"
         "    sys.exit(7)\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], timeout=60, check=False)
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=Path(__file__).parents[1], timeout=60, check=False)
     assert done.returncode == 7
 
 
