@@ -234,4 +234,6 @@ def _total(stats: list[ClientStats]) -> ClientStats:
 
 def _newest_delay(client: Client) -> float | None:
     record = client.newest_fused
-    return None if record is None else (record.fused_ns - record.captured_ns) / 1e6
+    if record is None or not record.captured_ns:
+        return None
+    return (record.fused_ns - record.captured_ns) / 1e6

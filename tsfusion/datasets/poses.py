@@ -127,12 +127,36 @@ def read_tum(path: Path) -> Trajectory:
     rows: list[list[float]] = []
     for number, line in read_lines(path, content):
         words = line.replace(",", " ").split()
-        values = numbers(path, number, words, 8, content)
-        norm = float(np.linalg.norm(values[4:]))
-        if abs(norm - 1) > 0.01:
-            raise DatasetError(f"{path}:{number}: quaternion must have length 1, got {norm:.4g}")
+        rows.append(numbers(path, number, words, 8, content)[1:])
+        check_quaternion(rows[-1][3:], path, number)
         stamps.append(nanoseconds(words[0], path, number))
-        rows.append(values[1:])
+    return _in_order(stamps, rows, path, content)
+
+
+def read_euroc(path: Path) -> Trajectory:
+    """EuRoC / ASL ground truth: `ns, px, py, pz, qw, qx, qy, qz, …` a line, T_world_body."""
+    content = "`ns,px,py,pz,qw,qx,qy,qz,…` a line"
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in read_lines(path, content):
+        words = [word.strip() for word in line.split(",")]
+        if not words[0].isdecimal() or int(words[0]) >= 2**63:
+            raise DatasetError(f"{path}:{number}: timestamp must be nanoseconds, got {words[0]!r}")
+        px, py, pz, qw, qx, qy, qz = numbers(path, number, words[1:8], 7, content)
+        check_quaternion([qx, qy, qz, qw], path, number)
+        stamps.append(int(words[0]))
+        rows.append([px, py, pz, qx, qy, qz, qw])
+    return _in_order(stamps, rows, path, content)
+
+
+def check_quaternion(quaternion: Sequence[float] | NDArray[np.float64], path: Path, line: int) -> None:
+    """Raise a DatasetError unless its length is 1 to a hundredth."""
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1) > 0.01:
+        raise DatasetError(f"{path}:{line}: quaternion must have length 1, got {norm:.4g}")
+
+
+def _in_order(stamps: list[int], rows: list[list[float]], path: Path, content: str) -> Trajectory:
     if not rows:
         raise DatasetError(f"{path} holds no poses; expected {content}")
     order = np.unique(np.array(stamps, dtype=np.int64), return_index=True)[1]
