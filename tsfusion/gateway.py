@@ -12,9 +12,11 @@ from typing import Any
 
 import zmq
 
-from tsfusion import codec, logs, process, reports
+from tsfusion import codec, corrections, logs, process, reports
 from tsfusion.atlas import Atlas
 from tsfusion.config import ServerConfig
+from tsfusion.corrections import Corrections
+from tsfusion.corrector import Corrector
 from tsfusion.door import Door
 from tsfusion.errors import DecodeError
 from tsfusion.hosted import HostedMap
@@ -22,6 +24,7 @@ from tsfusion.intake import Intake
 from tsfusion.metrics import Metrics
 from tsfusion.ports import MemoryBound, Ports, each, send_now
 from tsfusion.questions import Questions
+from tsfusion.revisions import Kept
 from tsfusion.routes import Route, Routes
 from tsfusion.subscriptions import Subscriptions
 from tsfusion.transport import messages, sockets, work
@@ -60,6 +63,7 @@ class Gateway:
         self._routes = Routes()
         self._intake = Intake(server, self.maps, door, self)
         self._refused = self._intake.refused
+        self._corrector = Corrector(server, self.maps, self._intake)
         self._questions = Questions(self._answer, server.memory_bytes // _MESHES_SHARE)
         self._topics = Subscriptions()
         self._watched: dict[str, bool] = {}  # what each fuser knows of it
@@ -176,17 +180,27 @@ class Gateway:
 
     def _on_control(self, frames: list[zmq.Frame]) -> None:
         client = self._door.client_of(frames[0])
-        identity, *rest = (frame.bytes for frame in frames)
         if client is None:
             self._refused["key"] += 1
             return
+        identity, *rest = frames
         try:
-            message = messages.decode_to_server(b"".join(rest))
+            message = _said(rest)
         except DecodeError as error:
             self._refused["control"] += 1
             log.debug("%s", error)
             return
-        if isinstance(message, messages.Command):
+        self._on_message(identity.bytes, message, client, rest)
+
+    def _on_message(
+        self, identity: bytes, message: messages.ToServer, client: str, frames: list[zmq.Frame]
+    ) -> None:
+        if isinstance(message, Corrections):
+            if self._accepting:
+                answer = self._corrector.take(message, [frame.buffer for frame in frames[1:]], client)
+                if answer is not None:
+                    self._answer(identity, answer)
+        elif isinstance(message, messages.Command):
             self._on_command(identity, message, client)
         elif isinstance(message, messages.Hello):
             self._on_hello(identity, message, client)
@@ -206,6 +220,7 @@ class Gateway:
             window_keyframes=self._server.window_keyframes,
             window_bytes=self._server.window_bytes,
             max_frame_bytes=self._server.max_frame_bytes,
+            corrections=self._corrected(hello.map, hello.session)[0],
         )
         self._answer(identity, welcome)
 
@@ -241,6 +256,11 @@ class Gateway:
     def _progress(self, map_name: str, session: bytes) -> tuple[int, int]:
         hosted = self.maps.get(map_name)
         return hosted.sessions.progress(session) if hosted else (0, 0)
+
+    def _corrected(self, map_name: str, session: bytes) -> tuple[int, int]:
+        hosted = self.maps.get(map_name)
+        kept = hosted.revisions.of(session) if hosted else Kept()
+        return kept.revision, kept.keyframes
 
     def _on_command(self, identity: bytes, command: messages.Command, client: str) -> None:
         if command.name == "ping":
@@ -279,10 +299,12 @@ class Gateway:
             refused=dict(self._refused + self._door.refused),
             duplicates=self._intake.duplicates,
             maps=found,
-            clients=tuple(
-                route.health(now, self._progress(route.map, route.session)) for route in self._routes
-            ),
+            clients=tuple(self._client_health(route, now) for route in self._routes),
         )
+
+    def _client_health(self, route: Route, now: float) -> messages.ClientHealth:
+        where = (route.map, route.session)
+        return route.health(now, self._progress(*where), self._corrected(*where))
 
     # --- sending: an answer that cannot leave at once is dropped, the asker will ask again ---
 
@@ -309,3 +331,13 @@ class Gateway:
 
     def _answer(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
         send_now(self.ports.control, [identity, messages.encode(message), *frames])
+
+
+def _said(frames: Sequence[zmq.Frame]) -> messages.ToServer:
+    """What a control message says. Only corrections have frames behind their head."""
+    if len(frames) > 1 + corrections.MAX_FRAMES:
+        raise DecodeError(f"a control message of {len(frames)} frames")
+    said = messages.decode_to_server(frames[0].buffer if frames else b"")
+    if len(frames) > 1 and not isinstance(said, Corrections):
+        raise DecodeError("a control message of several frames")
+    return said

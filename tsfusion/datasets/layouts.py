@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from tsfusion.datasets import (
     archives,
+    bags,
     euroc,
     kitti,
     kitti_raw,
@@ -80,10 +81,12 @@ BUILT_IN = (
     Layout("Replica", replica.EXPECTED, replica.recognises, replica.Replica),
     Layout("nerfstudio", nerfstudio.EXPECTED, nerfstudio.recognises, nerfstudio.Nerfstudio),
     Layout("LiDAR keyframes", lidar_dump.EXPECTED, lidar_dump.recognises, lidar_dump.LidarDump),
+    Layout("ROS bag", bags.EXPECTED, bags.recognises, bags.Bag),
     Layout("TUM RGB-D", f"{tum.EXPECTED} (also CoRBS, ICL-NUIM)", tum.recognises, tum.TUM),
     Layout("HoloLens", rgbd_folders.HOLOLENS_EXPECTED, rgbd_folders.recognises_hololens,
            rgbd_folders.HoloLens),
     Layout("Redwood", rgbd_folders.REDWOOD_EXPECTED, rgbd_folders.recognises_redwood, rgbd_folders.Redwood),
+    Layout("ROS bag", bags.EXPECTED, bags.recognises, bags.Bag),
 )  # fmt: skip
 # Asked where none of those fits.
 PLAIN = (

@@ -77,6 +77,34 @@ def rigid(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> 
     return T
 
 
+def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) rotation → (4,) unit quaternion x y z w with w >= 0."""
+    # The largest of the four squares is at least 1/4: dividing by its root loses no digits.
+    squares = np.array(
+        [
+            1 + R[0, 0] - R[1, 1] - R[2, 2],
+            1 - R[0, 0] + R[1, 1] - R[2, 2],
+            1 - R[0, 0] - R[1, 1] + R[2, 2],
+            1 + R[0, 0] + R[1, 1] + R[2, 2],
+        ]
+    )
+    k = int(squares.argmax())
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
+    rows = ((squares[0], xy, xz, x), (xy, squares[1], yz, y), (xz, yz, squares[2], z), (x, y, z, squares[3]))
+    unit: NDArray[np.float64] = np.array(rows[k]) / np.linalg.norm(rows[k])
+    return -unit if unit[3] < 0 else unit
+
+
+def write_tum(path: Path, timestamps_ns: Sequence[int], poses: Sequence[Pose]) -> None:
+    """`timestamp tx ty tz qx qy qz qw` a line, nine decimals: what `read_tum` and the field's tools read."""
+    lines = ["# timestamp tx ty tz qx qy qz qw (T_world_camera)\n"]
+    for stamp, T in zip(timestamps_ns, poses, strict=True):
+        numbers_ = " ".join(f"{value:.9f}" for value in (*T[:3, 3], *quaternion(T[:3, :3])))
+        lines.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {numbers_}\n")
+    path.write_text("".join(lines), encoding="utf-8")
+
+
 def nanoseconds(seconds: str, path: Path, line: int) -> int:
     """Decimal seconds as exact integer nanoseconds (a double holds a Unix stamp only to 0.2 µs)."""
     whole, _, fraction = seconds.partition(".")

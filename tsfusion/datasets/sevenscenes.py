@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Microsoft 7-Scenes, and the 3DMatch data sets that share its layout."""
 
+from functools import lru_cache
 from pathlib import Path
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tsfusion.datasets.base import (
     Frames,
@@ -21,6 +20,7 @@ from tsfusion.datasets.poses import Pose, read_matrix
 from tsfusion.errors import DatasetError
 from tsfusion.frame import Frame
 from tsfusion.keyframe import Intrinsics
+from tsfusion.registration import Registration
 
 EXPECTED = "frame-XXXXXX.{depth.png,pose.txt,color.png|jpg}, in the folder or in its seq-XX folders"
 KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0)  # the release's own figure
@@ -92,7 +92,8 @@ class SevenScenes(Frames):
         depth = read_depth(_file(stem, "depth.png"), invalid=NOT_MEASURED)
         color = None if self._suffix is None else read_color(_file(stem, self._suffix), depth.shape)
         if color is not None and self._register:
-            color = registered(color, depth, self.intrinsics)
+            registration = _registration(self.intrinsics, depth.shape)
+            color = registration.color_of_depth(color, depth * np.float32(0.001))
         return Frame(
             depth=depth,
             depth_scale=0.001,
@@ -103,17 +104,11 @@ class SevenScenes(Frames):
         )
 
 
-def registered(color: NDArray[np.uint8], depth_mm: NDArray[np.uint16], K: Intrinsics) -> NDArray[np.uint8]:
-    """The colour of every depth pixel, seen by the Kinect's colour camera: (H, W, 3) uint8 → the same."""
-    C = KINECT_COLOR
-    z = np.where(depth_mm > 0, depth_mm, 65535).astype(np.float32) * np.float32(0.001)
-    u, v = (np.arange(size, dtype=np.float32) for size in (color.shape[1], color.shape[0]))
-    column = (C.fx / K.fx * (u - K.cx) + C.cx).astype(np.float32) + np.float32(C.fx * KINECT_BASELINE) / z
-    row = np.broadcast_to((C.fy / K.fy * (v - K.cy) + C.cy).astype(np.float32)[:, None], z.shape)
-    moved: NDArray[np.uint8] = cv2.remap(
-        color, column, np.ascontiguousarray(row), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    return moved
+@lru_cache(maxsize=1)
+def _registration(depth: Intrinsics, size: tuple[int, int]) -> Registration:
+    T_color_depth = np.eye(4)
+    T_color_depth[0, 3] = KINECT_BASELINE
+    return Registration(depth, KINECT_COLOR, T_color_depth, size)
 
 
 def _sequences(root: Path) -> list[Path]:
