@@ -81,7 +81,6 @@ BUILT_IN = (
     Layout("Replica", replica.EXPECTED, replica.recognises, replica.Replica),
     Layout("nerfstudio", nerfstudio.EXPECTED, nerfstudio.recognises, nerfstudio.Nerfstudio),
     Layout("LiDAR keyframes", lidar_dump.EXPECTED, lidar_dump.recognises, lidar_dump.LidarDump),
-    Layout("ROS bag", bags.EXPECTED, bags.recognises, bags.Bag),
     Layout("TUM RGB-D", f"{tum.EXPECTED} (also CoRBS, ICL-NUIM)", tum.recognises, tum.TUM),
     Layout("HoloLens", rgbd_folders.HOLOLENS_EXPECTED, rgbd_folders.recognises_hololens,
            rgbd_folders.HoloLens),
