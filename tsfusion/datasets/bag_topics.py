@@ -7,7 +7,7 @@ from itertools import takewhile
 from typing import Any, Literal, NamedTuple
 
 from tsfusion.datasets import bag_messages
-from tsfusion.datasets.bag_cameras import RECTIFIED, Cameras, Picture
+from tsfusion.datasets.bag_cameras import RECTIFIED, Cameras, Picture, Rig, View, picture
 from tsfusion.datasets.bag_messages import CAMERA, CLOUD, COMPRESSED, IMAGE
 from tsfusion.datasets.bag_reader import Recording, Stream, frame_id
 from tsfusion.errors import DatasetError
@@ -23,7 +23,6 @@ _OF_MODALITY: dict[Modality, tuple[str, ...]] = {
     "lidar": ("points_topic",),
 }
 _REGISTERED = re.compile(r"aligned|registered")
-_TRANSPORT = re.compile(r"/(compressed|compressedDepth)$")
 _LEFT_OF = (("right", "left"), ("infra2", "infra1"), ("infra_2", "infra_1"), ("cam1", "cam0"),
             ("image_1", "image_0"), ("image_3", "image_2"), ("camera_1", "camera_0"))  # fmt: skip
 _SENSORS = ((r"realsense|aligned_depth|d4[0-9]5|l515", "realsense"), (r"k4a|kinect2|azure|tof", "tof"))
@@ -36,6 +35,7 @@ class Chosen(NamedTuple):
         main: depth images, left images or point clouds.
         other: colour images of the depth, or right images; None = none.
         frame: that `main` is in; empty = it does not say.
+        view, rig: the cameras of a depth image and its colour, or of a pair.
     """
 
     modality: Modality
@@ -43,8 +43,8 @@ class Chosen(NamedTuple):
     other: Stream | None
     sensor: str
     frame: str
-    intrinsics: Intrinsics | None = None
-    baseline_fx: float | None = None
+    view: View | None = None
+    rig: Rig | None = None
 
 
 class Chooser:
@@ -106,12 +106,8 @@ class Chooser:
         """Every topic of images that can be read."""
         if self._found is None:
             streams = [one for one in self._recording.streams if one.kind in (IMAGE, COMPRESSED)]
-            firsts = [(one, self._recording.first(one)) for one in streams]
-            self._found = [
-                Picture(stream, _TRANSPORT.sub("", stream.topic), first, frame_id(first))
-                for stream, first in firsts
-                if first is not None
-            ]
+            found = [picture(self._recording, one) for one in streams]
+            self._found = [one for one in found if one is not None]
         return self._found
 
     def _picture(self, option: str) -> Picture | None:
@@ -120,7 +116,7 @@ class Chooser:
             return None
         found = next((one for one in self._pictures() if one.stream == stream), None)
         if found is None:
-            raise self._error(f"no image of {stream.topic} can be read")
+            raise self._error(f"the images of {stream.topic} cannot be decoded")
         return found
 
     def _depth(self) -> Chosen | None:
@@ -133,8 +129,9 @@ class Chooser:
             return None
         other = self._color_of(main)
         sensor = next((name for pattern, name in _SENSORS if re.search(pattern, main.base)), "kinect")
-        intrinsics = self._cameras.pinhole(main)
-        return Chosen("depth", main.stream, other and other.stream, sensor, main.frame, intrinsics)
+        return Chosen(
+            "depth", main.stream, other and other.stream, sensor, main.frame, self._cameras.view(main)
+        )
 
     def _color_of(self, depth: Picture) -> Picture | None:
         """The colour images registered to the depth: told, or in its frame, or of a depth that says so."""
@@ -149,13 +146,7 @@ class Chooser:
                     self._path, found[0].base, depth.base, found[0].stream.topic,
                 )  # fmt: skip
             return None
-        try:
-            shape, expected = (
-                bag_messages.color(best.first).shape[:2],
-                bag_messages.depth(depth.first)[0].shape,
-            )
-        except DatasetError as error:
-            raise DatasetError(f"{self._path}: the first image of the camera {error}") from error
+        shape, expected = best.size, depth.size
         if shape == expected:
             return best
         sizes = f"{best.stream.topic} is {shape[1]}×{shape[0]}, its depth {expected[1]}×{expected[0]}"
@@ -178,13 +169,8 @@ class Chooser:
             return None
         if left is None or right is None:
             raise self._error("left_topic and right_topic go together")
-        intrinsics = self._cameras.pinhole(left, pair=True)
-        self._cameras.pinhole(right, pair=True)
-        baseline_fx = self._cameras.camera(left).P[0, 3] - self._cameras.camera(right).P[0, 3]
-        if not baseline_fx > 0:
-            raise self._error(f"the CameraInfo of {right.stream.topic} has no baseline in P[0, 3]")
         return Chosen(
-            "stereo", left.stream, right.stream, "stereo", left.frame, intrinsics, float(baseline_fx)
+            "stereo", left.stream, right.stream, "stereo", left.frame, rig=self._cameras.rig(left, right)
         )
 
     def _pair(self, right: Picture) -> tuple[Picture, Picture] | None:

@@ -55,7 +55,8 @@ class Bag(Frames):
         world_frame: default the root of the sensor's tree, or the frame of the pose topic.
         body_frame: the frame whose poses the pose topic tells; default its `child_frame_id`, or the sensor's.
         intrinsics: instead of a CameraInfo's.
-        rectified: the images are rectified whatever their topic is called, and `P` is theirs.
+        rectified: whether the images are rectified, so that `P` is theirs; default where the topic's name
+            has `rect`. Others are undistorted or rectified here (colour by its depth's camera).
         max_difference_s: between a depth image and its colour (default 20 ms), or left and right (5 ms).
         max_gap_s: between the two poses interpolated, seconds.
         posed: leave out frames without a pose; otherwise they have `T_world_camera` None.
@@ -165,6 +166,10 @@ class Bag(Frames):
         """Find the frames' poses; leave out those without."""
         assert self.timestamps_ns is not None
         self._poses = [at(stamp) for stamp in self.timestamps_ns.tolist()]
+        rig = self._chosen.rig
+        if rig is not None and rig.rectifier is not None:
+            turned = rig.rectifier.T_left_rectified
+            self._poses = [None if pose is None else pose @ turned for pose in self._poses]
         kept = [i for i, pose in enumerate(self._poses) if pose is not None or not posed]
         if len(kept) < len(self._poses):
             self.skipped["without a pose in time"] = len(self._poses) - len(kept)
@@ -190,23 +195,35 @@ class Bag(Frames):
             beside = None if other is None else self._recording.read(other)
             if chosen.modality == "stereo":
                 return self._pair_frame(content, beside, common)
-            depth, scale = bag_messages.depth(content)
-            color = None if beside is None else bag_messages.color(beside)
+            return self._depth_frame(content, beside, common)
         except DatasetError as error:
             raise DatasetError(
                 f"{self._recording.path}: message {index} of {chosen.main.topic} {error}"
             ) from error
-        return Frame(depth=depth, depth_scale=scale, color=color, intrinsics=chosen.intrinsics, **common)
+
+    def _depth_frame(self, content: Any, beside: Any, common: dict[str, Any]) -> Frame:
+        view = self._chosen.view
+        assert view is not None
+        depth, scale = bag_messages.depth(content)
+        color = None if beside is None else bag_messages.color(beside)
+        if view.undistorter is not None:
+            depth = view.undistorter.depth(depth)
+            color = None if color is None else view.undistorter.image(color)
+        return Frame(depth=depth, depth_scale=scale, color=color, intrinsics=view.intrinsics, **common)
 
     def _pair_frame(self, left: Any, right: Any, common: dict[str, Any]) -> Frame:
+        rig = self._chosen.rig
+        assert rig is not None
+        pair = bag_messages.gray(left), bag_messages.gray(right)
+        color = bag_messages.color(left) if self._with_color else None
+        if rig.rectifier is not None:
+            if color is not None:
+                color = rig.rectifier.pair(color, color)[0]
+            pair = rig.rectifier.pair(*pair)
         return Frame(
-            left=bag_messages.gray(left),
-            right=bag_messages.gray(right),
-            color=bag_messages.color(left) if self._with_color else None,
-            intrinsics=self._chosen.intrinsics,
-            baseline_fx=self._chosen.baseline_fx,
-            **common,
-        )
+            left=pair[0], right=pair[1], color=color,
+            intrinsics=rig.intrinsics, baseline_fx=rig.baseline_fx, **common,
+        )  # fmt: skip
 
 
 _CHECKS: dict[str, Callable[[Any], None]] = {

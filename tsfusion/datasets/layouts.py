@@ -73,7 +73,6 @@ class Found(NamedTuple):
 
 # The first that fits is taken: the more specific stand first.
 BUILT_IN = (
-    Layout("ROS bag", bags.EXPECTED, bags.recognises, bags.Bag),
     Layout("EuRoC", euroc.EXPECTED, euroc.recognises, euroc.EuRoC),
     Layout("KITTI odometry", kitti.EXPECTED, kitti.recognises, kitti.open_kitti),
     Layout("KITTI raw", kitti_raw.EXPECTED, kitti_raw.recognises, kitti_raw.KITTIRaw),
@@ -82,10 +81,12 @@ BUILT_IN = (
     Layout("Replica", replica.EXPECTED, replica.recognises, replica.Replica),
     Layout("nerfstudio", nerfstudio.EXPECTED, nerfstudio.recognises, nerfstudio.Nerfstudio),
     Layout("LiDAR keyframes", lidar_dump.EXPECTED, lidar_dump.recognises, lidar_dump.LidarDump),
+    Layout("ROS bag", bags.EXPECTED, bags.recognises, bags.Bag),
     Layout("TUM RGB-D", f"{tum.EXPECTED} (also CoRBS, ICL-NUIM)", tum.recognises, tum.TUM),
     Layout("HoloLens", rgbd_folders.HOLOLENS_EXPECTED, rgbd_folders.recognises_hololens,
            rgbd_folders.HoloLens),
     Layout("Redwood", rgbd_folders.REDWOOD_EXPECTED, rgbd_folders.recognises_redwood, rgbd_folders.Redwood),
+    Layout("ROS bag", bags.EXPECTED, bags.recognises, bags.Bag),
 )  # fmt: skip
 # Asked where none of those fits.
 PLAIN = (
@@ -226,5 +227,5 @@ def _unrecognised(root: Path, several: list[Path]) -> str:
             f"{root} is not a folder, nor a file that stands for a dataset (an archive, a transforms.json, "
             "a trajectory.log, a file of a recognised folder)"
         )
-    known = "; ".join(f"{layout.name}: {layout.description}" for layout in layouts())
-    return f"{root} is in no layout known here. Expected one of: {known}; {': '.join(SYNTHETIC)}"
+    known = ", ".join(layout.name for layout in layouts())
+    return f"{root} is in no layout known here: {known}; `tsfusion datasets` says what each expects"

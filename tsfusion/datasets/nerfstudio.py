@@ -201,8 +201,8 @@ def _resized(camera: Camera, shape: tuple[int, ...], where: str) -> Camera:
     """The camera for images of another size."""
     if abs(shape[0] / camera.size[0] - shape[1] / camera.size[1]) > 0.01:
         raise DatasetError(
-            f"{where}: an image of {shape[1]}×{shape[0]}, but the camera is "
-            f"{camera.size[1]}×{camera.size[0]}; expected the same shape"
+            f"{where}: image {shape[1]}×{shape[0]}, but camera {camera.size[1]}×{camera.size[0]}; "
+            "expected the same shape"
         )
     intrinsics = camera.intrinsics.scaled(shape[1] / camera.size[1])
     return Camera(intrinsics, (shape[0], shape[1]), camera.model, camera.distortion)

@@ -123,9 +123,10 @@ class Places:
         self._seen[:, slot >> 3] &= np.uint8(255 ^ 128 >> (slot & 7))
         del self.views[number]
 
-    def alike(self, view: View, *, before: int, count: int = 4) -> list[int]:
-        """The places with numbers below `before` that look most like the view, best first."""
-        slots = np.flatnonzero((self._numbers >= 0) & (self._numbers < before))
+    def alike(self, view: View, *, before: int | None = None, count: int = 4) -> list[int]:
+        """The places (with numbers below `before`) that look most like the view, best first."""
+        allowed = self._numbers >= 0
+        slots = np.flatnonzero(allowed if before is None else allowed & (self._numbers < before))
         scores = self._count(view)[slots] / self._votes[slots]
         best = np.argsort(-scores, kind="stable")[:count]
         return [int(self._numbers[slots[i]]) for i in best if scores[i] > 0]
