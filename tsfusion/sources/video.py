@@ -257,7 +257,9 @@ def _why(place: str, file: bool) -> str:
     device = Path(f"/dev/video{place}" if place.isdigit() else place)
     if not device.exists():
         there = ", ".join(sorted(map(str, Path("/dev").glob("video*"))))
-        return f"there is no {device}; expected one of: {there or 'no camera is plugged in'}"
+        return f"there is no {device}; " + (
+            f"expected one of {there}" if there else "no camera is plugged in"
+        )
     if not os.access(device, os.R_OK | os.W_OK):
         return f"no permission for {device}; add the user to its group (sudo usermod -aG video $USER)"
     return (
