@@ -2,13 +2,13 @@
 """A recorded dataset as a source of frames."""
 
 import dataclasses
-import threading
 import time
 from collections.abc import Iterator
 from types import TracebackType
 
 from tsfusion.datasets.base import Dataset, frame_of
 from tsfusion.frame import Frame
+from tsfusion.sources.live import Closed
 
 NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a second
 
@@ -25,7 +25,7 @@ class Recorded:
         self.name, self.sensor, self.skipped = dataset.name, dataset.sensor, dataset.skipped
         self.length: int | None = len(dataset)
         self._dataset, self._rate = dataset, rate
-        self._closed = threading.Event()
+        self._closed = Closed()
 
     def __iter__(self) -> Iterator[Frame]:
         """Frames with the recording's times, or nominal ones where it has none."""
