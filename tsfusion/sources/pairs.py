@@ -87,7 +87,15 @@ def rectifier(calibration: str | Path, *, size: Size | None) -> Rectifier:
         raise SourceError(f"calibration: {error}") from error
 
 
-def frame_of(left: NDArray[Any], right: NDArray[Any], pairs: Pairs, *, sensor: str, **stamps: int) -> Frame:
+def frame_of(
+    left: NDArray[Any],
+    right: NDArray[Any],
+    pairs: Pairs,
+    *,
+    sensor: str,
+    timestamp_ns: int,
+    captured_ns: int,
+) -> Frame:
     """Raw images, grey or BGR, (H, W) or (H, W, 3) uint8, as a rectified frame with the left one's colour."""
     left, right = pairs.pair(left, right)
     return Frame(
@@ -97,8 +105,8 @@ def frame_of(left: NDArray[Any], right: NDArray[Any], pairs: Pairs, *, sensor: s
         color=left if left.ndim == 3 else np.repeat(left[:, :, None], 3, axis=2),
         intrinsics=pairs.intrinsics,
         baseline_fx=pairs.baseline_fx,
-        timestamp_ns=stamps["timestamp_ns"],
-        captured_ns=stamps["captured_ns"],
+        timestamp_ns=timestamp_ns,
+        captured_ns=captured_ns,
     )
 
 

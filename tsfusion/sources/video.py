@@ -67,7 +67,7 @@ class StereoVideo(Live):
             )
         super().__init__(f"camera {place}", sensor)
         self._place, self._deadline = str(place), deadline
-        self._file = _is_file(self._place)
+        self._file, self._reading = _is_file(self._place), threading.RLock()
         pairs = None if calibration is None else _when_it_says(calibration, size)
         wanted = size or (None if pairs is None else pairs.size)
         self._capture = _open(self._place, self._file, wanted, fps, deadline)
@@ -96,17 +96,19 @@ class StereoVideo(Live):
         if self._grabber is not None:
             self._grabber.close()
         else:
-            self._capture.release()
+            with self._reading:
+                self._capture.release()
 
     def _all(self) -> Iterator["Picture"]:
         count, fps = 0, self._capture.get(cv2.CAP_PROP_FPS)
         period = round(1e9 / fps) if fps > 0 else 1  # a time of 0 would mean that it is unknown
         while not self._closed.is_set():
-            there, image = self._capture.read()
+            with self._reading:
+                there, image = self._capture.read()
+                since_start = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
             if not there:
                 break
             count += 1
-            since_start = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
             yield Picture(image, since_start + period, time.monotonic_ns())
         if not count and not self._closed.is_set():
             raise SourceError(f"{self._place} holds no pictures that can be decoded; expected a video")
