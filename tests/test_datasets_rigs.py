@@ -10,8 +10,10 @@ import cv2
 import numpy as np
 import pytest
 import recordings
+import rig_recordings
 from geometry import move, warp_residual
-from recordings import at, circle, fits_together
+from recordings import at, fits_together
+from rig_recordings import circle
 
 from tsfusion.calibration import Camera
 from tsfusion.datasets import EuRoC, KITTIRaw, describe, open_dataset
@@ -27,7 +29,7 @@ CAM0, CAM1, TRUTH = "mav0/cam0", "mav0/cam1", "mav0/state_groundtruth_estimate0/
 
 @pytest.fixture(scope="module", params=["radial-tangential", "equidistant"])
 def euroc_root(request, tmp_path_factory):
-    return recordings.euroc(tmp_path_factory.mktemp("euroc") / request.param, request.param)
+    return rig_recordings.euroc(tmp_path_factory.mktemp("euroc") / request.param, request.param)
 
 
 @pytest.fixture
@@ -38,7 +40,7 @@ def euroc(euroc_root, tmp_path):
 
 @pytest.fixture(scope="module")
 def drive_root(tmp_path_factory):
-    return recordings.kitti_raw(tmp_path_factory.mktemp("kitti"), cameras=("00", "01", "02", "03"))
+    return rig_recordings.kitti_raw(tmp_path_factory.mktemp("kitti"), cameras=("00", "01", "02", "03"))
 
 
 @pytest.fixture
@@ -70,7 +72,7 @@ def test_euroc_frames_are_pairs_with_stamps(euroc_root):
     assert dataset.name == f"EuRoC {euroc_root.name}"
     frame = dataset.frame(1)
     assert (frame.kind, frame.shape) == ("pair", (240, 376))
-    assert frame.timestamp_ns == recordings.FIRST_NS + 50_000_000
+    assert frame.timestamp_ns == rig_recordings.FIRST_NS + 50_000_000
     assert frame.baseline_fx == pytest.approx(dataset.intrinsics.fx * np.linalg.norm((0.06, 0.002, -0.003)))
     assert describe(dataset).endswith("3 stereo pairs 376×240 at 20 Hz, all with poses")
 
@@ -118,7 +120,7 @@ def put(name: str, text: str) -> Change:
         (replace(f"{CAM0}/sensor.yaml", "resolution: [376, 240]", "resolution: [752, 480]"),
          r"the camera was calibrated for images of 752×480, got 376×240"),
         (replace(f"{CAM0}/data.csv", ",", ";"), r"cam0/data\.csv:2: .*; expected `ns,file` a line"),
-        (replace(TRUTH, f"{recordings.FIRST_NS},", "soon,"), r"timestamp must be nanoseconds, got 'soon'"),
+        (replace(TRUTH, f"{rig_recordings.FIRST_NS},", "soon,"), r"must be nanoseconds, got 'soon'"),
         (replace(TRUTH, ",0,0,0,0,0,0,0,0,0", ""), None),
         (put(TRUTH, "1,2,3\n"), r"data\.csv:1: 2 numbers, expected 7"),
         (put(TRUTH, "1,2,3,4,5,6,7,8\n"), r"quaternion must have length 1"),
@@ -188,7 +190,7 @@ def test_kitti_raw_numbers_agree_with_pykittis_own(drive_root):
     import pykitti
 
     with contextlib.redirect_stdout(None):
-        theirs = pykitti.raw(str(drive_root.parents[1]), recordings.DAY, "0001")
+        theirs = pykitti.raw(str(drive_root.parents[1]), rig_recordings.DAY, "0001")
     grey, color, lidar = (
         KITTIRaw(drive_root, **options) for options in ({}, {"cameras": "color"}, {"modality": "lidar"})
     )
