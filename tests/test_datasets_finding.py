@@ -167,16 +167,14 @@ def test_a_broken_archive_leaves_nothing_behind(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zip", "b.tgz"]
 
 
-def test_an_archive_cannot_write_beside_its_folder(tmp_path):
-    place = tmp_path / "downloads"
-    place.mkdir()
-    with zipfile.ZipFile(place / "a.zip", "w") as packed:
-        packed.writestr("..\\..\\out.txt", "x")
-        packed.writestr("/etc/out.txt", "x")
-    with pytest.raises(DatasetError, match="is in no layout known here"):
-        open_dataset(place / "a.zip", unpack=True)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["downloads"]
-    assert sorted(str(p.relative_to(place)) for p in place.rglob("*.txt")) == ["a/etc/out.txt", "a/out.txt"]
+@pytest.mark.parametrize("name", ["..\\..\\out.txt", "/etc/out.txt", "C:\\out.txt"])
+def test_an_archive_cannot_write_beside_its_folder(tmp_path, name):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as packed:
+        packed.writestr("in.txt", "x")
+        packed.writestr(name, "x")
+    with pytest.raises(DatasetError, match=r"cannot unpack .*a\.zip: .*leads out of the archive's folder"):
+        open_dataset(tmp_path / "a.zip", unpack=True)
+    assert [path.name for path in tmp_path.rglob("*")] == ["a.zip"]
 
 
 def test_a_file_stands_for_its_folder(tmp_path):
