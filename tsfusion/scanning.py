@@ -215,7 +215,7 @@ def _warn_of_another_world(place: _Place) -> None:
         status = fetch_status(link.address, control=link.control, map_name=link.map, timeout=2.0, keys=keys)
         if status.keyframes_durable:
             log.warning(
-                "the map %s has %d keyframes already: a scan that localises itself begins a world of its own; "
+                "the map %s has %d keyframes already: a scan that localises itself begins its own world; "
                 "give it a map of its own (--map NAME)", link.map, status.keyframes_durable,
             )  # fmt: skip
 
