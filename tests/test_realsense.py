@@ -234,6 +234,36 @@ def test_depth_is_brought_onto_colour() -> None:
     assert (frame.color == wall["color"]).all()
 
 
+def test_a_distorted_colour_camera_is_flattened() -> None:
+    """Each pixel shows what librealsense says the camera sees in its direction."""
+    coefficients = (-0.056, 0.066, 0.0004, -0.0006, -0.02)  # about a D455's
+    camera = Camera(coefficients=coefficients)
+    column, row = np.meshgrid(np.arange(W), np.arange(H))
+    ramp = np.stack([column * 3, row * 4, column * 0], axis=2).astype(np.uint8)
+    depth = (1000 + column * 10).astype(np.uint16)
+    with RealSense(device=camera.device) as source, showing(camera, shown={"depth": depth, "color": ramp}):
+        frame = next(iter(source))
+    own = camera.profiles["color"].as_video_stream_profile().get_intrinsics()
+    flat = frame.intrinsics
+    assert frame.color is not None
+    assert frame.depth_m is not None
+    assert flat is not None
+    moved = 0.0
+    for u, v in [(0, 0), (W - 1, 0), (W - 1, H - 1), (0, H - 1), (20, 10), (60, 45), (40, 30)]:
+        ray = [(u - flat.cx) / flat.fx, (v - flat.cy) / flat.fy, 1.0]
+        x, y = rs.rs2_project_point_to_pixel(own, ray)
+        assert -0.01 <= x <= W - 0.99  # every pixel was seen
+        assert -0.01 <= y <= H - 0.99
+        assert frame.color[v, u, :2] == pytest.approx([3 * x, 4 * y], abs=2)
+        z = frame.depth_m[v, u]
+        if z > 0:  # of the depth pixel that sees this direction, a pixel or two beside
+            ideal = ray[0] * FX + (W - 1) / 2
+            assert z == pytest.approx(1 + 0.01 * ideal, abs=0.025)
+        moved = max(moved, abs(x - (ray[0] * own.fx + own.ppx)))
+    assert moved > 0.3
+    assert (frame.depth_m > 0).mean() > 0.9
+
+
 def test_the_infrared_pair() -> None:
     camera = Camera()
     with RealSense(device=camera.device, images="infrared") as source, showing(camera):
@@ -338,7 +368,8 @@ def test_ctrl_c_comes_through() -> None:
         "except KeyboardInterrupt:\n"
         "    sys.exit(7)\n"
     )
-    done = subprocess.run([sys.executable, "-c", program], timeout=60, check=False)
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=Path(__file__).parents[1], timeout=60, check=False)
     assert done.returncode == 7
 
 

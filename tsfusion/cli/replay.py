@@ -96,14 +96,7 @@ def replay(
 
 def open_recording(path: Path, *, unpack: bool = False, **given: Any) -> "Dataset":
     """A dataset, or a journal; `given` are settings of a dataset, None = left out."""
-    from tsfusion import maps
-
-    if (
-        path.suffix == ".mcap"
-        or any(path.glob("*.mcap"))
-        or any(path.glob("journal/*.mcap"))
-        or maps.is_state(path)
-    ):
+    if _is_journal(path):
         from tsfusion.errors import DatasetError
         from tsfusion.recording import Recording
 
@@ -116,6 +109,16 @@ def open_recording(path: Path, *, unpack: bool = False, **given: Any) -> "Datase
     dataset = open_dataset(path, unpack=unpack, **given)
     typer.echo(f"found: {describe(dataset)}", err=True)
     return dataset
+
+
+def _is_journal(path: Path) -> bool:
+    """Whether it is a journal of ours, or a place with one; a ROS recording may be an `.mcap` too."""
+    from tsfusion import maps
+    from tsfusion.datasets import bags
+
+    if maps.is_state(path) or any(path.glob("journal/*.mcap")):
+        return True
+    return (path.suffix == ".mcap" or any(path.glob("*.mcap"))) and not bags.recognises(path)
 
 
 @options.takes_map_settings

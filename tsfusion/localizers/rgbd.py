@@ -42,6 +42,8 @@ class RGBD:
     Gauss-Newton over their reprojection and the distances of the frame's points to the keyframe's planes.
     """
 
+    absolute = False
+
     def __init__(self) -> None:
         self._next = 0
         self._kept: deque[View] = deque(maxlen=_KEPT)

@@ -60,6 +60,8 @@ class Stereo:
     that stands still does not drift. (Keyframes of several metres were worse in turns.)
     """
 
+    absolute = False
+
     def __init__(self) -> None:
         self._anchors = Anchors()
         self._rectification = Rectification()

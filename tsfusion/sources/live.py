@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
 """What all live sources do alike: count what they leave out, and close."""
 
-import threading
+import queue
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from contextlib import suppress
 from types import TracebackType
 from typing import TypeVar
 
@@ -12,6 +13,30 @@ from tsfusion.frame import Frame
 
 SECOND = 1_000_000_000  # nanoseconds
 _Self = TypeVar("_Self", bound="Live")
+
+
+class Closed:
+    """A `threading.Event` that a signal's handler may set while its own thread waits for it."""
+
+    def __init__(self) -> None:
+        self._set = False
+        self._told: queue.SimpleQueue[None] = queue.SimpleQueue()  # its `put` is reentrant; a lock is not
+
+    def set(self) -> None:
+        """From now on `is_set`, and whoever waits is woken."""
+        self._set = True
+        self._told.put(None)
+
+    def is_set(self) -> bool:
+        """Whether it was set."""
+        return self._set
+
+    def wait(self, timeout: float) -> bool:
+        """Whether it is set within `timeout` seconds; for one thread at a time."""
+        if not self._set:
+            with suppress(queue.Empty):
+                self._told.get(timeout=timeout)
+        return self._set
 
 
 class Live(ABC):
@@ -22,7 +47,7 @@ class Live(ABC):
     def __init__(self, name: str, sensor: str) -> None:
         self.name, self.sensor = name, sensor
         self.skipped: dict[str, int] = {}
-        self._closed = threading.Event()
+        self._closed = Closed()
 
     @abstractmethod
     def __iter__(self) -> Iterator[Frame]:

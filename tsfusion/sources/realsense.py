@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tsfusion.calibration import Camera, Undistorter
 from tsfusion.errors import InvalidConfig, MissingDependency, SourceError
 from tsfusion.frame import Frame
 from tsfusion.keyframe import Intrinsics
@@ -16,6 +17,12 @@ from tsfusion.sources.live import Live, monotonic_of
 
 RECORDINGS = (".db3", ".bag")
 
+_LENSES = {
+    "brown_conrady": "radtan",
+    "modified_brown_conrady": "radtan",
+    "inverse_brown_conrady": "radtan",
+    "kannala_brandt4": "equidistant",
+}
 _ADVICE = "Close other programs that use it, or try another cable and USB 3 port"
 _SLICE_MS = 100  # between two looks at whether the source was closed
 _APART = 0.75  # of a period: images further apart are not of one exposure
@@ -133,7 +140,12 @@ class RealSense(Live):
             baseline = feeds.baseline(self._rs, self._feed.device)
             self.sensor = "tof" if baseline is None else "realsense"
             self._align = self._rs.align(stream.color)
-        self.intrinsics = _pinhole(shown, self.name)
+        self._undistorter = _undistorter(shown, self.name)
+        if self._undistorter is None:
+            camera = shown.get_intrinsics()
+            self.intrinsics = Intrinsics(camera.fx, camera.fy, camera.ppx, camera.ppy)
+        else:
+            self.intrinsics = self._undistorter.intrinsics
         self.baseline_fx = None if baseline is None else baseline * left.get_intrinsics().fx
 
     def _depth(self, frames: Any) -> Frame | None:
@@ -145,9 +157,13 @@ class RealSense(Live):
         if self._color:
             aligned = self._align.process(frames)
             depth, color = aligned.get_depth_frame(), feeds.bgr(self._rs, aligned.get_color_frame())
+        image = np.array(depth.get_data())
+        if self._undistorter is not None:
+            image = self._undistorter.depth(image)
+            color = None if color is None else self._undistorter.image(color)
         return Frame(
             sensor=self.sensor,
-            depth=np.array(depth.get_data()),
+            depth=image,
             depth_scale=round(depth.get_units(), 9),  # it comes in single precision
             color=color,
             intrinsics=self.intrinsics,
@@ -201,14 +217,23 @@ class RealSense(Live):
         return stamp, captured
 
 
-def _pinhole(profile: Any, name: str) -> Intrinsics:
+def _undistorter(profile: Any, name: str) -> Undistorter | None:
+    """For colour cameras that are not corrected in the camera (D455, D405); None for all others.
+
+    Librealsense projects with the forward polynomial in all three Brown-Conrady models (`rs2_project`).
+    """
     camera = profile.get_intrinsics()
-    if any(camera.coeffs):
+    if not any(camera.coeffs):
+        return None
+    model = _LENSES.get(camera.model.name)
+    if model is None or profile.stream_type().name == "infrared":
         raise SourceError(
             f"{name}: the {profile.stream_type().name} images are distorted ({camera.model.name} "
-            f"{list(camera.coeffs)}); expected images without distortion"
+            f"{list(camera.coeffs)}), which is not expected of a RealSense's depth or infrared images"
         )
-    return Intrinsics(camera.fx, camera.fy, camera.ppx, camera.ppy)
+    K = (camera.fx, camera.fy, camera.ppx, camera.ppy)
+    coefficients = camera.coeffs[:4] if model == "equidistant" else camera.coeffs
+    return Undistorter(Camera.named(K, (camera.height, camera.width), model, coefficients))
 
 
 def _pyrealsense2() -> Any:
