@@ -19,10 +19,11 @@ from tsfusion.localizers.posegraph import Matrix
 
 _GAP = (10, 3.0)  # keyframes, and metres and radians of way: what is younger is no loop
 _CHECKS = 4  # views compared with each keyframe's
-_ENOUGH = 2  # loops of one keyframe
+_ENOUGH = 2  # loops of one keyframe; one if it says what was known
 _NEAR = (1.0, np.radians(30))  # metres and radians: places worth a look whatever they look like
 _PATIENCE = 10  # keyframes that loops which change little wait for the next optimisation
 _CHANGE = (0.04, np.radians(1.0))  # of metres and radians: a loop that changes more does not wait
+_THRIFT = 50  # with so many keyframes an optimisation costs as much as finding one's loops
 _RELOCALISED = 30  # matches that must agree where no odometry speaks for a place
 
 log = logging.getLogger(__name__)
@@ -44,7 +45,7 @@ class LoopClosing:
 
     Poses never jump; `corrections()` says what they should have been. Each tracking keyframe with an image
     and depth costs about 30 CPU ms, plus 0.15 ms a keyframe of the graph when it is optimised, which with
-    1,000 keyframes is every tenth time at most. Memory: 52 KB a place, of which at most `capacity`
+    1,000 keyframes is every twentieth time at most. Memory: 52 KB a place, of which at most `capacity`
     are remembered (then the one that is nearest to its neighbours goes), and 2 KB a tracking keyframe.
     LiDAR frames have no image: they are passed through, and no loop is found.
 
@@ -137,7 +138,7 @@ class LoopClosing:
             self._due |= bool(believed)
             waited = self.counts.keyframes - self._optimised_at
             patience = 0 if any(map(self._changes_much, believed)) else _PATIENCE
-            if self._due and waited >= max(patience, self.counts.keyframes // 100):
+            if self._due and waited >= max(patience, self.counts.keyframes // _THRIFT):
                 self._optimise()
             self._remember(pose.anchor, seen)
 
@@ -154,7 +155,7 @@ class LoopClosing:
             if result.refused is None and result.T_old_new is not None:
                 self.counts.verified += 1
                 found.append(Loop(place, number, result.T_old_new, result.sigma))
-                if len(found) == _ENOUGH:
+                if len(found) == _ENOUGH or not self._changes_much(found[-1]):
                     break
         return found
 
