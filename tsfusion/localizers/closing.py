@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Loop closure around any localizer that follows images with depth."""
 
+import itertools
 import logging
 from dataclasses import dataclass
 
@@ -16,12 +17,13 @@ from tsfusion.localizers.odometry import Chain, Drift
 from tsfusion.localizers.places import CAPACITY, Places, View, view
 from tsfusion.localizers.posegraph import Matrix
 
-_GAP = 30  # keyframes: the youngest ones are no loops
+_GAP = (10, 3.0)  # keyframes, and metres and radians of way: what is younger is no loop
 _CHECKS = 4  # views compared with each keyframe's
-_ENOUGH = 2  # loops of one keyframe
+_ENOUGH = 2  # loops of one keyframe; one if it says what was known
 _NEAR = (1.0, np.radians(30))  # metres and radians: places worth a look whatever they look like
 _PATIENCE = 10  # keyframes that loops which change little wait for the next optimisation
-_CHANGE = (0.02, np.radians(0.5))  # of metres and radians: a loop that changes more does not wait
+_CHANGE = (0.04, np.radians(1.0))  # of metres and radians: a loop that changes more does not wait
+_THRIFT = 50  # with so many keyframes an optimisation costs as much as finding one's loops
 _RELOCALISED = 30  # matches that must agree where no odometry speaks for a place
 
 log = logging.getLogger(__name__)
@@ -42,8 +44,8 @@ class LoopClosing:
     """Passes a localizer's poses through, and finds out where the sensor has been before.
 
     Poses never jump; `corrections()` says what they should have been. Each tracking keyframe with an image
-    and depth costs about 25 CPU ms, plus 0.15 ms a keyframe of the graph when it is optimised, which is at
-    most every tenth keyframe while loops change little. Memory: 52 KB a place, of which at most `capacity`
+    and depth costs about 30 CPU ms, plus 0.15 ms a keyframe of the graph when it is optimised, which with
+    1,000 keyframes is every twentieth time at most. Memory: 52 KB a place, of which at most `capacity`
     are remembered (then the one that is nearest to its neighbours goes), and 2 KB a tracking keyframe.
     LiDAR frames have no image: they are passed through, and no loop is found.
 
@@ -134,16 +136,17 @@ class LoopClosing:
             believed = self.consensus.hear(self._loops(pose.anchor, seen))
             self.counts.closed += len(believed)
             self._due |= bool(believed)
-            if self._due and (self._waited() or any(map(self._changes_much, believed))):
+            waited = self.counts.keyframes - self._optimised_at
+            patience = 0 if any(map(self._changes_much, believed)) else _PATIENCE
+            if self._due and waited >= max(patience, self.counts.keyframes // _THRIFT):
                 self._optimise()
             self._remember(pose.anchor, seen)
 
     def _loops(self, number: int, seen: View) -> list[Loop]:
         """Loops from a new keyframe to places that check out."""
-        numbers = list(self._chain.poses)
-        if len(numbers) <= _GAP:
+        before = self._old_enough(number)
+        if before is None:
             return []
-        before = numbers[-_GAP - 1] + 1
         likely = [*self._nearby(number, before)[:1], *self._places.alike(seen, before=before, count=_CHECKS)]
         found: list[Loop] = []
         for place in list(dict.fromkeys(likely))[:_CHECKS]:
@@ -151,8 +154,16 @@ class LoopClosing:
             self.counts.checks += 1
             if result.refused is None and result.T_old_new is not None:
                 self.counts.verified += 1
-                found.append(Loop(place, number, result.T_old_new, max(0.01, 0.01 * result.depth)))
-        return found[:_ENOUGH]
+                found.append(Loop(place, number, result.T_old_new, result.sigma))
+                if len(found) == _ENOUGH or not self._changes_much(found[-1]):
+                    break
+        return found
+
+    def _old_enough(self, number: int) -> int | None:
+        """Keyframes below this number may be loops; None = no one is old enough."""
+        ways = self._chain.ways
+        earlier = itertools.islice(reversed(ways), _GAP[0], None)
+        return next((other + 1 for other in earlier if ways[number] - ways[other] >= _GAP[1]), None)
 
     def _nearby(self, number: int, before: int) -> list[int]:
         """Places that by the corrected poses show the same, the nearest first."""
@@ -165,10 +176,6 @@ class LoopClosing:
         cosine = (np.einsum("nij,ij->n", poses[:, :3, :3], here[:3, :3]) - 1) / 2
         turned = np.arccos(np.clip(cosine, -1, 1)) / _NEAR[1]
         return [places[i] for i in np.argsort(away + turned) if max(away[i], turned[i]) < 1]
-
-    def _waited(self) -> bool:
-        count = self.counts.keyframes
-        return count - self._optimised_at >= max(_PATIENCE, count // 100)
 
     def _changes_much(self, loop: Loop) -> bool:
         T = se3.inverse(self._corrected[loop.old]) @ self._corrected[loop.new]

@@ -12,7 +12,8 @@ from tsfusion.localizers.posegraph import Edge, Matrix, information
 
 GATE = 6.0  # standard deviations by which a loop may contradict what was known
 _AMBIGUOUS = 12.0  # deviations up to which another explanation is not ruled out
-_SUPPORT = 3  # keyframes whose loops must agree before the first is believed
+_SUPPORT = 3  # keyframes whose loops must agree before the first is believed,
+_EXPECTED = 3.0  # or one less within so many deviations
 _WINDOW = 15  # keyframes for which a loop waits for support
 _TWINS = 4  # look-alikes remembered of a place
 _ROTATION = 0.005  # radians of error of a loop
@@ -46,7 +47,8 @@ class Consensus:
     2. No other explanation may remain: a view that also fits a place elsewhere, or whose place was seen to
        look like another one (a *twin*), is believed only where odometry rules the other out.
     3. Loops of three keyframes near each other must agree pairwise (Mangelson et al., "Pairwise Consistent
-       Measurement Set Maximization", 2018) before any is; later ones agree with those by rule 1.
+       Measurement Set Maximization", 2018) before any is, or of two where odometry expects them there;
+       later ones agree with those by rule 1.
     """
 
     def __init__(self, chain: Chain) -> None:
@@ -115,7 +117,8 @@ class Consensus:
             return [loop]
         self._waiting = [w for w in self._waiting if self._age(w, loop) <= _WINDOW]
         friends = [w for w in self._waiting if self._agree(w, loop)]
-        if len({loop.new, *(friend.new for friend in friends)}) < _SUPPORT:
+        expected = self.deviation(loop.old, loop.new, loop.T_old_new, loop.covariance) <= _EXPECTED
+        if len({loop.new, *(friend.new for friend in friends)}) < _SUPPORT - expected:
             self._waiting.append(loop)
             return []
         self._waiting = [w for w in self._waiting if w not in friends]

@@ -34,14 +34,14 @@ class Check:
             found.
         refused: why they are not taken for the same place; None = they are.
         inliers: matches that agree with the pose.
-        depth: of them, metres, the median.
+        sigma: metres by which the pose may be off.
         depths: how the dense depths agree; None where not compared.
     """
 
     T_old_new: se3.Transform | None = None
     refused: str | None = None
     inliers: int = 0
-    depth: float = 0.0
+    sigma: float = 0.0
     depths: Agreement | None = None
 
 
@@ -75,7 +75,8 @@ def check(old: View, new: View) -> Check:
     T = refined(old, new, T, first, second)
     depths = agreement(old, new, T)
     refused = _contradiction(depths, measured=old.measured and new.measured)
-    return Check(T_old_new=T, refused=refused, inliers=count, depth=depth, depths=depths)
+    sigma = max(0.01, 0.01 * depth, 0.5 * max(old.noise, new.noise) * depth**2)
+    return Check(T_old_new=T, refused=refused, inliers=count, sigma=sigma, depths=depths)
 
 
 def matches(old: NDArray[np.uint8], new: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
