@@ -620,6 +620,21 @@ def test_the_registered_depth_and_its_colour_are_chosen(tmp_path: Path) -> None:
     assert Bag(path, posed=False, color=False).frame(0).color is None
 
 
+@pytest.mark.parametrize("units", ["0.000250", 0.00025])
+def test_a_recording_of_librealsense_has_its_own_depth_units(tmp_path: Path, units: Any) -> None:
+    place = "/device_0/sensor_0"
+    with writing(tmp_path, "sqlite3" if isinstance(units, str) else "ros1") as (bag, path):
+        kind = "std_msgs/msg/String" if isinstance(units, str) else "std_msgs/msg/Float32"
+        bag.write(f"{place}/option/Depth_Units/value", bag.make(kind, data=units), T0)
+        bag.image(f"{place}/Depth_0/image/data", wall().measurement, "mono16", T0, "Depth")
+        bag.camera_info(f"{place}/Depth_0/info/camera_info", CAMERA, SHAPE, T0)
+        bag.image(f"{place}/Infrared_1/image/data", _GRAY, "mono8", T0, "Depth")
+    found = Bag(path, posed=False)
+    assert (found.sensor, found.frame(0).color) == ("realsense", None)
+    assert found.frame(0).depth_scale == pytest.approx(0.00025)
+    assert Bag(path, posed=False, depth_scale=0.001).frame(0).depth_scale == 0.001
+
+
 def test_what_cannot_be_chosen_is_listed(tmp_path: Path) -> None:
     with writing(tmp_path, "mcap") as (bag, path):
         for camera in ("front", "back"):

@@ -21,7 +21,7 @@ from tsfusion.keyframe import Intrinsics
 _TRIED = 20  # messages
 _TRANSPORT = re.compile(r"/(compressed|compressedDepth)$")
 RECTIFIED = re.compile(r"rect")
-_NO_COLOR = re.compile(r"infra|(^|[/_])ir([/_\d]|$)|fisheye|confidence")
+_NO_COLOR = re.compile(r"infra|(^|[/_])ir([/_\d]|$)|fisheye|confidence", re.IGNORECASE)
 _UNDISTORTED = 1e-6  # largest coefficient of a camera without distortion
 _NO_TURN = 1e-6
 
@@ -65,7 +65,7 @@ def picture(recording: Recording, stream: Stream) -> Picture | None:
             with suppress(DatasetError):
                 is_depth = bag_messages.is_depth(content)
                 height, width = (
-                    bag_messages.depth(content)[0] if is_depth else bag_messages.gray(content)
+                    bag_messages.depth(content) if is_depth else bag_messages.gray(content)
                 ).shape
                 return Picture(
                     stream, _TRANSPORT.sub("", stream.topic), content, (height, width), frame_id(content)

@@ -25,7 +25,10 @@ _OF_MODALITY: dict[Modality, tuple[str, ...]] = {
 _REGISTERED = re.compile(r"aligned|registered")
 _LEFT_OF = (("right", "left"), ("infra2", "infra1"), ("infra_2", "infra_1"), ("cam1", "cam0"),
             ("image_1", "image_0"), ("image_3", "image_2"), ("camera_1", "camera_0"))  # fmt: skip
-_SENSORS = ((r"realsense|aligned_depth|d4[0-9]5|l515", "realsense"), (r"k4a|kinect2|azure|tof", "tof"))
+_SENSORS = (
+    (r"realsense|aligned_depth|d4[0-9]5|l515|^/device_\d+/sensor_\d+/", "realsense"),
+    (r"k4a|kinect2|azure|tof", "tof"),
+)
 
 
 class Chosen(NamedTuple):
@@ -212,6 +215,18 @@ class Chooser:
             topics = ", ".join(sorted({one.base for one in best}))
             raise self._error(f"several fit ({topics}): choose with {option}")
         return max(best, key=lambda one: (one.stream.messages, one.stream.kind == IMAGE))
+
+
+def recorded_scale(recording: Recording, depth: Stream) -> float | None:
+    """Metres per unit of a depth that librealsense itself recorded; None = it is somebody else's."""
+    device = re.match(r"/device_\d+/sensor_\d+", depth.topic)
+    for stream in recording.streams if device else ():
+        if re.fullmatch(rf"{device and device[0]}/option/Depth[_ ]Units/value", stream.topic):
+            try:
+                return float(recording.first(stream).data)
+            except (AttributeError, TypeError, ValueError):
+                return None
+    return None
 
 
 def _closeness(color: Picture, depth: Picture) -> tuple[object, ...]:

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.datasets import bag_messages
+from tsfusion.datasets.bag_messages import MILLIMETRES
 from tsfusion.datasets.bag_poses import PoseFinder, pose_streams
 from tsfusion.datasets.bag_reader import ENDINGS, Message, Place, Recording, is_journal, recording
-from tsfusion.datasets.bag_topics import Chooser, Modality
+from tsfusion.datasets.bag_topics import Chooser, Modality, recorded_scale
 from tsfusion.datasets.base import Frames, require_frames
 from tsfusion.datasets.poses import Pose
 from tsfusion.errors import DatasetError
@@ -55,6 +56,7 @@ class Bag(Frames):
         world_frame: default the root of the sensor's tree, or the frame of the pose topic.
         body_frame: the frame whose poses the pose topic tells; default its `child_frame_id`, or the sensor's.
         intrinsics: instead of a CameraInfo's.
+        depth_scale: metres per unit of 16-bit depth; default 0.001 (REP 118), or as a RealSense recorded it.
         rectified: whether the images are rectified, so that `P` is theirs; default where the topic's name
             has `rect`. Others are undistorted or rectified here (colour by its depth's camera).
         max_difference_s: between a depth image and its colour (default 20 ms), or left and right (5 ms).
@@ -81,6 +83,7 @@ class Bag(Frames):
         world_frame: str | None = None,
         body_frame: str | None = None,
         intrinsics: Intrinsics | None = None,
+        depth_scale: float | None = None,
         rectified: bool | None = None,
         max_difference_s: float | None = None,
         max_gap_s: float = 0.25,
@@ -102,6 +105,7 @@ class Bag(Frames):
         self._chosen = chosen
         self.name, self.sensor, self.skipped = f"ROS {place.name}", sensor or chosen.sensor, {}
         self._with_color = color
+        self.depth_scale = depth_scale or recorded_scale(self._recording, chosen.main) or MILLIMETRES
         self.uncolored = 0
         poses = PoseFinder(
             place, chosen.frame, pose_streams(self._recording, pose_topic),
@@ -204,12 +208,14 @@ class Bag(Frames):
     def _depth_frame(self, content: Any, beside: Any, common: dict[str, Any]) -> Frame:
         view = self._chosen.view
         assert view is not None
-        depth, scale = bag_messages.depth(content)
+        depth = bag_messages.depth(content)
         color = None if beside is None else bag_messages.color(beside)
         if view.undistorter is not None:
             depth = view.undistorter.depth(depth)
             color = None if color is None else view.undistorter.image(color)
-        return Frame(depth=depth, depth_scale=scale, color=color, intrinsics=view.intrinsics, **common)
+        return Frame(
+            depth=depth, depth_scale=self.depth_scale, color=color, intrinsics=view.intrinsics, **common
+        )  # fmt: skip
 
     def _pair_frame(self, left: Any, right: Any, common: dict[str, Any]) -> Frame:
         rig = self._chosen.rig
