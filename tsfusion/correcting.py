@@ -48,6 +48,7 @@ class Correcting:
         self._covers = 0  # `taken`, as far as what is under way goes
         self._due = 0.0
         self._again = _AGAIN[0]
+        self._warned = False
         spool.pinned = bool(self._pending)
 
     def _left(self) -> SessionCorrections:
@@ -81,7 +82,7 @@ class Correcting:
         Raises:
             InvalidKeyframe: when that makes too many.
         """
-        both = replace(self._pending.merged(new), revision=self._revision)
+        both = replace(self._pending.merged(new), revision=self._revision + 1)
         if len(both) > corrections.MAX_KEYFRAMES:
             raise InvalidKeyframe(f"corrections of {len(both)} keyframes wait: that is too many")
         self.taken += 1
@@ -89,7 +90,13 @@ class Correcting:
         self._spool.pinned = bool(self._pending)
         if not self._pending:
             self.acknowledged = self.taken
+        self._warn()
         return self._pending
+
+    def _warn(self) -> None:
+        if self.wanted is False and self._pending and not self._warned:
+            self._warned = True
+            log.warning("this server is of an older version and takes no corrections: they wait for a newer")
 
     def save(self, content: SessionCorrections) -> None:
         """For the next scanner, should this one die. A disk that refuses is logged: they are sent anyway."""
@@ -142,9 +149,8 @@ class Correcting:
 
     def welcomed(self, revision: int | None, now: float) -> None:
         """A server let us in, and says what it has of this session; None = it takes no corrections."""
-        if revision is None and self.wanted is not False and self._pending:
-            log.warning("this server is of an older version and takes no corrections: they wait")
         self.wanted = revision is not None
+        self._warn()
         if revision is not None:
             self.told(revision, now)
             self._under_way = None  # it is lost, or will come too late

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A whole scan: a source's frames localised, chosen, sent and fused, and what is left in a folder."""
 
+import dataclasses
 import os
 import shutil
 import time
@@ -104,7 +105,10 @@ def scan(
         )
         progress.stage(f"scanning {source.name}")
         started = time.monotonic()
-        scanner.run(chain([first], frames), _watcher(source, place, progress))
+        if source.length is not None:  # a live one's first frame is old by now
+            first = dataclasses.replace(first, captured_ns=time.monotonic_ns())
+            frames = chain([first], frames)
+        scanner.run(frames, _watcher(source, place, progress))
         peak = process.peak_rss_bytes()
         if not any(submap.located for submap in scanner.submaps):
             raise failure[0] if failure else OutputError(_nowhere(scanner.state()))

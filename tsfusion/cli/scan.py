@@ -31,7 +31,7 @@ def scan(
         _option(_SOURCE, "SPEC", "A dataset, or live: realsense, camera:0, folder:PATH (docs/sources.md)."),
     ],
     calibration: Annotated[
-        Path | None, _option(_SOURCE, "FILE", "Of a stereo camera: Kalibr, OpenCV, ROS or EuRoC.")
+        Path | None, _option(_SOURCE, "FILE", "Of a camera: Kalibr, OpenCV, ROS or EuRoC (a file, or a folder of two).")
     ] = None,
     rate: Annotated[
         float | None,
@@ -150,7 +150,7 @@ def _open(
         )
         live = sources.open_source(spec, calibration=calibration)
         return live if part["limit"] is None else Limited(live, part["limit"])
-    options.refuse(context, ("calibration",), "is for a live stereo camera")
+    options.refuse(context, ("calibration",), "is for a live camera")
     from tsfusion.cli.replay import open_recording
     from tsfusion.datasets import select
     from tsfusion.sources.recorded import Recorded

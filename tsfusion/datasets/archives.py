@@ -71,7 +71,8 @@ def extract(path: Path, into: Path, *, nested: bool = False) -> None:
             _extract_tar(path, into)
     except (ValueError, tarfile.TarError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError,
             NotImplementedError, RuntimeError) as error:  # fmt: skip
-        raise DatasetError(f"cannot unpack {path}: {error}") from error
+        reason = " ".join(str(error).split())  # tarfile's goes over many lines
+        raise DatasetError(f"cannot unpack {path}: {reason}") from error
     for inner in sorted(into.rglob("*.zip")) if nested else ():
         extract(inner, inner.parent)
         inner.unlink()

@@ -226,5 +226,5 @@ def _unrecognised(root: Path, several: list[Path]) -> str:
             f"{root} is not a folder, nor a file that stands for a dataset (an archive, a transforms.json, "
             "a trajectory.log, a file of a recognised folder)"
         )
-    known = "; ".join(f"{layout.name}: {layout.description}" for layout in layouts())
-    return f"{root} is in no layout known here. Expected one of: {known}; {': '.join(SYNTHETIC)}"
+    known = ", ".join(layout.name for layout in layouts())
+    return f"{root} is in no layout known here: {known}; `tsfusion datasets` says what each expects"
