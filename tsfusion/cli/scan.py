@@ -31,7 +31,8 @@ def scan(
         _option(_SOURCE, "SPEC", "A dataset, or live: realsense, camera:0, folder:PATH (docs/sources.md)."),
     ],
     calibration: Annotated[
-        Path | None, _option(_SOURCE, "FILE", "Of a camera: Kalibr, OpenCV, ROS or EuRoC (a file, or a folder of two).")
+        Path | None,
+        _option(_SOURCE, "FILE", "Of a camera: Kalibr, OpenCV, ROS or EuRoC (a file, or a folder of two)."),
     ] = None,
     rate: Annotated[
         float | None,

@@ -23,6 +23,7 @@ from tsfusion.datasets.poses import Pose
 from tsfusion.errors import DatasetError
 from tsfusion.frame import Frame
 from tsfusion.keyframe import Intrinsics
+from tsfusion.registration import Registration
 
 log = logging.getLogger(__name__)
 
@@ -39,8 +40,9 @@ def recognises(path: Path) -> bool:
 class Bag(Frames):
     """Depth images, stereo pairs or point clouds of a ROS recording, in the order of their header stamps.
 
-    Colour goes with a depth image it is registered to (the same frame, or `aligned`/`registered` in the depth
-    topic's name), the nearest in time; depth without one is kept and counted in `uncolored`. Poses come from
+    Colour goes with the depth image nearest in time; where it is not registered to it (in the same frame, or
+    `aligned`/`registered` in the depth topic's name), /tf_static and its CameraInfo register it here. Depth
+    without colour is kept and counted in `uncolored`. Poses come from
     /tf where a transform between the sensor's frame and the root of its tree changes, else from odometry,
     transform, pose or path messages, carried to the sensor by /tf_static. A time without poses around it
     gives none. Broken messages, pairs that miss an image, and (`posed`) frames without a pose are counted in
@@ -115,6 +117,7 @@ class Bag(Frames):
         difference_s = _DIFFERENCE_S[chosen.modality] if max_difference_s is None else max_difference_s
         self._pair(mains, others, round(difference_s * 1e9))
         self._pose(poses.finish(required=posed), posed)
+        self._registration = self._register(poses)
         require_frames(len(self._mains), place, EXPECTED, self.skipped)
 
     def __len__(self) -> int:
@@ -182,6 +185,24 @@ class Bag(Frames):
             self._others = [self._others[i] for i in kept]
             self._poses = [self._poses[i] for i in kept]
 
+    def _register(self, poses: PoseFinder) -> Registration | None:
+        """What brings the colour of a camera of its own onto the depth; without it such colour is left out."""
+        chosen = self._chosen
+        if chosen.apart is None or chosen.view is None or not len(self):
+            return None
+        T_color_depth = poses.between(chosen.apart.frame, chosen.frame, self._stamp(0))
+        if T_color_depth is None:
+            log.warning(
+                "%s: no transforms lead from %r to %r, so that colour cannot be registered and is left out",
+                self._recording.path, chosen.frame, chosen.apart.frame,
+            )  # fmt: skip
+            self._others = [None] * len(self)
+            return None
+        return Registration(
+            chosen.view.intrinsics, chosen.apart.view.intrinsics, T_color_depth, chosen.size,
+            color_size=chosen.apart.size,
+        )  # fmt: skip
+
     def _frame(self, index: int) -> Frame:
         chosen, place = self._chosen, self._mains[index]
         common: dict[str, Any] = {
@@ -210,9 +231,14 @@ class Bag(Frames):
         assert view is not None
         depth = bag_messages.depth(content)
         color = None if beside is None else bag_messages.color(beside)
+        color_view = view if self._chosen.apart is None else self._chosen.apart.view
         if view.undistorter is not None:
             depth = view.undistorter.depth(depth)
-            color = None if color is None else view.undistorter.image(color)
+        if color is not None and color_view.undistorter is not None:
+            color = color_view.undistorter.image(color)
+        if color is not None and self._registration is not None:
+            metres = np.nan_to_num(depth * (1.0 if depth.dtype == np.float32 else self.depth_scale))
+            color = self._registration.color_of_depth(color, metres.astype(np.float32))
         return Frame(
             depth=depth, depth_scale=self.depth_scale, color=color, intrinsics=view.intrinsics, **common
         )  # fmt: skip

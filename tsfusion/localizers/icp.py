@@ -166,9 +166,7 @@ def match(there: Surface, here: Surface, T_there_here: se3.Transform, some: NDAr
     return Match(moved, planes[:3], distance, sigma[chosen], which, block[chosen])
 
 
-def equations(
-    found: Match, weight: Floats
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def equations(found: Match, weight: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(6, 6) and (6,) of the step that brings the points to their planes: `exp(step) @ T_there_here`."""
     x, y, z = found.moved
     nx, ny, nz = found.normals

@@ -68,7 +68,9 @@ class RGBD:
         seen = Seen.of(frame)
         planes = int(np.count_nonzero(seen.surface.planes[3]))
         if planes < _ENOUGH:
-            return self._lost(frame, f"{planes} of {len(seen.surface.planes[3])} blocks of the depth image show a surface")
+            return self._lost(
+                frame, f"{planes} of {len(seen.surface.planes[3])} blocks of the depth image show a surface"
+            )
         if not self._kept:
             return self._start(frame, seen, np.eye(4), 1.0)
         reason = ""
