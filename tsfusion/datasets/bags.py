@@ -186,7 +186,7 @@ class Bag(Frames):
             self._poses = [self._poses[i] for i in kept]
 
     def _register(self, poses: PoseFinder) -> Registration | None:
-        """What brings the colour of a camera of its own onto the depth; without it such colour is left out."""
+        """What brings the colour of a camera of its own onto the depth; else such colour is left out."""
         chosen = self._chosen
         if chosen.apart is None or chosen.view is None or not len(self):
             return None
