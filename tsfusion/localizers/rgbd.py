@@ -10,18 +10,19 @@ from numpy.typing import NDArray
 
 from tsfusion import se3
 from tsfusion.frame import Frame
-from tsfusion.localizers import features, joint, judge
+from tsfusion.localizers import features, icp, joint, judge
 from tsfusion.localizers.base import Corrections, Lost, Pose
 from tsfusion.localizers.views import Seen, View
 
 Matrix = NDArray[np.float64]
 
-_KEPT = 12  # tracking keyframes
+_KEPT = 40  # tracking keyframes
 _DISTANCE, _ANGLE = 0.1, np.radians(10)  # to the next one
 _OVERLAP = 0.6  # with the last one; below: the next one
 _ENOUGH = 500  # blocks with a plane
 
 EVIDENCE = []
+X = dict(n=1, a=np.radians(60), o=.5, g=.7)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +100,28 @@ class RGBD:
             points, pixels = points[inliers], pixels[inliers]
         else:
             points, pixels = points[:0], pixels[:0]
-        link = joint.Link(np.eye(4), view.seen.surface, points, pixels.astype(np.float64))
-        estimate = joint.solve([link], seen.surface, seen.intrinsics, seen.columns, guess)
+        links = [joint.Link(np.eye(4), view.seen.surface, points, pixels.astype(np.float64))]
+        for other in self._others(view, seen, guess):
+            T_other_view = se3.inverse(other.T_world_camera) @ view.T_world_camera
+            links.append(joint.Link(T_other_view, other.seen.surface, points[:0], pixels[:0]))
+        estimate = joint.solve(links, seen.surface, seen.intrinsics, seen.columns, guess)
         evidence = judge.weigh(seen, view, estimate, len(points))
         EVIDENCE.append((evidence, len(view.points), estimate.scale, strict))
         doubt = evidence.doubt(strict=strict)
         return (None, doubt) if doubt else (_Found(view, estimate.T_anchor_camera, evidence), "")
+
+    def _others(self, view: View, seen: Seen, guess: Matrix) -> list[View]:
+        T = view.T_world_camera @ guess
+        some = seen.surface.every(8)
+        near = []
+        for other in self._kept:
+            if len(near) == X['n'] or other is view: break
+            D = se3.inverse(other.T_world_camera) @ T
+            if se3.angle(D) > X['a']: continue
+            m = icp.match(other.seen.surface, seen.surface, D, some)
+            if len(m.distance) > X['o'] * len(some) and (np.abs(m.distance) < .03 + 3 * m.sigma).mean() > X['g']:
+                near.append(other)
+        return near
 
     def _go_on(self, frame: Frame, seen: Seen, found: _Found) -> Pose:
         T = found.T_world_camera
