@@ -14,26 +14,28 @@ PACKAGE = Path(__file__).parent.parent / "tsfusion"
 
 # Top to bottom. A module may import from its own row (without a cycle) and from the rows below it.
 ROWS: tuple[tuple[str, frozenset[str]], ...] = (
-    ("command line", frozenset({"__main__", "cli"})),
-    ("whole runs", frozenset({"pipeline", "child"})),
-    ("processes", frozenset({"server", "gateway", "intake", "door", "hosted", "outcomes", "retention",
-                             "reports", "atlas", "questions", "quota", "quarantine", "routes", "sessions",
-                             "subscriptions", "ports", "fuser_link", "fuser_process", "fuser", "saved_map",
-                             "client", "fetch", "backpressure", "room", "sender", "connection",
-                             "conversation", "refused", "outbox", "spool", "gone", "times", "recording"})),
-    ("views and sources", frozenset({"datasets", "evaluation", "ledger", "preview", "results", "metrics",
-                                     "inspection", "salvage", "ros", "localizers", "sources"})),
+    ("command line", frozenset({"cli", "__main__"})),
+    ("whole runs", frozenset({"pipeline", "scanning", "scan_results", "summary", "child"})),
+    ("processes", frozenset({"server", "gateway", "intake", "door", "atlas", "hosted", "outcomes",
+                             "retention", "reports", "questions", "quota", "quarantine", "routes",
+                             "sessions", "subscriptions", "ports", "fuser_link", "fuser_process",
+                             "fuser", "saved_map", "client", "scanner", "fetch", "backpressure", "room",
+                             "sender", "connection", "conversation", "refused", "outbox", "spool",
+                             "gone", "times", "recording", "corrector", "revisions", "correcting"})),
+    ("views and sources", frozenset({"datasets", "localizers", "sources", "evaluation", "ledger", "preview",
+                             "results", "metrics", "inspection", "salvage", "ros"})),
     ("map and wire", frozenset({"volume", "integration", "surface", "field", "blockstore", "meshing",
-                                "scratch", "storage", "checkpoint", "warmup",
-                                "journal", "transport", "codec", "maps", "keys"})),
-    ("ground", frozenset({"kernels", "runtime", "mesh", "keyframe", "config", "config_toml", "errors",
-                          "process", "disk", "logs", "watchdog", "private_folder", "frame", "stereo",
-                          "se3"})),
+                             "scratch", "storage", "checkpoint", "warmup", "journal", "transport",
+                             "codec", "maps", "keys", "corrections"})),
+    ("ground", frozenset({"kernels", "runtime", "keyframe", "frame", "stereo", "se3", "calibration",
+                             "calibration_files", "config", "config_toml", "mesh", "errors", "process",
+                             "disk", "logs", "watchdog", "private_folder", "registration"})),
 )  # fmt: skip
 
 # All others run where there is no Taichi, and answer while kernels run.
 MAY_REACH_TAICHI = frozenset({
-    "__main__", "cli", "pipeline", "fuser", "saved_map", "datasets", "evaluation", "preview",
+    "__main__", "cli", "pipeline", "scanning", "scan_results", "summary", "fuser", "saved_map", "datasets",
+    "evaluation", "preview",
     "volume", "integration", "surface", "field", "blockstore", "meshing", "scratch", "storage", "checkpoint",
     "warmup", "kernels", "runtime",
 })  # fmt: skip

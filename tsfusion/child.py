@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import IO
 
 from tsfusion import config_toml
-from tsfusion.config import Config, ServerConfig, VolumeConfig
+from tsfusion.config import ClientConfig, Config, ServerConfig, VolumeConfig, override
 from tsfusion.errors import TransportError
 
 START_DEADLINE = 180.0  # seconds; a cold kernel compilation on a slow machine
@@ -127,3 +127,13 @@ def _read_line(process: subprocess.Popen[str], seconds: float) -> str:
     if readable and not line:
         process.wait(STOP_DEADLINE)
     return line
+
+
+@contextmanager
+def own_server(
+    client: ClientConfig, server: ServerConfig | None, volume: VolumeConfig, scratch: Path
+) -> Iterator[tuple[ClientConfig, ServerChild | None]]:
+    """Where to send, and the server that runs there for as long as the block."""
+    server = server or ServerConfig(listen="tcp://127.0.0.1:0", state=str(scratch / "state"))
+    with serving(server, volume, scratch) as child:
+        yield override(client, address=child.listen, control=child.control), child

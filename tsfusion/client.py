@@ -15,13 +15,18 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import TracebackType
 
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion import corrections
 from tsfusion.backpressure import Backpressure
 from tsfusion.config import ClientConfig, Policy, override
+from tsfusion.corrections import SessionCorrections
 from tsfusion.errors import FlushTimeout, KeyframeRefused, NotAllowed, ServerUnreachable, TransportError
-from tsfusion.keyframe import Keyframe
+from tsfusion.keyframe import Keyframe, check_pose
 from tsfusion.outbox import ClientStats, Outbox
 from tsfusion.sender import Sender
 from tsfusion.spool import Spool
@@ -105,6 +110,43 @@ class Client:
                 self._sender.wake()
             return seq
 
+    def correct(
+        self, poses: Mapping[int, NDArray[np.float64]], *, T_map_odometry: NDArray[np.float64] | None = None
+    ) -> int:
+        """Say where keyframes that were sent before really were taken; which call of this it was, from 1.
+
+        The newest pose of a keyframe counts; one that is not named keeps what was said of it before. Kept in
+        the spool until the server has it on its disk (`stats.corrections_acknowledged`); never waits for it.
+
+        Args:
+            poses: by the number that `send` returned, (4, 4) float64 `T_world_camera`, at most 100,000.
+            T_map_odometry: (4, 4) float64, what poses after the last keyframe are to be multiplied by from
+                the left; None = as before.
+
+        Raises:
+            InvalidKeyframe: for a number that was never sent, a pose that is no rigid transform, or more
+                keyframes than a session may have corrected.
+            TransportError: after `close`.
+        """
+        seqs, checked = corrections.checked(poses)
+        T = None if T_map_odometry is None else check_pose(T_map_odometry)
+        box = self._outbox
+        with self._sending:
+            self._check_running()
+            with box.changed:
+                box.check_taken(seqs)
+                new = SessionCorrections(
+                    session=box.spool.session,
+                    seqs=seqs,
+                    poses=checked,
+                    T_map_odometry=T,
+                    map=self._config.map,
+                )
+                content, number = box.correcting.add(new), box.correcting.taken
+            box.correcting.save(content)
+        self._sender.wake()
+        return number
+
     def connect(self, timeout: float | None = None) -> None:
         """Wait until the server has answered. Not needed before `send`.
 
@@ -122,23 +164,26 @@ class Client:
             raise ServerUnreachable(f"{self._why()} (waited {timeout:g} s)")
 
     def flush(self, timeout: float = 10.0) -> None:
-        """Wait until everything sent is on the server's disk.
+        """Wait until everything sent is on the server's disk, corrections included (but where it takes none).
 
         Raises:
             FlushTimeout: after `timeout` seconds; the rest stays in the spool and is still being sent.
             KeyframeRefused: when the server turned some away for good since the last flush.
         """
         box = self._outbox
-        done = self._wait(lambda: not box.spool.waiting, timeout)
+        done = self._wait(lambda: not box.spool.waiting and box.correcting.settled, timeout)
         with box.changed:
             refusals, first = box.take_refusals()
+            refusal = box.correcting.take_refusal()
         if refusals:
             more = f" (and {refusals - 1} more)" if refusals > 1 else ""
             raise KeyframeRefused(f"keyframe {first}{more}")
+        if refusal:
+            raise KeyframeRefused(refusal)
         if not done:
-            raise FlushTimeout(
-                f"{len(box.spool.waiting)} keyframes are not acknowledged after {timeout:g} s: {self._why()}"
-            )
+            waiting, pending = len(box.spool.waiting), box.correcting.pending
+            what = f"{waiting} keyframes" if waiting else f"corrections of {pending} keyframes"
+            raise FlushTimeout(f"{what} are not acknowledged after {timeout:g} s: {self._why()}")
 
     def wait_fused(self, timeout: float = 60.0) -> None:
         """Wait until the map has taken or rejected everything sent (`stats.rejected` says what).
@@ -167,6 +212,12 @@ class Client:
             return self._outbox.times.copy()
 
     @property
+    def newest_fused(self) -> KeyframeTimes | None:
+        """The stamps of the newest keyframe that is in the map; None = none is."""
+        with self._outbox.changed:
+            return self._outbox.times.newest_fused()
+
+    @property
     def stats(self) -> ClientStats:
         """Counts since this client began."""
         with self._outbox.changed:
@@ -176,6 +227,12 @@ class Client:
     def connected(self) -> bool:
         """Whether the server answered and has not fallen silent."""
         return self._outbox.connected
+
+    @property
+    def problem(self) -> str:
+        """Why the server takes nothing at the moment; empty when it does."""
+        box = self._outbox
+        return "" if box.connected and not box.turned_away else self._why()
 
     def close(self) -> None:
         """Stop sending. Call `flush` first: what a temporary spool still holds is lost (and logged)."""
@@ -191,6 +248,7 @@ class Client:
             lost = len(self._outbox.spool.waiting) if self._outbox.spool.temporary else 0
             if lost:
                 log.error("%d keyframes are lost: not acknowledged, and the spool was temporary", lost)
+            self._outbox.correcting.close()
             self._outbox.spool.close()
 
     def __enter__(self) -> "Client":

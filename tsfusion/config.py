@@ -32,6 +32,7 @@ Policy = Literal["thin", "block", "drop_oldest", "spool_all"]
 LogFormat = Literal["text", "json"]
 LogLevel = Literal["debug", "info", "warning", "error"]
 DEFAULT_MAP = "default"
+MAP_NAME_LENGTH = 32
 # Becomes a folder's name, so it is no path: \A and \Z, because `$` would let a newline through.
 MapName = Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9_-]{0,31}\Z")]
 ClientName = Annotated[str, Meta(pattern=r"\A[A-Za-z0-9][A-Za-z0-9_.-]{0,31}\Z")]

@@ -5,7 +5,7 @@ import logging
 import math
 import time
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from tsfusion import codec
 from tsfusion.errors import DecodeError
@@ -22,13 +22,17 @@ _FIRST_PINGS_INTERVAL = 0.02  # until the clock estimate stands on all its sampl
 _REWIND_INTERVAL = 0.2  # one gap is reported by every keyframe behind it
 _LATEST = 1 << 62  # nanoseconds; no clock shows more than a century
 _HOLD = (0.05, 60.0)  # seconds: no server may hold a client for less or longer at a time
+_News: TypeAlias = (
+    messages.Ack | messages.Nack | messages.Hold | messages.Denied | messages.Corrected | messages.Uncorrected
+)
 
 
 class Conversation:
     """One client's side. For the sending thread only; `heard` may be read by any.
 
     Args:
-        say: sends a message, or drops it when it cannot leave at once: it is said again when due.
+        say: sends the frames of a message, or drops them when they cannot leave at once: what they say is
+            said again when due.
         address: of the control socket, for messages to people.
 
     Attributes:
@@ -42,7 +46,7 @@ class Conversation:
         self,
         outbox: Outbox,
         refused: RefusedFolder,
-        say: Callable[[messages.ToServer], None],
+        say: Callable[..., None],
         *,
         address: str,
         map_name: str,
@@ -79,6 +83,9 @@ class Conversation:
             due = min(due, self._held_until)
         if self._asked_again:
             due = min(due, self._rewound + _REWIND_INTERVAL)
+        if self.welcome is not None:
+            with self._outbox.changed:
+                due = min(due, self._outbox.correcting.due(self._outbox.durable))
         return due
 
     def tick(self, now: float) -> None:
@@ -86,7 +93,7 @@ class Conversation:
         if self.welcome is None and now >= self._hello_due:
             self._hello_due = now + self._hello_interval
             self._hello_interval = min(2 * self._hello_interval, _HELLO_INTERVAL[1])
-            self._say(self._hello)
+            self._say(messages.encode(self._hello))
         if now >= self._ping_due:
             self._ping(now)
         if self._held_until and now >= self._held_until:
@@ -95,22 +102,31 @@ class Conversation:
         if self._asked_again and now - self._rewound > _REWIND_INTERVAL:
             with self._outbox.changed:
                 self.rewind()
+        if self.welcome is not None:
+            self._correct(now)
 
     def _ping(self, now: float) -> None:
         settled = self.welcome is None or self.clock.count >= SAMPLES
         self._ping_due = now + (_PING_INTERVAL if settled else _FIRST_PINGS_INTERVAL)
         with self._outbox.changed:
             waiting, skipped = len(self._outbox.spool.waiting), dict(self._outbox.skipped)
-        self._say(
-            messages.Ping(
-                session=self._hello.session,
-                sent_ns=time.monotonic_ns(),
-                offset_ns=self.clock.offset_ns,
-                bound_ns=self.clock.bound_ns,
-                waiting=waiting,
-                skipped=skipped,
-            )
+        ping = messages.Ping(
+            session=self._hello.session,
+            sent_ns=time.monotonic_ns(),
+            offset_ns=self.clock.offset_ns,
+            bound_ns=self.clock.bound_ns,
+            waiting=waiting,
+            skipped=skipped,
         )
+        self._say(messages.encode(ping))
+
+    def _correct(self, now: float) -> None:
+        with self._outbox.changed:
+            frames = self._outbox.correcting.message(self._outbox.durable, now)
+            if self._outbox.correcting.settled:
+                self._outbox.changed.notify_all()
+        if frames:
+            self._say(*frames)
 
     def greet_again(self, after: float = 0.0) -> None:
         """Ask to be let in (once more), first after so many seconds."""
@@ -161,7 +177,7 @@ class Conversation:
                 self._outbox.problem = f"what answers at {self._address} is no tsfusion server: {error}"
         log.debug("the server sent %s", error)
 
-    def _on_news(self, message: messages.Ack | messages.Nack | messages.Hold | messages.Denied) -> None:
+    def _on_news(self, message: _News) -> None:
         if isinstance(message, messages.Denied):
             self._on_denied(message)
         elif isinstance(message, messages.Nack):
@@ -170,8 +186,10 @@ class Conversation:
             with self._outbox.changed:
                 if isinstance(message, messages.Ack):
                     self._on_ack(message)
-                else:
+                elif isinstance(message, messages.Hold):
                     self._on_hold(message)
+                else:
+                    self._on_corrections(message)
 
     def _on_welcome(self, welcome: messages.Welcome) -> None:
         if welcome.version != codec.VERSION:
@@ -183,6 +201,7 @@ class Conversation:
             self.welcome = welcome
             self._ping_due = self._held_until = 0.0
             self._outbox.welcomed(welcome.durable, welcome.window_keyframes)
+            self._outbox.correcting.welcomed(welcome.corrections, self.heard)
             self._on_progress(welcome.durable, welcome.fused)
             self._outbox.meshed(welcome.fused)  # a new server stamps only what it fuses from here on
             self.rewind()
@@ -255,6 +274,16 @@ class Conversation:
             entry = self._outbox.find(nack.seq)
         if entry is not None:
             self._refused.give_up(entry, nack.reason, nack.message)
+
+    def _on_corrections(self, answer: messages.Corrected | messages.Uncorrected) -> None:
+        if isinstance(answer, messages.Corrected):
+            self._outbox.correcting.told(answer.revision, self.heard)
+        else:
+            again_s = answer.again_s if math.isfinite(answer.again_s) else _HOLD[1]
+            self._outbox.correcting.turned_away(
+                answer.revision, answer.reason, answer.message, again_s, self.heard
+            )
+        self._outbox.changed.notify_all()
 
     def _on_hold(self, hold: messages.Hold) -> None:
         shortest, longest = _HOLD

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
 """What makes a file outlast a power cut, and how much room is left for it."""
 
+import contextlib
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 
@@ -23,6 +25,22 @@ def sync_folder(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def replace(path: Path, parts: Iterable[bytes]) -> None:
+    """Write a file: on the disk when this returns, and the one before until then; raises OSError."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        with partial.open("wb") as file:
+            file.writelines(parts)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except BaseException:  # an interrupted one leaves no part either
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
 
 
 def free_bytes(folder: Path) -> int:

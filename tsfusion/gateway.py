@@ -15,6 +15,8 @@ import zmq
 from tsfusion import codec, logs, process, reports
 from tsfusion.atlas import Atlas
 from tsfusion.config import ServerConfig
+from tsfusion.corrections import Corrections
+from tsfusion.corrector import Corrector, said
 from tsfusion.door import Door
 from tsfusion.errors import DecodeError
 from tsfusion.hosted import HostedMap
@@ -60,6 +62,7 @@ class Gateway:
         self._routes = Routes()
         self._intake = Intake(server, self.maps, door, self)
         self._refused = self._intake.refused
+        self._corrector = Corrector(server, self.maps, self._intake)
         self._questions = Questions(self._answer, server.memory_bytes // _MESHES_SHARE)
         self._topics = Subscriptions()
         self._watched: dict[str, bool] = {}  # what each fuser knows of it
@@ -176,17 +179,25 @@ class Gateway:
 
     def _on_control(self, frames: list[zmq.Frame]) -> None:
         client = self._door.client_of(frames[0])
-        identity, *rest = (frame.bytes for frame in frames)
         if client is None:
             self._refused["key"] += 1
             return
+        identity, *rest = frames
         try:
-            message = messages.decode_to_server(b"".join(rest))
+            message = said([frame.buffer for frame in rest])
         except DecodeError as error:
             self._refused["control"] += 1
             log.debug("%s", error)
             return
-        if isinstance(message, messages.Command):
+        self._on_message(identity.bytes, message, client, [frame.buffer for frame in rest[1:]])
+
+    def _on_message(
+        self, identity: bytes, message: messages.ToServer, client: str, arrays: Sequence[Any]
+    ) -> None:
+        if isinstance(message, Corrections):
+            if self._accepting and (answer := self._corrector.take(message, arrays, client)) is not None:
+                self._answer(identity, answer)
+        elif isinstance(message, messages.Command):
             self._on_command(identity, message, client)
         elif isinstance(message, messages.Hello):
             self._on_hello(identity, message, client)
@@ -197,7 +208,7 @@ class Gateway:
         if denied := self._denial(identity, hello, client):
             self._answer(identity, messages.Denied(hello.session, *denied))
             return
-        durable, fused = self._progress(hello.map, hello.session)
+        durable, fused = self.maps.progress(hello.map, hello.session)
         welcome = messages.Welcome(
             epoch=self.epoch,
             version=codec.VERSION,
@@ -206,6 +217,7 @@ class Gateway:
             window_keyframes=self._server.window_keyframes,
             window_bytes=self._server.window_bytes,
             max_frame_bytes=self._server.max_frame_bytes,
+            corrections=self.maps.corrected(hello.map, hello.session)[0],
         )
         self._answer(identity, welcome)
 
@@ -234,13 +246,9 @@ class Gateway:
         if route is not None and route.client == client:
             self._routes.heard(route)
             route.said(ping)
-            progress = self._progress(route.map, ping.session)
+            progress = self.maps.progress(route.map, ping.session)
         pong = messages.Pong(self.epoch, ping.sent_ns, received_ns, time.monotonic_ns(), *progress)
         self._answer(identity, pong)
-
-    def _progress(self, map_name: str, session: bytes) -> tuple[int, int]:
-        hosted = self.maps.get(map_name)
-        return hosted.sessions.progress(session) if hosted else (0, 0)
 
     def _on_command(self, identity: bytes, command: messages.Command, client: str) -> None:
         if command.name == "ping":
@@ -280,7 +288,8 @@ class Gateway:
             duplicates=self._intake.duplicates,
             maps=found,
             clients=tuple(
-                route.health(now, self._progress(route.map, route.session)) for route in self._routes
+                route.health(now, self.maps.progress(*route.place), self.maps.corrected(*route.place))
+                for route in self._routes
             ),
         )
 

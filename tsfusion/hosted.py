@@ -17,6 +17,7 @@ from tsfusion.journal import Journal
 from tsfusion.outcomes import Clients, Outcomes
 from tsfusion.quarantine import Quarantine
 from tsfusion.retention import Retention
+from tsfusion.revisions import Revisions
 from tsfusion.sessions import KeyframeIndex, Sessions, Turns
 from tsfusion.transport import messages, work
 
@@ -34,6 +35,7 @@ class HostedMap:
     Attributes:
         warm: the fuser has been ready once: what the map has of each session is known.
         problem: why keyframes are not taken now; empty = they are.
+        revisions: the corrected poses of its keyframes.
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class HostedMap:
         self._journal = Journal(
             self.folder / maps.JOURNAL_FOLDER, segment, min_free_bytes=server.min_free_bytes
         )
+        self.revisions = Revisions(self.folder / maps.CORRECTIONS_FOLDER, server.min_free_bytes)
         self._quarantine = Quarantine(self.folder / maps.QUARANTINE_FOLDER, server.quarantine_bytes)
         self.sessions = Sessions()
         self._index = KeyframeIndex()
@@ -246,6 +249,8 @@ class HostedMap:
         """What a person should know, though keyframes are taken and fused."""
         damaged = self._journal.damaged
         told = [f"{damaged} keyframes of its journal are damaged and lost"] if damaged else []
+        if self.revisions.damaged:
+            told.append(f"the corrections of {self.revisions.damaged} sessions are damaged and lost")
         return [*told, self._lost] if self._lost else told
 
     def health(self) -> messages.MapHealth:
@@ -268,4 +273,5 @@ class HostedMap:
             last_keyframe_s=None if self._last is None else max(now - self._last, 0.0),
             delay_ms=told.delays.summary(),
             delay_bound_ms=told.delays.bound_ms,
+            corrections=self.revisions.taken,
         )

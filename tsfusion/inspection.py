@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: MIT
 """What a journal holds, and whether all of it is as it was written."""
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from msgspec import Struct
 
-from tsfusion import codec, journal
-from tsfusion.errors import DecodeError, InvalidKeyframe
+from tsfusion import codec, corrections, journal, maps, se3
+from tsfusion.corrections import SessionCorrections
+from tsfusion.errors import DecodeError, InvalidKeyframe, JournalError
 from tsfusion.journal import Damage, Record
 from tsfusion.journal.places import Place, Watcher
+from tsfusion.keyframe import check_pose
 
 
 class Problem(Struct, frozen=True):
@@ -39,7 +43,13 @@ class SegmentInfo(Struct, kw_only=True):
 
 
 class SessionInfo(Struct, kw_only=True):
-    """The keyframes of one spool: `seq` numbers them, `client` is whose key they came under."""
+    """The keyframes of one spool: `seq` numbers them, `client` is whose key they came under.
+
+    Attributes:
+        revision: of its corrections the newest; 0 = there are none.
+        corrected: keyframes that they name.
+        moved_m, turned_deg: the most that any of these in the journal is away from where it was sent.
+    """
 
     session: str
     client: str
@@ -48,6 +58,10 @@ class SessionInfo(Struct, kw_only=True):
     last_seq: int
     first_logged_ns: int  # wall clock
     last_logged_ns: int
+    revision: int = 0
+    corrected: int = 0
+    moved_m: float = 0.0
+    turned_deg: float = 0.0
 
 
 class Info(Struct, kw_only=True):
@@ -83,7 +97,8 @@ def summarize(place: Place, watch: Watcher) -> Info:
     """
     segments = {path: _segment(path) for path in place.files()}
     sessions: dict[bytes, SessionInfo] = {}
-    problems = []
+    problems: list[Problem] = []
+    moves = _Moves(_corrections(place, problems))
     for path, step in place.steps(watch):
         segment = segments.setdefault(path, _segment(path))
         if isinstance(step, Damage):
@@ -92,7 +107,7 @@ def summarize(place: Place, watch: Watcher) -> Info:
             segment.state = segment.state if step.torn else "damaged"
         else:
             segment.keyframes += 1
-            _count(sessions, step)
+            moves.note(_count(sessions, step), step)
     return Info(
         path=str(place.path),
         keyframes=sum(segment.keyframes for segment in segments.values()),
@@ -113,7 +128,42 @@ def _segment(path: Path) -> SegmentInfo:
     return SegmentInfo(name=path.name, nbytes=nbytes, state="closed" if journal.is_closed(path) else "open")
 
 
-def _count(sessions: dict[bytes, SessionInfo], record: Record) -> None:
+def _corrections(place: Place, problems: list[Problem]) -> dict[bytes, SessionCorrections]:
+    try:
+        return {} if place.corrections is None else corrections.read(place.corrections)
+    except JournalError as error:
+        problems.append(Problem("damage", maps.CORRECTIONS_FOLDER, 0, 0, 0, str(error)))
+        return {}
+
+
+class _Moves:
+    """How far corrections move what a journal holds."""
+
+    def __init__(self, said: dict[bytes, SessionCorrections]) -> None:
+        self._said = said
+
+    def note(self, session: SessionInfo, record: Record) -> None:
+        said = self._said.get(record.session)
+        if said is None:
+            return
+        session.revision, session.corrected = said.revision, len(said)
+        at = int(np.searchsorted(said.seqs, record.seq))
+        if at == len(said) or said.seqs[at] != record.seq:
+            return
+        try:
+            sent = check_pose([*_rows(codec.unpack(record.frames[0]).pose), (0.0, 0.0, 0.0, 1.0)])
+        except (DecodeError, InvalidKeyframe, IndexError):
+            return  # `verify` says so
+        move = se3.inverse(sent) @ said.poses[at]
+        session.moved_m = max(session.moved_m, se3.distance(move))
+        session.turned_deg = max(session.turned_deg, math.degrees(se3.angle(move)))
+
+
+def _rows(pose: tuple[float, ...]) -> list[tuple[float, ...]]:
+    return [pose[at : at + 4] for at in (0, 4, 8)]
+
+
+def _count(sessions: dict[bytes, SessionInfo], record: Record) -> SessionInfo:
     known = sessions.get(record.session)
     if known is None:
         known = sessions[record.session] = SessionInfo(
@@ -128,6 +178,7 @@ def _count(sessions: dict[bytes, SessionInfo], record: Record) -> None:
     known.keyframes += 1
     known.last_seq = record.seq
     known.last_logged_ns = record.logged_ns
+    return known
 
 
 def problem(path: Path, damage: Damage) -> Problem:

@@ -33,6 +33,7 @@ class Intake:
     Attributes:
         refused: messages that were not journaled, by reason.
         duplicates: those that were journaled before.
+        quotas: of every client, whatever it sends.
     """
 
     def __init__(self, server: ServerConfig, maps: Atlas, door: Door, clients: Clients) -> None:
@@ -42,7 +43,7 @@ class Intake:
         self._maps = maps
         self._door = door
         self._clients = clients
-        self._quotas = Quotas(server)
+        self.quotas = Quotas(server)
 
     def take(self, frames: list[zmq.Frame]) -> None:
         """One message."""
@@ -86,7 +87,7 @@ class Intake:
         if seconds := hosted.held(now):
             self._hold(key, seconds, "disk", hosted.problem)
             return True
-        if seconds := self._quotas.wait(client, nbytes, now):
+        if seconds := self.quotas.wait(client, nbytes, now):
             rates = f"{self._server.quota_keyframes:g} keyframes and {self._server.quota_bytes >> 20} MB"
             self._hold(
                 key,
@@ -118,7 +119,7 @@ class Intake:
             return
         try:
             codec.check(buffers, self._server.max_frame_bytes)
-            self._quotas.check(header)
+            self.quotas.check(header)
             self._clients.heard(header.session, client, scans=True)
             hosted.accept(header, buffers, client, received_ns)
         except codec.Refused as error:

@@ -9,6 +9,7 @@ from tsfusion.errors import JournalError
 MAPS_FOLDER = "maps"
 JOURNAL_FOLDER = "journal"
 QUARANTINE_FOLDER = "quarantine"
+CORRECTIONS_FOLDER = "corrections"
 MAP_FILE = "map.tsf"
 PREVIOUS_FILE = "map.previous.tsf"
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")  # as config.MapName

@@ -5,8 +5,12 @@ import threading
 from collections import Counter, OrderedDict, deque
 from typing import Literal
 
+import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
+from tsfusion.correcting import Correcting
+from tsfusion.errors import InvalidKeyframe
 from tsfusion.keyframe import Keyframe
 from tsfusion.spool import Spool, Waiting
 from tsfusion.times import Times
@@ -29,6 +33,9 @@ class ClientStats(Struct, frozen=True):
         waiting: in the spool.
         waiting_bytes: the bytes of those.
         state: of the spool: `ok`, or the reason why it cannot keep all that comes: `spool` or `disk`.
+        corrections_sent: calls of `correct`.
+        corrections_acknowledged: how many of them, from the first on, are on the server's disk.
+        corrections_refused: messages of corrections that were turned away for good: reason → count.
     """
 
     sent: int
@@ -40,6 +47,9 @@ class ClientStats(Struct, frozen=True):
     waiting: int
     waiting_bytes: int
     state: str
+    corrections_sent: int = 0
+    corrections_acknowledged: int = 0
+    corrections_refused: dict[str, int] = {}
 
 
 class Outbox:
@@ -57,6 +67,8 @@ class Outbox:
         skipped: see `ClientStats`.
         state: see `ClientStats`.
         times: of the keyframes, as far as they are known.
+        durable: the highest number that is on the server's disk, as far as it said; 0 = none.
+        correcting: corrected poses that it does not have yet.
     """
 
     def __init__(self, spool: Spool) -> None:
@@ -74,6 +86,8 @@ class Outbox:
         self.skipped: Counter[str] = Counter()
         self.state = "ok"
         self.times = Times()
+        self.durable = 0
+        self.correcting = Correcting(spool)
         self._sent = self._durable = self._fused = 0
         self._refused: Counter[str] = Counter()
         self._rejected: Counter[str] = Counter()
@@ -174,6 +188,7 @@ class Outbox:
 
     def progress(self, durable: int, fused: int) -> bool:
         """The server has these; whether anything left the spool."""
+        self.durable = max(self.durable, durable)
         dropped = self.spool.drop(durable)
         self.outstanding = max(self.outstanding - len(dropped), 0)
         self._durable += len(dropped)
@@ -197,6 +212,12 @@ class Outbox:
             self.times.stamp(stamps, offset_ns, bound_ns)
         if stamps.meshed_ns:
             self.meshed(stamps.seq)
+
+    def check_taken(self, seqs: NDArray[np.int64]) -> None:
+        """Raise InvalidKeyframe unless each is the number of a keyframe of this session, now or before."""
+        known = (seqs <= self.spool.left) | ((seqs > self._used_before) & (seqs < self.spool.next_seq))
+        if not known.all():
+            raise InvalidKeyframe(f"keyframe {seqs[np.argmin(known)]} was never sent from here")
 
     # --- turned away ---
 
@@ -248,4 +269,7 @@ class Outbox:
             waiting=len(self.spool.waiting),
             waiting_bytes=self.spool.waiting_bytes,
             state=self.state,
+            corrections_sent=self.correcting.taken,
+            corrections_acknowledged=self.correcting.acknowledged,
+            corrections_refused=dict(self.correcting.refused),
         )

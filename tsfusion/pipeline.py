@@ -3,32 +3,24 @@
 
 import dataclasses
 import os
-import platform
 import shutil
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
-from importlib import metadata
-from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol
 
-import msgspec
-import numpy as np
-from numpy.typing import NDArray
-
-from tsfusion import __version__, ledger, preview, process
-from tsfusion.child import ServerChild, serving
+from tsfusion import preview, process, summary
+from tsfusion.child import ServerChild, own_server
 from tsfusion.client import Client
 from tsfusion.config import ClientConfig, ServerConfig, VolumeConfig, override
 from tsfusion.datasets import Dataset
 from tsfusion.errors import FlushTimeout, OutputError, TransportError
 from tsfusion.fetch import fetch_mesh, fetch_status
 from tsfusion.keyframe import Keyframe
-from tsfusion.mesh import Mesh
-from tsfusion.results import RECORD, building
-from tsfusion.transport import KeyframeTimes, Status, client_keys
-from tsfusion.transport.messages import Spread
+from tsfusion.results import building
+from tsfusion.summary import KnownSurface, RunSummary, Sent
+from tsfusion.transport import client_keys
 
 AHEAD = 3  # keyframes under way when no rate is asked for: fusing, waiting, travelling
 PATIENCE = 60.0  # seconds without a newly fused keyframe before a run gives up
@@ -43,47 +35,6 @@ class Progress(Protocol):
 
     def count(self, sent: int, fused: int, total: int) -> None:
         """Keyframes handed over and keyframes in the map, of how many."""
-
-
-@runtime_checkable
-class KnownSurface(Protocol):
-    """A dataset of a world whose surface is known."""
-
-    def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n,) signed metres from (n, 3) points to the true surface."""
-
-
-class Accuracy(msgspec.Struct, frozen=True):
-    """Distance from the mesh's vertices to the known surface, millimetres."""
-
-    vertices: int
-    mean_mm: float
-    p50_mm: float
-    p95_mm: float
-    rmse_mm: float
-    max_mm: float
-
-
-class RunSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `run.json` holds."""
-
-    dataset: str
-    keyframes_sent: int
-    keyframes_fused: int
-    keyframes_rejected: dict[str, int]
-    seconds: float  # first keyframe handed over → last one fused
-    server_start_seconds: float | None  # None: the server was there already
-    map_hash: str
-    blocks: int
-    delay_ms: Spread
-    delay_slope_ms_per_keyframe: float
-    stages_ms: dict[str, Spread]
-    clock_bound_ms: float
-    mesh: dict[str, int]
-    accuracy: Accuracy | None
-    peak_rss_bytes: dict[str, int]
-    config: dict[str, Any]
-    versions: dict[str, str]
 
 
 class Silent:
@@ -134,7 +85,7 @@ def replay(
         place: AbstractContextManager[tuple[ClientConfig, ServerChild | None]]
         if connect is None:
             progress.stage("starting a server (the first start compiles kernels)")
-            place = _own_server(client, server, volume, scratch)
+            place = own_server(client, server, volume, scratch)
         else:
             progress.stage(f"connecting to {connect}")
             place = nullcontext((override(client, address=connect), None))
@@ -150,29 +101,23 @@ def replay(
                 progress.stage("fetching the mesh")
                 with suppress(FlushTimeout):  # a stamp less in the ledger is no reason to lose the run
                     scanner.wait_meshed()
-                run.records = scanner.records
+                run.sent.records = scanner.records
             status = fetch_status(link.address, control=link.control, map_name=link.map, keys=keys)
             mesh = fetch_mesh(
                 link.address, control=link.control, map_name=link.map, min_weight=min_weight, keys=keys
             )
         if not len(mesh.faces):
             raise OutputError(
-                f"the map has no surface to write: {run.stats.fused} of {run.stats.sent} keyframes fused; "
-                "send more of them or lower --min-weight"
+                f"the map has no surface to write: {run.sent.stats.fused} of {run.sent.stats.sent} keyframes "
+                "fused; send more of them or lower --min-weight"
             )
         progress.stage("writing the results")
         shutil.rmtree(scratch)
-        return _write(work, run, mesh, _summarise(run, mesh, status, child))
-
-
-@contextmanager
-def _own_server(
-    client: ClientConfig, server: ServerConfig | None, volume: VolumeConfig, scratch: Path
-) -> Iterator[tuple[ClientConfig, ServerChild | None]]:
-    """Where to send, and the server that runs there for as long as the block."""
-    server = server or ServerConfig(listen="tcp://127.0.0.1:0", state=str(scratch / "state"))
-    with serving(server, volume, scratch) as child:
-        yield override(client, address=child.listen, control=child.control), child
+        result = summary.summarise(run.sent, mesh, status, child.start_seconds if child else None)
+        summary.write_mesh(work, mesh, run.sent.ups)
+        summary.write_ledger(work, run.sent.records)
+        summary.write_record(work, result)
+        return result
 
 
 class _Run:
@@ -187,12 +132,8 @@ class _Run:
         progress: Progress,
     ) -> None:
         self.dataset = dataset
-        self.ups: list[NDArray[np.float64]] = []
-        self.seconds = 0.0
-        self.peak_rss_bytes = 0  # while scanning: drawing the result is not a scanner's work
-        self.records: list[KeyframeTimes] = []
-        self.rate: float | None = None
-        self.stats = scanner.stats
+        surface = dataset if isinstance(dataset, KnownSurface) else None
+        self.sent = Sent(name=dataset.name, stats=scanner.stats, surface=surface)
         self._first = first
         self._scanner = scanner
         self._child = child
@@ -202,7 +143,7 @@ class _Run:
 
     def feed(self, rate: float | None) -> None:
         """Send every keyframe and wait until each is fused or refused."""
-        self.rate = rate
+        self.sent.rate = rate
         self._progress.stage(f"scanning {self.dataset.name}")
         keyframe = self._first
         started = due = self._moved = time.monotonic()
@@ -214,10 +155,10 @@ class _Run:
                 due = max(due + 1 / rate, time.monotonic())  # a sensor that was late does not catch up
                 self._wait(partial(_is_time, due), patience=None)
             self._scanner.send(dataclasses.replace(keyframe, captured_ns=time.monotonic_ns()))
-            self.ups.append(preview.sensor_up(keyframe.T_world_camera, self.dataset.sensor))
+            self.sent.ups.append(preview.sensor_up(keyframe.T_world_camera, self.dataset.sensor))
         self._wait(lambda: self._done >= len(self.dataset))
-        self.seconds = time.monotonic() - started
-        self.peak_rss_bytes = process.peak_rss_bytes()
+        self.sent.seconds = time.monotonic() - started
+        self.sent.peak_rss_bytes = process.peak_rss_bytes()
 
     def _may_send(self, index: int) -> bool:
         return index - self._done < AHEAD
@@ -232,7 +173,7 @@ class _Run:
             time.sleep(_POLL)
 
     def _look(self) -> None:
-        stats = self.stats = self._scanner.stats
+        stats = self.sent.stats = self._scanner.stats
         done = stats.fused + sum(map(_total, (stats.refused, stats.rejected, stats.skipped)))
         if done != self._done:
             self._done, self._moved = done, time.monotonic()
@@ -247,75 +188,3 @@ def _total(counts: dict[str, int]) -> int:
 
 def _is_time(due: float) -> bool:
     return time.monotonic() >= due
-
-
-def _write(work: Path, run: _Run, mesh: Mesh, summary: RunSummary) -> RunSummary:
-    mesh.save(work / "mesh.ply")
-    mesh.save(work / "mesh.glb")
-    preview.render(mesh, work / "preview.png", ups=run.ups)
-    ledger.write_csv(run.records, work / "delay.csv")
-    ledger.plot(run.records, work / "delay.png")
-    text = msgspec.json.format(msgspec.json.encode(summary), indent=2)
-    (work / RECORD).write_bytes(text + b"\n")
-    return summary
-
-
-def _summarise(run: _Run, mesh: Mesh, status: Status, child: ServerChild | None) -> RunSummary:
-    delays = ledger.summarise(run.records)
-    dataset = run.dataset
-    surface = dataset if isinstance(dataset, KnownSurface) else None
-    return RunSummary(
-        dataset=dataset.name,
-        keyframes_sent=run.stats.sent,
-        keyframes_fused=run.stats.fused,
-        keyframes_rejected={**run.stats.skipped, **run.stats.refused, **run.stats.rejected},
-        seconds=round(run.seconds, 3),
-        server_start_seconds=round(child.start_seconds, 3) if child else None,
-        map_hash=status.map_hash,
-        blocks=status.blocks,
-        delay_ms=delays.delay_ms,
-        delay_slope_ms_per_keyframe=delays.slope_ms_per_keyframe,
-        stages_ms=delays.stages_ms,
-        clock_bound_ms=delays.clock_bound_ms,
-        mesh={"vertices": len(mesh.vertices), "triangles": len(mesh.faces)},
-        accuracy=measure(surface, mesh) if surface else None,
-        peak_rss_bytes={**_server_rss(status), "client": run.peak_rss_bytes},
-        config={**status.config, "rate": run.rate},
-        versions=versions(),
-    )
-
-
-def _server_rss(status: Status) -> dict[str, int]:
-    """Gateway and fuser, and as `server` the two together."""
-    gateway, fuser = status.peak_rss_bytes["server"], status.peak_rss_bytes["fuser"]
-    return {"server": gateway + fuser, "gateway": gateway, "fuser": fuser}
-
-
-def measure(surface: KnownSurface, mesh: Mesh) -> Accuracy:
-    """How far the mesh's vertices are from the known surface."""
-    error_mm = 1000 * np.abs(surface.distance(mesh.vertices.astype(np.float64)))
-    p50, p95 = np.percentile(error_mm, (50, 95))
-    rmse = np.sqrt(np.mean(error_mm**2))
-    figures = [round(float(x), 3) for x in (error_mm.mean(), p50, p95, rmse, error_mm.max())]
-    return Accuracy(len(error_mm), *figures)
-
-
-def versions() -> dict[str, str]:
-    """Of Python, the platform, tsfusion and what it stands on."""
-    packages = (
-        "taichi",
-        "numpy",
-        "opencv-python-headless",
-        "pyzmq",
-        "trimesh",
-        "mcap",
-        "msgspec",
-        "zstandard",
-    )
-    found = {"tsfusion": __version__, "python": platform.python_version(), "platform": platform.platform()}
-    for name in packages:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "missing"
-    return found

@@ -46,6 +46,11 @@ class Route(Struct, eq=False):
     held_until: float = 0.0
     held: str = ""
 
+    @property
+    def place(self) -> tuple[str, bytes]:
+        """Map and session."""
+        return self.map, self.session
+
     def open_to(self, client: str) -> bool:
         """Whether this client may go on with the session: it is its own, or its client is silent for long."""
         return self.client == client or time.monotonic() - self.heard >= _TAKEN
@@ -56,9 +61,15 @@ class Route(Struct, eq=False):
         possible = abs(ping.offset_ns or 0) <= _LARGEST_OFFSET_NS and 0 <= ping.bound_ns <= _LARGEST_BOUND_NS
         self.offset_ns, self.bound_ns = (ping.offset_ns, ping.bound_ns) if possible else (None, 0)
 
-    def health(self, now: float, progress: tuple[int, int]) -> ClientHealth:
-        """How the client is doing. `progress`: the highest seq that is durable, and that is fused."""
+    def health(self, now: float, progress: tuple[int, int], corrections: tuple[int, int]) -> ClientHealth:
+        """How the client is doing.
+
+        Args:
+            progress: the highest seq that is durable, and that is fused.
+            corrections: their newest revision, and how many keyframes they name.
+        """
         durable, fused = progress
+        revision, corrected = corrections
         return ClientHealth(
             client=self.client,
             session=self.session.hex()[:8],
@@ -70,6 +81,8 @@ class Route(Struct, eq=False):
             waiting=self.waiting,
             skipped=self.skipped,
             held=self.held if now < self.held_until else "",
+            revision=revision,
+            corrected=corrected,
         )
 
 

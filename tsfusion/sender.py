@@ -23,7 +23,7 @@ from tsfusion.errors import DecodeError, JournalError
 from tsfusion.outbox import Outbox
 from tsfusion.refused import RefusedFolder
 from tsfusion.spool import Waiting
-from tsfusion.transport import messages, sockets
+from tsfusion.transport import sockets
 from tsfusion.transport.curve import ClientKeys
 
 log = logging.getLogger(__name__)
@@ -115,9 +115,12 @@ class Sender:
         with suppress(BlockingIOError):
             self._woken.recv(4096)
 
-    def _say(self, message: messages.ToServer) -> None:
+    def _say(self, *frames: bytes) -> None:
         with suppress(zmq.Again):
-            self._link.socket.send(messages.encode(message), zmq.NOBLOCK)
+            if len(frames) == 1:
+                self._link.socket.send(frames[0], zmq.NOBLOCK)
+            else:
+                self._link.socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
 
     def _watch_connections(self, now: float) -> None:
         for connection in (self._link, self._data):

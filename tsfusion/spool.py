@@ -65,6 +65,8 @@ class Spool:
         waiting_bytes: the bytes of their messages.
         used_bytes: of the disk; keyframes that have left the queue but share a file with others count.
         next_seq: the number of the next keyframe.
+        left: the last number that an earlier scanner is known to have used; 0 = there was none.
+        pinned: there is more to say of its session: an empty spool keeps it, too.
 
     Raises:
         JournalError: when the folder cannot be used, another scanner uses it, or it waits for another map.
@@ -78,6 +80,8 @@ class Spool:
         map_name: str = DEFAULT_MAP,
     ) -> None:
         self.temporary = folder is None
+        self.map_name = map_name
+        self.pinned = False
         self.folder = _temporary_folder() if folder is None else Path(folder)
         self._lock = lock_folder(self.folder, "spool", "scanner")
         try:
@@ -106,6 +110,7 @@ class Spool:
                 self.waiting.append(Waiting(record.seq, record.position, record.nbytes))
         self.waiting_bytes = sum(entry.nbytes for entry in self.waiting)
         last = max([record.seq for record in found] + [*self._gone.numbers], default=0)
+        self.left = last
         self.next_seq = last + _RESTART_GAP + secrets.randbelow(_RESTART_SPREAD) if last else 1
         self._idle = {number for number, segment in self._segments.items() if not segment.waiting}
         self.used_bytes = sum(segment.nbytes for segment in self._segments.values())
@@ -204,7 +209,7 @@ class Spool:
     def _delete_segments(self, below: int | None = None) -> None:
         # The newest stays: a keyframe that `write` has just put there may not be queued yet.
         newest = next(reversed(self._segments), 0)
-        for number in [n for n in self._idle if n < (newest if below is None else below)]:
+        for number in [n for n in self._idle if n < (newest if below is None or self.pinned else below)]:
             self._forget(number)
 
     def _forget(self, number: int) -> None:
@@ -224,7 +229,7 @@ class Spool:
             log.warning("%s", error)
         if self.temporary:
             shutil.rmtree(self.folder, ignore_errors=True)
-        elif not self.waiting:
+        elif not self.waiting and not self.pinned:
             for number in list(self._segments):
                 self._forget(number)
             self._gone.clear()

@@ -59,6 +59,31 @@ class Matcher:
         return np.maximum(forward, 0).astype(np.uint16)
 
 
+def quick_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(H, W) float32 pixels of disparity, matched at half the resolution and one way; 0 = none.
+
+    For following a sensor, where a seventh of `Matcher`'s time counts more than its edges.
+    """
+    small = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in (left, right)]
+    search = max(32, -(-small[0].shape[1] // (12 * 16)) * 16)
+    matcher = cv2.StereoSGBM.create(
+        numDisparities=search,
+        blockSize=5,
+        P1=200,
+        P2=800,
+        preFilterCap=63,
+        uniquenessRatio=10,
+        speckleWindowSize=50,
+        speckleRange=1,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+    disparity = np.maximum(_match(matcher, small[0], small[1], search), 0).astype(np.float32) * np.float32(
+        2 / UNITS
+    )
+    whole: NDArray[np.float32] = cv2.resize(disparity, left.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    return whole
+
+
 def _match(matcher: Any, left: NDArray[np.uint8], right: NDArray[np.uint8], search: int) -> NDArray[np.int16]:
     wide = [cv2.copyMakeBorder(image, 0, 0, search, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
     disparity: NDArray[np.int16] = matcher.compute(*wide)[:, search:]

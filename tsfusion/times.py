@@ -43,6 +43,14 @@ class Times:
                 if (value := getattr(stamps, name)) and not row[_COLUMN[name]]:
                     row[_COLUMN[name]] = min(max(value - offset_ns, -_LARGEST), _LARGEST)
 
+    def newest_fused(self) -> KeyframeTimes | None:
+        """The newest keyframe that is in the map; None = there is none yet."""
+        seqs = np.where(self._rows[:, _COLUMN["fused_ns"]] > 0, self._rows[:, 0], 0)
+        newest = int(seqs.argmax())
+        if not seqs[newest]:
+            return None
+        return KeyframeTimes(**dict(zip(_FIELDS, self._rows[newest].tolist(), strict=True)))
+
     def copy(self) -> list[KeyframeTimes]:
         """All rows, oldest first."""
         rows = self._rows[self._rows[:, 0] > 0]

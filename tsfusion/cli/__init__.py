@@ -12,7 +12,20 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from tsfusion.cli import config, datasets, doctor, journal, keys, mesh, replay, serve, status
+from tsfusion.cli import (
+    ate,
+    config,
+    datasets,
+    doctor,
+    download,
+    journal,
+    keys,
+    mesh,
+    replay,
+    scan,
+    serve,
+    status,
+)
 from tsfusion.errors import TsfusionError
 
 INTERRUPTED = 128 + signal.SIGINT
@@ -28,10 +41,13 @@ app = typer.Typer(
 )
 app.command()(replay.demo)
 app.command()(replay.replay)
+app.command()(scan.scan)
 app.command()(serve.serve)
 app.command()(mesh.mesh)
 app.command()(status.status)
+app.command()(ate.ate)
 app.command()(doctor.doctor)
+app.command()(download.download)
 app.add_typer(keys.app, name="keys")
 app.add_typer(journal.app, name="journal")
 app.add_typer(config.app, name="config")

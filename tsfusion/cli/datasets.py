@@ -1,17 +1,28 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion datasets list`."""
+"""`tsfusion datasets`."""
 
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from tsfusion.cli import options
 
 _DEPTH = 4  # folders below PATH
 
-app = typer.Typer(help="What can be replayed.")
+
+class _ListByDefault(TyperGroup):
+    """`tsfusion datasets [PATH]` is `tsfusion datasets list [PATH]`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if not args or args[0] not in {*self.commands, *ctx.help_option_names}:
+            args = ["list", *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(cls=_ListByDefault, help="What can be replayed.")
 
 
 @app.callback()
@@ -44,9 +55,11 @@ def _line(name: str, *, description: str = "", path: str = "", sensor: str = "",
 
 
 def _layouts() -> list[dict[str, Any]]:
-    from tsfusion.datasets import LAYOUTS
+    from tsfusion.datasets import layouts
+    from tsfusion.datasets.layouts import SYNTHETIC
 
-    return [{"name": name, "description": description} for name, description in LAYOUTS]
+    rows = [(layout.name, layout.description) for layout in layouts()]
+    return [{"name": name, "description": description} for name, description in [*rows, SYNTHETIC]]
 
 
 def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:

@@ -202,8 +202,15 @@ def _session(one: "SessionInfo") -> str:
     first, last = _clock(one.first_logged_ns), _clock(one.last_logged_ns)
     return (
         f"  {one.session[:8]}  {one.client or 'no key':<12} {one.keyframes:>7} keyframes  "
-        f"{one.first_seq}…{one.last_seq}  {first} – {last}"
+        f"{one.first_seq}…{one.last_seq}  {first} – {last}{_corrected(one)}"
     )
+
+
+def _corrected(one: "SessionInfo") -> str:
+    if not one.revision:
+        return ""
+    most = f"{one.moved_m:.3g} m, {one.turned_deg:.2g}°"
+    return f"  {one.corrected} corrected by up to {most} (revision {one.revision})"
 
 
 def _clock(stamp_ns: int) -> str:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from tsfusion.config import Config
+    from tsfusion.config import ClientConfig, Config
 
 ConfigFile = Annotated[
     Path | None,
@@ -150,6 +150,13 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
         client=loaded.client,
         scan=loaded.scan,
     )
+
+
+def local(client: "ClientConfig") -> "ClientConfig":
+    """Settings of a client whose server is its own: nobody else is there, so no keys."""
+    from msgspec.structs import replace
+
+    return replace(client, key=None, server_key=None)
 
 
 def _band(truncation: float | None, support: str | None) -> dict[str, float]:

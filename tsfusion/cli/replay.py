@@ -31,7 +31,7 @@ Limit = Annotated[
 def replay(
     context: typer.Context,
     path: Annotated[
-        Path, typer.Argument(metavar="PATH", help="A dataset; `tsfusion datasets list` names the layouts.")
+        Path, typer.Argument(metavar="PATH", help="A dataset; `tsfusion datasets` names the layouts.")
     ],
     *,
     out: Out = Path("out"),
@@ -56,8 +56,13 @@ def replay(
     ] = None,
     poses: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", rich_help_panel=_DATASET, help="KITTI: poses to use instead."),
+        typer.Option(
+            metavar="FILE", rich_help_panel=_DATASET, help="KITTI, TUM, Redwood: poses to use instead."
+        ),
     ] = None,
+    unpack: Annotated[
+        bool, typer.Option("--unpack", rich_help_panel=_DATASET, help="Unpack an archive beside itself.")
+    ] = False,
     state: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Keep the own server's journal and map here.")
     ] = None,
@@ -75,7 +80,7 @@ def replay(
         )  # fmt: skip
     else:
         options.refuse(context, ("control", "key", "server_key"), "has no effect without --connect")
-    dataset = _open(path, sequence=sequence, modality=modality, poses=poses)
+    dataset = open_recording(path, unpack=unpack, sequence=sequence, modality=modality, poses=poses)
     chosen = options.configuration(
         config, preset={"sensor": dataset.sensor}, **settings,
     )  # fmt: skip
@@ -89,25 +94,31 @@ def replay(
     )  # fmt: skip
 
 
-def _open(path: Path, **given: Any) -> "Dataset":
-    from tsfusion import maps
-
-    if (
-        path.suffix == ".mcap"
-        or any(path.glob("*.mcap"))
-        or any(path.glob("journal/*.mcap"))
-        or maps.is_state(path)
-    ):
+def open_recording(path: Path, *, unpack: bool = False, **given: Any) -> "Dataset":
+    """A dataset, or a journal; `given` are settings of a dataset, None = left out."""
+    if _is_journal(path):
         from tsfusion.errors import DatasetError
         from tsfusion.recording import Recording
 
         for name, value in given.items():
-            if value is not None:
+            if value is not None and name != "posed":
                 raise DatasetError(f"--{name} has no effect on a journal")
         return Recording(path)
-    from tsfusion.datasets import open_dataset
+    from tsfusion.datasets import describe, open_dataset
 
-    return open_dataset(path, **given)
+    dataset = open_dataset(path, unpack=unpack, **given)
+    typer.echo(f"found: {describe(dataset)}", err=True)
+    return dataset
+
+
+def _is_journal(path: Path) -> bool:
+    """Whether it is a journal of ours, or a place with one; a ROS recording may be an `.mcap` too."""
+    from tsfusion import maps
+    from tsfusion.datasets import bags
+
+    if maps.is_state(path) or any(path.glob("journal/*.mcap")):
+        return True
+    return (path.suffix == ".mcap" or any(path.glob("*.mcap"))) and not bags.recognises(path)
 
 
 @options.takes_map_settings
@@ -164,7 +175,7 @@ def _run(
     client = override(chosen.client, control=control, map=map_, key=key, server_key=server_key)
     if connect is None:  # a server of its own: only this machine reaches it, its errors are told here
         server = replace(server, keys=None, metrics=None, log_format="text") if server else None
-        client = replace(client, key=None, server_key=None)
+        client = options.local(client)
     with show.progress(quiet=json) as progress:
         run = pipeline.replay(
             dataset, out, volume=chosen.volume, server=server, client=client, progress=progress,

@@ -12,7 +12,8 @@ import msgspec
 import typer
 
 if TYPE_CHECKING:
-    from tsfusion.pipeline import Progress, RunSummary
+    from tsfusion.pipeline import Progress
+    from tsfusion.summary import RunSummary
 
 _PLAIN_INTERVAL = 2.0  # seconds between plain lines
 

@@ -4,7 +4,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import cv2
 import numpy as np
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from tsfusion.errors import DatasetError, InvalidKeyframe
 from tsfusion.frame import Frame
 from tsfusion.keyframe import Intrinsics, Keyframe, check_intrinsics
+
+SCAN = "`tsfusion scan --source PATH` finds poses by itself"
+_T = TypeVar("_T")
 
 
 @runtime_checkable
@@ -41,12 +44,13 @@ class Dataset(Protocol):
 
 
 class Frames(ABC):
-    """Indexing and iteration over `_load(index)`; files are opened there, not before."""
+    """Indexing and iteration over `_frame(index)`; files are opened there, not before."""
 
     name: str
     sensor: str
     timestamps_ns: NDArray[np.int64] | None = None
     skipped: dict[str, int]
+    _poses: Sequence[NDArray[np.float64] | None] = ()
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -62,13 +66,15 @@ class Frames(ABC):
         except InvalidKeyframe as error:
             raise DatasetError(f"keyframe {index} of {self.name}: {error}") from error
 
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        """(4, 4) T_world_camera as recorded, None where it is not; no image is read where that can be."""
+        index = self._checked(index)
+        return self._poses[index] if self._poses else self.frame(index).T_world_camera
+
     def __getitem__(self, index: int) -> Keyframe:
         frame = self.frame(index)
         if frame.T_world_camera is None:
-            raise DatasetError(
-                f"frame {self._checked(index)} of {self.name} has no pose; "
-                "`tsfusion scan --source PATH` finds poses by itself"
-            )
+            raise DatasetError(f"frame {self._checked(index)} of {self.name} has no pose; {SCAN}")
         return frame.keyframe(frame.T_world_camera)
 
     def __iter__(self) -> Iterator[Keyframe]:
@@ -103,6 +109,9 @@ class Selection(Frames):
     def __len__(self) -> int:
         return len(self._indices)
 
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        return pose_of(self._dataset, self._indices[self._checked(index)])
+
     def _frame(self, index: int) -> Frame:
         return frame_of(self._dataset, self._indices[index])
 
@@ -114,6 +123,27 @@ def frame_of(dataset: Dataset, index: int) -> Frame:
     """Frame `index` of any dataset: without its pose's help where the dataset has frames of its own."""
     own: Callable[[int], Frame] | None = getattr(dataset, "frame", None)
     return own(index) if own is not None else Frame.of(dataset[index], dataset.sensor)
+
+
+def pose_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:
+    """Frame `index`'s (4, 4) T_world_camera as recorded, of any dataset; None where there is none."""
+    own: Callable[[int], NDArray[np.float64] | None] | None = getattr(dataset, "pose", None)
+    return own(index) if own is not None else dataset[index].T_world_camera
+
+
+def kept(
+    files: Sequence[_T],
+    poses: Sequence[NDArray[np.float64] | None],
+    *,
+    posed: bool,
+    skipped: dict[str, int],
+    reason: str = "without a pose",
+) -> tuple[list[_T], list[NDArray[np.float64] | None]]:
+    """The frames to offer: with `posed` only those with a pose; the others are counted in `skipped`."""
+    pairs = [pair for pair in zip(files, poses, strict=True) if pair[1] is not None or not posed]
+    if len(pairs) < len(files):
+        skipped[reason] = skipped.get(reason, 0) + len(files) - len(pairs)
+    return [file for file, _ in pairs], [pose for _, pose in pairs]
 
 
 def select(
@@ -207,14 +237,14 @@ def read_depth(path: Path, *, invalid: int | None = None) -> NDArray[np.uint16]:
     return depth
 
 
-def read_color(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 BGR of the depth image's `shape`."""
+def read_color(path: Path, shape: tuple[int, ...] | None) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 BGR of the depth image's `shape`; None: of any."""
     if not path.is_file():
         raise DatasetError(f"{path} is missing; expected a colour image")
     color: NDArray[np.uint8] | None = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if color is None:
         raise DatasetError(f"{path} cannot be decoded; expected a colour image")
-    if color.shape[:2] != shape:
+    if shape is not None and color.shape[:2] != shape:
         raise DatasetError(
             f"{path} is {color.shape[1]}×{color.shape[0]}, its depth image {shape[1]}×{shape[0]}; "
             "expected equal sizes"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets.base import Frames, checked_intrinsics, folder, read_lines, require_frames
+from tsfusion.datasets.base import Frames, checked_intrinsics, folder, kept, read_lines, require_frames
 from tsfusion.datasets.poses import Pose, nanoseconds, read_kitti
 from tsfusion.errors import DatasetError, InvalidKeyframe
 from tsfusion.frame import Frame
@@ -35,6 +35,7 @@ def open_kitti(
     modality: str | None = None,
     poses: str | Path | None = None,
     color: bool = True,
+    posed: bool = True,
 ) -> "KITTI":
     """Open the root or a sequence's own folder; sequence and modality may be left out where one exists."""
     root = Path(root)
@@ -44,7 +45,7 @@ def open_kitti(
         sequence = _only_sequence(root)
     if modality is None:
         modality = "stereo" if (root / "sequences" / sequence / "image_0").is_dir() else "lidar"
-    return KITTI(root, sequence, modality=modality, poses=poses, color=color)
+    return KITTI(root, sequence, modality=modality, poses=poses, color=color, posed=posed)
 
 
 class KITTI(Frames):
@@ -52,12 +53,13 @@ class KITTI(Frames):
 
     Stereo: the left camera's frame, disparity in 1/16 px by semi-global matching at each access; colour is
     the grey image. LiDAR: points in the Velodyne's axes (x forward, z up), pose inv(Tr)·P·Tr; scans are as
-    recorded, not corrected for the car's motion. Frames without a pose are skipped and counted.
+    recorded, not corrected for the car's motion.
 
     Args:
         root: the benchmark's folder, holding `sequences/` and `poses/`.
         sequence: "00" … "21".
         poses: another poses file in KITTI's format, from here or from `root`; default `poses/NN.txt`.
+        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
 
     Raises:
         DatasetError: no such folder, files or calibration; unequal image pairs; a malformed line.
@@ -71,6 +73,7 @@ class KITTI(Frames):
         poses: str | Path | None = None,
         *,
         color: bool = True,
+        posed: bool = True,
     ) -> None:
         if modality not in ("stereo", "lidar"):
             raise DatasetError(f"modality of KITTI must be stereo or lidar, got {modality!r}")
@@ -81,19 +84,20 @@ class KITTI(Frames):
         calibration = _read_calibration(
             place / "calib.txt", ("P0", "P1") if modality == "stereo" else ("Tr",)
         )
-        trajectory = read_kitti(_poses_file(root, sequence, poses))
-        self._frames = [number for number in self._left if number < len(trajectory)]
-        if len(self._frames) < len(self._left):
-            self.skipped["without a pose"] = len(self._left) - len(self._frames)
+        trajectory = _trajectory(root, sequence, poses, posed=posed)
+        self._frames, found = kept(
+            list(self._left), [trajectory.get(n) for n in self._left], posed=posed, skipped=self.skipped
+        )
         require_frames(len(self._frames), place, EXPECTED, self.skipped)
         self.timestamps_ns = _read_times(place / "times.txt", self._frames)
-        self._poses = [trajectory[number] for number in self._frames]
         self._with_color = color
         if modality == "stereo":
             self.intrinsics, self.baseline_fx = _stereo_camera(calibration, place / "calib.txt")
         else:
             T_cam0_velo = _transform(calibration["Tr"], place / "calib.txt")
-            self._poses = [np.linalg.inv(T_cam0_velo) @ T @ T_cam0_velo for T in self._poses]
+            T_velo_cam0 = np.linalg.inv(T_cam0_velo)
+            found = [None if T is None else T_velo_cam0 @ T @ T_cam0_velo for T in found]
+        self._poses = found
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -106,8 +110,8 @@ class KITTI(Frames):
             "timestamp_ns": self._stamp(index),
         }
         if self.sensor == "lidar":
-            return Frame(points=_read_scan(self._left[number]), **common)
-        left, right = _read_grey(self._left[number]), _read_grey(self._right[number])
+            return Frame(points=read_scan(self._left[number]), **common)
+        left, right = read_grey(self._left[number]), read_grey(self._right[number])
         if left.shape != right.shape:
             raise DatasetError(
                 f"{self._right[number]} has shape {right.shape}, its left image {left.shape}; "
@@ -138,7 +142,7 @@ def _only_sequence(root: Path) -> str:
     return found[0]
 
 
-def _numbered(place: Path, suffix: str) -> dict[int, Path]:
+def numbered(place: Path, suffix: str) -> dict[int, Path]:
     """Frame number → file, in order."""
     files = sorted(place.glob(f"*{suffix}"))
     for path in files:
@@ -148,7 +152,7 @@ def _numbered(place: Path, suffix: str) -> dict[int, Path]:
 
 
 def _stereo_files(place: Path) -> tuple[dict[int, Path], dict[int, Path]]:
-    left, right = _numbered(place / "image_0", ".png"), _numbered(place / "image_1", ".png")
+    left, right = numbered(place / "image_0", ".png"), numbered(place / "image_1", ".png")
     if not left or not right:
         raise DatasetError(f"{place} has {len(left)} left and {len(right)} right images; expected {EXPECTED}")
     alone = sorted(left.keys() ^ right.keys())
@@ -163,16 +167,20 @@ def _stereo_files(place: Path) -> tuple[dict[int, Path], dict[int, Path]]:
 
 
 def _scan_files(place: Path) -> dict[int, Path]:
-    scans = _numbered(place / "velodyne", ".bin")
+    scans = numbered(place / "velodyne", ".bin")
     if not scans:
         raise DatasetError(f"{place / 'velodyne'} has no scans (*.bin); expected {EXPECTED}")
     return scans
 
 
-def _poses_file(root: Path, sequence: str, poses: str | Path | None) -> Path:
-    if poses is None:
-        return root / "poses" / f"{sequence}.txt"
-    return Path(poses) if Path(poses).is_file() else root / poses
+def _trajectory(root: Path, sequence: str, poses: str | Path | None, *, posed: bool) -> dict[int, Pose]:
+    """Frame number → pose; without `posed` the benchmark's own file may be missing, as it is from 11 on."""
+    path = root / "poses" / f"{sequence}.txt"
+    if poses is not None:
+        path = Path(poses) if Path(poses).is_file() else root / poses
+    elif not posed and not path.exists():
+        return {}
+    return dict(enumerate(read_kitti(path)))
 
 
 def _read_calibration(path: Path, wanted: tuple[str, ...]) -> Mapping[str, NDArray[np.float64]]:
@@ -226,7 +234,8 @@ def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
     return np.array([stamps[number] for number in frames], dtype=np.int64)
 
 
-def _read_grey(path: Path) -> NDArray[np.uint8]:
+def read_grey(path: Path) -> NDArray[np.uint8]:
+    """(H, W), a colour image's luminance."""
     import pykitti.utils
 
     try:
@@ -235,7 +244,8 @@ def _read_grey(path: Path) -> NDArray[np.uint8]:
         raise DatasetError(f"{path} cannot be decoded; expected a grey image ({error})") from error
 
 
-def _read_scan(path: Path) -> NDArray[np.float32]:
+def read_scan(path: Path) -> NDArray[np.float32]:
+    """(n, 3) metres in the Velodyne's axes, without the reflectance."""
     import pykitti.utils
 
     try:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Trajectories: the text formats of the field, and the pose at a time between two of them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,6 +77,34 @@ def rigid(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> 
     return T
 
 
+def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) rotation → (4,) unit quaternion x y z w with w >= 0."""
+    # The largest of the four squares is at least 1/4: dividing by its root loses no digits.
+    squares = np.array(
+        [
+            1 + R[0, 0] - R[1, 1] - R[2, 2],
+            1 - R[0, 0] + R[1, 1] - R[2, 2],
+            1 - R[0, 0] - R[1, 1] + R[2, 2],
+            1 + R[0, 0] + R[1, 1] + R[2, 2],
+        ]
+    )
+    k = int(squares.argmax())
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
+    rows = ((squares[0], xy, xz, x), (xy, squares[1], yz, y), (xz, yz, squares[2], z), (x, y, z, squares[3]))
+    unit: NDArray[np.float64] = np.array(rows[k]) / np.linalg.norm(rows[k])
+    return -unit if unit[3] < 0 else unit
+
+
+def write_tum(path: Path, timestamps_ns: Sequence[int], poses: Sequence[Pose]) -> None:
+    """`timestamp tx ty tz qx qy qz qw` a line, nine decimals: what `read_tum` and the field's tools read."""
+    lines = ["# timestamp tx ty tz qx qy qz qw (T_world_camera)\n"]
+    for stamp, T in zip(timestamps_ns, poses, strict=True):
+        numbers_ = " ".join(f"{value:.9f}" for value in (*T[:3, 3], *quaternion(T[:3, :3])))
+        lines.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {numbers_}\n")
+    path.write_text("".join(lines), encoding="utf-8")
+
+
 def nanoseconds(seconds: str, path: Path, line: int) -> int:
     """Decimal seconds as exact integer nanoseconds (a double holds a Unix stamp only to 0.2 µs)."""
     whole, _, fraction = seconds.partition(".")
@@ -98,12 +127,36 @@ def read_tum(path: Path) -> Trajectory:
     rows: list[list[float]] = []
     for number, line in read_lines(path, content):
         words = line.replace(",", " ").split()
-        values = numbers(path, number, words, 8, content)
-        norm = float(np.linalg.norm(values[4:]))
-        if abs(norm - 1) > 0.01:
-            raise DatasetError(f"{path}:{number}: quaternion must have length 1, got {norm:.4g}")
+        rows.append(numbers(path, number, words, 8, content)[1:])
+        check_quaternion(rows[-1][3:], path, number)
         stamps.append(nanoseconds(words[0], path, number))
-        rows.append(values[1:])
+    return _in_order(stamps, rows, path, content)
+
+
+def read_euroc(path: Path) -> Trajectory:
+    """EuRoC / ASL ground truth: `ns, px, py, pz, qw, qx, qy, qz, …` a line, T_world_body."""
+    content = "`ns,px,py,pz,qw,qx,qy,qz,…` a line"
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in read_lines(path, content):
+        words = [word.strip() for word in line.split(",")]
+        if not words[0].isdecimal() or int(words[0]) >= 2**63:
+            raise DatasetError(f"{path}:{number}: timestamp must be nanoseconds, got {words[0]!r}")
+        px, py, pz, qw, qx, qy, qz = numbers(path, number, words[1:8], 7, content)
+        check_quaternion([qx, qy, qz, qw], path, number)
+        stamps.append(int(words[0]))
+        rows.append([px, py, pz, qx, qy, qz, qw])
+    return _in_order(stamps, rows, path, content)
+
+
+def check_quaternion(quaternion: Sequence[float] | NDArray[np.float64], path: Path, line: int) -> None:
+    """Raise a DatasetError unless its length is 1 to a hundredth."""
+    norm = float(np.linalg.norm(quaternion))
+    if abs(norm - 1) > 0.01:
+        raise DatasetError(f"{path}:{line}: quaternion must have length 1, got {norm:.4g}")
+
+
+def _in_order(stamps: list[int], rows: list[list[float]], path: Path, content: str) -> Trajectory:
     if not rows:
         raise DatasetError(f"{path} holds no poses; expected {content}")
     order = np.unique(np.array(stamps, dtype=np.int64), return_index=True)[1]

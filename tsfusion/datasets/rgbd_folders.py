@@ -5,82 +5,68 @@ import json
 from pathlib import Path
 
 from tsfusion.datasets.base import (
-    Frames,
+    SCAN,
     checked_intrinsics,
     folder,
-    read_color,
-    read_depth,
+    kept,
     read_intrinsics,
     require_frames,
 )
+from tsfusion.datasets.depth_images import DepthImages, by_number, images, matched
 from tsfusion.datasets.poses import Pose, read_log, read_matrix_rows
 from tsfusion.errors import DatasetError
-from tsfusion.frame import Frame
 from tsfusion.keyframe import Intrinsics
 
-IMAGES = (".png", ".jpg", ".jpeg")
 HOLOLENS_EXPECTED = "K.txt, poses.txt, depth/*.png and images/*.png"
-REDWOOD_EXPECTED = "trajectory.log, depth/*.png and image/, color/ or rgb/"
+REDWOOD_EXPECTED = "depth/*.png, image/, color/ or rgb/, and trajectory.log, odometry.log or *-traj.txt"
+PLAIN_EXPECTED = "depth/*.png and image/, color/ or rgb/, of equal names; without poses, so for a scan only"
 PRIMESENSE = Intrinsics(525.0, 525.0, 319.5, 239.5)  # Open3D's PrimeSenseDefault
+_LOGS = ("trajectory.log", "scene/trajectory.log", "odometry.log")  # by preference
+_LOG_NAMES = ("*traj*.log", "*-traj.txt")
+_COLOR = ("image", "color", "rgb")
 
 
 def recognises_hololens(path: Path) -> bool:
-    """Whether the folder has `K.txt`, `poses.txt` and `depth/`."""
-    return (path / "K.txt").is_file() and (path / "poses.txt").is_file() and (path / "depth").is_dir()
+    """Whether the folder has `K.txt`, `depth/`, and `poses.txt` or `images/`."""
+    if not (path / "K.txt").is_file() or not (path / "depth").is_dir():
+        return False
+    return (path / "poses.txt").is_file() or (path / "images").is_dir()
 
 
 def recognises_redwood(path: Path) -> bool:
-    """Whether the folder has `trajectory.log` and `depth/`."""
-    return (path / "trajectory.log").is_file() and (path / "depth").is_dir()
+    """Whether the folder has depth images and a trajectory; or the file is a `.log` of such a folder."""
+    if path.is_file():
+        return path.suffix == ".log" and _root_of(path) is not None
+    return bool(_depth_folders(path)) and _log(path) is not None
 
 
-class PosedFolders(Frames):
-    """Depth and colour images in two folders, with a pose each; depth in uint16 millimetres."""
-
-    def __init__(
-        self,
-        name: str,
-        *,
-        sensor: str,
-        depth: list[Path],
-        color: list[Path],
-        poses: list[Pose],
-        intrinsics: Intrinsics,
-        skipped: dict[str, int],
-    ) -> None:
-        self.name, self.sensor, self.skipped, self.intrinsics = name, sensor, skipped, intrinsics
-        self._depth, self._color, self._poses = depth, color, poses
-
-    def __len__(self) -> int:
-        return len(self._depth)
-
-    def _frame(self, index: int) -> Frame:
-        depth = read_depth(self._depth[index])
-        color = read_color(self._color[index], depth.shape) if self._color else None
-        return Frame(
-            depth=depth,
-            depth_scale=0.001,
-            color=color,
-            intrinsics=self.intrinsics,
-            T_world_camera=self._poses[index],
-            sensor=self.sensor,
-        )
+def recognises_plain(path: Path) -> bool:
+    """Whether the folder has one of depth images and one of colour images."""
+    return bool(_depth_folders(path)) and _color_folder(path) is not None
 
 
-class HoloLens(PosedFolders):
+class HoloLens(DepthImages):
     """HoloLens RGB-D as in deep-video-mvs: line k of `poses.txt` belongs to the k-th image by name.
 
-    Time-of-flight depth in uint16 millimetres, registered to colour; no timestamps.
+    https://github.com/ardaduz/deep-video-mvs. Time-of-flight depth in uint16 millimetres, registered to
+    colour; no timestamps.
+
+    Args:
+        posed: `poses.txt` must be there; else frames come without a pose where it is not.
 
     Raises:
         DatasetError: no such folder, no frames, unequal numbers of images and poses, a malformed line.
     """
 
-    def __init__(self, path: str | Path, *, sensor: str = "tof", color: bool = True) -> None:
+    def __init__(
+        self, path: str | Path, *, sensor: str = "tof", color: bool = True, posed: bool = True
+    ) -> None:
         root = folder(path, "HoloLens")
-        depth = _images(root / "depth", HOLOLENS_EXPECTED)
+        depth = images(root / "depth", HOLOLENS_EXPECTED)
         require_frames(len(depth), root / "depth", HOLOLENS_EXPECTED, {})
-        poses = read_matrix_rows(root / "poses.txt")
+        poses: list[Pose | None] = [None] * len(depth)
+        if posed or (root / "poses.txt").exists():
+            poses = [*read_matrix_rows(root / "poses.txt")]
         if len(poses) != len(depth):
             raise DatasetError(
                 f"{root / 'poses.txt'} has {len(poses)} poses for {len(depth)} depth images; "
@@ -90,21 +76,29 @@ class HoloLens(PosedFolders):
             f"HoloLens {root.name}",
             sensor=sensor,
             depth=depth,
-            color=_matched(depth, root / "images", HOLOLENS_EXPECTED) if color else [],
+            color=matched(depth, root / "images", HOLOLENS_EXPECTED) if color else [],
             poses=poses,
             intrinsics=read_intrinsics(root / "K.txt"),
             skipped={},
         )
 
 
-class Redwood(PosedFolders):
-    """Redwood and Open3D reconstructions: `trajectory.log` with uint16 millimetre depth; no timestamps.
+class Redwood(DepthImages):
+    """Redwood's data sets and Open3D's reconstructions: a `.log` of poses, depth in uint16 millimetres.
 
-    With as many poses as images the k-th pose is the k-th image's; otherwise a pose's number is its image's
-    file name. Images without a pose are skipped and counted, poses without an image ignored.
+    http://redwood-data.org and Open3D's reconstruction system: `depth/` beside `image/`, `color/` or `rgb/`,
+    or Redwood's own `NAME-depth-clean/`, `NAME-color/`, `NAME-traj.txt`. With as many poses as images the
+    k-th pose is the k-th image's; otherwise a pose's number is its image's file name. Poses without an image
+    are ignored. No timestamps.
 
     Args:
-        intrinsics: default `camera_intrinsic.json` (Open3D's) in the folder, else 525, 525, 319.5, 239.5.
+        path: the folder, or the `.log` in it to take the poses from.
+        trajectory: default `trajectory.log`, `scene/trajectory.log`, `odometry.log` or the one file named
+            `*traj*.log` or `*-traj.txt`.
+        intrinsics: default `camera_intrinsic.json` or `intrinsic.json` (Open3D's) in the folder, else 525,
+            525, 319.5, 239.5.
+        depth_scale: metres per unit.
+        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
 
     Raises:
         DatasetError: no such folder, no frames, a missing image, a malformed trajectory.
@@ -114,62 +108,77 @@ class Redwood(PosedFolders):
         self,
         path: str | Path,
         *,
+        trajectory: str | Path | None = None,
         intrinsics: Intrinsics | None = None,
+        depth_scale: float = 0.001,
         sensor: str = "kinect",
         color: bool = True,
+        posed: bool = True,
     ) -> None:
+        path = Path(path).expanduser()
+        if path.is_file():
+            path, trajectory = _root_of(path) or path.parent, trajectory or path.absolute()
         root = folder(path, "Redwood")
-        images = _images(root / "depth", REDWOOD_EXPECTED)
-        by_image = _assign(images, read_log(root / "trajectory.log"), root)
-        depth = [image for image in images if image in by_image]
-        skipped = {"without a pose": len(images) - len(depth)} if len(depth) < len(images) else {}
+        files = images(_depth_folder(root), REDWOOD_EXPECTED)
+        log = _log(root) if trajectory is None else _given(root, trajectory)
+        if log is None and posed:
+            raise DatasetError(f"{root} has no trajectory; expected {REDWOOD_EXPECTED}; {SCAN}")
+        skipped: dict[str, int] = {}
+        found = [None] * len(files) if log is None else by_number(files, read_log(log), log)
+        depth, poses = kept(files, found, posed=posed, skipped=skipped)
         require_frames(len(depth), root, REDWOOD_EXPECTED, skipped)
-        where = next((root / name for name in ("image", "color", "rgb") if (root / name).is_dir()), None)
-        if intrinsics is None:
-            intrinsics = _open3d_intrinsics(root / "camera_intrinsic.json")
+        where = _color_folder(root)
         super().__init__(
             f"Redwood {root.name}",
             sensor=sensor,
             depth=depth,
-            color=_matched(depth, where, REDWOOD_EXPECTED) if color and where else [],
-            poses=[by_image[image] for image in depth],
-            intrinsics=checked_intrinsics(intrinsics, "intrinsics"),
+            color=matched(depth, where, REDWOOD_EXPECTED) if color and where else [],
+            poses=poses,
+            intrinsics=checked_intrinsics(intrinsics or _open3d_intrinsics(root), "intrinsics"),
             skipped=skipped,
+            depth_scale=depth_scale,
         )
 
 
-def _images(where: Path, expected: str) -> list[Path]:
-    if not where.is_dir():
-        raise DatasetError(f"{where} is missing; expected {expected}")
-    return sorted(path for path in where.iterdir() if path.suffix.lower() in IMAGES)
+def _root_of(log: Path) -> Path | None:
+    """The recording that a trajectory lies in: `scene/trajectory.log` is one folder down."""
+    log = log.absolute()
+    return next((place for place in (log.parent, log.parent.parent) if _depth_folders(place)), None)
 
 
-def _matched(depth: list[Path], where: Path, expected: str) -> list[Path]:
-    """The colour image of each depth image, by file name."""
-    by_stem = {path.stem: path for path in _images(where, expected)}
-    for image in depth:
-        if image.stem not in by_stem:
-            raise DatasetError(
-                f"{where / image.stem}.png or .jpg is missing, but {image} is there; expected {expected}"
-            )
-    return [by_stem[image.stem] for image in depth]
+def _depth_folders(root: Path) -> list[Path]:
+    if (root / "depth").is_dir():
+        return [root / "depth"]
+    return sorted(path for path in root.glob("*-depth*") if path.is_dir())
 
 
-def _assign(images: list[Path], poses: list[tuple[int, Pose]], root: Path) -> dict[Path, Pose]:
-    if len(images) == len(poses):
-        return {image: pose for image, (_, pose) in zip(images, poses, strict=True)}
-    if not all(image.stem.isdigit() for image in images):
-        raise DatasetError(
-            f"{root / 'trajectory.log'} has {len(poses)} poses for {len(images)} depth images, "
-            "whose names are not frame numbers; "
-            "expected as many poses as images, or images named by frame number"
-        )
-    by_number = dict(poses)
-    return {image: by_number[int(image.stem)] for image in images if int(image.stem) in by_number}
+def _depth_folder(root: Path) -> Path:
+    found = _depth_folders(root)
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found)
+        raise DatasetError(f"{root} holds {len(found)} depth folders ({names}); name the one to use depth/")
+    return found[0] if found else root / "depth"
 
 
-def _open3d_intrinsics(path: Path) -> Intrinsics:
-    if not path.exists():
+def _color_folder(root: Path) -> Path | None:
+    places = [*(root / name for name in _COLOR), *sorted(root.glob("*-color"))]
+    return next((place for place in places if place.is_dir()), None)
+
+
+def _log(root: Path) -> Path | None:
+    known = [root / name for name in _LOGS if (root / name).is_file()]
+    named = [path for pattern in _LOG_NAMES for path in sorted(root.glob(pattern)) if path.is_file()]
+    return next(iter([*known, *named]), None)
+
+
+def _given(root: Path, trajectory: str | Path) -> Path:
+    return Path(trajectory) if Path(trajectory).is_file() else root / trajectory
+
+
+def _open3d_intrinsics(root: Path) -> Intrinsics:
+    names = ("camera_intrinsic.json", "intrinsic.json")
+    path = next((root / name for name in names if (root / name).exists()), None)
+    if path is None:
         return PRIMESENSE
     try:
         K = json.loads(path.read_text(encoding="utf-8"))["intrinsic_matrix"]  # column-major

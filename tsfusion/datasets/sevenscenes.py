@@ -1,25 +1,26 @@
 # SPDX-License-Identifier: MIT
 """Microsoft 7-Scenes, and the 3DMatch data sets that share its layout."""
 
+from functools import lru_cache
 from pathlib import Path
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from tsfusion.datasets.base import (
     Frames,
     checked_intrinsics,
     folder,
+    kept,
     read_color,
     read_depth,
     read_intrinsics,
     require_frames,
 )
-from tsfusion.datasets.poses import read_matrix
+from tsfusion.datasets.poses import Pose, read_matrix
 from tsfusion.errors import DatasetError
 from tsfusion.frame import Frame
 from tsfusion.keyframe import Intrinsics
+from tsfusion.registration import Registration
 
 EXPECTED = "frame-XXXXXX.{depth.png,pose.txt,color.png|jpg}, in the folder or in its seq-XX folders"
 KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0)  # the release's own figure
@@ -39,8 +40,7 @@ class SevenScenes(Frames):
     """A scene (every `seq-*` in it, one world) or a single sequence.
 
     Depth is uint16 millimetres. 7-Scenes colour has the depth's size but comes from another camera, up to
-    35 pixels off: it is registered to the depth here. There are no timestamps (nominally 30 Hz). Frames
-    without a pose file are skipped and counted.
+    35 pixels off: it is registered to the depth here. There are no timestamps (nominally 30 Hz).
 
     Args:
         path: the scene's or the sequence's folder.
@@ -49,6 +49,7 @@ class SevenScenes(Frames):
         color: read colour images.
         register: move colour onto depth; default: where the depth camera is 7-Scenes' own (3DMatch's colour
             is registered already).
+        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
 
     Raises:
         DatasetError: no such folder, no frames, a missing image, a malformed pose or camera file.
@@ -62,26 +63,23 @@ class SevenScenes(Frames):
         sensor: str = "kinect",
         color: bool = True,
         register: bool | None = None,
+        posed: bool = True,
     ) -> None:
         root = folder(path, "7-Scenes")
         self.name, self.sensor, self.skipped = f"7-Scenes {root.name}", sensor, {}
-        self._stems: list[Path] = []
-        unposed = 0
+        stems: list[Path] = []
         for sequence in _sequences(root):
             depth = _frames(sequence, "depth.png")
-            posed = _frames(sequence, "pose.txt")
-            if posed - depth:
+            alone = _frames(sequence, "pose.txt") - depth
+            if alone:
                 raise DatasetError(
-                    f"{sequence / min(posed - depth)}.depth.png is missing, but its pose.txt is there; "
+                    f"{sequence / min(alone)}.depth.png is missing, but its pose.txt is there; "
                     f"expected {EXPECTED}"
                 )
-            unposed += len(depth - posed)
-            self._stems += [sequence / stem for stem in sorted(depth & posed)]
-        if unposed:
-            self.skipped["without a pose"] = unposed
+            stems += [sequence / stem for stem in sorted(depth)]
+        self._stems, self._poses = kept(stems, [_pose(s) for s in stems], posed=posed, skipped=self.skipped)
         require_frames(len(self._stems), root, EXPECTED, self.skipped)
         self._suffix = _color_suffix(self._stems[0]) if color else None
-        self._poses = [read_matrix(_file(stem, "pose.txt")) for stem in self._stems]
         self.intrinsics = _intrinsics(root, self._stems[0].parent) if intrinsics is None else intrinsics
         checked_intrinsics(self.intrinsics, "intrinsics")
         self._register = self.intrinsics == KINECT if register is None else register
@@ -94,7 +92,8 @@ class SevenScenes(Frames):
         depth = read_depth(_file(stem, "depth.png"), invalid=NOT_MEASURED)
         color = None if self._suffix is None else read_color(_file(stem, self._suffix), depth.shape)
         if color is not None and self._register:
-            color = registered(color, depth, self.intrinsics)
+            registration = _registration(self.intrinsics, depth.shape)
+            color = registration.color_of_depth(color, depth * np.float32(0.001))
         return Frame(
             depth=depth,
             depth_scale=0.001,
@@ -105,17 +104,11 @@ class SevenScenes(Frames):
         )
 
 
-def registered(color: NDArray[np.uint8], depth_mm: NDArray[np.uint16], K: Intrinsics) -> NDArray[np.uint8]:
-    """The colour of every depth pixel, seen by the Kinect's colour camera: (H, W, 3) uint8 → the same."""
-    C = KINECT_COLOR
-    z = np.where(depth_mm > 0, depth_mm, 65535).astype(np.float32) * np.float32(0.001)
-    u, v = (np.arange(size, dtype=np.float32) for size in (color.shape[1], color.shape[0]))
-    column = (C.fx / K.fx * (u - K.cx) + C.cx).astype(np.float32) + np.float32(C.fx * KINECT_BASELINE) / z
-    row = np.broadcast_to((C.fy / K.fy * (v - K.cy) + C.cy).astype(np.float32)[:, None], z.shape)
-    moved: NDArray[np.uint8] = cv2.remap(
-        color, column, np.ascontiguousarray(row), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    return moved
+@lru_cache(maxsize=1)
+def _registration(depth: Intrinsics, size: tuple[int, int]) -> Registration:
+    T_color_depth = np.eye(4)
+    T_color_depth[0, 3] = KINECT_BASELINE
+    return Registration(depth, KINECT_COLOR, T_color_depth, size)
 
 
 def _sequences(root: Path) -> list[Path]:
@@ -131,6 +124,11 @@ def _frames(sequence: Path, suffix: str) -> set[str]:
 
 def _file(stem: Path, suffix: str) -> Path:
     return stem.with_name(f"{stem.name}.{suffix}")
+
+
+def _pose(stem: Path) -> Pose | None:
+    path = _file(stem, "pose.txt")
+    return read_matrix(path) if path.exists() else None
 
 
 def _color_suffix(stem: Path) -> str | None:

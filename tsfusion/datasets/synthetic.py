@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets import worlds
+from tsfusion.datasets import corridor, worlds
 from tsfusion.datasets.base import Frames
 from tsfusion.errors import DatasetError
 from tsfusion.frame import Frame
@@ -55,6 +55,8 @@ LIDARS = {"room": Lidar(lowest=-45.0, highest=45.0, max_range=30.0), "street": L
 WORLDS: dict[str, Callable[[int], worlds.World]] = {  # by the number of keyframes
     "room": lambda _: worlds.room(),
     "street": lambda count: worlds.street(max(80.0, count + 40.0)),
+    "corridor": lambda _: corridor.ring(),
+    "rooms": lambda _: corridor.rooms(),
     **{
         name: lambda _, name=name: worlds.room(name)  # type: ignore[misc]
         for name in ("room-untextured", "room-plain", "room-bare")

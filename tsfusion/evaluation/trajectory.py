@@ -1,10 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Error of an estimated trajectory (Sturm et al., "A benchmark for RGB-D SLAM systems", 2012)."""
 
+from pathlib import Path
+
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.datasets.base import read_lines
+from tsfusion.datasets.poses import read_kitti, read_log, read_tum, rigid
 from tsfusion.errors import DatasetError
 
 Poses = NDArray[np.float64]  # (n, 4, 4) T_world_camera
@@ -40,14 +44,7 @@ def umeyama(
     Returns:
         (4, 4) rotation and translation, and the scale (1 without `with_scale`): target ≈ scale·R·source + t.
 
-    Raises:
-        DatasetError: for fewer than 2 pairs, or unequal numbers.
     """
-    if source.shape != target.shape or len(source) < 2:
-        raise DatasetError(
-            f"two positions or more are needed of each trajectory to align them, got {len(source)} and "
-            f"{len(target)}"
-        )
     mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
     centered = source - mean_source
     U, S, Vt = np.linalg.svd((target - mean_target).T @ centered / len(source))
@@ -66,8 +63,11 @@ def absolute_error(estimate: Poses, reference: Poses, *, align: bool = True) -> 
     Raises:
         DatasetError: for fewer than 2 pairs, or unequal numbers.
     """
-    T, _ = umeyama(estimate[:, :3, 3], reference[:, :3, 3])
-    aligned = T @ estimate if align else estimate
+    if len(estimate) != len(reference) or len(estimate) < 2:
+        raise DatasetError(
+            f"two positions or more are needed of each trajectory, got {len(estimate)} and {len(reference)}"
+        )
+    aligned = aligned_to(estimate, reference) if align else estimate
     error = np.linalg.norm(aligned[:, :3, 3] - reference[:, :3, 3], axis=1)
     traces = np.einsum("nij,nij->n", aligned[:, :3, :3], reference[:, :3, :3])
     angles = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
@@ -86,7 +86,84 @@ def absolute_error(estimate: Poses, reference: Poses, *, align: bool = True) -> 
     )
 
 
+def aligned_to(estimate: Poses, reference: Poses) -> Poses:
+    """The estimate, moved so that its positions lie nearest to the reference's."""
+    T, _ = umeyama(estimate[:, :3, 3], reference[:, :3, 3])
+    moved: Poses = T @ estimate
+    return moved
+
+
 def _end_error(estimate: Poses, reference: Poses) -> float:
     """Metres between the last positions, seen from the first poses."""
     ends = [np.linalg.solve(poses[0], poses[-1]) for poses in (estimate, reference)]
     return float(np.linalg.norm(ends[0][:3, 3] - ends[1][:3, 3]))
+
+
+def associate(
+    first_ns: NDArray[np.int64], second_ns: NDArray[np.int64], max_difference_ns: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices of poses that belong together by time: each of the shorter list with the nearest of the other.
+
+    Raises:
+        DatasetError: when none are within `max_difference_ns`.
+    """
+    swapped = len(first_ns) > len(second_ns)
+    few, many = (second_ns, first_ns) if swapped else (first_ns, second_ns)
+    right = np.clip(np.searchsorted(many, few), 1, max(len(many) - 1, 1))
+    right = np.minimum(right, len(many) - 1)
+    left = np.maximum(right - 1, 0)
+    nearest = np.where(np.abs(many[left] - few) <= np.abs(many[right] - few), left, right)
+    kept = np.flatnonzero(np.abs(many[nearest] - few) <= max_difference_ns)
+    if not len(kept):
+        raise DatasetError(
+            f"no two poses are within {max_difference_ns / 1e9:g} s of each other: the trajectories cover "
+            f"{_span(first_ns)} and {_span(second_ns)}"
+        )
+    return (nearest[kept], kept) if swapped else (kept, nearest[kept])
+
+
+def _span(stamps_ns: NDArray[np.int64]) -> str:
+    return f"{stamps_ns[0] / 1e9:.3f} to {stamps_ns[-1] / 1e9:.3f} s"
+
+
+def read(path: Path) -> tuple[NDArray[np.int64] | None, Poses]:
+    """A trajectory file by its looks: TUM (8 numbers a line), KITTI (12) or Redwood's `.log`.
+
+    Returns:
+        (n,) timestamps in nanoseconds, None where the format has none; (n, 4, 4) poses.
+
+    Raises:
+        DatasetError: for a missing file, or one of another format.
+    """
+    lines = read_lines(path, "a trajectory: TUM, KITTI or .log")
+    columns = len(lines[0][1].replace(",", " ").split()) if lines else 0
+    if columns == 8:
+        tum = read_tum(path)
+        poses = [rigid(q, t) for q, t in zip(tum.quaternions, tum.translations, strict=True)]
+        return tum.timestamps_ns, np.array(poses)
+    if columns == 12:
+        return None, np.array(read_kitti(path))
+    if columns == 3:
+        return None, np.array([T for _, T in read_log(path)])
+    raise DatasetError(
+        f"{path} is no trajectory: expected 8 numbers a line (TUM), 12 (KITTI) or a Redwood .log, "
+        f"got {columns}"
+    )
+
+
+def paired(estimate: Path, reference: Path, *, max_difference_s: float = 0.01) -> tuple[Poses, Poses]:
+    """The poses of two files that belong together: by time, or by line where a file has no times.
+
+    Raises:
+        DatasetError: when nothing can be paired, or without times for unequal numbers.
+    """
+    (stamps, poses), (reference_stamps, references) = read(estimate), read(reference)
+    if stamps is not None and reference_stamps is not None:
+        a, b = associate(stamps, reference_stamps, round(max_difference_s * 1e9))
+        return poses[a], references[b]
+    if len(poses) != len(references):
+        raise DatasetError(
+            f"{estimate} has {len(poses)} poses and {reference} {len(references)}: without times in both, "
+            "they belong together line by line"
+        )
+    return poses, references

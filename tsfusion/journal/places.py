@@ -21,10 +21,12 @@ class Place(Struct, frozen=True):
     Attributes:
         path: a folder of segments, or one segment file.
         quarantine: where the server of its map keeps what could not be fused; None = it is no map's.
+        corrections: where it keeps corrected poses; None = it is no map's.
     """
 
     path: Path
     quarantine: Path | None = None
+    corrections: Path | None = None
 
     def files(self) -> list[Path]:
         """Its segments, oldest first.
@@ -79,13 +81,23 @@ def find(path: Path, map_name: str | None = None) -> Place:
         )
     path = maps.resolve(path, map_name)
     if (path / maps.JOURNAL_FOLDER).is_dir():
-        return Place(path / maps.JOURNAL_FOLDER, path / maps.QUARANTINE_FOLDER)
+        return _of_map(path)
+    if path.name == maps.JOURNAL_FOLDER and _is_map(path.parent):
+        return _of_map(path.parent)
     if path.is_dir():
-        quarantine = path.parent / maps.QUARANTINE_FOLDER
-        return Place(path, quarantine if path.name == maps.JOURNAL_FOLDER and quarantine.is_dir() else None)
+        return Place(path)
     if path.suffix != ".mcap":
         raise JournalError(f"{path} is no journal; expected a folder or an .mcap file")
     return Place(path)
+
+
+def _of_map(folder: Path) -> Place:
+    beside = (folder / name for name in (maps.QUARANTINE_FOLDER, maps.CORRECTIONS_FOLDER))
+    return Place(folder / maps.JOURNAL_FOLDER, *beside)
+
+
+def _is_map(folder: Path) -> bool:
+    return any((folder / name).is_dir() for name in (maps.QUARANTINE_FOLDER, maps.CORRECTIONS_FOLDER))
 
 
 def _size(path: Path) -> int:

@@ -1,6 +1,92 @@
 # SPDX-License-Identifier: MIT
 """Localizers by name. Without Taichi: they run on the scanner."""
 
-from tsfusion.localizers.base import Corrections, Localizer, Lost, Pose
+import logging
 
-__all__ = ["Corrections", "Localizer", "Lost", "Pose"]
+from tsfusion.config import LocalizerName, ScanConfig
+from tsfusion.errors import InvalidConfig, MissingDependency
+from tsfusion.frame import Frame
+from tsfusion.localizers.base import Corrections, Localizer, Lost, Pose, corrected
+
+__all__ = ["Corrections", "Localizer", "Lost", "Pose", "choose", "corrected", "make"]
+
+_BY_KIND: dict[str, LocalizerName] = {
+    "depth": "rgbd",
+    "disparity": "rgbd",
+    "pair": "stereo",
+    "points": "lidar",
+}
+
+log = logging.getLogger(__name__)
+
+
+def choose(config: ScanConfig, first: Frame) -> LocalizerName:
+    """The localizer's name: the config's, or for `auto` the one that follows such frames."""
+    if config.localizer != "auto":
+        return config.localizer
+    if config.trajectory is not None:
+        return "trajectory"
+    if config.feed is not None:
+        return "feed"
+    return _BY_KIND[first.kind]
+
+
+def make(config: ScanConfig, first: Frame) -> Localizer:
+    """The localizer of `choose`, with loop closure where it follows images.
+
+    Raises:
+        InvalidConfig: when it lacks its file or address.
+        MissingDependency: when it needs an optional package.
+    """
+    name = choose(config, first)
+    if name == "given":
+        from tsfusion.localizers.given import Given
+
+        return Given()
+    if name == "trajectory":
+        from tsfusion.localizers.trajectory import FromFile
+
+        return FromFile(
+            _needed(config.trajectory, "--trajectory FILE"),
+            max_gap_s=config.max_gap,
+            time_offset_s=config.time_offset,
+        )
+    if name == "feed":
+        from tsfusion.localizers.feed import Feed
+
+        return Feed(
+            _needed(config.feed, "--feed ADDRESS"), max_gap_s=config.max_gap, time_offset_s=config.time_offset
+        )
+    if name == "lidar":
+        from tsfusion.localizers.lidar import Lidar
+
+        return Lidar()
+    return _with_loops(_tracker(name), wanted=config.loop_closure)
+
+
+def _needed(value: str | None, flag: str) -> str:
+    if value is None:
+        raise InvalidConfig(f"this localizer needs {flag}")
+    return value
+
+
+def _tracker(name: LocalizerName) -> Localizer:
+    if name == "stereo":
+        from tsfusion.localizers.stereo import Stereo
+
+        return Stereo()
+    from tsfusion.localizers.rgbd import RGBD
+
+    return RGBD()
+
+
+def _with_loops(tracker: Localizer, *, wanted: bool) -> Localizer:
+    if not wanted:
+        return tracker
+    from tsfusion.localizers.closing import LoopClosing
+
+    try:
+        return LoopClosing(tracker)
+    except MissingDependency as error:
+        log.warning("no loop closure: %s", error)
+        return tracker

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What a localizer is, and what it says of a frame."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
@@ -64,8 +65,28 @@ class Corrections:
     loops: int
 
 
+def corrected(poses: Sequence[Pose], corrections: Corrections | None) -> list[Matrix]:
+    """T_world_camera of each pose, after loop closure."""
+    if corrections is None:
+        return [pose.T_world_camera for pose in poses]
+    anchors, T = corrections.anchors, corrections.T_corrected_world
+    return [
+        anchors[pose.anchor] @ pose.T_anchor_camera if pose.anchor in anchors else T @ pose.T_world_camera
+        for pose in poses
+    ]
+
+
 class Localizer(Protocol):
-    """Follows a sensor. Frames come in time order, from one thread."""
+    """Follows a sensor. Frames come in time order, from one thread.
+
+    One that holds a socket has `close()`, too.
+
+    Attributes:
+        absolute: whether its world outlasts `reset`: poses from elsewhere are in one world, however often
+            there is none.
+    """
+
+    absolute: bool
 
     def track(self, frame: Frame) -> Pose | Lost:
         """Where the sensor was; Lost when that is not known (then try the next frame, or `reset`).

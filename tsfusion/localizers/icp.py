@@ -47,6 +47,11 @@ class Surface:
     index: NDArray[np.intp]
     planes: Floats
 
+    @property
+    def covered(self) -> float:
+        """Share of the blocks that have a plane."""
+        return float(np.count_nonzero(self.planes[3]) / self.planes.shape[1])
+
     def every(self, step: int) -> NDArray[np.intp]:
         """Which points are on every `step`-th row and column of blocks."""
         row, column = np.divmod(self.index, self.shape[1])

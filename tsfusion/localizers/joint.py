@@ -21,7 +21,7 @@ PIXEL = 1.0  # deviation of a followed corner, at 640 columns
 _REACH = 3.0  # deviations at which a residual counts a quarter
 _TRUST = 0.1  # of a plane's residual against a corner's, until it is known how far neighbours err alike
 _FLOOR, _CEILING = 0.25, 3.0  # deviation of the distances to planes, as a share of the sensor's
-_PLANE_NOISE = 50.0  # sum of squares of a fit's offsets in blocks: 5 × 5 of them
+_PLANE_NOISE = 6.0  # sum of squares of a fit's offsets along one axis, in blocks: 3 × 3 of them
 _STEPS = ((4, 5, 0.1), (2, 4, 0.05), (1, 3, 0.03))  # blocks apart, iterations, gate in metres
 
 

@@ -10,6 +10,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from tsfusion.config import MapName
+from tsfusion.corrections import Corrections
 from tsfusion.errors import DecodeError
 
 SessionId = Annotated[bytes, Meta(min_length=16, max_length=16)]
@@ -26,7 +27,10 @@ class Hello(Struct, frozen=True, tag="hello", omit_defaults=True):
 
 
 class Welcome(Struct, frozen=True, tag="welcome"):
-    """The server's answer. A new `epoch` is a new server process: resend everything after `durable`."""
+    """The server's answer. A new `epoch` is a new server process: resend everything after `durable`.
+
+    `corrections`: the revision of this session's that is on the server's disk; None = it takes none.
+    """
 
     epoch: str
     version: int
@@ -35,6 +39,7 @@ class Welcome(Struct, frozen=True, tag="welcome"):
     window_keyframes: int  # credit: sent, not yet durable
     window_bytes: int
     max_frame_bytes: int
+    corrections: Annotated[int, Meta(ge=0)] | None = None
 
 
 class Stamps(Struct, frozen=True, array_like=True):
@@ -86,6 +91,26 @@ class Hold(Struct, frozen=True, tag="hold"):
     seconds: float
     reason: str
     message: str
+
+
+class Corrected(Struct, frozen=True, tag="corrected"):
+    """The answer to Corrections: this revision of the session is on the server's disk, or a later one."""
+
+    session: SessionId
+    revision: Annotated[int, Meta(ge=0)]
+
+
+class Uncorrected(Struct, frozen=True, tag="uncorrected"):
+    """The answer to Corrections that are not taken.
+
+    `again_s`: seconds after which they may be sent again; 0 = they never will be.
+    """
+
+    session: SessionId
+    revision: Annotated[int, Meta(ge=0)]
+    reason: str
+    message: str
+    again_s: float = 0.0
 
 
 class Denied(Struct, frozen=True, tag="denied"):
@@ -198,6 +223,7 @@ class MapHealth(Struct, frozen=True, kw_only=True):
     last_keyframe_s: float | None
     delay_ms: Spread
     delay_bound_ms: float
+    corrections: int = 0  # messages with corrected poses that were taken since the server began
 
 
 class ClientHealth(Struct, frozen=True, kw_only=True):
@@ -209,6 +235,7 @@ class ClientHealth(Struct, frozen=True, kw_only=True):
         heard_s: seconds since its last message.
         waiting, skipped: as its last Ping said.
         held: why nothing is taken from it now; empty = it is.
+        revision, corrected: of its corrections the newest, and how many keyframes they name.
     """
 
     client: str
@@ -221,6 +248,8 @@ class ClientHealth(Struct, frozen=True, kw_only=True):
     waiting: int
     skipped: dict[str, int]
     held: str
+    revision: int = 0
+    corrected: int = 0
 
 
 class Health(Struct, frozen=True, kw_only=True):
@@ -287,8 +316,8 @@ class KeyframeTimes(Struct, kw_only=True):
     clock_bound_ns: int = 0
 
 
-ToServer = Hello | Ping | Command
-ToClient = Welcome | Denied | Hold | Ack | Nack | Pong | Reply
+ToServer = Hello | Ping | Command | Corrections
+ToClient = Welcome | Denied | Hold | Ack | Nack | Corrected | Uncorrected | Pong | Reply
 _TO_SERVER = msgspec.msgpack.Decoder(ToServer)
 _TO_CLIENT = msgspec.msgpack.Decoder(ToClient)
 encode = msgspec.msgpack.encode

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: MIT
+"""How well the scanner finds its way: the trajectory error of every localizer on every scene, in one table.
+
+    python scripts/localization.py                  all scenes
+    python scripts/localization.py --only kitchen   those whose name holds it
+    python scripts/localization.py --json           a JSON line a scene instead
+    python scripts/localization.py --write-docs     the tables of docs/localization.md
+
+Recorded scenes are found under TSFUSION_DATA (default ../shared/data); what is missing is said and left out.
+Every scene runs in a fresh process, with one thread: `cpu_ms` is processor time of the localizer a frame,
+`peak_rss_mb` the process's peak while it tracks (where no synthetic world is rendered in it).
+
+`mesh`: the kitchen scanned by `tsfusion scan` with poses of its own and with the true ones; how far the depth
+that either mesh predicts for frames that were not fused is from the depth measured there.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
+
+import msgspec
+import numpy as np
+from _peers import DATA, surroundings
+
+from tsfusion import localizers, open_dataset, process
+from tsfusion.cli.ate import table
+from tsfusion.config import LocalizerName, ScanConfig
+from tsfusion.datasets import Dataset, select
+from tsfusion.evaluation.trajectory import TrajectoryError, absolute_error
+from tsfusion.localizers import Lost
+from tsfusion.sources.recorded import Recorded
+
+DOCS = Path(__file__).parents[1] / "docs" / "localization.md"
+BEGIN, END = "<!-- table: python scripts/localization.py --write-docs -->", "<!-- end of table -->"
+
+
+class Scene(NamedTuple):
+    """One row.
+
+    Attributes:
+        bar: metres of RMSE, or percent of drift for `stereo`, that it must stay under; None = none is set.
+    """
+
+    name: str
+    path: str  # under DATA, or synthetic:…
+    localizer: LocalizerName
+    options: dict[str, Any] = {}
+    part: dict[str, Any] = {}
+    loops: bool = False
+    bar: float | None = None
+
+    def open(self) -> Dataset | None:
+        synthetic = self.path.startswith("synthetic:")
+        if not synthetic and not (DATA / self.path).exists():
+            return None
+        options = dict(self.options)
+        if isinstance(options.get("poses"), str):
+            options["poses"] = DATA / options["poses"]
+        dataset = open_dataset(self.path if synthetic else DATA / self.path, **options)
+        return select(dataset, **self.part)
+
+
+KITCHEN, ORB = "7scenes/redkitchen", "kitti_odometry/poses_estimated/00_ORB.txt"
+SCENES = (
+    Scene("kitchen, first 75", KITCHEN, "rgbd", part={"limit": 75}, bar=0.030),
+    Scene("kitchen, 125", KITCHEN, "rgbd", bar=0.040),
+    Scene("kitchen, every 2nd", KITCHEN, "rgbd", part={"stride": 2}),
+    Scene("kitchen, every 3rd", KITCHEN, "rgbd", part={"stride": 3}),
+    Scene("HoloLens", "hololens", "rgbd"),
+    Scene("Redwood living room", "redwood_livingroom1", "rgbd"),
+    Scene("KITTI 06", "kitti_odometry", "stereo", {"sequence": "06"}, bar=1.0),
+    Scene("KITTI 00, LiDAR", "kitti_odometry", "lidar",
+          {"sequence": "00", "modality": "lidar", "poses": ORB}, bar=0.15),
+    Scene("street, LiDAR", "synthetic:street:lidar", "lidar", {"count": 40, "color": False}),
+)  # fmt: skip
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", default="", metavar="WORD", help="scenes whose name holds it")
+    parser.add_argument("--json", action="store_true", help="a JSON line a scene")
+    parser.add_argument("--write-docs", action="store_true", help=f"put the table into {DOCS.name}")
+    parser.add_argument("--scene", type=int, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.scene is not None:
+        print(json.dumps(_track(SCENES[options.scene])))
+        return 0
+    rows = []
+    for name, measure in _cases():
+        if options.only.lower() not in name.lower():
+            continue
+        row = measure()
+        rows.append(row)
+        if options.json:
+            print(json.dumps({**row, **surroundings(1)}), flush=True)
+        else:
+            print(f"{name} …", file=sys.stderr)
+    if not options.json:
+        print(_report(rows))
+    if options.write_docs:
+        _write_docs(rows)
+    return int(any(row.get("reached") is False for row in rows))
+
+
+def _cases() -> list[tuple[str, Callable[[], dict[str, Any]]]]:
+    scenes = [(scene.name, lambda index=index: _fresh(index)) for index, scene in enumerate(SCENES)]
+    return [*scenes, ("mesh", _meshes)]
+
+
+def _fresh(index: int) -> dict[str, Any]:
+    """A scene in a process of its own."""
+    command = [sys.executable, __file__, "--scene", str(index)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
+    if done.returncode:
+        return {"name": SCENES[index].name, "error": done.stderr.strip().splitlines()[-1]}
+    row: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return row
+
+
+def _track(scene: Scene) -> dict[str, Any]:
+    """Follow one scene from its beginning to its end."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    dataset = scene.open()
+    if dataset is None:
+        return {"name": scene.name, "error": f"no {scene.path} in {DATA}"}
+    config = ScanConfig(localizer=scene.localizer, loop_closure=scene.loops)
+    localizer, poses, references, spent, lost = None, [], [], 0.0, 0
+    corrections = None
+    for frame in Recorded(dataset):
+        localizer = localizer or localizers.make(config, frame)
+        before = time.process_time()
+        found = localizer.track(frame)
+        corrections = localizer.corrections() or corrections
+        spent += time.process_time() - before
+        if isinstance(found, Lost):
+            lost += 1
+            continue
+        poses.append(found)
+        references.append(frame.T_world_camera)
+    truth = np.array(references)
+    error = absolute_error(np.array(localizers.corrected(poses, None)), truth)
+    row: dict[str, Any] = {
+        "name": scene.name, "localizer": scene.localizer, "frames": len(dataset), "lost": lost,
+        "error": None, "ate": msgspec.to_builtins(error), "cpu_ms": 1e3 * spent / len(dataset),
+        "peak_rss_mb": process.peak_rss_bytes() / 1e6,
+    }  # fmt: skip
+    reached = error.rmse
+    if scene.loops:
+        after = absolute_error(np.array(localizers.corrected(poses, corrections)), truth)
+        row |= {"loops": corrections.loops if corrections else 0, "corrected": msgspec.to_builtins(after)}
+    elif scene.localizer == "stereo":
+        reached = error.drift_percent
+    if scene.bar is not None:
+        row |= {"bar": scene.bar, "reached": lost == 0 and reached <= scene.bar}
+    return row
+
+
+def _meshes() -> dict[str, Any]:
+    """`tsfusion scan` of the kitchen with poses of its own and with the true ones."""
+    if not (DATA / KITCHEN).exists():
+        return {"name": "mesh", "error": f"no {KITCHEN} in {DATA}"}
+    from tsfusion.evaluation.unseen import compare_scans
+
+    with tempfile.TemporaryDirectory(prefix="tsfusion-localization-") as folder:
+        for name in ("rgbd", "given"):
+            command = [
+                sys.executable, "-m", "tsfusion", "scan", "--source", str(DATA / KITCHEN),
+                "--localizer", name, "--voxel-size", "0.02", "--out", str(Path(folder) / name), "--json",
+            ]  # fmt: skip
+            subprocess.run(command, check=True, capture_output=True, timeout=600)
+        folders = [Path(folder) / name for name in ("rgbd", "given")]
+        own, given = compare_scans(open_dataset(DATA / KITCHEN), folders, voxel_size=0.02)
+    ratio = own["median_mm"] / given["median_mm"]
+    return {
+        "name": "mesh", "error": None, "own": own, "given": given, "ratio": ratio, "bar": 1.3,
+        "reached": ratio <= 1.3,
+    }  # fmt: skip
+
+
+def _report(rows: list[dict[str, Any]]) -> str:
+    """The table as the paper prints it, what it costs, and what is missing."""
+    tracked = [row for row in rows if not row["error"] and "ate" in row]
+    lines = []
+    if tracked:
+        named = []
+        for row in tracked:
+            named.append((row["name"], _struct(row["ate"])))
+            if "corrected" in row:
+                named.append((f"  after {row['loops']} loops", _struct(row["corrected"])))
+        lines.append(table(named))
+        lines += ["", f"{'':<24}{'frames':>8}{'lost':>6}{'CPU ms':>8}{'RSS MB':>8}  bar"]
+        lines += [
+            f"{row['name']:<24}{row['frames']:>8}{row['lost']:>6}{row['cpu_ms']:>8.1f}"
+            f"{row['peak_rss_mb']:>8.0f}  {_bar(row)}"
+            for row in tracked
+        ]
+    for row in rows:
+        if row["error"]:
+            lines.append(f"{row['name']}: {row['error']}")
+        elif "ratio" in row:
+            own, given = row["own"], row["given"]
+            lines.append(
+                f"mesh of the kitchen, depth of frames not fused, median / p90: own poses "
+                f"{own['median_mm']:.1f} / {own['p90_mm']:.1f} mm, true ones {given['median_mm']:.1f} / "
+                f"{given['p90_mm']:.1f} mm: {row['ratio']:.2f} times"
+            )
+    return "\n".join(lines)
+
+
+def _struct(values: dict[str, Any]) -> TrajectoryError:
+    return msgspec.convert(values, TrajectoryError)
+
+
+def _bar(row: dict[str, Any]) -> str:
+    if "bar" not in row:
+        return ""
+    unit = f"{row['bar']:g} %" if row["localizer"] == "stereo" else f"{1000 * row['bar']:g} mm"
+    return f"{unit}: {'reached' if row['reached'] else 'MISSED'}"
+
+
+def _write_docs(rows: list[dict[str, Any]]) -> None:
+    text = DOCS.read_text(encoding="utf-8")
+    before, rest = text.split(BEGIN)
+    after = rest.split(END)[1]
+    DOCS.write_text(f"{before}{BEGIN}\n```text\n{_report(rows)}\n```\n{END}{after}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

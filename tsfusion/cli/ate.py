@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion ate`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tsfusion.cli import options
+
+if TYPE_CHECKING:
+    from tsfusion.evaluation.trajectory import TrajectoryError
+
+_FORMATS = "TUM, KITTI or Redwood .log."
+
+
+def ate(
+    estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE", help=f"A trajectory file: {_FORMATS}")],
+    reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="The truth, likewise.")],
+    *,
+    max_difference: Annotated[
+        float, typer.Option(metavar="SECONDS", min=0.0, help="Between two poses that belong together.")
+    ] = 0.01,
+    align: Annotated[
+        bool, typer.Option("--align/--no-align", help="Lay one upon the other first, by a rigid motion.")
+    ] = True,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Draw the trajectory, coloured by its error.")
+    ] = None,
+    json: options.Json = False,
+) -> None:
+    """Absolute trajectory error (ATE): how far an estimated trajectory is from a true one."""
+    from tsfusion.cli import show
+    from tsfusion.evaluation import trajectory
+    from tsfusion.results import check_writable
+
+    if plot is not None:
+        check_writable(plot, (".png", ".pdf", ".svg"))
+    a, b = trajectory.paired(estimate, reference, max_difference_s=max_difference)
+    error = trajectory.absolute_error(a, b, align=align)
+    if plot is not None:
+        from tsfusion.evaluation.trajectory_plot import draw
+
+        draw(a, b, plot, align=align)
+    if json:
+        show.as_json(error)
+        return
+    typer.echo(table([("ATE", error)]))
+
+
+def table(rows: "list[tuple[str, TrajectoryError]]") -> str:
+    """The field's table of trajectories, metres."""
+    head = ("min", "max", "mean", "median", "std", "RMSE")
+    width = max(len(name) for name, _ in rows)
+    lines = [" " * width + "".join(f"{name:>10}" for name in head) + "   poses    length   drift"]
+    for name, error in rows:
+        figures = (error.min, error.max, error.mean, error.median, error.std, error.rmse)
+        lines.append(
+            f"{name:<{width}}" + "".join(f"{_metres(value):>10}" for value in figures)
+            + f"{error.count:>8}{error.length:>8.1f} m{error.drift_percent:>6.2f} %"
+        )  # fmt: skip
+    return "\n".join(lines)
+
+
+def _metres(value: float) -> str:
+    return f"{1000 * value:.1f} mm" if value < 1 else f"{value:.2f} m"

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion scan`."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tsfusion.cli import options
+
+if TYPE_CHECKING:
+    from tsfusion.sources import Source
+
+_SOURCE, _POSES, _KEYFRAMES = "Source", "Poses", "Keyframes"
+
+
+def _option(panel: str, metavar: str, help_: str, **settings: Any) -> Any:
+    return typer.Option(metavar=metavar, help=help_, rich_help_panel=panel, **settings)
+
+
+@options.takes_map_settings
+def scan(
+    context: typer.Context,
+    *,
+    source: Annotated[
+        str,
+        _option(_SOURCE, "SPEC", "A dataset, or live: realsense, camera:0, folder:PATH (docs/sources.md)."),
+    ],
+    calibration: Annotated[
+        Path | None,
+        _option(_SOURCE, "FILE", "Of a camera: Kalibr, OpenCV, ROS or EuRoC (a file, or a folder of two)."),
+    ] = None,
+    rate: Annotated[
+        float | None,
+        _option(_SOURCE, "HZ", "Frames a second of a recording; else as fast as they go.", min=1e-3),
+    ] = None,
+    max_frames: Annotated[int | None, _option(_SOURCE, "N", "Stop after so many.", min=1)] = None,
+    start: Annotated[int, _option(_SOURCE, "N", "Skip so many first.", min=0)] = 0,
+    stride: Annotated[int, _option(_SOURCE, "N", "Every N-th frame.", min=1)] = 1,
+    sequence: Annotated[str | None, _option(_SOURCE, "NN", "KITTI: the sequence.")] = None,
+    modality: Annotated[str | None, _option(_SOURCE, "KIND", "KITTI: stereo or lidar.")] = None,
+    localizer: Annotated[
+        str | None,
+        _option(
+            _POSES,
+            "NAME",
+            "rgbd, stereo or lidar (by what the source gives); given (its own poses), trajectory or feed.",
+        ),
+    ] = None,
+    trajectory: Annotated[
+        str | None, _option(_POSES, "FILE", "Poses of another SLAM: a TUM or KITTI file.")
+    ] = None,
+    feed: Annotated[
+        str | None, _option(_POSES, "ADDRESS", "Poses of another SLAM, live: tcp://… it is heard at.")
+    ] = None,
+    loop_closure: Annotated[
+        bool | None,
+        typer.Option(
+            "--loop-closure/--no-loop-closure", help="Look for places seen before.", rich_help_panel=_POSES
+        ),
+    ] = None,
+    patience: Annotated[
+        float | None, _option(_POSES, "SECONDS", "Lost for so long, a new map begins.", min=0.0)
+    ] = None,
+    min_overlap: Annotated[
+        float | None, _option(_KEYFRAMES, "SHARE", "Of the last keyframe's view; below, a new one.")
+    ] = None,
+    distance: Annotated[
+        float | None, _option(_KEYFRAMES, "METRES", "To the next; else 0.1, for stereo and LiDAR 2.")
+    ] = None,
+    angle: Annotated[float | None, _option(_KEYFRAMES, "DEGREES", "To the next; else 10.")] = None,
+    max_rate: Annotated[float | None, _option(_KEYFRAMES, "HZ", "At most so many a second.")] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where the results go.")] = Path("out"),
+    connect: options.Connect = None,
+    control: options.Control = None,
+    map_: options.Map = None,
+    key: options.Key = None,
+    server_key: options.ServerKey = None,
+    spool: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR",
+            envvar="TSFUSION_SPOOL",
+            help="With --connect: keyframes wait here until the server has them.",
+        ),
+    ] = Path("tsfusion-spool"),
+    config: options.ConfigFile = None,
+    json: options.Json = False,
+    **settings: Any,
+) -> None:
+    """Localise a sensor, pick keyframes and send them; Ctrl-C ends well.
+
+    Without --connect it starts a server of its own and leaves the mesh. With it, what the server does not
+    have in the end stays in the spool, and the next scan sends it first.
+    """
+    if connect is not None:
+        options.refuse(
+            context, options.MAP_OPTIONS,
+            "has no effect with --connect: give it to the `tsfusion serve` that listens there",
+        )  # fmt: skip
+    else:
+        options.refuse(context, ("control", "key", "server_key", "spool"), "has no effect without --connect")
+    from tsfusion import scanning
+    from tsfusion.cli import show, show_scan
+    from tsfusion.config import override
+
+    recording = {"sequence": sequence, "modality": modality}
+    opened = _open(
+        context, source, recording, calibration=calibration, rate=rate,
+        part={"start": start, "stride": stride, "limit": max_frames},
+    )  # fmt: skip
+    with opened, _ended_by_signals(opened), show_scan.watching(quiet=json) as progress:
+        chosen = options.configuration(config, preset={"sensor": opened.sensor}, **settings)
+        rules = override(
+            chosen.scan, localizer=localizer, trajectory=trajectory, feed=feed, loop_closure=loop_closure,
+            patience=patience, min_overlap=min_overlap, distance=distance, angle=angle, max_rate=max_rate,
+        )  # fmt: skip
+        client = override(chosen.client, control=control, map=map_, key=key, server_key=server_key)
+        if connect is None:
+            client = options.local(client)
+        result = scanning.scan(
+            opened, out, config=rules, volume=chosen.volume, client=client, connect=connect, spool=spool,
+            min_weight=settings["min_weight"], progress=progress,
+        )  # fmt: skip
+    if json:
+        show.as_json(result)
+    else:
+        show_scan.summary(result, out, spool)
+
+
+def _open(
+    context: typer.Context,
+    spec: str,
+    recording: dict[str, Any],
+    *,
+    calibration: Path | None,
+    rate: float | None,
+    part: dict[str, Any],
+) -> "Source":
+    """The source by its name, as much of it as is asked for."""
+    from tsfusion import sources
+    from tsfusion.sources.limited import Limited
+
+    if sources.is_live(spec):
+        options.refuse(
+            context, (*recording, "rate", "start", "stride"), "is for recordings, and this source is live"
+        )
+        live = sources.open_source(spec, calibration=calibration)
+        return live if part["limit"] is None else Limited(live, part["limit"])
+    options.refuse(context, ("calibration",), "is for a live camera")
+    from tsfusion.cli.replay import open_recording
+    from tsfusion.datasets import select
+    from tsfusion.sources.recorded import Recorded
+
+    dataset = open_recording(Path(spec), **recording, posed=False)
+    return Recorded(select(dataset, **part), rate=rate)
+
+
+@contextmanager
+def _ended_by_signals(source: "Source") -> Iterator[None]:
+    """The first Ctrl-C or SIGTERM closes the source, and the scan ends as at the end of a recording.
+
+    The second one does what it always does.
+    """
+    before = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
+
+    def stop(signum: int, frame: FrameType | None) -> None:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+        source.close()
+
+    for signum in before:
+        signal.signal(signum, stop)
+    try:
+        yield
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)

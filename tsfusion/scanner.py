@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: MIT
+"""The scanner: a source of frames, a localizer, the choice of keyframes, and the client that sends them.
+
+No Taichi here: it runs on the robot.
+"""
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion import localizers
+from tsfusion.client import Client, ClientStats
+from tsfusion.config import MAP_NAME_LENGTH, ScanConfig
+from tsfusion.frame import Frame
+from tsfusion.localizers import Corrections, Localizer, Lost, Pose
+from tsfusion.localizers.selection import Selector
+
+Matrix = NDArray[np.float64]
+State = Literal["starting", "tracking", "lost"]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """One frame that has a pose.
+
+    Attributes:
+        reference: (4, 4), what the source itself said of the pose; None = nothing.
+        seq: its number as a keyframe; None = it is none, or was left out.
+    """
+
+    pose: Pose
+    reference: Matrix | None
+    seq: int | None
+
+
+@dataclass(eq=False)
+class Submap:
+    """A world of its own: everything between two losses.
+
+    Attributes:
+        name: of the map it goes into.
+        client: sends its keyframes.
+        located: its frames, in order.
+        corrections: the newest of loop closure, None = there were none.
+    """
+
+    name: str
+    client: Client
+    located: list[Located] = field(default_factory=list)
+    corrections: Corrections | None = None
+
+    @property
+    def poses(self) -> list[Pose]:
+        """Of its frames, as they were tracked."""
+        return [at.pose for at in self.located]
+
+
+class ScanState(msgspec.Struct, frozen=True, kw_only=True):
+    """How a scan is doing.
+
+    Attributes:
+        why: what a lost sensor lacks.
+        selected: keyframes by the rule that chose them.
+        loops: closed so far, over all submaps.
+        stats: of all clients together.
+        link: why the server takes nothing at the moment; empty when it does.
+        keyframe_delay_ms: captured to fused, of the newest keyframe that is known; None = none yet.
+    """
+
+    state: State
+    why: str
+    frames: int
+    tracked: int
+    lost: int
+    submap: str
+    submaps: int
+    selected: dict[str, int]
+    loops: int
+    stats: ClientStats
+    link: str
+    keyframe_delay_ms: float | None
+
+
+class Scanner:
+    """Takes frames one by one; `run` takes all of a source.
+
+    A lost sensor sends nothing. When it is not found again within `patience` seconds of the frames' clock,
+    the localizer begins a new world, whose keyframes go into a map of their own: NAME-2, NAME-3, …
+
+    Args:
+        localizer: says where each frame was taken.
+        config: when a keyframe is taken, and how long to be patient.
+        connect: opens a client that sends to the map of that name.
+        map_name: of the first submap.
+        taken: names that no submap may have.
+        outdoors: see `Selector`.
+    """
+
+    def __init__(
+        self,
+        localizer: Localizer,
+        config: ScanConfig,
+        connect: Callable[[str], Client],
+        *,
+        map_name: str,
+        taken: Collection[str] = (),
+        outdoors: bool = False,
+    ) -> None:
+        self._localizer, self._config = localizer, config
+        self._connect, self._map_name, self._taken = connect, map_name, {map_name, *taken}
+        self._selector = Selector(config, outdoors=outdoors)
+        self._lost_since: int | None = None
+        self._why = ""
+        self._state: State = "starting"
+        self._frames = self._lost = 0
+        self._tracking_cpu = 0.0
+        self._selected: Counter[str] = Counter()
+        self.submaps: list[Submap] = [Submap(map_name, connect(map_name))]
+
+    def run(self, frames: Iterable[Frame], watch: Callable[["Scanner"], None]) -> None:
+        """Take every frame, and let `watch` look after each."""
+        for frame in frames:
+            self.take(frame)
+            watch(self)
+
+    def take(self, frame: Frame) -> None:
+        """Find the frame's pose, and send it if it is a keyframe."""
+        self._frames += 1
+        before = time.process_time()
+        found = self._localizer.track(frame)
+        self._tracking_cpu += time.process_time() - before
+        if isinstance(found, Lost):
+            self._missed(found, frame)
+        else:
+            self._located(found, frame)
+        corrections = self._localizer.corrections()
+        if corrections is not None:
+            self._correct(corrections)
+
+    @property
+    def tracking_cpu_ms(self) -> float:
+        """CPU milliseconds of the process while the localizer was at work, a frame."""
+        return 1000 * self._tracking_cpu / max(self._frames, 1)
+
+    def state(self) -> ScanState:
+        """What to show."""
+        clients = [submap.client for submap in self.submaps]
+        return ScanState(
+            state=self._state,
+            why=self._why,
+            frames=self._frames,
+            tracked=self._frames - self._lost,
+            lost=self._lost,
+            submap=self.submaps[-1].name,
+            submaps=len(self.submaps),
+            selected=dict(self._selected),
+            loops=sum(submap.corrections.loops for submap in self.submaps if submap.corrections),
+            stats=_total([client.stats for client in clients]),
+            link=clients[-1].problem,
+            keyframe_delay_ms=_newest_delay(clients[-1]),
+        )
+
+    def _located(self, pose: Pose, frame: Frame) -> None:
+        if self._state == "lost":
+            log.info("the sensor is found again")
+        self._state, self._why, self._lost_since = "tracking", "", None
+        submap, T = self.submaps[-1], pose.T_world_camera
+        reason = self._selector.reason(frame, T)
+        seq = None
+        if reason is not None:
+            self._selected[reason] += 1
+            self._selector.took(frame, T)
+            seq = submap.client.send(frame.keyframe(T))
+        submap.located.append(Located(pose, frame.T_world_camera, seq))
+
+    def _missed(self, lost: Lost, frame: Frame) -> None:
+        self._lost += 1
+        if self._state == "tracking":
+            log.warning("the sensor is lost: %s", lost.reason)
+        self._why = lost.reason
+        self._state = "lost" if self.submaps[-1].located else "starting"
+        if self._lost_since is None:
+            self._lost_since = frame.timestamp_ns
+        seconds = (frame.timestamp_ns - self._lost_since) / 1e9
+        if self._state == "lost" and seconds >= self._config.patience and not self._localizer.absolute:
+            self._begin_submap(seconds)
+
+    def _begin_submap(self, seconds: float) -> None:
+        name = next(name for name in map(self._name, count(2)) if name not in self._taken)
+        self._taken.add(name)
+        log.warning("lost for %.1f s (%s): what follows goes into a new map, %s", seconds, self._why, name)
+        self._localizer.reset()
+        self._selector.reset()
+        self._state, self._lost_since = "starting", None
+        self.submaps.append(Submap(name, self._connect(name)))
+
+    def _name(self, number: int) -> str:
+        suffix = f"-{number}"
+        return self._map_name[: MAP_NAME_LENGTH - len(suffix)] + suffix
+
+    def _correct(self, corrections: Corrections) -> None:
+        submap = self.submaps[-1]
+        before = submap.corrections.loops if submap.corrections else 0
+        submap.corrections = corrections
+        if corrections.loops > before:
+            log.info("a place was seen again: %d loops closed", corrections.loops)
+        now = localizers.corrected(submap.poses, corrections)
+        poses = {at.seq: T for at, T in zip(submap.located, now, strict=True) if at.seq is not None}
+        if poses:
+            submap.client.correct(poses, T_map_odometry=corrections.T_corrected_world)
+
+
+def _total(stats: list[ClientStats]) -> ClientStats:
+    """Sums; of the state, the first that is not well."""
+
+    def add(name: str) -> dict[str, int]:
+        return dict(sum((Counter(getattr(each, name)) for each in stats), Counter()))
+
+    return ClientStats(
+        sent=sum(each.sent for each in stats),
+        durable=sum(each.durable for each in stats),
+        fused=sum(each.fused for each in stats),
+        refused=add("refused"),
+        rejected=add("rejected"),
+        skipped=add("skipped"),
+        waiting=sum(each.waiting for each in stats),
+        waiting_bytes=sum(each.waiting_bytes for each in stats),
+        state=next((each.state for each in stats if each.state != "ok"), "ok"),
+    )
+
+
+def _newest_delay(client: Client) -> float | None:
+    record = client.newest_fused
+    if record is None or not record.captured_ns:
+        return None
+    return (record.fused_ns - record.captured_ns) / 1e6

@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: MIT
+"""A whole scan: a source's frames localised, chosen, sent and fused, and what is left in a folder."""
+
+import dataclasses
+import logging
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any, Protocol
+
+from tsfusion import localizers, preview, process, scan_results, summary
+from tsfusion.child import ServerChild, own_server
+from tsfusion.client import Client
+from tsfusion.config import ClientConfig, ScanConfig, ServerConfig, VolumeConfig, override
+from tsfusion.errors import (
+    DatasetError,
+    FlushTimeout,
+    OutputError,
+    SourceError,
+    TransportError,
+    TsfusionError,
+)
+from tsfusion.fetch import fetch_mesh, fetch_status
+from tsfusion.frame import Frame
+from tsfusion.results import building
+from tsfusion.scan_results import MapResult, ScanSummary
+from tsfusion.scanner import Scanner, ScanState, Submap
+from tsfusion.sources import Source
+from tsfusion.transport import client_keys
+
+AHEAD = 3  # keyframes of a recording under way: fusing, waiting, travelling
+OUTDOOR_SENSORS = ("stereo", "lidar")
+_PATIENCE = 60.0  # seconds without progress before an own server is given up
+_LINGER = 10.0  # seconds without progress before what a distant server does not take is left in the spool
+_MAPS = 16  # of an own server: a submap each
+_POLL = 0.05  # seconds
+
+log = logging.getLogger(__name__)
+
+
+class ScanProgress(Protocol):
+    """What a scan tells while it goes; the command line draws it."""
+
+    def stage(self, text: str) -> None:
+        """Something that takes a while begins."""
+
+    def scan(self, state: ScanState, length: int | None) -> None:
+        """After every frame, and while the rest is being fused; `length` of the source, where it is known."""
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where the keyframes of a sensor go: the link's settings, the own server, the folder of spools."""
+
+    link: ClientConfig
+    child: ServerChild | None
+    spools: Path
+    sensor: str
+
+
+def scan(
+    source: Source,
+    out: str | os.PathLike[str],
+    *,
+    config: ScanConfig,
+    volume: VolumeConfig,
+    server: ServerConfig | None = None,
+    client: ClientConfig | None = None,
+    connect: str | None = None,
+    spool: str | os.PathLike[str] = "tsfusion-spool",
+    min_weight: float | None = None,
+    progress: ScanProgress,
+) -> ScanSummary:
+    """Take a source's frames to its end, or until it is closed, and leave the results in the folder `out`.
+
+    `trajectory.txt`, `keyframes.txt` (and `trajectory-corrected.txt` where loops were closed), `delay.csv`,
+    `delay.png` and `run.json`; with a server of its own also `mesh.ply`, `mesh.glb` and `preview.png`. A
+    second submap's have `-2` before the ending, and so on.
+
+    Args:
+        volume: the map of the own server; a server at `connect` has its own.
+        connect: data address of a running server; None starts one for this scan.
+        spool: with `connect`, the folder where keyframes wait until they are acknowledged.
+        min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
+
+    Raises:
+        SourceError: the sensor failed; what came before is in `out`.
+        DatasetError: a recording's file cannot be read; likewise.
+        OutputError: `out` cannot be written, or no frame could be localised.
+        TransportError: the server cannot be reached or stopped fusing.
+    """
+    failure: list[Exception] = []
+    with building(out) as work, ExitStack() as stack:
+        frames = _until_failure(iter(source), failure)
+        first = next(frames, None)
+        if first is None:
+            raise failure[0] if failure else SourceError(f"{source.name} gave no frames")
+        localizer = localizers.make(config, first)
+        stack.callback(getattr(localizer, "close", lambda: None))
+        place = _place(
+            stack, work=work, sensor=source.sensor, volume=volume, server=server, client=client,
+            connect=connect, spool=Path(spool), progress=progress,
+        )  # fmt: skip
+        if place.child is None and not localizer.absolute:
+            _warn_of_another_world(place)
+        leftovers, open_client = _opener(stack, place, _pace(source, place))
+        scanner = Scanner(
+            localizer, config, open_client, map_name=place.link.map, taken=leftovers,
+            outdoors=source.sensor in OUTDOOR_SENSORS,
+        )  # fmt: skip
+        progress.stage(f"scanning {source.name}")
+        started = time.monotonic()
+        if source.length is not None:  # a live one's first frame is old by now
+            first = dataclasses.replace(first, captured_ns=time.monotonic_ns())
+            frames = chain([first], frames)
+        scanner.run(frames, _watcher(source, place, progress))
+        peak = process.peak_rss_bytes()
+        if not any(submap.located for submap in scanner.submaps):
+            raise failure[0] if failure else OutputError(_nowhere(scanner.state()))
+        _settle(scanner, source, place, progress)
+        seconds = time.monotonic() - started
+        progress.stage("writing the results")
+        maps = [
+            _write(work, place, submap, f"-{number}" if number > 1 else "", min_weight)
+            for number, submap in enumerate(scanner.submaps, 1)
+        ]
+        records = scan_results.records(scanner.submaps)
+        summary.write_ledger(work, records)
+        result = scan_results.summarise(
+            source, scanner, maps, records,
+            localizer=localizers.choose(config, first), complete=not failure, seconds=seconds,
+            peak_rss_bytes=peak, config=config, volume=volume if place.child else None,
+        )  # fmt: skip
+        stack.close()  # clients and server end before the folder of theirs goes
+        if place.child is not None:
+            shutil.rmtree(place.spools.parent)
+        summary.write_record(work, result)
+    if failure:
+        raise failure[0]
+    return result
+
+
+def _until_failure(frames: Iterator[Frame], failure: list[Exception]) -> Iterator[Frame]:
+    """The frames up to a failure of the source, which is kept: what came before it is not thrown away."""
+    try:
+        yield from frames
+    except (SourceError, DatasetError) as error:
+        failure.append(error)
+
+
+def _place(
+    stack: ExitStack,
+    *,
+    work: Path,
+    sensor: str,
+    volume: VolumeConfig,
+    server: ServerConfig | None,
+    client: ClientConfig | None,
+    connect: str | None,
+    spool: Path,
+    progress: ScanProgress,
+) -> _Place:
+    client = client or ClientConfig()
+    if connect is not None:
+        return _Place(override(client, address=connect), None, spool, sensor)
+    scratch = work / ".scratch"
+    scratch.mkdir()
+    progress.stage("starting a server (the first start compiles kernels)")
+    own = server or ServerConfig(listen="tcp://127.0.0.1:0", state=str(scratch / "state"))
+    own = override(own, max_maps=max(own.max_maps, _MAPS))
+    link, child = stack.enter_context(own_server(client, own, volume, scratch))
+    return _Place(link, child, scratch / "spool", sensor)
+
+
+def _pace(source: Source, place: _Place) -> dict[str, Any]:
+    """A recording leaves nothing out: it waits for a server of its own, and for no other."""
+    if source.length is None:
+        return {}
+    return {"policy": "block", "backlog": AHEAD} if place.child else {"policy": "spool_all"}
+
+
+def _opener(
+    stack: ExitStack, place: _Place, pace: dict[str, Any]
+) -> tuple[set[str], Callable[[str], Client]]:
+    """The maps that an earlier scan's keyframes wait for, and what opens a client and closes it in the end.
+
+    Those keyframes are sent, too, but this scan begins no submap of their names.
+    """
+
+    def connect(name: str) -> Client:
+        link = override(place.link, map=name, **pace)
+        client = Client(link.address, spool=place.spools / name, control=link.control, config=link)
+        stack.callback(client.close)
+        return client
+
+    waiting = {path.parent.name for path in place.spools.glob("*/*.mcap")} - {place.link.map}
+    for name in sorted(waiting):
+        try:
+            connect(name)
+        except TsfusionError as error:
+            log.warning("what waits in %s is not sent: %s", place.spools / name, error)
+    return waiting, connect
+
+
+def _warn_of_another_world(place: _Place) -> None:
+    """Say so when the server's map has keyframes already: this scan's world is not theirs."""
+    link = place.link
+    with suppress(TransportError):  # a server that is not there yet, or has no such map
+        keys = client_keys(link.key, link.server_key)
+        status = fetch_status(link.address, control=link.control, map_name=link.map, timeout=2.0, keys=keys)
+        if status.keyframes_durable:
+            log.warning(
+                "the map %s has %d keyframes already: a scan that localises itself begins its own world; "
+                "give it a map of its own (--map NAME)", link.map, status.keyframes_durable,
+            )  # fmt: skip
+
+
+def _watcher(source: Source, place: _Place, progress: ScanProgress) -> Callable[[Scanner], None]:
+    def watch(scanner: Scanner) -> None:
+        if place.child is not None:
+            place.child.check()
+        progress.scan(scanner.state(), source.length)
+
+    return watch
+
+
+def _nowhere(state: ScanState) -> str:
+    return f"the sensor was not localised in any of {state.frames} frames: {state.why}"
+
+
+def _settle(scanner: Scanner, source: Source, place: _Place, progress: ScanProgress) -> None:
+    """Wait until everything is fused; with a server elsewhere, for as long as it takes any."""
+    progress.stage("fusing what is on its way" if place.child else "sending what is on its way")
+    patience = _PATIENCE if place.child else _LINGER
+    last, moved = (-1, -1), time.monotonic()
+    while True:
+        state = scanner.state()
+        progress.scan(state, source.length)
+        stats = state.stats
+        done = stats.fused + sum(stats.rejected.values()) if place.child else stats.durable
+        lost = sum(map(sum, (stats.refused.values(), stats.skipped.values())))
+        if not stats.waiting and (not place.child or done + lost >= stats.sent):
+            break
+        if (stats.waiting, done) != last:
+            last, moved = (stats.waiting, done), time.monotonic()
+        if time.monotonic() - moved > patience:
+            if place.child:
+                raise TransportError(f"the server has fused nothing for {patience:.0f} s")
+            return
+        if place.child is not None:
+            place.child.check()
+        time.sleep(_POLL)
+    for submap in scanner.submaps:
+        with suppress(FlushTimeout):  # stamps and corrections: no reason to lose the scan
+            (submap.client.wait_meshed if place.child else submap.client.flush)()
+
+
+def _write(work: Path, place: _Place, submap: Submap, suffix: str, min_weight: float | None) -> MapResult:
+    """The files of one submap."""
+    if submap.located:
+        scan_results.write_trajectory(work, submap, suffix)
+    if place.child is None or not submap.located:
+        return scan_results.describe(submap, None, None)
+    link = place.link
+    keys = client_keys(link.key, link.server_key)
+    status = fetch_status(link.address, control=link.control, map_name=submap.name, keys=keys)
+    mesh = fetch_mesh(
+        link.address, control=link.control, map_name=submap.name, min_weight=min_weight, keys=keys
+    )
+    if len(mesh.faces):
+        ups = [preview.sensor_up(pose.T_world_camera, place.sensor) for pose in submap.poses]
+        summary.write_mesh(work, mesh, ups, suffix)
+    elif not suffix:
+        raise OutputError(
+            f"the map has no surface to write: {status.keyframes_fused} keyframes fused; "
+            "scan for longer or lower --min-weight"
+        )
+    return scan_results.describe(submap, status, mesh)
