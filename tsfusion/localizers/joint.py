@@ -17,11 +17,11 @@ from tsfusion.localizers import icp
 
 Matrix = NDArray[np.float64]
 
-PIXEL = 0.7  # deviation of a followed corner, at 640 columns
+PIXEL = 1.0  # deviation of a followed corner, at 640 columns
 _REACH = 3.0  # deviations at which a residual counts a quarter
-_TRUST = 0.1  # of a plane's residual against a corner's: neighbours err together
+_TRUST = 0.1  # of a plane's residual against a corner's, until it is known how far neighbours err alike
 _FLOOR, _CEILING = 0.25, 3.0  # deviation of the distances to planes, as a share of the sensor's
-_PLANE_NOISE = 50.0  # sum of squares of a fit's offsets in blocks: 5 × 5 of them
+_PLANE_NOISE = 6.0  # sum of squares of a fit's offsets along one axis, in blocks: 3 × 3 of them
 _STEPS = ((4, 5, 0.1), (2, 4, 0.05), (1, 3, 0.03))  # blocks apart, iterations, gate in metres
 
 
@@ -68,20 +68,23 @@ def solve(
         here: surface of the new view.
         camera, columns: intrinsics and width of its image.
     """
-    T, scale = T_anchor_camera, 1.0
+    T, scale, trust = T_anchor_camera, 1.0, _TRUST
     pixel = PIXEL * columns / 640
     H = spurious = np.zeros((6, 6))
     for round_, (apart, iterations, gate) in enumerate(_STEPS):
         some = here.every(apart) if apart > 1 else None
+        first = True
         for _ in range(iterations):
             H, g, spurious = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
-            for link in links:
+            for link in links if apart == 1 else links[:1]:
                 T_view_camera = link.T_view_anchor @ T
                 A = se3.adjoint(link.T_view_anchor)
                 h, b = _corners(link, camera, T_view_camera, pixel * (4 if round_ == 0 else 1))
                 if link.surface is not None:
                     found = icp.match(link.surface, here, T_view_camera, some)
-                    hp, bp, sp, scale = _planes(found, gate, apart, link.surface)
+                    if apart == 1 and first:
+                        trust, first = 1 / icp.alike(found, link.surface.shape[1]), False
+                    hp, bp, sp, scale = _planes(found, gate, apart**2 * trust, link.surface)
                     h, b = h + hp, b + bp
                     spurious = spurious + A.T @ sp @ A
                 H, g = H + A.T @ h @ A, g + A.T @ b
@@ -93,7 +96,7 @@ def solve(
 
 
 def _planes(
-    found: icp.Match, gate: float, apart: int, there: icp.Surface
+    found: icp.Match, gate: float, trust: float, there: icp.Surface
 ) -> tuple[Matrix, Matrix, Matrix, float]:
     """Normal equations of the distances to planes, what of them is noise, and the distances' scale."""
     near = np.abs(found.distance) < gate + 3 * found.sigma
@@ -103,9 +106,9 @@ def _planes(
     scale = float(np.clip(1.48 * np.median(np.abs(whitened[near])), _FLOOR, _CEILING))
     ratio = whitened / (scale * _REACH)
     weight = near / (1 + ratio * ratio) ** 2
-    total = _TRUST * apart**2 * weight / (scale * found.sigma) ** 2
+    total = trust * weight / (scale * found.sigma) ** 2
     H, g = icp.equations(found, total.astype(np.float32))
-    slope = _TRUST * apart**2 * weight * (there.intrinsics.fx / found.moved[2]) ** 2 / _PLANE_NOISE
+    slope = trust * weight * (there.intrinsics.fx / found.moved[2]) ** 2 / _PLANE_NOISE
     return H, g, _isotropic(found.moved, slope), scale
 
 
