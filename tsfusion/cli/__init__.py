@@ -12,7 +12,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from tsfusion.cli import config, datasets, doctor, journal, keys, mesh, replay, serve, status
+from tsfusion.cli import check, config, datasets, doctor, journal, keys, mesh, replay, serve, status
 from tsfusion.errors import TsfusionError
 
 INTERRUPTED = 128 + signal.SIGINT
@@ -28,6 +28,7 @@ app = typer.Typer(
 )
 app.command()(replay.demo)
 app.command()(replay.replay)
+app.command()(check.check)
 app.command()(serve.serve)
 app.command()(mesh.mesh)
 app.command()(status.status)

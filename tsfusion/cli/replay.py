@@ -61,6 +61,9 @@ def replay(
     state: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Keep the own server's journal and map here.")
     ] = None,
+    check_: Annotated[
+        bool, typer.Option("--check/--no-check", help="Warn when the dataset's poses and depth disagree.")
+    ] = True,
     config: options.ConfigFile = None,
     json: options.Json = False,
     **settings: Any,
@@ -83,6 +86,8 @@ def replay(
         dataset = select(dataset, start=start, stride=stride, limit=max_keyframes)
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count} frames {reason}", err=True)
+    if check_:
+        _warn(dataset)
     _run(
         dataset, out, chosen, connect=connect, control=control, map_=map_, rate=rate, state=state, json=json,
         min_weight=settings["min_weight"], key=key, server_key=server_key,
@@ -108,6 +113,15 @@ def _open(path: Path, **given: Any) -> "Dataset":
     from tsfusion.datasets import open_dataset
 
     return open_dataset(path, **given)
+
+
+def _warn(dataset: "Dataset") -> None:
+    """One line on stderr when poses and depth disagree."""
+    from tsfusion.datasets import consistency
+
+    report = consistency.check(dataset)
+    if report.verdict == "disagree":
+        typer.echo(f"warning: {report.text}", err=True)
 
 
 @options.takes_map_settings
