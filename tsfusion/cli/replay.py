@@ -63,6 +63,7 @@ def replay(
     unpack: Annotated[
         bool, typer.Option("--unpack", rich_help_panel=_DATASET, help="Unpack an archive beside itself.")
     ] = False,
+    option: options.DatasetOptions = None,
     state: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Keep the own server's journal and map here.")
     ] = None,
@@ -83,7 +84,10 @@ def replay(
         )  # fmt: skip
     else:
         options.refuse(context, ("control", "key", "server_key"), "has no effect without --connect")
-    dataset = open_recording(path, unpack=unpack, sequence=sequence, modality=modality, poses=poses)
+    dataset = open_recording(
+        path, unpack=unpack, sequence=sequence, modality=modality, poses=poses,
+        **options.dataset_options(option),
+    )  # fmt: skip
     chosen = options.configuration(
         config, preset={"sensor": dataset.sensor}, **settings,
     )  # fmt: skip
