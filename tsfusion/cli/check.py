@@ -24,7 +24,7 @@ def check(
     from tsfusion.cli import show
     from tsfusion.datasets import consistency
 
-    dataset = replay._open(path, sequence=sequence, modality=modality, poses=poses)
+    dataset = replay.open_recording(path, sequence=sequence, modality=modality, poses=poses)
     report = consistency.check(dataset)
     if json:
         show.as_json({"name": dataset.name, **asdict(report)})
