@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -110,7 +111,7 @@ WHOLE = (
 
 
 @cache
-def opened(place: Path, **options: str) -> Dataset:
+def opened(place: Path, **options: Any) -> Dataset:
     """The dataset, each frame read once for all tests."""
     return Corrupted(open_dataset(place, **options))
 
