@@ -98,7 +98,10 @@ def _uncertainty(estimate: Estimate, found: icp.Match) -> float:
     around[:3, 3] = center
     A = se3.adjoint(around)
     lever = max(0.1, float(np.sqrt(found.moved.astype(np.float64).var(axis=1).sum())))
-    S = np.diag([1, 1, 1, *[1 / lever] * 3])
-    information = S @ A.T @ (estimate.information - _SAFETY * estimate.spurious) @ A @ S
-    least = float(np.linalg.eigvalsh(information)[0])
-    return 1 / np.sqrt(least) if least > 0 else float("inf")
+    to_metres = A @ np.diag([1, 1, 1, *[1 / lever] * 3])
+    planes, noise, corners = (
+        to_metres.T @ H @ to_metres for H in (estimate.planes, _SAFETY * estimate.spurious, estimate.corners)
+    )
+    values, axes = np.linalg.eigh(planes - noise)
+    least = float(np.linalg.eigvalsh(axes @ np.diag(np.maximum(values, 0)) @ axes.T + corners)[0])
+    return 1 / np.sqrt(least) if least > 1e-9 else float("inf")
