@@ -653,6 +653,7 @@ def test_who_has_to_wait_says_the_same_again(tmp_path: Path) -> None:
         talk.add(own(box, {1: pose(1)}))
         frames = talk.message(3, now=0.0)
         talk.turned_away(1, "quota", "slower", 2.0, now=1.0)
+        assert talk.held == "they have to wait (quota): slower"
         assert talk.message(3, now=2.9) == []
         assert talk.message(3, now=3.0) == frames
         talk.turned_away(1, "disk", "full", 1e300, now=4.0)
