@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Feed mutated messages, journal segments and saved maps to what reads them; a JSON line for each target.
 
-    python scripts/fuzz.py                            10⁶ cases over message, control, journal and checkpoint
+    python scripts/fuzz.py                            10⁶ cases over messages, segments and maps
     python scripts/fuzz.py --only journal --cases 5000000 --seed 7
     python scripts/fuzz.py --corpus FOLDER            go on with what was found there, and add to it
 
@@ -24,8 +24,9 @@ from pathlib import Path
 from typing import Any
 
 TESTS = Path(__file__).parents[1] / "tests"
-SHARES = {"message": 0.4, "control": 0.3, "journal": 0.25, "checkpoint": 0.05}
+SHARES = {"message": 0.35, "control": 0.25, "corrections": 0.1, "journal": 0.25, "checkpoint": 0.05}
 INSTRUMENTED = ["tsfusion.codec", "tsfusion.journal", "tsfusion.transport.messages", "tsfusion.checkpoint",
+                "tsfusion.corrections",
                 "tsfusion.keyframe", "tsfusion.quota"]  # fmt: skip
 UNGUIDED = {"control"}  # decided in C, whose coverage is not seen
 _STATUS = re.compile(r"^#(\d+)\s+(\w+)\s+cov: (\d+) ft: (\d+) corp: (\d+)", re.MULTILINE)

@@ -7,6 +7,7 @@ It prints `begun`, and in the end how many messages, connections or bytes it cam
 """
 
 import contextlib
+import dataclasses
 import itertools
 import os
 import socket
@@ -18,11 +19,13 @@ from contextlib import ExitStack
 from typing import Any
 
 import msgspec
+import numpy as np
 import zmq
-from hostile_messages import Frames, bad_values, bombs, lies
-from wire import connected
+from hostile_messages import Frames, bad_values, bombs, hostile_corrections, lies
+from wire import connected, wall
 
-from tsfusion import codec
+from tsfusion import codec, corrections
+from tsfusion.corrections import SessionCorrections
 from tsfusion.transport import Command, messages, sockets
 from tsfusion.transport.curve import ClientKeys
 
@@ -97,6 +100,32 @@ def rubbish(target: Target) -> int:
             link.send_multipart([message, b"x"] if sent % 7 == 0 else [message])
             sent += 1
             time.sleep(_PAUSE / 2)
+    return sent
+
+
+def wrong_corrections(target: Target) -> int:
+    """Poses for a session of its own that are none; and good ones as fast as they go, now and then huge."""
+    session, sent = os.urandom(16), 0
+    many = {1 + i: np.eye(4) for i in range(corrections.MAX_KEYFRAMES)}
+    seqs, poses = corrections.checked(many)
+    huge = SessionCorrections(session=session, seqs=seqs, poses=poses)
+    last = corrections.MAX_KEYFRAMES
+    keyframe = codec.encode(wall(), session=session, seq=last, previous=0, jpeg_quality=90)
+    with connected(sockets.push, target.data) as push, connected(sockets.dealer, target.control) as link:
+        if push.poll(1000, zmq.POLLOUT):
+            push.send_multipart(keyframe)
+        for revision in itertools.count(1):
+            said = hostile_corrections(session, revision)
+            content = huge if revision % 10 == 0 else huge.up_to(20)
+            said.append(("good", "", corrections.pack(dataclasses.replace(content, revision=revision))))
+            for _, _, frames in said:
+                if target.over or not link.poll(1000, zmq.POLLOUT):
+                    return sent
+                link.send_multipart(frames)
+                while link.poll(0):
+                    link.recv_multipart()
+                sent += 1
+                time.sleep(_PAUSE)
     return sent
 
 
@@ -301,6 +330,7 @@ ATTACKS: dict[str, Callable[[Target], int]] = {
     "lies": lambda target: _push(target, lies),
     "oversized": oversized,
     "rubbish": rubbish,
+    "corrections": wrong_corrections,
     "greetings": greetings,
     "sessions": sessions,
     "mesh flood": mesh_flood,

@@ -14,9 +14,11 @@ import numpy as np
 from msgspec import Struct
 from wire import CAMERA, SHAPE, pose, wall
 
-from tsfusion import Keyframe, checkpoint, codec, journal
+from tsfusion import Keyframe, checkpoint, codec, corrections, journal, se3
 from tsfusion.codec.message import measurement
 from tsfusion.config import ServerConfig, VolumeConfig
+from tsfusion.corrections import Corrections, SessionCorrections
+from tsfusion.corrector import said
 from tsfusion.errors import CheckpointError, DecodeError, InvalidKeyframe, JournalError
 from tsfusion.quota import Quotas
 from tsfusion.transport import messages
@@ -132,6 +134,8 @@ def _control_seeds() -> list[bytes]:
         messages.Nack(session, 3, "door", "size", "too large"),
         messages.Hold(session, 1.5, "disk", "full"),
         messages.Denied(session, "map", "no"),
+        messages.Corrected(session, 3),
+        messages.Uncorrected(session, 3, "disk", "full", 1.0),
         messages.Pong("e", 1, 2, 3, 4, 5),
         messages.Reply(name="health", health=health),
         messages.Reply(name="mesh", mesh=layout),
@@ -251,9 +255,56 @@ def run_checkpoint(content: bytes) -> str:
     return "good"
 
 
+# --- corrected poses ---
+
+
+def _correction_seeds() -> list[bytes]:
+    found, path = [], scratch() / "seed.tsc"
+    rng = np.random.default_rng(0)
+    for count in (0, 1, 20):
+        poses = {1 + 3 * i: se3.exp(rng.normal(size=6)) for i in range(count)}
+        seqs, checked = corrections.checked(poses)
+        one = SessionCorrections(
+            session=bytes(16), seqs=seqs, poses=checked, revision=3, T_map_odometry=pose(1.0)
+        )
+        corrections.write(path, one)
+        found += [fuzz_mutate.join(corrections.pack(one)), path.read_bytes()]
+    return found
+
+
+def run_corrections(content: bytes) -> str:
+    """The server's door, or a file that is read; what passes is as good as what a client would send."""
+    try:
+        one = _corrections_of(content)
+    except (DecodeError, JournalError) as error:
+        return f"{type(error).__name__} {str(error).replace(str(scratch()), '')}"
+    poses = dict(zip(one.seqs.tolist(), one.poses, strict=True))
+    seqs, checked = corrections.checked(poses)
+    if seqs.tobytes() != one.seqs.tobytes() or checked.tobytes() != one.poses.tobytes():
+        raise Broken("a client would not have sent it so")
+    head, *frames = corrections.pack(one)
+    again = messages.decode_to_server(head)
+    if not isinstance(again, Corrections) or corrections.unpack(again, frames).without(one):
+        raise Broken("it is not said again as it was")
+    return f"good {min(len(one), 3)} {one.T_map_odometry is None}"
+
+
+def _corrections_of(content: bytes) -> SessionCorrections:
+    if content[:3] == b"TSF":
+        path = scratch() / "case.tsc"
+        path.write_bytes(content)
+        return corrections.load(path)
+    frames = fuzz_mutate.split(content)
+    head = said(frames)
+    if not isinstance(head, Corrections):
+        raise DecodeError(f"a {type(head).__name__}")
+    return corrections.unpack(head, frames[1:])
+
+
 TARGETS: dict[str, Target] = {
     "message": Target(_message_seeds, run_message, fuzz_mutate.message),
     "control": Target(_control_seeds, run_control, fuzz_mutate.msgpack),
+    "corrections": Target(_correction_seeds, run_corrections, fuzz_mutate.corrections),
     "journal": Target(_segment_seeds, run_journal, fuzz_mutate.mcap),
     "checkpoint": Target(_checkpoint_seeds, run_checkpoint, fuzz_mutate.checkpoint),
 }

@@ -12,7 +12,7 @@ from fuzz_targets import TARGETS
 
 from tsfusion import codec
 
-CASES = {"message": 6000, "control": 20_000, "journal": 2000, "checkpoint": 1000}
+CASES = {"message": 6000, "control": 20_000, "corrections": 3000, "journal": 2000, "checkpoint": 1000}
 _CHECK_BYTES = 1 << 20  # besides the message itself
 
 

@@ -42,6 +42,19 @@ class Atlas:
         """A map that is open."""
         return self._open.get(name)
 
+    def progress(self, name: str, session: bytes) -> tuple[int, int]:
+        """The highest seq of a session that is durable, and that is fused."""
+        hosted = self.get(name)
+        return hosted.sessions.progress(session) if hosted else (0, 0)
+
+    def corrected(self, name: str, session: bytes) -> tuple[int, int]:
+        """Of a session's corrections the newest revision, and how many keyframes they name."""
+        hosted = self.get(name)
+        if hosted is None:
+            return 0, 0
+        kept = hosted.revisions.of(session)
+        return kept.revision, kept.keyframes
+
     def begin(self, volumes: Mapping[str, VolumeConfig]) -> None:
         """Open these maps with these settings; one that a client asks for gets those of the default map.
 

@@ -33,13 +33,14 @@ class Correcting:
             server's disk with all they named, or what was said of it since.
         refused: messages that the server will never take, by reason.
         refusal: the first that nobody was told of, in words; empty = none.
+        held: why the server does not take any for now; empty = it said nothing of that.
     """
 
     def __init__(self, spool: Spool) -> None:
         self.wanted: bool | None = None
         self.taken = self.acknowledged = 0
         self.refused: Counter[str] = Counter()
-        self.refusal = ""
+        self.refusal = self.held = ""
         self._spool = spool
         self._path = spool.folder / NAME
         self._pending = self._left()
@@ -48,6 +49,7 @@ class Correcting:
         self._covers = 0  # `taken`, as far as what is under way goes
         self._due = 0.0
         self._again = _AGAIN[0]
+        self._warned = False
         spool.pinned = bool(self._pending)
 
     def _left(self) -> SessionCorrections:
@@ -81,7 +83,7 @@ class Correcting:
         Raises:
             InvalidKeyframe: when that makes too many.
         """
-        both = replace(self._pending.merged(new), revision=self._revision)
+        both = replace(self._pending.merged(new), revision=self._revision + 1)
         if len(both) > corrections.MAX_KEYFRAMES:
             raise InvalidKeyframe(f"corrections of {len(both)} keyframes wait: that is too many")
         self.taken += 1
@@ -89,7 +91,13 @@ class Correcting:
         self._spool.pinned = bool(self._pending)
         if not self._pending:
             self.acknowledged = self.taken
+        self._warn()
         return self._pending
+
+    def _warn(self) -> None:
+        if self.wanted is False and self._pending and not self._warned:
+            self._warned = True
+            log.warning("this server is of an older version and takes no corrections: they wait for a newer")
 
     def save(self, content: SessionCorrections) -> None:
         """For the next scanner, should this one die. A disk that refuses is logged: they are sent anyway."""
@@ -142,9 +150,8 @@ class Correcting:
 
     def welcomed(self, revision: int | None, now: float) -> None:
         """A server let us in, and says what it has of this session; None = it takes no corrections."""
-        if revision is None and self.wanted is not False and self._pending:
-            log.warning("this server is of an older version and takes no corrections: they wait")
         self.wanted = revision is not None
+        self._warn()
         if revision is not None:
             self.told(revision, now)
             self._under_way = None  # it is lost, or will come too late
@@ -153,6 +160,7 @@ class Correcting:
     def told(self, revision: int, now: float) -> None:
         """This revision is on the server's disk."""
         self._revision = max(self._revision, revision)
+        self.held = ""
         if self._under_way is None:
             return
         if revision == self._under_way.revision:
@@ -168,7 +176,7 @@ class Correcting:
             return
         if again_s > 0:
             self._due = now + min(max(again_s, _HOLD[0]), _HOLD[1])
-            log.info("corrections have to wait (%s): %s", reason, message)
+            self.held = f"they have to wait ({reason}): {message}"
             return
         log.error("corrections of %d keyframes are lost (%s): %s", len(self._under_way), reason, message)
         self.refused[reason] += 1

@@ -10,30 +10,36 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from tsfusion import corrections, logs
 from tsfusion.atlas import Atlas
 from tsfusion.codec import Refused
 from tsfusion.config import ServerConfig
 from tsfusion.corrections import Corrections, SessionCorrections
-from tsfusion.errors import JournalError
+from tsfusion.errors import DecodeError, JournalError
 from tsfusion.hosted import HostedMap
 from tsfusion.intake import Intake
-from tsfusion.transport.messages import Corrected, Uncorrected
+from tsfusion.quota import Quotas
+from tsfusion.transport.messages import Corrected, ToServer, Uncorrected, decode_to_server
 
 log = logging.getLogger(__name__)
 
 _DISK_AGAIN = 1.0  # seconds
 _LONGEST = 10.0
+_SHARE = 16  # of what a client may send in keyframes: each message writes its session's file anew
+_RATE = 20.0  # messages a second of a client
 
 
 class Corrector:
-    """The way from the control socket into the maps' corrections. Shares owners and quotas with keyframes."""
+    """The way from the control socket into the maps' corrections."""
 
     def __init__(self, server: ServerConfig, maps: Atlas, intake: Intake) -> None:
         self._server = server
         self._maps = maps
         self._intake = intake
+        share = max(server.quota_bytes // _SHARE, 1)
+        self._quotas = Quotas(structs.replace(server, quota_bytes=share, quota_keyframes=_RATE))
 
     def take(self, head: Corrections, frames: Sequence[Any], client: str) -> Corrected | Uncorrected | None:
         """One message; the answer. None = none: its client will say hello, and send it again."""
@@ -70,8 +76,8 @@ class Corrector:
         if seconds := hosted.held(now):
             return self._later(head, seconds, "disk", hosted.problem)
         nbytes = kept_bytes + corrections.file_bytes(head.count)
-        if seconds := self._intake.quotas.wait(client, nbytes, now):
-            return self._later(head, seconds, "quota", "the quota of this client is used up")
+        if seconds := self._quotas.wait(client, nbytes, now):
+            return self._later(head, seconds, "quota", "a client's corrections have a quota, too")
         return None
 
     def _within(self, frames: Sequence[Any]) -> Sequence[Any]:
@@ -99,3 +105,17 @@ class Corrector:
         subject = logs.about(map=head.map, session=head.session, client=client, reason=error.reason)
         log.warning("corrections are refused: %s", error, extra=subject)
         return Uncorrected(head.session, head.revision, error.reason, str(error))
+
+
+def said(frames: Sequence[Any]) -> ToServer:
+    """What a control message says. Only corrections have frames behind their head.
+
+    Raises:
+        DecodeError: for anything but a message to the server.
+    """
+    if len(frames) > 1 + corrections.MAX_FRAMES:
+        raise DecodeError(f"a control message of {len(frames)} frames")
+    message = decode_to_server(frames[0] if frames else b"")
+    if len(frames) > 1 and not isinstance(message, Corrections):
+        raise DecodeError(f"a {type(message).__name__} of {len(frames)} frames")
+    return message

@@ -12,11 +12,11 @@ from typing import Any
 
 import zmq
 
-from tsfusion import codec, corrections, logs, process, reports
+from tsfusion import codec, logs, process, reports
 from tsfusion.atlas import Atlas
 from tsfusion.config import ServerConfig
 from tsfusion.corrections import Corrections
-from tsfusion.corrector import Corrector
+from tsfusion.corrector import Corrector, said
 from tsfusion.door import Door
 from tsfusion.errors import DecodeError
 from tsfusion.hosted import HostedMap
@@ -24,7 +24,6 @@ from tsfusion.intake import Intake
 from tsfusion.metrics import Metrics
 from tsfusion.ports import MemoryBound, Ports, each, send_now
 from tsfusion.questions import Questions
-from tsfusion.revisions import Kept
 from tsfusion.routes import Route, Routes
 from tsfusion.subscriptions import Subscriptions
 from tsfusion.transport import messages, sockets, work
@@ -185,21 +184,19 @@ class Gateway:
             return
         identity, *rest = frames
         try:
-            message = _said(rest)
+            message = said([frame.buffer for frame in rest])
         except DecodeError as error:
             self._refused["control"] += 1
             log.debug("%s", error)
             return
-        self._on_message(identity.bytes, message, client, rest)
+        self._on_message(identity.bytes, message, client, [frame.buffer for frame in rest[1:]])
 
     def _on_message(
-        self, identity: bytes, message: messages.ToServer, client: str, frames: list[zmq.Frame]
+        self, identity: bytes, message: messages.ToServer, client: str, arrays: Sequence[Any]
     ) -> None:
         if isinstance(message, Corrections):
-            if self._accepting:
-                answer = self._corrector.take(message, [frame.buffer for frame in frames[1:]], client)
-                if answer is not None:
-                    self._answer(identity, answer)
+            if self._accepting and (answer := self._corrector.take(message, arrays, client)) is not None:
+                self._answer(identity, answer)
         elif isinstance(message, messages.Command):
             self._on_command(identity, message, client)
         elif isinstance(message, messages.Hello):
@@ -211,7 +208,7 @@ class Gateway:
         if denied := self._denial(identity, hello, client):
             self._answer(identity, messages.Denied(hello.session, *denied))
             return
-        durable, fused = self._progress(hello.map, hello.session)
+        durable, fused = self.maps.progress(hello.map, hello.session)
         welcome = messages.Welcome(
             epoch=self.epoch,
             version=codec.VERSION,
@@ -220,7 +217,7 @@ class Gateway:
             window_keyframes=self._server.window_keyframes,
             window_bytes=self._server.window_bytes,
             max_frame_bytes=self._server.max_frame_bytes,
-            corrections=self._corrected(hello.map, hello.session)[0],
+            corrections=self.maps.corrected(hello.map, hello.session)[0],
         )
         self._answer(identity, welcome)
 
@@ -249,18 +246,9 @@ class Gateway:
         if route is not None and route.client == client:
             self._routes.heard(route)
             route.said(ping)
-            progress = self._progress(route.map, ping.session)
+            progress = self.maps.progress(route.map, ping.session)
         pong = messages.Pong(self.epoch, ping.sent_ns, received_ns, time.monotonic_ns(), *progress)
         self._answer(identity, pong)
-
-    def _progress(self, map_name: str, session: bytes) -> tuple[int, int]:
-        hosted = self.maps.get(map_name)
-        return hosted.sessions.progress(session) if hosted else (0, 0)
-
-    def _corrected(self, map_name: str, session: bytes) -> tuple[int, int]:
-        hosted = self.maps.get(map_name)
-        kept = hosted.revisions.of(session) if hosted else Kept()
-        return kept.revision, kept.keyframes
 
     def _on_command(self, identity: bytes, command: messages.Command, client: str) -> None:
         if command.name == "ping":
@@ -299,12 +287,11 @@ class Gateway:
             refused=dict(self._refused + self._door.refused),
             duplicates=self._intake.duplicates,
             maps=found,
-            clients=tuple(self._client_health(route, now) for route in self._routes),
+            clients=tuple(
+                route.health(now, self.maps.progress(*route.place), self.maps.corrected(*route.place))
+                for route in self._routes
+            ),
         )
-
-    def _client_health(self, route: Route, now: float) -> messages.ClientHealth:
-        where = (route.map, route.session)
-        return route.health(now, self._progress(*where), self._corrected(*where))
 
     # --- sending: an answer that cannot leave at once is dropped, the asker will ask again ---
 
@@ -331,13 +318,3 @@ class Gateway:
 
     def _answer(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
         send_now(self.ports.control, [identity, messages.encode(message), *frames])
-
-
-def _said(frames: Sequence[zmq.Frame]) -> messages.ToServer:
-    """What a control message says. Only corrections have frames behind their head."""
-    if len(frames) > 1 + corrections.MAX_FRAMES:
-        raise DecodeError(f"a control message of {len(frames)} frames")
-    said = messages.decode_to_server(frames[0].buffer if frames else b"")
-    if len(frames) > 1 and not isinstance(said, Corrections):
-        raise DecodeError("a control message of several frames")
-    return said

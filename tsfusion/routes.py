@@ -46,6 +46,11 @@ class Route(Struct, eq=False):
     held_until: float = 0.0
     held: str = ""
 
+    @property
+    def place(self) -> tuple[str, bytes]:
+        """Map and session."""
+        return self.map, self.session
+
     def open_to(self, client: str) -> bool:
         """Whether this client may go on with the session: it is its own, or its client is silent for long."""
         return self.client == client or time.monotonic() - self.heard >= _TAKEN

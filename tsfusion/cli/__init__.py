@@ -12,7 +12,21 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from tsfusion.cli import ate, config, datasets, doctor, journal, keys, mesh, replay, scan, serve, status
+from tsfusion.cli import (
+    ate,
+    check,
+    config,
+    datasets,
+    doctor,
+    download,
+    journal,
+    keys,
+    mesh,
+    replay,
+    scan,
+    serve,
+    status,
+)
 from tsfusion.errors import TsfusionError
 
 INTERRUPTED = 128 + signal.SIGINT
@@ -29,11 +43,13 @@ app = typer.Typer(
 app.command()(replay.demo)
 app.command()(replay.replay)
 app.command()(scan.scan)
+app.command()(check.check)
 app.command()(serve.serve)
 app.command()(mesh.mesh)
 app.command()(status.status)
 app.command()(ate.ate)
 app.command()(doctor.doctor)
+app.command()(download.download)
 app.add_typer(keys.app, name="keys")
 app.add_typer(journal.app, name="journal")
 app.add_typer(config.app, name="config")

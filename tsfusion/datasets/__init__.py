@@ -7,6 +7,7 @@ Any object with `__len__` and `__getitem__` that follows the `Dataset` protocol 
 from pathlib import Path
 from typing import Any
 
+from tsfusion.datasets.bags import Bag
 from tsfusion.datasets.base import Dataset, Selection, select
 from tsfusion.datasets.euroc import EuRoC
 from tsfusion.datasets.kitti import KITTI
@@ -25,6 +26,7 @@ from tsfusion.errors import DatasetError
 __all__ = [
     "KITTI",
     "TUM",
+    "Bag",
     "Dataset",
     "EuRoC",
     "Found",

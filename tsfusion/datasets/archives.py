@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Recordings as they are downloaded: archives, unpacked beside themselves."""
 
+import lzma
+import stat
 import tarfile
 import tempfile
 import zipfile
-from pathlib import Path
+import zlib
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from tsfusion.errors import DatasetError
 
@@ -43,19 +46,56 @@ def unpack(path: Path) -> Path:
         with tempfile.TemporaryDirectory(prefix=".unpacking-", dir=path.parent) as place:
             partial = Path(place) / into.name
             partial.mkdir()
-            _extract(path, partial)
+            extract(path, partial)
             partial.rename(into)
-    except (OSError, ValueError, tarfile.TarError, zipfile.BadZipFile, EOFError) as error:
+    except OSError as error:
         raise DatasetError(f"cannot unpack {path}: {error}") from error
     return into
 
 
-def _extract(path: Path, into: Path) -> None:
-    if path.suffix.lower() != ".zip":
-        with tarfile.open(path) as tar:
-            tar.extractall(into, filter="data")
-        return
+def extract(path: Path, into: Path, *, nested: bool = False) -> None:
+    """Unpack into a folder, which should be an empty one: what was unpacked stays when the rest fails.
+
+    Args:
+        nested: zip files that come out are unpacked where they are, and removed.
+
+    Raises:
+        DatasetError: when it is broken, or a member is a link or leads out of the folder.
+        OSError: when it cannot be written.
+    """
+    into.mkdir(parents=True, exist_ok=True)
+    try:
+        if path.suffix.lower() == ".zip":
+            _extract_zip(path, into)
+        else:
+            _extract_tar(path, into)
+    except (ValueError, tarfile.TarError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError,
+            NotImplementedError, RuntimeError) as error:  # fmt: skip
+        reason = " ".join(str(error).split())  # tarfile's goes over many lines
+        raise DatasetError(f"cannot unpack {path}: {reason}") from error
+    for inner in sorted(into.rglob("*.zip")) if nested else ():
+        extract(inner, inner.parent)
+        inner.unlink()
+
+
+def _extract_tar(path: Path, into: Path) -> None:
+    with tarfile.open(path) as tar:
+        for member in tar:
+            _require_inside(member.name, is_link=not (member.isfile() or member.isdir()))
+            tar.extract(member, into, filter="data")
+
+
+def _extract_zip(path: Path, into: Path) -> None:
     with zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
             member.filename = member.filename.replace("\\", "/")
-            archive.extract(member, into)  # leaves out drive letters, leading slashes and `..`
+            _require_inside(member.filename, is_link=stat.S_ISLNK(member.external_attr >> 16))
+            archive.extract(member, into)
+
+
+def _require_inside(name: str, *, is_link: bool) -> None:
+    """Raise ValueError for a member that is a link or leads out of the folder."""
+    inside = PurePosixPath(name)
+    if is_link or inside.is_absolute() or ".." in inside.parts or PureWindowsPath(name).drive:
+        what = "is no plain file" if is_link else "leads out of the archive's folder"
+        raise ValueError(f"its member {name!r} {what}; nothing of it is kept")

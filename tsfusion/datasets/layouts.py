@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from tsfusion.datasets import (
     archives,
+    bags,
     euroc,
     kitti,
     kitti_raw,
@@ -84,6 +85,7 @@ BUILT_IN = (
     Layout("HoloLens", rgbd_folders.HOLOLENS_EXPECTED, rgbd_folders.recognises_hololens,
            rgbd_folders.HoloLens),
     Layout("Redwood", rgbd_folders.REDWOOD_EXPECTED, rgbd_folders.recognises_redwood, rgbd_folders.Redwood),
+    Layout("ROS bag", bags.EXPECTED, bags.recognises, bags.Bag),
 )  # fmt: skip
 # Asked where none of those fits.
 PLAIN = (
@@ -224,5 +226,5 @@ def _unrecognised(root: Path, several: list[Path]) -> str:
             f"{root} is not a folder, nor a file that stands for a dataset (an archive, a transforms.json, "
             "a trajectory.log, a file of a recognised folder)"
         )
-    known = "; ".join(f"{layout.name}: {layout.description}" for layout in layouts())
-    return f"{root} is in no layout known here. Expected one of: {known}; {': '.join(SYNTHETIC)}"
+    known = ", ".join(layout.name for layout in layouts())
+    return f"{root} is in no layout known here: {known}; `tsfusion datasets` says what each expects"

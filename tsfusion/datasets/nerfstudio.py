@@ -47,11 +47,11 @@ def recognises(path: Path) -> bool:
 class Nerfstudio(Frames):
     """Frames with depth of a nerfstudio or instant-ngp capture.
 
-    https://docs.nerf.studio/quickstart/data_conventions.html. Poses are camera-to-world with OpenGL axes,
-    in metres; pixel centres lie at halves. Depth is along the optical axis, a 16-bit image (0 = none) or a
-    `.npy`, of `depth_file_path` (nerfstudio) or `depth_path` (instant-ngp, NeRFCapture). Distorted images
-    are undistorted, depth by the nearest pixel. Where depth has another size than colour, colour is
-    resampled to it. No timestamps.
+    https://docs.nerf.studio/quickstart/data_conventions.html. Poses are camera-to-world with OpenGL axes, in
+    `applied_scale` units a metre (default 1); pixel centres lie at halves. Depth is along the optical axis,
+    a 16-bit image (0 = none) or a `.npy`, of `depth_file_path` (nerfstudio) or `depth_path` (instant-ngp,
+    NeRFCapture). Distorted images are undistorted, depth by the nearest pixel. Where depth has another size
+    than colour, colour is resampled to it. No timestamps.
 
     Args:
         path: the folder, or the `.json` file in it.
@@ -77,13 +77,14 @@ class Nerfstudio(Frames):
         capture = _read(file)
         self.name, self.sensor, self.skipped = f"nerfstudio {file.absolute().parent.name}", sensor, {}
         self.depth_scale = _depth_scale(capture, file) if depth_scale is None else depth_scale
+        applied = _scale(capture, "applied_scale", file) if "applied_scale" in capture else 1.0
         views, poses = [], []
         for number, frame in enumerate(capture["frames"]):
             where = f"{file}, frame {number}"
             view = _view(file.parent, capture, frame, where, color=color)
             if view is not None:
                 views.append(view)
-                poses.append(_pose(frame, where))
+                poses.append(_pose(frame, applied, where))
         if not views:
             raise DatasetError(
                 f"{file} has {len(capture['frames'])} frames, none with depth_file_path or depth_path; "
@@ -102,7 +103,7 @@ class Nerfstudio(Frames):
         view = self._views[index]
         depth, scale = _read_depth(view.depth, self.depth_scale)
         color = None if view.color is None else read_color(view.color, None)
-        size = view.size or depth.shape[:2] if color is None else view.size or color.shape[:2]
+        size = view.size or (depth if color is None else color).shape[:2]
         camera = _camera(view, size)
         fitted = _resized(camera, depth.shape[:2], view.where)
         if color is not None and color.shape != (*depth.shape, 3):
@@ -162,13 +163,14 @@ def _image(path: Path) -> Path:
     return path if path.suffix or not path.with_suffix(".png").exists() else path.with_suffix(".png")
 
 
-def _pose(frame: dict[str, Any], where: str) -> Pose | None:
+def _pose(frame: dict[str, Any], applied_scale: float, where: str) -> Pose | None:
     if frame.get("transform_matrix") is None:
         return None
     try:
         matrix = np.array(frame["transform_matrix"], dtype=np.float64)
         T = np.eye(4)
         T[: len(matrix)] = matrix
+        T[:3, 3] /= applied_scale
         return check_pose(T @ _OPENCV)
     except (ValueError, TypeError, InvalidKeyframe) as error:
         raise DatasetError(f"{where}: transform_matrix: {error}") from error
@@ -201,8 +203,8 @@ def _resized(camera: Camera, shape: tuple[int, ...], where: str) -> Camera:
     """The camera for images of another size."""
     if abs(shape[0] / camera.size[0] - shape[1] / camera.size[1]) > 0.01:
         raise DatasetError(
-            f"{where}: an image of {shape[1]}×{shape[0]}, but the camera is "
-            f"{camera.size[1]}×{camera.size[0]}; expected the same shape"
+            f"{where}: image {shape[1]}×{shape[0]}, but camera {camera.size[1]}×{camera.size[0]}; "
+            "expected the same shape"
         )
     intrinsics = camera.intrinsics.scaled(shape[1] / camera.size[1])
     return Camera(intrinsics, (shape[0], shape[1]), camera.model, camera.distortion)
@@ -218,11 +220,15 @@ def _number(given: dict[str, Any], key: str, where: str) -> float:
 def _depth_scale(capture: dict[str, Any], file: Path) -> float:
     for key in ("depth_unit_scale_factor", "integer_depth_scale"):
         if key in capture:
-            scale = _number(capture, key, str(file))
-            if scale <= 0:
-                raise DatasetError(f"{file}: {key} must be > 0 metres a unit, got {scale}")
-            return scale
+            return _scale(capture, key, file)
     return DEPTH_SCALE
+
+
+def _scale(capture: dict[str, Any], key: str, file: Path) -> float:
+    scale = _number(capture, key, str(file))
+    if scale <= 0:
+        raise DatasetError(f"{file}: {key} must be > 0, got {scale}")
+    return scale
 
 
 def _read_depth(path: Path, scale: float) -> tuple[NDArray[Any], float]:

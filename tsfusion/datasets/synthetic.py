@@ -57,6 +57,10 @@ WORLDS: dict[str, Callable[[int], worlds.World]] = {  # by the number of keyfram
     "street": lambda count: worlds.street(max(80.0, count + 40.0)),
     "corridor": lambda _: corridor.ring(),
     "rooms": lambda _: corridor.rooms(),
+    **{
+        name: lambda _, name=name: worlds.room(name)  # type: ignore[misc]
+        for name in ("room-untextured", "room-plain", "room-bare")
+    },
 }
 
 
@@ -70,13 +74,13 @@ class Synthetic(Frames):
     - lidar: 64 × 900 rays, range error 2 cm, 2 % lost, grazing rays lost. Points carry colour.
 
     Args:
-        world: `room`, `street`, or a `World` of your own, seen with the room's camera and LiDAR.
+        world: a name in `WORLDS`: `room`, `street`, … or a `World` of your own, seen with the room's camera and LiDAR.
         count: keyframes; the room's path is a closed circle, the street's goes on by a metre each.
         seed: of the noise; the world does not change.
         width: of the image, pixels; default 320 in the room, 620 in the street. The noise in pixels stays.
         color: render colour too.
-        path: of the sensor; `circle` (looking in, default) or `tour` (all of it) in the room, `drive` in the
-            street.
+        path: of the sensor; in a room `circle` (looking in, default), `tour` (all of it) or `handheld` (10 Hz
+            as a person walks, whatever the count), in the street `drive`.
 
     Raises:
         DatasetError: for an unknown world, sensor or path, or a count or width below 1.

@@ -14,7 +14,7 @@ Solids = NDArray[np.float64]  # (m, 11): kind, centre xyz, half sizes xyz, cos y
 
 # As in kernels/synthetic.py, which cannot be imported without Taichi; a test compares them.
 ROOM, BOX, SPHERE, CYLINDER, GROUND = range(5)
-INTERIOR, WOOD, MARBLE, STRIPES, ROAD, PAVEMENT, FACADE, PAINT, METAL, BARK, LEAVES, GLASS = range(12)
+INTERIOR, WOOD, MARBLE, STRIPES, ROAD, PAVEMENT, FACADE, PAINT, METAL, BARK, LEAVES, GLASS, PLAIN = range(13)
 
 _CHUNK = 1 << 16  # points measured at once
 
@@ -53,15 +53,24 @@ class World:
         return np.ascontiguousarray(self.solids[endless | (away < reach)])
 
 
-def room() -> World:
-    """A 4×4×2.8 m room with a sphere, a box and a column; the usual path is a closed circle."""
-    solids = [
-        solid(ROOM, (0, 0, 1.4), (2, 2, 1.4), INTERIOR),
+def room(name: str = "room") -> World:
+    """A 4×4×2.8 m room with a sphere, a box and a column; the usual path is a closed circle.
+
+    Others, hard for one who has to find the path: `room-untextured` (everything of one colour), `room-plain`
+    (the walls of one colour), `room-bare` (the walls alone, coloured: one to three planes in view).
+    """
+    walls = solid(ROOM, (0, 0, 1.4), (2, 2, 1.4), INTERIOR)
+    things = [
         solid(SPHERE, (0.6, 0.3, 0.5), (0.5, 0.5, 0.5), MARBLE),
         solid(BOX, (-0.7, 0.6, 0.4), (0.4, 0.3, 0.4), WOOD),
         solid(CYLINDER, (0, -0.8, 0.6), (0.15, 0.15, 0.6), STRIPES),
     ]
-    return World("room", np.array(solids), {"circle": _circle, "tour": _tour})
+    solids = np.array([walls] if name == "room-bare" else [walls, *things])
+    if name == "room-untextured":
+        solids[:, 9] = PLAIN
+    elif name == "room-plain":
+        solids[0, 9] = PLAIN
+    return World(name, solids, {"circle": _circle, "tour": _tour, "handheld": _handheld})
 
 
 def street(length: float = 80.0) -> World:
@@ -125,6 +134,20 @@ def _tour(index: int, count: int) -> NDArray[np.float64]:
     if index < second:
         return look_at(0.8 * toward + (0, 0, 2.1), wall + (0, 0, 0.4))
     return look_at(0.03 * toward + (0, 0, 1.31), wall + (0, 0, 1.7))
+
+
+def _handheld(index: int, _count: int) -> NDArray[np.float64]:
+    """As a person walks round with a camera, ten frames a second: 0.4 m/s and 20 to 40 degrees/s."""
+    t = index * 0.1
+    angle = 2.5 + 0.4 * t + 0.12 * np.sin(0.9 * t)
+    radius = 0.9 + 0.15 * np.sin(0.7 * t + 1)
+    position = np.array([radius * np.cos(angle), radius * np.sin(angle), 1.5 + 0.12 * np.sin(1.1 * t)])
+    sway = 0.12 * np.sin([1.7 * t, 1.3 * t + 0.5, 1.9 * t + 2])
+    target = np.array([1.2 * np.cos(angle - 2.5), 1.2 * np.sin(angle - 2.5), 0.6]) + sway
+    T, roll = look_at(position, target), 0.07 * np.sin(0.8 * t)
+    turned = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
+    T[:3, :3] = T[:3, :3] @ turned
+    return T
 
 
 def _drive(index: int, count: int) -> NDArray[np.float64]:

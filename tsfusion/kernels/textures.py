@@ -5,7 +5,7 @@ import taichi as ti
 import taichi.math as tm
 
 # Materials, column 9 of a solid
-INTERIOR, WOOD, MARBLE, STRIPES, ROAD, PAVEMENT, FACADE, PAINT, METAL, BARK, LEAVES, GLASS = range(12)
+INTERIOR, WOOD, MARBLE, STRIPES, ROAD, PAVEMENT, FACADE, PAINT, METAL, BARK, LEAVES, GLASS, PLAIN = range(13)
 
 vec3 = ti.types.vector(3, ti.f64)
 
@@ -181,7 +181,7 @@ def solid_color(solids: ti.template(), s, p, normal):
         stretch = vec3(1, 1, 0.3)
     # Fine, middle and coarse noise once for all materials: every call is inlined and costs compile time.
     grain = vec3(noise(stretch * p, 0.045, 1), noise(stretch * p, 0.17, 2), noise(stretch * p, 0.7, 3))
-    rgb = vec3(0.6, 0.6, 0.6)
+    rgb = vec3(0.6, 0.6, 0.6)  # PLAIN
     if material == INTERIOR:
         rgb = interior_color(p, normal, half, grain)
     elif material == WOOD:

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Corners, followed from image to image (Shi and Tomasi 1994; Lucas and Kanade 1981); the pose they give."""
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -25,15 +23,10 @@ def corners(gray: NDArray[np.uint8], count: int, *, mask: NDArray[np.uint8] | No
     return np.empty((0, 2), np.float32) if found is None else found.reshape(-1, 2).astype(np.float32)
 
 
-def pyramid(gray: NDArray[np.uint8]) -> Any:
-    """What `follow` takes for an image: made once, used as the new image and then as the old one."""
-    return cv2.buildOpticalFlowPyramid(gray, _WINDOW, _LEVELS)[1]
-
-
 def follow(
-    old: Any, new: Any, points: Pixels, *, guess: Pixels | None = None
+    old: NDArray[np.uint8], new: NDArray[np.uint8], points: Pixels, *, guess: Pixels | None = None
 ) -> tuple[Pixels, NDArray[np.bool_]]:
-    """Where (n, 2) points of one pyramid are in the other, and which lead back to where they began."""
+    """Where (n, 2) points of one grey image are in the other, and which lead back to where they began."""
     if not len(points):
         return points.copy(), np.zeros(0, bool)
     flags = cv2.OPTFLOW_USE_INITIAL_FLOW if guess is not None else 0

@@ -123,7 +123,7 @@ class _Problem:
     """The edges as arrays, and the sparsity of their normal equations."""
 
     def __init__(self, nodes: Mapping[int, Matrix], edges: Sequence[Edge]) -> None:
-        self._linalg, self._sparse = _scipy()
+        self._linalg, self._sparse = require()
         place = {key: index for index, key in enumerate(nodes)}
         self._start = np.array([place[edge.start] for edge in edges], dtype=np.int64)
         self._end = np.array([place[edge.end] for edge in edges], dtype=np.int64)
@@ -212,7 +212,12 @@ def _squares(error: NDArray[np.float64], information: NDArray[np.float64]) -> ND
     return result
 
 
-def _scipy() -> tuple[Any, Any]:
+def require() -> tuple[Any, Any]:
+    """scipy's sparse linear algebra and matrices.
+
+    Raises:
+        MissingDependency: without scipy.
+    """
     try:
         import scipy.sparse
         import scipy.sparse.linalg

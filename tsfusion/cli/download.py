@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion download`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tsfusion.cli import options
+
+if TYPE_CHECKING:
+    from tsfusion.datasets.catalogue import Recording
+    from tsfusion.datasets.download import Checked
+
+
+def download(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="What to fetch; without it, what there is.")
+    ] = None,
+    *,
+    to: Annotated[Path, typer.Option("--to", metavar="DIR", help="Where recordings are kept.")] = Path(
+        "datasets"
+    ),
+    base: Annotated[
+        str | None,
+        typer.Option(
+            "--from", metavar="URL", envvar="TSFUSION_DOWNLOAD_FROM",
+            help="A mirror: the folder that has the archives by their names.",
+        ),
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only compare the archives in DIR with their checksums.")
+    ] = False,
+    json: options.Json = False,
+) -> None:  # fmt: skip
+    """Fetch a public recording, or list those that are known.
+
+    An interrupted download goes on with the same command. Mind each recording's licence.
+    """
+    from tsfusion.datasets import catalogue
+
+    if check:
+        _check([catalogue.entry(name)] if name else list(catalogue.CATALOGUE), to, json=json)
+    elif name is None:
+        _list(list(catalogue.CATALOGUE), json=json)
+    else:
+        _fetch(catalogue.entry(name), to, base, json=json)
+
+
+def _list(recordings: "list[Recording]", *, json: bool) -> None:
+    from tsfusion.cli import show
+
+    if json:
+        show.as_json([recording._asdict() for recording in recordings])
+        return
+    for one in recordings:
+        size = "by hand" if not one.files else "size unknown" if one.nbytes is None else show.size(one.nbytes)
+        typer.echo(f"{one.name:<24}  {size:>12}  {one.title}\n{'':<24}  {'':>12}  {one.licence}; {one.page}")
+
+
+def _fetch(recording: "Recording", to: Path, base: str | None, *, json: bool) -> None:
+    from tsfusion.cli import show
+    from tsfusion.datasets import download
+
+    if not json:
+        typer.echo(f"{recording.title}\nlicence: {recording.licence}; {recording.page}", err=True)
+    with show.reading(f"fetching {recording.name}", quiet=json) as watch:
+        done = download.fetch(recording, to, watch, base=base)
+    if json:
+        show.as_json({"path": str(done.path), "files": [_row(one) for one in done.files]})
+        return
+    for one in done.files:
+        _say(one)
+    typer.echo(f"{done.path}\nnext: tsfusion replay {done.path}")
+
+
+def _check(recordings: "list[Recording]", to: Path, *, json: bool) -> None:
+    from tsfusion.cli import show
+    from tsfusion.datasets import download
+
+    found = [one for recording in recordings for one in download.check(recording, to)]
+    if json:
+        show.as_json([_row(one) for one in found])
+        return
+    for one in found:
+        _say(one)
+    if not found:
+        typer.echo(f"no archives of these recordings in {to}", err=True)
+
+
+def _row(one: "Checked") -> dict[str, object]:
+    return {**one._asdict(), "path": str(one.path)}
+
+
+def _say(one: "Checked") -> None:
+    verdict = "as expected" if one.known else "unverified: no checksum is published; recorded for later"
+    typer.echo(f"{one.path}  sha256 {one.sha256}  {verdict}", err=True)
