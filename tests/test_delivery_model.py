@@ -3,23 +3,25 @@
 
 Anything may be lost or late on either socket, data that was under way may arrive after what was sent later,
 both ends may die at any time. Whatever happens: each keyframe is journaled once and in order, or refused, or
-counted as skipped. Nothing else.
+counted as skipped. Nothing else. And the newest corrected pose of each that is journaled gets to the server.
 """
 
 import math
 import random
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import zmq
+from wire import pose
 
-from tsfusion import Keyframe, backpressure, codec, conversation, room, sender
+from tsfusion import Keyframe, backpressure, codec, conversation, corrections, room, sender
 from tsfusion.backpressure import Backpressure
 from tsfusion.config import ClientConfig
+from tsfusion.corrections import Corrections, SessionCorrections, nothing
 from tsfusion.outbox import Outbox
 from tsfusion.sender import Sender
 from tsfusion.spool import Spool
@@ -61,7 +63,7 @@ class Link:
             raise zmq.Again
         self.there.append(frame)
 
-    def send_multipart(self, frames: list[Any], _: int, *, copy: bool) -> None:
+    def send_multipart(self, frames: Sequence[Any], _: int, *, copy: bool) -> None:
         assert not copy
         self.send([bytes(frame) for frame in frames], 0)
 
@@ -96,6 +98,8 @@ class ModelServer:
         self.hasty = rng.random() < 0.5  # refuses before it looks for gaps
         self.hold = 0.0  # how likely it is that a keyframe is not wanted now
         self.deny = 0.0
+        self.corrects = rng.random() < 0.8  # else it is of an older version
+        self.corrected: dict[bytes, SessionCorrections] = {}
 
     def durable(self, session: bytes) -> int:
         return max((seq for one, seq, _ in self.journal if one == session), default=0)
@@ -119,15 +123,33 @@ class ModelServer:
                 self.journal.append((session, header.seq, number))
         return [messages.Ack(session, self.durable(session), self.fused.get(session, 0), (), resend)]
 
-    def on_control(self, frame: bytes, now_ns: int) -> list[messages.ToClient]:
-        message = messages.decode_to_server(frame)
+    def revision(self, session: bytes) -> int:
+        return self.corrected.get(session, nothing(session)).revision
+
+    def on_corrections(self, head: Corrections, frames: list[bytes]) -> list[messages.ToClient]:
+        session = head.session
+        assert self.corrects
+        if self.rng.random() < self.hold:
+            return [messages.Uncorrected(session, head.revision, "quota", "slower", self.rng.random())]
+        if head.revision > self.revision(session):
+            new = corrections.unpack(head, frames)
+            assert new.seqs[-1] <= self.durable(session)
+            self.corrected[session] = self.corrected.get(session, nothing(session)).merged(new)
+        return [messages.Corrected(session, self.revision(session))]
+
+    def on_control(self, frames: bytes | list[bytes], now_ns: int) -> list[messages.ToClient]:
+        head, *others = [frames] if isinstance(frames, bytes) else frames
+        message = messages.decode_to_server(head)
         assert not isinstance(message, messages.Command)
+        if isinstance(message, Corrections):
+            return self.on_corrections(message, others)
         durable, fused = self.durable(message.session), self.fused.get(message.session, 0)
         if isinstance(message, messages.Ping):
             return [messages.Pong(self.epoch, message.sent_ns, now_ns, now_ns, durable, fused)]
         if self.rng.random() < self.deny:
             return [messages.Denied(message.session, self.rng.choice(("opening", "map")), "not yet")]
-        return [messages.Welcome(self.epoch, codec.VERSION, durable, fused, self.window, 1 << 20, 1 << 20)]
+        terms = (self.window, 1 << 20, 1 << 20, self.revision(message.session) if self.corrects else None)
+        return [messages.Welcome(self.epoch, codec.VERSION, durable, fused, *terms)]
 
 
 class World:
@@ -147,6 +169,7 @@ class World:
         self.offered = 0
         self.skipped: set[int] = set()
         self.dropped: set[int] = set()
+        self.corrected: dict[tuple[bytes, int], int] = {}  # the x of the newest pose
         self.deaths = 0
         self.busy = True
         self.start_client()
@@ -198,6 +221,18 @@ class World:
             self.dropped.add(self.numbers[self.spool.session, gone])
         self.offered += 1
 
+    def correct(self) -> None:
+        session = self.spool.session
+        taken = [seq for one, seq in self.numbers if one == session]
+        if taken:
+            seqs = sorted(self.rng.sample(taken, min(len(taken), self.rng.choice((1, 5)))))
+            x = len(self.corrected) + self.rng.randrange(1000)
+            seqs, poses = corrections.checked({seq: pose(x) for seq in seqs})
+            new = SessionCorrections(session=session, seqs=seqs, poses=poses)
+            self.outbox.check_taken(seqs)
+            self.outbox.correcting.save(self.outbox.correcting.add(new))
+            self.corrected.update({(session, seq): x for seq in seqs.tolist()})
+
     # --- the network ---
 
     def deliver_data(self) -> None:
@@ -248,6 +283,7 @@ class World:
     def step(self) -> None:
         happens: dict[Callable[[], None], float] = {
             self.run_client: 10, self.deliver_data: 6, self.deliver_control: 6, self.offer: 3, self.fuse: 2,
+            self.correct: 0.2,
             self.cut_data: 0.1, self.cut_control: 0.1, self.kill_server: 0.05, self.kill_client: 0.05,
         }  # fmt: skip
         self.data.open = self.rng.random() < 0.95
@@ -264,7 +300,7 @@ class World:
             for happens in (self.run_client, self.deliver_data, self.deliver_control, self.fuse):
                 happens()
             self.check_order()
-            if not self.outbox.behind:
+            if not self.outbox.behind and self.outbox.correcting.settled:
                 return
         raise AssertionError(f"it does not come to an end: {self.outbox.stats()}, {self.outbox.problem}")
 
@@ -274,6 +310,18 @@ class World:
         journaled = self.server.journal[-2:]
         if len(journaled) == 2 and journaled[0][0] == journaled[1][0]:
             assert journaled[0][1] < journaled[1][1]
+
+    def check_corrections(self) -> None:
+        """Those of keyframes that never got to the server may have been said, or not."""
+        kept = {
+            (session, seq): int(T[0, 3])
+            for session, one in self.server.corrected.items()
+            for seq, T in zip(one.seqs.tolist(), one.poses, strict=True)
+        }
+        assert kept.keys() <= self.corrected.keys()
+        if self.server.corrects:
+            for session, seq, _ in self.server.journal:
+                assert kept.get((session, seq)) == self.corrected.get((session, seq))
 
     def check_fates(self) -> None:
         journaled = [number for _, _, number in self.server.journal]
@@ -300,13 +348,15 @@ def play(seed: int, folder: Path, monkeypatch: pytest.MonkeyPatch) -> World:
     for module in (backpressure, conversation, room, sender):
         if hasattr(module, "time"):
             monkeypatch.setattr(module, "time", clock)
-    monkeypatch.setattr("os.fdatasync", lambda _: None)
+    for name in ("os.fdatasync", "os.fsync"):
+        monkeypatch.setattr(name, lambda _: None)
     rng = random.Random(seed)
     world = World(rng, folder, clock)
     for _ in range(rng.choice((200, 1000))):
         world.step()
     world.settle()
     world.check_fates()
+    world.check_corrections()
     world.end_client()
     return world
 

@@ -7,11 +7,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from tsfusion import ledger, summary
+from tsfusion.config import ScanConfig, VolumeConfig
 from tsfusion.datasets.poses import write_tum
 from tsfusion.evaluation.trajectory import TrajectoryError, absolute_error
 from tsfusion.localizers import Corrections, corrected
 from tsfusion.mesh import Mesh
-from tsfusion.scanner import Submap
+from tsfusion.scanner import Scanner, Submap
+from tsfusion.sources import Source
 from tsfusion.transport import KeyframeTimes, Status
 from tsfusion.transport.messages import Spread
 
@@ -98,6 +101,46 @@ def describe(submap: Submap, status: Status | None, mesh: Mesh | None) -> MapRes
         trajectory_error=_error(submap, None),
         corrected_error=_error(submap, corrections) if corrections else None,
         **in_map,
+    )
+
+
+def summarise(
+    source: Source,
+    scanner: Scanner,
+    maps: list[MapResult],
+    times: list[KeyframeTimes],
+    *,
+    localizer: str,
+    complete: bool,
+    seconds: float,
+    peak_rss_bytes: int,
+    config: ScanConfig,
+    volume: VolumeConfig | None,
+) -> ScanSummary:
+    """A scan in figures."""
+    state = scanner.state()
+    stats = state.stats
+    settings = {"scan": config} if volume is None else {"scan": config, "volume": volume}
+    return ScanSummary(
+        source=source.name,
+        localizer=localizer,
+        complete=complete,
+        frames=state.frames,
+        frames_tracked=state.tracked,
+        frames_skipped=dict(source.skipped),
+        keyframes_sent=stats.sent,
+        keyframes_durable=stats.durable,
+        keyframes_fused=stats.fused,
+        keyframes_rejected={**stats.skipped, **stats.refused, **stats.rejected},
+        keyframes_by_rule=state.selected,
+        left=stats.waiting,
+        seconds=round(seconds, 3),
+        tracking_cpu_ms=round(scanner.tracking_cpu_ms, 3),
+        maps=maps,
+        delay_ms=ledger.summarise(times).delay_ms,
+        peak_rss_bytes={"client": peak_rss_bytes},
+        config={name: msgspec.to_builtins(each) for name, each in settings.items()},
+        versions=summary.versions(),
     )
 
 

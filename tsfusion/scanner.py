@@ -7,8 +7,9 @@ No Taichi here: it runs on the robot.
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Literal
 
 import msgspec
@@ -101,6 +102,7 @@ class Scanner:
         config: when a keyframe is taken, and how long to be patient.
         connect: opens a client that sends to the map of that name.
         map_name: of the first submap.
+        taken: names that no submap may have.
         outdoors: see `Selector`.
     """
 
@@ -111,10 +113,11 @@ class Scanner:
         connect: Callable[[str], Client],
         *,
         map_name: str,
+        taken: Collection[str] = (),
         outdoors: bool = False,
     ) -> None:
         self._localizer, self._config = localizer, config
-        self._connect, self._map_name = connect, map_name
+        self._connect, self._map_name, self._taken = connect, map_name, {map_name, *taken}
         self._selector = Selector(config, outdoors=outdoors)
         self._lost_since: int | None = None
         self._why = ""
@@ -193,13 +196,17 @@ class Scanner:
             self._begin_submap(seconds)
 
     def _begin_submap(self, seconds: float) -> None:
-        number = f"-{len(self.submaps) + 1}"
-        name = self._map_name[: MAP_NAME_LENGTH - len(number)] + number
+        name = next(name for name in map(self._name, count(2)) if name not in self._taken)
+        self._taken.add(name)
         log.warning("lost for %.1f s (%s): what follows goes into a new map, %s", seconds, self._why, name)
         self._localizer.reset()
         self._selector.reset()
         self._state, self._lost_since = "starting", None
         self.submaps.append(Submap(name, self._connect(name)))
+
+    def _name(self, number: int) -> str:
+        suffix = f"-{number}"
+        return self._map_name[: MAP_NAME_LENGTH - len(suffix)] + suffix
 
     def _correct(self, corrections: Corrections) -> None:
         submap = self.submaps[-1]

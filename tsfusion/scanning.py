@@ -2,6 +2,7 @@
 """A whole scan: a source's frames localised, chosen, sent and fused, and what is left in a folder."""
 
 import dataclasses
+import logging
 import os
 import shutil
 import time
@@ -12,13 +13,18 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Protocol
 
-import msgspec
-
-from tsfusion import ledger, localizers, preview, process, scan_results, summary
+from tsfusion import localizers, preview, process, scan_results, summary
 from tsfusion.child import ServerChild, own_server
 from tsfusion.client import Client
 from tsfusion.config import ClientConfig, ScanConfig, ServerConfig, VolumeConfig, override
-from tsfusion.errors import DatasetError, FlushTimeout, OutputError, SourceError, TransportError
+from tsfusion.errors import (
+    DatasetError,
+    FlushTimeout,
+    OutputError,
+    SourceError,
+    TransportError,
+    TsfusionError,
+)
 from tsfusion.fetch import fetch_mesh, fetch_status
 from tsfusion.frame import Frame
 from tsfusion.results import building
@@ -33,6 +39,8 @@ _PATIENCE = 60.0  # seconds without progress before an own server is given up
 _LINGER = 10.0  # seconds without progress before what a distant server does not take is left in the spool
 _MAPS = 16  # of an own server: a submap each
 _POLL = 0.05  # seconds
+
+log = logging.getLogger(__name__)
 
 
 class ScanProgress(Protocol):
@@ -92,17 +100,19 @@ def scan(
         first = next(frames, None)
         if first is None:
             raise failure[0] if failure else SourceError(f"{source.name} gave no frames")
+        localizer = localizers.make(config, first)
+        stack.callback(getattr(localizer, "close", lambda: None))
         place = _place(
             stack, work=work, sensor=source.sensor, volume=volume, server=server, client=client,
             connect=connect, spool=Path(spool), progress=progress,
         )  # fmt: skip
+        if place.child is None and not localizer.absolute:
+            _warn_of_another_world(place)
+        leftovers, open_client = _opener(stack, place, _pace(source, place))
         scanner = Scanner(
-            localizers.make(config, first),
-            config,
-            _opener(stack, place, _pace(source, place)),
-            map_name=place.link.map,
+            localizer, config, open_client, map_name=place.link.map, taken=leftovers,
             outdoors=source.sensor in OUTDOOR_SENSORS,
-        )
+        )  # fmt: skip
         progress.stage(f"scanning {source.name}")
         started = time.monotonic()
         if source.length is not None:  # a live one's first frame is old by now
@@ -121,29 +131,11 @@ def scan(
         ]
         records = scan_results.records(scanner.submaps)
         summary.write_ledger(work, records)
-        state = scanner.state()
-        stats = state.stats
-        result = ScanSummary(
-            source=source.name,
-            localizer=localizers.choose(config, first),
-            complete=not failure,
-            frames=state.frames,
-            frames_tracked=state.tracked,
-            frames_skipped=dict(source.skipped),
-            keyframes_sent=stats.sent,
-            keyframes_durable=stats.durable,
-            keyframes_fused=stats.fused,
-            keyframes_rejected={**stats.skipped, **stats.refused, **stats.rejected},
-            keyframes_by_rule=state.selected,
-            left=stats.waiting,
-            seconds=round(seconds, 3),
-            tracking_cpu_ms=round(scanner.tracking_cpu_ms, 3),
-            maps=maps,
-            delay_ms=ledger.summarise(records).delay_ms,
-            peak_rss_bytes={"client": peak},
-            config={"scan": msgspec.to_builtins(config), "volume": msgspec.to_builtins(volume)},
-            versions=summary.versions(),
-        )
+        result = scan_results.summarise(
+            source, scanner, maps, records,
+            localizer=localizers.choose(config, first), complete=not failure, seconds=seconds,
+            peak_rss_bytes=peak, config=config, volume=volume if place.child else None,
+        )  # fmt: skip
         stack.close()  # clients and server end before the folder of theirs goes
         if place.child is not None:
             shutil.rmtree(place.spools.parent)
@@ -192,8 +184,13 @@ def _pace(source: Source, place: _Place) -> dict[str, Any]:
     return {"policy": "block", "backlog": AHEAD} if place.child else {"policy": "spool_all"}
 
 
-def _opener(stack: ExitStack, place: _Place, pace: dict[str, Any]) -> Callable[[str], Client]:
-    """Opens a client for a map, and closes it in the end."""
+def _opener(
+    stack: ExitStack, place: _Place, pace: dict[str, Any]
+) -> tuple[set[str], Callable[[str], Client]]:
+    """The maps that an earlier scan's keyframes wait for, and what opens a client and closes it in the end.
+
+    Those keyframes are sent, too, but this scan begins no submap of their names.
+    """
 
     def connect(name: str) -> Client:
         link = override(place.link, map=name, **pace)
@@ -201,7 +198,26 @@ def _opener(stack: ExitStack, place: _Place, pace: dict[str, Any]) -> Callable[[
         stack.callback(client.close)
         return client
 
-    return connect
+    waiting = {path.parent.name for path in place.spools.glob("*/*.mcap")} - {place.link.map}
+    for name in sorted(waiting):
+        try:
+            connect(name)
+        except TsfusionError as error:
+            log.warning("what waits in %s is not sent: %s", place.spools / name, error)
+    return waiting, connect
+
+
+def _warn_of_another_world(place: _Place) -> None:
+    """Say so when the server's map has keyframes already: this scan's world is not theirs."""
+    link = place.link
+    with suppress(TransportError):  # a server that is not there yet, or has no such map
+        keys = client_keys(link.key, link.server_key)
+        status = fetch_status(link.address, control=link.control, map_name=link.map, timeout=2.0, keys=keys)
+        if status.keyframes_durable:
+            log.warning(
+                "the map %s has %d keyframes already: a scan that localises itself begins its own world; "
+                "give it a map of its own (--map NAME)", link.map, status.keyframes_durable,
+            )  # fmt: skip
 
 
 def _watcher(source: Source, place: _Place, progress: ScanProgress) -> Callable[[Scanner], None]:

@@ -31,7 +31,8 @@ def scan(
         _option(_SOURCE, "SPEC", "A dataset, or live: realsense, camera:0, folder:PATH (docs/sources.md)."),
     ],
     calibration: Annotated[
-        Path | None, _option(_SOURCE, "FILE", "Of a camera: Kalibr, OpenCV, ROS or EuRoC (a file, or a folder of two).")
+        Path | None,
+        _option(_SOURCE, "FILE", "Of a camera: Kalibr, OpenCV, ROS or EuRoC (a file, or a folder of two)."),
     ] = None,
     rate: Annotated[
         float | None,
@@ -42,6 +43,7 @@ def scan(
     stride: Annotated[int, _option(_SOURCE, "N", "Every N-th frame.", min=1)] = 1,
     sequence: Annotated[str | None, _option(_SOURCE, "NN", "KITTI: the sequence.")] = None,
     modality: Annotated[str | None, _option(_SOURCE, "KIND", "KITTI: stereo or lidar.")] = None,
+    option: options.DatasetOptions = None,
     localizer: Annotated[
         str | None,
         _option(
@@ -107,7 +109,7 @@ def scan(
     from tsfusion.cli import show, show_scan
     from tsfusion.config import override
 
-    recording = {"sequence": sequence, "modality": modality}
+    recording = {"sequence": sequence, "modality": modality, **options.dataset_options(option)}
     opened = _open(
         context, source, recording, calibration=calibration, rate=rate,
         part={"start": start, "stride": stride, "limit": max_frames},
@@ -146,7 +148,9 @@ def _open(
 
     if sources.is_live(spec):
         options.refuse(
-            context, (*recording, "rate", "start", "stride"), "is for recordings, and this source is live"
+            context,
+            ("sequence", "modality", "option", "rate", "start", "stride"),
+            "is for recordings, and this source is live",
         )
         live = sources.open_source(spec, calibration=calibration)
         return live if part["limit"] is None else Limited(live, part["limit"])

@@ -21,7 +21,7 @@ from tsfusion.keyframe import Intrinsics
 _TRIED = 20  # messages
 _TRANSPORT = re.compile(r"/(compressed|compressedDepth)$")
 RECTIFIED = re.compile(r"rect")
-_NO_COLOR = re.compile(r"infra|(^|[/_])ir([/_\d]|$)|fisheye|confidence")
+_NO_COLOR = re.compile(r"infra|(^|[/_])ir([/_\d]|$)|fisheye|confidence", re.IGNORECASE)
 _UNDISTORTED = 1e-6  # largest coefficient of a camera without distortion
 _NO_TURN = 1e-6
 
@@ -65,7 +65,7 @@ def picture(recording: Recording, stream: Stream) -> Picture | None:
             with suppress(DatasetError):
                 is_depth = bag_messages.is_depth(content)
                 height, width = (
-                    bag_messages.depth(content)[0] if is_depth else bag_messages.gray(content)
+                    bag_messages.depth(content) if is_depth else bag_messages.gray(content)
                 ).shape
                 return Picture(
                     stream, _TRANSPORT.sub("", stream.topic), content, (height, width), frame_id(content)
@@ -151,6 +151,13 @@ class Cameras:
         undistorter = Undistorter(self._lens(picture, camera))
         return View(undistorter.intrinsics, undistorter)
 
+    def own_view(self, picture: Picture) -> View | None:
+        """The view of another camera than that of the depth; None where no CameraInfo of its own tells it."""
+        if self._intrinsics is not None or self._info_topic is not None:
+            return None
+        stream = self._info_stream(picture)
+        return None if stream is None or not _is_beside(stream.topic, picture.base) else self.view(picture)
+
     def rig(self, left: Picture, right: Picture) -> Rig:
         """How a pair's images become those of two equal cameras whose rows match; raises as `view` does."""
         cameras = [self._checked(one) for one in (left, right)]
@@ -193,6 +200,12 @@ class Cameras:
                 f"{self._recording.path}: CameraInfo of {picture.stream.topic}: {error} (a rectified topic, "
                 "as image_proc makes, needs no lens; rectified=True says that these images are)"
             ) from error
+
+
+def _is_beside(info_topic: str, base: str) -> bool:
+    """Whether a CameraInfo is of these images alone: in their topic's own folder."""
+    place = base.rpartition("/")[0]
+    return info_topic.startswith((f"{place}/", f"{base}/"))
 
 
 def _turn(camera: Camera) -> float:

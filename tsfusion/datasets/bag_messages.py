@@ -96,12 +96,12 @@ def check_image(message: Any) -> None:
     _layout(message)
 
 
-def depth(message: Any) -> tuple[NDArray[Any], float]:
-    """(H, W) uint16 millimetres or float32 metres, and metres per unit."""
+def depth(message: Any) -> NDArray[Any]:
+    """(H, W) uint16, millimetres unless a driver says otherwise, or float32 metres."""
     image = _stored(message) if hasattr(message, "encoding") else _decoded_depth(message)
     if image.ndim != 2 or image.dtype not in (np.uint16, np.float32):
         raise DatasetError(f"is no depth image: {encoding(message)} of shape {image.shape}")
-    return image, MILLIMETRES
+    return image
 
 
 def color(message: Any) -> NDArray[np.uint8]:

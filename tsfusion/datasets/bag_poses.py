@@ -90,6 +90,10 @@ class PoseFinder:
             )
         return lambda _stamp: None
 
+    def between(self, target: str, source: str, stamp: int) -> Pose | None:
+        """`T_target_source` at a time by the transforms, after `finish`; None where they do not tell it."""
+        return self._transforms.at(target, source, stamp)
+
     def _by_transforms(self) -> Callable[[int], Pose | None]:
         world = self._transforms.ancestors(self._frame)[-1] if self._world is None else self._world
         if not self._transforms.connected(world, self._frame):

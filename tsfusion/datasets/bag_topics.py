@@ -25,7 +25,18 @@ _OF_MODALITY: dict[Modality, tuple[str, ...]] = {
 _REGISTERED = re.compile(r"aligned|registered")
 _LEFT_OF = (("right", "left"), ("infra2", "infra1"), ("infra_2", "infra_1"), ("cam1", "cam0"),
             ("image_1", "image_0"), ("image_3", "image_2"), ("camera_1", "camera_0"))  # fmt: skip
-_SENSORS = ((r"realsense|aligned_depth|d4[0-9]5|l515", "realsense"), (r"k4a|kinect2|azure|tof", "tof"))
+_SENSORS = (
+    (r"realsense|aligned_depth|d4[0-9]5|l515|^/device_\d+/sensor_\d+/", "realsense"),
+    (r"k4a|kinect2|azure|tof", "tof"),
+)
+
+
+class Apart(NamedTuple):
+    """A colour camera that is not the depth camera."""
+
+    frame: str
+    view: View
+    size: tuple[int, int]
 
 
 class Chosen(NamedTuple):
@@ -35,7 +46,9 @@ class Chosen(NamedTuple):
         main: depth images, left images or point clouds.
         other: colour images of the depth, or right images; None = none.
         frame: that `main` is in; empty = it does not say.
-        view, rig: the cameras of a depth image and its colour, or of a pair.
+        size: height and width of an image of `main`.
+        view, rig: the camera of depth images, or those of a pair.
+        apart: the camera of `other`, where these colour images are yet to be registered.
     """
 
     modality: Modality
@@ -43,8 +56,10 @@ class Chosen(NamedTuple):
     other: Stream | None
     sensor: str
     frame: str
+    size: tuple[int, int]
     view: View | None = None
     rig: Rig | None = None
+    apart: Apart | None = None
 
 
 class Chooser:
@@ -127,33 +142,34 @@ class Chooser:
         )
         if main is None:
             return None
-        other = self._color_of(main)
+        other, apart = self._color_of(main)
         sensor = next((name for pattern, name in _SENSORS if re.search(pattern, main.base)), "kinect")
-        return Chosen(
-            "depth", main.stream, other and other.stream, sensor, main.frame, self._cameras.view(main)
-        )
+        view = self._cameras.view(main)
+        return Chosen("depth", main.stream, other, sensor, main.frame, main.size, view, apart=apart)
 
-    def _color_of(self, depth: Picture) -> Picture | None:
-        """The colour images registered to the depth: told, or in its frame, or of a depth that says so."""
-        given = self._picture("color_topic")
-        found = [one for one in self._pictures() if one.is_color]
-        fitting = [one for one in found if one.frame == depth.frame or _REGISTERED.search(depth.base)]
-        best = given or max(fitting, key=lambda one: _closeness(one, depth), default=None)
+    def _color_of(self, depth: Picture) -> tuple[Stream | None, Apart | None]:
+        """The colour images of a depth camera, and their own camera where they are not registered to it.
+
+        Registered are images told by a depth that says so in its name, or in the depth's frame, of its size.
+        """
+        given, found = self._picture("color_topic"), [one for one in self._pictures() if one.is_color]
+        best = given or max(found, key=lambda one: _closeness(one, depth), default=None)
         if best is None:
-            if found:
-                log.warning(
-                    "%s: %s is not registered to %s and left out; color_topic=%r takes it all the same",
-                    self._path, found[0].base, depth.base, found[0].stream.topic,
-                )  # fmt: skip
-            return None
-        shape, expected = best.size, depth.size
-        if shape == expected:
-            return best
-        sizes = f"{best.stream.topic} is {shape[1]}×{shape[0]}, its depth {expected[1]}×{expected[0]}"
+            return None, None
+        fits = best.frame == depth.frame or bool(_REGISTERED.search(depth.base))
+        if fits and best.size == depth.size:
+            return best.stream, None
+        if (view := self._cameras.own_view(best)) is not None:
+            return best.stream, Apart(best.frame, view, best.size)
+        if given is not None and best.size == depth.size:
+            return best.stream, None
+        sizes = (
+            f"{best.stream.topic} is {best.size[1]}×{best.size[0]}, its depth {depth.size[1]}×{depth.size[0]}"
+        )
         if given is not None:
-            raise DatasetError(f"{self._path}: {sizes}; expected equal sizes")
-        log.warning("%s: %s; it is left out", self._path, sizes)
-        return None
+            raise DatasetError(f"{self._path}: {sizes}; expected equal sizes, or a CameraInfo of each")
+        log.warning("%s: %s has no CameraInfo and is left out (%s)", self._path, best.stream.topic, sizes)
+        return None, None
 
     def _stereo(self) -> Chosen | None:
         left, right = self._picture("left_topic"), self._picture("right_topic")
@@ -170,7 +186,13 @@ class Chooser:
         if left is None or right is None:
             raise self._error("left_topic and right_topic go together")
         return Chosen(
-            "stereo", left.stream, right.stream, "stereo", left.frame, rig=self._cameras.rig(left, right)
+            "stereo",
+            left.stream,
+            right.stream,
+            "stereo",
+            left.frame,
+            left.size,
+            rig=self._cameras.rig(left, right),
         )
 
     def _pair(self, right: Picture) -> tuple[Picture, Picture] | None:
@@ -200,7 +222,7 @@ class Chooser:
         first = self._recording.first(stream)
         if first is None:
             raise self._error(f"no point cloud of {stream.topic} can be read")
-        return Chosen("lidar", stream, None, "lidar", frame_id(first))
+        return Chosen("lidar", stream, None, "lidar", frame_id(first), (0, 0))
 
     def _only(self, found: list[Picture], rank: Any, option: str) -> Picture | None:
         """The one that ranks highest; of the transports of one topic the fullest, then the raw one."""
@@ -212,6 +234,18 @@ class Chooser:
             topics = ", ".join(sorted({one.base for one in best}))
             raise self._error(f"several fit ({topics}): choose with {option}")
         return max(best, key=lambda one: (one.stream.messages, one.stream.kind == IMAGE))
+
+
+def recorded_scale(recording: Recording, depth: Stream) -> float | None:
+    """Metres per unit of a depth that librealsense itself recorded; None = it is somebody else's."""
+    device = re.match(r"/device_\d+/sensor_\d+", depth.topic)
+    for stream in recording.streams if device else ():
+        if re.fullmatch(rf"{device and device[0]}/option/Depth[_ ]Units/value", stream.topic):
+            try:
+                return float(recording.first(stream).data)
+            except (AttributeError, TypeError, ValueError):
+                return None
+    return None
 
 
 def _closeness(color: Picture, depth: Picture) -> tuple[object, ...]:

@@ -14,14 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.datasets import bag_messages
+from tsfusion.datasets.bag_messages import MILLIMETRES
 from tsfusion.datasets.bag_poses import PoseFinder, pose_streams
 from tsfusion.datasets.bag_reader import ENDINGS, Message, Place, Recording, is_journal, recording
-from tsfusion.datasets.bag_topics import Chooser, Modality
+from tsfusion.datasets.bag_topics import Chooser, Modality, recorded_scale
 from tsfusion.datasets.base import Frames, require_frames
 from tsfusion.datasets.poses import Pose
 from tsfusion.errors import DatasetError
 from tsfusion.frame import Frame
 from tsfusion.keyframe import Intrinsics
+from tsfusion.registration import Registration
 
 log = logging.getLogger(__name__)
 
@@ -38,8 +40,9 @@ def recognises(path: Path) -> bool:
 class Bag(Frames):
     """Depth images, stereo pairs or point clouds of a ROS recording, in the order of their header stamps.
 
-    Colour goes with a depth image it is registered to (the same frame, or `aligned`/`registered` in the depth
-    topic's name), the nearest in time; depth without one is kept and counted in `uncolored`. Poses come from
+    Colour goes with the depth image nearest in time; where it is not registered to it (in the same frame, or
+    `aligned`/`registered` in the depth topic's name), /tf_static and its CameraInfo register it here. Depth
+    without colour is kept and counted in `uncolored`. Poses come from
     /tf where a transform between the sensor's frame and the root of its tree changes, else from odometry,
     transform, pose or path messages, carried to the sensor by /tf_static. A time without poses around it
     gives none. Broken messages, pairs that miss an image, and (`posed`) frames without a pose are counted in
@@ -55,6 +58,7 @@ class Bag(Frames):
         world_frame: default the root of the sensor's tree, or the frame of the pose topic.
         body_frame: the frame whose poses the pose topic tells; default its `child_frame_id`, or the sensor's.
         intrinsics: instead of a CameraInfo's.
+        depth_scale: metres per unit of 16-bit depth; default 0.001 (REP 118), or as a RealSense recorded it.
         rectified: whether the images are rectified, so that `P` is theirs; default where the topic's name
             has `rect`. Others are undistorted or rectified here (colour by its depth's camera).
         max_difference_s: between a depth image and its colour (default 20 ms), or left and right (5 ms).
@@ -81,6 +85,7 @@ class Bag(Frames):
         world_frame: str | None = None,
         body_frame: str | None = None,
         intrinsics: Intrinsics | None = None,
+        depth_scale: float | None = None,
         rectified: bool | None = None,
         max_difference_s: float | None = None,
         max_gap_s: float = 0.25,
@@ -102,6 +107,7 @@ class Bag(Frames):
         self._chosen = chosen
         self.name, self.sensor, self.skipped = f"ROS {place.name}", sensor or chosen.sensor, {}
         self._with_color = color
+        self.depth_scale = depth_scale or recorded_scale(self._recording, chosen.main) or MILLIMETRES
         self.uncolored = 0
         poses = PoseFinder(
             place, chosen.frame, pose_streams(self._recording, pose_topic),
@@ -111,6 +117,7 @@ class Bag(Frames):
         difference_s = _DIFFERENCE_S[chosen.modality] if max_difference_s is None else max_difference_s
         self._pair(mains, others, round(difference_s * 1e9))
         self._pose(poses.finish(required=posed), posed)
+        self._registration = self._register(poses)
         require_frames(len(self._mains), place, EXPECTED, self.skipped)
 
     def __len__(self) -> int:
@@ -178,6 +185,24 @@ class Bag(Frames):
             self._others = [self._others[i] for i in kept]
             self._poses = [self._poses[i] for i in kept]
 
+    def _register(self, poses: PoseFinder) -> Registration | None:
+        """What brings the colour of a camera of its own onto the depth; else such colour is left out."""
+        chosen = self._chosen
+        if chosen.apart is None or chosen.view is None or not len(self):
+            return None
+        T_color_depth = poses.between(chosen.apart.frame, chosen.frame, self._stamp(0))
+        if T_color_depth is None:
+            log.warning(
+                "%s: no transforms lead from %r to %r, so that colour cannot be registered and is left out",
+                self._recording.path, chosen.frame, chosen.apart.frame,
+            )  # fmt: skip
+            self._others = [None] * len(self)
+            return None
+        return Registration(
+            chosen.view.intrinsics, chosen.apart.view.intrinsics, T_color_depth, chosen.size,
+            color_size=chosen.apart.size,
+        )  # fmt: skip
+
     def _frame(self, index: int) -> Frame:
         chosen, place = self._chosen, self._mains[index]
         common: dict[str, Any] = {
@@ -204,12 +229,19 @@ class Bag(Frames):
     def _depth_frame(self, content: Any, beside: Any, common: dict[str, Any]) -> Frame:
         view = self._chosen.view
         assert view is not None
-        depth, scale = bag_messages.depth(content)
+        depth = bag_messages.depth(content)
         color = None if beside is None else bag_messages.color(beside)
+        color_view = view if self._chosen.apart is None else self._chosen.apart.view
         if view.undistorter is not None:
             depth = view.undistorter.depth(depth)
-            color = None if color is None else view.undistorter.image(color)
-        return Frame(depth=depth, depth_scale=scale, color=color, intrinsics=view.intrinsics, **common)
+        if color is not None and color_view.undistorter is not None:
+            color = color_view.undistorter.image(color)
+        if color is not None and self._registration is not None:
+            metres = np.nan_to_num(depth * (1.0 if depth.dtype == np.float32 else self.depth_scale))
+            color = self._registration.color_of_depth(color, metres.astype(np.float32))
+        return Frame(
+            depth=depth, depth_scale=self.depth_scale, color=color, intrinsics=view.intrinsics, **common
+        )  # fmt: skip
 
     def _pair_frame(self, left: Any, right: Any, common: dict[str, Any]) -> Frame:
         rig = self._chosen.rig

@@ -79,6 +79,8 @@ def corrected(poses: Sequence[Pose], corrections: Corrections | None) -> list[Ma
 class Localizer(Protocol):
     """Follows a sensor. Frames come in time order, from one thread.
 
+    One that holds a socket has `close()`, too.
+
     Attributes:
         absolute: whether its world outlasts `reset`: poses from elsewhere are in one world, however often
             there is none.

@@ -24,6 +24,7 @@ _FIT_SHARE = 0.6  # of the blocks around one that must be valid
 _NEAREST = 0.1  # metres
 _CURVED = 0.006  # deviation within a block or from its plane, as a share of the depth
 _GRAZING = 0.17  # cosine between ray and normal
+_CELL = 8  # blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +46,11 @@ class Surface:
     sigma: Floats
     index: NDArray[np.intp]
     planes: Floats
+
+    @property
+    def covered(self) -> float:
+        """Share of the blocks that have a plane."""
+        return float(np.count_nonzero(self.planes[3]) / self.planes.shape[1])
 
     def every(self, step: int) -> NDArray[np.intp]:
         """Which points are on every `step`-th row and column of blocks."""
@@ -166,9 +172,24 @@ def match(there: Surface, here: Surface, T_there_here: se3.Transform, some: NDAr
     return Match(moved, planes[:3], distance, sigma[chosen], which, block[chosen])
 
 
-def equations(
-    found: Match, weight: Floats
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def alike(found: Match, columns: int) -> float:
+    """How many blocks err as one: 1 for white noise, dozens where a sensor's errors are smooth over the image.
+
+    The variance of the distances' means over cells of `_CELL` × `_CELL` blocks, against a single block's.
+    """
+    near = np.abs(found.distance) < 4 * found.sigma
+    whitened = (found.distance[near] / found.sigma[near]).astype(np.float64)
+    row, column = np.divmod(found.block[near], columns)
+    cell = row // _CELL * columns + column // _CELL
+    count, total = np.bincount(cell), np.bincount(cell, weights=whitened)
+    full = count > _CELL * _CELL // 2
+    if not full.any():
+        return 1.0
+    variance = max(float(np.mean(whitened**2)), 1e-12)
+    return max(1.0, float((total[full] ** 2).sum() / count[full].sum()) / variance)
+
+
+def equations(found: Match, weight: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(6, 6) and (6,) of the step that brings the points to their planes: `exp(step) @ T_there_here`."""
     x, y, z = found.moved
     nx, ny, nz = found.normals

@@ -17,11 +17,13 @@ from tsfusion.localizers import icp
 
 Matrix = NDArray[np.float64]
 
-PIXEL = 0.7  # deviation of a followed corner, at 640 columns
+PIXEL = 1.0  # deviation of a followed corner, at 640 columns
 _REACH = 3.0  # deviations at which a residual counts a quarter
-_TRUST = 0.1  # of a plane's residual against a corner's: neighbours err together
+_TRUST = 0.1  # of a plane's residual against a corner's, until it is known how far neighbours err alike
 _FLOOR, _CEILING = 0.25, 3.0  # deviation of the distances to planes, as a share of the sensor's
-_PLANE_NOISE = 50.0  # sum of squares of a fit's offsets in blocks: 5 × 5 of them
+_PLANE_NOISE = 6.0  # sum of squares of a fit's offsets along one axis, in blocks: 3 × 3 of them
+_DAMPING = 1e-6  # of the information's trace
+_STILL = 2e-5  # metres or radians; below, the round is over
 _STEPS = ((4, 5, 0.1), (2, 4, 0.05), (1, 3, 0.03))  # blocks apart, iterations, gate in metres
 
 
@@ -31,13 +33,13 @@ class Link:
 
     Attributes:
         T_view_anchor: (4, 4), fixed.
-        surface: of that view; None = corners alone.
+        surface: of that view.
         points: (n, 3) of its corners, in its camera's axes.
         pixels: (n, 2) where the new image has them.
     """
 
     T_view_anchor: Matrix
-    surface: icp.Surface | None
+    surface: icp.Surface
     points: NDArray[np.float64]
     pixels: NDArray[np.float64]
 
@@ -48,15 +50,15 @@ class Estimate:
 
     Attributes:
         T_anchor_camera: (4, 4).
-        information: (6, 6) of a step from the left, with the deviations above.
-        spurious: (6, 6), what noise in the planes' normals alone would add to it.
-        scale: deviation of the distances to planes, as a share of the sensor's.
+        planes: (6, 6) information of a step from the left that the distances to planes give.
+        spurious: (6, 6), what noise in the planes' normals alone would give.
+        corners: (6, 6) information that the corners give.
     """
 
     T_anchor_camera: Matrix
-    information: Matrix
+    planes: Matrix
     spurious: Matrix
-    scale: float
+    corners: Matrix
 
 
 def solve(
@@ -68,45 +70,47 @@ def solve(
         here: surface of the new view.
         camera, columns: intrinsics and width of its image.
     """
-    T, scale = T_anchor_camera, 1.0
+    T, trust = T_anchor_camera, _TRUST
     pixel = PIXEL * columns / 640
-    H = spurious = np.zeros((6, 6))
-    for round_, (apart, iterations, gate) in enumerate(_STEPS):
+    planes = spurious = corners = np.zeros((6, 6))
+    for apart, iterations, gate in _STEPS:
         some = here.every(apart) if apart > 1 else None
-        for _ in range(iterations):
-            H, g, spurious = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
-            for link in links:
+        reach = pixel * (4 if apart == _STEPS[0][0] else 1)
+        for iteration in range(iterations):
+            planes, spurious, corners, g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
+            for link in links if apart == 1 else links[:1]:
                 T_view_camera = link.T_view_anchor @ T
+                found = icp.match(link.surface, here, T_view_camera, some)
+                if apart == 1 and iteration == 0 and link is links[0]:
+                    trust = 1 / icp.alike(found, link.surface.shape[1])
+                H_planes, g_planes, H_spurious = _planes(found, gate, apart**2 * trust, link.surface)
+                H_corners, g_corners = _corners(link, camera, T_view_camera, reach)
                 A = se3.adjoint(link.T_view_anchor)
-                h, b = _corners(link, camera, T_view_camera, pixel * (4 if round_ == 0 else 1))
-                if link.surface is not None:
-                    found = icp.match(link.surface, here, T_view_camera, some)
-                    hp, bp, sp, scale = _planes(found, gate, apart, link.surface)
-                    h, b = h + hp, b + bp
-                    spurious = spurious + A.T @ sp @ A
-                H, g = H + A.T @ h @ A, g + A.T @ b
-            step = np.linalg.solve(H + 1e-6 * np.trace(H) * np.eye(6) + 1e-9 * np.eye(6), g)
+                planes, spurious = planes + A.T @ H_planes @ A, spurious + A.T @ H_spurious @ A
+                corners, g = corners + A.T @ H_corners @ A, g + A.T @ (g_planes + g_corners)
+            H = planes + corners
+            step = np.linalg.solve(H + (_DAMPING * np.trace(H) + 1e-9) * np.eye(6), g)
             T = se3.exp(step) @ T
-            if np.abs(step).max() < 2e-5:
+            if np.abs(step).max() < _STILL:
                 break
-    return Estimate(se3.nearest(T), H, spurious, scale)
+    return Estimate(se3.nearest(T), planes, spurious, corners)
 
 
 def _planes(
-    found: icp.Match, gate: float, apart: int, there: icp.Surface
-) -> tuple[Matrix, Matrix, Matrix, float]:
-    """Normal equations of the distances to planes, what of them is noise, and the distances' scale."""
+    found: icp.Match, gate: float, trust: float, there: icp.Surface
+) -> tuple[Matrix, Matrix, Matrix]:
+    """Normal equations of the distances to planes, and what of their information noise alone would give."""
     near = np.abs(found.distance) < gate + 3 * found.sigma
     if near.sum() < 12:
-        return np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6)), 1.0
+        return np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
     whitened = found.distance / found.sigma
     scale = float(np.clip(1.48 * np.median(np.abs(whitened[near])), _FLOOR, _CEILING))
     ratio = whitened / (scale * _REACH)
     weight = near / (1 + ratio * ratio) ** 2
-    total = _TRUST * apart**2 * weight / (scale * found.sigma) ** 2
+    total = trust * weight / (scale * found.sigma) ** 2
     H, g = icp.equations(found, total.astype(np.float32))
-    slope = _TRUST * apart**2 * weight * (there.intrinsics.fx / found.moved[2]) ** 2 / _PLANE_NOISE
-    return H, g, _isotropic(found.moved, slope), scale
+    slope = trust * weight * (there.intrinsics.fx / found.moved[2]) ** 2 / _PLANE_NOISE
+    return H, g, _isotropic(found.moved, slope)
 
 
 def _isotropic(points: icp.Floats, weight: NDArray[np.floating]) -> Matrix:

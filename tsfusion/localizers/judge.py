@@ -18,7 +18,7 @@ _PATTERN = 0.03  # of what all could be: below, there is nothing to compare
 _SAFETY = 3.0  # times the information that noise alone would give
 
 _OVERLAP = 0.25
-_AGREEING, _AGREEING_STRICT = 0.6, 0.8  # strict: without an image, or when the pose came out of the blue
+_AGREEING, _AGREEING_STRICT, _AGREEING_DEPTH_ALONE = 0.6, 0.8, 0.92
 _LIKENESS, _LIKENESS_STRICT = 0.2, 0.3
 _UNCERTAINTY = 0.01
 
@@ -42,10 +42,18 @@ class Evidence:
     uncertainty: float
 
     def doubt(self, *, strict: bool) -> str | None:
-        """Why the pose cannot be believed; None = it can. Right poses are far from these bounds, wrong ones too."""
-        strict = strict or self.likeness is None
+        """Why the pose cannot be believed; None = it can.
+
+        Measured on a recorded kitchen: right poses agree by 0.92 or more in depth and 0.35 or more in the
+        image, wrong ones by 0.26 and 0.05 or less; depth alone slides along itself by centimetres at 0.9.
+
+        Args:
+            strict: the pose came out of the blue.
+        """
         agreeing = _AGREEING_STRICT if strict else _AGREEING
         likeness = _LIKENESS_STRICT if strict else _LIKENESS
+        if self.likeness is None:
+            agreeing = _AGREEING_DEPTH_ALONE
         if self.overlap < _OVERLAP:
             return f"{self.overlap:.0%} of the view overlaps with what is known, at least {_OVERLAP:.0%} must"
         if self.agreeing < agreeing:
@@ -90,7 +98,10 @@ def _uncertainty(estimate: Estimate, found: icp.Match) -> float:
     around[:3, 3] = center
     A = se3.adjoint(around)
     lever = max(0.1, float(np.sqrt(found.moved.astype(np.float64).var(axis=1).sum())))
-    S = np.diag([1, 1, 1, *[1 / lever] * 3])
-    information = S @ A.T @ (estimate.information - _SAFETY * estimate.spurious) @ A @ S
-    least = float(np.linalg.eigvalsh(information)[0])
-    return 1 / np.sqrt(least) if least > 0 else float("inf")
+    to_metres = A @ np.diag([1, 1, 1, *[1 / lever] * 3])
+    planes, noise, corners = (
+        to_metres.T @ H @ to_metres for H in (estimate.planes, _SAFETY * estimate.spurious, estimate.corners)
+    )
+    values, axes = np.linalg.eigh(planes - noise)
+    least = float(np.linalg.eigvalsh(axes @ np.diag(np.maximum(values, 0)) @ axes.T + corners)[0])
+    return 1 / np.sqrt(least) if least > 1e-9 else float("inf")

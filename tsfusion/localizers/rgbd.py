@@ -10,18 +10,24 @@ from numpy.typing import NDArray
 
 from tsfusion import se3
 from tsfusion.frame import Frame
-from tsfusion.localizers import features, joint, judge
+from tsfusion.localizers import features, icp, joint, judge
 from tsfusion.localizers.base import Corrections, Lost, Pose
 from tsfusion.localizers.views import Seen, View
 
 Matrix = NDArray[np.float64]
 
-_KEPT = 12  # tracking keyframes
+_KEPT = 40  # tracking keyframes, about 1 MB each at 640×480
 _DISTANCE, _ANGLE = 0.1, np.radians(10)  # to the next one
 _OVERLAP = 0.6  # with the last one; below: the next one
-_ENOUGH = 500  # blocks with a plane
+_SURFACE = 0.03  # share of the depth image that must show planes
+_INLIERS = 12  # corners
+_TOLERANCE = 2.0  # pixels at 640 columns
+_RECALLED = 4  # keyframes compared by their descriptions, when nothing else helps
+_LONGEST = 3.0  # times the interval before, over which a motion is taken to go on
 
-EVIDENCE = []
+_OLDER = 2  # keyframes that take part beside the last one
+_OLDER_ANGLE = np.radians(60)
+_OLDER_OVERLAP, _OLDER_AGREEING, _OLDER_NEAR = 0.5, 0.75, 0.03  # shares; metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,16 +36,15 @@ class _Found:
     T_view_camera: Matrix
     evidence: judge.Evidence
 
-    @property
-    def T_world_camera(self) -> Matrix:
-        return self.view.T_world_camera @ self.T_view_camera
-
 
 class RGBD:
     """Follows a depth camera, with colour where there is some. A `Localizer`.
 
-    A frame's corners are followed from the tracking keyframe (Lucas and Kanade); the pose they give begins a
-    Gauss-Newton over their reprojection and the distances of the frame's points to the keyframe's planes.
+    Corners are followed from the tracking keyframe (Lucas and Kanade); the pose they give begins a Gauss-Newton
+    over their reprojection and the distances of the frame's points to the planes of that keyframe and of the
+    two oldest that see the same. Frames without an image go by depth alone. A pose is given only where depth,
+    image and geometry bear it out; after that frames are looked for near the last pose, then by descriptions
+    (ORB) in the last keyframes.
     """
 
     absolute = False
@@ -53,7 +58,9 @@ class RGBD:
         """Forget the world: the next frame's camera is the new one's origin."""
         self._kept.clear()
         self._last: Matrix = np.eye(4)
-        self._step: Matrix | None = np.eye(4)  # since the frame before; None = lost
+        self._last_ns = self._interval_ns = 0
+        self._motion: Matrix | None = None  # between the last two frames; None = not known
+        self._is_lost = False
 
     def corrections(self) -> Corrections | None:
         """None: this localizer never looks back."""
@@ -66,71 +73,103 @@ class RGBD:
             InvalidKeyframe: when the frame has no depth image.
         """
         seen = Seen.of(frame)
-        planes = int(np.count_nonzero(seen.surface.planes[3]))
-        if planes < _ENOUGH:
-            return self._lost(frame, f"{planes} of {len(seen.surface.planes[3])} blocks of the depth image show a surface")
+        if seen.surface.covered < _SURFACE:
+            return self._lost(frame, f"{seen.surface.covered:.1%} of the depth image shows a surface")
         if not self._kept:
             return self._start(frame, seen, np.eye(4), 1.0)
-        reason = ""
-        for view, guess, strict in self._guesses(seen):
-            found, why = self._attempt(seen, view, guess, strict)
-            if found is not None:
+        reason: str | None = None
+        for view, guess in self._guesses(frame, seen):
+            found = self._attempt(seen, view, guess)
+            doubt = found.evidence.doubt(strict=self._is_lost)
+            if doubt is None:
                 return self._go_on(frame, seen, found)
-            reason = reason or why
-        return self._lost(frame, reason)
+            reason = reason or doubt
+        return self._lost(frame, reason or "nothing known is in view")
 
-    def _guesses(self, seen: Seen) -> Iterator[tuple[View, Matrix, bool]]:
-        """What to try: (view, T_view_camera, whether it takes strong evidence)."""
-        view = self._kept[-1]
-        T_view_last = se3.inverse(view.T_world_camera) @ self._last
-        if self._step is not None:
-            yield view, T_view_last @ self._step, False
-        yield view, T_view_last, self._step is None
-        for view in reversed(self._kept):
-            points, pixels = view.recall(seen)
-            resected = features.resection(points, pixels, seen.intrinsics, tolerance=3 * seen.columns / 640)
-            if resected is not None and resected[1].sum() >= 12:
-                yield view, resected[0], True
+    def _guesses(self, frame: Frame, seen: Seen) -> Iterator[tuple[View, Matrix]]:
+        """(view, T_view_camera) to begin with, the likeliest first; those after the first two are wild."""
+        last = self._kept[-1]
+        T_view_last = se3.inverse(last.T_world_camera) @ self._last
+        if self._motion is not None:
+            yield last, T_view_last @ self._expected_motion(frame)
+        yield last, T_view_last
+        self._is_lost = True
+        if seen.gray is None:
+            return
+        for view, points, pixels in self._recalled(seen):
+            tolerance = 1.5 * _TOLERANCE * seen.columns / 640
+            resected = features.resection(points, pixels, seen.intrinsics, tolerance=tolerance)
+            if resected is not None and resected[1].sum() >= _INLIERS:
+                yield view, resected[0]
 
-    def _attempt(self, seen: Seen, view: View, guess: Matrix, strict: bool) -> tuple[_Found | None, str]:
+    def _recalled(self, seen: Seen) -> list[tuple[View, NDArray[np.float64], features.Pixels]]:
+        """The keyframes that look most like the frame, with the corners they share."""
+        recalled = [(view, *view.recall(seen)) for view in reversed(self._kept)]
+        return sorted(recalled, key=lambda entry: -len(entry[1]))[:_RECALLED]
+
+    def _expected_motion(self, frame: Frame) -> Matrix:
+        """The last motion, going on for as long as this frame is after the last one."""
+        assert self._motion is not None
+        now_ns = frame.timestamp_ns - self._last_ns
+        if now_ns <= 0 or self._interval_ns <= 0:
+            return self._motion
+        longer = now_ns / self._interval_ns
+        return se3.exp(se3.log(self._motion) * longer) if longer <= _LONGEST else np.eye(4)
+
+    def _attempt(self, seen: Seen, view: View, guess: Matrix) -> _Found:
+        """The best pose near `guess`, T_view_camera, and what speaks for it."""
         points, pixels = view.follow(seen, guess)
-        tolerance = 2 * seen.columns / 640
+        tolerance = _TOLERANCE * seen.columns / 640
         resected = features.resection(points, pixels, seen.intrinsics, guess=guess, tolerance=tolerance)
-        if resected is not None and resected[1].sum() >= 12:
-            guess, inliers = resected
-            points, pixels = points[inliers], pixels[inliers]
-        else:
-            points, pixels = points[:0], pixels[:0]
-        link = joint.Link(np.eye(4), view.seen.surface, points, pixels.astype(np.float64))
-        estimate = joint.solve([link], seen.surface, seen.intrinsics, seen.columns, guess)
-        evidence = judge.weigh(seen, view, estimate, len(points))
-        EVIDENCE.append((evidence, len(view.points), estimate.scale, strict))
-        doubt = evidence.doubt(strict=strict)
-        return (None, doubt) if doubt else (_Found(view, estimate.T_anchor_camera, evidence), "")
+        agree = np.zeros(len(points), bool)
+        if resected is not None and resected[1].sum() >= _INLIERS:
+            guess, agree = resected
+        points, pixels = points[agree], pixels[agree].astype(np.float64)
+        links = [joint.Link(np.eye(4), view.seen.surface, points, pixels)]
+        for older in self._older(seen, view.T_world_camera @ guess, view):
+            T_older_view = se3.inverse(older.T_world_camera) @ view.T_world_camera
+            links.append(joint.Link(T_older_view, older.seen.surface, points[:0], pixels[:0]))
+        estimate = joint.solve(links, seen.surface, seen.intrinsics, seen.columns, guess)
+        return _Found(view, estimate.T_anchor_camera, judge.weigh(seen, view, estimate, len(points)))
+
+    def _older(self, seen: Seen, T_world_camera: Matrix, view: View) -> list[View]:
+        """The oldest keyframes that see the same as the frame, and agree about where it is."""
+        some, chosen = seen.surface.every(8), []
+        for older in self._kept:
+            if len(chosen) == _OLDER or older is view:
+                break
+            T_older_camera = se3.inverse(older.T_world_camera) @ T_world_camera
+            if se3.angle(T_older_camera) < _OLDER_ANGLE:
+                found = icp.match(older.seen.surface, seen.surface, T_older_camera, some)
+                agree = np.abs(found.distance) < _OLDER_NEAR + 3 * found.sigma
+                enough = max(1.0, _OLDER_OVERLAP * len(some))
+                if len(agree) >= enough and agree.mean() >= _OLDER_AGREEING:
+                    chosen.append(older)
+        return chosen
 
     def _go_on(self, frame: Frame, seen: Seen, found: _Found) -> Pose:
-        T = found.T_world_camera
-        self._step = None if self._step is None else se3.inverse(self._last) @ T
-        if self._step is None:
-            self._step = np.eye(4)
-        self._last = T
-        quality = found.evidence.agreeing
-        away = found.T_view_camera
-        if se3.distance(away) > _DISTANCE or se3.angle(away) > _ANGLE or found.evidence.overlap < _OVERLAP:
-            return self._start(frame, seen, T, quality)
+        away, evidence, known = found.T_view_camera, found.evidence, not self._is_lost
+        T = se3.nearest(found.view.T_world_camera @ away)
+        self._motion = se3.inverse(self._last) @ T if known else None
+        self._interval_ns = frame.timestamp_ns - self._last_ns if known else 0
+        far = se3.distance(away) > _DISTANCE or se3.angle(away) > _ANGLE or evidence.overlap < _OVERLAP
+        if far or found.view is not self._kept[-1]:
+            return self._start(frame, seen, T, evidence.agreeing)
+        self._stand(T, frame)
         return Pose(
             T_world_camera=T,
             timestamp_ns=frame.timestamp_ns,
             anchor=found.view.number,
             T_anchor_camera=away,
-            quality=quality,
+            quality=evidence.agreeing,
         )
 
     def _start(self, frame: Frame, seen: Seen, T: Matrix, quality: float) -> Pose:
+        """The frame becomes the tracking keyframe."""
         view = View.of(seen, self._next, T)
         self._next += 1
-        self._last = T
         self._kept.append(view)
+        self._stand(T, frame)
         return Pose(
             T_world_camera=T,
             timestamp_ns=frame.timestamp_ns,
@@ -140,6 +179,9 @@ class RGBD:
             quality=quality,
         )
 
+    def _stand(self, T: Matrix, frame: Frame) -> None:
+        self._last, self._last_ns, self._is_lost = T, frame.timestamp_ns, False
+
     def _lost(self, frame: Frame, reason: str) -> Lost:
-        self._step = None
+        self._motion, self._is_lost = None, True
         return Lost(reason=reason, timestamp_ns=frame.timestamp_ns)

@@ -123,7 +123,8 @@ class View:
 
     def follow(self, seen: Seen, T_view_camera: Matrix) -> tuple[NDArray[np.float64], features.Pixels]:
         """(n, 3) corners of this view that are found again near where the pose given says, and (n, 2) there."""
-        if seen.gray is None or self.seen.gray is None or not len(self.points):
+        old, new = self.seen.gray, seen.gray
+        if old is None or new is None or old.shape != new.shape or not len(self.points):
             return np.empty((0, 3)), np.empty((0, 2), np.float32)
         K = seen.intrinsics
         q = se3.apply(se3.inverse(T_view_camera), self.points)
@@ -133,9 +134,7 @@ class View:
         margin = seen.columns // 16
         ok = ahead & (expected > -margin).all(axis=1)
         ok &= (expected[:, 0] < seen.shape[1] + margin) & (expected[:, 1] < seen.shape[0] + margin)
-        moved, found = features.follow(
-            self.seen.gray, seen.gray, self.corners[ok], guess=expected[ok].astype(np.float32)
-        )
+        moved, found = features.follow(old, new, self.corners[ok], guess=expected[ok].astype(np.float32))
         return self.points[ok][found], moved[found]
 
     def recall(self, seen: Seen) -> tuple[NDArray[np.float64], features.Pixels]:

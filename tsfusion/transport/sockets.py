@@ -90,6 +90,14 @@ def subscriber(
     return made
 
 
+def pose_feed(context: "zmq.Context[Any]", max_frame_bytes: int) -> AnySocket:
+    """Where a scanner hears the poses of another process; a flood of them fills the queue, no more."""
+    limits: dict[int, int] = {zmq.IMMEDIATE: 0, zmq.RCVHWM: 256, zmq.MAXMSGSIZE: max_frame_bytes}
+    made = _make(context, zmq.SUB, {**_CONNECTING, **limits})
+    made.setsockopt(zmq.SUBSCRIBE, b"")
+    return made
+
+
 def pair(context: "zmq.Context[Any]") -> AnySocket:
     """Gateway and fuser, over a file only this user can open."""
     return _make(context, zmq.PAIR, {zmq.SNDHWM: 64, zmq.RCVHWM: 64})
@@ -163,6 +171,15 @@ def check_reachable(address: str, *, has_keys: bool) -> None:
     )
 
 
+def check_own_machine(address: str) -> None:
+    """Raise InvalidConfig when others can reach the address."""
+    if not _is_loopback(split(address)[0]):
+        raise InvalidConfig(
+            f"there are no keys here, so that only tcp://127.0.0.1 can be bound, got {address}; let the "
+            "sender bind, or come through an ssh tunnel"
+        )
+
+
 def _is_loopback(host: str) -> bool:
     try:
         return host == "localhost" or ip_address(host).is_loopback
@@ -193,9 +210,9 @@ def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, t
     for last in reversed(range(tries)):
         bound: list[tuple[AnySocket, str]] = []
         try:
-            bound.append((data, _bind(data, join(host, port))))
-            bound.append((control, _bind(control, control_address(bound[0][1], to))))
-            bound.append((publish, _bind(publish, _following(bound[1][1], "mesh updates"))))
+            bound.append((data, bind_one(data, join(host, port))))
+            bound.append((control, bind_one(control, control_address(bound[0][1], to))))
+            bound.append((publish, bind_one(publish, _following(bound[1][1], "mesh updates"))))
             return Addresses(*(address for _, address in bound))
         except (TransportError, InvalidConfig):
             for made, address in bound:
@@ -205,7 +222,8 @@ def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, t
     raise AssertionError("the last try returns or raises")
 
 
-def _bind(made: AnySocket, address: str) -> str:
+def bind_one(made: AnySocket, address: str) -> str:
+    """Bind a socket; its address with the real port number. Raises TransportError."""
     host, port = split(address)
     try:
         made.bind(join(host, port) if port else join(host, 0).replace(":0", ":*"))
