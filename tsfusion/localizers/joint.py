@@ -96,9 +96,7 @@ def solve(
     return Estimate(se3.nearest(T), planes, spurious, corners)
 
 
-def _planes(
-    found: icp.Match, gate: float, trust: float, there: icp.Surface
-) -> tuple[Matrix, Matrix, Matrix]:
+def _planes(found: icp.Match, gate: float, trust: float, there: icp.Surface) -> tuple[Matrix, Matrix, Matrix]:
     """Normal equations of the distances to planes, and what of their information noise alone would give."""
     near = np.abs(found.distance) < gate + 3 * found.sigma
     if near.sum() < 12:
