@@ -142,6 +142,9 @@ def test_another_place_is_no_motion(data: Data) -> None:
     poses(stereo, clip[:4])
     elsewhere = [both(frame, lambda image: np.ascontiguousarray(image[:370, :1226])) for frame in other]
     assert all(isinstance(stereo.track(frame), Lost) for frame in [*elsewhere, *clip[14:18]])
+    larger = stereo.track(other[0])
+    assert isinstance(larger, Lost)
+    assert larger.reason == "the image is 1241×376, unlike those before"
 
 
 def test_reset_begins_a_new_world(data: Data) -> None:
