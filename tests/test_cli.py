@@ -411,6 +411,7 @@ def test_every_verb_that_fuses_takes_the_map_flags(verb: str) -> None:
         ("=3", "--option must be KEY=VALUE"),
         ("focal=3", "a synthetic dataset takes no `focal`"),
         ("count=0", "expected count >= 1"),
+        ("path=spiral", "path must be one of circle, tour"),
     ],
 )
 def test_a_wrong_option_of_a_dataset(here: Here, given: str, words: str) -> None:
