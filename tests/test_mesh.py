@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Marching cubes: closed, manifold, without cracks or duplicates, and where the surface is."""
 
+import signal
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -258,3 +261,33 @@ def test_the_bunny_lies_within_a_millimetre_of_its_reference(
     assert np.median(distance) < 0.5e-3
     assert np.percentile(distance, 95) < 1e-3
     assert len(mesh.vertices) > 50_000
+
+
+_PRESSED_WHILE_IT_LOADS = """
+import os, signal, sys
+import numpy as np
+from tsfusion import Mesh
+
+class Pressing:
+    def find_spec(self, name, *_):
+        if name == "scipy.spatial":
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), int(sys.argv[1]))
+
+sys.meta_path.insert(0, Pressing())
+signal.signal(signal.SIGTERM, lambda *_: sys.exit("terminated"))
+floats = np.eye(3, dtype=np.float32)
+try:
+    Mesh(floats, np.array([[0, 1, 2]], dtype=np.int32), floats, None).encode(".ply")
+except KeyboardInterrupt:
+    sys.exit("interrupted")
+"""
+
+
+@pytest.mark.parametrize(("number", "word"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")])
+def test_who_wants_it_to_end_is_heard_while_trimesh_loads(number: signal.Signals, word: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _PRESSED_WHILE_IT_LOADS, str(int(number))],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr.strip()) == (1, word)

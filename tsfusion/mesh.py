@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion import process
 from tsfusion.errors import OutputError
 
 FORMATS = (".ply", ".glb", ".obj")
@@ -52,7 +53,8 @@ class Mesh:
 
     def encode(self, suffix: str) -> bytes:
         """The file's bytes for `.ply`, `.glb` or `.obj`."""
-        import trimesh
+        with process.uninterrupted():  # trimesh passes over whatever is raised while it is imported
+            import trimesh
 
         colors = self.colors
         if colors is not None and suffix == ".glb":

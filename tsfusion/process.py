@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
@@ -102,16 +103,30 @@ def oom_kills() -> int:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Hold Ctrl-C back until the end of the block: what must happen whole happens whole, or not at all."""
+    """Hold Ctrl-C and SIGTERM back until the end of the block.
+
+    What must happen whole happens whole, or not at all; and who swallows exceptions swallows none of these.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield  # signals only ever interrupt the main thread
         return
-    pressed: list[tuple[int, FrameType | None]] = []
-    usual = signal.getsignal(signal.SIGINT)
-    signal.signal(signal.SIGINT, lambda number, frame: pressed.append((number, frame)))
+    came: list[tuple[int, FrameType | None]] = []
+    usual: dict[int, Any] = {}
+
+    def later(number: int, frame: FrameType | None) -> None:
+        came.append((number, frame))
+
+    for held in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(held) is not None:  # one that Python did not set cannot be put back
+            usual[held] = signal.signal(held, later)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, usual)
-    if pressed and callable(usual):
-        usual(*pressed[0])
+        for number, handler in usual.items():
+            signal.signal(number, handler)
+    for number, frame in came:
+        handler = signal.getsignal(number)  # of the first one's making, perhaps
+        if callable(handler):
+            handler(number, frame)
+        elif handler == signal.SIG_DFL:
+            signal.raise_signal(number)
