@@ -17,6 +17,7 @@ class Times:
 
     def __init__(self) -> None:
         self._rows = np.zeros((CAPACITY, len(_FIELDS)), np.int64)  # pages are taken when they are written to
+        self._newest_fused = 0
 
     def add(self, seq: int, *, timestamp_ns: int, captured_ns: int) -> None:
         """A keyframe begins."""
@@ -42,14 +43,15 @@ class Times:
             for name in _OF_THE_SERVER:
                 if (value := getattr(stamps, name)) and not row[_COLUMN[name]]:
                     row[_COLUMN[name]] = min(max(value - offset_ns, -_LARGEST), _LARGEST)
+            if row[_COLUMN["fused_ns"]] > 0:
+                self._newest_fused = max(self._newest_fused, stamps.seq)
 
     def newest_fused(self) -> KeyframeTimes | None:
         """The newest keyframe that is in the map; None = there is none yet."""
-        seqs = np.where(self._rows[:, _COLUMN["fused_ns"]] > 0, self._rows[:, 0], 0)
-        newest = int(seqs.argmax())
-        if not seqs[newest]:
+        if not self._newest_fused or not self._has(self._newest_fused):
             return None
-        return KeyframeTimes(**dict(zip(_FIELDS, self._rows[newest].tolist(), strict=True)))
+        row = self._rows[self._newest_fused % CAPACITY].tolist()
+        return KeyframeTimes(**dict(zip(_FIELDS, row, strict=True)))
 
     def copy(self) -> list[KeyframeTimes]:
         """All rows, oldest first."""
