@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What a person sees while a scan goes, and after it. Progress goes to stderr, results to stdout."""
 
+import logging
 import sys
 import time
 from collections import deque
@@ -12,8 +13,11 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from tsfusion.cli import show
+from tsfusion.logs import printable
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from tsfusion.evaluation.trajectory import TrajectoryError
     from tsfusion.scan_results import MapResult, ScanSummary
     from tsfusion.scanner import ScanState
@@ -78,6 +82,18 @@ class _Lines:
             typer.echo(f"  {words}", err=True)
 
 
+class _Above(logging.Handler):
+    """Warnings go above the table, which would be drawn over them."""
+
+    def __init__(self, console: "Console") -> None:
+        super().__init__(logging.WARNING)
+        self._console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = printable(record.getMessage())
+        self._console.print(text, style="yellow", markup=False, highlight=False)
+
+
 class _Table:
     """The scan's state in a few rows, drawn anew a few times a second."""
 
@@ -92,13 +108,16 @@ class _Table:
         )  # fmt: skip
         self._drawn = 0.0
         self._rates = _Rates()
+        self._above = _Above(self._console)
 
     def __enter__(self) -> "_Table":
+        logging.getLogger("tsfusion").addHandler(self._above)
         self._live.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._live.stop()
+        logging.getLogger("tsfusion").removeHandler(self._above)
 
     def stage(self, text: str) -> None:
         self._console.print(f"[cyan]›[/] {text}", highlight=False)
