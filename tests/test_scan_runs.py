@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: MIT
 """`tsfusion scan` as users run it: processes, sockets, files, Ctrl-C."""
 
+import dataclasses
 import json
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +17,16 @@ import pytest
 from commands import end, environment, eventually, read_until, server, started, tsfusion
 from test_datasets import seven_scenes
 
-from tsfusion import open_dataset
+from tsfusion import open_dataset, scanning
+from tsfusion.config import ScanConfig, VolumeConfig
 from tsfusion.datasets.poses import read_tum, write_tum
+from tsfusion.errors import InvalidKeyframe
 from tsfusion.evaluation.unseen import compare_scans
 from tsfusion.fetch import fetch_status
+from tsfusion.frame import Frame
 from tsfusion.recording import Recording
+from tsfusion.scanner import ScanState
+from tsfusion.sources.live import Live
 
 VOXEL = 0.05
 SOURCE = "synthetic:room"
@@ -230,3 +237,65 @@ def test_a_mesh_with_poses_of_its_own_is_as_good_as_with_the_true_ones(data, tmp
     assert own["median_mm"] <= 1.3 * given["median_mm"]
     assert own["p90_mm"] <= 1.3 * given["p90_mm"]
     assert own["predicted"] > 95
+
+
+class Told:
+    """Keeps what a scan tells."""
+
+    def stage(self, text: str) -> None:
+        pass
+
+    def scan(self, state: ScanState, length: int | None) -> None:
+        self.state = state
+
+
+class Frames(Live):
+    """Frames from a list."""
+
+    def __init__(self, frames: list[Frame]) -> None:
+        super().__init__("a list", "kinect")
+        self._frames, self.length = frames, len(frames)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self._frames)
+
+
+def test_a_frame_that_cannot_be_followed_keeps_what_came_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scanning, "_LINGER", 0.2)
+    room = open_dataset(SOURCE, count=150)
+    frames = [
+        dataclasses.replace(room.frame(index), T_world_camera=None, timestamp_ns=(index + 1) * 10**8)
+        for index in range(4)
+    ]
+    points = Frame(sensor="lidar", points=np.ones((9, 3), np.float32), timestamp_ns=10**9)
+    with pytest.raises(InvalidKeyframe, match="needs a depth"):
+        scanning.scan(
+            Frames([*frames, points]), tmp_path / "out", config=ScanConfig(loop_closure=False),
+            volume=VolumeConfig(), connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Told(),
+        )  # fmt: skip
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert (run["frames_tracked"], run["complete"]) == (4, False)
+    assert len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) == 4
+    with pytest.raises(InvalidKeyframe):
+        scanning.scan(
+            Frames([points]), tmp_path / "none", config=ScanConfig(localizer="rgbd"),
+            volume=VolumeConfig(), connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Told(),
+        )  # fmt: skip
+    assert not (tmp_path / "none").exists()
+
+
+def test_keyframes_that_are_refused_do_not_cost_the_results(walk: Path, tmp_path: Path) -> None:
+    settings = tmp_path / "server.toml"
+    settings.write_text("[server]\nquota_extent = 0.001\n")
+    with server(tmp_path / "state", "--config", settings) as (address, _):
+        run = figures(
+            tsfusion(
+                "scan", "--source", walk, "--localizer", "given", "--connect", address,
+                "--spool", tmp_path / "spool", "--out", tmp_path / "out", "--json",
+            )
+        )  # fmt: skip
+    assert run["keyframes_rejected"] == {"quota": run["keyframes_sent"]}
+    assert run["left"] == 0
+    assert len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) == 12

@@ -2,6 +2,7 @@
 """The scanner's loop: what is lost is never sent, and a new world goes into a map of its own."""
 
 import logging
+import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -11,9 +12,11 @@ import pytest
 from wire import CAMERA, pose, serving, wall
 
 from tsfusion import Client, corrections, se3
+from tsfusion.cli import show_scan
 from tsfusion.config import ScanConfig
 from tsfusion.frame import Frame
 from tsfusion.localizers import Corrections, Localizer, Lost, Pose, corrected
+from tsfusion.localizers.track import Track
 from tsfusion.recording import Recording
 from tsfusion.scanner import Scanner
 
@@ -142,6 +145,68 @@ def test_corrections_reach_the_server(tmp_path: Path) -> None:
     np.testing.assert_allclose(sent.T_map_odometry, pose(0, 0.05))
 
 
+def test_in_the_end_keyframes_since_the_last_loop_are_moved_too(tmp_path: Path) -> None:
+    with (
+        serving(tmp_path / "state") as server,
+        scanned(tmp_path / "spools", Scripted("TCTT"), 4, address=server.address) as scanner,
+    ):
+        (submap,) = scanner.submaps
+        scanner.finish()
+        scanner.finish()
+        submap.client.flush(timeout=60)
+        assert submap.client.stats.corrections_sent == 2
+        found = corrections.read(tmp_path / "state/maps/hall/corrections")
+    (sent,) = found.values()
+    assert len(sent) == 4
+    np.testing.assert_allclose(sent.poses[3], pose(0, 0.05) @ submap.located[3].pose.T_world_camera)
+
+
+def test_warnings_stand_above_the_table(capsys: pytest.CaptureFixture[str]) -> None:
+    with show_scan._Table():
+        logging.getLogger("tsfusion.scanner").warning("lost [at %s]\x1b[2J", "sea")
+        logging.getLogger("tsfusion.scanner").info("nothing")
+    assert capsys.readouterr().err.strip() == "lost [at sea]\\x1b[2J"
+    assert not logging.getLogger("tsfusion").handlers
+
+
+def test_a_track_gives_back_what_it_took() -> None:
+    rng = np.random.default_rng(5)
+    track, poses = Track(), []
+    assert (len(track), len(track.poses()), len(track.keyframes()[0]), track.last_seq) == (0, 0, 0, -1)
+    for number in range(20):
+        T, T_anchor, reference = (se3.exp(rng.normal(0, 1, 6)) for _ in range(3))
+        poses.append(
+            Pose(T_world_camera=T, timestamp_ns=number << 40, anchor=number // 3, T_anchor_camera=T_anchor,
+                 starts_anchor=number % 3 == 0)
+        )  # fmt: skip
+        track.add(poses[-1], reference if number % 2 else None, number + 7 if number % 4 == 0 else None)
+    for at, given in zip(track, poses, strict=True):
+        np.testing.assert_array_equal(at.pose.T_world_camera, given.T_world_camera)
+        np.testing.assert_array_equal(at.pose.T_anchor_camera, given.T_anchor_camera)
+        assert (at.pose.timestamp_ns, at.pose.anchor) == (given.timestamp_ns, given.anchor)
+        assert at.pose.starts_anchor == given.starts_anchor
+    anchors = {number: se3.exp(rng.normal(0, 1, 6)) for number in range(4)}
+    moved = Corrections(revision=1, anchors=anchors, T_corrected_world=se3.exp(rng.normal(0, 1, 6)), loops=1)
+    np.testing.assert_allclose(track.poses(moved), corrected(poses, moved), atol=1e-12)
+    seqs, chosen = track.keyframes(moved)
+    assert seqs.tolist() == [7, 11, 15, 19, 23]
+    np.testing.assert_allclose(chosen, track.poses(moved)[::4])
+    which, references = track.with_reference()
+    assert which.tolist() == [*range(1, 20, 2)]
+    np.testing.assert_array_equal(references[-1], track[-1].reference)
+
+
+def test_a_track_of_an_hour_is_small() -> None:
+    track = Track()
+    T = np.eye(4)
+    tracemalloc.start()
+    for number in range(20_000):
+        track.add(Pose(T_world_camera=T, timestamp_ns=number, anchor=0, T_anchor_camera=T), T, number)
+    size, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert size / len(track) < 400
+
+
 def test_corrected_poses_hang_on_their_anchors() -> None:
     T = se3.exp(np.array([0.1, 0.2, 0, 0, 0, 0.3]))
     poses = [
@@ -168,4 +233,5 @@ def test_names_of_submaps_fit() -> None:
     made: Callable[..., Scanner] = Scanner
     scanner = made(Scripted("T"), ScanConfig(), connect, map_name="m" * 32)
     scanner._begin_submap(1.0)
-    assert names == ["m" * 32, "m" * 30 + "-2"]
+    assert scanner._next == "m" * 30 + "-2"
+    assert names == ["m" * 32]  # no map on the server for a sensor that never sees anything again

@@ -11,7 +11,7 @@ from tsfusion import ledger, summary
 from tsfusion.config import ScanConfig, VolumeConfig
 from tsfusion.datasets.poses import write_tum
 from tsfusion.evaluation.trajectory import TrajectoryError, absolute_error
-from tsfusion.localizers import Corrections, corrected
+from tsfusion.localizers import Corrections
 from tsfusion.mesh import Mesh
 from tsfusion.scanner import Scanner, Submap
 from tsfusion.sources import Source
@@ -74,13 +74,13 @@ def write_trajectory(work: Path, submap: Submap, suffix: str) -> None:
 
     Where loops were closed `trajectory-corrected.txt`, too.
     """
-    stamps = [pose.timestamp_ns for pose in submap.poses]
-    tracked = corrected(submap.poses, None)
+    track = submap.located
+    stamps, tracked = track.stamps_ns, list(track.poses())
+    chosen = np.flatnonzero(track.seqs >= 0).tolist()
     write_tum(work / f"trajectory{suffix}.txt", stamps, tracked)
-    chosen = [index for index, at in enumerate(submap.located) if at.seq is not None]
     write_tum(work / f"keyframes{suffix}.txt", [stamps[i] for i in chosen], [tracked[i] for i in chosen])
     if submap.corrections is not None and submap.corrections.loops:
-        now = corrected(submap.poses, submap.corrections)
+        now = list(track.poses(submap.corrections))
         write_tum(work / f"trajectory-corrected{suffix}.txt", stamps, now)
 
 
@@ -96,7 +96,7 @@ def describe(submap: Submap, status: Status | None, mesh: Mesh | None) -> MapRes
     return MapResult(
         name=submap.name,
         frames=len(submap.located),
-        keyframes=sum(at.seq is not None for at in submap.located),
+        keyframes=int((submap.located.seqs >= 0).sum()),
         loops=corrections.loops if corrections else 0,
         trajectory_error=_error(submap, None),
         corrected_error=_error(submap, corrections) if corrections else None,
@@ -151,10 +151,7 @@ def records(submaps: list[Submap]) -> list[KeyframeTimes]:
 
 def _error(submap: Submap, corrections: Corrections | None) -> TrajectoryError | None:
     """Against the source's own poses, over the frames that have one."""
-    poses = corrected(submap.poses, corrections)
-    pairs = [
-        (T, at.reference) for T, at in zip(poses, submap.located, strict=True) if at.reference is not None
-    ]
-    if len(pairs) < 2:
+    which, references = submap.located.with_reference()
+    if len(which) < 2:
         return None
-    return absolute_error(np.array([T for T, _ in pairs]), np.array([T for _, T in pairs]))
+    return absolute_error(submap.located.poses(corrections)[which], references)

@@ -13,34 +13,17 @@ from itertools import count
 from typing import Literal
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
-from tsfusion import localizers
 from tsfusion.client import Client, ClientStats
 from tsfusion.config import MAP_NAME_LENGTH, ScanConfig
 from tsfusion.frame import Frame
 from tsfusion.localizers import Corrections, Localizer, Lost, Pose
 from tsfusion.localizers.selection import Selector
+from tsfusion.localizers.track import Track
 
-Matrix = NDArray[np.float64]
 State = Literal["starting", "tracking", "lost"]
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, eq=False)
-class Located:
-    """One frame that has a pose.
-
-    Attributes:
-        reference: (4, 4), what the source itself said of the pose; None = nothing.
-        seq: its number as a keyframe; None = it is none, or was left out.
-    """
-
-    pose: Pose
-    reference: Matrix | None
-    seq: int | None
 
 
 @dataclass(eq=False)
@@ -52,17 +35,23 @@ class Submap:
         client: sends its keyframes.
         located: its frames, in order.
         corrections: the newest of loop closure, None = there were none.
+        said: number of the last keyframe whose correction the client was told.
     """
 
     name: str
     client: Client
-    located: list[Located] = field(default_factory=list)
+    located: Track = field(default_factory=Track)
     corrections: Corrections | None = None
+    said: int = 0
 
-    @property
-    def poses(self) -> list[Pose]:
-        """Of its frames, as they were tracked."""
-        return [at.pose for at in self.located]
+    def correct(self) -> None:
+        """Have the client say where its keyframes were, by the newest corrections."""
+        assert self.corrections is not None
+        seqs, poses = self.located.keyframes(self.corrections)
+        if len(seqs):
+            self.said = int(seqs[-1])
+            said = dict(zip(seqs.tolist(), poses, strict=True))
+            self.client.correct(said, T_map_odometry=self.corrections.T_corrected_world)
 
 
 class ScanState(msgspec.Struct, frozen=True, kw_only=True):
@@ -95,7 +84,8 @@ class Scanner:
     """Takes frames one by one; `run` takes all of a source.
 
     A lost sensor sends nothing. When it is not found again within `patience` seconds of the frames' clock,
-    the localizer begins a new world, whose keyframes go into a map of their own: NAME-2, NAME-3, …
+    the localizer begins a new world, whose keyframes go into a map of their own: NAME-2, NAME-3, …; it is
+    opened when there is a pose again.
 
     Args:
         localizer: says where each frame was taken.
@@ -119,6 +109,7 @@ class Scanner:
         self._localizer, self._config = localizer, config
         self._connect, self._map_name, self._taken = connect, map_name, {map_name, *taken}
         self._selector = Selector(config, outdoors=outdoors)
+        self._next: str | None = None  # the map of the submap that begins with the next pose
         self._lost_since: int | None = None
         self._why = ""
         self._state: State = "starting"
@@ -135,10 +126,10 @@ class Scanner:
 
     def take(self, frame: Frame) -> None:
         """Find the frame's pose, and send it if it is a keyframe."""
-        self._frames += 1
         before = time.process_time()
         found = self._localizer.track(frame)
         self._tracking_cpu += time.process_time() - before
+        self._frames += 1
         if isinstance(found, Lost):
             self._missed(found, frame)
         else:
@@ -146,6 +137,12 @@ class Scanner:
         corrections = self._localizer.corrections()
         if corrections is not None:
             self._correct(corrections)
+
+    def finish(self) -> None:
+        """No frame comes any more: keyframes since the last loops are moved by what those said, too."""
+        for submap in self.submaps:
+            if submap.corrections is not None and submap.located.last_seq > submap.said:
+                submap.correct()
 
     @property
     def tracking_cpu_ms(self) -> float:
@@ -161,8 +158,8 @@ class Scanner:
             frames=self._frames,
             tracked=self._frames - self._lost,
             lost=self._lost,
-            submap=self.submaps[-1].name,
-            submaps=len(self.submaps),
+            submap=self._next or self.submaps[-1].name,
+            submaps=len(self.submaps) + (self._next is not None),
             selected=dict(self._selected),
             loops=sum(submap.corrections.loops for submap in self.submaps if submap.corrections),
             stats=_total([client.stats for client in clients]),
@@ -174,6 +171,9 @@ class Scanner:
         if self._state == "lost":
             log.info("the sensor is found again")
         self._state, self._why, self._lost_since = "tracking", "", None
+        if self._next is not None:
+            self.submaps.append(Submap(self._next, self._connect(self._next)))
+            self._next = None
         submap, T = self.submaps[-1], pose.T_world_camera
         reason = self._selector.reason(frame, T)
         seq = None
@@ -181,14 +181,14 @@ class Scanner:
             self._selected[reason] += 1
             self._selector.took(frame, T)
             seq = submap.client.send(frame.keyframe(T))
-        submap.located.append(Located(pose, frame.T_world_camera, seq))
+        submap.located.add(pose, frame.T_world_camera, seq)
 
     def _missed(self, lost: Lost, frame: Frame) -> None:
         self._lost += 1
         if self._state == "tracking":
             log.warning("the sensor is lost: %s", lost.reason)
         self._why = lost.reason
-        self._state = "lost" if self.submaps[-1].located else "starting"
+        self._state = "lost" if self.submaps[-1].located and self._next is None else "starting"
         if self._lost_since is None:
             self._lost_since = frame.timestamp_ns
         seconds = (frame.timestamp_ns - self._lost_since) / 1e9
@@ -201,8 +201,7 @@ class Scanner:
         log.warning("lost for %.1f s (%s): what follows goes into a new map, %s", seconds, self._why, name)
         self._localizer.reset()
         self._selector.reset()
-        self._state, self._lost_since = "starting", None
-        self.submaps.append(Submap(name, self._connect(name)))
+        self._state, self._lost_since, self._next = "starting", None, name
 
     def _name(self, number: int) -> str:
         suffix = f"-{number}"
@@ -214,10 +213,7 @@ class Scanner:
         submap.corrections = corrections
         if corrections.loops > before:
             log.info("a place was seen again: %d loops closed", corrections.loops)
-        now = localizers.corrected(submap.poses, corrections)
-        poses = {at.seq: T for at, T in zip(submap.located, now, strict=True) if at.seq is not None}
-        if poses:
-            submap.client.correct(poses, T_map_odometry=corrections.T_corrected_world)
+        submap.correct()
 
 
 def _total(stats: list[ClientStats]) -> ClientStats:

@@ -20,6 +20,7 @@ from tsfusion.config import ClientConfig, ScanConfig, ServerConfig, VolumeConfig
 from tsfusion.errors import (
     DatasetError,
     FlushTimeout,
+    KeyframeRefused,
     OutputError,
     SourceError,
     TransportError,
@@ -91,6 +92,7 @@ def scan(
     Raises:
         SourceError: the sensor failed; what came before is in `out`.
         DatasetError: a recording's file cannot be read; likewise.
+        InvalidKeyframe: a frame lacks what the localizer needs; likewise.
         OutputError: `out` cannot be written, or no frame could be localised.
         TransportError: the server cannot be reached or stopped fusing.
     """
@@ -118,10 +120,11 @@ def scan(
         if source.length is not None:  # a live one's first frame is old by now
             first = dataclasses.replace(first, captured_ns=time.monotonic_ns())
             frames = chain([first], frames)
-        scanner.run(frames, _watcher(source, place, progress))
+        _run(scanner, frames, _watcher(source, place, progress), failure)
         peak = process.peak_rss_bytes()
         if not any(submap.located for submap in scanner.submaps):
             raise failure[0] if failure else OutputError(_nowhere(scanner.state()))
+        scanner.finish()
         _settle(scanner, source, place, progress)
         seconds = time.monotonic() - started
         progress.stage("writing the results")
@@ -150,6 +153,18 @@ def _until_failure(frames: Iterator[Frame], failure: list[Exception]) -> Iterato
     try:
         yield from frames
     except (SourceError, DatasetError) as error:
+        failure.append(error)
+
+
+def _run(
+    scanner: Scanner, frames: Iterator[Frame], watch: Callable[[Scanner], None], failure: list[Exception]
+) -> None:
+    """Take the frames; what stops that ends the scan, but what was localised before is not thrown away."""
+    try:
+        scanner.run(frames, watch)
+    except TsfusionError as error:
+        if not any(submap.located for submap in scanner.submaps):
+            raise
         failure.append(error)
 
 
@@ -243,7 +258,7 @@ def _settle(scanner: Scanner, source: Source, place: _Place, progress: ScanProgr
         progress.scan(state, source.length)
         stats = state.stats
         done = stats.fused + sum(stats.rejected.values()) if place.child else stats.durable
-        lost = sum(map(sum, (stats.refused.values(), stats.skipped.values())))
+        lost = sum(stats.refused.values()) + stats.skipped.get("dropped", 0)
         if not stats.waiting and (not place.child or done + lost >= stats.sent):
             break
         if (stats.waiting, done) != last:
@@ -256,7 +271,8 @@ def _settle(scanner: Scanner, source: Source, place: _Place, progress: ScanProgr
             place.child.check()
         time.sleep(_POLL)
     for submap in scanner.submaps:
-        with suppress(FlushTimeout):  # stamps and corrections: no reason to lose the scan
+        # Stamps and corrections are no reason to lose the scan; what was refused is counted.
+        with suppress(FlushTimeout, KeyframeRefused):
             (submap.client.wait_meshed if place.child else submap.client.flush)()
 
 
@@ -273,7 +289,7 @@ def _write(work: Path, place: _Place, submap: Submap, suffix: str, min_weight: f
         link.address, control=link.control, map_name=submap.name, min_weight=min_weight, keys=keys
     )
     if len(mesh.faces):
-        ups = [preview.sensor_up(pose.T_world_camera, place.sensor) for pose in submap.poses]
+        ups = [preview.sensor_up(T, place.sensor) for T in submap.located.poses()]
         summary.write_mesh(work, mesh, ups, suffix)
     elif not suffix:
         raise OutputError(
