@@ -392,6 +392,22 @@ def test_a_flood_does_not_hold_up_a_frame(feed: Feed) -> None:
         flood.wait()
 
 
+def test_large_graphs_one_after_the_other_do_not_hold_up_a_frame(feed: Feed) -> None:
+    stamps = [START + index for index in range(2000)]
+    graph = {"stamps_ns": stamps, "poses": [[0.0, 0, 0, 0, 0, 0, 1]] * len(stamps)}
+    with publisher(feed.address) as send:
+        heard(feed, lambda count: send(said(-100 + count)))
+        received = feed.received
+        for _ in range(100):
+            send({"corrections": graph})
+        until = time.monotonic() + DEADLINE
+        while feed.received == received:
+            assert time.monotonic() < until
+            before = time.thread_time()
+            feed.track(frame(START))
+            assert time.thread_time() - before < 3
+
+
 def test_corrections_move_the_tracking_keyframes(feed: Feed) -> None:
     """Odometry drifts sideways by 1 cm in 0.1 s; the sender's loop closure finds out at 1.0 s."""
     with publisher(feed.address) as send:

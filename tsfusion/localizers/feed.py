@@ -25,7 +25,7 @@ from tsfusion.transport import sockets
 log = logging.getLogger(__name__)
 
 WAIT = 0.1  # seconds for a pose that is under way
-_MOST_AT_ONCE = 2000  # messages taken for one frame, so that a flood cannot hold it up
+_BUSY = 0.1  # seconds that messages are taken for one frame, so that a flood cannot hold it up
 _SILENCE = 5.0  # seconds; libzmq gives some connections up for good, so that it is made again
 _ANOTHER_CLOCK = 3600.0  # seconds
 _KINDS = 20  # of reasons that are told apart
@@ -115,24 +115,29 @@ class Feed:
 
     def _hear(self, seconds: float) -> None:
         """Take the messages that are there; wait for the first one at most so long."""
-        for count in range(_MOST_AT_ONCE):
-            parts = self._link.receive(seconds if count == 0 else 0)
-            if parts is None:
+        parts = self._link.receive(seconds)
+        enough = time.monotonic() + _BUSY
+        while parts is not None:
+            self._take(parts)
+            if time.monotonic() > enough:
                 return
-            try:
-                if len(parts) != 1:
-                    raise DecodeError(f"a message has 1 frame, got {len(parts)}")
-                said = decode(parts[0])
-            except DecodeError as error:
-                self._drop(str(error))
-                continue
-            self.received += 1
-            if said.stamp_ns is not None:
-                self._history.add(said.stamp_ns, said.pose)
-            if said.graph is not None:
-                unknown = self._deformation.learn(said.graph, self._history, self._max_gap_ns)
-                if unknown:
-                    log.warning("%d corrected poses are of moments that no pose was sent of", unknown)
+            parts = self._link.receive(0)
+
+    def _take(self, parts: list[bytes]) -> None:
+        try:
+            if len(parts) != 1:
+                raise DecodeError(f"a message has 1 frame, got {len(parts)}")
+            said = decode(parts[0])
+        except DecodeError as error:
+            self._drop(str(error))
+            return
+        self.received += 1
+        if said.stamp_ns is not None:
+            self._history.add(said.stamp_ns, said.pose)
+        if said.graph is not None:
+            unknown = self._deformation.learn(said.graph, self._history, self._max_gap_ns)
+            if unknown:
+                log.warning("%d corrected poses are of moments that no pose was sent of", unknown)
 
     def _drop(self, reason: str) -> None:
         kind = re.split(r",| \(| - ", reason)[0]
