@@ -131,6 +131,7 @@ def test_ctrl_c_without_a_server_keeps_all_for_the_next_scan(walk: Path, tmp_pat
     assert run["complete"]
     assert 0 < run["frames"] < 40
     assert run["left"] == run["keyframes_sent"] >= 1
+    assert "no server answers" in run["link"]
     assert len(Recording(spool / "default")) == run["left"]
     with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, _):
         more = figures(
@@ -240,7 +241,7 @@ def test_a_mesh_with_poses_of_its_own_is_as_good_as_with_the_true_ones(data, tmp
 
 
 class Told:
-    """Keeps what a scan tells."""
+    """keeps what a scan tells."""
 
     def stage(self, text: str) -> None:
         pass
@@ -260,19 +261,37 @@ class Frames(Live):
         return iter(self._frames)
 
 
+def unposed(count: int) -> list[Frame]:
+    """The room's first frames, without their poses."""
+    room = open_dataset(SOURCE, count=150)
+    return [
+        dataclasses.replace(room.frame(index), T_world_camera=None, timestamp_ns=(index + 1) * 10**8)
+        for index in range(count)
+    ]
+
+
+def test_what_waits_for_the_map_is_of_another_world(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(scanning, "_LINGER", 0.2)
+    for left in (1, 2):
+        assert "of an earlier scan" not in caplog.text
+        result = scanning.scan(
+            Frames(unposed(1)), tmp_path / "out", config=ScanConfig(), volume=VolumeConfig(),
+            connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Told(),
+        )  # fmt: skip
+        assert result.left == left
+    assert "of an earlier scan wait for the map default" in caplog.text
+
+
 def test_a_frame_that_cannot_be_followed_keeps_what_came_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(scanning, "_LINGER", 0.2)
-    room = open_dataset(SOURCE, count=150)
-    frames = [
-        dataclasses.replace(room.frame(index), T_world_camera=None, timestamp_ns=(index + 1) * 10**8)
-        for index in range(4)
-    ]
     points = Frame(sensor="lidar", points=np.ones((9, 3), np.float32), timestamp_ns=10**9)
     with pytest.raises(InvalidKeyframe, match="needs a depth"):
         scanning.scan(
-            Frames([*frames, points]), tmp_path / "out", config=ScanConfig(loop_closure=False),
+            Frames([*unposed(4), points]), tmp_path / "out", config=ScanConfig(loop_closure=False),
             volume=VolumeConfig(), connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Told(),
         )  # fmt: skip
     run = json.loads((tmp_path / "out" / "run.json").read_text())

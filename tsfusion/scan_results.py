@@ -45,6 +45,7 @@ class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         complete: whether the source came to its end, or was ended by the user: no sensor failed.
         left: keyframes that are still in the spool.
+        link: why the server takes nothing at the moment; empty when it does.
         tracking_cpu_ms: CPU milliseconds of the localizer a frame.
     """
 
@@ -60,6 +61,7 @@ class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
     keyframes_rejected: dict[str, int]
     keyframes_by_rule: dict[str, int]
     left: int
+    link: str
     seconds: float
     tracking_cpu_ms: float
     maps: list[MapResult]
@@ -134,6 +136,7 @@ def summarise(
         keyframes_rejected={**stats.skipped, **stats.refused, **stats.rejected},
         keyframes_by_rule=state.selected,
         left=stats.waiting,
+        link=state.link,
         seconds=round(seconds, 3),
         tracking_cpu_ms=round(scanner.tracking_cpu_ms, 3),
         maps=maps,

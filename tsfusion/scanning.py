@@ -223,16 +223,17 @@ def _opener(
 
 
 def _warn_of_another_world(place: _Place) -> None:
-    """Say so when the server's map has keyframes already: this scan's world is not theirs."""
+    """Say so when the map has keyframes already, or will have: this scan's world is not theirs."""
     link = place.link
+    begins = "a scan that localises itself begins its own world; give it a map of its own (--map NAME)"
+    if any((place.spools / link.map).glob("*.mcap")):
+        log.warning("keyframes of an earlier scan wait for the map %s: %s", link.map, begins)
+        return
     with suppress(TransportError):  # a server that is not there yet, or has no such map
         keys = client_keys(link.key, link.server_key)
         status = fetch_status(link.address, control=link.control, map_name=link.map, timeout=2.0, keys=keys)
         if status.keyframes_durable:
-            log.warning(
-                "the map %s has %d keyframes already: a scan that localises itself begins its own world; "
-                "give it a map of its own (--map NAME)", link.map, status.keyframes_durable,
-            )  # fmt: skip
+            log.warning("the map %s has %d keyframes already: %s", link.map, status.keyframes_durable, begins)
 
 
 def _watcher(source: Source, place: _Place, progress: ScanProgress) -> Callable[[Scanner], None]:

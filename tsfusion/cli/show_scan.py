@@ -181,9 +181,10 @@ def summary(result: "ScanSummary", out: Path, spool: Path) -> None:
     for found in result.maps:
         lines += _map_lines(found)
     if result.left:
+        why = f" ({result.link})" if result.link else ""
         lines.append(
-            f"spool      {result.left} keyframes are not acknowledged: the next scan with --spool {spool} "
-            "sends them"
+            f"spool      {result.left} keyframes are not acknowledged{why}: the next scan with "
+            f"--spool {spool} sends them"
         )
     lines.append(f"results    {out}/")
     typer.echo("\n".join(lines))
