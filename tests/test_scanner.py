@@ -145,6 +145,21 @@ def test_corrections_reach_the_server(tmp_path: Path) -> None:
     np.testing.assert_allclose(sent.T_map_odometry, pose(0, 0.05))
 
 
+def test_a_server_with_room_for_two_maps_is_asked_for_no_third(tmp_path: Path) -> None:
+    localizer = Scripted(("T" + "L" * 12) * 3 + "T")
+    names: list[str] = []
+    with ExitStack() as stack:
+
+        def connect(name: str) -> Client:
+            names.append(name)
+            return stack.enter_context(Client(NOBODY, spool=tmp_path / name, map=name, policy="spool_all"))
+
+        scanner = Scanner(localizer, ScanConfig(), connect, map_name="hall", most=2)
+        scanner.run(frames(40), lambda _: None)
+        assert (names, localizer.resets) == (["hall", "hall-2"], 1)
+        assert [len(submap.located) for submap in scanner.submaps] == [1, 3]
+
+
 def test_in_the_end_keyframes_since_the_last_loop_are_moved_too(tmp_path: Path) -> None:
     with (
         serving(tmp_path / "state") as server,

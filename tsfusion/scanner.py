@@ -94,6 +94,7 @@ class Scanner:
         map_name: of the first submap.
         taken: names that no submap may have.
         outdoors: see `Selector`.
+        most: submaps; a sensor that is lost once more has to find back into the last. None = any number.
     """
 
     def __init__(
@@ -105,8 +106,9 @@ class Scanner:
         map_name: str,
         taken: Collection[str] = (),
         outdoors: bool = False,
+        most: int | None = None,
     ) -> None:
-        self._localizer, self._config = localizer, config
+        self._localizer, self._config, self._most = localizer, config, most
         self._connect, self._map_name, self._taken = connect, map_name, {map_name, *taken}
         self._selector = Selector(config, outdoors=outdoors)
         self._next: str | None = None  # the map of the submap that begins with the next pose
@@ -192,8 +194,12 @@ class Scanner:
         if self._lost_since is None:
             self._lost_since = frame.timestamp_ns
         seconds = (frame.timestamp_ns - self._lost_since) / 1e9
-        if self._state == "lost" and seconds >= self._config.patience and not self._localizer.absolute:
+        if self._state == "lost" and seconds >= self._config.patience and self._may_begin_submap:
             self._begin_submap(seconds)
+
+    @property
+    def _may_begin_submap(self) -> bool:
+        return not self._localizer.absolute and len(self.submaps) != self._most
 
     def _begin_submap(self, seconds: float) -> None:
         name = next(name for name in map(self._name, count(2)) if name not in self._taken)

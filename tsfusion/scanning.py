@@ -38,7 +38,7 @@ AHEAD = 3  # keyframes of a recording under way: fusing, waiting, travelling
 OUTDOOR_SENSORS = ("stereo", "lidar")
 _PATIENCE = 60.0  # seconds without progress before an own server is given up
 _LINGER = 10.0  # seconds without progress before what a distant server does not take is left in the spool
-_MAPS = 16  # of an own server: a submap each
+_MAPS = 16  # of an own server: its default one, and a submap each
 _POLL = 0.05  # seconds
 
 log = logging.getLogger(__name__)
@@ -113,7 +113,7 @@ def scan(
         leftovers, open_client = _opener(stack, place, _pace(source, place))
         scanner = Scanner(
             localizer, config, open_client, map_name=place.link.map, taken=leftovers,
-            outdoors=source.sensor in OUTDOOR_SENSORS,
+            outdoors=source.sensor in OUTDOOR_SENSORS, most=_MAPS - 1 if place.child else None,
         )  # fmt: skip
         progress.stage(f"scanning {source.name}")
         started = time.monotonic()
