@@ -253,9 +253,9 @@ class Told:
 class Frames(Live):
     """Frames from a list."""
 
-    def __init__(self, frames: list[Frame]) -> None:
+    def __init__(self, frames: list[Frame], *, live: bool = False) -> None:
         super().__init__("a list", "kinect")
-        self._frames, self.length = frames, len(frames)
+        self._frames, self.length = frames, None if live else len(frames)
 
     def __iter__(self) -> Iterator[Frame]:
         return iter(self._frames)
@@ -268,6 +268,20 @@ def unposed(count: int) -> list[Frame]:
         dataclasses.replace(room.frame(index), T_world_camera=None, timestamp_ns=(index + 1) * 10**8)
         for index in range(count)
     ]
+
+
+@pytest.mark.parametrize(("count", "gap_ns", "taken"), [(1, 0, 1), (3, 0, 3), (3, 3 * 10**9, 2)])
+def test_a_live_sources_first_frame_is_taken_unless_it_is_old(
+    count: int, gap_ns: int, taken: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scanning, "_LINGER", 0.2)
+    first, *others = unposed(count)
+    later = [dataclasses.replace(frame, timestamp_ns=frame.timestamp_ns + gap_ns) for frame in others]
+    result = scanning.scan(
+        Frames([first, *later], live=True), tmp_path / "out", config=ScanConfig(), volume=VolumeConfig(),
+        connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Told(),
+    )  # fmt: skip
+    assert (result.frames, result.frames_tracked) == (taken, taken)
 
 
 def test_what_waits_for_the_map_is_of_another_world(

@@ -117,9 +117,10 @@ def scan(
         )  # fmt: skip
         progress.stage(f"scanning {source.name}")
         started = time.monotonic()
-        if source.length is not None:  # a live one's first frame is old by now
-            first = dataclasses.replace(first, captured_ns=time.monotonic_ns())
-            frames = chain([first], frames)
+        if source.length is None:
+            frames = _fresh(first, frames, config.patience)
+        else:
+            frames = chain([dataclasses.replace(first, captured_ns=time.monotonic_ns())], frames)
         _run(scanner, frames, _watcher(source, place, progress), failure)
         peak = process.peak_rss_bytes()
         if not any(submap.located for submap in scanner.submaps):
@@ -154,6 +155,16 @@ def _until_failure(frames: Iterator[Frame], failure: list[Exception]) -> Iterato
         yield from frames
     except (SourceError, DatasetError) as error:
         failure.append(error)
+
+
+def _fresh(first: Frame, frames: Iterator[Frame], patience: float) -> Iterator[Frame]:
+    """A live source's frames, but for the first if it grew old while the server started."""
+    second = next(frames, None)
+    if second is None or second.timestamp_ns - first.timestamp_ns <= 1e9 * patience:
+        yield first
+    if second is not None:
+        yield second
+    yield from frames
 
 
 def _run(
