@@ -25,7 +25,10 @@ from tsfusion.errors import InvalidConfig, OutputError
 Here = Callable[..., "subprocess.CompletedProcess[str]"]
 
 NOBODY = "tcp://127.0.0.1:9"  # the discard port: nobody listens there, and nobody may without being root
-VERBS = ["demo", "replay", "serve", "mesh", "status", "doctor", "keys", "journal", "config", "datasets"]
+VERBS = [
+    "demo", "replay", "scan", "check", "serve", "mesh", "status", "ate", "doctor", "download", "keys",
+    "journal", "config", "datasets",
+]  # fmt: skip
 
 
 def scene(folder: Path, *, pose: str | None = None, depth: bytes | None = None) -> Path:

@@ -64,6 +64,16 @@ class LoopClosing:
         self.absolute = localizer.absolute
         self._forget()
 
+    def _forget(self) -> None:
+        self._chain = Chain(self._drift)
+        self.consensus = Consensus(self._chain)
+        self._places = Places(self._capacity)
+        self._corrected: dict[int, Matrix] = {}
+        self.counts = Counts()
+        self._news = False
+        self._due = False
+        self._optimised_at = 0  # keyframes then
+
     def track(self, frame: Frame) -> Pose | Lost:
         """As the wrapped localizer says."""
         pose = self._localizer.track(frame)
@@ -110,16 +120,6 @@ class LoopClosing:
             anchor=place,
             T_anchor_camera=T,
         )
-
-    def _forget(self) -> None:
-        self._chain = Chain(self._drift)
-        self.consensus = Consensus(self._chain)
-        self._places = Places(self._capacity)
-        self._corrected: dict[int, Matrix] = {}
-        self.counts = Counts()
-        self._news: bool = False
-        self._due = False
-        self._optimised_at = 0  # keyframes then
 
     def _correction(self) -> Matrix:
         """`T_corrected_world` after the last keyframe."""

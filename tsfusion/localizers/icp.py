@@ -101,11 +101,11 @@ def _normals(inverse: Floats, valid: NDArray[np.bool_], K: Intrinsics) -> Floats
     """Normals of the planes fitted to inverse depth around each block: (3, n); 0 where none fits."""
     r = _FIT_RADIUS
     ones, step = np.ones(2 * r + 1), np.arange(-r, r + 1, dtype=np.float64)
-    w = valid.astype(np.float64)
+    w = valid.astype(np.float32)
     q = inverse * w
 
-    def moment(image: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]) -> Any:
-        return cv2.sepFilter2D(image, cv2.CV_64F, x, y, borderType=cv2.BORDER_CONSTANT)
+    def moment(image: Floats, x: NDArray[np.float64], y: NDArray[np.float64]) -> Any:
+        return cv2.sepFilter2D(image, cv2.CV_32F, x, y, borderType=cv2.BORDER_CONSTANT)
 
     s, su, sv = moment(w, ones, ones), moment(w, step, ones), moment(w, ones, step)
     suu, suv, svv = moment(w, step**2, ones), moment(w, step, step), moment(w, ones, step**2)
@@ -122,14 +122,15 @@ def _normals(inverse: Floats, valid: NDArray[np.bool_], K: Intrinsics) -> Floats
     rest = moment(q * inverse, ones, ones) / s - mq * mq - a * cuq - b * cvq
     z = 1 / np.where(ok, mq, 1)
     ok &= np.maximum(rest, 0) * z**4 < (_CURVED * z + deviation(z)) ** 2
-    v, u = np.indices(ok.shape)
-    x, y = (u - K.cx) / K.fx, (v - K.cy) / K.fy
+    x = ((np.arange(ok.shape[1]) - K.cx) / K.fx).astype(np.float32)[None, :]
+    y = ((np.arange(ok.shape[0]) - K.cy) / K.fy).astype(np.float32)[:, None]
     # 1/z = a (u - u0) + b (v - v0) + c around block (u0, v0) is normal · (x, y, 1) = 1/z.
-    nx, ny, c = a * K.fx, b * K.fy, mq - a * mu - b * mv
+    nx, ny, c = a * np.float32(K.fx), b * np.float32(K.fy), mq - a * mu - b * mv
     normals = np.stack([nx, ny, c - nx * x - ny * y])
-    length = np.maximum(np.linalg.norm(normals, axis=0), 1e-12)
+    length = np.maximum(np.sqrt((normals * normals).sum(axis=0)), np.float32(1e-12))
     ok &= c > _GRAZING * length * np.sqrt(x * x + y * y + 1)
-    return np.where(ok, normals / length, 0).astype(np.float32).reshape(3, -1)
+    flat: Floats = np.where(ok, normals / length, 0).reshape(3, -1)
+    return flat
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,18 +159,17 @@ def match(there: Surface, here: Surface, T_there_here: se3.Transform, some: NDAr
     points, sigma = (here.points, here.sigma) if some is None else (here.points[:, some], here.sigma[some])
     K, (rows, columns) = there.intrinsics, there.shape
     moved = T_there_here[:3, :3].astype(np.float32) @ points + T_there_here[:3, 3:].astype(np.float32)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scale = 1 / moved[2]
-        u = moved[0] * scale * np.float32(K.fx) + np.float32(K.cx + 0.5)
-        v = moved[1] * scale * np.float32(K.fy) + np.float32(K.cy + 0.5)
-    inside = (moved[2] > _NEAREST) & (u >= 0) & (v >= 0) & (u < columns) & (v < rows)
-    block = np.where(inside, v, 0).astype(np.intp) * columns + np.where(inside, u, 0).astype(np.intp)
-    planes = there.planes[:, block]
-    chosen = np.flatnonzero(inside & (planes[3] > 0))
-    moved, planes = moved[:, chosen], planes[:, chosen]
-    distance = np.einsum("in,in->n", planes[:3], moved) - planes[3]
+    scale = 1 / np.maximum(moved[2], np.float32(_NEAREST))
+    u = moved[0] * scale * np.float32(K.fx) + np.float32(K.cx + 0.5)
+    v = moved[1] * scale * np.float32(K.fy) + np.float32(K.cy + 0.5)
+    inside = np.flatnonzero((moved[2] > _NEAREST) & (u >= 0) & (v >= 0) & (u < columns) & (v < rows))
+    block = v[inside].astype(np.intp) * columns + u[inside].astype(np.intp)
+    there_is = there.planes[3].take(block) > 0
+    chosen, block = inside[there_is], block[there_is]
+    moved, planes = moved.take(chosen, axis=1), there.planes.take(block, axis=1)
+    distance = planes[0] * moved[0] + planes[1] * moved[1] + planes[2] * moved[2] - planes[3]
     which = chosen if some is None else some[chosen]
-    return Match(moved, planes[:3], distance, sigma[chosen], which, block[chosen])
+    return Match(moved, planes[:3], distance, sigma[chosen], which, block)
 
 
 def alike(found: Match, columns: int) -> float:

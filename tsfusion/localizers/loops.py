@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Which loops to believe: those that odometry allows, that stand alone, and that support each other."""
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -71,9 +72,7 @@ class Consensus:
                 self._remember_twin(loop, allowed)
         if not allowed:
             return []
-        if min((d for d in deviations if d > GATE), default=np.inf) < _AMBIGUOUS or any(
-            self._has_twin(loop) for loop in allowed
-        ):
+        if self._doubtful(allowed) or min((d for d in deviations if d > GATE), default=np.inf) < _AMBIGUOUS:
             self._count("fits another place too")
             return []
         return [found for loop in allowed for found in self._supported(loop)]
@@ -155,6 +154,14 @@ class Consensus:
             twins = self._twins.setdefault(a, [])
             twins.append((b, T))
             del twins[:-_TWINS]
+
+    def _doubtful(self, loops: list[Loop]) -> bool:
+        """Whether one keyframe's loops leave open where it is."""
+        for one, two in itertools.combinations(loops, 2):
+            if not self._agree(one, two):
+                self._remember_twin(two, [one])
+                return True
+        return any(self._has_twin(loop) for loop in loops)
 
     def _has_twin(self, loop: Loop) -> bool:
         """Whether the loop's place looks like another one where the keyframe could as well be."""

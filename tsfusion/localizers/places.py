@@ -142,4 +142,5 @@ class Places:
         rows = np.unpackbits(self._seen[self._keys(view)], axis=1)[:, : self._capacity]
         common = rows.sum(axis=1, dtype=np.int32) > max(_COMMON * len(self.views), 2)
         rows[common] = 0
-        return rows.sum(axis=0, dtype=np.int32).astype(np.float64)
+        votes: NDArray[np.float64] = rows.sum(axis=0, dtype=np.float64)
+        return votes
