@@ -142,6 +142,7 @@ def test_rooms_all_alike_are_not_one_room():
     dataset = Synthetic("rooms", count=45)
     run = Run([dataset.frame(index) for index in range(45)])
     assert run.closing.counts.verified > 30
+    assert run.closing.relocalise(dataset.frame(20)) is None
     assert run.closing.consensus.refused["contradicts the odometry"] > 30
     assert run.loops == []
     assert run.corrections == []
@@ -362,6 +363,19 @@ def test_a_look_alike_nearby_makes_a_loop_doubtful():
     for new in range(50, 54):
         found += sure.hear([claim(new - 50, new), claim(new - 48, new, off=2.0)])
     assert len(found) == 4
+
+
+def test_loops_of_one_keyframe_that_contradict_each_other_are_both_refused():
+    consensus = Consensus(straight(60))
+    for new in range(50, 54):
+        assert consensus.hear([claim(new - 50, new), claim(new - 49, new, off=0.9)]) == []
+    assert consensus.refused == {"fits another place too": 4}
+
+
+def test_an_image_too_small_is_no_place():
+    frame = two_laps()[0]
+    tiny = replace(frame, depth=frame.depth[:8, :40].copy(), color=frame.color[:8, :40].copy())
+    assert view(tiny, tiny.depth_m) is None
 
 
 def test_a_place_seen_to_have_a_twin_is_doubtful_ever_after():
