@@ -25,7 +25,10 @@ from tsfusion.errors import InvalidConfig, OutputError
 Here = Callable[..., "subprocess.CompletedProcess[str]"]
 
 NOBODY = "tcp://127.0.0.1:9"  # the discard port: nobody listens there, and nobody may without being root
-VERBS = ["demo", "replay", "serve", "mesh", "status", "doctor", "keys", "journal", "config", "datasets"]
+VERBS = [
+    "demo", "replay", "scan", "check", "serve", "mesh", "status", "ate", "doctor", "download", "keys",
+    "journal", "config", "datasets",
+]  # fmt: skip
 
 
 def scene(folder: Path, *, pose: str | None = None, depth: bytes | None = None) -> Path:
@@ -399,3 +402,25 @@ def test_every_verb_that_fuses_takes_the_map_flags(verb: str) -> None:
     shown = tsfusion(verb, "--help").stdout
     for option in MAP_OPTIONS.values():
         assert option.__metadata__[0].default.partition("/")[0] in shown
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("depth_topic", "--option must be KEY=VALUE, such as time_offset_s=0.02, got 'depth_topic'"),
+        ("=3", "--option must be KEY=VALUE"),
+        ("focal=3", "a synthetic dataset takes no `focal`"),
+        ("count=0", "expected count >= 1"),
+        ("path=spiral", "path must be one of circle, tour"),
+    ],
+)
+def test_a_wrong_option_of_a_dataset(here: Here, given: str, words: str) -> None:
+    for verb in (["replay", "synthetic:room"], ["scan", "--source", "synthetic:room"]):
+        assert words in one_line(here(*verb, "--option", given))
+
+
+def test_options_of_a_dataset() -> None:
+    from tsfusion.cli import options
+
+    parsed = options.dataset_options(["noise=maybe", "seed=3", "color=false", "poses=a=b"])
+    assert parsed == {"noise": "maybe", "seed": 3, "color": False, "poses": "a=b"}

@@ -570,6 +570,30 @@ def own(box: Outbox, poses: Mapping[int, Any]) -> SessionCorrections:
     return said(poses, session=box.spool.session)
 
 
+def test_a_spool_that_has_more_to_say_keeps_its_session(tmp_path: Path) -> None:
+    """Though every file is full, and every keyframe at the server."""
+
+    def emptied(*, corrects: bool) -> bytes:
+        box = Outbox(Spool(tmp_path, 1))
+        entry = box.spool.write(codec.encode(wall(), session=box.spool.session, seq=1, jpeg_quality=90))
+        with box.changed:
+            box.add(entry, wall())
+            if corrects:
+                box.correcting.save(box.correcting.add(own(box, {entry.seq: pose(1)})))
+            box.progress(entry.seq, 0)
+            box.spool.tidy()
+        box.spool._lock.close()  # it dies
+        return box.spool.session
+
+    before = emptied(corrects=False)
+    assert not list(tmp_path.glob("*.mcap"))
+    assert emptied(corrects=True) != before
+    assert len(list(tmp_path.glob("*.mcap"))) == 1
+    left = Outbox(Spool(tmp_path, 1))
+    assert left.correcting.pending == 1
+    left.spool.close()
+
+
 def test_a_correction_waits_for_its_keyframes(tmp_path: Path) -> None:
     with outbox(tmp_path) as box:
         talk = box.correcting
@@ -629,6 +653,7 @@ def test_who_has_to_wait_says_the_same_again(tmp_path: Path) -> None:
         talk.add(own(box, {1: pose(1)}))
         frames = talk.message(3, now=0.0)
         talk.turned_away(1, "quota", "slower", 2.0, now=1.0)
+        assert talk.held == "they have to wait (quota): slower"
         assert talk.message(3, now=2.9) == []
         assert talk.message(3, now=3.0) == frames
         talk.turned_away(1, "disk", "full", 1e300, now=4.0)

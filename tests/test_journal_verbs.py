@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from commands import end, started, tsfusion
 from mcap.reader import make_reader
-from wire import wall
+from wire import pose, wall
 
-from tsfusion import codec, journal
+from tsfusion import codec, corrections, journal, se3
 from tsfusion.cli import main
+from tsfusion.corrections import SessionCorrections
 from tsfusion.errors import JournalError
 from tsfusion.journal import Journal, segment_path
 from tsfusion.journal.places import find
@@ -119,6 +120,22 @@ def test_a_path_without_a_journal_says_what_was_expected(state: Path, tmp_path: 
 
 
 # --- info ---
+
+
+def test_info_says_what_is_corrected(state: Path, run: Run) -> None:
+    folder = state / "maps" / "hall" / "corrections"
+    folder.mkdir()
+    seqs, poses = corrections.checked({2: se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2])), 3: pose(0.12, 4.0)})
+    path = folder / "a.tsc"
+    corrections.write(path, SessionCorrections(session=ANNA, seqs=seqs, poses=poses, revision=7))
+    _, out, _ = run("info", state)
+    (anna,) = [line for line in out.splitlines() if " anna " in line]
+    assert anna.endswith("2 corrected by up to 4 m, 90° (revision 7)")
+    assert "corrected" not in next(line for line in out.splitlines() if " bob " in line)
+    path.write_bytes(path.read_bytes()[:-1])
+    status, out, _ = run("info", state)
+    assert status == 0
+    assert "damage  corrections, byte 0: " in out
 
 
 def test_info_counts_what_is_there(state: Path, run: Run) -> None:

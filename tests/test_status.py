@@ -55,6 +55,14 @@ def asking(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
     signal.signal(signal.SIGTERM, handler)
 
 
+def test_a_screen_shows_corrections_where_there_are_any() -> None:
+    told = health(client("cart", revision=3, corrected=120), client("drone"))
+    lines = [line.split() for line in shown(Look(address="tcp://host:5555", health=told)).splitlines()]
+    assert next(words[-1] for words in lines if words[:1] == ["client"]) == "corrected"
+    assert next(words[-1] for words in lines if words[:1] == ["cart"]) == "120"
+    assert "corrected" not in shown(Look(address="tcp://host:5555", health=health(client("drone"))))
+
+
 def test_a_screen_shows_it_all() -> None:
     yard = map_health(
         state="busy", keyframes_durable=1204, keyframes_fused=1191, waiting=12, fuser_restarts=2,

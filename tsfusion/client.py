@@ -181,9 +181,10 @@ class Client:
         if refusal:
             raise KeyframeRefused(refusal)
         if not done:
-            waiting, pending = len(box.spool.waiting), box.correcting.pending
-            what = f"{waiting} keyframes" if waiting else f"corrections of {pending} keyframes"
-            raise FlushTimeout(f"{what} are not acknowledged after {timeout:g} s: {self._why()}")
+            what, why = f"{len(box.spool.waiting)} keyframes", self._why()
+            if not box.spool.waiting:
+                what, why = f"corrections of {box.correcting.pending} keyframes", box.correcting.held or why
+            raise FlushTimeout(f"{what} are not acknowledged after {timeout:g} s: {why}")
 
     def wait_fused(self, timeout: float = 60.0) -> None:
         """Wait until the map has taken or rejected everything sent (`stats.rejected` says what).

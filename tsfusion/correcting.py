@@ -33,13 +33,14 @@ class Correcting:
             server's disk with all they named, or what was said of it since.
         refused: messages that the server will never take, by reason.
         refusal: the first that nobody was told of, in words; empty = none.
+        held: why the server does not take any for now; empty = it said nothing of that.
     """
 
     def __init__(self, spool: Spool) -> None:
         self.wanted: bool | None = None
         self.taken = self.acknowledged = 0
         self.refused: Counter[str] = Counter()
-        self.refusal = ""
+        self.refusal = self.held = ""
         self._spool = spool
         self._path = spool.folder / NAME
         self._pending = self._left()
@@ -159,6 +160,7 @@ class Correcting:
     def told(self, revision: int, now: float) -> None:
         """This revision is on the server's disk."""
         self._revision = max(self._revision, revision)
+        self.held = ""
         if self._under_way is None:
             return
         if revision == self._under_way.revision:
@@ -174,7 +176,7 @@ class Correcting:
             return
         if again_s > 0:
             self._due = now + min(max(again_s, _HOLD[0]), _HOLD[1])
-            log.info("corrections have to wait (%s): %s", reason, message)
+            self.held = f"they have to wait ({reason}): {message}"
             return
         log.error("corrections of %d keyframes are lost (%s): %s", len(self._under_way), reason, message)
         self.refused[reason] += 1

@@ -178,9 +178,7 @@ def pack(corrections: SessionCorrections) -> list[bytes]:
 
 
 def unpack(head: Corrections, frames: Sequence[Any]) -> SessionCorrections:
-    """The content of a message, its head decoded.
-
-    Nothing is allocated before the lengths are known to agree.
+    """The content of a message, its head decoded. Nothing is allocated before the lengths agree.
 
     Raises:
         Refused: `size`, `crc` or `values`: numbers that do not rise from 1, a pose that is not finite, or
@@ -204,13 +202,9 @@ def unpack(head: Corrections, frames: Sequence[Any]) -> SessionCorrections:
         raise Refused(
             "values", f"the corrected pose of keyframe {seq} is no rigid transform, exact to {_EXACT}"
         )
+    T = _transform(head.T_map_odometry)
     return SessionCorrections(
-        session=head.session,
-        seqs=seqs,
-        poses=poses,
-        T_map_odometry=_transform(head.T_map_odometry),
-        revision=head.revision,
-        map=head.map,
+        session=head.session, seqs=seqs, poses=poses, T_map_odometry=T, revision=head.revision, map=head.map
     )
 
 

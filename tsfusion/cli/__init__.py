@@ -14,6 +14,7 @@ import typer
 
 from tsfusion.cli import (
     ate,
+    check,
     config,
     datasets,
     doctor,
@@ -42,6 +43,7 @@ app = typer.Typer(
 app.command()(replay.demo)
 app.command()(replay.replay)
 app.command()(scan.scan)
+app.command()(check.check)
 app.command()(serve.serve)
 app.command()(mesh.mesh)
 app.command()(status.status)

@@ -108,6 +108,13 @@ ServerKey = Annotated[
         help="That server's public key: a file, or the 40 characters.",
     ),
 ]  # fmt: skip
+DatasetOptions = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--option", metavar="KEY=VALUE", rich_help_panel="Dataset",
+        help="A setting of the dataset's class, such as depth_topic=/camera/depth; may be repeated.",
+    ),
+]  # fmt: skip
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for a program to read.")]
 
 
@@ -150,6 +157,28 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
         client=loaded.client,
         scan=loaded.scan,
     )
+
+
+def dataset_options(given: list[str] | None) -> dict[str, Any]:
+    """`KEY=VALUE` each; numbers, true, false and lists as in JSON, anything else is text.
+
+    Raises:
+        InvalidConfig: for one that is not.
+    """
+    import json
+
+    from tsfusion.errors import InvalidConfig
+
+    found: dict[str, Any] = {}
+    for each in given or ():
+        key, equals, value = each.partition("=")
+        if not key.isidentifier() or not equals:
+            raise InvalidConfig(f"--option must be KEY=VALUE, such as time_offset_s=0.02, got {each!r}")
+        try:
+            found[key] = json.loads(value)
+        except ValueError:
+            found[key] = value
+    return found
 
 
 def local(client: "ClientConfig") -> "ClientConfig":

@@ -63,9 +63,13 @@ def replay(
     unpack: Annotated[
         bool, typer.Option("--unpack", rich_help_panel=_DATASET, help="Unpack an archive beside itself.")
     ] = False,
+    option: options.DatasetOptions = None,
     state: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Keep the own server's journal and map here.")
     ] = None,
+    check_: Annotated[
+        bool, typer.Option("--check/--no-check", help="Warn when the dataset's poses and depth disagree.")
+    ] = True,
     config: options.ConfigFile = None,
     json: options.Json = False,
     **settings: Any,
@@ -80,7 +84,10 @@ def replay(
         )  # fmt: skip
     else:
         options.refuse(context, ("control", "key", "server_key"), "has no effect without --connect")
-    dataset = open_recording(path, unpack=unpack, sequence=sequence, modality=modality, poses=poses)
+    dataset = open_recording(
+        path, unpack=unpack, sequence=sequence, modality=modality, poses=poses,
+        **options.dataset_options(option),
+    )  # fmt: skip
     chosen = options.configuration(
         config, preset={"sensor": dataset.sensor}, **settings,
     )  # fmt: skip
@@ -88,13 +95,15 @@ def replay(
         dataset = select(dataset, start=start, stride=stride, limit=max_keyframes)
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count} frames {reason}", err=True)
+    if check_:
+        _warn(dataset)
     _run(
         dataset, out, chosen, connect=connect, control=control, map_=map_, rate=rate, state=state, json=json,
         min_weight=settings["min_weight"], key=key, server_key=server_key,
     )  # fmt: skip
 
 
-def open_recording(path: Path, *, unpack: bool = False, **given: Any) -> "Dataset":
+def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dataset":
     """A dataset, or a journal; `given` are settings of a dataset, None = left out."""
     if _is_journal(path):
         from tsfusion.errors import DatasetError
@@ -119,6 +128,15 @@ def _is_journal(path: Path) -> bool:
     if maps.is_state(path) or any(path.glob("journal/*.mcap")):
         return True
     return (path.suffix == ".mcap" or any(path.glob("*.mcap"))) and not bags.recognises(path)
+
+
+def _warn(dataset: "Dataset") -> None:
+    """One line on stderr when poses and depth disagree."""
+    from tsfusion.datasets import consistency
+
+    report = consistency.check(dataset)
+    if report.verdict == "disagree":
+        typer.echo(f"warning: {report.text}", err=True)
 
 
 @options.takes_map_settings

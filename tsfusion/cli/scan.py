@@ -43,6 +43,7 @@ def scan(
     stride: Annotated[int, _option(_SOURCE, "N", "Every N-th frame.", min=1)] = 1,
     sequence: Annotated[str | None, _option(_SOURCE, "NN", "KITTI: the sequence.")] = None,
     modality: Annotated[str | None, _option(_SOURCE, "KIND", "KITTI: stereo or lidar.")] = None,
+    option: options.DatasetOptions = None,
     localizer: Annotated[
         str | None,
         _option(
@@ -56,6 +57,13 @@ def scan(
     ] = None,
     feed: Annotated[
         str | None, _option(_POSES, "ADDRESS", "Poses of another SLAM, live: tcp://… it is heard at.")
+    ] = None,
+    time_offset: Annotated[
+        float | None,
+        _option(_POSES, "SECONDS", "Added to a frame's time before its pose is looked up there."),
+    ] = None,
+    max_gap: Annotated[
+        float | None, _option(_POSES, "SECONDS", "Between two such poses; across a longer gap there is none.")
     ] = None,
     loop_closure: Annotated[
         bool | None,
@@ -108,7 +116,7 @@ def scan(
     from tsfusion.cli import show, show_scan
     from tsfusion.config import override
 
-    recording = {"sequence": sequence, "modality": modality}
+    recording = {"sequence": sequence, "modality": modality, **options.dataset_options(option)}
     opened = _open(
         context, source, recording, calibration=calibration, rate=rate,
         part={"start": start, "stride": stride, "limit": max_frames},
@@ -117,6 +125,7 @@ def scan(
         chosen = options.configuration(config, preset={"sensor": opened.sensor}, **settings)
         rules = override(
             chosen.scan, localizer=localizer, trajectory=trajectory, feed=feed, loop_closure=loop_closure,
+            time_offset=time_offset, max_gap=max_gap,
             patience=patience, min_overlap=min_overlap, distance=distance, angle=angle, max_rate=max_rate,
         )  # fmt: skip
         client = override(chosen.client, control=control, map=map_, key=key, server_key=server_key)
@@ -147,7 +156,9 @@ def _open(
 
     if sources.is_live(spec):
         options.refuse(
-            context, (*recording, "rate", "start", "stride"), "is for recordings, and this source is live"
+            context,
+            ("sequence", "modality", "option", "rate", "start", "stride"),
+            "is for recordings, and this source is live",
         )
         live = sources.open_source(spec, calibration=calibration)
         return live if part["limit"] is None else Limited(live, part["limit"])

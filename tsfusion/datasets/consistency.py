@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Do poses and depth agree? Frames are projected into their neighbours; if they do not fit, why not?
 
-A usual mistake (poses inverted, OpenGL axes, wrong units, …) is named when the poses it stands for fit clearly
-better than those given. Poses that no such mistake explains are moved a little to see whether the
+A usual mistake (poses inverted, OpenGL axes, wrong units, …) is named when the poses it stands for fit
+clearly better than those given. Poses that no such mistake explains are moved a little to see whether the
 measurements could fit better than they do. Where the sensor hardly moves, or frames share nothing, nobody can
 tell, and that is what is said.
 """
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tsfusion import se3
 from tsfusion.datasets.base import Dataset, frame_of
-from tsfusion.datasets.mistakes import MISTAKES, SCALES
+from tsfusion.datasets.mistakes import MISTAKES, SCALES, scale_text
 from tsfusion.datasets.poses import Pose
 from tsfusion.datasets.views import View, view_of
 
@@ -36,6 +36,7 @@ _SUSPICIOUS = 0.97
 _SHIFTS = 8  # frames that poses are tried early or late
 _SHIFT_PAIRS = 2
 _SHIFT_CLEARLY = 0.05
+_SHIFT_SHARE = 0.7  # of what small corrections reach
 _WIDEST = np.log(12)  # of the factors tried beside the known ones
 _STEPS = 61
 _AS_GOOD = 0.02
@@ -55,6 +56,7 @@ class Report:
         verdict: `disagree` only when it is sure.
         text: a sentence or two: what is wrong and what to do.
         mistake: short name of it: one of `MISTAKES`, `scale`, `time`, `unexplained`; None when they agree.
+        alternatives: other mistakes that would explain these frames as well.
         factor: for `scale`, what translations must be multiplied by.
         shift: for `time`, frames later whose pose each frame should have.
         pairs: of frames compared.
@@ -66,6 +68,7 @@ class Report:
     verdict: Verdict
     text: str
     mistake: str | None = None
+    alternatives: tuple[str, ...] = ()
     factor: float | None = None
     shift: float | None = None
     pairs: int = 0
@@ -77,7 +80,7 @@ class Report:
 def check(dataset: Dataset) -> Report:
     """Compare some neighbouring frames of a dataset under its poses and under those of usual mistakes.
 
-    Takes a second or less; reads about 20 frames, some more if there is a reason to suspect their times.
+    Takes about a second, of a LiDAR two; reads about 20 frames, more where their times are suspect.
 
     Raises:
         DatasetError: a frame cannot be read.
@@ -85,10 +88,10 @@ def check(dataset: Dataset) -> Report:
     pairs = _pairs(dataset)
     if not pairs:
         return Report("cannot tell", "no two frames with a pose and a measurement")
-    given = _fits(pairs, _Pair.motion)
-    best = np.array([_refined(pair, fit) for pair, fit in zip(pairs, given, strict=True)])
-    tried = {mistake.name: _fits(pairs, partial(_Pair.motion, meant=mistake.meant)) for mistake in MISTAKES}
-    factor, scaled = _best_scale(pairs)
+    motions = [pair.motion() for pair in pairs]
+    given = _fits(pairs, motions)
+    best = _refined(pairs, motions)
+    tried = {mistake.name: _fits(pairs, [p.motion(mistake.meant) for p in pairs]) for mistake in MISTAKES}
     report = partial(
         Report,
         pairs=len(pairs),
@@ -96,14 +99,22 @@ def check(dataset: Dataset) -> Report:
         best_fit=_mean(best, best >= _FITS),
         tried={name: _mean(fits, np.maximum(fits, given) >= _FITS) for name, fits in tried.items()},
     )
-    found = max(MISTAKES, key=lambda mistake: _gain(tried[mistake.name], given))
-    gains = {"mistake": _gain(tried[found.name], given), "scale": _gain(scaled, given)}
-    if gains["mistake"] > 0 and gains["mistake"] >= gains["scale"]:
-        return report(verdict="disagree", text=f"poses and depth disagree: {found.text}", mistake=found.name)
-    if gains["scale"] > 0:
-        return report(verdict="disagree", text=_scale_text(factor), mistake="scale", factor=factor)
+    factor, scaled = _best_scale(pairs, motions)
+    gains, scale_gain = {name: _gain(fits, given) for name, fits in tried.items()}, _gain(scaled, given)
+    gain = max(gains.values())
+    likely = [mistake for mistake in MISTAKES if gains[mistake.name] > gain - _AS_GOOD]
+    if gain > 0 and gain >= scale_gain and _explains(pairs, [p.motion(likely[0].meant) for p in pairs]):
+        alternatives = tuple(mistake.name for mistake in likely[1:])
+        return report(
+            verdict="disagree",
+            text=f"poses and depth disagree: {likely[0].text}" + _or(alternatives),
+            mistake=likely[0].name,
+            alternatives=alternatives,
+        )
+    if scale_gain > 0 and _explains(pairs, [_stretched(motion, factor) for motion in motions]):
+        return report(verdict="disagree", text=scale_text(factor), mistake="scale", factor=round(factor, 4))
     told = _told(given, best)
-    if told < _SUSPICIOUS and (late := _time_shift(dataset, pairs)) is not None:
+    if told < _SUSPICIOUS and (late := _time_shift(dataset, pairs, best)) is not None:
         return report(verdict="disagree", text=_time_text(dataset, late), mistake="time", shift=late)
     if told < _LOST:
         return report(verdict="disagree", text=_UNEXPLAINED, mistake="unexplained")
@@ -158,8 +169,8 @@ def _seen(dataset: Dataset, index: int) -> tuple[Pose, View] | None:
     return None if view is None or frame.T_world_camera is None else (frame.T_world_camera, view)
 
 
-def _fits(pairs: list[_Pair], motion: Callable[[_Pair], Motion]) -> NDArray[np.float64]:
-    return np.array([pair.fit(motion(pair)) for pair in pairs])
+def _fits(pairs: list[_Pair], motions: list[Motion]) -> NDArray[np.float64]:
+    return np.array([pair.fit(motion) for pair, motion in zip(pairs, motions, strict=True)])
 
 
 def _gain(fits: NDArray[np.float64], given: NDArray[np.float64]) -> float:
@@ -171,30 +182,42 @@ def _gain(fits: NDArray[np.float64], given: NDArray[np.float64]) -> float:
     return gain if gain > _CLEARLY else 0.0
 
 
-def _best_scale(pairs: list[_Pair]) -> tuple[float, NDArray[np.float64]]:
-    """The factor on translations that fits best, a known one if it is as good, and its fits."""
+def _best_scale(pairs: list[_Pair], motions: list[Motion]) -> tuple[float, NDArray[np.float64]]:
+    """The factor on translations that fits best, a usual one if it is as good, and its fits.
 
-    def fits(factor: float) -> NDArray[np.float64]:
-        return _fits(pairs, lambda pair: _stretched(pair.motion(), factor))
+    Translations that fit as well when left out have no scale: 1, and fits of 0.
+    """
 
-    known = {factor: fits(factor) for factor, _ in SCALES}
-    others = {factor: fits(factor) for factor in np.exp(np.linspace(-_WIDEST, _WIDEST, _STEPS)).tolist()}
-    usual = max(known, key=lambda factor: known[factor].mean())
-    best = max(others, key=lambda factor: others[factor].mean())
-    if known[usual].mean() > others[best].mean() - _AS_GOOD:
-        return usual, known[usual]
-    return best, others[best]
+    def best_of(factors: list[float]) -> tuple[float, float, NDArray[np.float64]]:
+        fits = [_fits(pairs, [_stretched(motion, factor) for motion in motions]) for factor in factors]
+        best = max(range(len(factors)), key=lambda index: fits[index].mean())
+        return float(fits[best].mean()), factors[best], fits[best]
+
+    usual = best_of([factor for factor, _ in SCALES])
+    coarse = np.linspace(-_WIDEST, _WIDEST, _STEPS)
+    other = best_of(np.exp(coarse).tolist())
+    other = best_of(
+        (other[1] * np.exp(np.linspace(coarse[0] - coarse[1], coarse[1] - coarse[0], 9))).tolist()
+    )
+    score, factor, fits = usual if usual[0] > other[0] - _AS_GOOD else other
+    if score < best_of([0.0])[0] + _AS_GOOD:
+        return 1.0, np.zeros(len(pairs))
+    return factor, fits
 
 
 def _stretched(motion: Motion, factor: float) -> Motion:
-    stretched = motion.copy()
+    stretched: Motion = np.array(motion)
     stretched[:3, 3] *= factor
     return stretched
 
 
-def _refined(pair: _Pair, fit: float) -> float:
-    """The fit after small corrections of the motion (hill climbing); 0 where there is nothing to correct."""
-    motion, best = pair.motion(), fit
+def _refined(pairs: list[_Pair], motions: list[Motion]) -> NDArray[np.float64]:
+    return np.array([_climbed(pair, motion) for pair, motion in zip(pairs, motions, strict=True)])
+
+
+def _climbed(pair: _Pair, motion: Motion) -> float:
+    """The fit after small corrections of a motion (hill climbing); 0 where there is nothing to correct."""
+    best = pair.fit(motion)
     if best == 0:
         return 0.0
     steps = np.array([_STEP * pair.by.range_m] * 3 + [_STEP] * 3)
@@ -211,16 +234,22 @@ def _refined(pair: _Pair, fit: float) -> float:
     return best
 
 
+def _explains(pairs: list[_Pair], motions: list[Motion]) -> bool:
+    """Whether motions leave little to be corrected."""
+    return _told(_fits(pairs, motions), _refined(pairs, motions)) >= _LOST
+
+
 def _told(given: NDArray[np.float64], best: NDArray[np.float64]) -> float:
     """Share of what corrections reach that the given poses reach already; 1 where nothing can be told."""
     telling = best >= _FITS
     return float(given[telling].sum() / best[telling].sum()) if telling.any() else 1.0
 
 
-def _time_shift(dataset: Dataset, pairs: list[_Pair]) -> int | None:
+def _time_shift(dataset: Dataset, pairs: list[_Pair], best: NDArray[np.float64]) -> int | None:
     """Frames later whose poses fit clearly better, None where there are none."""
     gap = next((gap for gap in (4, 1) if any(p.second - p.first == gap for p in pairs)), None)
-    chosen = [pair for pair in pairs if pair.second - pair.first == gap][:: max(1, _ANCHORS // 2)]
+    indices = [index for index, pair in enumerate(pairs) if pair.second - pair.first == gap][::2]
+    chosen, reachable = [pairs[index] for index in indices], best[indices]
     poses: dict[int, Pose | None] = {}
 
     def pose(index: int) -> Pose | None:
@@ -235,28 +264,23 @@ def _time_shift(dataset: Dataset, pairs: list[_Pair]) -> int | None:
             for pair, (first, second) in zip(chosen, moved, strict=True)
         ])  # fmt: skip
 
-    given, best = fits(0), (0.0, 0)
+    given, found = fits(0), (0.0, 0)
     for late in sorted(range(-_SHIFTS, _SHIFTS + 1), key=abs):
         moved = fits(late)
         known = np.isfinite(moved)
         if known.sum() >= _SHIFT_PAIRS and (moved > given)[known].all():
-            best = max(best, (float((moved - given)[known].mean()), late))
-    return best[1] if best[0] > _SHIFT_CLEARLY else None
+            gain, missing = (float((each - given)[known].mean()) for each in (moved, reachable))
+            if gain > max(_SHIFT_CLEARLY, _SHIFT_SHARE * missing):
+                found = max(found, (gain, late))
+    return found[1] or None
+
+
+def _or(alternatives: tuple[str, ...]) -> str:
+    return f" (these would fit as well: {', '.join(alternatives)})" if alternatives else ""
 
 
 def _mean(values: NDArray[np.float64], where: NDArray[np.bool_]) -> float:
     return round(float(values[where].mean()), 3) if where.any() else 0.0
-
-
-def _scale_text(factor: float) -> str:
-    known = dict(SCALES)
-    if factor in known:
-        return f"poses and depth disagree: {known[factor]}"
-    size = f"{1 / factor:.3g} times too large" if factor < 1 else f"{factor:.3g} times too small"
-    return (
-        f"poses and depth disagree: the translations are {size} for the depth (no usual unit): check the depth "
-        "scale, the intrinsics and where the poses come from"
-    )
 
 
 def _time_text(dataset: Dataset, late: int) -> str:

@@ -36,15 +36,18 @@ def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
     v = rotation_vector(R)
     angle = float(np.linalg.norm(v))
     axis = v / angle if angle > 1e-12 else v
-    return np.append(axis * np.sin(angle / 2), np.cos(angle / 2))
+    return np.array([*(axis * np.sin(angle / 2)), np.cos(angle / 2)])
 
 
 def _turned(order: list[int]) -> Callable[[Pose], Pose]:
-    return lambda T: rigid(quaternion(T[:3, :3])[order], T[:3, 3])
+    def meant(T: Pose) -> Pose:
+        return rigid(quaternion(T[:3, :3])[order], T[:3, 3])
+
+    return meant
 
 
 def _conjugated(T: Pose) -> Pose:
-    meant = T.copy()
+    meant: Pose = np.array(T)
     meant[:3, :3] = T[:3, :3].T
     return meant
 
@@ -61,39 +64,39 @@ MISTAKES: tuple[Mistake, ...] = (
     ),
     Mistake(
         "opengl",
-        "the poses are of a camera with OpenGL axes (y up, z back); OpenCV's are expected (y down, z forward): "
+        "the poses are of a camera with OpenGL axes (y up, z back), not OpenCV's (y down, z forward): "
         "multiply each from the right by diag(1, -1, -1, 1)",
-        lambda T: T @ _OPENGL,
+        lambda T: np.asarray(T @ _OPENGL),
     ),
     Mistake(
         "inverse opengl",
         "the poses are world-to-camera and of a camera with OpenGL axes (a view matrix): invert each, then "
         "multiply from the right by diag(1, -1, -1, 1)",
-        lambda T: _inverse(T) @ _OPENGL,
+        lambda T: np.asarray(_inverse(T) @ _OPENGL),
     ),
     Mistake(
         "mirror",
         "one of depth and poses is mirrored up-down: fy should have the other sign (ICL-NUIM's is negative), "
         "or the poses are left-handed (Unity)",
-        lambda T: T @ _MIRROR,
+        lambda T: np.asarray(T @ _MIRROR),
     ),
     Mistake(
         "inverse mirror",
         "the poses are world-to-camera and mirrored up-down: invert each; fy should have the other sign, or "
         "they are left-handed (Unity)",
-        lambda T: _inverse(T) @ _MIRROR,
+        lambda T: np.asarray(_inverse(T) @ _MIRROR),
     ),
     Mistake(
         "body axes",
         "the poses are of a body with x forward and z up, the measurement of a camera with z forward: "
         "multiply each pose from the right by the camera's pose in the body",
-        lambda T: T @ _CAMERA_BODY.T,
+        lambda T: np.asarray(T @ _CAMERA_BODY.T),
     ),
     Mistake(
         "camera axes",
         "the poses are of a camera with z forward, the measurement of a sensor with x forward and z up: "
         "multiply each pose from the right by the sensor's pose in the camera (KITTI: Tr)",
-        lambda T: T @ _CAMERA_BODY,
+        lambda T: np.asarray(T @ _CAMERA_BODY),
     ),
     Mistake(
         "quaternion wxyz",
@@ -116,8 +119,7 @@ MISTAKES: tuple[Mistake, ...] = (
 SCALES: tuple[tuple[float, str], ...] = (
     (0.001, "the translations are in millimetres, metres are expected: divide them by 1000"),
     (0.01, "the translations are in centimetres, metres are expected: divide them by 100"),
-    (0.1, "depth is ten times too small (0.1 mm a unit read as 1 mm would be too large): "
-          "check the depth scale, or divide the translations by 10"),
+    (0.1, "depth is ten times too small, or the translations too large: check the depth scale"),
     (0.2, "depth is 5 times too small: its unit is 1 mm (1/1000) where 1/5000 was taken"),
     (1000 / 6553.5, "depth is 6.55 times too small: its unit is 1 mm (1/1000) where 1/6553.5 was taken"),
     (5.0, "depth is 5 times too large: its unit is 1/5000 m (TUM) where 1 mm (1/1000) was taken"),
@@ -126,3 +128,15 @@ SCALES: tuple[tuple[float, str], ...] = (
     (100.0, "the translations are 100 times too small, or depth is in centimetres where metres were taken"),
     (1000.0, "depth is 1000 times too large (millimetres taken for metres), or the translations too small"),
 )  # fmt: skip
+
+
+def scale_text(factor: float) -> str:
+    """What a factor on the translations says, and what to do."""
+    known = dict(SCALES)
+    if factor in known:
+        return f"poses and depth disagree: {known[factor]}"
+    size = f"{1 / factor:.3g} times too large" if factor < 1 else f"{factor:.3g} times too small"
+    return (
+        f"poses and depth disagree: the translations are {size} for the depth (no usual unit): check "
+        "the depth scale, the intrinsics and where the poses come from"
+    )

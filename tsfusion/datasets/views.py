@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Measured surfaces that others can be compared with: how far do moved points lie from what a frame saw?"""
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -22,6 +22,7 @@ _LIDAR_FLOOR = 0.04  # metres
 _CELL = 0.01  # of the range: points of a scan closer than that count as one
 _GROUND = 0.03  # of the range: thickness of the slice that holds the ground
 _FLAT = 0.25  # share of the points in one such slice that makes it the ground
+_TREE = 20_000  # points of a scan that others are compared with
 _EXACT_TREE = 4  # FLANN_INDEX_KDTREE_SINGLE
 
 
@@ -122,17 +123,29 @@ class _Scan:
         finite = finite[np.linalg.norm(finite, axis=1) > 1e-6]
         self.range_m = float(np.median(np.linalg.norm(finite, axis=1))) if len(finite) else 0.0
         kept = _thinned(_above_ground(finite, self.range_m), max(_CELL * self.range_m, 1e-6))
-        self._tree = (
-            cv2.flann_Index(kept.astype(np.float32), {"algorithm": _EXACT_TREE}) if len(kept) else None
-        )
-        self.points = kept[np.linspace(0, len(kept) - 1, min(_POINTS, len(kept))).astype(np.intp)]
+        kept = _spread(kept, _TREE)
+        self._tree = _tree(kept) if len(kept) else None
+        self._box = (kept.min(axis=0), kept.max(axis=0)) if len(kept) else (np.zeros(3), np.zeros(3))
+        self.points = _spread(kept, _POINTS // 2)
 
     def off(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         assert self._tree is not None
-        _, squared = self._tree.knnSearch(points.astype(np.float32), 1, params={})
-        tolerance = _LIDAR_FLOOR + 0.005 * self.range_m + 0.01 * np.linalg.norm(points, axis=1)
-        off: NDArray[np.float64] = np.sqrt(squared[:, 0]) / tolerance
-        return np.where(off < 20, off, np.inf)
+        near = ((points >= self._box[0]) & (points <= self._box[1])).all(axis=1)
+        off = np.full(len(points), np.inf)
+        if near.any():
+            _, squared = self._tree.knnSearch(points[near].astype(np.float32), 1, params={})
+            tolerance = _LIDAR_FLOOR + 0.005 * self.range_m + 0.01 * np.linalg.norm(points[near], axis=1)
+            off[near] = np.sqrt(squared[:, 0]) / tolerance
+        return off
+
+
+def _spread(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    return np.asarray(points[np.linspace(0, len(points) - 1, min(count, len(points))).astype(np.intp)])
+
+
+def _tree(points: NDArray[np.float64]) -> Any:
+    index: Any = cv2.flann_Index  # type: ignore[attr-defined]
+    return index(points.astype(np.float32), {"algorithm": _EXACT_TREE})
 
 
 def _above_ground(points: NDArray[np.float64], range_m: float) -> NDArray[np.float64]:
@@ -140,10 +153,10 @@ def _above_ground(points: NDArray[np.float64], range_m: float) -> NDArray[np.flo
         heights = np.round(points[:, axis] / max(_GROUND * range_m, 1e-9)).astype(np.int64)
         values, counts = np.unique(heights, return_counts=True)
         if len(values) and counts.max() > _FLAT * len(points):
-            return points[np.abs(heights - values[np.argmax(counts)]) > 1]
+            return np.asarray(points[np.abs(heights - values[np.argmax(counts)]) > 1])
     return points
 
 
 def _thinned(points: NDArray[np.float64], cell: float) -> NDArray[np.float64]:
     _, first = np.unique(np.round(points / cell).astype(np.int64), axis=0, return_index=True)
-    return points[np.sort(first)]
+    return np.asarray(points[np.sort(first)])

@@ -25,6 +25,7 @@ _PATIENCE = 10  # keyframes that loops which change little wait for the next opt
 _CHANGE = (0.04, np.radians(1.0))  # of metres and radians: a loop that changes more does not wait
 _THRIFT = 50  # with so many keyframes an optimisation costs as much as finding one's loops
 _RELOCALISED = 30  # matches that must agree where no odometry speaks for a place
+_ONE_PLACE = 0.3  # metres between what several of them say
 
 log = logging.getLogger(__name__)
 
@@ -64,6 +65,16 @@ class LoopClosing:
         self.absolute = localizer.absolute
         self._forget()
 
+    def _forget(self) -> None:
+        self._chain = Chain(self._drift)
+        self.consensus = Consensus(self._chain)
+        self._places = Places(self._capacity)
+        self._corrected: dict[int, Matrix] = {}
+        self.counts = Counts()
+        self._news = False
+        self._due = False
+        self._optimised_at = 0  # keyframes then
+
     def track(self, frame: Frame) -> Pose | Lost:
         """As the wrapped localizer says."""
         pose = self._localizer.track(frame)
@@ -98,28 +109,18 @@ class LoopClosing:
             result = verify.check(self._places.views[place], seen)
             if result.refused is None and result.T_old_new is not None and result.inliers >= _RELOCALISED:
                 found.append((place, result.T_old_new))
-        if not found:
+        if not found or not all(self.consensus.unique(place) for place, _ in found):
+            return None
+        poses = [self._corrected[place] @ T for place, T in found]
+        if any(se3.distance(se3.inverse(poses[0]) @ other) > _ONE_PLACE for other in poses[1:]):
             return None
         place, T = found[0]
-        positions = [self._corrected[other] @ T_other for other, T_other in found]
-        if any(se3.distance(se3.inverse(positions[0]) @ other) > 0.3 for other in positions[1:]):
-            return None  # alike places
         return Pose(
             T_world_camera=self._chain.poses[place] @ T,
             timestamp_ns=frame.timestamp_ns,
             anchor=place,
             T_anchor_camera=T,
         )
-
-    def _forget(self) -> None:
-        self._chain = Chain(self._drift)
-        self.consensus = Consensus(self._chain)
-        self._places = Places(self._capacity)
-        self._corrected: dict[int, Matrix] = {}
-        self.counts = Counts()
-        self._news: bool = False
-        self._due = False
-        self._optimised_at = 0  # keyframes then
 
     def _correction(self) -> Matrix:
         """`T_corrected_world` after the last keyframe."""

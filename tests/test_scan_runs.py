@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion scan` as users run it: processes, sockets, files, Ctrl-C."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from commands import end, environment, eventually, read_until, server, started, tsfusion
+from test_datasets import seven_scenes
+
+from tsfusion import open_dataset
+from tsfusion.datasets.poses import read_tum, write_tum
+from tsfusion.evaluation.unseen import compare_scans
+from tsfusion.fetch import fetch_status
+from tsfusion.recording import Recording
+
+VOXEL = 0.05
+SOURCE = "synthetic:room"
+# As on a robot without Taichi: importing it fails.
+BARE = "import sys; sys.modules['taichi'] = None; from tsfusion.__main__ import main; main(sys.argv[1:])"
+
+
+def recording(folder: Path, count: int = 12, *, broken: int | None = None) -> Path:
+    """The room's first frames of a slow walk, as a TUM recording with its true poses."""
+    room = open_dataset(SOURCE, count=150)
+    for name in ("depth", "rgb"):
+        (folder / name).mkdir(parents=True)
+    lists: dict[str, list[str]] = {"depth": [], "rgb": []}
+    stamps = [10**9 + index * 10**8 for index in range(count)]
+    for index, stamp in enumerate(stamps):
+        keyframe, seconds = room[index], f"{stamp / 1e9:.6f}"
+        depth = (keyframe.measurement // 2).astype(np.uint16)  # 0.1 mm to the layout's 0.2 mm
+        cv2.imwrite(str(folder / f"depth/{seconds}.png"), depth)
+        cv2.imwrite(str(folder / f"rgb/{seconds}.png"), keyframe.color)
+        for name, lines in lists.items():
+            lines.append(f"{seconds} {name}/{seconds}.png\n")
+    for name, lines in lists.items():
+        (folder / f"{name}.txt").write_text("".join(lines))
+    write_tum(folder / "groundtruth.txt", stamps, [room[index].T_world_camera for index in range(count)])
+    (folder / "camera-intrinsics.txt").write_text("292.5 0 159.5\n0 292.5 119.5\n0 0 1\n")
+    if broken is not None:
+        (folder / lists["depth"][broken].split()[1]).write_bytes(b"\x89PNG, but cut")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recording(tmp_path_factory.mktemp("walk") / "room")
+
+
+def figures(done: "subprocess.CompletedProcess[str]") -> dict[str, Any]:
+    assert done.returncode == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def scan(*arguments: object) -> "subprocess.CompletedProcess[str]":
+    return tsfusion("scan", "--voxel-size", VOXEL, *arguments)
+
+
+def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run = figures(scan("--source", walk, "--localizer", "rgbd", "--out", out, "--json"))
+    assert {path.name for path in out.iterdir()} == {
+        "mesh.ply", "mesh.glb", "preview.png", "delay.csv", "delay.png", "run.json", "trajectory.txt",
+        "keyframes.txt",
+    }  # fmt: skip
+    assert run == json.loads((out / "run.json").read_text())
+    assert (run["frames"], run["frames_tracked"], run["complete"], run["left"]) == (12, 12, True, 0)
+    assert run["localizer"] == "rgbd"
+    assert run["keyframes_sent"] == run["keyframes_fused"] == sum(run["keyframes_by_rule"].values()) >= 3
+    (found,) = run["maps"]
+    assert found["mesh"]["triangles"] > 1000
+    assert found["trajectory_error"]["rmse"] < 0.005
+    assert len(read_tum(out / "trajectory.txt").timestamps_ns) == 12
+    assert len(read_tum(out / "keyframes.txt").timestamps_ns) == run["keyframes_sent"]
+    assert cv2.imread(str(out / "preview.png")).std() > 5
+    shown = scan("--source", walk, "--localizer", "given", "--out", tmp_path / "given")
+    assert "12/12 localised by given" in shown.stdout
+    assert "rmse" in shown.stdout
+
+
+def test_without_taichi_to_a_server_elsewhere(walk: Path, tmp_path: Path) -> None:
+    with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, process):
+        command = ["scan", "--source", walk, "--connect", address, "--map", "hall",
+                   "--spool", tmp_path / "spool", "--out", tmp_path / "out", "--json"]  # fmt: skip
+        done = subprocess.run(
+            [sys.executable, "-c", BARE, *map(str, command)], capture_output=True, text=True, timeout=120,
+            env=environment(), check=False,
+        )  # fmt: skip
+        run = figures(done)
+        assert run["keyframes_durable"] == run["keyframes_sent"] >= 3
+        assert run["left"] == 0
+        assert not (tmp_path / "out" / "mesh.ply").exists()
+        assert run["peak_rss_bytes"]["client"] < 200e6
+        eventually(lambda: fetch_status(address, map_name="hall").keyframes_fused == run["keyframes_sent"])
+        sent = read_tum(tmp_path / "out" / "keyframes.txt")
+        again = tsfusion(
+            "scan", "--source", walk, "--connect", address, "--map", "hall", "--max-frames", 1,
+            "--spool", tmp_path / "spool", "--out", tmp_path / "out",
+        )  # fmt: skip
+        assert "give it a map of its own (--map NAME)" in again.stderr
+        assert end(process) == 0
+    stamps = [keyframe.timestamp_ns for keyframe in Recording(tmp_path / "state", "hall")]
+    assert stamps == [*sent.timestamps_ns, stamps[0]]
+
+
+def test_ctrl_c_without_a_server_keeps_all_for_the_next_scan(walk: Path, tmp_path: Path) -> None:
+    spool, nobody = tmp_path / "spool", "tcp://127.0.0.1:9"
+    process = started(
+        "scan", "--source", SOURCE, "--rate", 3, "--connect", nobody, "--spool", spool,
+        "--out", tmp_path / "out",
+    )  # fmt: skip
+    read_until(process, "no server answers")
+    assert end(process, signal.SIGINT) == 0
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert run["complete"]
+    assert 0 < run["frames"] < 40
+    assert run["left"] == run["keyframes_sent"] >= 1
+    assert len(Recording(spool / "default")) == run["left"]
+    with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, _):
+        more = figures(
+            tsfusion(
+                "scan", "--source", walk, "--max-frames", 3, "--connect", address, "--map", "walk",
+                "--spool", spool, "--out", tmp_path / "more", "--json",
+            )
+        )  # fmt: skip
+        assert more["left"] == 0
+        eventually(lambda: fetch_status(address).keyframes_durable == run["left"])
+
+
+def test_ctrl_c_ends_a_scan_with_its_results(tmp_path: Path) -> None:
+    process = started("scan", "--source", SOURCE, "--rate", 4, "--voxel-size", 0.1, "--out", tmp_path / "out")
+    read_until(process, "frames ")
+    read_until(process, "frames ")
+    assert end(process, signal.SIGINT) == 0
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert 0 < run["frames"] < 40
+    assert run["keyframes_fused"] == run["keyframes_sent"]
+    assert (tmp_path / "out" / "mesh.ply").exists()
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_a_recording_that_breaks_off_keeps_what_came_before(tmp_path: Path) -> None:
+    folder = recording(tmp_path / "broken", broken=7)
+    done = scan("--source", folder, "--out", tmp_path / "out")
+    assert done.returncode == 1
+    assert "cannot be decoded" in done.stderr.splitlines()[-1]
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert (run["frames"], run["complete"]) == (7, False)
+    assert (tmp_path / "out" / "mesh.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (["--source", "nowhere"], 1, "nowhere does not exist"),
+        (["--source", SOURCE, "--localizer", "trajectory"], 1, "needs --trajectory FILE"),
+        (["--source", SOURCE, "--localizer", "gps"], 1, "localizer must be one of auto, rgbd"),
+        (["--source", SOURCE, "--localizer", "lidar"], 1, "points"),
+        (["--source", SOURCE, "--spool", "spool"], 1, "--spool has no effect without --connect"),
+        (["--source", SOURCE, "--connect", "tcp://127.0.0.1:9", "--voxel-size", "1"], 1, "tsfusion serve"),
+        (["--source", "realsense", "--rate", "2"], 1, "--rate is for recordings"),
+        (["--source", SOURCE, "--calibration", "a.yaml"], 1, "--calibration is for a live camera"),
+        (["--source", "folder:nowhere"], 1, "nowhere"),
+        ([], 2, "--source"),
+    ],
+)
+def test_what_cannot_be_scanned_is_one_clear_line(
+    tmp_path: Path, arguments: list[str], status: int, words: str
+) -> None:
+    done = tsfusion("scan", *arguments, "--out", tmp_path / "out")
+    assert done.returncode == status
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_sensor_that_is_never_localised(tmp_path: Path) -> None:
+    seven_scenes(tmp_path / "flat", 4, (48, 64))  # no texture, nothing near enough to be seen
+    done = scan(
+        "--source", tmp_path / "flat", "--trajectory", tmp_path / "none.txt", "--out", tmp_path / "out"
+    )
+    assert done.returncode == 1
+    (tmp_path / "late.txt").write_text("5000 0 0 0 0 0 0 1\n5001 0 0 0 0 0 0 1\n")
+    done = scan(
+        "--source", tmp_path / "flat", "--trajectory", tmp_path / "late.txt", "--out", tmp_path / "out"
+    )
+    assert done.returncode == 1
+    assert "was not localised in any of 4 frames" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_client_is_light() -> None:
+    """What a scanner loads before its first frame; without the optional packages."""
+    program = (
+        "import resource, tsfusion.client; used = resource.getrusage(resource.RUSAGE_SELF);"
+        "from tsfusion import process; print(used.ru_utime + used.ru_stime, process.peak_rss_bytes())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+    )  # fmt: skip
+    _, rss = map(float, done.stdout.split())
+    assert rss < 100e6
+
+
+@pytest.mark.slow
+def test_a_mesh_with_poses_of_its_own_is_as_good_as_with_the_true_ones(data, tmp_path: Path) -> None:
+    kitchen = data("7scenes/redkitchen")
+    for name in ("rgbd", "given"):
+        run = figures(
+            tsfusion(
+                "scan", "--source", kitchen, "--localizer", name, "--voxel-size", 0.02,
+                "--out", tmp_path / name, "--json", timeout=400,
+            )
+        )  # fmt: skip
+        assert run["frames_tracked"] == 125
+    assert run["maps"][0]["trajectory_error"]["rmse"] < 1e-9
+    own, given = compare_scans(
+        open_dataset(kitchen), [tmp_path / "rgbd", tmp_path / "given"], voxel_size=0.02
+    )
+    assert own["median_mm"] <= 1.3 * given["median_mm"]
+    assert own["p90_mm"] <= 1.3 * given["p90_mm"]
+    assert own["predicted"] > 95

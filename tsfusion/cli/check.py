@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion check`."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tsfusion.cli import options, replay
+
+
+def check(
+    path: Annotated[
+        Path, typer.Argument(metavar="PATH", help="A dataset or a journal, as `tsfusion replay` takes it.")
+    ],
+    *,
+    sequence: Annotated[str | None, typer.Option(metavar="NN", help="KITTI: the sequence.")] = None,
+    modality: Annotated[str | None, typer.Option(metavar="KIND", help="KITTI: stereo or lidar.")] = None,
+    poses: Annotated[Path | None, typer.Option(metavar="FILE", help="KITTI: poses to use instead.")] = None,
+    json: options.Json = False,
+) -> None:
+    """See whether a dataset's poses and depth agree; if not, say why. Status 1 when they disagree."""
+    from tsfusion.cli import show
+    from tsfusion.datasets import consistency
+
+    dataset = replay.open_recording(path, sequence=sequence, modality=modality, poses=poses)
+    report = consistency.check(dataset)
+    if json:
+        show.as_json({"name": dataset.name, **asdict(report)})
+    else:
+        typer.echo(f"{dataset.name}: {report.text}")
+        if report.fit is not None:
+            typer.echo(f"{report.pairs} pairs of frames; fit as given {report.fit:.2f}, "
+                       f"after small corrections {report.best_fit:.2f} (1 = exact)")  # fmt: skip
+            for name, fit in sorted(report.tried.items(), key=lambda item: -item[1]):
+                typer.echo(f"  if {name:<16} {fit:.2f}")
+    if report.verdict == "disagree":
+        raise typer.Exit(1)
