@@ -268,7 +268,7 @@ def test_frames_without_a_depth_image_are_refused(fields, kind):
 
 @pytest.mark.slow
 def test_a_scanner_stays_small(kitchen, tmp_path):
-    """No Taichi, no more than 200 MB, and nothing that grows once the keyframes kept are as many as may be."""
+    """No Taichi, no more than 200 MB, and nothing that grows once as many keyframes are kept as may be."""
     for index in range(len(kitchen)):
         frame = kitchen.frame(index)
         cv2.imwrite(str(tmp_path / f"{index:03}.png"), frame.depth)
@@ -302,4 +302,3 @@ print(megabytes("VmHWM"), max(sizes[200:]) - max(sizes[:200]))
     peak, growth = map(float, done.stdout.split())
     assert peak < 200
     assert growth < 10
-    print(peak, growth)
