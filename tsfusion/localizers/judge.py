@@ -63,8 +63,8 @@ class Evidence:
             return f"the image agrees by {self.likeness:.2f}, it must by {likeness:.2f} of 1"
         if self.uncertainty > _UNCERTAINTY:
             return (
-                f"the view leaves the pose open by {min(self.uncertainty, 9.99):.2f} m (a plain wall?), at most "
-                f"{_UNCERTAINTY:.2f} m is allowed"
+                f"the view leaves the pose open by {min(self.uncertainty, 9.99):.2f} m (a plain wall?), it may by "
+                f"{_UNCERTAINTY:.2f} m"
             )
         return None
 
