@@ -28,7 +28,9 @@ _LONGEST = 3.0  # times the interval before, over which a motion is taken to go 
 
 _OLDER = 2  # keyframes that take part beside the last one
 _OLDER_ANGLE = np.radians(60)
-_OLDER_OVERLAP, _OLDER_AGREEING, _OLDER_NEAR = 0.5, 0.75, 0.03  # shares; metres
+_OLDER_OVERLAP, _OLDER_AGREEING = 0.5, 0.75  # shares
+_NEAR = 0.03  # metres, and three deviations: depth that agrees before the pose is settled
+_WORSE, _FITS = 1.2, 0.3  # times the misfit without corners, and deviations: beyond, they are on what moves
 
 
 _NO_CORNERS = (np.empty((0, 3)), np.empty((0, 2), np.float32))
@@ -131,7 +133,9 @@ class RGBD:
         resected = features.resection(points, pixels, seen.intrinsics, guess=guess, tolerance=tolerance)
         agree = np.zeros(len(points), bool)
         if resected is not None and resected[1].sum() >= _INLIERS:
-            guess, agree = resected
+            before, after = (_misfit(seen, view, T) for T in (guess, resected[0]))
+            if after < _WORSE * before + _FITS:
+                guess, agree = resected
         points, pixels = points[agree], pixels[agree]
         links = [joint.Link(np.eye(4), view.seen.surface, points, pixels)]
         for older in self._older(seen, view.T_world_camera @ guess, view):
@@ -149,7 +153,7 @@ class RGBD:
             T_older_camera = se3.inverse(older.T_world_camera) @ T_world_camera
             if se3.angle(T_older_camera) < _OLDER_ANGLE:
                 found = icp.match(older.seen.surface, seen.surface, T_older_camera, some)
-                agree = np.abs(found.distance) < _OLDER_NEAR + 3 * found.sigma
+                agree = np.abs(found.distance) < _NEAR + 3 * found.sigma
                 enough = max(1.0, _OLDER_OVERLAP * len(some))
                 if len(agree) >= enough and agree.mean() >= _OLDER_AGREEING:
                     chosen.append(older)
@@ -193,3 +197,9 @@ class RGBD:
     def _lost(self, frame: Frame, reason: str) -> Lost:
         self._motion, self._is_lost = None, True
         return Lost(reason=reason, timestamp_ns=frame.timestamp_ns)
+
+
+def _misfit(seen: Seen, view: View, T_view_camera: Matrix) -> float:
+    """Median distance of the frame's points from the view's planes, in deviations of the sensor."""
+    found = icp.match(view.seen.surface, seen.surface, T_view_camera, seen.surface.every(4))
+    return float(np.median(np.abs(found.distance) / found.sigma)) if len(found.distance) else np.inf
