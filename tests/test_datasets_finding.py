@@ -5,9 +5,11 @@ import json
 import logging
 import re
 import shutil
+import struct
 import subprocess
 import sys
 import zipfile
+import zlib
 from pathlib import Path
 
 import cv2
@@ -275,6 +277,31 @@ def test_a_depth_image_of_the_wrong_kind_is_named(tmp_path):
     root = redwood(tmp_path, [0], [0])
     cv2.imwrite(str(root / "depth" / "00000.png"), np.zeros((6, 8), np.uint8))
     with pytest.raises(DatasetError, match="must hold one 16-bit channel"):
+        open_dataset(root)[0]
+
+
+def test_what_macos_puts_beside_files_is_no_recording(tmp_path):
+    redwood(tmp_path, [0, 1], [0, 1])
+    for path in [path for path in tmp_path.rglob("*") if path.is_file()]:
+        path.with_name(f"._{path.name}").write_bytes(b"\0\5\x16\7")
+    assert len(list(open_dataset(tmp_path))) == 2
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as packed:
+        for path in sorted(tmp_path.rglob("*.*")):
+            if path.suffix != ".zip":
+                place = "__MACOSX/depth" if path.name.startswith("._") else "recording"
+                packed.write(path, f"{place}/{path.relative_to(tmp_path)}")
+    assert len(open_dataset(tmp_path / "a.zip", unpack=True)) == 2
+
+
+@pytest.mark.parametrize("side", [20_000, 100_000])
+def test_an_image_that_claims_to_be_huge_is_named(tmp_path, side):
+    root = redwood(tmp_path, [0], [0])
+    depth = root / "depth" / "00000.png"
+    content = bytearray(depth.read_bytes())
+    struct.pack_into(">2I", content, 16, side, side)
+    struct.pack_into(">I", content, 29, zlib.crc32(content[12:29]))
+    depth.write_bytes(content)
+    with pytest.raises(DatasetError, match=r"00000\.png cannot be decoded; expected a 16-bit depth image"):
         open_dataset(root)[0]
 
 

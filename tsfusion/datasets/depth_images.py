@@ -96,8 +96,8 @@ def seen_by(
     return seen
 
 
-def images(where: Path, expected: str, pattern: str = "*") -> list[Path]:
-    """The images in a folder: by number where all names are numbers, else by name."""
+def images(where: Path, expected: str, pattern: str = "[!.]*") -> list[Path]:
+    """The images in a folder: by number where all names are numbers, else by name; no hidden ones (macOS)."""
     if not where.is_dir():
         raise DatasetError(f"{where} is missing; expected {expected}")
     found = sorted(path for path in where.glob(pattern) if path.suffix.lower() in SUFFIXES)

@@ -31,6 +31,7 @@ from tsfusion.errors import DatasetError
 GROUP = "tsfusion.datasets"
 
 _log = logging.getLogger(__name__)
+_MAC = "__MACOSX"  # what macOS puts into archives beside the recording
 _INDEX = (".txt", ".json", ".yaml", ".csv", ".freiburg")  # a file of these is taken for its folder
 
 
@@ -211,7 +212,11 @@ def _plugins() -> list[Layout]:
 
 def _folders_in(root: Path) -> list[Path]:
     try:
-        return sorted(child for child in root.iterdir() if child.is_dir())
+        return sorted(
+            child
+            for child in root.iterdir()
+            if child.is_dir() and not child.name.startswith(".") and child.name != _MAC
+        )
     except OSError as error:
         raise DatasetError(f"cannot read {root}: {error.strerror}") from error
 

@@ -168,7 +168,7 @@ def _color_folder(root: Path) -> Path | None:
 def _log(root: Path) -> Path | None:
     known = [root / name for name in _LOGS if (root / name).is_file()]
     named = [path for pattern in _LOG_NAMES for path in sorted(root.glob(pattern)) if path.is_file()]
-    return next(iter([*known, *named]), None)
+    return next((path for path in [*known, *named] if not path.name.startswith(".")), None)
 
 
 def _given(root: Path, trajectory: str | Path) -> Path:

@@ -8,11 +8,10 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets.base import checked_intrinsics, read_intrinsics, read_numbers
+from tsfusion.datasets.base import checked_intrinsics, decoded, read_intrinsics, read_numbers
 from tsfusion.errors import DatasetError
 from tsfusion.keyframe import Intrinsics
 
@@ -88,8 +87,7 @@ def whole_image(path: Path, flags: int) -> NDArray[Any] | None:
     raw = path.read_bytes()
     if not raw.endswith(_PNG_END if path.suffix == ".png" else _JPEG_END):
         return None
-    image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(raw, np.uint8), flags)
-    return image
+    return decoded(np.frombuffer(raw, np.uint8), flags)
 
 
 def whole_scan(path: Path) -> NDArray[np.float32] | None:
