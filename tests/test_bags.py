@@ -71,6 +71,17 @@ def only_depth(folder: Path, write: Callable[[BagWriter], None], **options: Any)
     return Bag(path, **options)
 
 
+def test_what_cannot_be_told_apart_or_is_of_another_size_is_counted(tmp_path: Path) -> None:
+    def write(bag: BagWriter) -> None:
+        for stamp in (T0 + 5, T0 + 5, T0 + 10**7):
+            bag.image(DEPTH, wall().measurement, "16UC1", stamp)
+        bag.image(DEPTH, np.ones((2 * SHAPE[0], SHAPE[1]), np.uint16), "16UC1", T0 + 2 * 10**7)
+
+    found = only_depth(tmp_path, write)
+    assert len(found) == 2
+    assert found.skipped == {f"of {DEPTH} with another's time": 1, f"of {DEPTH} that are broken": 1}
+
+
 # --- every form, and both kinds of sensors ---
 
 

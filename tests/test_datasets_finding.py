@@ -24,6 +24,7 @@ from test_datasets_tum import corbs
 from tsfusion.datasets import Dataset, Selection, describe, find, layouts, open_dataset, select
 from tsfusion.datasets.base import pose_of
 from tsfusion.errors import DatasetError
+from tsfusion.keyframe import Intrinsics
 
 
 def tum(root: Path) -> Path:
@@ -305,6 +306,15 @@ def test_an_image_that_claims_to_be_huge_is_named(tmp_path, side):
         open_dataset(root)[0]
 
 
+def test_a_depth_image_of_another_size_is_named(tmp_path):
+    dataset = open_dataset(redwood(tmp_path, [0, 1], [0, 1]))
+    assert dataset[0].shape == (6, 8)
+    for name, pixels in (("depth", np.ones((12, 16), np.uint16)), ("color", np.zeros((12, 16, 3), np.uint8))):
+        cv2.imwrite(str(tmp_path / name / "00001.png"), pixels)
+    with pytest.raises(DatasetError, match=r"00001\.png is 16×12, others are 8×6; expected one size"):
+        dataset[1]
+
+
 def command(*words: object) -> tuple[int, str, str]:
     """Exit status, output and messages of a command line."""
     done = subprocess.run(
@@ -334,3 +344,29 @@ def test_replay_says_what_it_found(tmp_path):
     assert first == "found: ScanNet scene0000_00, 3 RGB-D frames 160×120, all with poses"
     assert "sonar" in second
     assert (tmp_path / "scan" / "scene0000_00").is_dir()
+
+
+@pytest.mark.parametrize(
+    ("option", "expected"),
+    [
+        ({"depth_scale": "x"}, "`depth_scale` must be a number, got 'x'"),
+        ({"depth_scale": True}, "`depth_scale` must be a number, got True"),
+        ({"color": "False"}, "`color` must be true or false, got 'False'"),
+        ({"trajectory": ["a"]}, "`trajectory` must be text, got "),
+        ({"intrinsics": [1, 2]}, r"`intrinsics` must be four numbers, \[fx, fy, cx, cy\], got "),
+        ({"intrinsics": ["a", 2, 3, 4]}, "intrinsics must be four numbers"),
+    ],
+)
+def test_an_option_of_the_wrong_type_is_one_clear_line(tmp_path, option, expected):
+    with pytest.raises(DatasetError, match=expected) as caught:
+        open_dataset(redwood(tmp_path, [0], [0]), **option)
+    assert "\n" not in str(caught.value)
+
+
+def test_options_are_taken_as_they_were_meant(tmp_path):
+    redwood(tmp_path / "5", [0], [0])
+    dataset = open_dataset(tmp_path / "5", intrinsics=[500, 500, 3.5, 2.5], depth_scale=1)
+    assert dataset[0].intrinsics == Intrinsics(500, 500, 3.5, 2.5)
+    assert dataset[0].depth_scale == 1.0
+    with pytest.raises(DatasetError, match=r"5/17 is missing"):
+        open_dataset(tmp_path / "5", trajectory=17)

@@ -137,6 +137,7 @@ class Bag(Frames):
                 try:
                     if check is not None and message.stream.kind == chosen.main.kind:
                         check(message.content)
+                        chosen.check_size(message.stream, (message.content.height, message.content.width))
                     places[message.stream.topic].append(message.place)
                 except DatasetError as error:
                     broken[message.stream.topic] += 1
@@ -147,6 +148,8 @@ class Bag(Frames):
             if count:
                 self.skipped[f"of {topic} that are broken"] = count
         found = [_by_time(places[one.topic]) for one in used]
+        if repeated := len(places[chosen.main.topic]) - len(found[0]):
+            self.skipped[f"of {chosen.main.topic} with another's time"] = repeated
         return found[0], found[1] if len(found) > 1 else {}
 
     @property
@@ -230,6 +233,7 @@ class Bag(Frames):
         view = self._chosen.view
         assert view is not None
         depth = bag_messages.depth(content)
+        self._chosen.check_size(self._chosen.main, depth.shape)
         color = None if beside is None else bag_messages.color(beside)
         color_view = view if self._chosen.apart is None else self._chosen.apart.view
         if view.undistorter is not None:

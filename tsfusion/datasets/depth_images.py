@@ -44,12 +44,19 @@ class DepthImages(Frames):
         self.name, self.sensor, self.skipped, self.intrinsics = name, sensor, skipped, intrinsics
         self.depth_scale, self.timestamps_ns = depth_scale, timestamps_ns
         self._depth, self._color, self._poses = depth, color, poses
+        self._size: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return len(self._depth)
 
     def _frame(self, index: int) -> Frame:
         depth = read_depth(self._depth[index])
+        self._size = self._size or depth.shape
+        if depth.shape != self._size:
+            raise DatasetError(
+                f"{self._depth[index]} is {depth.shape[1]}×{depth.shape[0]}, others are "
+                f"{self._size[1]}×{self._size[0]}; expected one size, as there is one camera"
+            )
         color = self._color[index] if self._color else None
         return Frame(
             depth=depth,

@@ -9,7 +9,7 @@ import inspect
 import logging
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 from tsfusion.datasets import (
     archives,
@@ -27,11 +27,16 @@ from tsfusion.datasets import (
 )
 from tsfusion.datasets.base import Dataset
 from tsfusion.errors import DatasetError
+from tsfusion.keyframe import Intrinsics
 
 GROUP = "tsfusion.datasets"
 
 _log = logging.getLogger(__name__)
 _MAC = "__MACOSX"  # what macOS puts into archives beside the recording
+_TYPES = {
+    bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path",
+    Intrinsics: "four numbers, [fx, fy, cx, cy]",
+}  # fmt: skip
 _INDEX = (".txt", ".json", ".yaml", ".csv", ".freiburg")  # a file of these is taken for its folder
 
 
@@ -143,7 +148,30 @@ def opened(
     unknown = sorted(set(options) - set(known))
     if unknown:
         raise DatasetError(f"a {name} dataset takes no `{unknown[0]}`")
-    return opener(*places, **options)
+    parameters = inspect.signature(opener).parameters
+    given = {key: _typed(key, value, parameters[key].annotation) for key, value in options.items()}
+    return opener(*places, **given)
+
+
+def _typed(key: str, value: Any, annotation: Any) -> Any:
+    """An option as its parameter wants it: a number may be a name, four numbers may be intrinsics.
+
+    Raises:
+        DatasetError: it cannot be that; a parameter whose type is none of `_TYPES` takes anything.
+    """
+    wanted = [kind for kind in get_args(annotation) or (annotation,) if kind is not type(None)]
+    if not all(kind in _TYPES for kind in wanted):
+        return value
+    if isinstance(value, tuple(wanted)) and isinstance(value, bool) == (bool in wanted):
+        return value
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if float in wanted:
+            return float(value)
+        if str in wanted:
+            return str(value)
+    if Intrinsics in wanted and isinstance(value, list | tuple) and len(value) == 4:
+        return Intrinsics(*value)
+    raise DatasetError(f"`{key}` must be {_TYPES[wanted[0]]}, got {value!r}")
 
 
 def describe(dataset: Dataset) -> str:
