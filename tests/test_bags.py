@@ -71,6 +71,13 @@ def only_depth(folder: Path, write: Callable[[BagWriter], None], **options: Any)
     return Bag(path, **options)
 
 
+def test_images_of_a_late_clock_take_the_poses_of_their_time(tmp_path: Path) -> None:
+    found = only_depth(
+        tmp_path, lambda bag: bag.image(DEPTH, wall().measurement, "16UC1", T0 - 10**9), time_offset_s=1.05
+    )
+    assert np.allclose(found[0].T_world_camera[:3, 3], (pose(1.0) + pose(2.0))[:3, 3] / 2, atol=1e-6)
+
+
 def test_what_cannot_be_told_apart_or_is_of_another_size_is_counted(tmp_path: Path) -> None:
     def write(bag: BagWriter) -> None:
         for stamp in (T0 + 5, T0 + 5, T0 + 10**7):

@@ -16,8 +16,7 @@ from tsfusion import cli, se3
 from tsfusion.datasets import Dataset, Selection, Synthetic, open_dataset, select
 from tsfusion.datasets.base import Frames, frame_of
 from tsfusion.datasets.consistency import check
-from tsfusion.datasets.mistakes import quaternion
-from tsfusion.datasets.poses import Pose, rigid
+from tsfusion.datasets.poses import Pose, quaternion, rigid
 from tsfusion.frame import Frame
 from tsfusion.keyframe import Intrinsics
 
@@ -281,6 +280,8 @@ def test_verb_says_what_it_found(data: Data, capsys: pytest.CaptureFixture[str],
     assert json.loads(capsys.readouterr().out)["verdict"] == "agree"
     assert run("check", str(inverted(place, tmp_path))) == 1
     assert "world-to-camera" in capsys.readouterr().out
+    assert run("check", str(place), "--option", "depth_scale=0.0002") == 1
+    assert "depth is 5 times too small" in capsys.readouterr().out
 
 
 def inverted(place: Path, folder: Path) -> Path:

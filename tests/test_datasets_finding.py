@@ -141,6 +141,7 @@ def test_a_corbs_archive_is_unpacked_when_asked_to(tmp_path):
     dataset = open_dataset(archive, unpack=True)
     assert dataset.name == "CoRBS D1_pre_registereddata"
     assert (len(dataset), dataset.skipped, dataset.uncolored) == (4, {"without a pose in time": 1}, 1)
+    assert describe(dataset).endswith("all with poses, 1 without colour in time")
     assert float(dataset[1].depth[0, 0] * dataset[1].depth_scale) == pytest.approx(2)
     assert dataset[1].T_world_camera[0, 3] == pytest.approx(1.8)
     assert len(open_dataset(archive)) == 4  # its folder is there now
@@ -333,6 +334,12 @@ def test_the_command_lists_layouts_and_datasets(tmp_path):
     expected = f"{tmp_path}/a  ScanNet scene0000_00  kinect  4 keyframes\n"
     assert command("datasets", tmp_path) == (0, expected, "")
     assert json.loads(command("datasets", tmp_path, "--json")[1])[0]["name"] == "ScanNet scene0000_00"
+    tum(tmp_path / "b" / "rgbd")
+    status, listed, _ = command("datasets", tmp_path / "b")
+    assert (status, listed.split("  ", 1)[1]) == (
+        0,
+        "TUM rgbd  kinect  3 frames without poses, for `tsfusion scan`\n",
+    )
 
 
 def test_replay_says_what_it_found(tmp_path):

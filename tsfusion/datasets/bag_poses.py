@@ -9,10 +9,9 @@ import numpy as np
 
 from tsfusion.datasets.bag_reader import Message, Recording, Stream
 from tsfusion.datasets.bag_transforms import OLD_TF, PATH, POSE_KINDS, TF, Track, Transforms, track
+from tsfusion.datasets.base import SCAN
 from tsfusion.datasets.poses import Pose
 from tsfusion.errors import DatasetError
-
-_WITHOUT = "`tsfusion scan --source PATH` finds poses by itself"
 
 
 def pose_streams(recording: Recording, pose_topic: str | None) -> list[Stream]:
@@ -86,7 +85,7 @@ class PoseFinder:
         if required:
             raise DatasetError(
                 f"{self._path} tells no poses of {self._frame!r}: no changing transform and no topic of "
-                f"poses leads to it; {_WITHOUT}"
+                f"poses leads to it; {SCAN}"
             )
         return lambda _stamp: None
 

@@ -63,6 +63,7 @@ class Bag(Frames):
             has `rect`. Others are undistorted or rectified here (colour by its depth's camera).
         max_difference_s: between a depth image and its colour (default 20 ms), or left and right (5 ms).
         max_gap_s: between the two poses interpolated, seconds.
+        time_offset_s: added to a frame's stamp before its pose is looked up, seconds.
         posed: leave out frames without a pose; otherwise they have `T_world_camera` None.
 
     Raises:
@@ -89,6 +90,7 @@ class Bag(Frames):
         rectified: bool | None = None,
         max_difference_s: float | None = None,
         max_gap_s: float = 0.25,
+        time_offset_s: float = 0.0,
         sensor: str | None = None,
         color: bool = True,
         posed: bool = True,
@@ -116,7 +118,7 @@ class Bag(Frames):
         mains, others = self._index(poses)
         difference_s = _DIFFERENCE_S[chosen.modality] if max_difference_s is None else max_difference_s
         self._pair(mains, others, round(difference_s * 1e9))
-        self._pose(poses.finish(required=posed), posed)
+        self._pose(poses.finish(required=posed), round(time_offset_s * 1e9), posed)
         self._registration = self._register(poses)
         require_frames(len(self._mains), place, EXPECTED, self.skipped)
 
@@ -172,10 +174,10 @@ class Bag(Frames):
         self._mains = [mains[stamp] for stamp in stamps.tolist()]
         self._others = [others[int(there[i])] if ok else None for i, ok in zip(nearest, near, strict=True)]
 
-    def _pose(self, at: Callable[[int], Pose | None], posed: bool) -> None:
+    def _pose(self, at: Callable[[int], Pose | None], offset_ns: int, posed: bool) -> None:
         """Find the frames' poses; leave out those without."""
         assert self.timestamps_ns is not None
-        self._poses = [at(stamp) for stamp in self.timestamps_ns.tolist()]
+        self._poses = [at(stamp + offset_ns) for stamp in self.timestamps_ns.tolist()]
         rig = self._chosen.rig
         if rig is not None and rig.rectifier is not None:
             turned = rig.rectifier.T_left_rectified

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Depth images in one folder, colour images of the same names in another: common to many layouts."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets.base import Frames, read_color, read_depth
+from tsfusion.datasets.base import Frames, checked_intrinsics, read_color, read_depth
 from tsfusion.datasets.poses import Pose
 from tsfusion.errors import DatasetError
 from tsfusion.frame import Frame
@@ -109,6 +110,17 @@ def images(where: Path, expected: str, pattern: str = "[!.]*") -> list[Path]:
         raise DatasetError(f"{where} is missing; expected {expected}")
     found = sorted(path for path in where.glob(pattern) if path.suffix.lower() in SUFFIXES)
     return sorted(found, key=lambda path: int(path.stem)) if _numbered(found) else found
+
+
+def read_open3d_camera(path: Path) -> Intrinsics:
+    """Intrinsics of Open3D's `camera_intrinsic.json`."""
+    try:
+        K = json.loads(path.read_text(encoding="utf-8"))["intrinsic_matrix"]  # column-major
+        return checked_intrinsics(Intrinsics(float(K[0]), float(K[4]), float(K[6]), float(K[7])), path)
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        raise DatasetError(
+            f"{path} must be an Open3D camera with a 9-number intrinsic_matrix: {error}"
+        ) from error
 
 
 def matched(depth: list[Path], where: Path, expected: str) -> list[Path]:

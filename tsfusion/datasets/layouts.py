@@ -188,7 +188,9 @@ def describe(dataset: Dataset) -> str:
         rate = f" at {(len(stamps) - 1) / (stamps[-1] - stamps[0]) * 1e9:.3g} Hz"
     posed = sum(pose_of(dataset, index) is not None for index in range(len(dataset)))
     poses = "no poses" if not posed else "all with poses" if posed == len(dataset) else f"poses for {posed}"
-    return f"{dataset.name}, {len(dataset)} {kind}{size}{rate}, {poses}"
+    uncolored = getattr(dataset, "uncolored", 0)
+    color = f", {uncolored} without colour in time" if uncolored else ""
+    return f"{dataset.name}, {len(dataset)} {kind}{size}{rate}, {poses}{color}"
 
 
 def _unpacked(path: Path, *, unpack: bool) -> Path:
