@@ -8,6 +8,7 @@ import sqlite3
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -21,6 +22,7 @@ from tsfusion import codec, se3
 from tsfusion.calibration import Camera, Rectifier, StereoRig, Undistorter
 from tsfusion.cli import replay
 from tsfusion.datasets import open_dataset
+from tsfusion.datasets.bag_transforms import Samples
 from tsfusion.datasets.bags import Bag, recognises
 from tsfusion.errors import DatasetError, MissingDependency
 from tsfusion.journal import Journal, segment_path
@@ -834,3 +836,17 @@ def test_without_rosbags_the_error_names_the_command(tmp_path: Path, monkeypatch
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(MissingDependency, match=r"pip install 'tsfusion\[ros\]'"):
         open_dataset(path)
+
+
+def test_poses_of_a_long_recording_stay_small() -> None:
+    """A robot with thirty joints tells millions of transforms an hour."""
+    q, t = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0), SimpleNamespace(x=1.0, y=2.0, z=3.0)
+    samples = Samples()
+    tracemalloc.start()
+    try:
+        for stamp in range(10_000):
+            samples.add(stamp * 10**9, t, q)
+        assert tracemalloc.get_traced_memory()[0] < 100 * 10_000
+    finally:
+        tracemalloc.stop()
+    assert len(samples.trajectory().timestamps_ns) == 10_000

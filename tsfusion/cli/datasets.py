@@ -33,7 +33,7 @@ def _group() -> None:
 @app.command("list")
 def list_(
     path: Annotated[
-        Path | None, typer.Argument(metavar="[PATH]", help="Look for datasets in and under it.")
+        Path | None, typer.Argument(metavar="PATH", help="Look for datasets in and under it.")
     ] = None,
     json: options.Json = False,
 ) -> None:
