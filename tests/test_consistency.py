@@ -266,6 +266,16 @@ def test_frames_without_depth_cannot_tell(data: Data) -> None:
     assert check(Corrupted(opened(data(FOLDERS["open3d"])), frame=blind)).verdict == "cannot tell"
 
 
+def test_points_that_no_lidar_measures_are_no_matter() -> None:
+    scans = synthetic("room", "lidar")
+
+    def beyond(frame: Frame) -> dict[str, object]:
+        assert frame.points is not None
+        return {"points": np.vstack([[[3e38, 0, 0]], frame.points[1:]]).astype(np.float32)}
+
+    assert check(Corrupted(scans, frame=beyond)).verdict == "agree"
+
+
 def run(*arguments: str) -> int:
     with pytest.raises(SystemExit) as ended:
         cli.main(list(arguments))

@@ -377,3 +377,20 @@ def test_options_are_taken_as_they_were_meant(tmp_path):
     assert dataset[0].depth_scale == 1.0
     with pytest.raises(DatasetError, match=r"5/17 is missing"):
         open_dataset(tmp_path / "5", trajectory=17)
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["[" * 200_000, '{"intrinsic_matrix": [%s, 0, 0, 0, 1, 0, 3, 3, 1]}' % ("1" * 400),
+     '{"camera": {"w": 1e999, "h": 6, "fx": 1, "fy": 1, "cx": 1, "cy": 1, "scale": 1}}',
+     '{"camera": {"w": 0, "h": 0, "fx": 1, "fy": 1, "cx": 1, "cy": 1, "scale": 1}}'],
+)  # fmt: skip
+def test_a_broken_camera_file_is_one_clear_line(tmp_path, content):
+    redwood(tmp_path / "redwood", [0], [0])
+    (tmp_path / "redwood" / "camera_intrinsic.json").write_text(content)
+    recordings.replica(tmp_path / "replica")
+    (tmp_path / "replica" / "cam_params.json").write_text(content)
+    for place in ("redwood", "replica"):
+        with pytest.raises(DatasetError, match=r"\.json must ") as caught:
+            open_dataset(tmp_path / place)
+        assert "\n" not in str(caught.value)

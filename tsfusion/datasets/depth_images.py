@@ -117,7 +117,7 @@ def read_open3d_camera(path: Path) -> Intrinsics:
     try:
         K = json.loads(path.read_text(encoding="utf-8"))["intrinsic_matrix"]  # column-major
         return checked_intrinsics(Intrinsics(float(K[0]), float(K[4]), float(K[6]), float(K[7])), path)
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+    except (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
         raise DatasetError(
             f"{path} must be an Open3D camera with a 9-number intrinsic_matrix: {error}"
         ) from error
