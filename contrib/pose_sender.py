@@ -18,9 +18,5 @@ socket = zmq.Context().socket(zmq.PUB)
 (socket.connect if sys.argv[2:] == ["connect"] else socket.bind)(sys.argv[1])
 for line in sys.stdin:
     seconds, *rest = line.split()
-    message = {"stamp_ns": int(Decimal(seconds) * 10**9)}
-    if rest == ["lost"]:
-        message["lost"] = True
-    else:
-        message["pose"] = [float(number) for number in rest]
-    socket.send(json.dumps(message).encode())
+    pose = {"lost": True} if rest == ["lost"] else {"pose": [float(number) for number in rest]}
+    socket.send(json.dumps({"stamp_ns": int(Decimal(seconds) * 10**9), **pose}).encode())

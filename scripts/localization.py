@@ -10,6 +10,8 @@ Recorded scenes are found under TSFUSION_DATA (default ../shared/data); what is 
 Every scene runs in a fresh process, with one thread: `cpu_ms` is processor time of the localizer a frame,
 `peak_rss_mb` the process's peak while it tracks (where no synthetic world is rendered in it).
 
+Peers are followed frame to frame, with their defaults: Open3D's hybrid odometry (`bench` extra) and OpenCV's.
+
 `mesh`: the kitchen scanned by `tsfusion scan` with poses of its own and with the true ones; how far the depth
 that either mesh predicts for frames that were not fused is from the depth measured there.
 """
@@ -27,16 +29,22 @@ from typing import Any, NamedTuple
 
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
 
+import _odometry_peers
 import msgspec
 import numpy as np
 from _peers import DATA, surroundings
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+from test_loops import Drifting
 
 from tsfusion import localizers, open_dataset, process
 from tsfusion.cli.ate import table
 from tsfusion.config import LocalizerName, ScanConfig
 from tsfusion.datasets import Dataset, select
 from tsfusion.evaluation.trajectory import TrajectoryError, absolute_error
-from tsfusion.localizers import Lost
+from tsfusion.frame import Frame
+from tsfusion.localizers import Localizer, Lost
+from tsfusion.localizers.closing import LoopClosing
 from tsfusion.sources.recorded import Recorded
 
 DOCS = Path(__file__).parents[1] / "docs" / "localization.md"
@@ -47,6 +55,9 @@ class Scene(NamedTuple):
     """One row.
 
     Attributes:
+        loops: whether loops are closed.
+        drifting: the true poses with drift added, as tests/test_loops.py adds it, instead of a tracker's.
+        peer: another library's odometry instead, by its class in _odometry_peers.py.
         bar: metres of RMSE, or percent of drift for `stereo`, that it must stay under; None = none is set.
     """
 
@@ -56,6 +67,8 @@ class Scene(NamedTuple):
     options: dict[str, Any] = {}
     part: dict[str, Any] = {}
     loops: bool = False
+    drifting: bool = False
+    peer: str = ""
     bar: float | None = None
 
     def open(self) -> Dataset | None:
@@ -69,14 +82,26 @@ class Scene(NamedTuple):
         return select(dataset, **self.part)
 
 
+HANDHELD = {"count": 150, "path": "handheld"}
 KITCHEN, ORB = "7scenes/redkitchen", "kitti_odometry/poses_estimated/00_ORB.txt"
 SCENES = (
     Scene("kitchen, first 75", KITCHEN, "rgbd", part={"limit": 75}, bar=0.030),
     Scene("kitchen, 125", KITCHEN, "rgbd", bar=0.040),
     Scene("kitchen, every 2nd", KITCHEN, "rgbd", part={"stride": 2}),
     Scene("kitchen, every 3rd", KITCHEN, "rgbd", part={"stride": 3}),
+    *(Scene(f"{name}: {peer}", path, "rgbd", options, part, peer=peer)
+      for name, path, options, part in (
+          ("kitchen, 125", KITCHEN, {}, {}), ("kitchen, every 3rd", KITCHEN, {}, {"stride": 3}),
+          ("room", "synthetic:room", HANDHELD, {}), ("room-bare", "synthetic:room-bare", HANDHELD, {}),
+          ("room-untextured", "synthetic:room-untextured", HANDHELD, {}),
+      ) for peer in ("Open3D", "OpenCV")),
     Scene("HoloLens", "hololens", "rgbd"),
     Scene("Redwood living room", "redwood_livingroom1", "rgbd"),
+    *(Scene(f"room{name}", f"synthetic:room{name}", "rgbd", HANDHELD, bar=bar)
+      for name, bar in (("", 0.003), ("-untextured", 0.005), ("-plain", 0.005), ("-bare", 0.005))),
+    Scene("corridor, two laps", "synthetic:corridor", "rgbd", {"count": 520}, loops=True),
+    Scene("corridor, drift added", "synthetic:corridor", "given", {"count": 340}, loops=True, drifting=True),
+    Scene("identical rooms, drift", "synthetic:rooms", "given", {"count": 160}, loops=True, drifting=True),
     Scene("KITTI 06", "kitti_odometry", "stereo", {"sequence": "06"}, bar=1.0),
     Scene("KITTI 00, LiDAR", "kitti_odometry", "lidar",
           {"sequence": "00", "modality": "lidar", "poses": ORB}, bar=0.15),
@@ -136,11 +161,11 @@ def _track(scene: Scene) -> dict[str, Any]:
     dataset = scene.open()
     if dataset is None:
         return {"name": scene.name, "error": f"no {scene.path} in {DATA}"}
-    config = ScanConfig(localizer=scene.localizer, loop_closure=scene.loops)
     localizer, poses, references, spent, lost = None, [], [], 0.0, 0
     corrections = None
     for frame in Recorded(dataset):
-        localizer = localizer or localizers.make(config, frame)
+        if localizer is None:
+            localizer = _localizer(scene, frame)
         before = time.process_time()
         found = localizer.track(frame)
         corrections = localizer.corrections() or corrections
@@ -161,11 +186,31 @@ def _track(scene: Scene) -> dict[str, Any]:
     if scene.loops:
         after = absolute_error(np.array(localizers.corrected(poses, corrections)), truth)
         row |= {"loops": corrections.loops if corrections else 0, "corrected": msgspec.to_builtins(after)}
+        if scene.drifting:
+            row |= _verdict(scene, row, error, after)
     elif scene.localizer == "stereo":
         reached = error.drift_percent
     if scene.bar is not None:
         row |= {"bar": scene.bar, "reached": lost == 0 and reached <= scene.bar}
     return row
+
+
+def _localizer(scene: Scene, first: Frame) -> Localizer:
+    if scene.drifting:
+        return LoopClosing(Drifting())
+    if scene.peer:
+        made: Localizer = getattr(_odometry_peers, scene.peer)()
+        return made
+    return localizers.make(ScanConfig(localizer=scene.localizer, loop_closure=scene.loops), first)
+
+
+def _verdict(
+    scene: Scene, row: dict[str, Any], before: TrajectoryError, after: TrajectoryError
+) -> dict[str, Any]:
+    """Loops must help where there are some, and none be found where all rooms are alike."""
+    if "identical" in scene.name:
+        return {"bar": "no loop", "reached": row["loops"] == 0}
+    return {"bar": "0.3 times", "reached": row["loops"] > 0 and after.rmse <= 0.3 * before.rmse}
 
 
 def _meshes() -> dict[str, Any]:
@@ -227,6 +272,8 @@ def _struct(values: dict[str, Any]) -> TrajectoryError:
 def _bar(row: dict[str, Any]) -> str:
     if "bar" not in row:
         return ""
+    if isinstance(row["bar"], str):
+        return f"{row['bar']}: {'reached' if row['reached'] else 'MISSED'}"
     unit = f"{row['bar']:g} %" if row["localizer"] == "stereo" else f"{1000 * row['bar']:g} mm"
     return f"{unit}: {'reached' if row['reached'] else 'MISSED'}"
 

@@ -25,7 +25,10 @@ from tsfusion.errors import InvalidConfig, OutputError
 Here = Callable[..., "subprocess.CompletedProcess[str]"]
 
 NOBODY = "tcp://127.0.0.1:9"  # the discard port: nobody listens there, and nobody may without being root
-VERBS = ["demo", "replay", "serve", "mesh", "status", "doctor", "keys", "journal", "config", "datasets"]
+VERBS = [
+    "demo", "replay", "scan", "check", "serve", "mesh", "status", "ate", "doctor", "download", "keys",
+    "journal", "config", "datasets",
+]  # fmt: skip
 
 
 def scene(folder: Path, *, pose: str | None = None, depth: bytes | None = None) -> Path:
@@ -408,6 +411,7 @@ def test_every_verb_that_fuses_takes_the_map_flags(verb: str) -> None:
         ("=3", "--option must be KEY=VALUE"),
         ("focal=3", "a synthetic dataset takes no `focal`"),
         ("count=0", "expected count >= 1"),
+        ("path=spiral", "path must be one of circle, tour"),
     ],
 )
 def test_a_wrong_option_of_a_dataset(here: Here, given: str, words: str) -> None:

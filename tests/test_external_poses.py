@@ -356,6 +356,21 @@ def test_a_message_that_is_too_long_costs_its_connection_only(feed: Feed) -> Non
             send(said(0.0))
 
 
+def test_a_connection_that_libzmq_gave_up_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a message that is too long it never tries again to connect."""
+    monkeypatch.setattr("tsfusion.localizers.feed._SILENCE", 0.5)
+    with zmq.Context() as context, context.socket(zmq.PUB) as made:
+        made.setsockopt(zmq.LINGER, 0)
+        address = f"tcp://127.0.0.1:{made.bind_to_random_port('tcp://127.0.0.1')}"
+        with Feed(address, max_gap_s=0.15, wait_s=0.05) as feed:
+            heard(feed, lambda count: made.send(json.dumps(said(-100 + count)).encode()))
+            made.send(b"{" + b" " * MAX_BYTES)
+            until = time.monotonic() + DEADLINE
+            while isinstance(feed.track(frame(START)), Lost):
+                assert time.monotonic() < until
+                made.send(json.dumps(said(0.0)).encode())
+
+
 def test_a_flood_does_not_hold_up_a_frame(feed: Feed) -> None:
     code = (
         "import sys, zmq\n"

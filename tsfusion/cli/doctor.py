@@ -29,6 +29,16 @@ _MODULES = {
 }  # fmt: skip
 
 
+# The scanner's parts that not everybody needs: extra → its package, and what it is for.
+_EXTRAS = {
+    "slam": ("scipy", "loop closure"),
+    "lidar": ("kiss-icp", "LiDAR odometry"),
+    "realsense": ("pyrealsense2", "RealSense cameras"),
+    "ros": ("rosbags", "ROS recordings"),
+    "download": ("pooch", "public recordings"),
+}
+
+
 @dataclass(frozen=True)
 class Finding:
     """One check: what was looked at, what was found, and what to do if it is wrong."""
@@ -65,6 +75,7 @@ def check(path: Path) -> Iterator[Finding]:
     """Every finding, as soon as it is known."""
     yield _python()
     yield from _packages()
+    yield from map(_extra, _EXTRAS)
     yield _guarded(_kernels, "kernels", "pip install --force-reinstall taichi")
     yield _guarded(_port, "loopback", "let this user listen on 127.0.0.1")
     yield _disk(path)
@@ -115,6 +126,21 @@ def _package(requirement: "Requirement") -> Finding:
     if not requirement.specifier.contains(version, prereleases=True):
         return Finding(name, False, f"{version}, needs {requirement.specifier}", advice)
     return Finding(name, True, version)
+
+
+def _extra(name: str) -> Finding:
+    """An optional part is no fault when it is missing; one that is broken is."""
+    package, purpose = _EXTRAS[name]
+    install = f"pip install 'tsfusion[{name}]'"
+    try:
+        version = metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return Finding(package, True, f"not installed; for {purpose}: {install}")
+    try:
+        import_module(package.replace("-", "_"))
+    except Exception as error:  # noqa: BLE001  as above
+        return Finding(package, False, f"{version} does not import: {error}", f"{install} --force-reinstall")
+    return Finding(package, True, f"{version} ({purpose})")
 
 
 def _kernels() -> Finding:

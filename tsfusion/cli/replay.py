@@ -103,7 +103,7 @@ def replay(
     )  # fmt: skip
 
 
-def open_recording(path: Path, *, unpack: bool = False, **given: Any) -> "Dataset":
+def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dataset":
     """A dataset, or a journal; `given` are settings of a dataset, None = left out."""
     if _is_journal(path):
         from tsfusion.errors import DatasetError

@@ -58,6 +58,13 @@ def scan(
     feed: Annotated[
         str | None, _option(_POSES, "ADDRESS", "Poses of another SLAM, live: tcp://… it is heard at.")
     ] = None,
+    time_offset: Annotated[
+        float | None,
+        _option(_POSES, "SECONDS", "Added to a frame's time before its pose is looked up there."),
+    ] = None,
+    max_gap: Annotated[
+        float | None, _option(_POSES, "SECONDS", "Between two such poses; across a longer gap there is none.")
+    ] = None,
     loop_closure: Annotated[
         bool | None,
         typer.Option(
@@ -118,6 +125,7 @@ def scan(
         chosen = options.configuration(config, preset={"sensor": opened.sensor}, **settings)
         rules = override(
             chosen.scan, localizer=localizer, trajectory=trajectory, feed=feed, loop_closure=loop_closure,
+            time_offset=time_offset, max_gap=max_gap,
             patience=patience, min_overlap=min_overlap, distance=distance, angle=angle, max_rate=max_rate,
         )  # fmt: skip
         client = override(chosen.client, control=control, map=map_, key=key, server_key=server_key)

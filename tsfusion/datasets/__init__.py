@@ -51,7 +51,7 @@ __all__ = [
 _SYNTHETIC = "synthetic:"
 
 
-def open_dataset(path: str | Path, *, unpack: bool = False, **options: Any) -> Dataset:
+def open_dataset(path: str | Path, /, *, unpack: bool = False, **options: Any) -> Dataset:
     """Find out what a path is and open it.
 
     Args:

@@ -140,7 +140,7 @@ def opened(
     """Call an opener with the options it has: `posed` is dropped where it has none, `poses` may be its
     `trajectory`; another it does not have is a DatasetError, and one that is None is left out."""
     options = {key: value for key, value in options.items() if value is not None}
-    known = [key for key in inspect.signature(opener).parameters if key not in ("path", "root")]
+    known = list(inspect.signature(opener).parameters)[len(places) :]
     if "posed" not in known:
         options.pop("posed", None)
     if "poses" not in known and "trajectory" in known and "poses" in options:

@@ -97,6 +97,7 @@ def _graph(raw: _Graph) -> Graph:
 
 
 def _matrix(numbers: list[float]) -> Matrix:
+    """(4, 4) from 7 or 16 numbers. Raises DecodeError or InvalidKeyframe."""
     values = np.array(numbers, dtype=np.float64)
     if len(values) == 16:
         T = values.reshape(4, 4)

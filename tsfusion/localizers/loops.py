@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Which loops to believe: those that odometry allows, that stand alone, and that support each other."""
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -48,7 +49,7 @@ class Consensus:
        look like another one (a *twin*), is believed only where odometry rules the other out.
     3. Loops of three keyframes near each other must agree pairwise (Mangelson et al., "Pairwise Consistent
        Measurement Set Maximization", 2018) before any is, or of two where odometry expects them there;
-       later ones agree with those by rule 1.
+       later ones nearby need only agree with one of those.
     """
 
     def __init__(self, chain: Chain) -> None:
@@ -71,9 +72,7 @@ class Consensus:
                 self._remember_twin(loop, allowed)
         if not allowed:
             return []
-        if min((d for d in deviations if d > GATE), default=np.inf) < _AMBIGUOUS or any(
-            self._has_twin(loop) for loop in allowed
-        ):
+        if self._doubtful(allowed) or min((d for d in deviations if d > GATE), default=np.inf) < _AMBIGUOUS:
             self._count("fits another place too")
             return []
         return [found for loop in allowed for found in self._supported(loop)]
@@ -83,6 +82,10 @@ class Consensus:
         T, known = self._known(old, new)
         error = se3.log(se3.inverse(T_old_new) @ T)
         return float(np.sqrt(error @ np.linalg.solve(known + covariance, error)))
+
+    def unique(self, place: int) -> bool:
+        """Whether nothing was seen that looks like this place."""
+        return place not in self._twins
 
     def disown(self, loop: Loop) -> None:
         """The pose graph found it wrong."""
@@ -116,7 +119,10 @@ class Consensus:
             self._believe([loop])
             return [loop]
         self._waiting = [w for w in self._waiting if self._age(w, loop) <= _WINDOW]
-        friends = [w for w in self._waiting if self._agree(w, loop)]
+        friends: list[Loop] = []
+        for other in reversed(self._waiting):
+            if all(self._agree(other, friend) for friend in [loop, *friends]):
+                friends.insert(0, other)
         expected = self.deviation(loop.old, loop.new, loop.T_old_new, loop.covariance) <= _EXPECTED
         if len({loop.new, *(friend.new for friend in friends)}) < _SUPPORT - expected:
             self._waiting.append(loop)
@@ -155,6 +161,14 @@ class Consensus:
             twins = self._twins.setdefault(a, [])
             twins.append((b, T))
             del twins[:-_TWINS]
+
+    def _doubtful(self, loops: list[Loop]) -> bool:
+        """Whether one keyframe's loops leave open where it is."""
+        for one, two in itertools.combinations(loops, 2):
+            if not self._agree(one, two):
+                self._remember_twin(two, [one])
+                return True
+        return any(self._has_twin(loop) for loop in loops)
 
     def _has_twin(self, loop: Loop) -> bool:
         """Whether the loop's place looks like another one where the keyframe could as well be."""

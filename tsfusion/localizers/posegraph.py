@@ -189,9 +189,9 @@ class _Problem:
         information = weights[:, None, None] * self._information
         a, b = (J.transpose(0, 2, 1) @ information for J in (first, second))
         blocks = np.concatenate([a @ first, a @ second, b @ first, b @ second])
-        H = np.bincount(self._slot, weights=blocks.ravel()[self._variable], minlength=len(self._rows))
+        H = _sums(self._slot, blocks.ravel()[self._variable], len(self._rows))
         g = np.concatenate([np.einsum("nij,nj->ni", J, error) for J in (a, b)]).ravel()
-        return H, -np.bincount(self._ends, weights=g[self._known], minlength=self._size)
+        return H, -_sums(self._ends, g[self._known], self._size)
 
     def _solve(self, H: NDArray[np.float64], g: NDArray[np.float64], damping: float) -> NDArray[np.float64]:
         if not self._size:
@@ -205,6 +205,10 @@ class _Problem:
         )
         x: NDArray[np.float64] = factors.solve(g)
         return x
+
+
+def _sums(places: NDArray[np.int64], values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    return np.bincount(places, weights=values, minlength=count).astype(np.float64)
 
 
 def _squares(error: NDArray[np.float64], information: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -40,11 +40,11 @@ class _Found:
 class RGBD:
     """Follows a depth camera, with colour where there is some. A `Localizer`.
 
-    Corners are followed from the tracking keyframe (Lucas and Kanade); the pose they give begins a Gauss-Newton
-    over their reprojection and the distances of the frame's points to the planes of that keyframe and of the
-    two oldest that see the same. Frames without an image go by depth alone. A pose is given only where depth,
-    image and geometry bear it out; after that frames are looked for near the last pose, then by descriptions
-    (ORB) in the last keyframes.
+    Corners are followed from the tracking keyframe (Lucas and Kanade); the pose they give begins a
+    Gauss-Newton over their reprojection and the distances of the frame's points to the planes of that
+    keyframe and of the two oldest that see the same. Frames without an image go by depth alone. A pose is
+    given only where depth, image and geometry bear it out. What is lost is looked for near the last pose,
+    then by descriptions (ORB) among the last keyframes.
     """
 
     absolute = False
@@ -124,7 +124,7 @@ class RGBD:
         agree = np.zeros(len(points), bool)
         if resected is not None and resected[1].sum() >= _INLIERS:
             guess, agree = resected
-        points, pixels = points[agree], pixels[agree].astype(np.float64)
+        points, pixels = points[agree], pixels[agree]
         links = [joint.Link(np.eye(4), view.seen.surface, points, pixels)]
         for older in self._older(seen, view.T_world_camera @ guess, view):
             T_older_view = se3.inverse(older.T_world_camera) @ view.T_world_camera
@@ -134,7 +134,7 @@ class RGBD:
 
     def _older(self, seen: Seen, T_world_camera: Matrix, view: View) -> list[View]:
         """The oldest keyframes that see the same as the frame, and agree about where it is."""
-        some, chosen = seen.surface.every(8), []
+        some, chosen = seen.surface.every(8), list[View]()
         for older in self._kept:
             if len(chosen) == _OLDER or older is view:
                 break

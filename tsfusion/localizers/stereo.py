@@ -53,6 +53,21 @@ class _Seen:
         return float(np.median(self.points[:, 2]))
 
 
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A frame's left image, (H, W) pixels of disparity (0 = none), and the cameras."""
+
+    gray: NDArray[np.uint8]
+    disparity: NDArray[np.float32]
+    rig: Rig
+
+    @cached_property
+    def corners(self) -> tuple[features.Pixels, NDArray[np.float32]]:
+        """(n, 2) pixels, and the (n,) disparities there."""
+        pixels = features.corners(self.gray, _CORNERS)
+        return pixels, features.bilinear(self.disparity, pixels)
+
+
 class Stereo:
     """`Localizer` of rectified stereo pairs; also of disparity or depth images with an image beside them.
 
@@ -70,27 +85,29 @@ class Stereo:
 
     @property
     def rectification(self) -> RectificationCheck | None:
-        """What the pairs so far say of their rectification; None until ten were looked at."""
+        """What the pairs so far say of their rectification; None until eight were looked at."""
         return self._rectification.check
 
     def track(self, frame: Frame) -> Pose | Lost:
         """Where the left camera was, seen from the first one."""
-        gray, disparity, rig = _measured(frame)
-        self._check_rows(frame, disparity)
+        view = _measured(frame)
+        if frame.right is not None and self._rectification.wants_pair:
+            self._check_rows(view, frame.right)
         reference, T, quality, moved = self._reference, np.eye(4), 1.0, np.inf
         if reference is not None:
-            found = self._compare(reference, gray, frame.timestamp_ns)
+            found = self._compare(reference, view.gray, frame.timestamp_ns)
             if isinstance(found, str):
                 self._velocity = None
                 return Lost(reason=found, timestamp_ns=frame.timestamp_ns)
             T, quality, moved = se3.nearest(reference.T_world_camera @ found[0]), found[1], found[2]
         if moved > _STILL:
-            pixels, values = _corners(gray, disparity)
+            pixels, disparity = view.corners
+            deep = disparity > _LEAST_DISPARITY
             seen = _Seen(
-                gray=gray,
-                pixels=pixels,
-                disparity=values,
-                rig=rig,
+                gray=view.gray,
+                pixels=pixels[deep],
+                disparity=disparity[deep],
+                rig=view.rig,
                 timestamp_ns=frame.timestamp_ns,
                 T_world_camera=T,
             )
@@ -115,6 +132,8 @@ class Stereo:
         self, reference: _Seen, gray: NDArray[np.uint8], timestamp_ns: int
     ) -> tuple[se3.Transform, float, float] | str:
         """T_reference_camera, the share of points that agree, their median motion in pixels; or a reason."""
+        if gray.shape != reference.gray.shape:
+            return f"the image is {gray.shape[1]}×{gray.shape[0]}, unlike those before"
         elapsed = _elapsed(reference.timestamp_ns, timestamp_ns)
         expected = None if self._velocity is None else se3.exp(self._velocity * elapsed)
         pixels, followed = _follow(reference, gray, expected)
@@ -137,17 +156,14 @@ class Stereo:
         self._velocity = se3.log(motion.T_old_new) / elapsed
         return motion.T_old_new, share, float(np.median(np.abs(new - old)[agree].max(axis=1)))
 
-    def _check_rows(self, frame: Frame, disparity: NDArray[np.float32]) -> None:
+    def _check_rows(self, view: _View, right: NDArray[np.uint8]) -> None:
         """Also where the matcher found nothing: that may be just what is wrong with the pair."""
-        if frame.left is None or frame.right is None or not self._rectification.wants_pair:
-            return
-        pixels = features.corners(frame.left, _CORNERS)
-        values = features.bilinear(disparity, pixels)
-        matched = values > 0
+        pixels, disparity = view.corners
+        matched = disparity > 0
         guess = pixels.copy()
-        guess[:, 0] -= np.where(matched, values, np.median(values[matched]) if matched.any() else 0)
-        right, found = features.follow(frame.left, frame.right, pixels, guess=guess)
-        self._rectification.add_pair(pixels[found], right[found], frame.right.shape)
+        guess[:, 0] -= np.where(matched, disparity, np.median(disparity[matched]) if matched.any() else 0)
+        other, found = features.follow(view.gray, right, pixels, guess=guess)
+        self._rectification.add_pair(pixels[found], other[found], right.shape)
 
     def _check_disparity(
         self,
@@ -166,12 +182,8 @@ class Stereo:
             self._rectification.add_motion(motion.offset, motion.offset_sigma)
 
 
-def _measured(frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.float32], Rig]:
-    """Left image, (H, W) disparity in pixels (0 = none), and the cameras.
-
-    Raises:
-        InvalidKeyframe: for a frame without an image, or without depth.
-    """
+def _measured(frame: Frame) -> _View:
+    """Raises InvalidKeyframe for a frame without an image, or without depth."""
     gray, depth = frame.gray, frame.depth_m
     if gray is None or (depth is None and frame.right is None):
         raise InvalidKeyframe(
@@ -181,19 +193,9 @@ def _measured(frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.float32], Rig
     assert frame.intrinsics is not None
     rig = Rig(frame.intrinsics, frame.baseline_fx or _PROJECTOR)
     if frame.right is not None:
-        return gray, quick_disparity(gray, frame.right), rig
+        return _View(gray, quick_disparity(gray, frame.right), rig)
     assert depth is not None
-    return gray, np.divide(rig.baseline_fx, depth, out=np.zeros_like(depth), where=depth > 0), rig
-
-
-def _corners(
-    gray: NDArray[np.uint8], disparity: NDArray[np.float32]
-) -> tuple[features.Pixels, NDArray[np.float32]]:
-    """(n, 2) pixels of corners, and their disparity."""
-    pixels = features.corners(gray, _CORNERS)
-    values = features.bilinear(disparity, pixels)
-    deep = values > _LEAST_DISPARITY
-    return pixels[deep], values[deep]
+    return _View(gray, np.divide(rig.baseline_fx, depth, out=np.zeros_like(depth), where=depth > 0), rig)
 
 
 def _elapsed(before_ns: int, now_ns: int) -> float:

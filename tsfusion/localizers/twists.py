@@ -19,7 +19,8 @@ def hat(v: NDArray[np.float64]) -> NDArray[np.float64]:
     """(n, 3) → (n, 3, 3) matrices of the cross product."""
     W = np.zeros((len(v), 3, 3))
     W[:, 0, 1], W[:, 0, 2], W[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    return W - W.transpose(0, 2, 1)
+    W -= W.transpose(0, 2, 1).copy()
+    return W
 
 
 def exp(twists: Twists) -> Transforms:

@@ -75,7 +75,8 @@ def check(old: View, new: View) -> Check:
     T = refined(old, new, T, first, second)
     depths = agreement(old, new, T)
     refused = _contradiction(depths, measured=old.measured and new.measured)
-    sigma = max(0.01, 0.01 * depth, 0.5 * max(old.noise, new.noise) * depth**2)
+    near = float(np.nanpercentile(old.points[first][:, 2], 25))
+    sigma = max(0.01, 0.01 * near, 0.3 * max(old.noise, new.noise) * near**2)
     return Check(T_old_new=T, refused=refused, inliers=count, sigma=sigma, depths=depths)
 
 
