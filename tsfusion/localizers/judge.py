@@ -18,7 +18,7 @@ _PATTERN = 0.1  # of what all could be: below, there is nothing to compare
 _SAFETY = 3.0  # times the information that noise alone would give
 
 _OVERLAP, _OVERLAP_STRICT = 0.25, 0.4
-_AGREEING, _AGREEING_STRICT, _AGREEING_DEPTH_ALONE = 0.6, 0.8, 0.92
+_AGREEING, _AGREEING_STRICT, _AGREEING_DEPTH_ALONE = 0.7, 0.8, 0.92
 _LIKENESS, _LIKENESS_STRICT = 0.2, 0.3
 _UNCERTAINTY = 0.01
 
@@ -63,8 +63,8 @@ class Evidence:
             return f"the image agrees by {self.likeness:.2f}, it must by {likeness:.2f} of 1"
         if self.uncertainty > _UNCERTAINTY:
             return (
-                f"the view leaves the pose open by {min(self.uncertainty, 9.99):.2f} m (a plain wall?), it may by "
-                f"{_UNCERTAINTY:.2f} m"
+                f"the view leaves the pose open by {min(self.uncertainty, 9.99):.2f} m (a plain wall?), "
+                f"at most {_UNCERTAINTY:.2f} m is allowed"
             )
         return None
 
