@@ -111,12 +111,7 @@ class KITTI(Frames):
         }
         if self.sensor == "lidar":
             return Frame(points=read_scan(self._left[number]), **common)
-        left, right = read_grey(self._left[number]), read_grey(self._right[number])
-        if left.shape != right.shape:
-            raise DatasetError(
-                f"{self._right[number]} has shape {right.shape}, its left image {left.shape}; "
-                "expected equal sizes"
-            )
+        left, right = read_pair(self._left[number], self._right[number])
         return Frame(
             left=left,
             right=right,
@@ -234,13 +229,24 @@ def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
     return np.array([stamps[number] for number in frames], dtype=np.int64)
 
 
-def read_grey(path: Path) -> NDArray[np.uint8]:
+def read_pair(left_file: Path, right_file: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Two (H, W) grey images of one size."""
+    left, right = _read_grey(left_file), _read_grey(right_file)
+    if left.shape != right.shape:
+        raise DatasetError(
+            f"{right_file} has shape {right.shape}, its left image {left.shape}; expected equal sizes"
+        )
+    return left, right
+
+
+def _read_grey(path: Path) -> NDArray[np.uint8]:
     """(H, W), a colour image's luminance."""
     import pykitti.utils
+    from PIL import Image
 
     try:
         return np.asarray(pykitti.utils.load_image(path, "L"), dtype=np.uint8)
-    except (OSError, SyntaxError) as error:  # Pillow reports a broken PNG by either
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:  # a broken PNG is either of two
         raise DatasetError(f"{path} cannot be decoded; expected a grey image ({error})") from error
 
 

@@ -22,7 +22,7 @@ from tsfusion.datasets.base import (
     read_numbers,
     require_frames,
 )
-from tsfusion.datasets.kitti import numbered, read_grey, read_scan
+from tsfusion.datasets.kitti import numbered, read_pair, read_scan
 from tsfusion.datasets.poses import Pose
 from tsfusion.errors import DatasetError, InvalidKeyframe
 from tsfusion.frame import Frame
@@ -101,12 +101,7 @@ class KITTIRaw(Frames):
         }
         if self.sensor == "lidar":
             return Frame(points=read_scan(self._left[number]), **common)
-        left, right = read_grey(self._left[number]), read_grey(self._right[number])
-        if left.shape != right.shape:
-            raise DatasetError(
-                f"{self._right[number]} has shape {right.shape}, its left image {left.shape}; "
-                "expected equal sizes"
-            )
+        left, right = read_pair(self._left[number], self._right[number])
         color = None
         if self._with_color and self._colored:
             color = read_color(self._left[number], left.shape)
