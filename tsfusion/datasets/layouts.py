@@ -97,7 +97,11 @@ BUILT_IN = (
 PLAIN = (
     Layout("RGB-D folders", rgbd_folders.PLAIN_EXPECTED, rgbd_folders.recognises_plain, rgbd_folders.Redwood),
 )
-SYNTHETIC = ("synthetic", "no files: synthetic:room or synthetic:street, then :kinect, :stereo or :lidar")
+SYNTHETIC = (
+    "synthetic",
+    "no files: synthetic:WORLD, or synthetic:WORLD:SENSOR; worlds: room (also -untextured, -plain, -bare), "
+    "street, corridor, rooms; sensors: kinect, stereo, lidar",
+)
 
 
 def layouts() -> list[Layout]:
