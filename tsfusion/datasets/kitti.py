@@ -48,7 +48,45 @@ def open_kitti(
     return KITTI(root, sequence, modality=modality, poses=poses, color=color, posed=posed)
 
 
-class KITTI(Frames):
+class Drive(Frames):
+    """Stereo pairs or Velodyne scans of the KITTI car, by frame number."""
+
+    intrinsics: Intrinsics | None
+    baseline_fx: float | None
+    _frames: list[int]
+    _poses: list[Pose | None]
+    _left: dict[int, Path]  # or the scans
+    _right: dict[int, Path]
+    _with_color: bool
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def _frame(self, index: int) -> Frame:
+        number = self._frames[index]
+        common: dict[str, Any] = {
+            "T_world_camera": self._poses[index],
+            "sensor": self.sensor,
+            "timestamp_ns": self._stamp(index),
+        }
+        if self.sensor == "lidar":
+            return Frame(points=read_scan(self._left[number]), **common)
+        left, right = read_pair(self._left[number], self._right[number])
+        return Frame(
+            left=left,
+            right=right,
+            baseline_fx=self.baseline_fx,
+            intrinsics=self.intrinsics,
+            color=self._color(number, left) if self._with_color else None,
+            **common,
+        )
+
+    def _color(self, number: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(H, W, 3) uint8 BGR of the left camera: here the grey image."""
+        return np.repeat(left[:, :, None], 3, axis=2)
+
+
+class KITTI(Drive):
     """One sequence as stereo disparity (`modality="stereo"`) or as Velodyne scans (`"lidar"`).
 
     Stereo: the left camera's frame, disparity in 1/16 px by semi-global matching at each access; colour is
@@ -98,28 +136,6 @@ class KITTI(Frames):
             T_velo_cam0 = np.linalg.inv(T_cam0_velo)
             found = [None if T is None else T_velo_cam0 @ T @ T_cam0_velo for T in found]
         self._poses = found
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def _frame(self, index: int) -> Frame:
-        number = self._frames[index]
-        common: dict[str, Any] = {
-            "T_world_camera": self._poses[index],
-            "sensor": self.sensor,
-            "timestamp_ns": self._stamp(index),
-        }
-        if self.sensor == "lidar":
-            return Frame(points=read_scan(self._left[number]), **common)
-        left, right = read_pair(self._left[number], self._right[number])
-        return Frame(
-            left=left,
-            right=right,
-            baseline_fx=self.baseline_fx,
-            intrinsics=self.intrinsics,
-            color=np.repeat(left[:, :, None], 3, axis=2) if self._with_color else None,
-            **common,
-        )
 
 
 def _is_sequence(path: Path) -> bool:
