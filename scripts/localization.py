@@ -10,6 +10,8 @@ Recorded scenes are found under TSFUSION_DATA (default ../shared/data); what is 
 Every scene runs in a fresh process, with one thread: `cpu_ms` is processor time of the localizer a frame,
 `peak_rss_mb` the process's peak while it tracks (where no synthetic world is rendered in it).
 
+Peers are followed frame to frame, with their defaults: Open3D's hybrid odometry (`bench` extra) and OpenCV's.
+
 `mesh`: the kitchen scanned by `tsfusion scan` with poses of its own and with the true ones; how far the depth
 that either mesh predicts for frames that were not fused is from the depth measured there.
 """
@@ -27,6 +29,7 @@ from typing import Any, NamedTuple
 
 os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"))
 
+import _odometry_peers
 import msgspec
 import numpy as np
 from _peers import DATA, surroundings
@@ -39,7 +42,8 @@ from tsfusion.cli.ate import table
 from tsfusion.config import LocalizerName, ScanConfig
 from tsfusion.datasets import Dataset, select
 from tsfusion.evaluation.trajectory import TrajectoryError, absolute_error
-from tsfusion.localizers import Lost
+from tsfusion.frame import Frame
+from tsfusion.localizers import Localizer, Lost
 from tsfusion.localizers.closing import LoopClosing
 from tsfusion.sources.recorded import Recorded
 
@@ -53,6 +57,7 @@ class Scene(NamedTuple):
     Attributes:
         loops: whether loops are closed.
         drifting: the true poses with drift added, as tests/test_loops.py adds it, instead of a tracker's.
+        peer: another library's odometry instead, by its class in _odometry_peers.py.
         bar: metres of RMSE, or percent of drift for `stereo`, that it must stay under; None = none is set.
     """
 
@@ -63,6 +68,7 @@ class Scene(NamedTuple):
     part: dict[str, Any] = {}
     loops: bool = False
     drifting: bool = False
+    peer: str = ""
     bar: float | None = None
 
     def open(self) -> Dataset | None:
@@ -83,6 +89,12 @@ SCENES = (
     Scene("kitchen, 125", KITCHEN, "rgbd", bar=0.040),
     Scene("kitchen, every 2nd", KITCHEN, "rgbd", part={"stride": 2}),
     Scene("kitchen, every 3rd", KITCHEN, "rgbd", part={"stride": 3}),
+    *(Scene(f"{name}: {peer}", path, "rgbd", options, part, peer=peer)
+      for name, path, options, part in (
+          ("kitchen, 125", KITCHEN, {}, {}), ("kitchen, every 3rd", KITCHEN, {}, {"stride": 3}),
+          ("room", "synthetic:room", HANDHELD, {}), ("room-bare", "synthetic:room-bare", HANDHELD, {}),
+          ("room-untextured", "synthetic:room-untextured", HANDHELD, {}),
+      ) for peer in ("Open3D", "OpenCV")),
     Scene("HoloLens", "hololens", "rgbd"),
     Scene("Redwood living room", "redwood_livingroom1", "rgbd"),
     *(Scene(f"room{name}", f"synthetic:room{name}", "rgbd", HANDHELD, bar=bar)
@@ -149,12 +161,11 @@ def _track(scene: Scene) -> dict[str, Any]:
     dataset = scene.open()
     if dataset is None:
         return {"name": scene.name, "error": f"no {scene.path} in {DATA}"}
-    config = ScanConfig(localizer=scene.localizer, loop_closure=scene.loops)
     localizer, poses, references, spent, lost = None, [], [], 0.0, 0
     corrections = None
     for frame in Recorded(dataset):
         if localizer is None:
-            localizer = LoopClosing(Drifting()) if scene.drifting else localizers.make(config, frame)
+            localizer = _localizer(scene, frame)
         before = time.process_time()
         found = localizer.track(frame)
         corrections = localizer.corrections() or corrections
@@ -182,6 +193,15 @@ def _track(scene: Scene) -> dict[str, Any]:
     if scene.bar is not None:
         row |= {"bar": scene.bar, "reached": lost == 0 and reached <= scene.bar}
     return row
+
+
+def _localizer(scene: Scene, first: Frame) -> Localizer:
+    if scene.drifting:
+        return LoopClosing(Drifting())
+    if scene.peer:
+        made: Localizer = getattr(_odometry_peers, scene.peer)()
+        return made
+    return localizers.make(ScanConfig(localizer=scene.localizer, loop_closure=scene.loops), first)
 
 
 def _verdict(

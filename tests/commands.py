@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 COMMAND = [sys.executable, "-m", "tsfusion"]
 DEADLINE = 120.0  # seconds: a cold kernel compilation on a slow machine
@@ -40,23 +41,31 @@ def started(*arguments: object) -> "subprocess.Popen[str]":
     )  # fmt: skip
 
 
+# What came with the last line that was read. Not Python's own buffer: of that no selector knows.
+_unread: "WeakKeyDictionary[subprocess.Popen[str], bytes]" = WeakKeyDictionary()
+
+
 def read_until(process: "subprocess.Popen[str]", word: str, timeout: float = DEADLINE) -> str:
     """The first line that holds `word`."""
     assert process.stdout is not None
     deadline = time.monotonic() + timeout
-    seen = []
+    seen, rest = [], _unread.pop(process, b"")
     with selectors.DefaultSelector() as selector:
         selector.register(process.stdout, selectors.EVENT_READ)
         while time.monotonic() < deadline:
-            if not selector.select(0.2):
-                continue
-            line = process.stdout.readline()
-            if word in line:
-                return line
-            if not line:
-                break
-            seen.append(line)
-    raise AssertionError(f"no line with {word!r} came, but:\n{''.join(seen)}")
+            line, newline, after = rest.partition(b"\n")
+            if newline:
+                rest = after
+                seen.append(line.decode() + "\n")
+                if word in seen[-1]:
+                    _unread[process] = rest
+                    return seen[-1]
+            elif selector.select(0.2):
+                chunk = os.read(process.stdout.fileno(), 1 << 16)
+                if not chunk:
+                    break
+                rest += chunk
+    raise AssertionError(f"no line with {word!r} came, but:\n{''.join(seen)}{rest.decode()}")
 
 
 @contextmanager

@@ -8,6 +8,7 @@ import sqlite3
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -21,6 +22,7 @@ from tsfusion import codec, se3
 from tsfusion.calibration import Camera, Rectifier, StereoRig, Undistorter
 from tsfusion.cli import replay
 from tsfusion.datasets import open_dataset
+from tsfusion.datasets.bag_transforms import Samples
 from tsfusion.datasets.bags import Bag, recognises
 from tsfusion.errors import DatasetError, MissingDependency
 from tsfusion.journal import Journal, segment_path
@@ -69,6 +71,24 @@ def only_depth(folder: Path, write: Callable[[BagWriter], None], **options: Any)
         bag.transform(pose(2.0), WORLD, OPTICAL, T0 + 10**8)
         write(bag)
     return Bag(path, **options)
+
+
+def test_images_of_a_late_clock_take_the_poses_of_their_time(tmp_path: Path) -> None:
+    found = only_depth(
+        tmp_path, lambda bag: bag.image(DEPTH, wall().measurement, "16UC1", T0 - 10**9), time_offset_s=1.05
+    )
+    assert np.allclose(found[0].T_world_camera[:3, 3], (pose(1.0) + pose(2.0))[:3, 3] / 2, atol=1e-6)
+
+
+def test_what_cannot_be_told_apart_or_is_of_another_size_is_counted(tmp_path: Path) -> None:
+    def write(bag: BagWriter) -> None:
+        for stamp in (T0 + 5, T0 + 5, T0 + 10**7):
+            bag.image(DEPTH, wall().measurement, "16UC1", stamp)
+        bag.image(DEPTH, np.ones((2 * SHAPE[0], SHAPE[1]), np.uint16), "16UC1", T0 + 2 * 10**7)
+
+    found = only_depth(tmp_path, write)
+    assert len(found) == 2
+    assert found.skipped == {f"of {DEPTH} with another's time": 1, f"of {DEPTH} that are broken": 1}
 
 
 # --- every form, and both kinds of sensors ---
@@ -816,3 +836,17 @@ def test_without_rosbags_the_error_names_the_command(tmp_path: Path, monkeypatch
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(MissingDependency, match=r"pip install 'tsfusion\[ros\]'"):
         open_dataset(path)
+
+
+def test_poses_of_a_long_recording_stay_small() -> None:
+    """A robot with thirty joints tells millions of transforms an hour."""
+    q, t = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0), SimpleNamespace(x=1.0, y=2.0, z=3.0)
+    samples = Samples()
+    tracemalloc.start()
+    try:
+        for stamp in range(10_000):
+            samples.add(stamp * 10**9, t, q)
+        assert tracemalloc.get_traced_memory()[0] < 100 * 10_000
+    finally:
+        tracemalloc.stop()
+    assert len(samples.trajectory().timestamps_ns) == 10_000

@@ -395,6 +395,13 @@ def test_cameras_of_one_file(tmp_path: Path, data: Data) -> None:
             "camera_matrix: [500, x, 320, 0, 1, 1, 0, 0, 1]\nimage_width: 4\nimage_height: 4\n",
             "could not convert",
         ),
+        ("intrinsics: [500, 500, 320, 240]\nresolution: [1000000, 1000000]\n", "2 to 8192 pixels a side"),
+        ("intrinsics: [500, 500, 320, 240]\nresolution: [.Inf, 480]\n", "infinity"),
+        ('{"a":' + "[" * 100_000 + "]" * 100_000 + "}", "far too large or too deep"),
+        ("a: " + "[" * 100_000, "far too large or too deep"),
+        ("<?xml version='1.0'?><opencv_storage>" + "<a>" * 100_000, "far too large or too deep"),
+        ("\n".join(f"{' ' * i}a{i}:" for i in range(1000)), "far too large or too deep"),
+        ("a: 1\n" * 300_000, "far too large or too deep"),
     ],
 )
 def test_bad_files_are_named(text: str | None, message: str, tmp_path: Path) -> None:

@@ -16,8 +16,7 @@ from tsfusion import cli, se3
 from tsfusion.datasets import Dataset, Selection, Synthetic, open_dataset, select
 from tsfusion.datasets.base import Frames, frame_of
 from tsfusion.datasets.consistency import check
-from tsfusion.datasets.mistakes import quaternion
-from tsfusion.datasets.poses import Pose, rigid
+from tsfusion.datasets.poses import Pose, quaternion, rigid
 from tsfusion.frame import Frame
 from tsfusion.keyframe import Intrinsics
 
@@ -267,6 +266,16 @@ def test_frames_without_depth_cannot_tell(data: Data) -> None:
     assert check(Corrupted(opened(data(FOLDERS["open3d"])), frame=blind)).verdict == "cannot tell"
 
 
+def test_points_that_no_lidar_measures_are_no_matter() -> None:
+    scans = synthetic("room", "lidar")
+
+    def beyond(frame: Frame) -> dict[str, object]:
+        assert frame.points is not None
+        return {"points": np.vstack([[[3e38, 0, 0]], frame.points[1:]]).astype(np.float32)}
+
+    assert check(Corrupted(scans, frame=beyond)).verdict == "agree"
+
+
 def run(*arguments: str) -> int:
     with pytest.raises(SystemExit) as ended:
         cli.main(list(arguments))
@@ -281,6 +290,8 @@ def test_verb_says_what_it_found(data: Data, capsys: pytest.CaptureFixture[str],
     assert json.loads(capsys.readouterr().out)["verdict"] == "agree"
     assert run("check", str(inverted(place, tmp_path))) == 1
     assert "world-to-camera" in capsys.readouterr().out
+    assert run("check", str(place), "--option", "depth_scale=0.0002") == 1
+    assert "depth is 5 times too small" in capsys.readouterr().out
 
 
 def inverted(place: Path, folder: Path) -> Path:

@@ -5,9 +5,11 @@ import json
 import logging
 import re
 import shutil
+import struct
 import subprocess
 import sys
 import zipfile
+import zlib
 from pathlib import Path
 
 import cv2
@@ -22,6 +24,7 @@ from test_datasets_tum import corbs
 from tsfusion.datasets import Dataset, Selection, describe, find, layouts, open_dataset, select
 from tsfusion.datasets.base import pose_of
 from tsfusion.errors import DatasetError
+from tsfusion.keyframe import Intrinsics
 
 
 def tum(root: Path) -> Path:
@@ -138,6 +141,7 @@ def test_a_corbs_archive_is_unpacked_when_asked_to(tmp_path):
     dataset = open_dataset(archive, unpack=True)
     assert dataset.name == "CoRBS D1_pre_registereddata"
     assert (len(dataset), dataset.skipped, dataset.uncolored) == (4, {"without a pose in time": 1}, 1)
+    assert describe(dataset).endswith("all with poses, 1 without colour in time")
     assert float(dataset[1].depth[0, 0] * dataset[1].depth_scale) == pytest.approx(2)
     assert dataset[1].T_world_camera[0, 3] == pytest.approx(1.8)
     assert len(open_dataset(archive)) == 4  # its folder is there now
@@ -278,6 +282,40 @@ def test_a_depth_image_of_the_wrong_kind_is_named(tmp_path):
         open_dataset(root)[0]
 
 
+def test_what_macos_puts_beside_files_is_no_recording(tmp_path):
+    redwood(tmp_path, [0, 1], [0, 1])
+    for path in [path for path in tmp_path.rglob("*") if path.is_file()]:
+        path.with_name(f"._{path.name}").write_bytes(b"\0\5\x16\7")
+    assert len(list(open_dataset(tmp_path))) == 2
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as packed:
+        for path in sorted(tmp_path.rglob("*.*")):
+            if path.suffix != ".zip":
+                place = "__MACOSX/depth" if path.name.startswith("._") else "recording"
+                packed.write(path, f"{place}/{path.relative_to(tmp_path)}")
+    assert len(open_dataset(tmp_path / "a.zip", unpack=True)) == 2
+
+
+@pytest.mark.parametrize("side", [20_000, 100_000])
+def test_an_image_that_claims_to_be_huge_is_named(tmp_path, side):
+    root = redwood(tmp_path, [0], [0])
+    depth = root / "depth" / "00000.png"
+    content = bytearray(depth.read_bytes())
+    struct.pack_into(">2I", content, 16, side, side)
+    struct.pack_into(">I", content, 29, zlib.crc32(content[12:29]))
+    depth.write_bytes(content)
+    with pytest.raises(DatasetError, match=r"00000\.png cannot be decoded; expected a 16-bit depth image"):
+        open_dataset(root)[0]
+
+
+def test_a_depth_image_of_another_size_is_named(tmp_path):
+    dataset = open_dataset(redwood(tmp_path, [0, 1], [0, 1]))
+    assert dataset[0].shape == (6, 8)
+    for name, pixels in (("depth", np.ones((12, 16), np.uint16)), ("color", np.zeros((12, 16, 3), np.uint8))):
+        cv2.imwrite(str(tmp_path / name / "00001.png"), pixels)
+    with pytest.raises(DatasetError, match=r"00001\.png is 16×12, others are 8×6; expected one size"):
+        dataset[1]
+
+
 def command(*words: object) -> tuple[int, str, str]:
     """Exit status, output and messages of a command line."""
     done = subprocess.run(
@@ -296,6 +334,12 @@ def test_the_command_lists_layouts_and_datasets(tmp_path):
     expected = f"{tmp_path}/a  ScanNet scene0000_00  kinect  4 keyframes\n"
     assert command("datasets", tmp_path) == (0, expected, "")
     assert json.loads(command("datasets", tmp_path, "--json")[1])[0]["name"] == "ScanNet scene0000_00"
+    tum(tmp_path / "b" / "rgbd")
+    status, listed, _ = command("datasets", tmp_path / "b")
+    assert (status, listed.split("  ", 1)[1]) == (
+        0,
+        "TUM rgbd  kinect  3 frames without poses, for `tsfusion scan`\n",
+    )
 
 
 def test_replay_says_what_it_found(tmp_path):
@@ -307,3 +351,46 @@ def test_replay_says_what_it_found(tmp_path):
     assert first == "found: ScanNet scene0000_00, 3 RGB-D frames 160×120, all with poses"
     assert "sonar" in second
     assert (tmp_path / "scan" / "scene0000_00").is_dir()
+
+
+@pytest.mark.parametrize(
+    ("option", "expected"),
+    [
+        ({"depth_scale": "x"}, "`depth_scale` must be a number, got 'x'"),
+        ({"depth_scale": True}, "`depth_scale` must be a number, got True"),
+        ({"color": "False"}, "`color` must be true or false, got 'False'"),
+        ({"trajectory": ["a"]}, "`trajectory` must be text, got "),
+        ({"intrinsics": [1, 2]}, r"`intrinsics` must be four numbers, \[fx, fy, cx, cy\], got "),
+        ({"intrinsics": ["a", 2, 3, 4]}, "intrinsics must be four numbers"),
+    ],
+)
+def test_an_option_of_the_wrong_type_is_one_clear_line(tmp_path, option, expected):
+    with pytest.raises(DatasetError, match=expected) as caught:
+        open_dataset(redwood(tmp_path, [0], [0]), **option)
+    assert "\n" not in str(caught.value)
+
+
+def test_options_are_taken_as_they_were_meant(tmp_path):
+    redwood(tmp_path / "5", [0], [0])
+    dataset = open_dataset(tmp_path / "5", intrinsics=[500, 500, 3.5, 2.5], depth_scale=1)
+    assert dataset[0].intrinsics == Intrinsics(500, 500, 3.5, 2.5)
+    assert dataset[0].depth_scale == 1.0
+    with pytest.raises(DatasetError, match=r"5/17 is missing"):
+        open_dataset(tmp_path / "5", trajectory=17)
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["[" * 200_000, '{"intrinsic_matrix": [%s, 0, 0, 0, 1, 0, 3, 3, 1]}' % ("1" * 400),
+     '{"camera": {"w": 1e999, "h": 6, "fx": 1, "fy": 1, "cx": 1, "cy": 1, "scale": 1}}',
+     '{"camera": {"w": 0, "h": 0, "fx": 1, "fy": 1, "cx": 1, "cy": 1, "scale": 1}}'],
+)  # fmt: skip
+def test_a_broken_camera_file_is_one_clear_line(tmp_path, content):
+    redwood(tmp_path / "redwood", [0], [0])
+    (tmp_path / "redwood" / "camera_intrinsic.json").write_text(content)
+    recordings.replica(tmp_path / "replica")
+    (tmp_path / "replica" / "cam_params.json").write_text(content)
+    for place in ("redwood", "replica"):
+        with pytest.raises(DatasetError, match=r"\.json must ") as caught:
+            open_dataset(tmp_path / place)
+        assert "\n" not in str(caught.value)

@@ -3,6 +3,8 @@
 
 import contextlib
 import shutil
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -145,6 +147,18 @@ def test_calibration_without_tr_serves_stereo_only(tmp_path):
         KITTI(root, "06", "lidar")
 
 
+def _chunk(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+HUGE = (
+    b"\x89PNG\r\n\x1a\n"
+    + _chunk(b"IHDR", struct.pack(">IIBBBBB", 20_000, 20_000, 8, 0, 0, 0, 0))
+    + _chunk(b"IDAT", zlib.compress(b""))
+    + _chunk(b"IEND", b"")
+)
+
+
 def _write(name: str, content: str | bytes | None):
     def change(root: Path) -> None:
         path = root / name
@@ -173,6 +187,7 @@ SEQUENCE = "sequences/06"
             r"image_0/000000\.png is missing: 3 left and 4 right",
         ),
         ("stereo", _write(f"{SEQUENCE}/image_0/000002.png", "x"), r"image_0/000002\.png cannot be decoded"),
+        ("stereo", _write(f"{SEQUENCE}/image_0/000002.png", HUGE), r"image_0/000002\.png cannot be decoded"),
         ("stereo", _write(f"{SEQUENCE}/image_0/copy.png", "x"), r"copy\.png is not named by a frame number"),
         (
             "stereo",

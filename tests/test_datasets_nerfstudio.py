@@ -121,6 +121,8 @@ def test_distorted_captures_are_undistorted(tmp_path, lens):
         (lambda c: c["frames"][1].update(depth_file_path="gone.npy"), r"gone\.npy cannot be read"),
         (lambda c: c["frames"][1].update(depth_file_path="images/00000.png"), r"must hold one channel of"),
         (lambda c: c.update(frames=[]), r"has no list of frames"),
+        (lambda c: c.update(w=10**400), r"frame 0: w must be a number"),
+        (lambda c: [c.pop("fl_x"), c.update(camera_angle_x=0)], r"camera_angle_x must be radians"),
         (lambda c: [f.pop("transform_matrix") for f in c["frames"]], r"no usable .*\(4 without a pose\)"),
     ],
 )  # fmt: skip
@@ -137,3 +139,34 @@ def test_frames_without_depth_or_pose_are_counted(tmp_path):
     assert (len(dataset), dataset.skipped, dataset.pose(0)) == (3, {"without depth": 1}, None)
     put("transforms.json", "{")(root)
     one_line(lambda: Nerfstudio(root), r"transforms\.json cannot be read: ")
+
+
+def test_angles_of_view_tell_the_focal_lengths(tmp_path):
+    transforms(tmp_path)
+    plain = Nerfstudio(tmp_path)[0].intrinsics
+
+    def angles(capture):
+        for axis, side in (("x", "w"), ("y", "h")):
+            length = capture.pop(f"fl_{axis}") * (1 if axis == "x" else 2)
+            capture[f"camera_angle_{axis}"] = 2 * np.arctan(capture[side] / 2 / length)
+
+    rewrite(tmp_path, angles)
+    found = Nerfstudio(tmp_path)[0].intrinsics
+    assert found.fx == pytest.approx(plain.fx)
+    assert found.fy == pytest.approx(2 * plain.fy)
+
+
+def test_arrays_that_are_none_or_claim_too_much_are_one_clear_line(tmp_path):
+    rewrite(transforms(tmp_path), lambda c: c["frames"][0].update(depth_file_path="depth.npy"))
+    with (tmp_path / "depth.npy").open("wb") as file:
+        np.savez(file, depth=np.ones((120, 160), np.float32))
+    one_line(lambda: Nerfstudio(tmp_path)[0], r"depth\.npy cannot be read")
+    with (tmp_path / "depth.npy").open("wb") as file:
+        claimed = {"descr": "<f4", "fortran_order": False, "shape": (10**6, 10**6)}
+        np.lib.format.write_array_header_1_0(file, claimed)
+    one_line(lambda: Nerfstudio(tmp_path)[0], r"depth\.npy cannot be read")
+
+
+def test_a_file_of_brackets_is_one_clear_line(tmp_path):
+    (tmp_path / "transforms.json").write_text("[" * 200_000)
+    one_line(lambda: Nerfstudio(tmp_path), r"transforms\.json cannot be read")

@@ -8,6 +8,7 @@ import io
 import json
 import os
 import re
+import shutil
 import signal
 import tarfile
 import threading
@@ -21,7 +22,7 @@ import numpy as np
 import pytest
 from commands import end, eventually, started, tsfusion
 
-from tsfusion.datasets import fetching, open_dataset
+from tsfusion.datasets import archives, fetching, open_dataset
 from tsfusion.datasets.catalogue import CATALOGUE, File, Recording, entry
 from tsfusion.datasets.download import Fetched, check, fetch
 from tsfusion.errors import DatasetError, MissingDependency, OutputError
@@ -47,6 +48,7 @@ class Server(http.server.ThreadingHTTPServer):
         self.kind = "application/octet-stream"
         self.redirect: str | None = None
         self.with_length = True
+        self.wrong_place = False  # ranges begin a byte late
         self.asked: list[str | None] = []
         self.stalled, self.go_on = threading.Event(), threading.Event()
 
@@ -79,6 +81,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         start, end = 0, len(content)
         if asked and server.ranges and self.headers.get("If-Range") == server.tag:
             start = int(re.fullmatch(r"bytes=(\d+)-", asked)[1])  # type: ignore[index]
+        start += server.wrong_place and start > 0
         if start >= end:
             self.send_response(416)
             self.send_header("Content-Range", f"bytes */{end}")
@@ -235,6 +238,30 @@ def test_a_file_that_rots_on_the_disk_is_found(server: Server, tmp_path: Path) -
             verb()
 
 
+def test_a_server_that_takes_back_what_it_sent_is_left(server: Server, tmp_path: Path) -> None:
+    """Each answer is cut, and the next is of another place than was asked for."""
+    server.cuts, server.wrong_place = [1_000_000] * 100, True
+    with pytest.raises(DatasetError, match="the connection was cut"):
+        fetch(one(server.url), tmp_path, silent)
+    assert len(server.asked) < 10
+
+
+def test_a_server_that_never_ends_does_not_fill_the_disk(
+    server: Server, small_disk: Callable[[int], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = small_disk(4)
+    server.with_length, server.files["file.bin"] = False, bytes(32 << 20)
+    monkeypatch.setattr(fetching, "_RESERVE_BYTES", 1 << 20)
+    with pytest.raises(OutputError, match=r"1 MB are to come, \d MB are free on that disk"):
+        fetch(one(server.url), disk, silent)
+    assert shutil.disk_usage(disk).free >= 1 << 20
+
+
+def test_a_host_that_cannot_be_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"cannot download http://a\.\.b/file\.bin: no host can have"):
+        fetch(one("http://a..b"), tmp_path, silent)
+
+
 @pytest.mark.parametrize(
     ("setting", "value", "message"),
     [
@@ -324,7 +351,7 @@ def test_two_downloads_of_one_file_do_not_mix(server: Server, tmp_path: Path) ->
 
 def zipped(*members: tuple[str, bytes], links: tuple[str, ...] = ()) -> bytes:
     content = io.BytesIO()
-    with zipfile.ZipFile(content, "w") as archive:
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in members:
             archive.writestr(name, data)
         for name in links:
@@ -370,6 +397,32 @@ def test_archives_that_lead_out_are_refused_whole(
         fetch(one(server.url, name), tmp_path / "deep" / "er", silent)
     left = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert sorted(path.name for path in left) == [name, f"{name}.sha256"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("a.zip", zipped(("big", bytes(8 << 20)))), ("a.tgz", tarred(("fine", b"1"), ("big", bytes(8 << 20))))],
+)
+def test_archives_that_unfold_to_more_than_the_disk_holds_are_refused(
+    server: Server,
+    small_disk: Callable[[int], Path],
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    content: bytes,
+) -> None:
+    monkeypatch.setattr(archives, "_RESERVE_BYTES", 1 << 20)
+    disk = small_disk(4)
+    (disk / name).write_bytes(content)
+    with pytest.raises(OutputError, match=r"it unpacks to 8 MB, \d MB are free on that disk"):
+        fetch(one(server.url, name), disk, silent)
+    assert sorted(path.name for path in disk.iterdir()) == [name, f"{name}.sha256"]
+
+
+def test_an_archive_that_cannot_be_unpacked_can_be_fetched_again(server: Server, tmp_path: Path) -> None:
+    server.files["a.zip"] = b"no zip"
+    for _ in range(2):
+        with pytest.raises(DatasetError, match=r"cannot unpack .*a\.zip: .*; remove .* to fetch it again"):
+            fetch(one(server.url, "a.zip"), tmp_path, silent)
 
 
 def test_archives_within_archives_and_several_files_make_one_folder(server: Server, tmp_path: Path) -> None:

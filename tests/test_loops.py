@@ -21,6 +21,7 @@ from tsfusion.localizers.closing import LoopClosing
 from tsfusion.localizers.loops import Consensus, Loop
 from tsfusion.localizers.odometry import Chain, Drift
 from tsfusion.localizers.places import Places, View, view
+from tsfusion.localizers.rgbd import RGBD
 from tsfusion.localizers.verify import check, matches
 
 FAR, TURNED = 0.05, 2.0  # metres and degrees: a loop that is farther off is wrong
@@ -142,6 +143,7 @@ def test_rooms_all_alike_are_not_one_room():
     dataset = Synthetic("rooms", count=45)
     run = Run([dataset.frame(index) for index in range(45)])
     assert run.closing.counts.verified > 30
+    assert run.closing.relocalise(dataset.frame(20)) is None
     assert run.closing.consensus.refused["contradicts the odometry"] > 30
     assert run.loops == []
     assert run.corrections == []
@@ -276,6 +278,32 @@ def test_a_lost_camera_finds_itself():
     assert closing.counts.keyframes == 40
 
 
+def test_a_lost_tracker_goes_on_where_it_has_been_before():
+    """It walks on for 4 m, is covered, and wakes up where it was long ago: the world is the same."""
+    dataset = Synthetic("corridor", count=520, width=320)
+    alone = RGBD()
+    for index in range(34, 46):
+        alone.track(dataset.frame(index))
+    assert isinstance(alone.track(dataset.frame(8)), Lost)
+    closing = LoopClosing(RGBD())
+    for index in range(46):
+        assert isinstance(closing.track(dataset.frame(index)), Pose)
+    frame = dataset.frame(46)
+    black = replace(frame, depth=np.zeros_like(frame.depth), color=np.zeros_like(frame.color))
+    assert all(isinstance(closing.track(black), Lost) for _ in range(5))
+    found = [(index, closing.track(dataset.frame(index))) for index in range(8, 16)]
+    poses = [(index, pose) for index, pose in found if isinstance(pose, Pose)]
+    assert len(poses) >= 6, found
+    for index, pose in poses:
+        truth = se3.inverse(dataset.pose(0)) @ dataset.pose(index)
+        error = se3.inverse(truth) @ pose.T_world_camera
+        assert se3.distance(error) < FAR, index
+        assert np.degrees(se3.angle(error)) < TURNED
+    assert len({pose.anchor for _, pose in poses} & set(range(3))) == 0  # anchors are never used twice
+    elsewhere = Synthetic("room", count=40)
+    assert all(isinstance(closing.track(elsewhere.frame(0)), Lost) for _ in range(4))
+
+
 def test_lidar_frames_pass_through():
     dataset = Synthetic("room", "lidar", count=12, color=False)
     run = Run([dataset.frame(index) for index in range(12)])
@@ -362,6 +390,19 @@ def test_a_look_alike_nearby_makes_a_loop_doubtful():
     for new in range(50, 54):
         found += sure.hear([claim(new - 50, new), claim(new - 48, new, off=2.0)])
     assert len(found) == 4
+
+
+def test_loops_of_one_keyframe_that_contradict_each_other_are_both_refused():
+    consensus = Consensus(straight(60))
+    for new in range(50, 54):
+        assert consensus.hear([claim(new - 50, new), claim(new - 49, new, off=0.9)]) == []
+    assert consensus.refused == {"fits another place too": 4}
+
+
+def test_an_image_too_small_is_no_place():
+    frame = two_laps()[0]
+    tiny = replace(frame, depth=frame.depth[:8, :40].copy(), color=frame.color[:8, :40].copy())
+    assert view(tiny, tiny.depth_m) is None
 
 
 def test_a_place_seen_to_have_a_twin_is_doubtful_ever_after():

@@ -4,11 +4,13 @@
 import json
 import os
 import signal
+import struct
 import subprocess
 import sys
 import textwrap
 import threading
 import time
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ from tsfusion import sources
 from tsfusion.errors import InvalidConfig, SourceError
 from tsfusion.frame import Frame
 from tsfusion.keyframe import Intrinsics
+from tsfusion.sources import layouts
 from tsfusion.sources.folder import Folder
 
 H, W = 24, 32
@@ -324,6 +327,41 @@ def test_a_folder_that_goes_away(tmp_path: Path) -> None:
         place.rename(tmp_path / "elsewhere")
         with pytest.raises(SourceError, match="scan cannot be read any more"):
             next(frames)
+
+
+def test_files_that_go_away_while_they_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where another program clears up what is old."""
+    camera(tmp_path)
+    for number in (0, 1):
+        rgbd(tmp_path, number)
+    whole_image = layouts.whole_image
+
+    def then_gone(path: Path, flags: int) -> Any:
+        image = whole_image(path, flags)
+        if path.stem.endswith("0"):
+            path.unlink()
+        return image
+
+    monkeypatch.setattr(layouts, "whole_image", then_gone)
+    (tmp_path / "DONE").touch()
+    with Folder(tmp_path) as source:
+        assert numbers(list(source)) == [1]
+        assert source.skipped == {"damaged": 1}
+
+
+def test_an_image_that_claims_to_be_huge_is_left_out(tmp_path: Path) -> None:
+    camera(tmp_path)
+    for number in (0, 1):
+        rgbd(tmp_path, number)
+    first = tmp_path / "depth" / "000000.png"
+    content = bytearray(first.read_bytes())
+    struct.pack_into(">2I", content, 16, 100_000, 100_000)
+    struct.pack_into(">I", content, 29, zlib.crc32(content[12:29]))
+    first.write_bytes(content)
+    (tmp_path / "DONE").touch()
+    with Folder(tmp_path) as source:
+        assert numbers(list(source)) == [1]
+        assert source.skipped == {"damaged": 1}
 
 
 def test_close_from_another_thread_ends_the_iteration(tmp_path: Path) -> None:

@@ -89,6 +89,37 @@ def test_the_tour_sees_the_room_from_everywhere_within():
     assert Synthetic("room", count=1, path="tour")[0].shape == (240, 320)
 
 
+def test_rooms_that_are_hard_to_find_the_way_in():
+    """The same walls and things; what is plain has one colour but for the light, what is bare is empty."""
+    room, untextured, plain, bare = (
+        Synthetic(name, count=10, path="handheld", width=160)[0]
+        for name in ("room", "room-untextured", "room-plain", "room-bare")
+    )
+    np.testing.assert_array_equal(untextured.depth, room.depth)
+    np.testing.assert_array_equal(plain.depth, room.depth)
+    assert worlds.room("room-bare").distance(np.array([0.6, 0.3, 0.5])) == 0.5
+    things = np.abs(room.depth.astype(int) - bare.depth) > 1000  # 10 cm, of 0.1 mm each
+    assert 0.1 < things.mean() < 0.6
+    walls = ~cv2.dilate(things.astype(np.uint8), np.ones((9, 9))).astype(bool)
+    gray = {name: np.ptp(image.color, axis=2) for name, image in (("all", untextured), ("walls", plain))}
+    assert gray["all"].max() <= 1
+    assert gray["walls"][walls].max() <= 1
+    assert gray["walls"][things].mean() > 10
+    assert np.ptp(room.color, axis=2)[walls].mean() > 10
+
+
+def test_the_hand_moves_as_a_hand_does():
+    dataset = Synthetic("room", count=200, path="handheld", width=16)
+    poses = np.array([dataset.pose(index) for index in range(200)])
+    steps = np.linalg.inv(poses[:-1]) @ poses[1:]
+    speed = np.linalg.norm(steps[:, :3, 3], axis=1) * 10
+    turn = np.degrees(np.arccos((np.trace(steps[:, :3, :3], axis1=1, axis2=2) - 1) / 2)) * 10
+    assert 0.2 < speed.min() < 0.4 < speed.max() < 0.6
+    assert 20 < turn.mean() < 40
+    assert dataset.distance(poses[:, :3, 3]).min() > 0.15
+    np.testing.assert_array_equal(Synthetic("room", count=40, path="handheld").pose(30), poses[30])
+
+
 def test_the_signed_distance_of_the_room_is_the_documented_formula():
     rng = np.random.default_rng(1)
     p = rng.uniform((-2.2, -2.2, -0.2), (2.2, 2.2, 3.0), (5000, 3))

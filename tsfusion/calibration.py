@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.errors import InvalidConfig, InvalidKeyframe
-from tsfusion.keyframe import Intrinsics, check_intrinsics, check_pose
+from tsfusion.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics, check_pose
 
 Model = Literal["pinhole", "radtan", "equidistant"]
 Size = tuple[int, int]  # height, width
@@ -64,8 +64,10 @@ class Camera:
             raise InvalidConfig(
                 f"distortion of a {self.model} camera must be {counts} finite numbers, got {self.distortion}"
             )
-        if len(self.size) != 2 or min(self.size) < 2:
-            raise InvalidConfig(f"size of a camera must be (height, width) in pixels, got {self.size}")
+        if len(self.size) != 2 or not 2 <= min(self.size) <= max(self.size) <= MAX_IMAGE_SIDE:
+            raise InvalidConfig(
+                f"size of a camera must be 2 to {MAX_IMAGE_SIDE} pixels a side, got {self.size}"
+            )
         try:
             check_intrinsics(self.intrinsics)
         except InvalidKeyframe as error:

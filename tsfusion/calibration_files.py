@@ -21,6 +21,7 @@ from tsfusion.se3 import inverse
 EXPECTED = (
     "Kalibr's camchain.yaml, EuRoC's sensor.yaml, ROS camera_info, or OpenCV's matrices M1 D1 M2 D2 R T"
 )
+_MAX_TEXT, _MAX_DEPTH, _MAX_INDENTATION = 1 << 20, 64, 256  # characters, brackets or tags, spaces
 Tree = dict[str, Any]
 
 
@@ -36,7 +37,7 @@ def read_camera(path: str | Path, *, size: Size | None = None) -> Camera:
     path = Path(path)
     try:
         return _camera(read_tree(path), size)[0]
-    except (InvalidConfig, KeyError, TypeError, ValueError) as error:
+    except (InvalidConfig, KeyError, TypeError, ValueError, OverflowError) as error:
         raise _malformed([path], error) from error
 
 
@@ -50,7 +51,7 @@ def read_rig(*paths: str | Path, size: Size | None = None) -> StereoRig:
     trees = [read_tree(path) for path in files]
     try:
         return _rig(trees, size)
-    except (InvalidConfig, KeyError, TypeError, ValueError) as error:
+    except (InvalidConfig, KeyError, TypeError, ValueError, OverflowError) as error:
         raise _malformed(files, error) from error
 
 
@@ -78,6 +79,8 @@ def read_tree(path: Path) -> Tree:
         raise DatasetError(f"{path} is not a text file; expected {EXPECTED}") from error
     except OSError as error:
         raise DatasetError(f"cannot read {path}: {error.strerror}") from error
+    if _is_monstrous(text):
+        raise DatasetError(f"{path} is far too large or too deep for a calibration; expected {EXPECTED}")
     try:
         storage = cv2.FileStorage(_palatable(text), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         tree = _unfolded(storage.root())
@@ -88,6 +91,19 @@ def read_tree(path: Path) -> Tree:
     if not isinstance(tree, dict) or not tree:
         raise DatasetError(f"{path} holds no named values; expected {EXPECTED}")
     return tree
+
+
+def _is_monstrous(text: str) -> bool:
+    """Whether it is larger or deeper than any calibration: OpenCV's parser runs out of stack and crashes."""
+    if len(text) > _MAX_TEXT or re.search(rf"^ {{{_MAX_INDENTATION}}}", text, re.MULTILINE):
+        return True
+    depth = 0
+    tags = r"|<(?=[A-Za-z_])|</|/>" if text.lstrip().startswith("<") else ""
+    for found in re.finditer(r"[\[{\]}]" + tags, text):
+        depth += 1 if found[0] in "[{<" else -1
+        if depth > _MAX_DEPTH:
+            return True
+    return False
 
 
 def _palatable(text: str) -> str:

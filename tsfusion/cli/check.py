@@ -17,14 +17,21 @@ def check(
     *,
     sequence: Annotated[str | None, typer.Option(metavar="NN", help="KITTI: the sequence.")] = None,
     modality: Annotated[str | None, typer.Option(metavar="KIND", help="KITTI: stereo or lidar.")] = None,
-    poses: Annotated[Path | None, typer.Option(metavar="FILE", help="KITTI: poses to use instead.")] = None,
+    poses: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="KITTI, TUM, Redwood: poses to use instead.")
+    ] = None,
+    unpack: Annotated[bool, typer.Option("--unpack", help="Unpack an archive beside itself.")] = False,
+    option: options.DatasetOptions = None,
     json: options.Json = False,
 ) -> None:
     """See whether a dataset's poses and depth agree; if not, say why. Status 1 when they disagree."""
     from tsfusion.cli import show
     from tsfusion.datasets import consistency
 
-    dataset = replay.open_recording(path, sequence=sequence, modality=modality, poses=poses)
+    dataset = replay.open_recording(
+        path, unpack=unpack, sequence=sequence, modality=modality, poses=poses,
+        **options.dataset_options(option),
+    )  # fmt: skip
     report = consistency.check(dataset)
     if json:
         show.as_json({"name": dataset.name, **asdict(report)})

@@ -33,7 +33,7 @@ def _group() -> None:
 @app.command("list")
 def list_(
     path: Annotated[
-        Path | None, typer.Argument(metavar="[PATH]", help="Look for datasets in and under it.")
+        Path | None, typer.Argument(metavar="PATH", help="Look for datasets in and under it.")
     ] = None,
     json: options.Json = False,
 ) -> None:
@@ -50,8 +50,19 @@ def list_(
         typer.echo(f"no datasets in or under {path}", err=True)
 
 
-def _line(name: str, *, description: str = "", path: str = "", sensor: str = "", keyframes: int = 0) -> str:
-    return f"{path}  {name}  {sensor}  {keyframes} keyframes" if path else f"{name:<16}  {description}"
+def _line(
+    name: str,
+    *,
+    description: str = "",
+    path: str = "",
+    sensor: str = "",
+    keyframes: int = 0,
+    posed: bool = True,
+) -> str:
+    if not path:
+        return f"{name:<16}  {description}"
+    what = "keyframes" if posed else "frames without poses, for `tsfusion scan`"
+    return f"{path}  {name}  {sensor}  {keyframes} {what}"
 
 
 def _layouts() -> list[dict[str, Any]]:
@@ -69,19 +80,25 @@ def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
         DatasetError: when there is no folder.
     """
     from tsfusion.datasets import open_dataset
-    from tsfusion.errors import DatasetError
+    from tsfusion.errors import DatasetError, MissingDependency
 
-    try:
-        dataset = open_dataset(path)
-    except DatasetError:
-        if not path.is_dir():
-            raise
-        for child in _folders_in(path) if depth else []:
-            yield from _found(child, depth - 1)
+    for posed in (True, False):
+        try:
+            dataset = open_dataset(path, posed=posed)
+        except MissingDependency as error:
+            typer.echo(f"{path}: {error}", err=True)
+            return
+        except DatasetError:
+            continue
+        yield {
+            "path": str(path), "name": dataset.name, "sensor": dataset.sensor,
+            "keyframes": len(dataset), "posed": posed,
+        }  # fmt: skip
         return
-    yield {
-        "path": str(path), "name": dataset.name, "sensor": dataset.sensor, "keyframes": len(dataset),
-    }  # fmt: skip
+    if not path.is_dir():
+        open_dataset(path)
+    for child in _folders_in(path) if depth else []:
+        yield from _found(child, depth - 1)
 
 
 def _folders_in(path: Path) -> list[Path]:

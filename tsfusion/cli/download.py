@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def download(
     name: Annotated[
-        str | None, typer.Argument(metavar="[NAME]", help="What to fetch; without it, what there is.")
+        str | None, typer.Argument(metavar="NAME", help="What to fetch; without it, what there is.")
     ] = None,
     *,
     to: Annotated[Path, typer.Option("--to", metavar="DIR", help="Where recordings are kept.")] = Path(

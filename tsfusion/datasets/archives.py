@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Recordings as they are downloaded: archives, unpacked beside themselves."""
 
+import errno
 import lzma
+import shutil
 import stat
 import tarfile
 import tempfile
@@ -9,8 +11,11 @@ import zipfile
 import zlib
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
+from tsfusion import disk
 from tsfusion.errors import DatasetError
 
+_CHUNK_BYTES = 1 << 20
+_RESERVE_BYTES = 16 << 20  # left on the disk
 _SUFFIXES = (".tar.gz", ".tar.bz2", ".tar.xz", ".tgz", ".tbz2", ".txz", ".tar", ".zip")
 
 
@@ -49,7 +54,7 @@ def unpack(path: Path) -> Path:
             extract(path, partial)
             partial.rename(into)
     except OSError as error:
-        raise DatasetError(f"cannot unpack {path}: {error}") from error
+        raise DatasetError(f"cannot unpack {path}: {error.strerror or error}") from error
     return into
 
 
@@ -79,18 +84,37 @@ def extract(path: Path, into: Path, *, nested: bool = False) -> None:
 
 
 def _extract_tar(path: Path, into: Path) -> None:
-    with tarfile.open(path) as tar:
+    with tarfile.open(path) as tar:  # `tar.extract(filter="data")` is too new for Debian 12's Python
         for member in tar:
             _require_inside(member.name, is_link=not (member.isfile() or member.isdir()))
-            tar.extract(member, into, filter="data")
+            target = into / member.name
+            if member.isdir():
+                target.mkdir(parents=True, exist_ok=True)
+                continue
+            _require_room(member.size, into)
+            content = tar.extractfile(member)
+            assert content is not None
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with target.open("wb") as file:
+                shutil.copyfileobj(content, file, _CHUNK_BYTES)
 
 
 def _extract_zip(path: Path, into: Path) -> None:
     with zipfile.ZipFile(path) as archive:
+        _require_room(sum(member.file_size for member in archive.infolist()), into)
         for member in archive.infolist():
             member.filename = member.filename.replace("\\", "/")
             _require_inside(member.filename, is_link=stat.S_ISLNK(member.external_attr >> 16))
             archive.extract(member, into)
+
+
+def _require_room(nbytes: int, into: Path) -> None:
+    """Raise OSError where what is to be unpacked, as the archive says, would fill the disk."""
+    free = disk.free_bytes(into)
+    if nbytes + _RESERVE_BYTES > free:
+        raise OSError(
+            errno.ENOSPC, f"it unpacks to {nbytes / 1e6:.0f} MB, {free / 1e6:.0f} MB are free on that disk"
+        )
 
 
 def _require_inside(name: str, *, is_link: bool) -> None:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.datasets.base import decoded
 from tsfusion.errors import DatasetError
 from tsfusion.keyframe import MAX_IMAGE_SIDE
 
@@ -152,10 +153,7 @@ def _stored(message: Any) -> NDArray[Any]:
 
 def _decoded(message: Any, flags: int, start: int = 0) -> NDArray[Any]:
     content = np.ascontiguousarray(message.data, np.uint8)[start:]
-    try:
-        image: NDArray[Any] | None = cv2.imdecode(content, flags) if len(content) else None
-    except cv2.error:
-        image = None
+    image = decoded(content, flags)
     if image is None:
         raise DatasetError(f"of {len(message.data)} bytes cannot be decoded as {message.format!r}")
     return image

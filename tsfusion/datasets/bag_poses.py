@@ -3,16 +3,14 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from tsfusion.datasets.bag_reader import Message, Recording, Stream
-from tsfusion.datasets.bag_transforms import OLD_TF, PATH, POSE_KINDS, TF, Track, Transforms, track
+from tsfusion.datasets.bag_transforms import OLD_TF, PATH, POSE_KINDS, TF, Told, Track, Transforms
+from tsfusion.datasets.base import SCAN
 from tsfusion.datasets.poses import Pose
 from tsfusion.errors import DatasetError
-
-_WITHOUT = "`tsfusion scan --source PATH` finds poses by itself"
 
 
 def pose_streams(recording: Recording, pose_topic: str | None) -> list[Stream]:
@@ -58,16 +56,16 @@ class PoseFinder:
         self._world, self._body = world_frame, body_frame
         self._max_gap_ns = round(max_gap_s * 1e9)
         self._transforms = Transforms(self._max_gap_ns)
-        self._messages: dict[Stream, list[Any]] = {}
+        self._told_by: dict[Stream, Told] = {}
 
     def add(self, message: Message) -> None:
         """Take in one of `streams`."""
         if message.stream.kind in (TF, OLD_TF):
             self._transforms.add(message.content, static=message.stream.topic.endswith("static"))
-        elif message.stream.kind == PATH:  # each holds all that were before
-            self._messages[message.stream] = [message.content]
         else:
-            self._messages.setdefault(message.stream, []).append(message.content)
+            if message.stream.kind == PATH or message.stream not in self._told_by:
+                self._told_by[message.stream] = Told()  # each path holds all that were before
+            self._told_by[message.stream].add(message.content, message.stream.kind)
 
     def finish(self, *, required: bool) -> Callable[[int], Pose | None]:
         """What gives `T_world_sensor` at a time, None where it is not known.
@@ -86,7 +84,7 @@ class PoseFinder:
         if required:
             raise DatasetError(
                 f"{self._path} tells no poses of {self._frame!r}: no changing transform and no topic of "
-                f"poses leads to it; {_WITHOUT}"
+                f"poses leads to it; {SCAN}"
             )
         return lambda _stamp: None
 
@@ -108,8 +106,8 @@ class PoseFinder:
         for kind in POSE_KINDS:
             tracks = {
                 stream.topic: found
-                for stream, messages in self._messages.items()
-                if stream.kind == kind and (found := track(messages, kind)) is not None
+                for stream, told in self._told_by.items()
+                if stream.kind == kind and (found := told.track()) is not None
             }
             fitting = {topic: one for topic, one in tracks.items() if self._leads(one)}
             if len(fitting) == 1:

@@ -61,6 +61,12 @@ class Chosen(NamedTuple):
     rig: Rig | None = None
     apart: Apart | None = None
 
+    def check_size(self, stream: Stream, size: tuple[int, ...]) -> None:
+        """Raise DatasetError for an image of a stream that has not the size its camera was found for."""
+        expected = self.apart.size if self.apart is not None and stream == self.other else self.size
+        if self.modality != "lidar" and size != expected:
+            raise DatasetError(f"is {size[1]}×{size[0]}, the first {expected[1]}×{expected[0]}")
+
 
 class Chooser:
     """Chooses among the topics of one recording.

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Where frames are: the tree of ROS transforms, and poses that other topics tell."""
 
+from array import array
 from collections import defaultdict
-from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -23,7 +23,30 @@ POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 POSE_KINDS = (ODOMETRY, TRANSFORM, POSE, POSE_WITH_COVARIANCE, PATH)  # the most telling first
 _SAME = 1e-9  # metres, and quaternion components: a transform that is sent again and again
 
-Sample = tuple[int, tuple[float, ...]]  # nanoseconds; x y z qx qy qz qw
+
+class Samples:
+    """Poses as they come in: 64 bytes each, for a robot may tell a thousand a second."""
+
+    def __init__(self) -> None:
+        self._stamps, self._values = array("q"), array("d")
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def add(self, stamp: int, t: Any, q: Any) -> None:
+        """A translation and a quaternion at a time; left out where they are not finite, or no rotation."""
+        values = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
+        length = float(np.linalg.norm(values[3:]))
+        if np.isfinite(values).all() and 0.5 < length < 2:
+            values[3:] /= length
+            self._stamps.append(stamp)
+            self._values.extend(values.tolist())
+
+    def trajectory(self) -> Trajectory:
+        """All of them in time order, of equal times the first."""
+        stamps, order = np.unique(np.array(self._stamps, np.int64), return_index=True)
+        table: NDArray[np.float64] = np.array(self._values).reshape(-1, 7)[order]
+        return Trajectory(stamps, table[:, :3], table[:, 3:])
 
 
 class _Edge(NamedTuple):
@@ -48,7 +71,7 @@ class Transforms:
 
     def __init__(self, max_gap_ns: int) -> None:
         self._max_gap_ns = max_gap_ns
-        self._samples: dict[tuple[str, str], list[Sample]] = defaultdict(list)
+        self._samples: dict[tuple[str, str], Samples] = defaultdict(Samples)
         self._dynamic: set[tuple[str, str]] = set()
         self._edges: dict[str, _Edge] = {}
 
@@ -56,16 +79,17 @@ class Transforms:
         """Take in a TFMessage; transforms that are not finite are left out."""
         for one in message.transforms:
             key = frame_id(one), str(one.child_frame_id).strip("/")
-            sample = _transform(stamp_ns(one), one.transform.translation, one.transform.rotation)
-            if sample is not None and key[0] != key[1]:
-                self._samples[key].append(sample)
+            if key[0] != key[1]:
+                self._samples[key].add(stamp_ns(one), one.transform.translation, one.transform.rotation)
                 if not static:
                     self._dynamic.add(key)
 
     def finish(self) -> None:
         """Make the tree of what has been taken in."""
         for (parent, child), samples in sorted(self._samples.items(), key=lambda item: len(item[1])):
-            trajectory = _trajectory(samples)
+            if not samples:
+                continue
+            trajectory = samples.trajectory()
             rows = np.hstack([trajectory.translations, trajectory.quaternions])
             constant = (parent, child) not in self._dynamic or bool((np.ptp(rows, axis=0) < _SAME).all())
             self._edges[child] = _Edge(parent, trajectory, constant)
@@ -128,40 +152,30 @@ class Track(NamedTuple):
     trajectory: Trajectory
 
 
-def track(messages: list[Any], kind: str) -> Track | None:
-    """The poses of one topic's messages; of paths the last. None = there is none."""
-    if kind == PATH:
-        messages = [one for one in messages[-1:] for one in one.poses]
-        kind = POSE
-    samples = [sample for one in messages for sample in _pose(one, kind)]
-    if not samples:
-        return None
-    body = str(getattr(messages[0], "child_frame_id", "")).strip("/")
-    return Track(frame_id(messages[0]), body, _trajectory(samples))
+class Told:
+    """What one topic tells, message by message.
 
+    Attributes:
+        world, body: frames, of the first message; an empty body = the topic does not say.
+    """
 
-def _pose(message: Any, kind: str) -> Iterator[Sample]:
-    if kind == TRANSFORM:
-        where = message.transform.translation, message.transform.rotation
-    else:
-        pose = message.pose if kind == POSE else message.pose.pose
-        where = pose.position, pose.orientation
-    sample = _transform(stamp_ns(message), *where)
-    if sample is not None:
-        yield sample
+    def __init__(self) -> None:
+        self.world, self.body = "", ""
+        self._samples, self._began = Samples(), False
 
+    def add(self, message: Any, kind: str) -> None:
+        """Take in a message of a kind of `POSE_KINDS`."""
+        for one in message.poses if kind == PATH else [message]:
+            if not self._began:
+                self.world, self._began = frame_id(one), True
+                self.body = str(getattr(one, "child_frame_id", "")).strip("/")
+            if kind == TRANSFORM:
+                where = one.transform.translation, one.transform.rotation
+            else:
+                pose = one.pose if kind in (POSE, PATH) else one.pose.pose
+                where = pose.position, pose.orientation
+            self._samples.add(stamp_ns(one), *where)
 
-def _transform(stamp: int, t: Any, q: Any) -> Sample | None:
-    values = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
-    length = float(np.linalg.norm(values[3:]))
-    if not np.isfinite(values).all() or not 0.5 < length < 2:
-        return None
-    values[3:] /= length
-    return stamp, tuple(values.tolist())
-
-
-def _trajectory(samples: list[Sample]) -> Trajectory:
-    stamps = np.array([stamp for stamp, _ in samples], dtype=np.int64)
-    stamps, order = np.unique(stamps, return_index=True)
-    table: NDArray[np.float64] = np.array([values for _, values in samples])[order]
-    return Trajectory(stamps, table[:, :3], table[:, 3:])
+    def track(self) -> Track | None:
+        """The poses; None = there is none."""
+        return Track(self.world, self.body, self._samples.trajectory()) if self._samples else None

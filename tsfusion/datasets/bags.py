@@ -63,6 +63,7 @@ class Bag(Frames):
             has `rect`. Others are undistorted or rectified here (colour by its depth's camera).
         max_difference_s: between a depth image and its colour (default 20 ms), or left and right (5 ms).
         max_gap_s: between the two poses interpolated, seconds.
+        time_offset_s: added to a frame's stamp before its pose is looked up, seconds.
         posed: leave out frames without a pose; otherwise they have `T_world_camera` None.
 
     Raises:
@@ -89,6 +90,7 @@ class Bag(Frames):
         rectified: bool | None = None,
         max_difference_s: float | None = None,
         max_gap_s: float = 0.25,
+        time_offset_s: float = 0.0,
         sensor: str | None = None,
         color: bool = True,
         posed: bool = True,
@@ -116,7 +118,7 @@ class Bag(Frames):
         mains, others = self._index(poses)
         difference_s = _DIFFERENCE_S[chosen.modality] if max_difference_s is None else max_difference_s
         self._pair(mains, others, round(difference_s * 1e9))
-        self._pose(poses.finish(required=posed), posed)
+        self._pose(poses.finish(required=posed), round(time_offset_s * 1e9), posed)
         self._registration = self._register(poses)
         require_frames(len(self._mains), place, EXPECTED, self.skipped)
 
@@ -137,6 +139,7 @@ class Bag(Frames):
                 try:
                     if check is not None and message.stream.kind == chosen.main.kind:
                         check(message.content)
+                        chosen.check_size(message.stream, (message.content.height, message.content.width))
                     places[message.stream.topic].append(message.place)
                 except DatasetError as error:
                     broken[message.stream.topic] += 1
@@ -147,6 +150,8 @@ class Bag(Frames):
             if count:
                 self.skipped[f"of {topic} that are broken"] = count
         found = [_by_time(places[one.topic]) for one in used]
+        if repeated := len(places[chosen.main.topic]) - len(found[0]):
+            self.skipped[f"of {chosen.main.topic} with another's time"] = repeated
         return found[0], found[1] if len(found) > 1 else {}
 
     @property
@@ -169,10 +174,10 @@ class Bag(Frames):
         self._mains = [mains[stamp] for stamp in stamps.tolist()]
         self._others = [others[int(there[i])] if ok else None for i, ok in zip(nearest, near, strict=True)]
 
-    def _pose(self, at: Callable[[int], Pose | None], posed: bool) -> None:
+    def _pose(self, at: Callable[[int], Pose | None], offset_ns: int, posed: bool) -> None:
         """Find the frames' poses; leave out those without."""
         assert self.timestamps_ns is not None
-        self._poses = [at(stamp) for stamp in self.timestamps_ns.tolist()]
+        self._poses = [at(stamp + offset_ns) for stamp in self.timestamps_ns.tolist()]
         rig = self._chosen.rig
         if rig is not None and rig.rectifier is not None:
             turned = rig.rectifier.T_left_rectified
@@ -230,6 +235,7 @@ class Bag(Frames):
         view = self._chosen.view
         assert view is not None
         depth = bag_messages.depth(content)
+        self._chosen.check_size(self._chosen.main, depth.shape)
         color = None if beside is None else bag_messages.color(beside)
         color_view = view if self._chosen.apart is None else self._chosen.apart.view
         if view.undistorter is not None:

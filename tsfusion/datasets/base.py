@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What a dataset is, and how its files are read with one clear error each."""
 
+import struct
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from tsfusion.errors import DatasetError, InvalidKeyframe
 from tsfusion.frame import Frame
-from tsfusion.keyframe import Intrinsics, Keyframe, check_intrinsics
+from tsfusion.keyframe import MAX_IMAGE_SIDE, Intrinsics, Keyframe, check_intrinsics
 
 SCAN = "`tsfusion scan --source PATH` finds poses by itself"
 _T = TypeVar("_T")
@@ -214,13 +215,33 @@ def numbers(path: Path, line: int, words: list[str], count: int, content: str) -
     return values
 
 
-def read_image(path: Path, what: str) -> NDArray[Any]:
-    """Any image as stored: (H, W) or (H, W, 3) BGR."""
+def read_image(path: Path, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
+    """Any image as stored: (H, W) or (H, W, 3) BGR; or as OpenCV's `flags` say."""
     if not path.is_file():
         raise DatasetError(f"{path} is missing; expected {what}")
-    image: NDArray[Any] | None = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    try:
+        image = decoded(np.fromfile(path, np.uint8), flags)
+    except OSError as error:
+        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
     if image is None:
         raise DatasetError(f"{path} cannot be decoded; expected {what}")
+    return image
+
+
+def decoded(content: NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
+    """An image file's bytes as OpenCV's `flags` say; None where they are none, or one that is far too large.
+
+    OpenCV believes a PNG of a few bytes that claims gigabytes of pixels, and raises beyond that.
+    """
+    head = content[:24].tobytes()
+    if head[1:4] == b"PNG" and any(
+        side > MAX_IMAGE_SIDE for side in struct.unpack(">2I", head[16:].ljust(8))
+    ):
+        return None
+    try:
+        image: NDArray[Any] | None = cv2.imdecode(content, flags) if len(content) else None
+    except cv2.error:
+        image = None
     return image
 
 
@@ -239,11 +260,7 @@ def read_depth(path: Path, *, invalid: int | None = None) -> NDArray[np.uint16]:
 
 def read_color(path: Path, shape: tuple[int, ...] | None) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 BGR of the depth image's `shape`; None: of any."""
-    if not path.is_file():
-        raise DatasetError(f"{path} is missing; expected a colour image")
-    color: NDArray[np.uint8] | None = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if color is None:
-        raise DatasetError(f"{path} cannot be decoded; expected a colour image")
+    color: NDArray[np.uint8] = read_image(path, "a colour image", cv2.IMREAD_COLOR)
     if shape is not None and color.shape[:2] != shape:
         raise DatasetError(
             f"{path} is {color.shape[1]}×{color.shape[0]}, its depth image {shape[1]}×{shape[0]}; "

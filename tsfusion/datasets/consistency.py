@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion import se3
-from tsfusion.datasets.base import Dataset, frame_of
+from tsfusion.datasets.base import Dataset, frame_of, pose_of
 from tsfusion.datasets.mistakes import MISTAKES, SCALES, scale_text
 from tsfusion.datasets.poses import Pose
 from tsfusion.datasets.views import View, view_of
@@ -80,7 +80,7 @@ class Report:
 def check(dataset: Dataset) -> Report:
     """Compare some neighbouring frames of a dataset under its poses and under those of usual mistakes.
 
-    Takes about a second, of a LiDAR two; reads about 20 frames, more where their times are suspect.
+    Takes about a second, of a LiDAR two; reads about 20 frames.
 
     Raises:
         DatasetError: a frame cannot be read.
@@ -254,7 +254,7 @@ def _time_shift(dataset: Dataset, pairs: list[_Pair], best: NDArray[np.float64])
 
     def pose(index: int) -> Pose | None:
         if index not in poses:
-            poses[index] = frame_of(dataset, index).T_world_camera if 0 <= index < len(dataset) else None
+            poses[index] = pose_of(dataset, index) if 0 <= index < len(dataset) else None
         return poses[index]
 
     def fits(late: int) -> NDArray[np.float64]:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Depth images in one folder, colour images of the same names in another: common to many layouts."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets.base import Frames, read_color, read_depth
+from tsfusion.datasets.base import Frames, checked_intrinsics, read_color, read_depth
 from tsfusion.datasets.poses import Pose
 from tsfusion.errors import DatasetError
 from tsfusion.frame import Frame
@@ -44,12 +45,19 @@ class DepthImages(Frames):
         self.name, self.sensor, self.skipped, self.intrinsics = name, sensor, skipped, intrinsics
         self.depth_scale, self.timestamps_ns = depth_scale, timestamps_ns
         self._depth, self._color, self._poses = depth, color, poses
+        self._size: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return len(self._depth)
 
     def _frame(self, index: int) -> Frame:
         depth = read_depth(self._depth[index])
+        self._size = self._size or depth.shape
+        if depth.shape != self._size:
+            raise DatasetError(
+                f"{self._depth[index]} is {depth.shape[1]}×{depth.shape[0]}, others are "
+                f"{self._size[1]}×{self._size[0]}; expected one size, as there is one camera"
+            )
         color = self._color[index] if self._color else None
         return Frame(
             depth=depth,
@@ -96,12 +104,23 @@ def seen_by(
     return seen
 
 
-def images(where: Path, expected: str, pattern: str = "*") -> list[Path]:
-    """The images in a folder: by number where all names are numbers, else by name."""
+def images(where: Path, expected: str, pattern: str = "[!.]*") -> list[Path]:
+    """The images in a folder: by number where all names are numbers, else by name; no hidden ones (macOS)."""
     if not where.is_dir():
         raise DatasetError(f"{where} is missing; expected {expected}")
     found = sorted(path for path in where.glob(pattern) if path.suffix.lower() in SUFFIXES)
     return sorted(found, key=lambda path: int(path.stem)) if _numbered(found) else found
+
+
+def read_open3d_camera(path: Path) -> Intrinsics:
+    """Intrinsics of Open3D's `camera_intrinsic.json`."""
+    try:
+        K = json.loads(path.read_text(encoding="utf-8"))["intrinsic_matrix"]  # column-major
+        return checked_intrinsics(Intrinsics(float(K[0]), float(K[4]), float(K[6]), float(K[7])), path)
+    except (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
+        raise DatasetError(
+            f"{path} must be an Open3D camera with a 9-number intrinsic_matrix: {error}"
+        ) from error
 
 
 def matched(depth: list[Path], where: Path, expected: str) -> list[Path]:

@@ -155,6 +155,13 @@ def _hash(path: Path, kind: str) -> str:
         raise DatasetError(f"cannot read {path}: {error.strerror}") from error
 
 
+def _extract(archive: Path, into: Path) -> None:
+    try:
+        archives.extract(archive, into, nested=True)
+    except DatasetError as error:
+        raise DatasetError(f"{error}; remove {archive} to fetch it again") from error
+
+
 def _unpack(recording: Recording, to: Path, folder: Path) -> None:
     try:
         with tempfile.TemporaryDirectory(prefix=".unpacking-", dir=to) as place:
@@ -162,7 +169,7 @@ def _unpack(recording: Recording, to: Path, folder: Path) -> None:
             partial.mkdir()
             for file in recording.files:
                 if archives.is_archive(Path(file.name)):
-                    archives.extract(to / file.name, partial / file.into, nested=True)
+                    _extract(to / file.name, partial / file.into)
                 else:
                     shutil.copyfile(to / file.name, partial / file.name)
             partial.rename(folder)

@@ -37,9 +37,8 @@ def download(url: str, part: Path, watch: Watcher) -> None:
     """
     if not url.startswith(("https://", "http://")):
         raise DatasetError(f"cannot download {url}: only https and http are fetched")
-    in_vain, said = 0, "the connection was cut"
+    in_vain, said, most = 0, "the connection was cut", _nbytes(part)
     while in_vain < _GIVE_UP_AFTER:
-        before = _nbytes(part)
         try:
             if _attempt(url, part, watch):
                 _validator_file(part).unlink(missing_ok=True)
@@ -50,9 +49,12 @@ def download(url: str, part: Path, watch: Watcher) -> None:
             said = f"HTTP {error.code} {error.reason}"
             if error.code < 500 and error.code != http.client.TOO_MANY_REQUESTS:
                 raise DatasetError(f"cannot download {url}: {said}") from error
+        except UnicodeError as error:
+            raise DatasetError(f"cannot download {url}: no host can have that name") from error
         except (OSError, http.client.HTTPException) as error:
             said = str(getattr(error, "reason", error)) or type(error).__name__
-        in_vain = 0 if _nbytes(part) > before else in_vain + 1
+        in_vain = 0 if _nbytes(part) > most else in_vain + 1  # a part that was begun again is no progress
+        most = max(most, _nbytes(part))
         if in_vain < _GIVE_UP_AFTER:
             time.sleep(_PAUSE_S * in_vain)
     raise DatasetError(
@@ -97,6 +99,7 @@ def _copy(answer: Any, part: Path, at: int, total: int, watch: Watcher) -> None:
         file.seek(at)
         file.truncate()
         while chunk := answer.read(_CHUNK_BYTES):
+            _require_room(part, max(len(chunk), total - at))
             try:
                 file.write(chunk)
                 file.flush()

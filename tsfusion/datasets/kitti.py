@@ -48,7 +48,45 @@ def open_kitti(
     return KITTI(root, sequence, modality=modality, poses=poses, color=color, posed=posed)
 
 
-class KITTI(Frames):
+class Drive(Frames):
+    """Stereo pairs or Velodyne scans of the KITTI car, by frame number."""
+
+    intrinsics: Intrinsics | None
+    baseline_fx: float | None
+    _frames: list[int]
+    _poses: list[Pose | None]
+    _left: dict[int, Path]  # or the scans
+    _right: dict[int, Path]
+    _with_color: bool
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def _frame(self, index: int) -> Frame:
+        number = self._frames[index]
+        common: dict[str, Any] = {
+            "T_world_camera": self._poses[index],
+            "sensor": self.sensor,
+            "timestamp_ns": self._stamp(index),
+        }
+        if self.sensor == "lidar":
+            return Frame(points=read_scan(self._left[number]), **common)
+        left, right = read_pair(self._left[number], self._right[number])
+        return Frame(
+            left=left,
+            right=right,
+            baseline_fx=self.baseline_fx,
+            intrinsics=self.intrinsics,
+            color=self._color(number, left) if self._with_color else None,
+            **common,
+        )
+
+    def _color(self, number: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(H, W, 3) uint8 BGR of the left camera: here the grey image."""
+        return np.repeat(left[:, :, None], 3, axis=2)
+
+
+class KITTI(Drive):
     """One sequence as stereo disparity (`modality="stereo"`) or as Velodyne scans (`"lidar"`).
 
     Stereo: the left camera's frame, disparity in 1/16 px by semi-global matching at each access; colour is
@@ -98,33 +136,6 @@ class KITTI(Frames):
             T_velo_cam0 = np.linalg.inv(T_cam0_velo)
             found = [None if T is None else T_velo_cam0 @ T @ T_cam0_velo for T in found]
         self._poses = found
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def _frame(self, index: int) -> Frame:
-        number = self._frames[index]
-        common: dict[str, Any] = {
-            "T_world_camera": self._poses[index],
-            "sensor": self.sensor,
-            "timestamp_ns": self._stamp(index),
-        }
-        if self.sensor == "lidar":
-            return Frame(points=read_scan(self._left[number]), **common)
-        left, right = read_grey(self._left[number]), read_grey(self._right[number])
-        if left.shape != right.shape:
-            raise DatasetError(
-                f"{self._right[number]} has shape {right.shape}, its left image {left.shape}; "
-                "expected equal sizes"
-            )
-        return Frame(
-            left=left,
-            right=right,
-            baseline_fx=self.baseline_fx,
-            intrinsics=self.intrinsics,
-            color=np.repeat(left[:, :, None], 3, axis=2) if self._with_color else None,
-            **common,
-        )
 
 
 def _is_sequence(path: Path) -> bool:
@@ -234,13 +245,24 @@ def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
     return np.array([stamps[number] for number in frames], dtype=np.int64)
 
 
-def read_grey(path: Path) -> NDArray[np.uint8]:
+def read_pair(left_file: Path, right_file: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Two (H, W) grey images of one size."""
+    left, right = _read_grey(left_file), _read_grey(right_file)
+    if left.shape != right.shape:
+        raise DatasetError(
+            f"{right_file} has shape {right.shape}, its left image {left.shape}; expected equal sizes"
+        )
+    return left, right
+
+
+def _read_grey(path: Path) -> NDArray[np.uint8]:
     """(H, W), a colour image's luminance."""
     import pykitti.utils
+    from PIL import Image
 
     try:
         return np.asarray(pykitti.utils.load_image(path, "L"), dtype=np.uint8)
-    except (OSError, SyntaxError) as error:  # Pillow reports a broken PNG by either
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:  # a broken PNG is either of two
         raise DatasetError(f"{path} cannot be decoded; expected a grey image ({error})") from error
 
 

@@ -7,13 +7,12 @@ their names: `pykitti.raw` goes by their place in a sorted list, and several dri
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.datasets.base import (
-    Frames,
     checked_intrinsics,
     folder,
     kept,
@@ -22,10 +21,9 @@ from tsfusion.datasets.base import (
     read_numbers,
     require_frames,
 )
-from tsfusion.datasets.kitti import numbered, read_grey, read_scan
+from tsfusion.datasets.kitti import Drive, numbered
 from tsfusion.datasets.poses import Pose
 from tsfusion.errors import DatasetError, InvalidKeyframe
-from tsfusion.frame import Frame
 from tsfusion.keyframe import Intrinsics, check_pose
 from tsfusion.se3 import inverse
 
@@ -39,7 +37,7 @@ def recognises(path: Path) -> bool:
     return _is_drive(path) or bool(_drives(path))
 
 
-class KITTIRaw(Frames):
+class KITTIRaw(Drive):
     """One synchronised and rectified drive (`…_sync`) as stereo disparity or as Velodyne scans.
 
     https://www.cvlibs.net/datasets/kitti/raw_data.php. A frame's pose comes from the GPS/IMU packet of its
@@ -89,31 +87,8 @@ class KITTIRaw(Frames):
         )
         self.timestamps_ns = _read_times(times, self._frames)
 
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def _frame(self, index: int) -> Frame:
-        number = self._frames[index]
-        common: dict[str, Any] = {
-            "T_world_camera": self._poses[index],
-            "sensor": self.sensor,
-            "timestamp_ns": self._stamp(index),
-        }
-        if self.sensor == "lidar":
-            return Frame(points=read_scan(self._left[number]), **common)
-        left, right = read_grey(self._left[number]), read_grey(self._right[number])
-        if left.shape != right.shape:
-            raise DatasetError(
-                f"{self._right[number]} has shape {right.shape}, its left image {left.shape}; "
-                "expected equal sizes"
-            )
-        color = None
-        if self._with_color and self._colored:
-            color = read_color(self._left[number], left.shape)
-        elif self._with_color:
-            color = np.repeat(left[:, :, None], 3, axis=2)
-        common |= {"baseline_fx": self.baseline_fx, "intrinsics": self.intrinsics}
-        return Frame(left=left, right=right, color=color, **common)
+    def _color(self, number: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return read_color(self._left[number], left.shape) if self._colored else super()._color(number, left)
 
 
 class _Rig(NamedTuple):

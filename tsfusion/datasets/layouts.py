@@ -9,7 +9,7 @@ import inspect
 import logging
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 from tsfusion.datasets import (
     archives,
@@ -27,10 +27,16 @@ from tsfusion.datasets import (
 )
 from tsfusion.datasets.base import Dataset
 from tsfusion.errors import DatasetError
+from tsfusion.keyframe import Intrinsics
 
 GROUP = "tsfusion.datasets"
 
 _log = logging.getLogger(__name__)
+_MAC = "__MACOSX"  # what macOS puts into archives beside the recording
+_TYPES = {
+    bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path",
+    Intrinsics: "four numbers, [fx, fy, cx, cy]",
+}  # fmt: skip
 _INDEX = (".txt", ".json", ".yaml", ".csv", ".freiburg")  # a file of these is taken for its folder
 
 
@@ -91,7 +97,11 @@ BUILT_IN = (
 PLAIN = (
     Layout("RGB-D folders", rgbd_folders.PLAIN_EXPECTED, rgbd_folders.recognises_plain, rgbd_folders.Redwood),
 )
-SYNTHETIC = ("synthetic", "no files: synthetic:room or synthetic:street, then :kinect, :stereo or :lidar")
+SYNTHETIC = (
+    "synthetic",
+    "no files: synthetic:WORLD, or synthetic:WORLD:SENSOR; worlds: room (also -untextured, -plain, -bare), "
+    "street, corridor, rooms; sensors: kinect, stereo, lidar",
+)
 
 
 def layouts() -> list[Layout]:
@@ -142,7 +152,30 @@ def opened(
     unknown = sorted(set(options) - set(known))
     if unknown:
         raise DatasetError(f"a {name} dataset takes no `{unknown[0]}`")
-    return opener(*places, **options)
+    parameters = inspect.signature(opener).parameters
+    given = {key: _typed(key, value, parameters[key].annotation) for key, value in options.items()}
+    return opener(*places, **given)
+
+
+def _typed(key: str, value: Any, annotation: Any) -> Any:
+    """An option as its parameter wants it: a number may be a name, four numbers may be intrinsics.
+
+    Raises:
+        DatasetError: it cannot be that; a parameter whose type is none of `_TYPES` takes anything.
+    """
+    wanted = [kind for kind in get_args(annotation) or (annotation,) if kind is not type(None)]
+    if not all(kind in _TYPES for kind in wanted):
+        return value
+    if isinstance(value, tuple(wanted)) and isinstance(value, bool) == (bool in wanted):
+        return value
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if float in wanted:
+            return float(value)
+        if str in wanted:
+            return str(value)
+    if Intrinsics in wanted and isinstance(value, list | tuple) and len(value) == 4:
+        return Intrinsics(*value)
+    raise DatasetError(f"`{key}` must be {_TYPES[wanted[0]]}, got {value!r}")
 
 
 def describe(dataset: Dataset) -> str:
@@ -159,7 +192,9 @@ def describe(dataset: Dataset) -> str:
         rate = f" at {(len(stamps) - 1) / (stamps[-1] - stamps[0]) * 1e9:.3g} Hz"
     posed = sum(pose_of(dataset, index) is not None for index in range(len(dataset)))
     poses = "no poses" if not posed else "all with poses" if posed == len(dataset) else f"poses for {posed}"
-    return f"{dataset.name}, {len(dataset)} {kind}{size}{rate}, {poses}"
+    uncolored = getattr(dataset, "uncolored", 0)
+    color = f", {uncolored} without colour in time" if uncolored else ""
+    return f"{dataset.name}, {len(dataset)} {kind}{size}{rate}, {poses}{color}"
 
 
 def _unpacked(path: Path, *, unpack: bool) -> Path:
@@ -211,7 +246,11 @@ def _plugins() -> list[Layout]:
 
 def _folders_in(root: Path) -> list[Path]:
     try:
-        return sorted(child for child in root.iterdir() if child.is_dir())
+        return sorted(
+            child
+            for child in root.iterdir()
+            if child.is_dir() and not child.name.startswith(".") and child.name != _MAC
+        )
     except OSError as error:
         raise DatasetError(f"cannot read {root}: {error.strerror}") from error
 

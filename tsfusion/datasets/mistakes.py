@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets.poses import Pose, rigid
-from tsfusion.se3 import rotation_vector
+from tsfusion.datasets.poses import Pose, quaternion, rigid
 
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -29,14 +28,6 @@ class Mistake:
     name: str
     text: str
     meant: Callable[[Pose], NDArray[np.float64]]
-
-
-def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) → unit x y z w."""
-    v = rotation_vector(R)
-    angle = float(np.linalg.norm(v))
-    axis = v / angle if angle > 1e-12 else v
-    return np.array([*(axis * np.sin(angle / 2)), np.cos(angle / 2)])
 
 
 def _turned(order: list[int]) -> Callable[[Pose], Pose]:

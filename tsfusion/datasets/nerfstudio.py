@@ -3,7 +3,7 @@
 
 import json
 from dataclasses import dataclass
-from math import isfinite, tan
+from math import pi, tan
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from tsfusion.keyframe import check_pose
 
 EXPECTED = "transforms.json with fl_x, cx, … and frames of file_path, depth_file_path, transform_matrix"
 DEPTH_SCALE = 0.001  # metres per unit, where the file does not say
+_LARGEST = 1e15
 _OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes: OpenGL's y up, z back → OpenCV's
 _MODELS = {
     "PINHOLE": (), "SIMPLE_PINHOLE": (), "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
@@ -135,7 +136,7 @@ def _read(path: Path) -> dict[str, Any]:
         capture = json.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise DatasetError(f"{path} is missing; expected {EXPECTED}") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DatasetError(f"{path} cannot be read: {error}; expected {EXPECTED}") from error
     frames = capture.get("frames") if isinstance(capture, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
@@ -182,13 +183,10 @@ def _camera(view: _View, size: tuple[int, ...]) -> Camera:
     model = str(given.get("camera_model", "OPENCV"))
     if model not in _MODELS:
         raise DatasetError(f"{where}: camera_model must be one of {', '.join(_MODELS)}, got {model!r}")
-    if "fl_x" in given:
-        fx = _number(given, "fl_x", where)
-    elif "camera_angle_x" in given:
-        fx = size[1] / 2 / tan(_number(given, "camera_angle_x", where) / 2)
-    else:
+    fx = _focal_length(given, "x", size[1], where)
+    if fx is None:
         raise DatasetError(f"{where} has neither fl_x nor camera_angle_x; expected {EXPECTED}")
-    fy = _number(given, "fl_y", where) if "fl_y" in given else fx
+    fy = _focal_length(given, "y", size[0], where) or fx
     cx = _number(given, "cx", where) if "cx" in given else size[1] / 2
     cy = _number(given, "cy", where) if "cy" in given else size[0] / 2
     distortion = [_number(given, key, where) if key in given else 0.0 for key in _MODELS[model]]
@@ -197,6 +195,19 @@ def _camera(view: _View, size: tuple[int, ...]) -> Camera:
         return Camera.named((fx, fy, cx - 0.5, cy - 0.5), (size[0], size[1]), kind, distortion)
     except InvalidConfig as error:
         raise DatasetError(f"{where}: {error}") from error
+
+
+def _focal_length(given: dict[str, Any], axis: str, side: int, where: str) -> float | None:
+    """Pixels, as given or by the angle of view over `side` pixels; None where there is neither."""
+    if f"fl_{axis}" in given:
+        return _number(given, f"fl_{axis}", where)
+    name = f"camera_angle_{axis}"
+    if name not in given:
+        return None
+    angle = _number(given, name, where)
+    if not 0 < angle < pi:
+        raise DatasetError(f"{where}: {name} must be radians between 0 and pi, got {angle}")
+    return side / 2 / tan(angle / 2)
 
 
 def _resized(camera: Camera, shape: tuple[int, ...], where: str) -> Camera:
@@ -212,7 +223,7 @@ def _resized(camera: Camera, shape: tuple[int, ...], where: str) -> Camera:
 
 def _number(given: dict[str, Any], key: str, where: str) -> float:
     value = given[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
         raise DatasetError(f"{where}: {key} must be a number, got {value!r}")
     return float(value)
 
@@ -235,7 +246,9 @@ def _read_depth(path: Path, scale: float) -> tuple[NDArray[Any], float]:
     """Depth, and metres per unit: of `.npy`, metres."""
     if path.suffix == ".npy":
         try:
-            depth = np.load(path, allow_pickle=False)
+            depth = np.array(
+                np.lib.format.open_memmap(path, mode="r")
+            )  # its size is compared with what is there
         except (OSError, ValueError, EOFError) as error:
             raise DatasetError(
                 f"{path} cannot be read; expected an (H, W) array of depth ({error})"

@@ -105,7 +105,9 @@ def _camera(root: Path) -> tuple[Intrinsics, tuple[int, int], float]:
         camera = json.loads(path.read_text(encoding="utf-8"))["camera"]
         intrinsics = Intrinsics(*(float(camera[key]) for key in ("fx", "fy", "cx", "cy")))
         size, scale = (int(camera["h"]), int(camera["w"])), 1 / float(camera["scale"])
-    except (OSError, ValueError, KeyError, TypeError, ZeroDivisionError) as error:
+        if min(size) < 1:
+            raise ValueError(f"w and h must be >= 1, got {size[1]} and {size[0]}")
+    except (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
         raise DatasetError(
             f"{path} must hold camera: w, h, fx, fy, cx, cy, scale; {type(error).__name__}: {error}"
         ) from error

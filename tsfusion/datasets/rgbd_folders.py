@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """RGB-D folders with one pose file: HoloLens recordings and Redwood / Open3D reconstructions."""
 
-import json
 from pathlib import Path
 
 from tsfusion.datasets.base import (
@@ -12,7 +11,7 @@ from tsfusion.datasets.base import (
     read_intrinsics,
     require_frames,
 )
-from tsfusion.datasets.depth_images import DepthImages, by_number, images, matched
+from tsfusion.datasets.depth_images import DepthImages, by_number, images, matched, read_open3d_camera
 from tsfusion.datasets.poses import Pose, read_log, read_matrix_rows
 from tsfusion.errors import DatasetError
 from tsfusion.keyframe import Intrinsics
@@ -168,7 +167,7 @@ def _color_folder(root: Path) -> Path | None:
 def _log(root: Path) -> Path | None:
     known = [root / name for name in _LOGS if (root / name).is_file()]
     named = [path for pattern in _LOG_NAMES for path in sorted(root.glob(pattern)) if path.is_file()]
-    return next(iter([*known, *named]), None)
+    return next((path for path in [*known, *named] if not path.name.startswith(".")), None)
 
 
 def _given(root: Path, trajectory: str | Path) -> Path:
@@ -178,12 +177,4 @@ def _given(root: Path, trajectory: str | Path) -> Path:
 def _open3d_intrinsics(root: Path) -> Intrinsics:
     names = ("camera_intrinsic.json", "intrinsic.json")
     path = next((root / name for name in names if (root / name).exists()), None)
-    if path is None:
-        return PRIMESENSE
-    try:
-        K = json.loads(path.read_text(encoding="utf-8"))["intrinsic_matrix"]  # column-major
-        return checked_intrinsics(Intrinsics(float(K[0]), float(K[4]), float(K[6]), float(K[7])), path)
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-        raise DatasetError(
-            f"{path} must be an Open3D camera with a 9-number intrinsic_matrix: {error}"
-        ) from error
+    return PRIMESENSE if path is None else read_open3d_camera(path)

@@ -74,7 +74,8 @@ class Synthetic(Frames):
     - lidar: 64 × 900 rays, range error 2 cm, 2 % lost, grazing rays lost. Points carry colour.
 
     Args:
-        world: a name in `WORLDS`: `room`, `street`, … or a `World` of your own, seen with the room's camera and LiDAR.
+        world: a name in `WORLDS` (`room`, `street`, …), or a `World` of your own, seen with the room's camera
+            and LiDAR.
         count: keyframes; the room's path is a closed circle, the street's goes on by a metre each.
         seed: of the noise; the world does not change.
         width: of the image, pixels; default 320 in the room, 620 in the street. The noise in pixels stays.

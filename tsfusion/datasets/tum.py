@@ -148,7 +148,7 @@ def _trajectory(root: Path, given: str | Path | None, *, posed: bool) -> Path | 
     if not found and posed:
         raise DatasetError(
             f"{root / 'groundtruth.txt'} is missing; expected `timestamp tx ty tz qx qy qz qw` a line "
-            f"(one elsewhere: open_dataset(path, trajectory=FILE) in Python); {SCAN}"
+            f"(one elsewhere: --poses FILE, in Python trajectory=FILE); {SCAN}"
         )
     return found[0] if found else None
 
@@ -172,9 +172,9 @@ def _icl(root: Path) -> list[Path]:
     """`*.gt.freiburg` in the folder; or `livingRoom2.gt.freiburg` beside `living_room_traj2_frei_png`."""
     number = re.search(r"traj(\d)", root.name)
     if number is None:
-        return sorted(root.glob("*.gt.freiburg"))
+        return sorted(root.glob("[!.]*.gt.freiburg"))
     room = "livingRoom" if "living" in root.name else "traj"
-    return [*sorted(root.glob("*.gt.freiburg")), root.parent / f"{room}{number[1]}.gt.freiburg"]
+    return [*sorted(root.glob("[!.]*.gt.freiburg")), root.parent / f"{room}{number[1]}.gt.freiburg"]
 
 
 def _camera(root: Path, windows: bool) -> _Camera:

@@ -22,6 +22,7 @@ _LIDAR_FLOOR = 0.04  # metres
 _CELL = 0.01  # of the range: points of a scan closer than that count as one
 _GROUND = 0.03  # of the range: thickness of the slice that holds the ground
 _FLAT = 0.25  # share of the points in one such slice that makes it the ground
+_FARTHEST = 1e6  # metres: beyond it no LiDAR measures
 _TREE = 20_000  # points of a scan that others are compared with
 _EXACT_TREE = 4  # FLANN_INDEX_KDTREE_SINGLE
 
@@ -120,7 +121,8 @@ class _Scan:
 
     def __init__(self, points: NDArray[np.float32]) -> None:
         finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-        finite = finite[np.linalg.norm(finite, axis=1) > 1e-6]
+        distance = np.linalg.norm(finite, axis=1)
+        finite = finite[(distance > 1e-6) & (distance < _FARTHEST)]
         self.range_m = float(np.median(np.linalg.norm(finite, axis=1))) if len(finite) else 0.0
         kept = _thinned(_above_ground(finite, self.range_m), max(_CELL * self.range_m, 1e-6))
         kept = _spread(kept, _TREE)

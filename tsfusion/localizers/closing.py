@@ -3,7 +3,7 @@
 
 import itertools
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,9 @@ _NEAR = (1.0, np.radians(30))  # metres and radians: places worth a look whateve
 _PATIENCE = 10  # keyframes that loops which change little wait for the next optimisation
 _CHANGE = (0.04, np.radians(1.0))  # of metres and radians: a loop that changes more does not wait
 _THRIFT = 50  # with so many keyframes an optimisation costs as much as finding one's loops
+_TRY_AGAIN = 2  # lost frames: looking for a place costs more than tracking
 _RELOCALISED = 30  # matches that must agree where no odometry speaks for a place
+_ONE_PLACE = 0.3  # metres between what several of them say
 
 log = logging.getLogger(__name__)
 
@@ -73,13 +75,33 @@ class LoopClosing:
         self._news = False
         self._due = False
         self._optimised_at = 0  # keyframes then
+        self._lost = 0  # frames, since the last that was not
+        self._T_world_tracker: Matrix = np.eye(4)  # the tracker's world began anew where it was found again
 
     def track(self, frame: Frame) -> Pose | Lost:
-        """As the wrapped localizer says."""
-        pose = self._localizer.track(frame)
-        if isinstance(pose, Pose) and pose.starts_anchor:
+        """As the wrapped localizer says; a lost one goes on where a place is known again."""
+        found = self._localizer.track(frame)
+        if isinstance(found, Lost):
+            self._lost += 1
+            found = self._found_again(frame, found) if self._lost % _TRY_AGAIN == 0 else found
+        if isinstance(found, Lost):
+            return found
+        self._lost = 0
+        pose = replace(found, T_world_camera=self._T_world_tracker @ found.T_world_camera)
+        if pose.starts_anchor:
             self._keyframe(pose, frame)
         return pose
+
+    def _found_again(self, frame: Frame, lost: Lost) -> Pose | Lost:
+        """The tracker's pose after a new beginning at a place that was seen before."""
+        place = self.relocalise(frame)
+        if place is None:
+            return lost
+        self._localizer.reset()
+        begun = self._localizer.track(frame)
+        if isinstance(begun, Pose):
+            self._T_world_tracker = place.T_world_camera @ se3.inverse(begun.T_world_camera)
+        return begun
 
     def corrections(self) -> Corrections | None:
         """The poses of all tracking keyframes after the last optimisation; None if that is known already."""
@@ -108,12 +130,12 @@ class LoopClosing:
             result = verify.check(self._places.views[place], seen)
             if result.refused is None and result.T_old_new is not None and result.inliers >= _RELOCALISED:
                 found.append((place, result.T_old_new))
-        if not found:
+        if not found or not all(self.consensus.unique(place) for place, _ in found):
+            return None
+        poses = [self._corrected[place] @ T for place, T in found]
+        if any(se3.distance(se3.inverse(poses[0]) @ other) > _ONE_PLACE for other in poses[1:]):
             return None
         place, T = found[0]
-        positions = [self._corrected[other] @ T_other for other, T_other in found]
-        if any(se3.distance(se3.inverse(positions[0]) @ other) > 0.3 for other in positions[1:]):
-            return None  # alike places
         return Pose(
             T_world_camera=self._chain.poses[place] @ T,
             timestamp_ns=frame.timestamp_ns,

@@ -14,13 +14,36 @@ _WINDOW = (21, 21)
 _LEVELS = 3
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
 _THERE_AND_BACK = 1.0  # pixels
+_BLOCK = 5  # pixels around a corner
+_SECOND_DIFFERENCES = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+_NOISE_CORNER = (
+    1000.0  # least eigenvalue of Sobel gradients there in noise of one grey level: hardly ever more
+)
 
 
 def corners(gray: NDArray[np.uint8], count: int, *, mask: NDArray[np.uint8] | None = None) -> Pixels:
     """At most `count` corners, at least a 60th of the width apart, where `mask` (if given) is not 0."""
     apart = max(4, gray.shape[1] // 60)
-    found = cv2.goodFeaturesToTrack(gray, count, 0.005, apart, mask=mask, blockSize=5)
+    found = cv2.goodFeaturesToTrack(gray, count, 0.005, apart, mask=mask, blockSize=_BLOCK)
     return np.empty((0, 2), np.float32) if found is None else found.reshape(-1, 2).astype(np.float32)
+
+
+def above_noise(gray: NDArray[np.uint8], pixels: Pixels) -> NDArray[np.bool_]:
+    """Which corners are more than the image's noise: (n, 2) → (n,).
+
+    The noise is Immerkær's ("Fast noise variance estimation", 1996), by the median: what a plain wall shows.
+    """
+    rough = cv2.filter2D(gray, cv2.CV_16S, _SECOND_DIFFERENCES)[::3, ::3]
+    sigma = float(np.median(np.abs(rough))) / (0.6745 * 6)
+    across, down = (cv2.Sobel(gray, cv2.CV_16S, 1 - axis, axis) for axis in (0, 1))
+    near = np.arange(_BLOCK) - _BLOCK // 2
+    column = np.clip(pixels[:, 0, None, None].astype(np.intp) + near, 0, gray.shape[1] - 1)
+    row = np.clip(pixels[:, 1, None, None].astype(np.intp) + near[:, None], 0, gray.shape[0] - 1)
+    x, y = across[row, column].astype(np.float64), down[row, column].astype(np.float64)
+    xx, xy, yy = (product.sum(axis=(1, 2)) for product in (x * x, x * y, y * y))
+    strength = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
+    above: NDArray[np.bool_] = strength > _NOISE_CORNER * max(sigma, 1.0) ** 2
+    return above
 
 
 def follow(

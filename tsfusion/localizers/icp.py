@@ -38,6 +38,7 @@ class Surface:
         sigma: (n,) float32 metres, a depth camera's deviation at each.
         index: (n,) block of each, row by row.
         planes: (4, rows·columns) float32: unit normal and offset, normal · p = offset > 0; 0 = no plane.
+        roughness: deviation of the blocks from the planes fitted around them, as a share of `sigma`.
     """
 
     intrinsics: Intrinsics
@@ -46,6 +47,7 @@ class Surface:
     sigma: Floats
     index: NDArray[np.intp]
     planes: Floats
+    roughness: float
 
     @property
     def covered(self) -> float:
@@ -73,10 +75,10 @@ def surface(depth: Floats, intrinsics: Intrinsics) -> Surface:
     z = 1 / inverse.ravel()[index]
     points = np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z]).astype(np.float32)
     planes = np.zeros((4, valid.size), np.float32)
-    planes[:3] = _normals(inverse, valid, K)
+    planes[:3], roughness = _normals(inverse, valid, K)
     # Through the block's own point, not its neighbours' mean: that lies inside of what is round.
     planes[3, index] = np.einsum("in,in->n", planes[:3, index], points)
-    return Surface(K, shape, points, deviation(points[2]).astype(np.float32), index, planes)
+    return Surface(K, shape, points, deviation(points[2]).astype(np.float32), index, planes, roughness)
 
 
 def _blocks(depth: Floats, block: int) -> tuple[Floats, NDArray[np.bool_]]:
@@ -97,8 +99,8 @@ def _blocks(depth: Floats, block: int) -> tuple[Floats, NDArray[np.bool_]]:
     return mean, valid & (spread * z**4 < limit**2)
 
 
-def _normals(inverse: Floats, valid: NDArray[np.bool_], K: Intrinsics) -> Floats:
-    """Normals of the planes fitted to inverse depth around each block: (3, n); 0 where none fits."""
+def _normals(inverse: Floats, valid: NDArray[np.bool_], K: Intrinsics) -> tuple[Floats, float]:
+    """Normals of planes fitted to inverse depth around each block, (3, n), 0 where none fits; roughness."""
     r = _FIT_RADIUS
     ones, step = np.ones(2 * r + 1), np.arange(-r, r + 1, dtype=np.float64)
     w = valid.astype(np.float32)
@@ -121,7 +123,9 @@ def _normals(inverse: Floats, valid: NDArray[np.bool_], K: Intrinsics) -> Floats
     a, b = (cvv * cuq - cuv * cvq) / det, (cuu * cvq - cuv * cuq) / det
     rest = moment(q * inverse, ones, ones) / s - mq * mq - a * cuq - b * cvq
     z = 1 / np.where(ok, mq, 1)
-    ok &= np.maximum(rest, 0) * z**4 < (_CURVED * z + deviation(z)) ** 2
+    off = np.sqrt(np.maximum(rest, 0)) * z * z
+    sigma = deviation(z)
+    ok &= off < _CURVED * z + sigma
     x = ((np.arange(ok.shape[1]) - K.cx) / K.fx).astype(np.float32)[None, :]
     y = ((np.arange(ok.shape[0]) - K.cy) / K.fy).astype(np.float32)[:, None]
     # 1/z = a (u - u0) + b (v - v0) + c around block (u0, v0) is normal · (x, y, 1) = 1/z.
@@ -129,8 +133,9 @@ def _normals(inverse: Floats, valid: NDArray[np.bool_], K: Intrinsics) -> Floats
     normals = np.stack([nx, ny, c - nx * x - ny * y])
     length = np.maximum(np.sqrt((normals * normals).sum(axis=0)), np.float32(1e-12))
     ok &= c > _GRAZING * length * np.sqrt(x * x + y * y + 1)
-    flat: Floats = np.where(ok, normals / length, 0).reshape(3, -1)
-    return flat
+    free = 1 - 3 / (2 * r + 1) ** 2  # of the residuals, with three parameters fitted
+    roughness = float(np.median(off[ok] / sigma[ok]) / np.sqrt(free)) if ok.any() else 0.0
+    return np.where(ok, normals / length, 0).reshape(3, -1), roughness
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +178,7 @@ def match(there: Surface, here: Surface, T_there_here: se3.Transform, some: NDAr
 
 
 def alike(found: Match, columns: int) -> float:
-    """How many blocks err as one: 1 for white noise, dozens where a sensor's errors are smooth over the image.
+    """How many blocks err as one: 1 for white noise, dozens where a sensor's errors are smooth.
 
     The variance of the distances' means over cells of `_CELL` × `_CELL` blocks, against a single block's.
     """

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """One pose from corners and planes together: Gauss-Newton over reprojection and point-to-plane distances.
 
-Both errors are weighted by their deviations and made robust with the Geman-McClure kernel, whose reach shrinks
-as the estimate settles.
+Both errors are weighted by their deviations and made robust with the Geman-McClure kernel, whose reach
+shrinks as the estimate settles.
 """
 
 from collections.abc import Sequence
@@ -22,9 +22,10 @@ _REACH = 3.0  # deviations at which a residual counts a quarter
 _TRUST = 0.1  # of a plane's residual against a corner's, until it is known how far neighbours err alike
 _FLOOR, _CEILING = 0.25, 3.0  # deviation of the distances to planes, as a share of the sensor's
 _PLANE_NOISE = 6.0  # sum of squares of a fit's offsets along one axis, in blocks: 3 × 3 of them
+_WAVES = 0.03  # radians; what smooth errors of a sensor tilt its planes by
 _DAMPING = 1e-6  # of the information's trace
 _NEARLY_STILL, _STILL = 3e-4, 2e-5  # metres or radians; below, a round is over, the last one
-_STEPS = ((4, 5, 0.1), (2, 4, 0.05), (1, 3, 0.03))  # blocks apart, iterations, gate in metres
+_STEPS = ((4, 15, 0.3), (2, 6, 0.05), (1, 3, 0.03))  # blocks apart, iterations, gate in metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,7 @@ class Link:
     T_view_anchor: Matrix
     surface: icp.Surface
     points: NDArray[np.float64]
-    pixels: NDArray[np.float64]
+    pixels: NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,21 +100,22 @@ def solve(
 
 
 def _planes(found: icp.Match, gate: float, trust: float) -> tuple[Matrix, NDArray[np.float64], icp.Floats]:
-    """Normal equations of the distances to planes, and each one's weight without its deviation."""
+    """Normal equations of the distances to planes, and each one's weight."""
     near = np.abs(found.distance) < np.float32(gate) + 3 * found.sigma
     if np.count_nonzero(near) < 12:
         return np.zeros((6, 6)), np.zeros(6), np.zeros(len(near), np.float32)
     whitened = found.distance / found.sigma
     scale = np.float32(np.clip(1.48 * np.median(np.abs(whitened[near])), _FLOOR, _CEILING))
     ratio = whitened / (scale * np.float32(_REACH))
-    weight = np.float32(trust) * near / (1 + ratio * ratio) ** 2
-    H, g = icp.equations(found, weight / (scale * found.sigma) ** 2)
+    weight = np.float32(trust) * near / ((1 + ratio * ratio) * scale * found.sigma) ** 2
+    H, g = icp.equations(found, weight)
     return H, g, weight
 
 
 def _spurious(found: icp.Match, weight: icp.Floats, there: icp.Surface) -> Matrix:
-    """(6, 6) information that noise in the planes' normals alone would give."""
-    return _isotropic(found.moved, weight * (there.intrinsics.fx / found.moved[2]) ** 2 / _PLANE_NOISE)
+    """(6, 6) information that errors of the planes' normals alone would give."""
+    slope = there.roughness * found.sigma * (there.intrinsics.fx / found.moved[2])
+    return _isotropic(found.moved, weight * (slope * slope / _PLANE_NOISE + _WAVES**2))
 
 
 def _isotropic(points: icp.Floats, weight: NDArray[np.floating]) -> Matrix:

@@ -49,7 +49,7 @@ class Consensus:
        look like another one (a *twin*), is believed only where odometry rules the other out.
     3. Loops of three keyframes near each other must agree pairwise (Mangelson et al., "Pairwise Consistent
        Measurement Set Maximization", 2018) before any is, or of two where odometry expects them there;
-       later ones agree with those by rule 1.
+       later ones nearby need only agree with one of those.
     """
 
     def __init__(self, chain: Chain) -> None:
@@ -83,6 +83,10 @@ class Consensus:
         error = se3.log(se3.inverse(T_old_new) @ T)
         return float(np.sqrt(error @ np.linalg.solve(known + covariance, error)))
 
+    def unique(self, place: int) -> bool:
+        """Whether nothing was seen that looks like this place."""
+        return place not in self._twins
+
     def disown(self, loop: Loop) -> None:
         """The pose graph found it wrong."""
         self.believed.remove(loop)
@@ -115,7 +119,10 @@ class Consensus:
             self._believe([loop])
             return [loop]
         self._waiting = [w for w in self._waiting if self._age(w, loop) <= _WINDOW]
-        friends = [w for w in self._waiting if self._agree(w, loop)]
+        friends: list[Loop] = []
+        for other in reversed(self._waiting):
+            if all(self._agree(other, friend) for friend in [loop, *friends]):
+                friends.insert(0, other)
         expected = self.deviation(loop.old, loop.new, loop.T_old_new, loop.covariance) <= _EXPECTED
         if len({loop.new, *(friend.new for friend in friends)}) < _SUPPORT - expected:
             self._waiting.append(loop)

@@ -14,6 +14,7 @@ from tsfusion.localizers.features import bilinear, lifted
 FEATURES = 500
 CAPACITY = 1000  # places remembered
 
+_SMALLEST = 32  # pixels of an image's shorter side
 _SMALL = 4800  # pixels of the kept depth image, about
 _TABLES, _BITS = 8, 14
 _DEPTH_NOISE = 0.002  # metres at one metre (Khoshelham and Elberink 2012: 0.0014)
@@ -49,9 +50,9 @@ class View:
 
 
 def view(frame: Frame, depth_m: NDArray[np.float32]) -> View | None:
-    """Of a frame with its (H, W) depth in metres; None where there is no image or no camera."""
+    """Of a frame with its (H, W) depth in metres; None where there is no camera, or no image to speak of."""
     gray, K = frame.gray, frame.intrinsics
-    if gray is None or K is None:
+    if gray is None or K is None or min(gray.shape) < _SMALLEST:
         return None
     orb = cv2.ORB_create(nfeatures=FEATURES, fastThreshold=10)  # type: ignore[attr-defined]
     keypoints, descriptors = orb.detectAndCompute(gray, None)

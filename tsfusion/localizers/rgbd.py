@@ -22,12 +22,18 @@ _OVERLAP = 0.6  # with the last one; below: the next one
 _SURFACE = 0.03  # share of the depth image that must show planes
 _INLIERS = 12  # corners
 _TOLERANCE = 2.0  # pixels at 640 columns
-_RECALLED = 4  # keyframes compared by their descriptions, when nothing else helps
+_NEWEST, _RECALLED = 4, 10  # keyframes compared by descriptions with a lost frame: always, and in all
+_TRIED = 4  # of them, those that look most like it
 _LONGEST = 3.0  # times the interval before, over which a motion is taken to go on
 
 _OLDER = 2  # keyframes that take part beside the last one
 _OLDER_ANGLE = np.radians(60)
-_OLDER_OVERLAP, _OLDER_AGREEING, _OLDER_NEAR = 0.5, 0.75, 0.03  # shares; metres
+_OLDER_OVERLAP, _OLDER_AGREEING = 0.5, 0.75  # shares
+_NEAR = 0.03  # metres, and three deviations: depth that agrees before the pose is settled
+_WORSE, _FITS = 1.2, 0.3  # times the misfit without corners, and deviations: beyond, they are on what moves
+
+
+_NO_CORNERS = (np.empty((0, 3)), np.empty((0, 2), np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,17 +46,17 @@ class _Found:
 class RGBD:
     """Follows a depth camera, with colour where there is some. A `Localizer`.
 
-    Corners are followed from the tracking keyframe (Lucas and Kanade); the pose they give begins a Gauss-Newton
-    over their reprojection and the distances of the frame's points to the planes of that keyframe and of the
-    two oldest that see the same. Frames without an image go by depth alone. A pose is given only where depth,
-    image and geometry bear it out; after that frames are looked for near the last pose, then by descriptions
-    (ORB) in the last keyframes.
+    Corners are followed from the tracking keyframe (Lucas and Kanade); the pose they give begins a
+    Gauss-Newton over their reprojection and the distances of the frame's points to the planes of that
+    keyframe and of the two oldest that see the same. Frames without an image go by depth alone. A pose is
+    given only where depth, image and geometry bear it out. What is lost is looked for near the last pose,
+    then by descriptions (ORB) among the last keyframes.
     """
 
     absolute = False
 
     def __init__(self) -> None:
-        self._next = 0
+        self._next = self._turn = 0
         self._kept: deque[View] = deque(maxlen=_KEPT)
         self.reset()
 
@@ -87,7 +93,7 @@ class RGBD:
         return self._lost(frame, reason or "nothing known is in view")
 
     def _guesses(self, frame: Frame, seen: Seen) -> Iterator[tuple[View, Matrix]]:
-        """(view, T_view_camera) to begin with, the likeliest first; those after the first two are wild."""
+        """(view, T_view_camera to begin with), the likeliest first; what follows the last pose is wild."""
         last = self._kept[-1]
         T_view_last = se3.inverse(last.T_world_camera) @ self._last
         if self._motion is not None:
@@ -103,9 +109,13 @@ class RGBD:
                 yield view, resected[0]
 
     def _recalled(self, seen: Seen) -> list[tuple[View, NDArray[np.float64], features.Pixels]]:
-        """The keyframes that look most like the frame, with the corners they share."""
-        recalled = [(view, *view.recall(seen)) for view in reversed(self._kept)]
-        return sorted(recalled, key=lambda entry: -len(entry[1]))[:_RECALLED]
+        """Of the newest keyframes and some others, in turn, those most like the frame; the corners shared."""
+        newest, others = list(self._kept)[-_NEWEST:][::-1], list(self._kept)[:-_NEWEST]
+        self._turn += _RECALLED - _NEWEST
+        turned = others[self._turn % len(others) :] + others if others else []
+        views = newest + turned[: min(len(others), _RECALLED - _NEWEST)]
+        recalled = [(view, *view.recall(seen)) for view in views]
+        return sorted(recalled, key=lambda entry: -len(entry[1]))[:_TRIED]
 
     def _expected_motion(self, frame: Frame) -> Matrix:
         """The last motion, going on for as long as this frame is after the last one."""
@@ -123,25 +133,27 @@ class RGBD:
         resected = features.resection(points, pixels, seen.intrinsics, guess=guess, tolerance=tolerance)
         agree = np.zeros(len(points), bool)
         if resected is not None and resected[1].sum() >= _INLIERS:
-            guess, agree = resected
-        points, pixels = points[agree], pixels[agree].astype(np.float64)
+            before, after = (_misfit(seen, view, T) for T in (guess, resected[0]))
+            if after < _WORSE * before + _FITS:
+                guess, agree = resected
+        points, pixels = points[agree], pixels[agree]
         links = [joint.Link(np.eye(4), view.seen.surface, points, pixels)]
         for older in self._older(seen, view.T_world_camera @ guess, view):
             T_older_view = se3.inverse(older.T_world_camera) @ view.T_world_camera
-            links.append(joint.Link(T_older_view, older.seen.surface, points[:0], pixels[:0]))
+            links.append(joint.Link(T_older_view, older.seen.surface, *_NO_CORNERS))
         estimate = joint.solve(links, seen.surface, seen.intrinsics, seen.columns, guess)
         return _Found(view, estimate.T_anchor_camera, judge.weigh(seen, view, estimate, len(points)))
 
     def _older(self, seen: Seen, T_world_camera: Matrix, view: View) -> list[View]:
         """The oldest keyframes that see the same as the frame, and agree about where it is."""
-        some, chosen = seen.surface.every(8), []
+        some, chosen = seen.surface.every(8), list[View]()
         for older in self._kept:
             if len(chosen) == _OLDER or older is view:
                 break
             T_older_camera = se3.inverse(older.T_world_camera) @ T_world_camera
             if se3.angle(T_older_camera) < _OLDER_ANGLE:
                 found = icp.match(older.seen.surface, seen.surface, T_older_camera, some)
-                agree = np.abs(found.distance) < _OLDER_NEAR + 3 * found.sigma
+                agree = np.abs(found.distance) < _NEAR + 3 * found.sigma
                 enough = max(1.0, _OLDER_OVERLAP * len(some))
                 if len(agree) >= enough and agree.mean() >= _OLDER_AGREEING:
                     chosen.append(older)
@@ -185,3 +197,9 @@ class RGBD:
     def _lost(self, frame: Frame, reason: str) -> Lost:
         self._motion, self._is_lost = None, True
         return Lost(reason=reason, timestamp_ns=frame.timestamp_ns)
+
+
+def _misfit(seen: Seen, view: View, T_view_camera: Matrix) -> float:
+    """Median distance of the frame's points from the view's planes, in deviations of the sensor."""
+    found = icp.match(view.seen.surface, seen.surface, T_view_camera, seen.surface.every(4))
+    return float(np.median(np.abs(found.distance) / found.sigma)) if len(found.distance) else np.inf

@@ -22,7 +22,7 @@ _DESCRIBED = 600
 _RATIO = 0.8  # of the best match's distance to the second best's
 _ALIKE = 64  # bits that may differ
 _AROUND = 9  # blocks over which grey is normalised
-_FLAT = 5.0  # grey levels of contrast that count as half
+_FLAT = 8.0  # grey levels of contrast that count as half
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ class Seen:
 
     @cached_property
     def pattern(self) -> NDArray[np.float32] | None:
-        """(rows·columns of blocks,) grey less its surroundings' mean, over their contrast; None = no image."""
+        """(rows·columns,) grey of blocks less the mean around, over the contrast there; None = no image."""
         if self.gray is None:
             return None
         rows, columns = self.surface.shape
@@ -118,11 +118,12 @@ class View:
         if seen.gray is None:
             return cls(number, T_world_camera, seen, np.empty((0, 2), np.float32), np.empty((0, 3)))
         corners = features.corners(seen.gray, _CORNERS)
+        corners = corners[features.above_noise(seen.gray, corners)]
         points, ok = seen.lifted(corners)
         return cls(number, T_world_camera, seen, corners[ok], points[ok])
 
     def follow(self, seen: Seen, T_view_camera: Matrix) -> tuple[NDArray[np.float64], features.Pixels]:
-        """(n, 3) corners of this view that are found again near where the pose given says, and (n, 2) there."""
+        """(n, 3) corners of this view found again near where the pose given says, and (n, 2) there."""
         old, new = self.seen.gray, seen.gray
         if old is None or new is None or old.shape != new.shape or not len(self.points):
             return np.empty((0, 3)), np.empty((0, 2), np.float32)

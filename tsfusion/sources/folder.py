@@ -164,6 +164,8 @@ class Folder(Live):
         self._colored = self._colored or (kind == "depth" and len(images) == 2)
         try:
             return self._frame(kind, images, *self._stamps(name, first))
+        except OSError:  # taken away again
+            return self._skip("damaged")
         except (InvalidKeyframe, InvalidConfig, cv2.error) as error:
             if "malformed" not in self.skipped:
                 log.warning("%s: %s is left out: %s", self.name, first.name, error)

@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: MIT
 """Which files of a folder make up a frame, when a file is wholly written, and the camera of the folder."""
 
-import json
 import re
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets.base import checked_intrinsics, read_intrinsics, read_numbers
+from tsfusion.datasets.base import decoded, read_intrinsics, read_numbers
+from tsfusion.datasets.depth_images import read_open3d_camera
 from tsfusion.errors import DatasetError
 from tsfusion.keyframe import Intrinsics
 
@@ -88,8 +87,7 @@ def whole_image(path: Path, flags: int) -> NDArray[Any] | None:
     raw = path.read_bytes()
     if not raw.endswith(_PNG_END if path.suffix == ".png" else _JPEG_END):
         return None
-    image: NDArray[Any] | None = cv2.imdecode(np.frombuffer(raw, np.uint8), flags)
-    return image
+    return decoded(np.frombuffer(raw, np.uint8), flags)
 
 
 def whole_scan(path: Path) -> NDArray[np.float32] | None:
@@ -117,7 +115,7 @@ def camera_of(root: Path) -> Intrinsics | None:
         for name in CAMERAS:
             path = place / name
             if path.is_file():
-                return _open3d(path) if path.suffix == ".json" else read_intrinsics(path)
+                return read_open3d_camera(path) if path.suffix == ".json" else read_intrinsics(path)
     return None
 
 
@@ -134,13 +132,3 @@ def baseline_of(root: Path) -> float | None:
     if baseline <= 0:
         raise DatasetError(f"{path} must hold the baseline in metres, > 0, got {baseline}")
     return baseline
-
-
-def _open3d(path: Path) -> Intrinsics:
-    try:
-        K = json.loads(path.read_text(encoding="utf-8"))["intrinsic_matrix"]  # column-major
-        return checked_intrinsics(Intrinsics(float(K[0]), float(K[4]), float(K[6]), float(K[7])), path)
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-        raise DatasetError(
-            f"{path} must be an Open3D camera with a 9-number intrinsic_matrix: {error}"
-        ) from error
