@@ -148,7 +148,9 @@ def test_ctrl_c_ends_a_scan_with_its_results(tmp_path: Path) -> None:
     process = started("scan", "--source", SOURCE, "--rate", 4, "--voxel-size", 0.1, "--out", tmp_path / "out")
     read_until(process, "frames ")
     read_until(process, "frames ")
-    assert end(process, signal.SIGINT) == 0
+    process.send_signal(signal.SIGINT)
+    read_until(process, "ending: what is on its way is finished")
+    assert process.wait(60) == 0
     run = json.loads((tmp_path / "out" / "run.json").read_text())
     assert 0 < run["frames"] < 40
     assert run["keyframes_fused"] == run["keyframes_sent"]

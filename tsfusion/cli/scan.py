@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """`tsfusion scan`."""
 
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ from tsfusion.cli import options
 if TYPE_CHECKING:
     from tsfusion.sources import Source
 
+_ENDING = b"\nending: what is on its way is finished (again: at once)\n"
 _SOURCE, _POSES, _KEYFRAMES = "Source", "Poses", "Keyframes"
 
 
@@ -183,6 +185,7 @@ def _ended_by_signals(source: "Source") -> Iterator[None]:
         for each, handler in before.items():
             signal.signal(each, handler)
         source.close()
+        os.write(2, _ENDING)  # safe inside a handler, which `print` is not
 
     for signum in before:
         signal.signal(signum, stop)

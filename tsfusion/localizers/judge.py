@@ -63,8 +63,8 @@ class Evidence:
             return f"the image agrees by {self.likeness:.2f}, it must by {likeness:.2f} of 1"
         if self.uncertainty > _UNCERTAINTY:
             return (
-                f"the view leaves the pose open by {min(self.uncertainty, 9.99):.2f} m (a plain wall?), "
-                f"at most {_UNCERTAINTY:.2f} m is allowed"
+                f"the view leaves the pose open by {min(self.uncertainty, 9.99):.3f} m (a plain wall?), "
+                f"at most {_UNCERTAINTY:.3f} m is allowed"
             )
         return None
 
