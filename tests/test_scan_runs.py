@@ -150,7 +150,8 @@ def test_ctrl_c_ends_a_scan_with_its_results(tmp_path: Path) -> None:
     read_until(process, "frames ")
     process.send_signal(signal.SIGINT)
     read_until(process, "ending: what is on its way is finished")
-    assert process.wait(60) == 0
+    process.wait(60)
+    assert end(process) == 0
     run = json.loads((tmp_path / "out" / "run.json").read_text())
     assert 0 < run["frames"] < 40
     assert run["keyframes_fused"] == run["keyframes_sent"]
