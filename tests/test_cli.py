@@ -127,7 +127,9 @@ def test_datasets_list(here: Here, tmp_path: Path) -> None:
     assert "7-Scenes" in here("datasets", "list").stdout
     scene(tmp_path / "kitchen")
     found = json.loads(here("datasets", "list", tmp_path, "--json").stdout)
-    assert found == [{"path": str(tmp_path), "name": "7-Scenes kitchen", "sensor": "kinect", "keyframes": 1}]
+    assert found == [
+        {"path": str(tmp_path), "name": "7-Scenes kitchen", "sensor": "kinect", "keyframes": 1, "posed": True}
+    ]
     assert "kinect  1 keyframes" in here("datasets", "list", tmp_path).stdout
     layouts = json.loads(here("datasets", "list", "--json").stdout)
     assert all(value == value.strip() for row in layouts for value in row.values())

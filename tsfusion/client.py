@@ -87,6 +87,7 @@ class Client:
         self._sender = Sender(address, self._control, self._outbox, self._config, connection_keys)
         self._sending = threading.Lock()
         self._closed = False
+        self._began = time.monotonic()
         self._thread = threading.Thread(target=self._sender.run, name="tsfusion-client", daemon=True)
         self._thread.start()
         atexit.register(self.close)  # also who forgets to leaves no temporary spool behind
@@ -233,7 +234,8 @@ class Client:
     def problem(self) -> str:
         """Why the server takes nothing at the moment; empty when it does."""
         box = self._outbox
-        return "" if box.connected and not box.turned_away else self._why()
+        early = time.monotonic() - self._began < _SILENCE and not box.problem
+        return "" if (box.connected or early) and not box.turned_away else self._why()
 
     def close(self) -> None:
         """Stop sending. Call `flush` first: what a temporary spool still holds is lost (and logged)."""

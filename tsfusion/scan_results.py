@@ -43,7 +43,7 @@ class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
     """What `run.json` of a scan holds.
 
     Attributes:
-        complete: whether the source came to its end, or was ended by the user: no sensor failed.
+        complete: whether the source came to its end; not so after a failure, or of a recording after Ctrl-C.
         left: keyframes that are still in the spool.
         link: why the server takes nothing at the moment; empty when it does.
         tracking_cpu_ms: CPU milliseconds of the localizer a frame.
@@ -126,7 +126,7 @@ def summarise(
     return ScanSummary(
         source=source.name,
         localizer=localizer,
-        complete=complete,
+        complete=complete and state.frames >= (source.length or 0),
         frames=state.frames,
         frames_tracked=state.tracked,
         frames_skipped=dict(source.skipped),

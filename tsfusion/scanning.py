@@ -38,6 +38,7 @@ AHEAD = 3  # keyframes of a recording under way: fusing, waiting, travelling
 OUTDOOR_SENSORS = ("stereo", "lidar")
 _PATIENCE = 60.0  # seconds without progress before an own server is given up
 _LINGER = 10.0  # seconds without progress before what a distant server does not take is left in the spool
+_FUSED = 5.0  # seconds for a distant server to say when it fused the last ones: for the figures only
 _MAPS = 16  # of an own server: its default one, and a submap each
 _POLL = 0.05  # seconds
 
@@ -227,7 +228,9 @@ def _opener(
     waiting = {path.parent.name for path in place.spools.glob("*/*.mcap")} - {place.link.map}
     for name in sorted(waiting):
         try:
-            connect(name)
+            left = connect(name).stats.waiting
+            if left:
+                log.warning("an earlier scan left %d keyframes for the map %s: they go, too", left, name)
         except TsfusionError as error:
             log.warning("what waits in %s is not sent: %s", place.spools / name, error)
     return waiting, connect
@@ -285,7 +288,11 @@ def _settle(scanner: Scanner, source: Source, place: _Place, progress: ScanProgr
     for submap in scanner.submaps:
         # Stamps and corrections are no reason to lose the scan; what was refused is counted.
         with suppress(FlushTimeout, KeyframeRefused):
-            (submap.client.wait_meshed if place.child else submap.client.flush)()
+            if place.child:
+                submap.client.wait_meshed()
+            else:
+                submap.client.flush()
+                submap.client.wait_fused(_FUSED)
 
 
 def _write(work: Path, place: _Place, submap: Submap, suffix: str, min_weight: float | None) -> MapResult:

@@ -47,6 +47,7 @@ class Finding:
     ok: bool
     found: str
     advice: str = ""
+    optional: bool = False  # and not there
 
 
 def doctor(
@@ -83,6 +84,7 @@ def check(path: Path) -> Iterator[Finding]:
 
 def _show(finding: Finding) -> None:
     mark = typer.style("✓", fg="green") if finding.ok else typer.style("✗", fg="red")
+    mark = "–" if finding.optional else mark
     advice = f" → {finding.advice}" if finding.advice else ""
     typer.echo(f"{mark} {finding.name}: {finding.found}{advice}")
 
@@ -135,7 +137,7 @@ def _extra(name: str) -> Finding:
     try:
         version = metadata.version(package)
     except metadata.PackageNotFoundError:
-        return Finding(package, True, f"not installed; for {purpose}: {install}")
+        return Finding(package, True, f"not installed; for {purpose}: {install}", optional=True)
     try:
         import_module(package.replace("-", "_"))
     except Exception as error:  # noqa: BLE001  as above

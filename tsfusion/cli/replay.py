@@ -95,7 +95,7 @@ def replay(
         dataset = select(dataset, start=start, stride=stride, limit=max_keyframes)
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count} frames {reason}", err=True)
-    if check_:
+    if check_ and not _is_synthetic(path):
         _warn(dataset)
     _run(
         dataset, out, chosen, connect=connect, control=control, map_=map_, rate=rate, state=state, json=json,
@@ -116,8 +116,14 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
     from tsfusion.datasets import describe, open_dataset
 
     dataset = open_dataset(path, unpack=unpack, **given)
-    typer.echo(f"found: {describe(dataset)}", err=True)
+    if not _is_synthetic(path):
+        typer.echo(f"found: {describe(dataset)}", err=True)
     return dataset
+
+
+def _is_synthetic(path: Path) -> bool:
+    """Whether there is nothing to be found out: the first frame would have to be rendered."""
+    return str(path).startswith("synthetic:")
 
 
 def _is_journal(path: Path) -> bool:

@@ -65,7 +65,8 @@ def scan(
         _option(_POSES, "SECONDS", "Added to a frame's time before its pose is looked up there."),
     ] = None,
     max_gap: Annotated[
-        float | None, _option(_POSES, "SECONDS", "Between two such poses; across a longer gap there is none.")
+        float | None,
+        _option(_POSES, "SECONDS", "Between two such poses; across a longer gap there is none; else 0.2."),
     ] = None,
     loop_closure: Annotated[
         bool | None,
@@ -74,16 +75,18 @@ def scan(
         ),
     ] = None,
     patience: Annotated[
-        float | None, _option(_POSES, "SECONDS", "Lost for so long, a new map begins.", min=0.0)
+        float | None, _option(_POSES, "SECONDS", "Lost for so long, a new map begins; else 1.", min=0.0)
     ] = None,
     min_overlap: Annotated[
-        float | None, _option(_KEYFRAMES, "SHARE", "Of the last keyframe's view; below, a new one.")
+        float | None, _option(_KEYFRAMES, "SHARE", "Of the last keyframe's view; below, a new one; else 0.8.")
     ] = None,
     distance: Annotated[
         float | None, _option(_KEYFRAMES, "METRES", "To the next; else 0.1, for stereo and LiDAR 2.")
     ] = None,
     angle: Annotated[float | None, _option(_KEYFRAMES, "DEGREES", "To the next; else 10.")] = None,
-    max_rate: Annotated[float | None, _option(_KEYFRAMES, "HZ", "At most so many a second.")] = None,
+    max_rate: Annotated[
+        float | None, _option(_KEYFRAMES, "HZ", "At most so many a second; else as many as the rules take.")
+    ] = None,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where the results go.")] = Path("out"),
     connect: options.Connect = None,
     control: options.Control = None,
@@ -140,7 +143,7 @@ def scan(
     if json:
         show.as_json(result)
     else:
-        show_scan.summary(result, out, spool)
+        show_scan.summary(result, out, spool, connect)
 
 
 def _open(
@@ -167,9 +170,16 @@ def _open(
     options.refuse(context, ("calibration",), "is for a live camera")
     from tsfusion.cli.replay import open_recording
     from tsfusion.datasets import select
+    from tsfusion.errors import DatasetError
     from tsfusion.sources.recorded import Recorded
 
-    dataset = open_recording(Path(spec), **recording, posed=False)
+    path = Path(spec)
+    if not spec.startswith("synthetic:") and not path.expanduser().exists():
+        raise DatasetError(
+            f"{spec} does not exist; expected a dataset, synthetic:room, synthetic:street, or live: "
+            "realsense, camera:0, folder:PATH (docs/sources.md)"
+        )
+    dataset = open_recording(path, **recording, posed=False)
     return Recorded(select(dataset, **part), rate=rate)
 
 

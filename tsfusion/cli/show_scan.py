@@ -164,15 +164,18 @@ def _counts(counts: dict[str, int]) -> str:
     return "; ".join(f"{count} × {reason}" for reason, count in counts.items() if count)
 
 
-def summary(result: "ScanSummary", out: Path, spool: Path) -> None:
-    """A scan in a few lines."""
+def summary(result: "ScanSummary", out: Path, spool: Path, connect: str | None) -> None:
+    """A scan in a few lines; `connect`: the server elsewhere that has the map."""
     delay = result.delay_ms
+    ended = "" if result.complete else "; the source was not read to its end"
     lines = [
         f"frames     {result.frames_tracked}/{result.frames} localised by {result.localizer}, "
-        f"{result.tracking_cpu_ms:.0f} CPU ms each",
+        f"{result.tracking_cpu_ms:.0f} CPU ms each{ended}",
         f"keyframes  {result.keyframes_sent} sent, {result.keyframes_durable} acknowledged, "
         f"{result.keyframes_fused} fused ({_counts(result.keyframes_by_rule)})",
-        f"delay      mean {delay.mean:.0f} ms, p50 {delay.p50:.0f}, p95 {delay.p95:.0f}, max {delay.max:.0f}",
+        f"delay      mean {delay.mean:.0f} ms, p50 {delay.p50:.0f}, p95 {delay.p95:.0f}, max {delay.max:.0f}"
+        if delay.count
+        else "delay      not known: nothing was fused yet",
     ]
     if result.frames_skipped:
         lines.append(f"left out   {_counts(result.frames_skipped)}")
@@ -187,6 +190,10 @@ def summary(result: "ScanSummary", out: Path, spool: Path) -> None:
             f"--spool {spool} sends them"
         )
     lines.append(f"results    {out}/")
+    if connect is not None and result.keyframes_durable:
+        lines.append(
+            f"mesh       tsfusion mesh {connect} {result.maps[0].name}.glb --map {result.maps[0].name}"
+        )
     typer.echo("\n".join(lines))
 
 

@@ -17,6 +17,16 @@ _BY_KIND: dict[str, LocalizerName] = {
     "points": "lidar",
 }
 
+_FOLLOWS: dict[str, tuple[str, ...]] = {
+    "rgbd": ("depth", "disparity"),
+    "stereo": ("pair", "depth", "disparity"),
+    "lidar": ("points",),
+}
+_WORDS = {"rgbd": "depth images", "stereo": "stereo pairs, or depth with an image", "lidar": "points"}
+_KINDS = {
+    "depth": "depth images", "disparity": "disparity images", "pair": "stereo pairs", "points": "points"
+}  # fmt: skip
+
 log = logging.getLogger(__name__)
 
 
@@ -39,6 +49,10 @@ def make(config: ScanConfig, first: Frame) -> Localizer:
         MissingDependency: when it needs an optional package.
     """
     name = choose(config, first)
+    if first.kind not in _FOLLOWS.get(name, (first.kind,)):
+        raise InvalidConfig(
+            f"the localizer {name} follows {_WORDS[name]}, and this source gives {_KINDS[first.kind]}"
+        )
     if name == "given":
         from tsfusion.localizers.given import Given
 
