@@ -15,7 +15,7 @@ PACKAGE = Path(__file__).parent.parent / "tsfusion"
 # Top to bottom. A module may import from its own row (without a cycle) and from the rows below it.
 ROWS: tuple[tuple[str, frozenset[str]], ...] = (
     ("command line", frozenset({"cli", "__main__"})),
-    ("whole runs", frozenset({"pipeline", "scanning", "scan_results", "summary", "child"})),
+    ("whole runs", frozenset({"pipeline", "scanning", "destination", "scan_results", "summary", "child"})),
     ("processes", frozenset({"server", "gateway", "intake", "door", "atlas", "hosted", "outcomes",
                              "retention", "reports", "questions", "quota", "quarantine", "routes",
                              "sessions", "subscriptions", "ports", "fuser_link", "fuser_process",

@@ -335,3 +335,11 @@ def test_keyframes_that_are_refused_do_not_cost_the_results(walk: Path, tmp_path
     assert run["keyframes_rejected"] == {"quota": run["keyframes_sent"]}
     assert run["left"] == 0
     assert len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) == 12
+
+
+def test_a_map_without_a_surface_keeps_the_trajectory(walk: Path, tmp_path: Path) -> None:
+    done = scan("--source", walk, "--max-frames", 2, "--min-weight", 1000, "--out", tmp_path / "out")
+    assert done.returncode == 1
+    assert "the map has no surface to write: 1 keyframes fused" in done.stderr.splitlines()[-1]
+    assert len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) == 2
+    assert not (tmp_path / "out" / "mesh.ply").exists()

@@ -2,21 +2,18 @@
 """A whole scan: a source's frames localised, chosen, sent and fused, and what is left in a folder."""
 
 import dataclasses
-import logging
 import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-from tsfusion import localizers, preview, process, scan_results, summary
-from tsfusion.child import ServerChild, own_server
-from tsfusion.client import Client
-from tsfusion.config import ClientConfig, ScanConfig, ServerConfig, VolumeConfig, override
+from tsfusion import destination, localizers, preview, process, scan_results, summary
+from tsfusion.config import ClientConfig, ScanConfig, ServerConfig, VolumeConfig
+from tsfusion.destination import Destination
 from tsfusion.errors import (
     DatasetError,
     FlushTimeout,
@@ -34,15 +31,13 @@ from tsfusion.scanner import Scanner, ScanState, Submap
 from tsfusion.sources import Source
 from tsfusion.transport import client_keys
 
-AHEAD = 3  # keyframes of a recording under way: fusing, waiting, travelling
 OUTDOOR_SENSORS = ("stereo", "lidar")
 _PATIENCE = 60.0  # seconds without progress before an own server is given up
 _LINGER = 10.0  # seconds without progress before what a distant server does not take is left in the spool
 _FUSED = 5.0  # seconds for a distant server to say when it fused the last ones: for the figures only
-_MAPS = 16  # of an own server: its default one, and a submap each
 _POLL = 0.05  # seconds
 
-log = logging.getLogger(__name__)
+_NO_SURFACE = "the map has no surface to write: {} keyframes fused; scan for longer or lower --min-weight"
 
 
 class ScanProgress(Protocol):
@@ -53,16 +48,6 @@ class ScanProgress(Protocol):
 
     def scan(self, state: ScanState, length: int | None) -> None:
         """After every frame, and while the rest is being fused; `length` of the source, where it is known."""
-
-
-@dataclass(frozen=True)
-class _Place:
-    """Where the keyframes of a sensor go: the link's settings, the own server, the folder of spools."""
-
-    link: ClientConfig
-    child: ServerChild | None
-    spools: Path
-    sensor: str
 
 
 def scan(
@@ -94,7 +79,8 @@ def scan(
         SourceError: the sensor failed; what came before is in `out`.
         DatasetError: a recording's file cannot be read; likewise.
         InvalidKeyframe: a frame lacks what the localizer needs; likewise.
-        OutputError: `out` cannot be written, or no frame could be localised.
+        OutputError: `out` cannot be written, or no frame could be localised; or the own map has no surface,
+            when all else is in `out`.
         TransportError: the server cannot be reached or stopped fusing.
     """
     failure: list[Exception] = []
@@ -105,16 +91,17 @@ def scan(
             raise failure[0] if failure else SourceError(f"{source.name} gave no frames")
         localizer = localizers.make(config, first)
         stack.callback(getattr(localizer, "close", lambda: None))
-        place = _place(
-            stack, work=work, sensor=source.sensor, volume=volume, server=server, client=client,
-            connect=connect, spool=Path(spool), progress=progress,
-        )  # fmt: skip
-        if place.child is None and not localizer.absolute:
-            _warn_of_another_world(place)
-        leftovers, open_client = _opener(stack, place, _pace(source, place))
+        if connect is None:
+            progress.stage("starting a server (the first start compiles kernels)")
+            place = destination.of_its_own(stack, client, server, volume, work / ".scratch")
+        else:
+            place = destination.elsewhere(client, connect, Path(spool))
+            if not localizer.absolute:
+                destination.warn_of_another_world(place)
+        leftovers, open_client = destination.opener(stack, place, source)
         scanner = Scanner(
             localizer, config, open_client, map_name=place.link.map, taken=leftovers,
-            outdoors=source.sensor in OUTDOOR_SENSORS, most=_MAPS - 1 if place.child else None,
+            outdoors=source.sensor in OUTDOOR_SENSORS, most=destination.MAPS - 1 if place.child else None,
         )  # fmt: skip
         progress.stage(f"scanning {source.name}")
         started = time.monotonic()
@@ -131,14 +118,24 @@ def scan(
         seconds = time.monotonic() - started
         progress.stage("writing the results")
         maps = [
-            _write(work, place, submap, f"-{number}" if number > 1 else "", min_weight)
+            _write(
+                work,
+                place,
+                submap,
+                f"-{number}" if number > 1 else "",
+                sensor=source.sensor,
+                min_weight=min_weight,
+            )
             for number, submap in enumerate(scanner.submaps, 1)
         ]
+        complete = not failure
+        if place.child is not None and not any(found.mesh["triangles"] for found in maps if found.mesh):
+            failure.append(OutputError(_NO_SURFACE.format(scanner.state().stats.fused)))
         records = scan_results.records(scanner.submaps)
         summary.write_ledger(work, records)
         result = scan_results.summarise(
             source, scanner, maps, records,
-            localizer=localizers.choose(config, first), complete=not failure, seconds=seconds,
+            localizer=localizers.choose(config, first), complete=complete, seconds=seconds,
             peak_rss_bytes=peak, config=config, volume=volume if place.child else None,
         )  # fmt: skip
         stack.close()  # clients and server end before the folder of theirs goes
@@ -180,77 +177,7 @@ def _run(
         failure.append(error)
 
 
-def _place(
-    stack: ExitStack,
-    *,
-    work: Path,
-    sensor: str,
-    volume: VolumeConfig,
-    server: ServerConfig | None,
-    client: ClientConfig | None,
-    connect: str | None,
-    spool: Path,
-    progress: ScanProgress,
-) -> _Place:
-    client = client or ClientConfig()
-    if connect is not None:
-        return _Place(override(client, address=connect), None, spool, sensor)
-    scratch = work / ".scratch"
-    scratch.mkdir()
-    progress.stage("starting a server (the first start compiles kernels)")
-    own = server or ServerConfig(listen="tcp://127.0.0.1:0", state=str(scratch / "state"))
-    own = override(own, max_maps=max(own.max_maps, _MAPS))
-    link, child = stack.enter_context(own_server(client, own, volume, scratch))
-    return _Place(link, child, scratch / "spool", sensor)
-
-
-def _pace(source: Source, place: _Place) -> dict[str, Any]:
-    """A recording leaves nothing out: it waits for a server of its own, and for no other."""
-    if source.length is None:
-        return {}
-    return {"policy": "block", "backlog": AHEAD} if place.child else {"policy": "spool_all"}
-
-
-def _opener(
-    stack: ExitStack, place: _Place, pace: dict[str, Any]
-) -> tuple[set[str], Callable[[str], Client]]:
-    """The maps that an earlier scan's keyframes wait for, and what opens a client and closes it in the end.
-
-    Those keyframes are sent, too, but this scan begins no submap of their names.
-    """
-
-    def connect(name: str) -> Client:
-        link = override(place.link, map=name, **pace)
-        client = Client(link.address, spool=place.spools / name, control=link.control, config=link)
-        stack.callback(client.close)
-        return client
-
-    waiting = {path.parent.name for path in place.spools.glob("*/*.mcap")} - {place.link.map}
-    for name in sorted(waiting):
-        try:
-            left = connect(name).stats.waiting
-            if left:
-                log.warning("an earlier scan left %d keyframes for the map %s: they go, too", left, name)
-        except TsfusionError as error:
-            log.warning("what waits in %s is not sent: %s", place.spools / name, error)
-    return waiting, connect
-
-
-def _warn_of_another_world(place: _Place) -> None:
-    """Say so when the map has keyframes already, or will have: this scan's world is not theirs."""
-    link = place.link
-    begins = "a scan that localises itself begins its own world; give it a map of its own (--map NAME)"
-    if any((place.spools / link.map).glob("*.mcap")):
-        log.warning("keyframes of an earlier scan wait for the map %s: %s", link.map, begins)
-        return
-    with suppress(TransportError):  # a server that is not there yet, or has no such map
-        keys = client_keys(link.key, link.server_key)
-        status = fetch_status(link.address, control=link.control, map_name=link.map, timeout=2.0, keys=keys)
-        if status.keyframes_durable:
-            log.warning("the map %s has %d keyframes already: %s", link.map, status.keyframes_durable, begins)
-
-
-def _watcher(source: Source, place: _Place, progress: ScanProgress) -> Callable[[Scanner], None]:
+def _watcher(source: Source, place: Destination, progress: ScanProgress) -> Callable[[Scanner], None]:
     def watch(scanner: Scanner) -> None:
         if place.child is not None:
             place.child.check()
@@ -263,7 +190,7 @@ def _nowhere(state: ScanState) -> str:
     return f"the sensor was not localised in any of {state.frames} frames: {state.why}"
 
 
-def _settle(scanner: Scanner, source: Source, place: _Place, progress: ScanProgress) -> None:
+def _settle(scanner: Scanner, source: Source, place: Destination, progress: ScanProgress) -> None:
     """Wait until everything is fused; with a server elsewhere, for as long as it takes any."""
     progress.stage("fusing what is on its way" if place.child else "sending what is on its way")
     patience = _PATIENCE if place.child else _LINGER
@@ -295,7 +222,9 @@ def _settle(scanner: Scanner, source: Source, place: _Place, progress: ScanProgr
                 submap.client.wait_fused(_FUSED)
 
 
-def _write(work: Path, place: _Place, submap: Submap, suffix: str, min_weight: float | None) -> MapResult:
+def _write(
+    work: Path, place: Destination, submap: Submap, suffix: str, *, sensor: str, min_weight: float | None
+) -> MapResult:
     """The files of one submap."""
     if submap.located:
         scan_results.write_trajectory(work, submap, suffix)
@@ -308,11 +237,6 @@ def _write(work: Path, place: _Place, submap: Submap, suffix: str, min_weight: f
         link.address, control=link.control, map_name=submap.name, min_weight=min_weight, keys=keys
     )
     if len(mesh.faces):
-        ups = [preview.sensor_up(T, place.sensor) for T in submap.located.poses()]
+        ups = [preview.sensor_up(T, sensor) for T in submap.located.poses()]
         summary.write_mesh(work, mesh, ups, suffix)
-    elif not suffix:
-        raise OutputError(
-            f"the map has no surface to write: {status.keyframes_fused} keyframes fused; "
-            "scan for longer or lower --min-weight"
-        )
     return scan_results.describe(submap, status, mesh)
