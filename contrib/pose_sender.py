@@ -5,9 +5,9 @@
     your_slam | python3 pose_sender.py tcp://127.0.0.1:5570
 
 Reads lines `seconds tx ty tz qx qy qz qw` (TUM's format: T_world_camera, OpenCV axes), or `seconds lost` when
-your SLAM does not know where it is. Blank lines and those that begin with # are passed over, others are told on
-stderr. A file's poses are better given by `--trajectory FILE`: they are sent at once, and what is sent before
-anybody listens is lost. `pose_sender.py ADDRESS connect` is for `--feed @ADDRESS`.
+your SLAM does not know where it is. Blank lines and those that begin with # are skipped, bad ones are told
+on stderr. For a file use `tsfusion scan --trajectory FILE`: here its poses are out before anybody listens.
+`pose_sender.py ADDRESS connect` is for `--feed @ADDRESS`.
 """
 
 import json
@@ -28,7 +28,7 @@ for number, line in enumerate(sys.stdin, 1):
         if pose is not None and len(pose) != 7:
             raise ValueError
     except (ArithmeticError, ValueError):
-        print(f"line {number} is no `seconds tx ty tz qx qy qz qw`: {line.strip()[:80]}", file=sys.stderr)
+        sys.stderr.write(f"line {number} is no `seconds tx ty tz qx qy qz qw`: {line.strip()[:80]}\n")
         continue
     message = {"lost": True} if pose is None else {"pose": pose}
     socket.send(json.dumps({"stamp_ns": stamp_ns, **message}).encode())

@@ -221,7 +221,7 @@ def test_the_documented_sender_drives_it(feed: Feed) -> None:
         assert "no pose within 0.15 s on both sides" in between.reason
         silent = feed.track(frame(START + 5 * SECOND))
         assert isinstance(silent, Lost)
-        assert "the last one is 4.300 s older" in silent.reason
+        assert "is 4.300 s older than the frame, after 0.05 s of waiting" in silent.reason
         assert not feed.dropped
     finally:
         sender.close()
@@ -500,6 +500,9 @@ def test_a_sender_that_binds_may_come_later_and_again() -> None:
 
 
 def test_what_cannot_be_listened_to_is_explained(feed: Feed) -> None:
+    nothing = feed.track(frame(START))
+    assert isinstance(nothing, Lost)
+    assert f"@{feed.address}, where it listens" in nothing.reason
     for address, said_of_it in (
         ("5570", "an address looks like"),
         ("tcp://127.0.0.1:0", "connecting needs a port"),
