@@ -150,6 +150,16 @@ def test_ate_on_the_command_line(data, tmp_path):
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
+def test_a_straight_way_is_drawn_in_a_window():
+    from tsfusion.evaluation.trajectory_plot import _limits
+
+    for extent in ([30.0, 0.01], [0.0, 2.0], [3.0, 2.0], [0.0, 0.0]):
+        low, high = _limits(np.array([5.0, -5.0]), np.array([5.0, -5.0]) + extent)
+        assert (low < (5, -5)).all()
+        assert (high > np.array([5, -5]) + extent).all()
+        assert min(high - low) >= 0.25 * max(high - low)
+
+
 @pytest.mark.parametrize(
     ("text", "match"),
     [
