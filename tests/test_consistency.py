@@ -222,6 +222,17 @@ def test_shift_is_told_in_milliseconds(data: Data) -> None:
     assert "1 frame (133 ms) late" in check(moved).text
 
 
+def test_what_agrees_and_cannot_be_told_apart_is_said(data: Data) -> None:
+    report = check(opened(data(FOLDERS["3dmatch"])))
+    assert report.verdict == "agree"
+    assert set(report.alternatives) == {"mirror", "conjugate"}
+    assert "mirror, conjugate" in report.text
+    assert "tell them apart" in report.text
+    sure = check(opened(data(FOLDERS["7scenes"])))
+    assert sure.text == "poses and depth agree"
+    assert sure.alternatives == ()
+
+
 @pytest.mark.parametrize("name", ["7scenes", "hololens", "3dmatch"])
 def test_axes_of_the_world_do_not_matter(name: str, data: Data) -> None:
     assert check(Corrupted(opened(data(FOLDERS[name])), lambda T: OTHER_WORLD @ T)).verdict == "agree"

@@ -221,10 +221,35 @@ def test_the_documented_sender_drives_it(feed: Feed) -> None:
         assert "no pose within 0.15 s on both sides" in between.reason
         silent = feed.track(frame(START + 5 * SECOND))
         assert isinstance(silent, Lost)
-        assert "the last one is 4.300 s older" in silent.reason
+        assert "is 4.300 s older than the frame, after 0.05 s of waiting" in silent.reason
         assert not feed.dropped
     finally:
         sender.close()
+
+
+def test_the_documented_sender_passes_over_what_is_no_pose(feed: Feed) -> None:
+    seconds = START // SECOND
+    lines = "# timestamp tx ty tz qx qy qz qw", "", "now 0 0 0 0 0 0 1", f"{seconds} 0 0 0", f"{seconds} here"
+    pose = f"{seconds} " + " ".join(f"{number!r}" for number in seven(way(0.0)))
+    with subprocess.Popen(
+        [sys.executable, str(SENDER), feed.address, "connect"], stdin=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True,
+    ) as sender:  # fmt: skip
+        assert sender.stdin is not None
+        assert sender.stderr is not None
+        until = time.monotonic() + DEADLINE
+        sender.stdin.write("\n".join((*lines, "NaN 0 0 0 0 0 0 1", "Infinity lost", "")))
+        while not feed.received:
+            assert time.monotonic() < until, "nothing was heard"
+            sender.stdin.write(f"{pose}\n")
+            sender.stdin.flush()
+            feed.track(frame(START))
+        same(follow(feed, 0.0), way(0.0))
+        sender.stdin.close()
+        told = sender.stderr.read().splitlines()
+        assert sender.wait(DEADLINE) == 0
+    assert [line.split(" is no ")[0] for line in told] == [f"line {n}" for n in (3, 4, 5, 6, 7)]
+    assert not feed.dropped
 
 
 @contextlib.contextmanager
@@ -475,6 +500,9 @@ def test_a_sender_that_binds_may_come_later_and_again() -> None:
 
 
 def test_what_cannot_be_listened_to_is_explained(feed: Feed) -> None:
+    nothing = feed.track(frame(START))
+    assert isinstance(nothing, Lost)
+    assert f"@{feed.address}, where it listens" in nothing.reason
     for address, said_of_it in (
         ("5570", "an address looks like"),
         ("tcp://127.0.0.1:0", "connecting needs a port"),

@@ -7,13 +7,18 @@ import subprocess
 import zipfile
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from commands import tsfusion
 
 from tsfusion import DatasetError, se3
+from tsfusion.cli.ate import table
+from tsfusion.datasets import open_dataset, select
+from tsfusion.datasets.base import pose_of
 from tsfusion.datasets.poses import quaternion, read_tum, rigid, write_tum
 from tsfusion.evaluation.trajectory import absolute_error, associate, paired, read, umeyama
+from tsfusion.sources.recorded import Recorded
 
 RNG = np.random.default_rng(7)
 
@@ -151,6 +156,55 @@ def test_ate_on_the_command_line(data, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("folder", "option"), [("7scenes/redkitchen", ()), ("kitti_odometry", ("--option", "sequence=06"))]
+)
+def test_a_recording_is_a_reference(data, tmp_path, folder, option):
+    """By its times, or those that a scan counts where it has none."""
+    root, given = data(folder), dict(each.split("=") for each in option[1:])
+    dataset, estimate = open_dataset(root, **given), tmp_path / "estimate.txt"
+    stamps = [frame.timestamp_ns for frame in Recorded(select(dataset, limit=30))]
+    T = se3.exp(np.array([3.0, -2, 1, 0.5, -1, 2]))
+    write_tum(estimate, stamps, [T @ pose_of(dataset, index) for index in range(30)])
+    done = tsfusion("ate", estimate, root, *option, "--json")
+    assert done.returncode == 0, done.stderr
+    error = json.loads(done.stdout)
+    assert error["count"] == 30
+    assert error["max"] < 1e-5
+    assert error["rotation_deg"] < 1e-3
+
+
+def test_a_folder_that_is_no_recording_is_refused(tmp_path):
+    write_tum(tmp_path / "a.txt", [1, 2], list(walk(2)))
+    (tmp_path / "empty").mkdir()
+    done = tsfusion("ate", tmp_path / "a.txt", tmp_path / "empty")
+    assert done.returncode == 1
+    assert "7-Scenes" in done.stderr
+
+
+def test_other_axes_and_large_figures_are_legible(tmp_path):
+    poses = walk()
+    body = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    stamps = [10**9 * (index + 1) for index in range(len(poses))]
+    for name, each in (("a.txt", poses), ("b.txt", poses @ body)):
+        write_tum(tmp_path / name, stamps, list(each))
+    told = "the orientations differ by 120° on average"
+    assert told in tsfusion("ate", tmp_path / "b.txt", tmp_path / "a.txt").stdout
+    assert told not in tsfusion("ate", tmp_path / "a.txt", tmp_path / "a.txt").stdout
+    error = msgspec.structs.replace(absolute_error(poses, poses), length=12345.6, drift_percent=12345.67)
+    assert table([("ATE", error)]).endswith("      40   12345.6 m  12345.67 %")
+
+
+def test_a_straight_way_is_drawn_in_a_window():
+    from tsfusion.evaluation.trajectory_plot import _limits
+
+    for extent in ([30.0, 0.01], [0.0, 2.0], [3.0, 2.0], [0.0, 0.0]):
+        low, high = _limits(np.array([5.0, -5.0]), np.array([5.0, -5.0]) + extent)
+        assert (low < (5, -5)).all()
+        assert (high > np.array([5, -5]) + extent).all()
+        assert min(high - low) >= 0.25 * max(high - low)
+
+
+@pytest.mark.parametrize(
     ("text", "match"),
     [
         ("1 2 3\n", "five a pose"),
@@ -170,7 +224,7 @@ def test_unequal_numbers_without_times(data, tmp_path):
     kitti = data("kitti_odometry")
     lines = (kitti / "poses/00.txt").read_text().splitlines(keepends=True)
     (tmp_path / "short.txt").write_text("".join(lines[:100]))
-    with pytest.raises(DatasetError, match=r"100 poses and .* 4541"):
+    with pytest.raises(DatasetError, match=r"100 poses and .* 4541, .* the dataset's folder"):
         paired(tmp_path / "short.txt", kitti / "poses/00.txt")
     (tmp_path / "one.txt").write_text(lines[0])
     with pytest.raises(DatasetError, match="two positions or more"):

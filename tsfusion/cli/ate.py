@@ -2,21 +2,25 @@
 """`tsfusion ate`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tsfusion.cli import options
 
 if TYPE_CHECKING:
+    from tsfusion.datasets import Dataset
     from tsfusion.evaluation.trajectory import TrajectoryError
 
+_OTHER_AXES = 20  # degrees; no odometry is so far off on average
 _FORMATS = "TUM, KITTI or Redwood .log."
 
 
 def ate(
     estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE", help=f"A trajectory file: {_FORMATS}")],
-    reference: Annotated[Path, typer.Argument(metavar="REFERENCE", help="The truth, likewise.")],
+    reference: Annotated[
+        Path, typer.Argument(metavar="REFERENCE", help="The truth: likewise, or a dataset whose poses it is.")
+    ],
     *,
     max_difference: Annotated[
         float, typer.Option(metavar="SECONDS", min=0.0, help="Between two poses that belong together.")
@@ -27,6 +31,7 @@ def ate(
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Draw the trajectory, coloured by its error.")
     ] = None,
+    option: options.DatasetOptions = None,
     json: options.Json = False,
 ) -> None:
     """Absolute trajectory error (ATE): how far an estimated trajectory is from a true one."""
@@ -36,7 +41,8 @@ def ate(
 
     if plot is not None:
         check_writable(plot, (".png", ".pdf", ".svg"))
-    a, b = trajectory.paired(estimate, reference, max_difference_s=max_difference)
+    truth = _truth(reference, options.dataset_options(option))
+    a, b = trajectory.paired(estimate, truth, max_difference_s=max_difference)
     error = trajectory.absolute_error(a, b, align=align)
     if plot is not None:
         from tsfusion.evaluation.trajectory_plot import draw
@@ -46,18 +52,32 @@ def ate(
         show.as_json(error)
         return
     typer.echo(table([("ATE", error)]))
+    if error.rotation_deg > _OTHER_AXES:
+        typer.echo(
+            f"the orientations differ by {error.rotation_deg:.0f}° on average: are the poses of different "
+            "axes (camera, LiDAR, body)? drift is then meaningless"
+        )
+
+
+def _truth(reference: Path, given: dict[str, Any]) -> "Path | Dataset":
+    """A trajectory file as it is; anything else is opened, frames without a pose included: they count."""
+    if reference.is_file() and not given:
+        return reference
+    from tsfusion.cli.replay import open_recording
+
+    return open_recording(reference, posed=False, **given)
 
 
 def table(rows: "list[tuple[str, TrajectoryError]]") -> str:
     """The field's table of trajectories, metres."""
     head = ("min", "max", "mean", "median", "std", "RMSE")
     width = max(len(name) for name, _ in rows)
-    lines = [" " * width + "".join(f"{name:>10}" for name in head) + "   poses    length   drift"]
+    lines = [" " * width + "".join(f"{name:>10}" for name in head) + "   poses      length       drift"]
     for name, error in rows:
         figures = (error.min, error.max, error.mean, error.median, error.std, error.rmse)
         lines.append(
             f"{name:<{width}}" + "".join(f"{_metres(value):>10}" for value in figures)
-            + f"{error.count:>8}{error.length:>8.1f} m{error.drift_percent:>6.2f} %"
+            + f"{error.count:>8}{error.length:>10.1f} m{error.drift_percent:>10.2f} %"
         )  # fmt: skip
     return "\n".join(lines)
 

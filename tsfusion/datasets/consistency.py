@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tsfusion import se3
 from tsfusion.datasets.base import Dataset, frame_of, pose_of
-from tsfusion.datasets.mistakes import MISTAKES, SCALES, scale_text
+from tsfusion.datasets.mistakes import MISTAKES, SCALES, or_text, scale_text, untold_text
 from tsfusion.datasets.poses import Pose
 from tsfusion.datasets.views import View, view_of
 
@@ -56,7 +56,7 @@ class Report:
         verdict: `disagree` only when it is sure.
         text: a sentence or two: what is wrong and what to do.
         mistake: short name of it: one of `MISTAKES`, `scale`, `time`, `unexplained`; None when they agree.
-        alternatives: other mistakes that would explain these frames as well.
+        alternatives: (other) mistakes under which these frames would fit as well.
         factor: for `scale`, what translations must be multiplied by.
         shift: for `time`, frames later whose pose each frame should have.
         pairs: of frames compared.
@@ -107,7 +107,7 @@ def check(dataset: Dataset) -> Report:
         alternatives = tuple(mistake.name for mistake in likely[1:])
         return report(
             verdict="disagree",
-            text=f"poses and depth disagree: {likely[0].text}" + _or(alternatives),
+            text=f"poses and depth disagree: {likely[0].text}" + or_text(alternatives),
             mistake=likely[0].name,
             alternatives=alternatives,
         )
@@ -122,7 +122,9 @@ def check(dataset: Dataset) -> Report:
         return report(verdict="cannot tell", text="the frames looked at share too little to tell")
     if np.mean(given) - np.median([np.mean(fits) for fits in tried.values()]) < _SPREAD:
         return report(verdict="cannot tell", text="the sensor hardly moves between the frames looked at")
-    return report(verdict="agree", text="poses and depth agree")
+    likewise = _likewise(given, tried)
+    text = "poses and depth agree" + untold_text(likewise)
+    return report(verdict="agree", text=text, alternatives=likewise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,8 +277,10 @@ def _time_shift(dataset: Dataset, pairs: list[_Pair], best: NDArray[np.float64])
     return found[1] or None
 
 
-def _or(alternatives: tuple[str, ...]) -> str:
-    return f" (these would fit as well: {', '.join(alternatives)})" if alternatives else ""
+def _likewise(given: NDArray[np.float64], tried: dict[str, NDArray[np.float64]]) -> tuple[str, ...]:
+    """The mistakes under which the frames fit as well as under the poses given."""
+    gains = {name: _mean(fits - given, np.maximum(fits, given) >= _FITS) for name, fits in tried.items()}
+    return tuple(name for name, gain in gains.items() if gain > -_AS_GOOD)
 
 
 def _mean(values: NDArray[np.float64], where: NDArray[np.bool_]) -> float:

@@ -131,3 +131,18 @@ def scale_text(factor: float) -> str:
         f"poses and depth disagree: the translations are {size} for the depth (no usual unit): check "
         "the depth scale, the intrinsics and where the poses come from"
     )
+
+
+def or_text(alternatives: tuple[str, ...]) -> str:
+    """The other mistakes that a disagreement may come from; empty without any."""
+    return f" (these would fit as well: {', '.join(alternatives)})" if alternatives else ""
+
+
+def untold_text(alternatives: tuple[str, ...]) -> str:
+    """The mistakes that an agreement does not rule out; empty without any."""
+    if not alternatives:
+        return ""
+    return (
+        f", but so would poses that are wrong in one of these ways: {', '.join(alternatives)}; the sensor "
+        "moves too little or too straight here to tell them apart"
+    )

@@ -7,9 +7,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets.base import read_lines
+from tsfusion.datasets.base import Dataset, pose_of, read_lines
 from tsfusion.datasets.poses import read_kitti, read_log, read_tum, rigid
 from tsfusion.errors import DatasetError
+from tsfusion.sources.recorded import NOMINAL_NS
 
 Poses = NDArray[np.float64]  # (n, 4, 4) T_world_camera
 
@@ -151,19 +152,43 @@ def read(path: Path) -> tuple[NDArray[np.int64] | None, Poses]:
     )
 
 
-def paired(estimate: Path, reference: Path, *, max_difference_s: float = 0.01) -> tuple[Poses, Poses]:
-    """The poses of two files that belong together: by time, or by line where a file has no times.
+def of_dataset(dataset: Dataset) -> tuple[NDArray[np.int64], Poses]:
+    """The poses a recording has; its times, or where it has none those that `tsfusion scan` counts.
+
+    Returns:
+        (n,) timestamps in nanoseconds and (n, 4, 4) poses, of the frames that have one.
+
+    Raises:
+        DatasetError: when no frame has.
+    """
+    found = [(index, T) for index in range(len(dataset)) if (T := pose_of(dataset, index)) is not None]
+    if not found:
+        raise DatasetError(f"{dataset.name} has no poses to compare with")
+    stamps = dataset.timestamps_ns
+    times = [(index + 1) * NOMINAL_NS if stamps is None else int(stamps[index]) for index, _ in found]
+    return np.array(times, dtype=np.int64), np.array([T for _, T in found])
+
+
+def paired(
+    estimate: Path, reference: Path | Dataset, *, max_difference_s: float = 0.01
+) -> tuple[Poses, Poses]:
+    """The poses of two files (or a file and a recording) that belong together: by time, else by line.
 
     Raises:
         DatasetError: when nothing can be paired, or without times for unequal numbers.
     """
-    (stamps, poses), (reference_stamps, references) = read(estimate), read(reference)
+    stamps, poses = read(estimate)
+    reference_stamps, references = read(reference) if isinstance(reference, Path) else of_dataset(reference)
     if stamps is not None and reference_stamps is not None:
         a, b = associate(stamps, reference_stamps, round(max_difference_s * 1e9))
         return poses[a], references[b]
     if len(poses) != len(references):
+        name = reference if isinstance(reference, Path) else reference.name
+        both = ((estimate, stamps), (name, reference_stamps))
+        timeless = " and ".join(str(each) for each, times in both if times is None)
         raise DatasetError(
-            f"{estimate} has {len(poses)} poses and {reference} {len(references)}: without times in both, "
-            "they belong together line by line"
+            f"{estimate} has {len(poses)} poses and {name} {len(references)}, to be paired line by line as "
+            f"there are no times in {timeless}: give an estimate with times (TUM's format), and as reference "
+            "a file with times or the dataset's folder"
         )
     return poses, references

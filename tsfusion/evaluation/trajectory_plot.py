@@ -4,8 +4,11 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tsfusion.evaluation.trajectory import Poses, aligned_to
+
+_NARROWEST = 0.4  # of the view's longer side
 
 
 def draw(estimate: Poses, reference: Poses, path: Path, *, align: bool = True) -> None:
@@ -29,7 +32,10 @@ def draw(estimate: Poses, reference: Poses, path: Path, *, align: bool = True) -
     view.plot(*b.T, color="0.75", linewidth=3, label="reference", zorder=1)
     drawn = view.scatter(*a.T, c=error * factor, s=6, cmap="viridis", label="estimate", zorder=2)
     figure.colorbar(drawn, ax=view, label=f"error, {unit}")
-    view.set(aspect="equal", xlabel="m", ylabel="m", title="trajectory, seen across its widest plane")
+    both = np.vstack([a, b])
+    (left, low), (right, high) = _limits(both.min(axis=0), both.max(axis=0))
+    view.set(aspect="equal", xlim=(left, right), ylim=(low, high), xlabel="m", ylabel="m")
+    view.set_title("trajectory, seen across its widest plane")
     view.legend(loc="best")
     course.plot(along, error * factor, linewidth=1)
     rmse = float(np.sqrt(np.mean(error**2)))
@@ -37,3 +43,11 @@ def draw(estimate: Poses, reference: Poses, path: Path, *, align: bool = True) -
     course.set(xlabel="way, m", ylabel=f"error, {unit}", title="absolute error along the way", ylim=(0, None))
     course.legend(loc="best")
     figure.savefig(path, dpi=110)
+
+
+def _limits(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lower and upper limits, (2, 2), with a margin; a straight way is still seen in a window, not a slit."""
+    extent = high - low
+    wanted = np.maximum(1.1 * extent, _NARROWEST * extent.max() or 1.0)
+    middle = (low + high) / 2
+    return np.array([middle - wanted / 2, middle + wanted / 2])

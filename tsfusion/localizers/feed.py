@@ -24,7 +24,7 @@ from tsfusion.transport import sockets
 
 log = logging.getLogger(__name__)
 
-WAIT = 0.1  # seconds for a pose that is under way
+WAIT = 0.1  # seconds for a pose that is under way; docs/localization.md says so
 _BUSY = 0.1  # seconds that messages are taken for one frame, so that a flood cannot hold it up
 _SILENCE = 5.0  # seconds; libzmq gives some connections up for good, so that it is made again
 _ANOTHER_CLOCK = 3600.0  # seconds
@@ -148,6 +148,8 @@ class Feed:
     def _missing(self, stamp: int) -> str:
         where = f"from {self.address}"
         if not len(self._history):
+            if self._link.binds:
+                return f"no pose has come yet to @{self.address}, where it listens: senders connect to it"
             return f"no pose has come {where} yet"
         away = (stamp - self._history.last_ns) / _NS
         if abs(away) > _ANOTHER_CLOCK:
@@ -155,7 +157,10 @@ class Feed:
                 f"the last pose {where} is {abs(away):.0f} s away from the frame: are these the same clock?"
             )
         if away > 0:
-            return f"no pose for the frame has come {where}; the last one is {away:.3f} s older"
+            return (
+                f"the pose comes too late or not at all: the newest {where} is {away:.3f} s older than the "
+                f"frame, after {self._wait:g} s of waiting"
+            )
         return f"{where}, there is no pose within {self._max_gap_ns / _NS:g} s on both sides of the frame"
 
 
@@ -163,11 +168,11 @@ class _Link:
     """The SUB socket, made anew when nothing has come for a while."""
 
     def __init__(self, address: str) -> None:
-        self._binds = address.startswith("@")
+        self.binds = address.startswith("@")
         plain = address.removeprefix("@")
-        if self._binds:
+        if self.binds:
             sockets.check_own_machine(plain)
-        self._target = plain if self._binds else sockets.target(plain)
+        self._target = plain if self.binds else sockets.target(plain)
         self._context: zmq.Context[Any] = zmq.Context()
         self._socket = sockets.pose_feed(self._context, MAX_BYTES)
         self.endpoint = self._target
@@ -182,7 +187,7 @@ class _Link:
         if self._socket.poll(round(seconds * 1000)):
             self._heard = time.monotonic()
             return self._socket.recv_multipart()
-        if not self._binds and time.monotonic() - self._heard > _SILENCE:
+        if not self.binds and time.monotonic() - self._heard > _SILENCE:
             self._socket.close()
             self._socket = sockets.pose_feed(self._context, MAX_BYTES)
             self._open()
@@ -193,7 +198,7 @@ class _Link:
 
     def _open(self) -> None:
         self._heard = time.monotonic()
-        if self._binds:
+        if self.binds:
             self.endpoint = sockets.bind_one(self._socket, self._target)
         else:
             self._socket.connect(self._target)
