@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from datetime import datetime, timezone
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tsfusion.config import LogFormat, LogLevel
 
@@ -123,7 +123,13 @@ def _trace(record: logging.LogRecord) -> str:
     return text if len(text) <= TRACE_CHARACTERS else "…" + text[-TRACE_CHARACTERS:]
 
 
-class Stderr(logging.StreamHandler[Any]):
+if TYPE_CHECKING:
+    _Handler = logging.StreamHandler[Any]
+else:
+    _Handler = logging.StreamHandler  # takes no type before Python 3.11
+
+
+class Stderr(_Handler):
     """Standard error, by leave of a limiter."""
 
     def __init__(self, limiter: "Limiter") -> None:
