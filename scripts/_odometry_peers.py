@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What people use today to follow an RGB-D camera: Open3D's and OpenCV's odometry, frame to frame."""
 
+from abc import ABC, abstractmethod
 from importlib import import_module
 from typing import Any
 
@@ -14,15 +15,15 @@ from tsfusion.localizers import Corrections, Lost, Pose
 MAX_DEPTH = 5.0  # metres
 
 
-class FrameToFrame:
+class FrameToFrame(ABC):
     """The motion from each frame to the next, multiplied up; a failure keeps the last pose and is Lost."""
 
     absolute = False
 
     def __init__(self) -> None:
+        self._number = 0
         self._last: Any = None
         self._T = np.eye(4)
-        self._number = 0
 
     def track(self, frame: Frame) -> Pose | Lost:
         prepared = self.prepare(frame)
@@ -37,19 +38,19 @@ class FrameToFrame:
             T_anchor_camera=np.eye(4), starts_anchor=True,
         )  # fmt: skip
 
+    @abstractmethod
     def prepare(self, frame: Frame) -> Any:
         """What a frame becomes for the library."""
-        raise NotImplementedError
 
+    @abstractmethod
     def motion(self, last: Any, now: Any, frame: Frame) -> NDArray[np.float64] | None:
         """T_last_now, None = failed."""
-        raise NotImplementedError
 
     def corrections(self) -> Corrections | None:
         return None
 
     def reset(self) -> None:
-        self.__init__()  # type: ignore[misc]
+        self._last, self._T = None, np.eye(4)
 
 
 class Open3D(FrameToFrame):

@@ -31,7 +31,6 @@ os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
 
 import _odometry_peers
 import msgspec
-import numpy as np
 from _peers import DATA, surroundings
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -45,6 +44,7 @@ from tsfusion.evaluation.trajectory import TrajectoryError, absolute_error
 from tsfusion.frame import Frame
 from tsfusion.localizers import Localizer, Lost
 from tsfusion.localizers.closing import LoopClosing
+from tsfusion.localizers.track import Track
 from tsfusion.sources.recorded import Recorded
 
 DOCS = Path(__file__).parents[1] / "docs" / "localization.md"
@@ -161,7 +161,7 @@ def _track(scene: Scene) -> dict[str, Any]:
     dataset = scene.open()
     if dataset is None:
         return {"name": scene.name, "error": f"no {scene.path} in {DATA}"}
-    localizer, poses, references, spent, lost = None, [], [], 0.0, 0
+    localizer, track, spent, lost = None, Track(), 0.0, 0
     corrections = None
     for frame in Recorded(dataset):
         if localizer is None:
@@ -173,10 +173,9 @@ def _track(scene: Scene) -> dict[str, Any]:
         if isinstance(found, Lost):
             lost += 1
             continue
-        poses.append(found)
-        references.append(frame.T_world_camera)
-    truth = np.array(references)
-    error = absolute_error(np.array(localizers.corrected(poses, None)), truth)
+        track.add(found, frame.T_world_camera, None)
+    _, truth = track.with_reference()
+    error = absolute_error(track.poses(), truth)
     row: dict[str, Any] = {
         "name": scene.name, "localizer": scene.localizer, "frames": len(dataset), "lost": lost,
         "error": None, "ate": msgspec.to_builtins(error), "cpu_ms": 1e3 * spent / len(dataset),
@@ -184,7 +183,7 @@ def _track(scene: Scene) -> dict[str, Any]:
     }  # fmt: skip
     reached = error.rmse
     if scene.loops:
-        after = absolute_error(np.array(localizers.corrected(poses, corrections)), truth)
+        after = absolute_error(track.poses(corrections), truth)
         row |= {"loops": corrections.loops if corrections else 0, "corrected": msgspec.to_builtins(after)}
         if scene.drifting:
             row |= _verdict(scene, row, error, after)

@@ -113,6 +113,7 @@ def test_help_is_quick() -> None:
 def test_config_dump_is_read_back(here: Here, tmp_path: Path) -> None:
     text = here("config", "dump").stdout
     assert "voxel_size = 0.02  # > 0; metres" in text
+    assert "of each fuser; None = three quarters" in text  # whose line the formatter has broken
     (tmp_path / "a.toml").write_text(text)
     assert config.load(tmp_path / "a.toml") == Config()
     (tmp_path / "b.toml").write_text('[volume]\nvoxel_size = 0.5\nmax_range = 7\n[server]\nstate = "ä\\"b"\n')

@@ -16,12 +16,13 @@ from tsfusion.datasets.base import frame_of
 from tsfusion.errors import MissingDependency
 from tsfusion.evaluation.trajectory import TrajectoryError, absolute_error
 from tsfusion.frame import Frame
-from tsfusion.localizers import Corrections, Lost, Pose, corrected
+from tsfusion.localizers import Corrections, Lost, Pose
 from tsfusion.localizers.closing import LoopClosing
 from tsfusion.localizers.loops import Consensus, Loop
 from tsfusion.localizers.odometry import Chain, Drift
 from tsfusion.localizers.places import Places, View, view
 from tsfusion.localizers.rgbd import RGBD
+from tsfusion.localizers.track import Track
 from tsfusion.localizers.verify import check, matches
 
 FAR, TURNED = 0.05, 2.0  # metres and degrees: a loop that is farther off is wrong
@@ -75,19 +76,19 @@ class Run:
     def __init__(self, frames: Sequence[Frame], seed: int = 0) -> None:
         self.closing = LoopClosing(Drifting(seed))
         self.truth = np.array([frame.T_world_camera for frame in frames])
-        self.poses: list[Pose] = []
+        self.track = Track()
         self.corrections: list[Corrections] = []
         for frame in frames:
             pose = self.closing.track(frame)
             assert isinstance(pose, Pose)
-            self.poses.append(pose)
+            self.track.add(pose, None, None)
             if (news := self.closing.corrections()) is not None:
                 self.corrections.append(news)
                 assert self.closing.corrections() is None
         self.loops = self.closing.consensus.believed
 
     def error(self, corrections: Corrections | None) -> TrajectoryError:
-        return absolute_error(np.array(corrected(self.poses, corrections)), self.truth)
+        return absolute_error(self.track.poses(corrections), self.truth)
 
     def wrong(self) -> list[tuple[int, int, float, float]]:
         """Believed loops that are not where they should be."""
@@ -128,13 +129,13 @@ def test_two_laps_with_drift_become_one_place():
     assert run.wrong() == []
     alone = Drifting()
     expected = [alone.track(frame).T_world_camera for frame in two_laps()]
-    np.testing.assert_array_equal([pose.T_world_camera for pose in run.poses], expected)
+    np.testing.assert_array_equal(run.track.poses(), expected)
     assert [c.revision for c in run.corrections] == list(range(1, len(run.corrections) + 1))
     last = run.corrections[-1]
     assert last.loops == len(run.loops)
     newest = max(last.anchors)
     np.testing.assert_allclose(
-        last.T_corrected_world @ run.poses[newest - 1].T_world_camera, last.anchors[newest], atol=1e-12
+        last.T_corrected_world @ run.track.poses()[newest - 1], last.anchors[newest], atol=1e-12
     )
 
 
@@ -307,7 +308,7 @@ def test_a_lost_tracker_goes_on_where_it_has_been_before():
 def test_lidar_frames_pass_through():
     dataset = Synthetic("room", "lidar", count=12, color=False)
     run = Run([dataset.frame(index) for index in range(12)])
-    assert len(run.poses) == 12
+    assert len(run.track) == 12
     assert run.corrections == []
 
 

@@ -206,9 +206,7 @@ class ScanConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True
     max_gap: Positive = 0.2  # seconds between two given poses; across a longer gap there is none
     time_offset: float = 0.0  # seconds to add to a frame's time before its pose is looked up
     loop_closure: bool = True  # look for places seen before, and correct the poses since
-    min_overlap: Annotated[float, Meta(ge=0, le=1)] = (
-        0.8  # of the view with the last keyframe's; below: a new one
-    )
+    min_overlap: Annotated[float, Meta(ge=0, le=1)] = 0.8  # of the last keyframe's view; below: a new one
     distance: Positive | None = None  # metres to the next keyframe; None = 0.1, for stereo and LiDAR 2
     angle: Positive = 10.0  # degrees to the next keyframe
     max_rate: Positive | None = None  # keyframes a second, at most

@@ -11,6 +11,8 @@ from msgspec import Struct
 
 from tsfusion.config import Config
 
+# A long line as the formatter breaks it: the value and its comment in brackets of their own.
+_BROKEN = re.compile(r"= \(\n +(.+)\n +\)$", re.MULTILINE)
 _FIELD = re.compile(r"^    (\w+): .*?(?:  # (?P<comment>.+))?$")
 
 
@@ -63,5 +65,5 @@ def _comments(struct: type[Struct]) -> dict[str, str]:
         source = inspect.getsource(struct)
     except OSError:  # installed without sources
         return {}
-    matches = filter(None, map(_FIELD.match, source.splitlines()))
+    matches = filter(None, map(_FIELD.match, _BROKEN.sub(r"= \1", source).splitlines()))
     return {match[1]: match["comment"] for match in matches if match["comment"]}

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
 from itertools import count
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 
@@ -223,22 +223,17 @@ class Scanner:
 
 
 def _total(stats: list[ClientStats]) -> ClientStats:
-    """Sums; of the state, the first that is not well."""
+    """Sums of the counts; of the state, the first that is not well."""
 
-    def add(name: str) -> dict[str, int]:
-        return dict(sum((Counter(getattr(each, name)) for each in stats), Counter()))
+    def together(values: list[Any]) -> Any:
+        if isinstance(values[0], dict):
+            return dict(sum(map(Counter, values), Counter()))
+        if isinstance(values[0], int):
+            return sum(values)
+        return next((value for value in values if value != "ok"), "ok")
 
-    return ClientStats(
-        sent=sum(each.sent for each in stats),
-        durable=sum(each.durable for each in stats),
-        fused=sum(each.fused for each in stats),
-        refused=add("refused"),
-        rejected=add("rejected"),
-        skipped=add("skipped"),
-        waiting=sum(each.waiting for each in stats),
-        waiting_bytes=sum(each.waiting_bytes for each in stats),
-        state=next((each.state for each in stats if each.state != "ok"), "ok"),
-    )
+    names = ClientStats.__struct_fields__
+    return ClientStats(*(together([getattr(each, name) for each in stats]) for name in names))
 
 
 def _newest_delay(client: Client) -> float | None:

@@ -6,9 +6,9 @@ import logging
 from tsfusion.config import LocalizerName, ScanConfig
 from tsfusion.errors import InvalidConfig, MissingDependency
 from tsfusion.frame import Frame
-from tsfusion.localizers.base import Corrections, Localizer, Lost, Pose, corrected
+from tsfusion.localizers.base import Corrections, Localizer, Lost, Pose
 
-__all__ = ["Corrections", "Localizer", "Lost", "Pose", "choose", "corrected", "make"]
+__all__ = ["Corrections", "Localizer", "Lost", "Pose", "choose", "make"]
 
 _BY_KIND: dict[str, LocalizerName] = {
     "depth": "rgbd",

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """What a localizer is, and what it says of a frame."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
@@ -63,17 +62,6 @@ class Corrections:
     anchors: dict[int, Matrix]
     T_corrected_world: Matrix
     loops: int
-
-
-def corrected(poses: Sequence[Pose], corrections: Corrections | None) -> list[Matrix]:
-    """T_world_camera of each pose, after loop closure."""
-    if corrections is None:
-        return [pose.T_world_camera for pose in poses]
-    anchors, T = corrections.anchors, corrections.T_corrected_world
-    return [
-        anchors[pose.anchor] @ pose.T_anchor_camera if pose.anchor in anchors else T @ pose.T_world_camera
-        for pose in poses
-    ]
 
 
 class Localizer(Protocol):

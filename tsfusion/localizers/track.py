@@ -2,8 +2,6 @@
 """A trajectory that grows for hours: its frames' poses in plain numbers, some 300 bytes each."""
 
 from array import array
-from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,74 +11,48 @@ from tsfusion.localizers.base import Corrections, Matrix, Pose
 _NONE = -1
 _BOTTOM = (0.0, 0.0, 0.0, 1.0)
 _ROWS = 12  # numbers of a pose: the upper three rows
+_COLUMNS = 4  # other numbers of a frame
 
 Poses = NDArray[np.float64]  # (n, 4, 4)
 
 
-@dataclass(frozen=True, eq=False)
-class Located:
-    """One frame that has a pose.
+class Track:
+    """Frames that have a pose, in order.
 
-    Attributes:
-        reference: (4, 4), what the source itself said of the pose; None = nothing.
-        seq: its number as a keyframe; None = it is none, or was left out.
+    The number of a frame as a keyframe is -1 where it is none, or was left out.
     """
 
-    pose: Pose
-    reference: Matrix | None
-    seq: int | None
-
-
-class Track:
-    """Frames that have a pose, in order. Poses are kept but for their quality."""
-
     def __init__(self) -> None:
-        self._numbers = array("q")  # stamp, anchor, whether it starts it, seq, place of the reference
+        self._numbers = array("q")  # stamp, anchor, seq, place of the reference
         self._poses = array("d")  # T_world_camera, T_anchor_camera
         self._references = array("d")
 
     def add(self, pose: Pose, reference: Matrix | None, seq: int | None) -> None:
-        """The next frame."""
+        """The next frame.
+
+        Args:
+            reference: (4, 4), what the source itself said of the pose; None = nothing.
+            seq: its number as a keyframe, if it is one.
+        """
         at = _NONE
         if reference is not None:
             at = len(self._references) // _ROWS
             self._references.frombytes(_bytes(reference))
         self._poses.frombytes(_bytes(pose.T_world_camera) + _bytes(pose.T_anchor_camera))
-        self._numbers.extend(
-            (pose.timestamp_ns, pose.anchor, pose.starts_anchor, _NONE if seq is None else seq, at)
-        )
+        self._numbers.extend((pose.timestamp_ns, pose.anchor, _NONE if seq is None else seq, at))
 
     def __len__(self) -> int:
-        return len(self._numbers) // 5
-
-    def __getitem__(self, index: int) -> Located:
-        place = range(len(self))[index]
-        stamp, anchor, starts, seq, at = self._numbers[5 * place : 5 * (place + 1)]
-        pair = np.array(self._poses[2 * _ROWS * place : 2 * _ROWS * (place + 1)])
-        T_world_camera, T_anchor_camera = _matrices(pair.reshape(2, 3, 4))
-        pose = Pose(
-            T_world_camera=T_world_camera,
-            timestamp_ns=stamp,
-            anchor=anchor,
-            T_anchor_camera=T_anchor_camera,
-            starts_anchor=bool(starts),
-        )
-        rows = np.array(self._references[_ROWS * at : _ROWS * (at + 1)])
-        reference = None if at == _NONE else _matrices(rows.reshape(3, 4))
-        return Located(pose, reference, None if seq == _NONE else seq)
-
-    def __iter__(self) -> Iterator[Located]:
-        return (self[index] for index in range(len(self)))
+        return len(self._numbers) // _COLUMNS
 
     @property
     def stamps_ns(self) -> list[int]:
         """Of the frames."""
-        return self._numbers[::5].tolist()
+        return self._numbers[::_COLUMNS].tolist()
 
     @property
     def seqs(self) -> NDArray[np.int64]:
         """(n,): numbers of keyframes; -1 where a frame is none."""
-        return np.array(self._numbers[3::5], dtype=np.int64)
+        return np.array(self._numbers[2::_COLUMNS], dtype=np.int64)
 
     @property
     def last_seq(self) -> int:
@@ -99,7 +71,7 @@ class Track:
     def with_reference(self) -> tuple[NDArray[np.int64], Poses]:
         """Which frames the source itself said a pose of, (m,), and (m, 4, 4) those."""
         references = np.array(self._references).reshape(-1, 3, 4)
-        return np.flatnonzero(self._columns[:, 4] != _NONE), _matrices(references)
+        return np.flatnonzero(self._columns[:, 3] != _NONE), _matrices(references)
 
     def _corrected(self, corrections: Corrections | None, chosen: NDArray[np.int64]) -> Poses:
         pairs = self._pairs[chosen]
@@ -116,7 +88,7 @@ class Track:
 
     @property
     def _columns(self) -> NDArray[np.int64]:
-        return np.array(self._numbers, dtype=np.int64).reshape(-1, 5)
+        return np.array(self._numbers, dtype=np.int64).reshape(-1, _COLUMNS)
 
     @property
     def _pairs(self) -> NDArray[np.float64]:
