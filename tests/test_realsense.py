@@ -186,6 +186,7 @@ def test_a_slow_reader_of_a_recording_loses_nothing(recording: Path) -> None:
             time.sleep(0.02)
     assert numbers == list(range(1, 13))
     assert source.skipped == {}
+    assert not source.live
 
 
 def test_a_recording_in_real_time_drops_and_counts(tmp_path: Path) -> None:
@@ -193,6 +194,7 @@ def test_a_recording_in_real_time_drops_and_counts(tmp_path: Path) -> None:
     path = record(tmp_path / "fast.db3", list(range(1, 200)))  # all within a moment
     numbers = []
     with RealSense(recording=path, real_time=True) as source:
+        assert source.live
         for frame in source:
             numbers.append(round((frame.timestamp_ns / 1e6 - START_MS) / STEP_MS))
             assert frame.color is not None

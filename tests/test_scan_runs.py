@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import pytest
 from commands import end, environment, eventually, read_until, server, started, tsfusion
 from test_datasets import seven_scenes
 
-from tsfusion import open_dataset, scanning
+from tsfusion import destination, open_dataset, scanning
 from tsfusion.config import ScanConfig, VolumeConfig
 from tsfusion.datasets.poses import read_tum, write_tum
 from tsfusion.errors import InvalidConfig, InvalidKeyframe
@@ -258,7 +259,7 @@ class Frames(Live):
 
     def __init__(self, frames: list[Frame], *, live: bool = False) -> None:
         super().__init__("a list", "kinect")
-        self._frames, self.length = frames, None if live else len(frames)
+        self._frames, self.live, self.length = frames, live, None if live else len(frames)
 
     def __iter__(self) -> Iterator[Frame]:
         return iter(self._frames)
@@ -343,3 +344,14 @@ def test_a_map_without_a_surface_keeps_the_trajectory(walk: Path, tmp_path: Path
     assert "the map has no surface to write: 1 keyframes fused" in done.stderr.splitlines()[-1]
     assert len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) == 2
     assert not (tmp_path / "out" / "mesh.ply").exists()
+
+
+@pytest.mark.parametrize(("live", "policy"), [(True, "thin"), (False, "spool_all")])
+def test_only_what_cannot_wait_is_thinned_out(live: bool, policy: str, tmp_path: Path) -> None:
+    """Also where nobody knows how many frames there will be, as in a folder or a camera's recording."""
+    source = Frames([], live=live)
+    source.length = None
+    with ExitStack() as stack:
+        place = destination.elsewhere(None, "tcp://127.0.0.1:9", tmp_path / "spool")
+        _, connect = destination.opener(stack, place, source)
+        assert connect("hall")._config.policy == policy

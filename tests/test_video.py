@@ -97,6 +97,7 @@ def test_every_picture_of_a_file_in_order(numbered: str) -> None:
     with source:
         frames = list(source)
     assert source.length == len(frames) == 5
+    assert not source.live
     for number, frame in enumerate(frames):
         assert frame.kind == "pair"
         assert frame.left is not None
@@ -178,6 +179,7 @@ def test_a_live_camera_gives_its_newest_picture(quiet_ffmpeg: None) -> None:
     assert np.median(behind[2:]) <= 4  # JPEG, HTTP and FFmpeg hold a few; a queue would hold 5 more each turn
     assert source.skipped["dropped"] >= 20
     assert source.length is None
+    assert source.live
 
 
 def test_a_camera_that_stops(quiet_ffmpeg: None) -> None:

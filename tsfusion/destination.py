@@ -56,8 +56,8 @@ def of_its_own(
 
 
 def _pace(source: Source, place: Destination) -> dict[str, Any]:
-    """A recording leaves nothing out: it waits for a server of its own, and for no other."""
-    if source.length is None:
+    """What waits leaves nothing out: a recording waits for a server of its own, and for no other."""
+    if source.live:
         return {}
     return {"policy": "block", "backlog": AHEAD} if place.child else {"policy": "spool_all"}
 

@@ -105,7 +105,7 @@ def scan(
         )  # fmt: skip
         progress.stage(f"scanning {source.name}")
         started = time.monotonic()
-        if source.length is None:
+        if source.live:
             frames = _fresh(first, frames, config.patience)
         else:
             frames = chain([dataclasses.replace(first, captured_ns=time.monotonic_ns())], frames)

@@ -14,12 +14,14 @@ class Source(Protocol):
     Attributes:
         name: what to call it in a report.
         sensor: name of the sensor model of its frames.
+        live: whether frames pass by while nobody takes them; those of a recording or a folder wait.
         length: how many frames it has; None = nobody knows.
         skipped: frames that were not handed out, by reason, so far.
     """
 
     name: str
     sensor: str
+    live: bool
     length: int | None
     skipped: dict[str, int]
 

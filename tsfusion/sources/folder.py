@@ -55,6 +55,8 @@ class Folder(Live):
         SourceError: no such folder or calibration.
     """
 
+    live = False  # what was written stays there
+
     def __init__(
         self,
         path: str | Path,

@@ -14,6 +14,7 @@ class Limited:
 
     def __init__(self, source: Source, limit: int) -> None:
         self.name, self.sensor, self.skipped = source.name, source.sensor, source.skipped
+        self.live = source.live
         self.length = None if source.length is None else min(source.length, limit)
         self._source, self._limit = source, limit
 

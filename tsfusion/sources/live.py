@@ -42,6 +42,7 @@ class Closed:
 class Live(ABC):
     """A `Source`; `close` ends the iteration, which looks at `_closed` whenever it waits."""
 
+    live = True
     length: int | None = None
 
     def __init__(self, name: str, sensor: str) -> None:

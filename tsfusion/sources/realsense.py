@@ -76,6 +76,7 @@ class RealSense(Live):
         self._rs = _pyrealsense2()
         recording = None if recording is None else Path(recording).expanduser()
         super().__init__(f"RealSense {camera or (recording.name if recording else '')}".strip(), "realsense")
+        self.live = recording is None or real_time
         self._played, self._deadline, self._number = recording is not None, deadline, -_REORDERED
         try:
             self._feed, self._color = feeds.open_feed(

@@ -20,6 +20,8 @@ class Recorded(Live):
         rate: frames a second; None = as fast as they are taken.
     """
 
+    live = False
+
     def __init__(self, dataset: Dataset, *, rate: float | None = None) -> None:
         super().__init__(dataset.name, dataset.sensor)
         self.skipped = dataset.skipped

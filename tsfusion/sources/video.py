@@ -84,6 +84,7 @@ class StereoVideo(Live):
             raise
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT) if self._file else 0
         self.length = int(count) if count > 0 else None
+        self.live = not self._file
         self._grabber = None if self._file else Grabber(self._capture)
 
     def __iter__(self) -> Iterator[Frame]:
