@@ -174,7 +174,7 @@ def main():
     bridge = Bridge(parser.parse_args(rospy.myargv()[1:]))
     rospy.spin()
     if bridge.client is not None:
-        from tsfusion.errors import FlushTimeout
+        from tsfusion.core.errors import FlushTimeout
 
         try:
             bridge.client.flush(timeout=2.0)

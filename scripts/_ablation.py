@@ -11,13 +11,15 @@ import numpy as np
 from _peers import DATA, Open3D, VDBFusion, surroundings, timed_keyframes
 from numpy.typing import NDArray
 
-from tsfusion import runtime
-from tsfusion.config import SENSORS
+from tsfusion.core.config import SENSORS
 from tsfusion.datasets import Synthetic, open_dataset
-from tsfusion.evaluation import bunny, metrics, scenes
-from tsfusion.evaluation.predict import compare_views, points_world
-from tsfusion.evaluation.truth import COMPLETE_WITHIN, Reference, Solid, Truth, measure, rounded
-from tsfusion.keyframe import Intrinsics, Keyframe
+from tsfusion.datasets.formats import stanford_bunny
+from tsfusion.datasets.synthetic import benchmark_worlds
+from tsfusion.evaluation import surface_error
+from tsfusion.evaluation.known_surfaces import COMPLETE_WITHIN, Reference, Solid, Truth, measure, rounded
+from tsfusion.evaluation.view_prediction import compare_views, points_world
+from tsfusion.geometry.keyframe import Intrinsics, Keyframe
+from tsfusion.kernels import runtime
 
 # metres, for every system; else the sensor preset's. 2.8: the things in the middle, not the walls behind
 MAX_RANGE = {"street": 30.0, "corners": 2.8, "thin": 2.8, "kitchen": 4.0, "hololens": 4.0}
@@ -194,7 +196,11 @@ def _system(row: Row, material: Material, threads: int) -> Any:
 
 
 def _synthetic(setup: Setup) -> Material:
-    world: Any = {"room": scenes.room, "corners": scenes.corners, "thin": scenes.thin}.get(setup.scene)
+    world: Any = {
+        "room": benchmark_worlds.room,
+        "corners": benchmark_worlds.corners,
+        "thin": benchmark_worlds.thin,
+    }.get(setup.scene)
     sensor = "kinect" if setup.noise == "none" else setup.noise
     options: dict[str, Any] = {
         "world": world() if world else setup.scene, "count": setup.keyframes, "seed": setup.seed,
@@ -230,14 +236,14 @@ def _shared_room(setup: Setup) -> Material:
 
     clean = read("clean")
     fused = clean if setup.noise == "none" else read(setup.noise)
-    return Material(fused, sensor, Solid(scenes.room(), _seen(clean, setup)))
+    return Material(fused, sensor, Solid(benchmark_worlds.room(), _seen(clean, setup)))
 
 
 def _bunny(setup: Setup) -> Material:
     folder = DATA / FOLDERS[setup.scene]
-    scans = list(bunny.scans(folder))
+    scans = list(stanford_bunny.scans(folder))
     measured = _seen(scans, setup)
-    truth = Reference(*bunny.reference(folder), measured, reach=COMPLETE_WITHIN * setup.voxel_size)
+    truth = Reference(*stanford_bunny.reference(folder), measured, reach=COMPLETE_WITHIN * setup.voxel_size)
     return Material(scans, "scanner", truth)
 
 
@@ -259,4 +265,6 @@ def _seen(views: Iterable[Keyframe], setup: Setup, max_range: float | None = Non
         if max_range is not None:
             points = points[np.linalg.norm(points - view.T_world_camera[:3, 3], axis=1) < max_range]
         shown.append(points)
-    return metrics.one_per_cell(np.concatenate(shown), COMPLETE_WITHIN * setup.voxel_size, at_least=SEEN_BY)
+    return surface_error.one_per_cell(
+        np.concatenate(shown), COMPLETE_WITHIN * setup.voxel_size, at_least=SEEN_BY
+    )

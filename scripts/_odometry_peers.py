@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.frame import Frame
-from tsfusion.localizers import Corrections, Lost, Pose
+from tsfusion.geometry.frame import Frame
+from tsfusion.scanner.localization.localizer import Corrections, Lost, Pose
 
 MAX_DEPTH = 5.0  # metres
 

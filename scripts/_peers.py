@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.evaluation.predict import depth_metres, points_world
-from tsfusion.mesh import Mesh
-from tsfusion.process import peak_rss_bytes
+from tsfusion.core.process import peak_rss_bytes
+from tsfusion.evaluation.view_prediction import depth_metres, points_world
+from tsfusion.geometry.mesh import Mesh
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("TSFUSION_DATA", ROOT.parent / "shared" / "data"))

@@ -17,11 +17,11 @@ from typing import get_args
 
 import numpy as np
 
-from tsfusion.backpressure import Backpressure
-from tsfusion.config import ClientConfig, Policy
-from tsfusion.keyframe import Keyframe
-from tsfusion.outbox import Outbox
-from tsfusion.spool import Spool
+from tsfusion.core.config import ClientConfig, Policy
+from tsfusion.delivery.backpressure import Backpressure
+from tsfusion.delivery.outbox import Outbox
+from tsfusion.delivery.spool import Spool
+from tsfusion.geometry.keyframe import Keyframe
 
 _TICK_MS = 10
 _WINDOW = 8, 16 << 20  # a server's default credit

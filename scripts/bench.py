@@ -147,13 +147,13 @@ class Stages:
 
     @contextmanager
     def watch(self) -> Iterator[None]:
-        from tsfusion.kernels import blocks, integrate, points, rays, smooth
+        from tsfusion.kernels import block_hash, integrate, ray_smoothing, rays_from_images, rays_from_points
 
         watched: list[tuple[Any, str, str]] = [
-            (rays, "rays_from_image", "rays"), (points, "rays_from_points", "rays"),
-            (blocks, "insert_blocks", "allocate"), (integrate, "add_rays", "integrate"),
-            (integrate, "largest_weights", "check"), (smooth, "smooth_rays", "regularise"),
-            (smooth, "commit_votes", "regularise"),
+            (rays_from_images, "rays_from_image", "rays"), (rays_from_points, "rays_from_points", "rays"),
+            (block_hash, "insert_blocks", "allocate"), (integrate, "add_rays", "integrate"),
+            (integrate, "largest_weights", "check"), (ray_smoothing, "smooth_rays", "regularise"),
+            (ray_smoothing, "commit_votes", "regularise"),
         ]  # fmt: skip
         originals = [(owner, name, getattr(owner, name)) for owner, name, _ in watched]
         for owner, name, stage in watched:

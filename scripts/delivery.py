@@ -27,13 +27,13 @@ from typing import Any
 import numpy as np
 from _peers import DATA, surroundings
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from wire import UNSECURED, Server, secured, serving
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+from keyframes_and_servers import UNSECURED, Server, secured, serving
 
 from tsfusion import Client, Keyframe, VolumeConfig
-from tsfusion.config import ClientConfig, override
+from tsfusion.core.config import ClientConfig, override
 from tsfusion.datasets import open_dataset
-from tsfusion.fetch import fetch_health
+from tsfusion.wire.queries import fetch_health
 
 BLOCK = 30  # keyframes to one server before it is the other's turn
 DISTINCT = 60  # keyframes; then they come again
@@ -85,7 +85,7 @@ def _keyframes() -> tuple[list[Keyframe], str]:
     if recorded.exists():
         dataset = open_dataset(recorded)
         return [dataset[i] for i in range(min(DISTINCT, len(dataset)))], "7scenes"
-    from tsfusion.datasets.synthetic import Synthetic
+    from tsfusion.datasets.synthetic.dataset import Synthetic
 
     return list(Synthetic("room", count=DISTINCT, width=640)), "room"
 

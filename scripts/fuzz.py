@@ -23,11 +23,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-TESTS = Path(__file__).parents[1] / "tests"
+TESTS = Path(__file__).parents[1] / "tests" / "support"
 SHARES = {"message": 0.35, "control": 0.25, "corrections": 0.1, "journal": 0.25, "checkpoint": 0.05}
-INSTRUMENTED = ["tsfusion.codec", "tsfusion.journal", "tsfusion.transport.messages", "tsfusion.checkpoint",
-                "tsfusion.corrections",
-                "tsfusion.keyframe", "tsfusion.quota"]  # fmt: skip
+INSTRUMENTED = ["tsfusion.wire", "tsfusion.journal", "tsfusion.tsdf.checkpoint",
+
+                "tsfusion.geometry.keyframe", "tsfusion.gateway.quotas"]  # fmt: skip
 UNGUIDED = {"control"}  # decided in C, whose coverage is not seen
 _STATUS = re.compile(r"^#(\d+)\s+(\w+)\s+cov: (\d+) ft: (\d+) corp: (\d+)", re.MULTILINE)
 _FINAL = re.compile(r"^stat::(\w+):\s+(\d+)", re.MULTILINE)

@@ -33,19 +33,21 @@ import _odometry_peers
 import msgspec
 from _peers import DATA, surroundings
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from test_loops import Drifting
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+from drifting_localizer import Drifting
 
-from tsfusion import localizers, open_dataset, process
+from tsfusion import open_dataset
 from tsfusion.cli.ate import table
-from tsfusion.config import LocalizerName, ScanConfig
+from tsfusion.core import process
+from tsfusion.core.config import LocalizerName, ScanConfig
 from tsfusion.datasets import Dataset, select
-from tsfusion.evaluation.trajectory import TrajectoryError, absolute_error
-from tsfusion.frame import Frame
-from tsfusion.localizers import Localizer, Lost
-from tsfusion.localizers.closing import LoopClosing
-from tsfusion.localizers.track import Track
-from tsfusion.sources.recorded import Recorded
+from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
+from tsfusion.geometry.frame import Frame
+from tsfusion.scanner.localization import registry
+from tsfusion.scanner.localization.localizer import Localizer, Lost
+from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing
+from tsfusion.scanner.sources.recorded import Recorded
+from tsfusion.scanner.tracked_trajectory import Track
 
 DOCS = Path(__file__).parents[1] / "docs" / "localization.md"
 BEGIN, END = "<!-- table: python scripts/localization.py --write-docs -->", "<!-- end of table -->"
@@ -56,7 +58,8 @@ class Scene(NamedTuple):
 
     Attributes:
         loops: whether loops are closed.
-        drifting: the true poses with drift added, as tests/test_loops.py adds it, instead of a tracker's.
+        drifting: the true poses with drift added, as the tests of loop closure add it, instead of a
+            tracker's.
         peer: another library's odometry instead, by its class in _odometry_peers.py.
         bar: metres of RMSE, or percent of drift for `stereo`, that it must stay under; None = none is set.
     """
@@ -200,7 +203,7 @@ def _localizer(scene: Scene, first: Frame) -> Localizer:
     if scene.peer:
         made: Localizer = getattr(_odometry_peers, scene.peer)()
         return made
-    return localizers.make(ScanConfig(localizer=scene.localizer, loop_closure=scene.loops), first)
+    return registry.make(ScanConfig(localizer=scene.localizer, loop_closure=scene.loops), first)
 
 
 def _verdict(
@@ -216,7 +219,7 @@ def _meshes() -> dict[str, Any]:
     """`tsfusion scan` of the kitchen with poses of its own and with the true ones."""
     if not (DATA / KITCHEN).exists():
         return {"name": "mesh", "error": f"no {KITCHEN} in {DATA}"}
-    from tsfusion.evaluation.unseen import compare_scans
+    from tsfusion.evaluation.held_out_views import compare_scans
 
     with tempfile.TemporaryDirectory(prefix="tsfusion-localization-") as folder:
         for name in ("rgbd", "given"):

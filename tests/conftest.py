@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tsfusion import logs
+from tsfusion.core import logs
 
 DATA = Path(os.environ.get("TSFUSION_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

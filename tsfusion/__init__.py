@@ -10,32 +10,35 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tsfusion.client import Client as Client
-    from tsfusion.config import Config as Config
-    from tsfusion.config import VolumeConfig as VolumeConfig
+    from tsfusion.core.config import Config as Config
+    from tsfusion.core.config import VolumeConfig as VolumeConfig
+    from tsfusion.core.errors import CheckpointError as CheckpointError
+    from tsfusion.core.errors import DamagedCheckpoint as DamagedCheckpoint
+    from tsfusion.core.errors import DatasetError as DatasetError
+    from tsfusion.core.errors import DecodeError as DecodeError
+    from tsfusion.core.errors import FlushTimeout as FlushTimeout
+    from tsfusion.core.errors import InvalidConfig as InvalidConfig
+    from tsfusion.core.errors import InvalidKeyframe as InvalidKeyframe
+    from tsfusion.core.errors import JournalError as JournalError
+    from tsfusion.core.errors import KeyframeRefused as KeyframeRefused
+    from tsfusion.core.errors import MapError as MapError
+    from tsfusion.core.errors import MapFull as MapFull
+    from tsfusion.core.errors import MissingDependency as MissingDependency
+    from tsfusion.core.errors import NotAllowed as NotAllowed
+    from tsfusion.core.errors import OutputError as OutputError
+    from tsfusion.core.errors import ServerUnreachable as ServerUnreachable
+    from tsfusion.core.errors import SourceError as SourceError
+    from tsfusion.core.errors import TransportError as TransportError
+    from tsfusion.core.errors import TsfusionError as TsfusionError
+    from tsfusion.core.errors import WeightOverflow as WeightOverflow
+    from tsfusion.datasets import Layout as Layout
     from tsfusion.datasets import open_dataset as open_dataset
-    from tsfusion.errors import CheckpointError as CheckpointError
-    from tsfusion.errors import DamagedCheckpoint as DamagedCheckpoint
-    from tsfusion.errors import DatasetError as DatasetError
-    from tsfusion.errors import DecodeError as DecodeError
-    from tsfusion.errors import FlushTimeout as FlushTimeout
-    from tsfusion.errors import InvalidConfig as InvalidConfig
-    from tsfusion.errors import InvalidKeyframe as InvalidKeyframe
-    from tsfusion.errors import JournalError as JournalError
-    from tsfusion.errors import KeyframeRefused as KeyframeRefused
-    from tsfusion.errors import MapError as MapError
-    from tsfusion.errors import MapFull as MapFull
-    from tsfusion.errors import MissingDependency as MissingDependency
-    from tsfusion.errors import NotAllowed as NotAllowed
-    from tsfusion.errors import OutputError as OutputError
-    from tsfusion.errors import ServerUnreachable as ServerUnreachable
-    from tsfusion.errors import SourceError as SourceError
-    from tsfusion.errors import TransportError as TransportError
-    from tsfusion.errors import TsfusionError as TsfusionError
-    from tsfusion.errors import WeightOverflow as WeightOverflow
-    from tsfusion.keyframe import Intrinsics as Intrinsics
-    from tsfusion.keyframe import Keyframe as Keyframe
-    from tsfusion.mesh import Mesh as Mesh
-    from tsfusion.volume import Volume as Volume
+    from tsfusion.geometry.keyframe import Intrinsics as Intrinsics
+    from tsfusion.geometry.keyframe import Keyframe as Keyframe
+    from tsfusion.geometry.mesh import Mesh as Mesh
+    from tsfusion.scanner.sources.registry import open_source as open_source
+    from tsfusion.scanner.sources.source import Source as Source
+    from tsfusion.tsdf.volume import Volume as Volume
 
 __version__ = "0.1.0"
 
@@ -47,14 +50,17 @@ _ERRORS = (
 )  # fmt: skip
 _HOME = {
     "Client": "client",
-    "Config": "config",
-    "Intrinsics": "keyframe",
-    "Keyframe": "keyframe",
-    "Mesh": "mesh",
-    "Volume": "volume",
-    "VolumeConfig": "config",
+    "Config": "core.config",
+    "Intrinsics": "geometry.keyframe",
+    "Keyframe": "geometry.keyframe",
+    "Layout": "datasets",
+    "Mesh": "geometry.mesh",
+    "Source": "scanner.sources.source",
+    "Volume": "tsdf.volume",
+    "VolumeConfig": "core.config",
     "open_dataset": "datasets",
-    **dict.fromkeys(_ERRORS, "errors"),
+    "open_source": "scanner.sources.registry",
+    **dict.fromkeys(_ERRORS, "core.errors"),
 }
 __all__ = ["__version__", *_HOME]  # noqa: PLE0604
 

@@ -7,7 +7,8 @@
         client.flush(timeout=10.0)
 
 `send` encodes and writes to the spool; a thread of its own does the talking. What happens when keyframes come
-faster than the map takes them is the policy's choice (`tsfusion.backpressure`). Taichi is never imported.
+faster than the map takes them is the policy's choice (`tsfusion.delivery.backpressure`). Taichi is never
+imported.
 """
 
 import atexit
@@ -21,17 +22,18 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion import corrections
-from tsfusion.backpressure import Backpressure
-from tsfusion.config import ClientConfig, Policy, override
-from tsfusion.corrections import SessionCorrections
-from tsfusion.errors import FlushTimeout, KeyframeRefused, NotAllowed, ServerUnreachable, TransportError
-from tsfusion.keyframe import Keyframe, check_pose
-from tsfusion.outbox import ClientStats, Outbox
-from tsfusion.sender import Sender
-from tsfusion.spool import Spool
-from tsfusion.transport import KeyframeTimes, control_address, sockets
-from tsfusion.transport.curve import client_keys
+from tsfusion.core.config import ClientConfig, Policy, override
+from tsfusion.core.errors import FlushTimeout, KeyframeRefused, NotAllowed, ServerUnreachable, TransportError
+from tsfusion.delivery.backpressure import Backpressure
+from tsfusion.delivery.outbox import ClientStats, Outbox
+from tsfusion.delivery.sender import Sender
+from tsfusion.delivery.spool import Spool
+from tsfusion.geometry.keyframe import Keyframe, check_pose
+from tsfusion.wire import corrections, sockets
+from tsfusion.wire.corrections import SessionCorrections
+from tsfusion.wire.curve import client_keys
+from tsfusion.wire.keyframe_times import KeyframeTimes
+from tsfusion.wire.sockets import control_address
 
 __all__ = ["Client", "ClientStats"]
 

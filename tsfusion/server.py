@@ -12,15 +12,17 @@ from typing import Any
 
 import zmq
 
-from tsfusion import maps, process
-from tsfusion.config import DEFAULT_MAP, ServerConfig, VolumeConfig
-from tsfusion.door import Door
-from tsfusion.gateway import Gateway
-from tsfusion.metrics import Metrics
-from tsfusion.ports import Ports
-from tsfusion.spool import lock_folder
-from tsfusion.transport import Addresses, sockets
-from tsfusion.watchdog import Watchdog
+from tsfusion.core import process
+from tsfusion.core.config import DEFAULT_MAP, ServerConfig, VolumeConfig
+from tsfusion.core.folder_lock import lock_folder
+from tsfusion.core.service_manager import Watchdog
+from tsfusion.gateway.access_control import Door
+from tsfusion.gateway.gateway import Gateway
+from tsfusion.gateway.metrics import Metrics
+from tsfusion.gateway.ports import Ports
+from tsfusion.journal import state_folder
+from tsfusion.wire import sockets
+from tsfusion.wire.sockets import Addresses
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +76,7 @@ def _open(
     process.raise_file_limit()
     state = Path(server.state)
     stack.enter_context(lock_folder(state, "state", "server"))
-    for name in maps.names(state):
+    for name in state_folder.names(state):
         if len(volumes) < server.max_maps:
             volumes.setdefault(name, volumes[DEFAULT_MAP])
     context: zmq.Context[Any] = zmq.Context()

@@ -27,7 +27,7 @@ from tsfusion.cli import (
     serve,
     status,
 )
-from tsfusion.errors import TsfusionError
+from tsfusion.core.errors import TsfusionError
 
 INTERRUPTED = 128 + signal.SIGINT
 TERMINATED = 128 + signal.SIGTERM

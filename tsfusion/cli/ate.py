@@ -10,7 +10,7 @@ from tsfusion.cli import options
 
 if TYPE_CHECKING:
     from tsfusion.datasets import Dataset
-    from tsfusion.evaluation.trajectory import TrajectoryError
+    from tsfusion.evaluation.trajectory_error import TrajectoryError
 
 _OTHER_AXES = 20  # degrees; no odometry is so far off on average
 _FORMATS = "TUM, KITTI or Redwood .log."
@@ -35,21 +35,21 @@ def ate(
     json: options.Json = False,
 ) -> None:
     """Absolute trajectory error (ATE): how far an estimated trajectory is from a true one."""
-    from tsfusion.cli import show
-    from tsfusion.evaluation import trajectory
-    from tsfusion.results import check_writable
+    from tsfusion.cli import output
+    from tsfusion.core.output_folder import check_writable
+    from tsfusion.evaluation import trajectory_error
 
     if plot is not None:
         check_writable(plot, (".png", ".pdf", ".svg"))
     truth = _truth(reference, options.dataset_options(option))
-    a, b = trajectory.paired(estimate, truth, max_difference_s=max_difference)
-    error = trajectory.absolute_error(a, b, align=align)
+    a, b = trajectory_error.paired(estimate, truth, max_difference_s=max_difference)
+    error = trajectory_error.absolute_error(a, b, align=align)
     if plot is not None:
-        from tsfusion.evaluation.trajectory_plot import draw
+        from tsfusion.evaluation.trajectory_error import draw
 
         draw(a, b, plot, align=align)
     if json:
-        show.as_json(error)
+        output.as_json(error)
         return
     typer.echo(table([("ATE", error)]))
     if error.rotation_deg > _OTHER_AXES:

@@ -25,16 +25,16 @@ def check(
     json: options.Json = False,
 ) -> None:
     """See whether a dataset's poses and depth agree; if not, say why. Status 1 when they disagree."""
-    from tsfusion.cli import show
-    from tsfusion.datasets import consistency
+    from tsfusion.cli import output
+    from tsfusion.evaluation import pose_check
 
     dataset = replay.open_recording(
         path, unpack=unpack, sequence=sequence, modality=modality, poses=poses,
         **options.dataset_options(option),
     )  # fmt: skip
-    report = consistency.check(dataset)
+    report = pose_check.check(dataset)
     if json:
-        show.as_json({"name": dataset.name, **asdict(report)})
+        output.as_json({"name": dataset.name, **asdict(report)})
     else:
         typer.echo(f"{dataset.name}: {report.text}")
         if report.fit is not None:

@@ -16,13 +16,13 @@ def _group() -> None:
 @app.command()
 def dump(config: options.ConfigFile = None, json: options.Json = False) -> None:
     """Print every setting as commented TOML: the defaults, or what FILE makes of them."""
-    from tsfusion import config as settings
-    from tsfusion import config_toml
+    from tsfusion.core import config as core_config
+    from tsfusion.core import config as settings
 
     loaded = settings.load(config)
     if json:
-        from tsfusion.cli import show
+        from tsfusion.cli import output
 
-        show.as_json(loaded)
+        output.as_json(loaded)
     else:
-        typer.echo(config_toml.dumps(loaded), nl=False)
+        typer.echo(core_config.dumps(loaded), nl=False)

@@ -38,11 +38,11 @@ def list_(
     json: options.Json = False,
 ) -> None:
     """Name the layouts that `replay` recognises, or the datasets under PATH."""
-    from tsfusion.cli import show
+    from tsfusion.cli import output
 
     rows = _layouts() if path is None else list(_found(path, _DEPTH))
     if json:
-        show.as_json(rows)
+        output.as_json(rows)
         return
     for row in rows:
         typer.echo(_line(**row))
@@ -67,7 +67,7 @@ def _line(
 
 def _layouts() -> list[dict[str, Any]]:
     from tsfusion.datasets import layouts
-    from tsfusion.datasets.layouts import SYNTHETIC
+    from tsfusion.datasets.registry import SYNTHETIC
 
     rows = [(layout.name, layout.description) for layout in layouts()]
     return [{"name": name, "description": description} for name, description in [*rows, SYNTHETIC]]
@@ -79,8 +79,8 @@ def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
     Raises:
         DatasetError: when there is no folder.
     """
+    from tsfusion.core.errors import DatasetError, MissingDependency
     from tsfusion.datasets import open_dataset
-    from tsfusion.errors import DatasetError, MissingDependency
 
     for posed in (True, False):
         try:

@@ -64,9 +64,9 @@ def doctor(
             _show(finding)
     ok = all(finding.ok for finding in findings)
     if json:
-        from tsfusion.cli import show
+        from tsfusion.cli import output
 
-        show.as_json({"ok": ok, "checks": findings})
+        output.as_json({"ok": ok, "checks": findings})
     elif ok:
         typer.echo("all good: try `tsfusion demo`")
     return 0 if ok else 1
@@ -149,8 +149,8 @@ def _kernels() -> Finding:
     """Compile (or load) and run a kernel, and compare with what it must give."""
     import numpy as np
 
-    from tsfusion.mesh import Mesh
-    from tsfusion.preview import Camera, draw
+    from tsfusion.geometry.mesh import Mesh
+    from tsfusion.pipelines.mesh_preview import Camera, draw
 
     started = time.perf_counter()
     corners = np.array([(-9, -9, 2), (-9, 9, 2), (9, 9, 2)], np.float32)

@@ -9,8 +9,8 @@ import typer
 from tsfusion.cli import options
 
 if TYPE_CHECKING:
-    from tsfusion.datasets.catalogue import Recording
-    from tsfusion.datasets.download import Checked
+    from tsfusion.datasets.download.catalogue import Recording
+    from tsfusion.datasets.download.download import Checked
 
 
 def download(
@@ -37,7 +37,7 @@ def download(
 
     An interrupted download goes on with the same command. Mind each recording's licence.
     """
-    from tsfusion.datasets import catalogue
+    from tsfusion.datasets.download import catalogue
 
     if check:
         _check([catalogue.entry(name)] if name else list(catalogue.CATALOGUE), to, json=json)
@@ -48,26 +48,28 @@ def download(
 
 
 def _list(recordings: "list[Recording]", *, json: bool) -> None:
-    from tsfusion.cli import show
+    from tsfusion.cli import output
 
     if json:
-        show.as_json([recording._asdict() for recording in recordings])
+        output.as_json([recording._asdict() for recording in recordings])
         return
     for one in recordings:
-        size = "by hand" if not one.files else "size unknown" if one.nbytes is None else show.size(one.nbytes)
+        size = (
+            "by hand" if not one.files else "size unknown" if one.nbytes is None else output.size(one.nbytes)
+        )
         typer.echo(f"{one.name:<24}  {size:>12}  {one.title}\n{'':<24}  {'':>12}  {one.licence}; {one.page}")
 
 
 def _fetch(recording: "Recording", to: Path, base: str | None, *, json: bool) -> None:
-    from tsfusion.cli import show
-    from tsfusion.datasets import download
+    from tsfusion.cli import output
+    from tsfusion.datasets.download import download
 
     if not json:
         typer.echo(f"{recording.title}\nlicence: {recording.licence}; {recording.page}", err=True)
-    with show.reading(f"fetching {recording.name}", quiet=json) as watch:
+    with output.reading(f"fetching {recording.name}", quiet=json) as watch:
         done = download.fetch(recording, to, watch, base=base)
     if json:
-        show.as_json({"path": str(done.path), "files": [_row(one) for one in done.files]})
+        output.as_json({"path": str(done.path), "files": [_row(one) for one in done.files]})
         return
     for one in done.files:
         _say(one)
@@ -75,12 +77,12 @@ def _fetch(recording: "Recording", to: Path, base: str | None, *, json: bool) ->
 
 
 def _check(recordings: "list[Recording]", to: Path, *, json: bool) -> None:
-    from tsfusion.cli import show
-    from tsfusion.datasets import download
+    from tsfusion.cli import output
+    from tsfusion.datasets.download import download
 
     found = [one for recording in recordings for one in download.check(recording, to)]
     if json:
-        show.as_json([_row(one) for one in found])
+        output.as_json([_row(one) for one in found])
         return
     for one in found:
         _say(one)

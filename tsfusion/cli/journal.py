@@ -10,8 +10,8 @@ import typer
 from tsfusion.cli import options
 
 if TYPE_CHECKING:
-    from tsfusion.inspection import Info, Problem, SessionInfo, Verdict
-    from tsfusion.journal.places import Place
+    from tsfusion.journal.inspection import Info, Problem, SessionInfo, Verdict
+    from tsfusion.journal.state_folder import Place
 
 _MOST_LINES = 20  # of one kind, for a person; --json has all
 
@@ -45,14 +45,14 @@ def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
 
     Exit status 0 also for a damaged journal: `verify` is the judge.
     """
-    from tsfusion.cli import show
-    from tsfusion.inspection import summarize
+    from tsfusion.cli import output
+    from tsfusion.journal.inspection import summarize
 
     place = _find(path, map_)
-    with show.reading(f"reading {place.path}", quiet=json) as watch:
+    with output.reading(f"reading {place.path}", quiet=json) as watch:
         found = summarize(place, watch)
     if json:
-        show.as_json(found)
+        output.as_json(found)
     else:
         typer.echo(_describe_info(found))
 
@@ -66,14 +66,14 @@ def verify(path: Where, map_: Map = None, json: options.Json = False) -> None:
     took; it was never acknowledged, and its scanner sends it again. `note`:
     odd, but nothing is wrong with what is there.
     """
-    from tsfusion.cli import show
-    from tsfusion.inspection import verify as check
+    from tsfusion.cli import output
+    from tsfusion.journal.inspection import verify as check
 
     place = _find(path, map_)
-    with show.reading(f"checking {place.path}", quiet=json) as watch:
+    with output.reading(f"checking {place.path}", quiet=json) as watch:
         verdict = check(place, watch)
     if json:
-        show.as_json(verdict)
+        output.as_json(verdict)
     else:
         typer.echo(_describe_verdict(verdict))
     if not verdict.intact:
@@ -100,19 +100,19 @@ def recover(
     Exit status 1: OUT is there, but some keyframes could not be saved; the
     damaged places are named.
     """
-    from tsfusion.cli import show
-    from tsfusion.config import ServerConfig
-    from tsfusion.salvage import recover as save
+    from tsfusion.cli import output
+    from tsfusion.core.config import ServerConfig
+    from tsfusion.journal.recovery import recover as save
 
     place = _find(path, map_)
-    with show.reading(f"saving {place.path}", quiet=json) as watch:
+    with output.reading(f"saving {place.path}", quiet=json) as watch:
         done = save(place, out, ServerConfig().segment_bytes, watch)
     if json:
-        show.as_json(done)
+        output.as_json(done)
     else:
         typer.echo(
             f"{out}: {_count(done.keyframes, 'keyframe')} in {_count(done.segments, 'segment')}, "
-            f"{show.size(done.nbytes)}"
+            f"{output.size(done.nbytes)}"
         )
         if done.copies:
             typer.echo(f"{_count(done.copies, 'keyframe')} stood there twice and is saved once")
@@ -146,16 +146,16 @@ def export(
 
     Exit status 1: OUT is there, but without the damaged keyframes.
     """
-    from tsfusion.cli import show
-    from tsfusion.ros import export as write
+    from tsfusion.cli import output
+    from tsfusion.journal.ros2_export import export as write
 
     place = _find(path, map_)
-    with show.reading(f"exporting {place.path}", quiet=json) as watch:
+    with output.reading(f"exporting {place.path}", quiet=json) as watch:
         done = write(place, out, watch)
     if json:
-        show.as_json(done)
+        output.as_json(done)
     else:
-        typer.echo(f"{out}: {_count(done.keyframes, 'keyframe')}, {show.size(done.nbytes)}")
+        typer.echo(f"{out}: {_count(done.keyframes, 'keyframe')}, {output.size(done.nbytes)}")
         typer.echo("\n".join(f"  {topic}  {count}" for topic, count in done.messages.items()))
         typer.echo("\n".join([*_problem_lines(done.problems), _loss(done.lost)]))
     if done.lost:
@@ -163,7 +163,7 @@ def export(
 
 
 def _find(path: Path, map_name: str | None) -> "Place":
-    from tsfusion.journal.places import find
+    from tsfusion.journal.state_folder import find
 
     return find(path, map_name)
 
@@ -177,7 +177,7 @@ def _loss(lost: int) -> str:
 
 
 def _describe_info(found: "Info") -> str:
-    from tsfusion.cli.show import size
+    from tsfusion.cli.output import size
 
     lines = [
         f"journal    {found.path}",
@@ -222,7 +222,7 @@ def _clock(stamp_ns: int) -> str:
 
 
 def _describe_verdict(verdict: "Verdict") -> str:
-    from tsfusion.cli.show import size
+    from tsfusion.cli.output import size
 
     read = f"{_count(verdict.keyframes, 'keyframe')} in {_count(verdict.segments, 'segment')}"
     judged = "intact" if verdict.intact else f"damaged; {_loss(verdict.lost)}"

@@ -47,10 +47,9 @@ def new(
 
     The name `server` is for the server's own pair.
     """
-    from tsfusion import keys
-    from tsfusion.transport import curve
+    from tsfusion.wire import curve, key_folder
 
-    made = keys.create(folder, name, force=force)
+    made = key_folder.create(folder, name, force=force)
     typer.echo(f"public key of {name}: {made.public}")
     if name == curve.SERVER:
         place, at = (
@@ -80,9 +79,9 @@ def allow(
     A name has one key: allowing another replaces it, and the name keeps its sessions. KEY holds characters
     that a shell would read: put it in single quotes, and -- before it if it begins with a dash.
     """
-    from tsfusion import keys
+    from tsfusion.wire import key_folder
 
-    earlier = keys.allow(folder, name, key)
+    earlier = key_folder.allow(folder, name, key)
     typer.echo(f"{name} may connect")
     if earlier is not None:
         typer.echo(f"its earlier key no longer may: {earlier}")
@@ -91,23 +90,23 @@ def allow(
 @app.command()
 def revoke(name: Name, *, folder: Dir = _FOLDER) -> None:
     """Keep a scanner out; a running server cuts its connections at once."""
-    from tsfusion import keys
+    from tsfusion.wire import key_folder
 
-    key = keys.revoke(folder, name)
+    key = key_folder.revoke(folder, name)
     typer.echo(f"{name} may no longer connect: {key}")
 
 
 @app.command("list")
 def list_(*, folder: Dir = _FOLDER, json: options.Json = False) -> None:
     """Show the folder's own pairs (public halves), and on a server who is allowed and who was revoked."""
-    from tsfusion import keys
+    from tsfusion.wire import key_folder
 
-    own = keys.pairs(folder)
-    listed = keys.read_list(folder) if keys.has_list(folder) else None
+    own = key_folder.pairs(folder)
+    listed = key_folder.read_list(folder) if key_folder.has_list(folder) else None
     if json:
-        from tsfusion.cli import show
+        from tsfusion.cli import output
 
-        show.as_json(
+        output.as_json(
             {
                 "own": {pair.name: pair.public for pair in own},
                 "allowed": listed.allowed if listed else {},

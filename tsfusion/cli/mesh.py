@@ -10,10 +10,10 @@ import typer
 from tsfusion.cli import options
 
 if TYPE_CHECKING:
-    from tsfusion.config import VolumeConfig
-    from tsfusion.mesh import Mesh
-    from tsfusion.recording import Recording
-    from tsfusion.volume import Volume
+    from tsfusion.core.config import VolumeConfig
+    from tsfusion.geometry.mesh import Mesh
+    from tsfusion.journal.recording import Recording
+    from tsfusion.tsdf.volume import Volume
 
 
 @options.takes_map_settings
@@ -37,8 +37,8 @@ def mesh(
     **settings: Any,
 ) -> None:
     """Write the mesh of a saved map, of a journal (fused anew, with these map flags), or of a live server."""
-    from tsfusion.mesh import FORMATS
-    from tsfusion.results import check_writable
+    from tsfusion.core.output_folder import check_writable
+    from tsfusion.geometry.mesh import FORMATS
 
     check_writable(out, FORMATS)
     if preview is not None:
@@ -48,9 +48,9 @@ def mesh(
             context, {*options.MAP_OPTIONS, "config"} - {"min_weight"},
             "has no effect on a live server's map: give it to `tsfusion serve`",
         )  # fmt: skip
-        from tsfusion.config import DEFAULT_MAP
-        from tsfusion.fetch import fetch_mesh
-        from tsfusion.transport import client_keys
+        from tsfusion.core.config import DEFAULT_MAP
+        from tsfusion.wire.curve import client_keys
+        from tsfusion.wire.queries import fetch_mesh
 
         made = fetch_mesh(
             source, control=control, map_name=map_ or DEFAULT_MAP, min_weight=settings["min_weight"],
@@ -73,7 +73,7 @@ def mesh(
         made = _volume(Path(source), chosen.volume, name=map_, given=given, quiet=json).extract_mesh()
     made.save(out)
     if preview is not None:
-        from tsfusion.preview import render
+        from tsfusion.pipelines.mesh_preview import render
 
         render(made, preview)
     _tell(made, out, json)
@@ -81,21 +81,21 @@ def mesh(
 
 def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bool, quiet: bool) -> "Volume":
     """The saved map where there is a complete one, else a new one of every keyframe of the journal."""
-    from tsfusion.config import VIEW_SETTINGS
-    from tsfusion.errors import DatasetError
-    from tsfusion.volume import Volume
+    from tsfusion.core.config import VIEW_SETTINGS
+    from tsfusion.core.errors import DatasetError
+    from tsfusion.tsdf.volume import Volume
 
     view = {name: getattr(config, name) for name in VIEW_SETTINGS}
     if not source.exists():
         raise DatasetError(f"{source} does not exist; expected a map (.tsf), a state folder or a journal")
     if source.suffix == ".tsf":
         return Volume.load(source, config.threads, **view)
-    from tsfusion import maps
-    from tsfusion.recording import Recording
+    from tsfusion.journal import state_folder
+    from tsfusion.journal.recording import Recording
 
-    source = maps.resolve(source, name)
+    source = state_folder.resolve(source, name)
     recording = Recording(source)
-    saved = source / maps.MAP_FILE
+    saved = source / state_folder.MAP_FILE
     if saved.is_file() and not given:
         volume = Volume.load(saved, config.threads, **view)
         if volume.keyframes == len(recording):
@@ -106,11 +106,11 @@ def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bo
 
 def _fuse(recording: "Recording", volume: "Volume", quiet: bool) -> "Volume":
     """Add every keyframe; as in the server, one that the map cannot take is counted and left out."""
-    from tsfusion.cli import show
-    from tsfusion.errors import MapError
+    from tsfusion.cli import output
+    from tsfusion.core.errors import MapError
 
     left_out: Counter[str] = Counter()
-    with show.progress(quiet=quiet) as progress:
+    with output.progress(quiet=quiet) as progress:
         progress.stage(f"fusing {recording.name}")
         for index, keyframe in enumerate(recording, 1):
             try:
@@ -124,11 +124,11 @@ def _fuse(recording: "Recording", volume: "Volume", quiet: bool) -> "Volume":
 
 
 def _tell(made: "Mesh", out: Path, json: bool) -> None:
-    from tsfusion.cli import show
+    from tsfusion.cli import output
 
     figures: dict[str, Any] = {"path": str(out), "vertices": len(made.vertices), "triangles": len(made.faces)}
     if json:
-        show.as_json(figures)
+        output.as_json(figures)
     else:
-        vertices, triangles = show.grouped(figures["vertices"]), show.grouped(figures["triangles"])
+        vertices, triangles = output.grouped(figures["vertices"]), output.grouped(figures["triangles"])
         typer.echo(f"{out}: {vertices} vertices, {triangles} triangles")

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Flags that several verbs share, and the configuration they make.
 
-A flag beats its environment variable, which beats the file, which beats the default in `tsfusion.config`.
+A flag beats its environment variable, which beats the file, which beats the
+default in `tsfusion.core.config`.
 """
 
 import functools
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from tsfusion.config import ClientConfig, Config
+    from tsfusion.core.config import ClientConfig, Config
 
 ConfigFile = Annotated[
     Path | None,
@@ -123,7 +124,7 @@ def refuse(context: typer.Context, names: Collection[str], reason: str) -> None:
 
     One that the environment sets may be meant for other commands.
     """
-    from tsfusion.errors import InvalidConfig
+    from tsfusion.core.errors import InvalidConfig
 
     for parameter in context.command.params:
         source = context.get_parameter_source(parameter.name or "")
@@ -141,7 +142,7 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
     Raises:
         InvalidConfig: for a bad file or value.
     """
-    from tsfusion import config
+    from tsfusion.core import config
 
     loaded = config.load(file, **(preset or {}))
     flags |= _band(flags.pop("truncation", None), flags.pop("support", None))
@@ -167,7 +168,7 @@ def dataset_options(given: list[str] | None) -> dict[str, Any]:
     """
     import json
 
-    from tsfusion.errors import InvalidConfig
+    from tsfusion.core.errors import InvalidConfig
 
     found: dict[str, Any] = {}
     for each in given or ():
@@ -190,7 +191,7 @@ def local(client: "ClientConfig") -> "ClientConfig":
 
 def _band(truncation: float | None, support: str | None) -> dict[str, float]:
     """The settings that --truncation or --support stand for."""
-    from tsfusion.errors import InvalidConfig
+    from tsfusion.core.errors import InvalidConfig
 
     if truncation is not None and support is not None:
         raise InvalidConfig(

@@ -9,7 +9,7 @@ import typer
 from tsfusion.cli import options
 
 if TYPE_CHECKING:
-    from tsfusion.config import Config
+    from tsfusion.core.config import Config
     from tsfusion.datasets import Dataset
 
 _DATASET = "Dataset"
@@ -106,8 +106,8 @@ def replay(
 def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dataset":
     """A dataset, or a journal; `given` are settings of a dataset, None = left out."""
     if _is_journal(path):
-        from tsfusion.errors import DatasetError
-        from tsfusion.recording import Recording
+        from tsfusion.core.errors import DatasetError
+        from tsfusion.journal.recording import Recording
 
         for name, value in given.items():
             if value is not None and name != "posed":
@@ -128,19 +128,19 @@ def _is_synthetic(path: Path) -> bool:
 
 def _is_journal(path: Path) -> bool:
     """Whether it is a journal of ours, or a place with one; a ROS recording may be an `.mcap` too."""
-    from tsfusion import maps
-    from tsfusion.datasets import bags
+    from tsfusion.datasets.rosbag import dataset as rosbag_dataset
+    from tsfusion.journal import state_folder
 
-    if maps.is_state(path) or any(path.glob("journal/*.mcap")):
+    if state_folder.is_state(path) or any(path.glob("journal/*.mcap")):
         return True
-    return (path.suffix == ".mcap" or any(path.glob("*.mcap"))) and not bags.recognises(path)
+    return (path.suffix == ".mcap" or any(path.glob("*.mcap"))) and not rosbag_dataset.recognises(path)
 
 
 def _warn(dataset: "Dataset") -> None:
     """One line on stderr when poses and depth disagree."""
-    from tsfusion.datasets import consistency
+    from tsfusion.evaluation import pose_check
 
-    report = consistency.check(dataset)
+    report = pose_check.check(dataset)
     if report.verdict == "disagree":
         typer.echo(f"warning: {report.text}", err=True)
 
@@ -191,21 +191,21 @@ def _run(
 ) -> None:
     from msgspec.structs import replace
 
-    from tsfusion import pipeline
-    from tsfusion.cli import show
-    from tsfusion.config import override
+    from tsfusion.cli import output
+    from tsfusion.core.config import override
+    from tsfusion.pipelines import replay as pipelines_replay
 
     server = override(chosen.server, listen="tcp://127.0.0.1:0", state=str(state)) if state else None
     client = override(chosen.client, control=control, map=map_, key=key, server_key=server_key)
     if connect is None:  # a server of its own: only this machine reaches it, its errors are told here
         server = replace(server, keys=None, metrics=None, log_format="text") if server else None
         client = options.local(client)
-    with show.progress(quiet=json) as progress:
-        run = pipeline.replay(
+    with output.progress(quiet=json) as progress:
+        run = pipelines_replay.replay(
             dataset, out, volume=chosen.volume, server=server, client=client, progress=progress,
             connect=connect, **settings,
         )  # fmt: skip
     if json:
-        show.as_json(run)
+        output.as_json(run)
     else:
-        show.summary(run, out)
+        output.summary(run, out)

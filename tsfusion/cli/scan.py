@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tsfusion.cli import options
+from tsfusion.scanner.sources.registry import is_live, open_source
 
 if TYPE_CHECKING:
-    from tsfusion.sources import Source
+    from tsfusion.scanner.sources.source import Source
 
 _ENDING = b"\nending: what is on its way is finished (again: at once)\n"
 _SOURCE, _POSES, _KEYFRAMES = "Source", "Poses", "Keyframes"
@@ -117,16 +118,16 @@ def scan(
         )  # fmt: skip
     else:
         options.refuse(context, ("control", "key", "server_key", "spool"), "has no effect without --connect")
-    from tsfusion import scanning
-    from tsfusion.cli import show, show_scan
-    from tsfusion.config import override
+    from tsfusion.cli import output, scan_output
+    from tsfusion.core.config import override
+    from tsfusion.pipelines import scan as pipelines_scan
 
     recording = {"sequence": sequence, "modality": modality, **options.dataset_options(option)}
     opened = _open(
         context, source, recording, calibration=calibration, rate=rate,
         part={"start": start, "stride": stride, "limit": max_frames},
     )  # fmt: skip
-    with opened, _ended_by_signals(opened), show_scan.watching(quiet=json) as progress:
+    with opened, _ended_by_signals(opened), scan_output.watching(quiet=json) as progress:
         chosen = options.configuration(config, preset={"sensor": opened.sensor}, **settings)
         rules = override(
             chosen.scan, localizer=localizer, trajectory=trajectory, feed=feed, loop_closure=loop_closure,
@@ -136,14 +137,14 @@ def scan(
         client = override(chosen.client, control=control, map=map_, key=key, server_key=server_key)
         if connect is None:
             client = options.local(client)
-        result = scanning.scan(
+        result = pipelines_scan.scan(
             opened, out, config=rules, volume=chosen.volume, client=client, connect=connect, spool=spool,
             min_weight=settings["min_weight"], progress=progress,
         )  # fmt: skip
     if json:
-        show.as_json(result)
+        output.as_json(result)
     else:
-        show_scan.summary(result, out, spool, connect)
+        scan_output.summary(result, out, spool, connect)
 
 
 def _open(
@@ -156,22 +157,21 @@ def _open(
     part: dict[str, Any],
 ) -> "Source":
     """The source by its name, as much of it as is asked for."""
-    from tsfusion import sources
-    from tsfusion.sources.limited import Limited
+    from tsfusion.scanner.sources.recorded import Limited
 
-    if sources.is_live(spec):
+    if is_live(spec):
         options.refuse(
             context,
             ("sequence", "modality", "option", "rate", "start", "stride"),
             "is for recordings, and this source is live",
         )
-        live = sources.open_source(spec, calibration=calibration)
+        live = open_source(spec, calibration=calibration)
         return live if part["limit"] is None else Limited(live, part["limit"])
     options.refuse(context, ("calibration",), "is for a live camera")
     from tsfusion.cli.replay import open_recording
+    from tsfusion.core.errors import DatasetError
     from tsfusion.datasets import select
-    from tsfusion.errors import DatasetError
-    from tsfusion.sources.recorded import Recorded
+    from tsfusion.scanner.sources.recorded import Recorded
 
     path = Path(spec)
     if not spec.startswith("synthetic:") and not path.expanduser().exists():

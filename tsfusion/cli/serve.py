@@ -14,7 +14,7 @@ import typer
 from tsfusion.cli import options
 
 if TYPE_CHECKING:
-    from tsfusion.transport import Addresses
+    from tsfusion.wire.sockets import Addresses
 
 log = logging.getLogger(__name__)
 
@@ -74,8 +74,9 @@ def serve(
     Prints one line with `ready` once keyframes are welcome: every kernel is compiled by then.
     """
     started = time.monotonic()
-    from tsfusion import logs, server
-    from tsfusion.errors import TsfusionError
+    from tsfusion import server
+    from tsfusion.core import logs
+    from tsfusion.core.errors import TsfusionError
 
     chosen = options.configuration(
         config, listen=listen, control=control, state=state, keys=keys, metrics=metrics,
@@ -99,9 +100,9 @@ def serve(
 
 def _announce(addresses: "Addresses", state: str, seconds: float, json: bool) -> None:
     if json:
-        from tsfusion.cli import show
+        from tsfusion.cli import output
 
-        show.as_json_line(
+        output.as_json_line(
             {
                 "ready": True, "listen": addresses.data, "control": addresses.control,
                 "publish": addresses.publish, "state": state, "seconds": round(seconds, 3),

@@ -12,7 +12,7 @@ from tsfusion.cli import options
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from tsfusion.cli.looking import Ask, Look, Watcher
+    from tsfusion.cli.health_poll import Ask, Look, Watcher
 
 PLAIN_WIDTH = 160  # columns where there is no terminal
 
@@ -44,8 +44,8 @@ def status(
     With --watch, a terminal is redrawn until Ctrl-C. Elsewhere a block of lines (with --json: a line) is
     printed each time, until nobody answers (1) or nothing was well for --stall-after seconds (3).
     """
-    from tsfusion.cli.looking import Watcher
-    from tsfusion.config import ClientConfig
+    from tsfusion.cli.health_poll import Watcher
+    from tsfusion.core.config import ClientConfig
 
     address = connect or ClientConfig().address
     watcher = Watcher(
@@ -62,8 +62,11 @@ def status(
 
 
 def _asker(address: str, control: str | None, key: str | None, server_key: str | None) -> "Ask":
-    from tsfusion.transport import client_keys, control_address, request, sockets
-    from tsfusion.transport.messages import Command, Reply
+    from tsfusion.wire import sockets
+    from tsfusion.wire.curve import client_keys
+    from tsfusion.wire.messages import Command, Reply
+    from tsfusion.wire.queries import request
+    from tsfusion.wire.sockets import control_address
 
     to, keys = control_address(sockets.target(address), control), client_keys(key, server_key)
 
@@ -88,9 +91,9 @@ def _redraw(watcher: "Watcher", address: str, seconds: float) -> None:
     from rich.console import Console
     from rich.live import Live
 
-    from tsfusion.cli.looking import Look
+    from tsfusion.cli.health_poll import Look
     from tsfusion.cli.status_view import render
-    from tsfusion.errors import TransportError
+    from tsfusion.core.errors import TransportError
 
     with Live(console=Console(highlight=False), auto_refresh=False) as live:
         while True:
@@ -103,15 +106,15 @@ def _redraw(watcher: "Watcher", address: str, seconds: float) -> None:
 
 
 def _print(look: "Look", *, json: bool, line: bool) -> None:
-    from tsfusion.cli import show
+    from tsfusion.cli import output
     from tsfusion.cli.status_view import render
 
     if not json:
         typer.echo(_text(render(look)))
     elif line:
-        show.as_json_line(look.as_json())
+        output.as_json_line(look.as_json())
     else:
-        show.as_json(look.as_json())
+        output.as_json(look.as_json())
     sys.stdout.flush()
 
 

@@ -5,10 +5,11 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from tsfusion.cli.looking import Look
-from tsfusion.cli.show import size
-from tsfusion.logs import printable
-from tsfusion.transport.messages import ClientHealth, Health, MapHealth, Spread, Status
+from tsfusion.cli.health_poll import Look
+from tsfusion.cli.output import size
+from tsfusion.core.logs import printable
+from tsfusion.wire.health import ClientHealth, Health, MapHealth, Status
+from tsfusion.wire.keyframe_times import Spread
 
 GONE = 30.0  # seconds without a word
 MAX_CLIENTS = 40  # rows; those heard last

@@ -7,21 +7,21 @@ Any object with `__len__` and `__getitem__` that follows the `Dataset` protocol 
 from pathlib import Path
 from typing import Any
 
-from tsfusion.datasets.bags import Bag
-from tsfusion.datasets.base import Dataset, Selection, select
-from tsfusion.datasets.euroc import EuRoC
-from tsfusion.datasets.kitti import KITTI
-from tsfusion.datasets.kitti_raw import KITTIRaw
-from tsfusion.datasets.layouts import SYNTHETIC, Found, Layout, describe, find, layouts, opened
-from tsfusion.datasets.lidar_dump import LidarDump
-from tsfusion.datasets.nerfstudio import Nerfstudio
-from tsfusion.datasets.replica import Replica
-from tsfusion.datasets.rgbd_folders import HoloLens, Redwood
-from tsfusion.datasets.scannet import ScanNet
-from tsfusion.datasets.sevenscenes import SevenScenes
-from tsfusion.datasets.synthetic import Synthetic
-from tsfusion.datasets.tum import TUM
-from tsfusion.errors import DatasetError
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import Dataset, Selection, select
+from tsfusion.datasets.formats.euroc import EuRoC
+from tsfusion.datasets.formats.gtsam_points import LidarDump
+from tsfusion.datasets.formats.kitti import KITTI
+from tsfusion.datasets.formats.kitti_raw import KITTIRaw
+from tsfusion.datasets.formats.nerfstudio import Nerfstudio
+from tsfusion.datasets.formats.redwood_hololens import HoloLens, Redwood
+from tsfusion.datasets.formats.replica import Replica
+from tsfusion.datasets.formats.scannet import ScanNet
+from tsfusion.datasets.formats.sevenscenes import SevenScenes
+from tsfusion.datasets.formats.tum import TUM
+from tsfusion.datasets.registry import SYNTHETIC, Found, Layout, describe, find, layouts, opened
+from tsfusion.datasets.rosbag.dataset import Bag
+from tsfusion.datasets.synthetic.dataset import Synthetic
 
 __all__ = [
     "KITTI",

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""How good a surface is: measures against a known truth, and of real views that were not fused."""
+"""How good a map is: the error of surfaces and trajectories, and whether poses and depth agree."""

@@ -5,7 +5,8 @@ A keyframe is on the disk when `Journal.append` returns. MCAP cannot be appended
 new segment. One chunk a keyframe, uncompressed: the arrays are compressed already, and a chunk has a CRC.
 """
 
-from tsfusion.journal.layout import Position, Record
+from tsfusion.journal.mcap_layout import Position, Record
+from tsfusion.journal.record_scan import Damage, segment_number, walk
 from tsfusion.journal.segments import (
     Scan,
     describe,
@@ -17,7 +18,6 @@ from tsfusion.journal.segments import (
     segment_path,
     segments,
 )
-from tsfusion.journal.walk import Damage, segment_number, walk
 from tsfusion.journal.writer import Journal, write_file
 
 __all__ = [

@@ -10,11 +10,11 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from tsfusion.errors import JournalError
-from tsfusion.journal import layout, seal
-from tsfusion.journal.layout import Position, Record
-from tsfusion.journal.source import Source
-from tsfusion.journal.walk import Damage, failed, segment_number, walk
+from tsfusion.core.errors import JournalError
+from tsfusion.journal import mcap_layout, segment_file
+from tsfusion.journal.mcap_layout import Position, Record
+from tsfusion.journal.record_scan import Damage, failed, segment_number, walk
+from tsfusion.journal.segment_file import Source
 
 log = logging.getLogger(__name__)
 
@@ -68,9 +68,9 @@ def read_at(path: Path, offset: int) -> Record:
     """
     try:
         with Source(path) as source:
-            head = layout.head(source.read(offset, layout.HEAD_BYTES))
+            head = mcap_layout.head(source.read(offset, mcap_layout.HEAD_BYTES))
             raw = b"" if head is None else source.read(offset, head.nbytes)
-            record = layout.unpack(raw, Position(segment_number(path), offset))
+            record = mcap_layout.unpack(raw, Position(segment_number(path), offset))
             if record is None and source.failed:
                 raise OSError(errno.EIO, os.strerror(errno.EIO))
     except OSError as error:
@@ -112,7 +112,7 @@ def is_closed(path: Path) -> bool:
     """Whether a segment ends with an index, as normal MCAP readers need it; False when it cannot be read."""
     try:
         with Source(path) as source:
-            return seal.read(source).state == "whole"
+            return segment_file.read(source).state == "whole"
     except OSError:
         return False
 

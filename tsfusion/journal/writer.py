@@ -10,13 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from tsfusion import disk
-from tsfusion.errors import JournalError
-from tsfusion.journal import layout
-from tsfusion.journal.layout import Position
-from tsfusion.journal.room import Room
+from tsfusion.core import durable_files
+from tsfusion.core.errors import JournalError
+from tsfusion.journal import mcap_layout
+from tsfusion.journal.mcap_layout import Position
+from tsfusion.journal.record_scan import failed
 from tsfusion.journal.segments import Scan, scan, segment_path, segments
-from tsfusion.journal.walk import failed
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +58,7 @@ class Journal:
         self.found: list[Scan] = []
         self.damaged = 0
         try:
-            disk.make_folder(self.folder)
+            durable_files.make_folder(self.folder)
         except OSError as error:
             raise failed("create the journal", self.folder, error) from error
         self._recover()
@@ -129,7 +128,9 @@ class Journal:
         try:
             file = self._open()
             position = Position(self._number, file.tell())
-            layout.add(self._writer, layout.pack(frames, self._identity, session, seq, client), seq, now_ns)
+            mcap_layout.add(
+                self._writer, mcap_layout.pack(frames, self._identity, session, seq, client), seq, now_ns
+            )
             self._flush()
         except OSError as error:
             self._abandon(position.offset)
@@ -208,12 +209,12 @@ class Journal:
         if self._file is None:
             self._first = 0
             self._file = segment_path(self.folder, self._number).open("xb")
-            self._identity = secrets.token_bytes(layout.IDENTITY_BYTES)
-            self._writer = layout.start(self._file, self._identity, time.time_ns())
+            self._identity = secrets.token_bytes(mcap_layout.IDENTITY_BYTES)
+            self._writer = mcap_layout.start(self._file, self._identity, time.time_ns())
             # Before the first record: what a reader needs to find its way is never the end that a cut takes.
             self._flush()
             if self._sync:
-                disk.sync_folder(self.folder)
+                durable_files.sync_folder(self.folder)
             self._first = self._file.tell()
         return self._file
 
@@ -243,11 +244,11 @@ def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, c
         JournalError: when the disk refuses.
     """
     partial = path.with_name(f".{path.name}.partial")
-    identity, now_ns = secrets.token_bytes(layout.IDENTITY_BYTES), time.time_ns()
+    identity, now_ns = secrets.token_bytes(mcap_layout.IDENTITY_BYTES), time.time_ns()
     try:
         with partial.open("wb") as file:
-            writer = layout.start(file, identity, now_ns)
-            layout.add(writer, layout.pack(frames, identity, session, seq, client), seq, now_ns)
+            writer = mcap_layout.start(file, identity, now_ns)
+            mcap_layout.add(writer, mcap_layout.pack(frames, identity, session, seq, client), seq, now_ns)
             writer.finish()
         partial.replace(path)
     except OSError as error:
@@ -265,3 +266,50 @@ def _cut(path: Path, end: int) -> None:
     with path.open("r+b") as file:
         file.truncate(end)
         os.fsync(file.fileno())
+
+
+_LOOK_BYTES = 16 << 20  # written between two looks at the disk, at most
+_LOOK_SECONDS = 1.0
+
+
+class Room:
+    """The room for writing on a folder's disk, of which `min_free_bytes` are not for us."""
+
+    def __init__(self, folder: Path, min_free_bytes: int) -> None:
+        self._folder = folder
+        self._kept = min_free_bytes
+        self._left = 0  # may be written without another look
+        self._look_at = 0.0
+
+    def take(self, nbytes: int) -> None:
+        """Raise JournalError when writing so much would leave too little."""
+        now = time.monotonic()
+        if self._kept and (now >= self._look_at or nbytes > self._left):
+            spare = self.free_bytes - self._kept
+            self._left = min(spare, max(_LOOK_BYTES, nbytes))
+            self._look_at = now + _LOOK_SECONDS
+            if nbytes > spare:
+                self._look_at = 0.0
+                raise JournalError(
+                    f"cannot write {self._folder}: its disk has {_mb(spare + self._kept)} free, "
+                    f"and {_mb(self._kept)} must stay so: free some space"
+                )
+        self._left -= nbytes
+
+    @property
+    def free_bytes(self) -> int:
+        """Room on the disk.
+
+        Raises:
+            JournalError: when the disk does not say.
+        """
+        try:
+            return durable_files.free_bytes(self._folder)
+        except OSError as error:
+            raise JournalError(
+                f"cannot tell how full the disk of {self._folder} is: {error.strerror}"
+            ) from error
+
+
+def _mb(count: int) -> str:
+    return f"{count / 1e6:.1f} MB"

@@ -3,7 +3,7 @@
 
 import os
 
-from tsfusion.errors import MissingDependency
+from tsfusion.core.errors import MissingDependency
 
 os.environ.setdefault("HOME", os.path.expanduser("~"))  # without it (a daemon's environment) taichi aborts
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # the banner goes to stdout

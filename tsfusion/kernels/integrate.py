@@ -10,8 +10,8 @@ Addition modulo 2⁶⁴ is a group: any order gives the same bytes, and subtract
 
 import taichi as ti
 
-from tsfusion.kernels.blocks import map_find, set_insert
-from tsfusion.kernels.traversal import (
+from tsfusion.kernels.block_hash import map_find, set_insert
+from tsfusion.kernels.voxel_traversal import (
     COUNT,
     CROSSING,
     DEFERRED,

@@ -1,0 +1,430 @@
+# SPDX-License-Identifier: MIT
+"""The `tsfusion` command as a person or a script meets it: output, exit status, and what is left behind."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_processes import tsfusion
+
+from tsfusion import __version__
+from tsfusion.cli import main
+from tsfusion.core import config
+from tsfusion.core.config import Config
+from tsfusion.core.errors import InvalidConfig, OutputError
+from tsfusion.datasets import Dataset
+
+Here = Callable[..., "subprocess.CompletedProcess[str]"]
+
+NOBODY = "tcp://127.0.0.1:9"  # the discard port: nobody listens there, and nobody may without being root
+VERBS = [
+    "demo", "replay", "scan", "check", "serve", "mesh", "status", "ate", "doctor", "download", "keys",
+    "journal", "config", "datasets",
+]  # fmt: skip
+
+
+def scene(folder: Path, *, pose: str | None = None, depth: bytes | None = None) -> Path:
+    """A one-frame dataset in the 7-Scenes layout."""
+    import cv2
+    import numpy as np
+
+    folder.mkdir()
+    image = np.full((48, 64), 1500, np.uint16)
+    (folder / "frame-000000.depth.png").write_bytes(
+        cv2.imencode(".png", image)[1].tobytes() if depth is None else depth
+    )
+    (folder / "frame-000000.pose.txt").write_text(pose or "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    return folder
+
+
+@pytest.fixture
+def here(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Here]:
+    """Run a command line in this process, in an empty folder: quicker where no real process is needed."""
+    monkeypatch.chdir(tmp_path)
+    for name in [name for name in os.environ if name.startswith("TSFUSION_")]:
+        monkeypatch.delenv(name)
+    handler = signal.getsignal(signal.SIGTERM)
+
+    def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
+        words = [str(argument) for argument in arguments]
+        with pytest.raises(SystemExit) as exit_status:
+            main(words)
+        said = capsys.readouterr()
+        assert isinstance(exit_status.value.code, int)
+        return subprocess.CompletedProcess(words, exit_status.value.code, said.out, said.err)
+
+    yield run
+    signal.signal(signal.SIGTERM, handler)
+
+
+def one_line(done: "subprocess.CompletedProcess[str]", *, status: int = 1) -> str:
+    """The message of a command that failed as it should."""
+    assert done.returncode == status, done.stderr
+    lines = done.stderr.strip().splitlines()
+    messages = [line for line in lines if line.startswith("tsfusion: ")]
+    assert len(messages) == 1, done.stderr
+    assert lines[-1] == messages[0], done.stderr
+    assert "Traceback" not in done.stderr
+    return messages[0]
+
+
+def test_help_names_every_verb() -> None:
+    done = tsfusion("--help")
+    assert done.returncode == 0
+    assert all(verb in done.stdout for verb in VERBS)
+
+
+def test_nothing_is_help_and_version_is_a_line(here: Here) -> None:
+    assert "Usage" in here().stdout
+    assert here("--version").stdout == f"tsfusion {__version__}\n"
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_help(here: Here, verb: str) -> None:
+    done = here(verb, "--help")
+    assert done.returncode == 0
+    assert "Usage" in done.stdout
+
+
+def test_help_is_quick() -> None:
+    def seconds() -> float:
+        started = time.perf_counter()
+        tsfusion("--help")
+        return time.perf_counter() - started
+
+    assert min(seconds() for _ in range(3)) < 1.0  # 0.15 s on a quiet machine; CI is not quiet
+    program = (
+        "import sys, tsfusion.cli; "
+        "sys.exit(', '.join({'numpy', 'zmq', 'cv2', 'msgspec', 'taichi', 'trimesh'} & set(sys.modules)) or 0)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+
+
+def test_config_dump_is_read_back(here: Here, tmp_path: Path) -> None:
+    text = here("config", "dump").stdout
+    assert "voxel_size = 0.02  # > 0; metres" in text
+    assert "of each fuser; None = three quarters" in text  # whose line the formatter has broken
+    (tmp_path / "a.toml").write_text(text)
+    assert config.load(tmp_path / "a.toml") == Config()
+    (tmp_path / "b.toml").write_text('[volume]\nvoxel_size = 0.5\nmax_range = 7\n[server]\nstate = "ä\\"b"\n')
+    changed = config.load(tmp_path / "b.toml")
+    (tmp_path / "c.toml").write_text(here("config", "dump", "--config", tmp_path / "b.toml").stdout)
+    assert config.load(tmp_path / "c.toml") == changed != Config()
+    dumped = json.loads(here("config", "dump", "--json", "--config", tmp_path / "b.toml").stdout)
+    assert dumped["volume"]["voxel_size"] == 0.5
+
+
+def test_datasets_list(here: Here, tmp_path: Path) -> None:
+    assert "7-Scenes" in here("datasets", "list").stdout
+    scene(tmp_path / "kitchen")
+    found = json.loads(here("datasets", "list", tmp_path, "--json").stdout)
+    assert found == [
+        {"path": str(tmp_path), "name": "7-Scenes kitchen", "sensor": "kinect", "keyframes": 1, "posed": True}
+    ]
+    assert "kinect  1 keyframes" in here("datasets", "list", tmp_path).stdout
+    layouts = json.loads(here("datasets", "list", "--json").stdout)
+    assert all(value == value.strip() for row in layouts for value in row.values())
+    (tmp_path / "empty").mkdir()
+    assert "no datasets" in here("datasets", "list", tmp_path / "empty").stderr
+    assert "missing does not exist" in one_line(here("datasets", "list", tmp_path / "missing"))
+
+
+def test_doctor() -> None:
+    done = tsfusion("doctor", "--json")
+    report = json.loads(done.stdout)
+    assert done.returncode == 0, report
+    assert report["ok"]
+    names = {check["name"] for check in report["checks"]}
+    assert {"python", "taichi", "numpy", "kernels", "loopback"} <= names
+
+
+def test_doctor_says_what_to_do(here: Here, tmp_path: Path) -> None:
+    done = here("doctor", tmp_path / "missing")
+    assert done.returncode == 1
+    assert done.stdout.count("✗") == 1
+    assert "→ choose another folder" in done.stdout
+    assert "✓ numpy" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["replay", "missing"], "missing does not exist"),
+        (["replay", "empty"], "in no layout known"),
+        (["replay", "synthetic:cave"], "world must be one of"),
+        (["replay", "synthetic:room", "--voxel-size", "-1"], "voxel_size must be > 0, got -1.0"),
+        (
+            ["replay", "synthetic:room", "--sensor", "sonar"],
+            "sensor must be one of kinect, tof, realsense, stereo, lidar, scanner, got 'sonar'",
+        ),
+        (
+            ["replay", "synthetic:room", "--regularizer", "very"],
+            "regularizer must be one of off, paper, ray, got 'very'",
+        ),
+        (["replay", "synthetic:room", "--config", "missing.toml"], "missing.toml: No such file"),
+        (["replay", "synthetic:room", "--out", "file"], "not a folder"),
+        (["replay", "synthetic:room", "--out", "file/out"], "cannot write"),
+        (["demo", "--out", "/proc/out"], "cannot write"),
+        (["demo", "--world", "cave"], "world must be one of"),
+        (["mesh", "missing", "a.ply"], "missing does not exist"),
+        (["mesh", "empty", "a.ply"], "no keyframes"),
+        (["mesh", "garbage.tsf", "a.ply"], "not a tsfusion map"),
+        (["mesh", "garbage.tsf", "a.stl"], "ending in .ply, .glb, .obj"),
+        (["mesh", "garbage.tsf", "missing/a.ply"], "cannot write"),
+        (["mesh", "nonsense://x", "a.ply"], "an address looks like"),
+        (["serve", "--listen", "nonsense"], "an address looks like"),
+        (["serve", "--listen", "tcp://0.0.0.0:5555"], "127.0.0.1"),
+        (["replay", "synthetic:room", "--key", "file"], "--key has no effect without --connect"),
+        (["replay", "synthetic:room", "--connect", NOBODY, "--key", "file"], "key needs server_key, too"),
+        (["mesh", NOBODY, "a.ply", "--server-key", "K"], "server_key needs key, too"),
+        (["mesh", "garbage.tsf", "a.ply", "--key", "file"], "--key has no effect on garbage.tsf"),
+        (["serve", "--state", "file"], "cannot write the state folder"),
+        (["serve", "--threads", "0"], "threads must be >= 1, got 0"),
+        (["serve", "--max-range", "0.01"], "min_range"),
+        (["serve", "--config", "file"], "is not TOML"),
+        (["replay", "synthetic:room", "--start", "99"], "has 40 keyframes, none after the first 99"),
+        (["replay", "synthetic:room", "--sequence", "06"], "a synthetic dataset takes no `sequence`"),
+        (["replay", "synthetic:room", "--connect", NOBODY, "--state", "s"], "--state has no effect with"),
+        (["replay", "synthetic:room", "--connect", NOBODY, "--voxel-size", "1"], "`tsfusion serve`"),
+        (["replay", "synthetic:room", "--control", NOBODY], "--control has no effect without --connect"),
+        (["mesh", "garbage.tsf", "a.ply", "--voxel-size", "1"], "--voxel-size has no effect on a saved map"),
+        (["mesh", "garbage.tsf", "a.ply", "--control", NOBODY], "only a live server"),
+        (["mesh", NOBODY, "a.ply", "--threads", "1"], "--threads has no effect on a live server's map"),
+        (["mesh", NOBODY, "a.ply"], "no server answered at tcp://127.0.0.1:10 within 0.2 s"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    here: Here, arguments: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").write_text("here first")
+    (tmp_path / "garbage.tsf").write_bytes(bytes(range(200)))
+    monkeypatch.setattr("tsfusion.wire.queries._ANSWER_TIMEOUT", 0.2)
+    done = here(*arguments)
+    assert words in one_line(done)
+    left = {path.name for path in tmp_path.rglob("*")} - {
+        "tsfusion-state",
+        "maps",
+        "default",
+        "journal",
+        "lock",
+        "fuser.lock",
+    }
+    assert left == {"empty", "file", "garbage.tsf"}
+    assert (tmp_path / "file").read_text() == "here first"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["replay"], ["fly"], ["replay", "x", "--fast"], ["serve", "--voxel-size", "small"], ["config"]],
+)
+def test_wrong_usage_is_status_2(here: Here, arguments: list[str]) -> None:
+    assert "see --help" in one_line(here(*arguments), status=2)
+
+
+@pytest.mark.parametrize(
+    ("broken", "words"),
+    [
+        ({"pose": "nan 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"}, "nan"),
+        ({"pose": "2 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"}, "rotation"),
+        ({"depth": b""}, "cannot be decoded"),
+    ],
+)
+def test_a_broken_dataset_leaves_nothing(
+    here: Here, broken: dict[str, str], words: str, tmp_path: Path
+) -> None:
+    scene(tmp_path / "scene", **broken)
+    done = here("replay", tmp_path / "scene", "--out", tmp_path / "out")
+    assert words in one_line(done).lower()
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+def test_dead_server(here: Here, tmp_path: Path) -> None:
+    with socket.socket() as reserved:
+        reserved.bind(("127.0.0.1", 0))  # bound, never listening: nobody answers here
+        address = f"tcp://127.0.0.1:{reserved.getsockname()[1]}"
+        assert "no server" in one_line(here("status", "--connect", address, "--timeout", 0.3))
+        (tmp_path / "quick.toml").write_text("[client]\nconnect_timeout = 0.3\n")
+        done = here(
+            "replay", "synthetic:room", "--connect", address, "--config", tmp_path / "quick.toml",
+            "--out", tmp_path / "new" / "folders" / "out",
+        )  # fmt: skip
+        assert "no server" in one_line(done)
+    assert [path.name for path in tmp_path.iterdir()] == ["quick.toml"]
+
+
+def test_busy_port(here: Here, tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+        done = here("serve", "--listen", address, "--state", tmp_path / "state")
+    assert f"cannot listen on {address}" in one_line(done)
+
+
+@pytest.fixture
+def replayed(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What `replay` asks of the pipeline, which is not run."""
+    asked: dict[str, Any] = {}
+
+    def record(dataset: Dataset, out: Path, **settings: Any) -> None:
+        asked.update(settings, dataset=dataset)
+        raise OutputError("recorded")
+
+    monkeypatch.setattr("tsfusion.pipelines.replay.replay", record)
+    return asked
+
+
+@pytest.mark.parametrize(
+    ("toml", "flags", "sensor"),
+    [
+        ("", [], "stereo"),
+        ("[volume]\nvoxel_size = 0.5\n", [], "stereo"),
+        ("[volume]\nsensor = 'kinect'\n", [], "kinect"),
+        ("[volume]\nsensor = 'lidar'\n", [], "lidar"),
+        ("[volume]\nsensor = 'lidar'\n", ["--sensor", "kinect"], "kinect"),
+    ],
+)
+@pytest.mark.parametrize("command", [["replay", "synthetic:street:stereo"], ["demo", "--world", "street"]])
+def test_a_sensor_that_was_chosen_beats_the_datasets(
+    here: Here, replayed: dict[str, Any], tmp_path: Path, command: list[str], toml: str, flags: list[str],
+    sensor: str,
+) -> None:  # fmt: skip
+    (tmp_path / "a.toml").write_text(toml)
+    assert "recorded" in one_line(here(*command, "--config", "a.toml", *flags))
+    assert replayed["volume"].sensor == sensor
+
+
+def test_a_sensor_chosen_in_the_environment_counts(
+    here: Here, replayed: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TSFUSION_SENSOR", "kinect")
+    here("replay", "synthetic:street:stereo")
+    assert replayed["volume"].sensor == "kinect"
+
+
+def test_flags_of_the_environment_are_not_refused(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They may be meant for other commands."""
+    monkeypatch.setenv("TSFUSION_VOXEL_SIZE", "0.5")
+    monkeypatch.setattr("tsfusion.wire.queries._ANSWER_TIMEOUT", 0.2)
+    assert "no server" in one_line(here("mesh", NOBODY, "a.ply"))
+
+
+@pytest.mark.parametrize(
+    ("toml", "words"),
+    [
+        ("[volume]\nvoxel_size = -1\n", "a.toml: volume.voxel_size must be > 0, got -1"),
+        ("[volume]\nvoxel_size = inf\n", "voxel_size must be finite, got inf"),
+        ("[volume]\nsensor = 'ear'\n", "volume.sensor must be one of kinect, tof,"),
+        ("[volume]\nthreads = 'x'\n", "volume.threads must be a whole number, got 'x'"),
+        ("[server]\nlisten = 3\n", "server.listen must be text, got 3"),
+        ("[volume]\nspeed = 1\n", "unknown setting volume.speed"),
+        ("speed = 1\n", "unknown setting speed"),
+        ("volume = 1\n", "volume must be a table, got 1"),
+    ],
+)
+def test_a_bad_setting_is_named_once(here: Here, tmp_path: Path, toml: str, words: str) -> None:
+    (tmp_path / "a.toml").write_text(toml)
+    said = one_line(here("config", "dump", "--config", "a.toml"))
+    assert words in said
+    assert said.count("got") <= 1
+
+
+def test_settings_may_be_numpy_scalars() -> None:
+    made = config.make(config.VolumeConfig, {"voxel_size": np.float32(0.25), "threads": np.int64(2)})
+    assert (made.voxel_size, made.threads) == (0.25, 2)
+    with pytest.raises(InvalidConfig, match=r"^voxel_size must be > 0, got -1.0$"):
+        config.make(config.VolumeConfig, {"voxel_size": np.float32(-1)})
+
+
+def test_ctrl_c_while_modules_load_is_no_traceback() -> None:
+    """The command is interrupted at its first import beyond the door."""
+    program = (
+        "import builtins, os, signal, sys\n"
+        "from tsfusion.__main__ import main\n"
+        "load = builtins.__import__\n"
+        "def interrupted(name, *rest):\n"
+        "    if name == 'tsfusion': os.kill(os.getpid(), signal.SIGINT)\n"
+        "    return load(name, *rest)\n"
+        "builtins.__import__ = interrupted\n"
+        "main(['--version'])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == -signal.SIGINT
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ({"truncation": 4.0}, {"min_support": 4.0, "max_support": 4.0}),
+        ({"support": "3:6.5"}, {"min_support": 3.0, "max_support": 6.5}),
+        ({"min_weight": 0.5, "max_range": 3.0}, {"min_weight": 0.5, "max_range": 3.0}),
+        ({"lambda_": 7.0}, {"smoothness": 7.0}),
+        ({"space_carving": True}, {"space_carving": True}),
+    ],
+)
+def test_map_flags_become_settings(flags: dict[str, object], expected: dict[str, object]) -> None:
+    from tsfusion.cli.options import configuration
+
+    volume = configuration(None, **flags).volume
+    assert {name: getattr(volume, name) for name in expected} == expected
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({"truncation": 4.0, "support": "3:6"}, "exclude each other"),
+        ({"support": "3-6"}, "LEAST:MOST"),
+        ({"support": "3:99"}, "max_support must be <= 16"),
+    ],
+)
+def test_a_bad_band_is_explained(flags: dict[str, object], message: str) -> None:
+    from tsfusion.cli.options import configuration
+
+    with pytest.raises(InvalidConfig, match=message):
+        configuration(None, **flags)
+
+
+@pytest.mark.parametrize("verb", ["serve", "replay", "demo", "mesh"])
+def test_every_verb_that_fuses_takes_the_map_flags(verb: str) -> None:
+    from tsfusion.cli.options import MAP_OPTIONS
+
+    shown = tsfusion(verb, "--help").stdout
+    for option in MAP_OPTIONS.values():
+        assert option.__metadata__[0].default.partition("/")[0] in shown
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("depth_topic", "--option must be KEY=VALUE, such as time_offset_s=0.02, got 'depth_topic'"),
+        ("=3", "--option must be KEY=VALUE"),
+        ("focal=3", "a synthetic dataset takes no `focal`"),
+        ("count=0", "expected count >= 1"),
+        ("path=spiral", "path must be one of circle, tour"),
+    ],
+)
+def test_a_wrong_option_of_a_dataset(here: Here, given: str, words: str) -> None:
+    for verb in (["replay", "synthetic:room"], ["scan", "--source", "synthetic:room"]):
+        assert words in one_line(here(*verb, "--option", given))
+
+
+def test_options_of_a_dataset() -> None:
+    from tsfusion.cli import options
+
+    parsed = options.dataset_options(["noise=maybe", "seed=3", "color=false", "poses=a=b"])
+    assert parsed == {"noise": "maybe", "seed": 3, "color": False, "poses": "a=b"}

@@ -1,0 +1,384 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion journal`: what it finds, what it saves, its exit status, and that it changes nothing."""
+
+import json
+import shutil
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_processes import end, started, tsfusion
+from keyframes_and_servers import pose, wall
+from mcap.reader import make_reader
+
+from tsfusion import journal
+from tsfusion.cli import main
+from tsfusion.core.errors import JournalError
+from tsfusion.geometry import se3
+from tsfusion.journal import Journal, segment_path
+from tsfusion.journal.recording import Recording
+from tsfusion.journal.state_folder import find
+from tsfusion.wire import codec, corrections
+from tsfusion.wire.corrections import SessionCorrections
+
+Run = Callable[..., tuple[int, str, str]]
+ANNA, BOB = b"a" * 16, b"b" * 16
+
+
+def fill(folder: Path, count: int = 6, segment_bytes: int = 2_500) -> Path:
+    """Keyframes of two scanners in turn, in several segments."""
+    log = Journal(folder, segment_bytes, sync=False)
+    for i in range(count):
+        session, client = ((ANNA, "anna"), (BOB, "bob"))[i % 2]
+        seq = 1 + i // 2
+        frames = codec.encode(wall(i), session=session, seq=seq, jpeg_quality=90)
+        log.append(frames, session=session, seq=seq, client=client, logged_ns=10**18 + i)
+    log.close()
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def damage(folder: Path, number: int, seq: int) -> int:
+    """Flip a bit in a keyframe; where it starts."""
+    path = segment_path(folder, number)
+    record = next(one for one in journal.records(path) if one.seq == seq)
+    content = bytearray(path.read_bytes())
+    content[record.position.offset + 700] ^= 16
+    path.write_bytes(content)
+    return record.position.offset
+
+
+def leave_open(folder: Path) -> None:
+    """Take the index and half of the last record away, as a crash does."""
+    path = segment_path(folder, journal.segments(folder)[-1])
+    last = list(journal.records(path))[-1]
+    path.write_bytes(path.read_bytes()[: last.position.offset + 900])
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Exit status, stdout and stderr of a `tsfusion journal` line, in this process."""
+    handler = signal.getsignal(signal.SIGTERM)
+
+    def verb(*arguments: object) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as status:
+            main(["journal", *map(str, arguments)])
+        signal.signal(signal.SIGTERM, handler)
+        said = capsys.readouterr()
+        return int(status.value.code or 0), said.out, said.err
+
+    return verb
+
+
+@pytest.fixture
+def state(tmp_path: Path) -> Path:
+    """A state folder with one map; what is in it stays as it is."""
+    folder = tmp_path / "state"
+    fill(folder / "maps" / "hall" / "journal")
+    (folder / "maps" / "hall" / "quarantine").mkdir()
+    (folder / "maps" / "hall" / "quarantine" / "000001.mcap").write_bytes(bytes(100))
+    return folder
+
+
+# --- places ---
+
+
+def test_a_journal_is_found_by_any_folder_above_it(state: Path) -> None:
+    hall = state / "maps" / "hall"
+    for path in (state, hall, hall / "journal"):
+        place = find(path)
+        assert (place.path, place.quarantine) == (hall / "journal", hall / "quarantine")
+    assert find(state, "hall") == find(state)
+    assert find(segment_path(hall / "journal", 1)).files() == [segment_path(hall / "journal", 1)]
+
+
+def test_several_maps_must_be_told_apart(state: Path) -> None:
+    fill(state / "maps" / "attic" / "journal", 2)
+    with pytest.raises(JournalError, match=r"several maps \(attic, hall\): choose one with --map NAME"):
+        find(state)
+    assert find(state, "attic").path == state / "maps" / "attic" / "journal"
+    with pytest.raises(JournalError, match=r"no map cellar; it has: attic, hall"):
+        find(state, "cellar")
+
+
+def test_a_path_without_a_journal_says_what_was_expected(state: Path, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("")
+    (tmp_path / "empty" / "maps").mkdir(parents=True)
+    for path, name, message in (
+        (tmp_path / "nothing", None, "does not exist; expected a state folder"),
+        (tmp_path / "notes.txt", None, "is no journal"),
+        (tmp_path / "empty", None, "has no map with a journal"),
+        (state / "maps" / "hall", "hall", "--map has no effect"),
+    ):
+        with pytest.raises(JournalError, match=message):
+            find(path, name)
+
+
+# --- info ---
+
+
+def test_info_says_what_is_corrected(state: Path, run: Run) -> None:
+    folder = state / "maps" / "hall" / "corrections"
+    folder.mkdir()
+    seqs, poses = corrections.checked({2: se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2])), 3: pose(0.12, 4.0)})
+    path = folder / "a.tsc"
+    corrections.write(path, SessionCorrections(session=ANNA, seqs=seqs, poses=poses, revision=7))
+    _, out, _ = run("info", state)
+    (anna,) = [line for line in out.splitlines() if " anna " in line]
+    assert anna.endswith("2 corrected by up to 4 m, 90° (revision 7)")
+    assert "corrected" not in next(line for line in out.splitlines() if " bob " in line)
+    path.write_bytes(path.read_bytes()[:-1])
+    status, out, _ = run("info", state)
+    assert status == 0
+    assert "damage  corrections, byte 0: " in out
+
+
+def test_info_counts_what_is_there(state: Path, run: Run) -> None:
+    before = contents(state)
+    status, out, _ = run("info", state, "--json")
+    found = json.loads(out)
+    assert status == 0
+    assert (found["keyframes"], found["lost"], found["problems"]) == (6, 0, [])
+    folder = state / "maps" / "hall" / "journal"
+    assert [one["name"] for one in found["segments"]] == [path.name for path in sorted(folder.iterdir())]
+    assert found["nbytes"] == sum(path.stat().st_size for path in folder.iterdir())
+    assert {one["state"] for one in found["segments"]} == {"closed"}
+    assert found["sessions"] == [
+        {
+            "session": session.hex(), "client": client, "keyframes": 3, "first_seq": 1, "last_seq": 3,
+            "first_logged_ns": 10**18 + first, "last_logged_ns": 10**18 + first + 4,
+                "revision": 0, "corrected": 0, "moved_m": 0.0, "turned_deg": 0.0,
+        }
+        for first, (session, client) in enumerate([(ANNA, "anna"), (BOB, "bob")])
+    ]  # fmt: skip
+    assert found["quarantined"] == [{"name": "000001.mcap", "bytes": 100}]
+    assert contents(state) == before
+
+
+def test_info_says_it_to_a_person(state: Path, run: Run) -> None:
+    folder = state / "maps" / "hall" / "journal"
+    damage(folder, 1, 1)
+    leave_open(folder)
+    status, out, _ = run("info", state)
+    assert status == 0
+    for text in (
+        "4, ",
+        "1 keyframe lost",
+        "closed",
+        "open",
+        "damaged",
+        "anna",
+        "bob",
+        "1…2",
+        "2001-09-09",
+        "quarantine",
+    ):
+        assert text in out, text
+    assert "torn" in out
+
+
+# --- verify ---
+
+
+def test_a_whole_journal_is_intact(state: Path, run: Run) -> None:
+    before = contents(state)
+    status, out, _ = run("verify", state)
+    assert (status, "6 keyframes in " in out, "intact" in out) == (0, True, True)
+    assert contents(state) == before
+
+
+def test_a_torn_tail_is_told_and_is_no_damage(state: Path, run: Run) -> None:
+    leave_open(state / "maps" / "hall" / "journal")
+    status, out, _ = run("verify", state, "--json")
+    verdict = json.loads(out)
+    assert (status, verdict["intact"], verdict["keyframes"], verdict["lost"]) == (0, True, 5, 0)
+    assert [one["kind"] for one in verdict["problems"]] == ["torn"]
+
+
+def test_each_damaged_place_is_named(state: Path, run: Run) -> None:
+    folder = state / "maps" / "hall" / "journal"
+    offset = damage(folder, 1, 1)
+    status, out, _ = run("verify", state, "--json")
+    verdict = json.loads(out)
+    assert (status, verdict["intact"], verdict["lost"]) == (1, False, 1)
+    (found,) = verdict["problems"]
+    assert (found["kind"], found["segment"], found["offset"], found["lost"]) == (
+        "damage",
+        "000001.mcap",
+        offset,
+        1,
+    )
+    status, out, _ = run("verify", state)
+    assert status == 1
+    assert f"damage  000001.mcap, byte {offset}: keyframe 1 of session" in out
+
+
+def one_by_one(folder: Path, messages: list[tuple[bytes, int, list[bytes]]]) -> None:
+    log = Journal(folder, 1 << 30, sync=False)
+    for session, seq, frames in messages:
+        log.append(frames, session=session, seq=seq)
+    log.close()
+
+
+def encoded(i: int, session: bytes = ANNA) -> list[bytes]:
+    return codec.encode(wall(i), session=session, seq=i, jpeg_quality=90)
+
+
+@pytest.mark.parametrize(
+    ("messages", "status", "what"),
+    [
+        ([(ANNA, 1, encoded(1)), (ANNA, 1, encoded(1))], 0, "a second time"),
+        ([(ANNA, 2, encoded(2)), (ANNA, 1, encoded(1))], 1, "comes after 2"),
+        ([(ANNA, 1, encoded(1)), (ANNA, 2, [b"no", b"keyframe"])], 1, "is no keyframe"),
+        ([(ANNA, 1, encoded(1)), (ANNA, 2, [])], 1, "is no keyframe"),
+        ([(ANNA, 1, encoded(1)), (ANNA, 2, encoded(3))], 1, "says of itself that it is 3"),
+        ([(ANNA, 1, encoded(1)), (BOB, 1, encoded(1))], 1, "says of itself"),
+        ([(ANNA, 1, encoded(1)), (ANNA, 2, [*encoded(2)[:-1], bytes(5)])], 1, "announced with"),
+    ],
+)
+def test_what_a_crc_does_not_see_is_found(
+    tmp_path: Path, run: Run, messages: list[Any], status: int, what: str
+) -> None:
+    one_by_one(tmp_path / "journal", messages)
+    done = run("verify", tmp_path)
+    assert (done[0], what in done[1]) == (status, True), done
+
+
+def test_a_missing_segment_is_noted(tmp_path: Path, run: Run) -> None:
+    fill(tmp_path / "journal")
+    segment_path(tmp_path / "journal", 2).unlink()
+    status, out, _ = run("verify", tmp_path)
+    assert (status, "1 numbers before this one have no file" in out) == (0, True)
+
+
+def test_a_file_that_cannot_be_read_does_not_hide_the_others(tmp_path: Path, run: Run) -> None:
+    folder = fill(tmp_path / "journal")
+    segment_path(folder, 2).unlink()
+    segment_path(folder, 2).mkdir()
+    status, out, _ = run("verify", tmp_path, "--json")
+    verdict = json.loads(out)
+    assert status == 1
+    assert verdict["keyframes"] > 2
+    assert "Is a directory" in verdict["problems"][0]["what"]
+
+
+# --- recover ---
+
+
+def test_what_is_whole_is_saved_in_order_into_closed_segments(state: Path, tmp_path: Path, run: Run) -> None:
+    folder = state / "maps" / "hall" / "journal"
+    damage(folder, 1, 1)
+    leave_open(folder)
+    before = contents(state)
+    whole = [
+        one for number in journal.segments(folder) for one in journal.records(segment_path(folder, number))
+    ]
+    status, out, _ = run("recover", state, tmp_path / "saved", "--json")
+    done = json.loads(out)
+    assert (status, done["keyframes"], done["lost"], done["copies"]) == (1, 4, 1, 0)
+    assert sorted(one["kind"] for one in done["problems"]) == ["damage", "torn"]
+    saved = [one for path in find(tmp_path / "saved").files() for one in journal.records(path)]
+    for old, new in zip(whole, saved, strict=True):
+        assert (old.session, old.seq, old.client, old.logged_ns) == (
+            new.session,
+            new.seq,
+            new.client,
+            new.logged_ns,
+        )
+        assert [bytes(frame) for frame in old.frames] == [bytes(frame) for frame in new.frames]
+    for path in find(tmp_path / "saved").files():
+        with path.open("rb") as file:
+            assert list(make_reader(file, validate_crcs=True).iter_messages())
+    assert run("verify", tmp_path / "saved")[0] == 0
+    keyframe = next(iter(Recording(tmp_path / "saved")))
+    assert np.array_equal(keyframe.depth, wall(1).depth)
+    assert contents(state) == before
+
+
+def test_a_whole_journal_is_saved_with_status_0_also_into_an_empty_folder(tmp_path: Path, run: Run) -> None:
+    fill(tmp_path / "journal")
+    (tmp_path / "saved").mkdir()
+    status, out, _ = run("recover", tmp_path / "journal", tmp_path / "saved")
+    assert (status, "6 keyframes" in out, "no keyframe is lost" in out) == (0, True, True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["journal", "saved"]
+
+
+def test_a_keyframe_that_stands_there_twice_is_saved_once(tmp_path: Path, run: Run) -> None:
+    one_by_one(tmp_path / "journal", [(ANNA, 1, encoded(1)), (ANNA, 1, encoded(1)), (ANNA, 2, encoded(2))])
+    status, out, _ = run("recover", tmp_path, tmp_path / "saved", "--json")
+    done = json.loads(out)
+    assert (status, done["keyframes"], done["copies"]) == (0, 2, 1)
+
+
+def test_nothing_is_written_over_or_into_the_source(state: Path, tmp_path: Path, run: Run) -> None:
+    folder = state / "maps" / "hall" / "journal"
+    before = contents(state)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine").write_text("mine")
+    for out, message in (
+        (tmp_path / "full", "it is not empty"),
+        (folder, "it is not empty"),
+        (folder / "saved", "inside the journal that is read"),
+        (segment_path(folder, 1), "inside the journal that is read"),
+    ):
+        status, _, err = run("recover", folder, out)
+        assert (status, message in err) == (1, True), err
+    assert contents(state) == before
+    assert contents(tmp_path / "full") == {"mine": b"mine"}
+
+
+def test_where_nothing_can_be_saved_nothing_is_made(tmp_path: Path, run: Run) -> None:
+    fill(tmp_path / "journal", 1)
+    damage(tmp_path / "journal", 1, 1)
+    status, _, err = run("recover", tmp_path, tmp_path / "saved")
+    assert (status, "no keyframe that could be saved" in err) == (1, True)
+    assert not (tmp_path / "saved").exists()
+
+
+def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
+    folder = tmp_path / "journal"
+    log = Journal(folder, 64 << 20, sync=False)
+    for seq in range(1, 400):
+        log.append([b"head", bytes(1 << 20)], session=ANNA, seq=seq)
+    log.close()
+    process = started("journal", "recover", folder, tmp_path / "saved")
+    deadline = time.monotonic() + 60
+    while not any(tmp_path.glob(".saved.partial-*/*.mcap")) and process.poll() is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    status = end(process, signal.SIGINT)
+    left = sorted(path.name for path in tmp_path.iterdir())
+    assert (status, left) in ((130, ["journal"]), (0, ["journal", "saved"]))  # it may have been quicker
+
+
+# --- all of them ---
+
+
+def test_every_verb_has_a_help_that_teaches() -> None:
+    for verb in ("info", "verify", "recover", "export"):
+        text = tsfusion("journal", verb, "--help").stdout
+        assert "xit status" in text
+        assert "--json" in text
+
+
+def test_export_is_one_file_with_every_topic(state: Path, tmp_path: Path, run: Run) -> None:
+    pytest.importorskip("rosbags")
+    status, out, _ = run("export", state, tmp_path / "out.mcap")
+    assert status == 0
+    assert "/anna/depth/image  3" in out
+    assert "/bob/color/image/compressed  3" in out
+    damage(state / "maps" / "hall" / "journal", 1, 1)
+    status, out, _ = run("export", state, tmp_path / "out.mcap", "--json")
+    assert (status, json.loads(out)["lost"]) == (1, 1)
+    shutil.rmtree(state / "maps" / "hall" / "journal")
+    (state / "maps" / "hall" / "journal").mkdir()
+    status, _, err = run("export", state, tmp_path / "other.mcap")
+    assert (status, "no keyframes in" in err) == (1, True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out.mcap", "state"]

@@ -1,0 +1,331 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion status`: what it shows, and the exit status that tells a health check."""
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import msgspec
+import pytest
+from command_processes import COMMAND, DEADLINE, end, environment, read_until, started, tsfusion
+from fake_server import saying, serving, status
+from health_snapshots import client, health, map_health
+from rich.console import Console
+
+from tsfusion.cli import main
+from tsfusion.cli.health_poll import Look
+from tsfusion.cli.status_view import MAX_CLIENTS, render
+from tsfusion.core.errors import TransportError
+from tsfusion.wire.health import Health
+from tsfusion.wire.messages import Command, Reply
+
+NOBODY = "tcp://127.0.0.1:9"
+Asking = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+def shown(look: Look, width: int = 160) -> str:
+    """The screen, as text."""
+    console = Console(width=width, highlight=False)
+    with console.capture() as captured:
+        console.print(render(look))
+    return captured.get()
+
+
+@pytest.fixture
+def asking(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Asking]:
+    """The command, asking at a control address; in this process, which is quicker."""
+    for name in [name for name in os.environ if name.startswith("TSFUSION_")]:
+        monkeypatch.delenv(name)
+    handler = signal.getsignal(signal.SIGTERM)
+
+    def ask(control: str, *more: object) -> "subprocess.CompletedProcess[str]":
+        words = ["status", "--connect", NOBODY, "--control", control, *map(str, more)]
+        with pytest.raises(SystemExit) as exit_status:
+            main(words)
+        said = capsys.readouterr()
+        assert isinstance(exit_status.value.code, int)
+        return subprocess.CompletedProcess(words, exit_status.value.code, said.out, said.err)
+
+    yield ask
+    signal.signal(signal.SIGTERM, handler)
+
+
+def test_a_screen_shows_corrections_where_there_are_any() -> None:
+    told = health(client("cart", revision=3, corrected=120), client("drone"))
+    lines = [line.split() for line in shown(Look(address="tcp://host:5555", health=told)).splitlines()]
+    assert next(words[-1] for words in lines if words[:1] == ["client"]) == "corrected"
+    assert next(words[-1] for words in lines if words[:1] == ["cart"]) == "120"
+    assert "corrected" not in shown(Look(address="tcp://host:5555", health=health(client("drone"))))
+
+
+def test_a_screen_shows_it_all() -> None:
+    yard = map_health(
+        state="busy", keyframes_durable=1204, keyframes_fused=1191, waiting=12, fuser_restarts=2,
+        rejected={"MapFull": 1},
+    )  # fmt: skip
+    told = health(
+        client("cart", waiting=12, skipped={"thinned": 31}, held="disk", map="yard"),
+        client("", heard_s=7.5),
+        ready=False, problems=("map yard: the disk is full",), refused={"gap": 3, "header": 1}, duplicates=9,
+        maps={"yard": yard, "shed": map_health(state="restarting", last_keyframe_s=None, rejected={})},
+    )  # fmt: skip
+    look = Look(
+        address="tcp://host:5555", health=told, maps={"yard": status(map="yard")},
+        unavailable={"shed": "the fuser restarts; ask again"},
+    )  # fmt: skip
+    for width in (80, 160):
+        text = shown(look, width)
+        lines = [" ".join(line.split()) for line in text.splitlines()]
+        assert lines[0] == "✗ map yard: the disk is full"
+        assert "tcp://host:5555 not ready up 1 h 2 min, gateway 62.9 MB, 9 duplicates" in lines
+        assert "yard busy 1191/1204 12 21/28/61 ±0.5 1234 10.5 MB 3.15 MB 2.0 s" in lines
+        assert "shed restarting 5/6 0 21/28/61 ±0.5 1234 10.5 MB 3.15 MB –" in lines
+        assert "cart 1a2b3c4d yard 6/6 3.15 MB 12 0.2 s disk 31 × thinned" in lines
+        assert "- 1a2b3c4d default 6/6 3.15 MB 0 7.5 s" in lines
+        assert "refused messages: 3 × gap, 1 × header" in lines
+    assert "map yard: 1 quarantined, 2 × the fuser restarted, rejected: 1 × MapFull" in text
+    assert f"map yard: hash {'1f' * 16}, voxel_size 0.04, sensor kinect, fuser 2 B at most" in text
+    assert "map shed: hash and settings are not known now: the fuser restarts; ask again" in text
+
+
+def test_a_server_that_is_well_says_little() -> None:
+    look = Look(
+        address="tcp://host:5555", health=health(maps={"default": map_health(rejected={}, quarantined=0)})
+    )
+    text = shown(look)
+    assert "ready" in text
+    assert not any(word in text for word in ("✗", "refused", "client", "duplicates", "quarantined", "not"))
+
+
+def test_nothing_that_peers_say_commands_the_terminal() -> None:
+    evil = "\x1b[2J[red]\n\x07\u202e"
+    told = health(
+        client("x", skipped={evil: 1}, held=evil), problems=(evil,), refused={evil: 1},
+        maps={"default": map_health(problem=evil, rejected={evil: 1})},
+    )  # fmt: skip
+    text = shown(Look(address="tcp://host:5555", health=told, unavailable={"default": evil}))
+    assert all(line.isprintable() for line in text.splitlines())
+    assert text.count("[red]") == 6
+
+
+def test_many_clients_are_cut_short() -> None:
+    told = health(*(client(f"robot{i}", heard_s=1000 - i) for i in range(500)))
+    text = shown(Look(address="tcp://host:5555", health=told))
+    assert "robot499 " in text
+    assert "robot0 " not in text
+    assert f"and {500 - MAX_CLIENTS} more sessions" in text
+    only = shown(
+        Look(address="x", health=health(client("a", map="yard"), client("b", map="shed")), only="shed")
+    )
+    assert "b " in only
+    assert "yard" not in only
+
+
+def test_ready_is_0(asking: Asking) -> None:
+    with serving(saying(health(client("cart")))) as (control, asked):
+        done = asking(control, "--json")
+        assert done.returncode == 0, done.stderr
+        told = json.loads(done.stdout)
+        assert msgspec.convert(told["health"], Health) == health(client("cart"))
+        assert told["maps"]["default"]["map_hash"] == "1f" * 16
+        assert (told["unavailable"], told["stalled"], told["exit_status"]) == ({}, [], 0)
+        plain = asking(control)
+        assert plain.returncode == 0
+        assert "\x1b" not in plain.stdout
+        assert "cart" in plain.stdout
+        assert {command.name for command in asked} == {"health", "status"}
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        (health(ready=False), "not ready"),
+        (health(ready=False, problems=("map yard: the disk is full",)), "✗ map yard: the disk is full"),
+    ],
+)
+def test_not_ready_is_3(told: Health, words: str, asking: Asking) -> None:
+    with serving(saying(told)) as (control, _):
+        done = asking(control)
+        assert (done.returncode, done.stderr) == (3, "")
+        assert words in done.stdout
+        assert json.loads(asking(control, "--json").stdout)["exit_status"] == 3
+
+
+def test_nobody_is_1(asking: Asking) -> None:
+    with serving(lambda command: None) as (control, _):
+        done = asking(control, "--timeout", 0.3, "--json")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == f"tsfusion: no server answered at {control} within 0.3 s\n"
+
+
+def test_one_that_knows_no_health_is_1(asking: Asking) -> None:
+    with serving(lambda command: Reply(name="health", status=status())) as (control, _):
+        done = asking(control)
+    assert done.returncode == 1
+    assert "does not tell its health" in done.stderr
+
+
+def test_a_fuser_that_restarts_is_said_and_no_failure(asking: Asking) -> None:
+    with serving(saying(health(), error="the fuser restarts; ask again")) as (control, _):
+        done = asking(control, "--json")
+        assert done.returncode == 0
+        told = json.loads(done.stdout)
+        assert (told["maps"], told["unavailable"]) == ({}, {"default": "the fuser restarts; ask again"})
+        assert (
+            "map default: hash and settings are not known now: the fuser restarts" in asking(control).stdout
+        )
+
+
+def test_a_fuser_that_is_stuck_is_said_in_time(asking: Asking) -> None:
+    def answer(command: Command) -> Reply | None:
+        return Reply(name="health", health=health()) if command.name == "health" else None
+
+    with serving(answer) as (control, _):
+        done = asking(control, "--timeout", 0.5)
+    assert done.returncode == 0
+    assert "its fuser did not answer within 0." in done.stdout
+
+
+def waiting(fused: int) -> Health:
+    return health(
+        maps={"yard": map_health(state="busy", waiting=3, keyframes_fused=fused), "shed": map_health()}
+    )
+
+
+def test_stalled_is_3(asking: Asking) -> None:
+    with serving(saying(waiting(5))) as (control, asked):
+        done = asking(control, "--stall-after", 0.6, "--json")
+        assert done.returncode == 3
+        assert json.loads(done.stdout)["stalled"] == ["yard"]
+        assert (
+            "✗ map yard: 3 keyframes wait, and none was fused for 1 s"
+            in asking(control, "--stall-after", 0.6).stdout
+        )
+        assert asking(control, "--stall-after", 60, "--map", "shed").returncode == 0
+    assert len([command for command in asked if command.name == "health"]) > 4
+
+
+def test_slow_is_not_stalled(asking: Asking) -> None:
+    looks = iter(range(1000))
+    with serving(saying(lambda: waiting(next(looks) // 3))) as (control, asked):
+        assert asking(control, "--stall-after", 60).returncode == 0
+    assert len([command for command in asked if command.name == "health"]) == 4
+
+
+def test_one_map_is_judged_by_itself(asking: Asking) -> None:
+    maps = {"yard": map_health(state="failed", problem="broken"), "shed": map_health()}
+    told = health(ready=False, problems=("map yard: broken",), maps=maps)
+    with serving(saying(told)) as (control, asked):
+        assert asking(control, "--map", "shed").returncode == 0
+        assert {command.map for command in asked if command.name == "status"} == {"shed"}
+        assert asking(control, "--map", "yard").returncode == 3
+        done = asking(control, "--map", "attic")
+        assert done.returncode == 3
+        assert "✗ no map attic is open here, but yard, shed" in done.stdout
+        told_of = json.loads(asking(control, "--map", "attic", "--json").stdout)
+        assert told_of["maps"] == {}
+
+
+def test_watching_prints_a_line_each_time_and_ends_with_the_server(asking: Asking) -> None:
+    counts = iter(range(3))
+
+    def answer(command: Command) -> Reply | None:
+        return (
+            saying(health())(command) if command.name != "health" or next(counts, None) is not None else None
+        )
+
+    with serving(answer) as (control, asked):
+        done = asking(control, "--watch", 0.1, "--json", "--timeout", 0.5)
+    assert done.returncode == 1
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [line["exit_status"] for line in lines] == [0, 0, 0]
+    assert [command.name for command in asked].count("status") == 1, "nothing changed: its fuser is let be"
+    assert "no server answered" in done.stderr
+
+
+@pytest.mark.parametrize("told", [waiting(5), health(ready=False)])
+def test_watching_ends_when_nothing_gets_well(told: Health, asking: Asking) -> None:
+    with serving(saying(told)) as (control, _):
+        done = asking(control, "--watch", 0.1, "--stall-after", 0.5)
+    assert done.returncode == 3
+    assert done.stdout.count("gateway 62.9 MB") > 1
+
+
+def test_a_pause_does_not_end_watching() -> None:
+    looks = iter(range(1_000_000))
+    with serving(saying(lambda: health(ready=next(looks) % 4 == 0))) as (control, _):
+        process = started(
+            "status", "--connect", NOBODY, "--control", control, "--watch", 0.1, "--stall-after", 5, "--json"
+        )
+        try:
+            for _ in range(12):
+                read_until(process, "exit_status")
+        finally:
+            code = end(process, signal.SIGINT)
+    assert code == 130
+
+
+@pytest.mark.parametrize("arguments", [["--watch", "0"], ["--stall-after", "0"], ["--timeout", "x"]])
+def test_wrong_usage_is_2(arguments: list[str]) -> None:
+    assert tsfusion("status", *arguments).returncode == 2
+
+
+def test_help_tells_the_exit_statuses() -> None:
+    text = " ".join(tsfusion("status", "--help").stdout.split())
+    assert "0 = ready; 1 = nobody answers; 2 = wrong usage; 3 = it answers, but is not ready" in text
+
+
+def test_a_terminal_is_redrawn_until_ctrl_c_whatever_becomes_of_the_server() -> None:
+    gone: list[bool] = []
+    answer = saying(health(client("cart")))
+    with serving(lambda command: None if gone else answer(command)) as (control, _):
+        leader, follower = pty.openpty()
+        command = ["status", "--connect", NOBODY, "--control", control, "--watch", "0.1", "--timeout", "0.3"]
+        process = subprocess.Popen(
+            [*COMMAND, *command], stdin=follower, stdout=follower, stderr=follower, start_new_session=True,
+            env={**environment(), "TERM": "xterm", "COLUMNS": "100"},
+        )  # fmt: skip
+        os.close(follower)
+        try:
+            seen = _read_terminal(leader, lambda text: text.count("cart") >= 3)
+            assert "\x1b[" in seen
+            gone.append(True)
+            _read_terminal(leader, lambda text: text.count("no server answered") >= 2)
+            gone.clear()
+            _read_terminal(leader, lambda text: "cart" in text)
+            process.send_signal(signal.SIGINT)
+            rest = _read_terminal(leader, lambda text: "interrupted" in text)
+            assert "\x1b[?25h" in rest, "the cursor is back"
+            assert process.wait(DEADLINE) == 130
+        finally:
+            process.kill()
+            process.wait()
+            os.close(leader)
+
+
+def _read_terminal(leader: int, enough: Callable[[str], bool]) -> str:
+    text = ""
+    deadline = time.monotonic() + DEADLINE
+    while not enough(text):
+        assert time.monotonic() < deadline, text
+        text += os.read(leader, 65536).decode(errors="replace")
+    return text
+
+
+def test_help_needs_none_of_it() -> None:
+    program = (
+        "import sys, tsfusion.cli.status; "
+        "sys.exit(', '.join({'zmq', 'rich.table', 'msgspec', 'numpy'} & set(sys.modules)) or 0)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+
+
+def test_errors_stay_errors() -> None:
+    look: Any = Look(address="tcp://host:5555", error=str(TransportError("no server\x1b[2J answered")))
+    assert shown(look) == "✗ no server\\x1b[2J answered\n"

@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: MIT
+"""Whole runs of the `tsfusion` command: processes, sockets and files as users have them."""
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from command_processes import alive, descendants, end, eventually, read_until, server, started, tsfusion
+
+from tsfusion import Client, FlushTimeout, Keyframe, Volume, VolumeConfig
+from tsfusion.core.output_folder import building
+from tsfusion.datasets import Synthetic
+
+RESULTS = {"mesh.ply", "mesh.glb", "preview.png", "delay.csv", "delay.png", "run.json"}
+VOXEL = 0.08
+
+
+def room(count: int) -> list[Keyframe]:
+    """The first keyframes of the synthetic room of 40."""
+    return [Synthetic("room", count=40)[index] for index in range(count)]
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A replay of six keyframes, with its state kept."""
+    folder = tmp_path_factory.mktemp("run")
+    (folder / "out").mkdir()
+    (folder / "out" / "notes.txt").write_text("mine")
+    done = tsfusion(
+        "replay", "synthetic:room", "--max-keyframes", 6, "--voxel-size", VOXEL, "--state", folder / "state",
+        "--rate", 10, "--out", folder / "out", "--json",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    (folder / "stdout.json").write_text(done.stdout)
+    return folder
+
+
+def test_replay_leaves_everything(run_folder: Path) -> None:
+    out = run_folder / "out"
+    assert {path.name for path in out.iterdir()} == RESULTS | {"notes.txt"}
+    assert (out / "notes.txt").read_text() == "mine"
+    run = json.loads((out / "run.json").read_text())
+    assert run == json.loads((run_folder / "stdout.json").read_text())
+    assert (run["keyframes_sent"], run["keyframes_fused"], run["keyframes_rejected"]) == (6, 6, {})
+    assert set(run["delay_ms"]) >= {"mean", "p50", "p95", "p99", "max"}
+    assert 0 < run["delay_ms"]["mean"] <= run["delay_ms"]["max"]
+    assert "delay_slope_ms_per_keyframe" in run
+    assert min(run["peak_rss_bytes"][name] for name in ("server", "client")) > 1 << 20
+    assert run["config"]["volume"]["voxel_size"] == VOXEL
+    assert {"tsfusion", "python", "taichi"} <= set(run["versions"])
+    mesh = trimesh.load(out / "mesh.ply", process=False)
+    assert (len(mesh.vertices), len(mesh.faces)) == (run["mesh"]["vertices"], run["mesh"]["triangles"])
+    assert cv2.imread(str(out / "preview.png")).std() > 5
+    with (out / "delay.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 6
+    assert all(float(row["delay_ms"]) > 0 for row in rows)
+
+
+def test_replay_over_sockets_is_the_map_of_the_library(run_folder: Path) -> None:
+    volume = Volume(voxel_size=VOXEL, threads=1)
+    for keyframe in reversed(room(6)):
+        volume.integrate(keyframe)
+    run = json.loads((run_folder / "out" / "run.json").read_text())
+    assert run["map_hash"] == volume.map_hash()
+
+
+@pytest.mark.slow
+def test_a_journal_replays_to_the_same_map(run_folder: Path, tmp_path: Path) -> None:
+    done = tsfusion(
+        "replay", run_folder / "state", "--voxel-size", VOXEL, "--out", tmp_path / "again", "--json"
+    )
+    assert done.returncode == 0, done.stderr
+    first = json.loads((run_folder / "out" / "run.json").read_text())
+    assert json.loads(done.stdout)["map_hash"] == first["map_hash"]
+    assert {path.name for path in (tmp_path / "again").iterdir()} == RESULTS
+    assert (tmp_path / "again").stat().st_mode & 0o777 == 0o777 & ~_umask()
+
+
+def slow_replay(out: Path) -> "subprocess.Popen[str]":
+    """A replay that takes 80 s if nobody ends it."""
+    return started("replay", "synthetic:room", "--rate", 0.5, "--voxel-size", VOXEL, "--out", out)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+@pytest.mark.slow
+def test_mesh_of_map_state_and_journal_agree(run_folder: Path, tmp_path: Path) -> None:
+    vertices = set()
+    state = run_folder / "state"
+    for index, source in enumerate(
+        ([state / "maps/default/map.tsf"], [state], [state / "maps/default/journal", "--voxel-size", VOXEL])
+    ):
+        done = tsfusion("mesh", source[0], tmp_path / f"{index}.ply", *source[1:], "--json")
+        assert done.returncode == 0, done.stderr
+        vertices.add(json.loads(done.stdout)["vertices"])
+        vertices.add(len(trimesh.load(tmp_path / f"{index}.ply", process=False).vertices))
+    assert len(vertices) == 1
+    assert vertices.pop() > 100
+
+
+@pytest.mark.slow
+def test_mesh_fuses_what_the_checkpoint_missed(run_folder: Path, tmp_path: Path) -> None:
+    """A state folder whose map is older than its journal, as a killed server leaves it."""
+    shutil.copytree(run_folder / "state/maps/default/journal", tmp_path / "state/maps/default/journal")
+    volume = Volume(voxel_size=VOXEL)
+    volume.integrate(room(1)[0])
+    volume.save(tmp_path / "state/maps/default/map.tsf")
+    done = tsfusion("mesh", tmp_path / "state", tmp_path / "a.glb", "--preview", tmp_path / "a.png")
+    assert done.returncode == 0, done.stderr
+    run = json.loads((run_folder / "out" / "run.json").read_text())
+    assert f"{run['mesh']['vertices']:,}".replace(",", "\u202f") in done.stdout
+    assert cv2.imread(str(tmp_path / "a.png")).std() > 5
+
+
+def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
+    with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, process):
+        with Client(address, spool=tmp_path / "spool") as client:
+            for keyframe in room(2):
+                client.send(keyframe)
+            client.flush(timeout=30)
+            client.wait_fused(timeout=30)
+        status = json.loads(tsfusion("status", "--connect", address, "--json").stdout)["maps"]["default"]
+        assert (status["keyframes_durable"], status["keyframes_fused"]) == (2, 2)
+        assert status["blocks"] > 10
+        assert len(status["map_hash"]) == 32
+        assert " 2/2 " in tsfusion("status", "--connect", address).stdout
+        done = tsfusion("mesh", address, tmp_path / "live.obj", "--min-weight", 0.5)
+        assert done.returncode == 0, done.stderr
+        done = tsfusion(
+            "replay", "synthetic:room", "--start", 2, "--max-keyframes", 1, "--connect", address,
+            "--out", tmp_path / "more", "--json",
+        )  # fmt: skip
+        assert json.loads(done.stdout)["keyframes_fused"] == 1, done.stderr
+        assert end(process) == 0
+    assert Volume.load(tmp_path / "state/maps/default/map.tsf").keyframes == 3
+
+
+def test_a_server_that_fell_silent_is_not_called_slow(tmp_path: Path) -> None:
+    with (
+        server(tmp_path / "state", "--voxel-size", VOXEL) as (address, process),
+        Client(address, spool=tmp_path / "spool") as client,
+    ):
+        client.connect()
+        process.send_signal(signal.SIGSTOP)
+        try:
+            client.send(room(1)[0])
+            heard = r"nothing was heard from the server at tcp://\S+ for [12]\.\d s; they stay in .*spool"
+            with pytest.raises(FlushTimeout, match=heard):
+                client.flush(timeout=1.5)
+        finally:
+            process.send_signal(signal.SIGCONT)
+        client.flush(timeout=30)
+
+
+@pytest.mark.slow
+def test_ready_line_is_for_people_too(tmp_path: Path) -> None:
+    process = started("serve", "--listen", "tcp://127.0.0.1:0", "--state", tmp_path / "state")
+    try:
+        line = read_until(process, "ready")
+        assert "ready in" in line
+        assert line.count("tcp://127.0.0.1:") == 3
+    finally:
+        status = end(process, signal.SIGINT)
+    assert status == 0
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+@pytest.mark.parametrize(
+    ("number", "word"),
+    [(signal.SIGINT, "interrupted"), pytest.param(signal.SIGTERM, "terminated", marks=pytest.mark.slow)],
+)
+def test_interrupted_replay_leaves_nothing(number: signal.Signals, word: str, tmp_path: Path) -> None:
+    process = slow_replay(tmp_path / "new" / "out")
+    read_until(process, "scanning")
+    below = descendants(process.pid)
+    assert len(below) == 2  # gateway and fuser
+    process.send_signal(number)
+    said = process.communicate(timeout=60)[0]
+    assert process.returncode == 128 + number
+    assert said.strip().splitlines()[-1] == f"tsfusion: {word}"
+    assert eventually(lambda: not any(map(alive, below)))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_a_killed_replay_takes_its_server_along(tmp_path: Path) -> None:
+    process = slow_replay(tmp_path / "out")
+    read_until(process, "scanning")
+    below = descendants(process.pid)
+    end(process, signal.SIGKILL)
+    assert eventually(lambda: not any(map(alive, below)))
+    assert not (tmp_path / "out").exists()
+    assert len(list(tmp_path.iterdir())) == 1
+    with building(tmp_path / "out"):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_a_replay_whose_server_dies_says_so(tmp_path: Path) -> None:
+    process = slow_replay(tmp_path / "out")
+    read_until(process, "scanning")
+    gateway, fuser = descendants(process.pid)
+    os.kill(gateway, signal.SIGKILL)
+    assert "the server ended with status -9" in read_until(process, "tsfusion:")
+    assert process.wait(60) == 1
+    end(process)
+    assert eventually(lambda: not alive(fuser))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_replay_without_a_surface_says_so(tmp_path: Path) -> None:
+    done = tsfusion(
+        "replay", "synthetic:room", "--max-keyframes", 1, "--min-weight", 1000, "--out", tmp_path / "out"
+    )
+    assert done.returncode == 1
+    assert "tsfusion: the map has no surface to write: 1 of 1 keyframes fused" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_demo(tmp_path: Path) -> None:
+    done = tsfusion("demo", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert run["keyframes_fused"] == 90
+    assert run["mesh"]["vertices"] > 160_000  # the path shows all of the room
+    assert run["accuracy"]["mean_mm"] < 2
+    assert run["delay_ms"]["mean"] < 500
+    assert "from the known surface" in done.stdout
+
+
+@pytest.mark.slow
+def test_red_kitchen(data, tmp_path: Path) -> None:
+    done = tsfusion(
+        "replay", data("7scenes/redkitchen"), "--voxel-size", 0.02, "--rate", 4, "--out", tmp_path, "--json",
+        timeout=300,
+    )  # fmt: skip
+    run = json.loads(done.stdout)
+    assert (run["keyframes_sent"], run["keyframes_fused"]) == (125, 125)
+    assert run["delay_ms"]["mean"] < 500
+    assert abs(run["delay_slope_ms_per_keyframe"]) < 1
+    image = cv2.imread(str(tmp_path / "preview.png"))
+    assert np.count_nonzero(image.std(axis=2) > 3) > 0.2 * image.shape[0] * image.shape[1]
+    assert run["config"]["volume"]["sensor"] == VolumeConfig().sensor

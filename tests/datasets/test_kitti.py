@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: MIT
+"""KITTI odometry: geometry of the real pairs and scans, the stereo matcher, pykitti's traps."""
+
+import contextlib
+import shutil
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from geometry_checks import warp_residual
+from small_recordings import P0, P1, TR, kitti
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets import KITTI, open_dataset
+from tsfusion.evaluation.view_prediction import depth_metres, points_world
+from tsfusion.geometry.stereo_matching import Matcher
+
+scipy_spatial = pytest.importorskip("scipy.spatial")
+
+
+def test_stereo_depth_of_one_pair_lands_on_the_next(data):
+    dataset = KITTI(data("kitti_odometry"), "06")
+    a, b = dataset[5], dataset[6]
+    residual = warp_residual(a, b, max_depth=15)
+    inverse = warp_residual(a, b, T_b_a=b.T_world_camera @ np.linalg.inv(a.T_world_camera), max_depth=15)
+    assert residual < 0.065
+    assert inverse > 4 * residual
+    assert a.baseline_fx == pytest.approx(379.8145)
+    assert (a.disparity > 0).mean() > 0.65
+    assert a.color.shape == (370, 1226, 3)
+
+
+def test_the_road_is_flat_and_at_the_height_of_the_car(data):
+    keyframe = KITTI(data("kitti_odometry"), "06", color=False)[0]
+    z, K = depth_metres(keyframe)[310:365, 500:760], keyframe.intrinsics
+    height = ((np.arange(310, 365)[:, None] - K.cy) / K.fy * z)[z > 0]
+    assert (z > 0).mean() > 0.95
+    assert 1.4 < np.median(height) < 1.75  # the benchmark's cameras are nominally 1.65 m up
+    assert np.percentile(height, 95) - np.percentile(height, 5) < 0.08
+
+
+def test_velodyne_scans_meet_with_the_slam_poses_and_not_with_the_bad_ground_truth(data):
+    scans = KITTI(data("kitti_odometry"), "00", "lidar", poses="poses_estimated/00_ORB.txt")
+    a, b = scans[0], scans[1]
+    assert a.points.shape == (124668, 3)
+    above_ground = np.flatnonzero(a.points[:, 2] > -1.4)[::12]
+    tree = scipy_spatial.cKDTree(points_world(b))
+    apart = np.median(tree.query(points_world(a)[above_ground])[0])
+    assert apart < 0.055
+    truth = KITTI(data("kitti_odometry"), "00", "lidar")
+    bad = np.median(
+        scipy_spatial.cKDTree(points_world(truth[1])).query(points_world(truth[0])[above_ground])[0]
+    )
+    assert bad > 1.3 * apart
+
+
+def test_numbers_agree_with_pykittis_own(data):
+    root = data("kitti_odometry")
+    import pykitti
+
+    with contextlib.redirect_stdout(None):
+        theirs = pykitti.odometry(str(root), "06", frames=range(30))
+    ours = KITTI(root, "06", color=False)
+    K = ours.intrinsics
+    np.testing.assert_allclose(K.matrix, theirs.calib.K_cam0)
+    assert ours.baseline_fx / K.fx == pytest.approx(theirs.calib.b_gray)
+    np.testing.assert_allclose(ours._poses, theirs.poses, atol=2e-6)
+    seconds = [stamp.total_seconds() for stamp in theirs.timestamps]
+    np.testing.assert_allclose(ours.timestamps_ns / 1e9, seconds, atol=1e-6)
+    scan = KITTI(root, "00", "lidar")
+    with contextlib.redirect_stdout(None):
+        T = pykitti.odometry(str(root), "00", frames=range(6)).calib.T_cam0_velo
+    first = np.loadtxt(root / "poses" / "00.txt")[3].reshape(3, 4)
+    expected = np.linalg.inv(T) @ np.vstack([first, (0, 0, 0, 1)]) @ T
+    np.testing.assert_allclose(scan[3].T_world_camera, expected, atol=2e-5)
+
+
+def test_a_tiny_sequence_in_both_modalities(tmp_path):
+    root = kitti(tmp_path)
+    stereo, lidar = open_dataset(root), open_dataset(root, modality="lidar")
+    assert (stereo.name, lidar.name) == ("KITTI 06 stereo", "KITTI 06 lidar")
+    keyframe = stereo[2]
+    found = keyframe.disparity[keyframe.disparity > 0]
+    assert len(found) > 0.7 * keyframe.disparity.size
+    assert np.median(found) == 8 * 16
+    assert np.median(depth_metres(keyframe)[keyframe.disparity > 0]) == pytest.approx(350 / 8)
+    assert keyframe.T_world_camera[2, 3] == 2
+    assert lidar[2].T_world_camera[:3, 3] == pytest.approx([2, 0, 0])  # forward is x for the scanner
+    assert list(stereo.timestamps_ns) == [0, 100_000_000, 200_000_000, 300_000_000]
+
+
+def test_a_pose_belongs_to_the_frame_of_its_line(tmp_path):
+    root = kitti(tmp_path)
+    for side in ("image_0", "image_1"):
+        (root / "sequences" / "06" / side / "000001.png").unlink()
+    dataset = KITTI(root, "06")
+    assert [keyframe.T_world_camera[2, 3] for keyframe in dataset] == [0, 2, 3]
+    assert list(dataset.timestamps_ns) == [0, 200_000_000, 300_000_000]
+
+
+def test_frames_beyond_the_poses_are_skipped_and_counted(tmp_path):
+    root = kitti(tmp_path)
+    (root / "poses" / "06.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3 + "\n")
+    dataset = KITTI(root, "06", "lidar")
+    assert (len(dataset), dataset.skipped) == (3, {"without a pose": 1})
+
+
+def test_calibration_without_tr_serves_stereo_only(tmp_path):
+    root = kitti(tmp_path)
+    (root / "sequences" / "06" / "calib.txt").write_text(f"P0: {P0}\nP1: {P1}\n")
+    assert len(KITTI(root, "06")) == 4
+    with pytest.raises(
+        DatasetError, match=r"calib\.txt has no line Tr; expected `Tr:` and 12 finite numbers"
+    ):
+        KITTI(root, "06", "lidar")
+
+
+def _chunk(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+HUGE = (
+    b"\x89PNG\r\n\x1a\n"
+    + _chunk(b"IHDR", struct.pack(">IIBBBBB", 20_000, 20_000, 8, 0, 0, 0, 0))
+    + _chunk(b"IDAT", zlib.compress(b""))
+    + _chunk(b"IEND", b"")
+)
+
+
+def _write(name: str, content: str | bytes | None):
+    def change(root: Path) -> None:
+        path = root / name
+        if content is None:
+            path.unlink()
+        else:
+            path.write_bytes(content.encode() if isinstance(content, str) else content)
+
+    return change
+
+
+SEQUENCE = "sequences/06"
+
+
+@pytest.mark.parametrize(
+    ("modality", "change", "match"),
+    [
+        (
+            "stereo",
+            _write(f"{SEQUENCE}/image_1/000002.png", None),
+            r"image_1/000002\.png is missing: 4 left and 3 right",
+        ),
+        (
+            "stereo",
+            _write(f"{SEQUENCE}/image_0/000000.png", None),
+            r"image_0/000000\.png is missing: 3 left and 4 right",
+        ),
+        ("stereo", _write(f"{SEQUENCE}/image_0/000002.png", "x"), r"image_0/000002\.png cannot be decoded"),
+        ("stereo", _write(f"{SEQUENCE}/image_0/000002.png", HUGE), r"image_0/000002\.png cannot be decoded"),
+        ("stereo", _write(f"{SEQUENCE}/image_0/copy.png", "x"), r"copy\.png is not named by a frame number"),
+        (
+            "stereo",
+            _write(f"{SEQUENCE}/calib.txt", "hello"),
+            r"calib\.txt:1: 'hello'; expected `name: 12 numbers`",
+        ),
+        (
+            "stereo",
+            _write(f"{SEQUENCE}/calib.txt", f"P0: {P0}\nP1: 1 2\n"),
+            r"no usable \(2 numbers\) line P1",
+        ),
+        (
+            "stereo",
+            _write(f"{SEQUENCE}/calib.txt", f"P0: {P1}\nP1: {P0}\n"),
+            r"P1 must lie to the right of P0",
+        ),
+        (
+            "stereo",
+            _write(f"{SEQUENCE}/calib.txt", None),
+            r"calib\.txt is missing; expected KITTI's calibration",
+        ),
+        (
+            "lidar",
+            _write(f"{SEQUENCE}/calib.txt", f"Tr: 2{TR[1:]}\n"),
+            r"calib\.txt: Tr: T_world_camera must hold a rot",
+        ),
+        ("lidar", _write(f"{SEQUENCE}/velodyne/000001.bin", b"12345"), r"000001\.bin is not a Velodyne scan"),
+        ("lidar", _write(f"{SEQUENCE}/velodyne/000001.bin", b""), r"000001\.bin is empty"),
+        ("stereo", _write("poses/06.txt", None), r"poses/06\.txt is missing; expected 12 numbers a line"),
+        ("stereo", _write("poses/06.txt", "1 0 0 0 0 1 0 0 0 0 1 nan\n"), r"06\.txt:1: not finite"),
+        ("stereo", _write("poses/06.txt", "1 0 0 0\n"), r"06\.txt:1: 4 numbers, expected 12"),
+        (
+            "stereo",
+            _write("poses/06.txt", "1 0 0 0 0 1 0 0 0 0 1 zero\n"),
+            r"06\.txt:1: could not convert .*zero",
+        ),
+        (
+            "stereo",
+            _write("poses/06.txt", "1 0 0 0 0 1 0 0 0 0 9 0\n"),
+            r"06\.txt, pose 0: T_world_camera must hold",
+        ),
+        ("stereo", _write(f"{SEQUENCE}/times.txt", "0\n"), r"times\.txt has 1 lines, but there is a frame 3"),
+        ("radar", lambda _: None, r"modality of KITTI must be stereo or lidar, got 'radar'"),
+    ],
+)
+def test_a_broken_sequence_is_one_clear_line(tmp_path, modality, change, match):
+    root = kitti(tmp_path)
+    change(root)
+    with pytest.raises(DatasetError, match=match) as caught:
+        list(KITTI(root, "06", modality))
+    assert "\n" not in str(caught.value)
+
+
+def test_which_sequence_must_be_clear(tmp_path):
+    root = kitti(tmp_path)
+    with pytest.raises(DatasetError, match=r"sequences/99 does not exist"):
+        KITTI(root, "99")
+    shutil.copytree(root / "sequences" / "06", root / "sequences" / "07")
+    with pytest.raises(
+        DatasetError, match=r"holds 2 KITTI sequences with data \(06, 07\); name one with --sequence"
+    ):
+        open_dataset(root)
+    assert open_dataset(root / "sequences" / "06").name == "KITTI 06 stereo"
+
+
+def test_the_matcher_against_ground_truth(data):
+    place = data("middlebury_motorcycle")
+    left, right = (
+        cv2.imread(str(place / f"motorcycle_{side}.png"), cv2.IMREAD_GRAYSCALE) for side in ("left", "right")
+    )
+    truth = np.load(place / "motorcycle_disp.npz")["arr_0"]
+    disparity = Matcher()(left, right)
+    both = np.isfinite(truth) & (disparity > 0)
+    error = np.abs(disparity / 16 - truth)[both]
+    assert both.sum() > 0.85 * np.isfinite(truth).sum()
+    assert np.median(error) < 0.2
+    assert (error > 1).mean() < 0.07
+
+
+def test_the_matcher_is_silent_where_there_is_nothing_to_match():
+    rng = np.random.default_rng(0)
+    left, right = (rng.integers(0, 256, (60, 200)).astype(np.uint8) for _ in range(2))
+    assert (Matcher()(left, right) > 0).mean() < 0.02
+    assert Matcher()(left, right).dtype == np.uint16

@@ -1,0 +1,393 @@
+# SPDX-License-Identifier: MIT
+"""What a path is: found out and said; archives, files, other packages' layouts, frames without poses."""
+
+import json
+import logging
+import re
+import shutil
+import struct
+import subprocess
+import sys
+import zipfile
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import written_recordings
+from small_recordings import corbs, hololens, kitti, redwood, seven_scenes
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets import Dataset, Selection, describe, find, layouts, open_dataset, select
+from tsfusion.datasets.dataset import pose_of
+from tsfusion.geometry.keyframe import Intrinsics
+
+
+def tum(root: Path) -> Path:
+    """Three frames with lists and no trajectory."""
+    for name in ("depth", "rgb"):
+        lines = []
+        for frame in range(3):
+            pixels = (
+                np.full((480, 640), 5000, np.uint16) if name == "depth" else np.zeros((480, 640, 3), np.uint8)
+            )
+            written_recordings.write(root / name / f"{frame}.png", pixels)
+            lines.append(f"{frame / 30:.4f} {name}/{frame}.png\n")
+        (root / f"{name}.txt").write_text("".join(lines))
+    return root
+
+
+def without_poses(root: Path, layout: str) -> Path:
+    """A recording of a layout as it is before any SLAM has run."""
+    if layout == "7-Scenes":
+        seven_scenes(root)
+        for path in root.glob("*.pose.txt"):
+            path.unlink()
+    elif layout == "HoloLens":
+        (hololens(root) / "poses.txt").unlink()
+    elif layout == "RGB-D folders":
+        (redwood(root, [0, 1, 2], [0]) / "trajectory.log").unlink()
+    elif layout == "KITTI odometry":
+        shutil.rmtree(kitti(root, count=3) / "poses")
+    elif layout == "TUM RGB-D":
+        tum(root)
+    elif layout == "ScanNet":
+        shutil.rmtree(written_recordings.scannet(root, count=3) / "pose")
+    return root
+
+
+@pytest.mark.parametrize(
+    "layout", ["7-Scenes", "HoloLens", "RGB-D folders", "KITTI odometry", "TUM RGB-D", "ScanNet"]
+)
+def test_a_recording_without_poses_is_there_for_a_scan(tmp_path, layout):
+    root = without_poses(tmp_path / "recording", layout)
+    assert find(root).layout.name == layout
+    dataset = open_dataset(root, posed=False)
+    assert isinstance(dataset, Dataset)
+    assert (len(dataset), dataset.skipped) == (3, {})
+    assert all(dataset.frame(index).T_world_camera is None for index in range(3))
+    assert describe(dataset).endswith(", no poses")
+    with pytest.raises(DatasetError, match=r"frame 2 of .* has no pose; `tsfusion scan --source PATH` finds"):
+        dataset[2]
+    with pytest.raises(DatasetError) as caught:
+        open_dataset(root)
+    assert "\n" not in str(caught.value)
+    assert re.search(r"pose|trajectory|groundtruth", str(caught.value))
+
+
+def test_some_poses_are_given_where_they_are_known(tmp_path):
+    seven_scenes(tmp_path, 4)
+    (tmp_path / "frame-000002.pose.txt").unlink()
+    dataset = open_dataset(tmp_path, posed=False)
+    assert [dataset.pose(index) is None for index in range(-4, 0)] == [False, False, True, False]
+    assert describe(dataset) == f"7-Scenes {tmp_path.name}, 4 RGB-D frames 8×6, poses for 3"
+    every_second = select(dataset, stride=2)
+    assert [pose_of(every_second, index) is None for index in range(2)] == [False, True]
+    assert isinstance(every_second, Selection)
+    with pytest.raises(IndexError):
+        dataset.pose(4)
+
+
+def test_poses_that_are_there_and_broken_are_an_error_all_the_same(tmp_path):
+    seven_scenes(tmp_path)
+    (tmp_path / "frame-000001.pose.txt").write_text("1 0 0\n")
+    with pytest.raises(DatasetError, match="3 numbers, expected 4"):
+        open_dataset(tmp_path, posed=False)
+    root = kitti(tmp_path / "kitti")
+    with pytest.raises(DatasetError, match=r"gone\.txt is missing"):
+        open_dataset(root, posed=False, poses="gone.txt")
+
+
+def test_kitti_poses_may_end_early(tmp_path):
+    root = kitti(tmp_path)
+    (root / "poses" / "06.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    for modality in ("stereo", "lidar"):
+        dataset = open_dataset(root, modality=modality, posed=False)
+        assert [dataset.pose(index) is None for index in range(4)] == [False, False, False, True]
+        assert dataset.frame(3).T_world_camera is None
+    pairs = open_dataset(root, posed=False)
+    assert describe(pairs) == "KITTI 06 stereo, 4 stereo pairs 160×48 at 10 Hz, poses for 3"
+
+
+def test_worlds_have_all_poses(tmp_path):
+    assert open_dataset("synthetic:room", posed=False, count=2).pose(1) is not None
+
+
+def corbs_zip(root: Path) -> Path:
+    """The archive as its authors' Windows packs it: backslashes inside, the trajectory in one of its own."""
+    place = corbs(root / "unpacked")
+    archive = root / "D1_pre_registereddata.zip"
+    with zipfile.ZipFile(archive, "w") as packed:
+        for path in sorted(place.rglob("*")):
+            if path.is_file():
+                packed.write(
+                    path, "D1_pre_registereddata\\" + str(path.relative_to(place)).replace("/", "\\")
+                )
+    shutil.move(root / "unpacked" / "D1_Trajectory", root / "D1_Trajectory")
+    shutil.rmtree(root / "unpacked")
+    return archive
+
+
+def test_a_corbs_archive_is_unpacked_when_asked_to(tmp_path):
+    archive = corbs_zip(tmp_path)
+    with pytest.raises(
+        DatasetError, match=r"\.zip is an archive; unpack it with: unzip -q '.*\.zip' -d '.*'"
+    ):
+        open_dataset(archive)
+    dataset = open_dataset(archive, unpack=True)
+    assert dataset.name == "CoRBS D1_pre_registereddata"
+    assert (len(dataset), dataset.skipped, dataset.uncolored) == (4, {"without a pose in time": 1}, 1)
+    assert describe(dataset).endswith("all with poses, 1 without colour in time")
+    assert float(dataset[1].depth[0, 0] * dataset[1].depth_scale) == pytest.approx(2)
+    assert dataset[1].T_world_camera[0, 3] == pytest.approx(1.8)
+    assert len(open_dataset(archive)) == 4  # its folder is there now
+    assert not list(tmp_path.glob(".unpacking-*"))
+
+
+@pytest.mark.parametrize("suffix", [".tar.gz", ".tgz", ".tar"])
+def test_other_archives_are_unpacked_too(tmp_path, suffix):
+    seven_scenes(tmp_path / "in" / "chess")
+    kind = {".tar.gz": "gztar", ".tgz": "gztar", ".tar": "tar"}[suffix]
+    made = Path(shutil.make_archive(str(tmp_path / "chess-made"), kind, tmp_path / "in"))
+    archive = made.rename(tmp_path / f"chess{suffix}")
+    with pytest.raises(
+        DatasetError, match=r"unpack it with: mkdir '.*chess' && tar -xf '.*' -C '.*chess', then"
+    ):
+        find(archive)
+    assert find(archive, unpack=True).path == tmp_path / "chess" / "chess"
+
+
+def test_a_broken_archive_leaves_nothing_behind(tmp_path):
+    (tmp_path / "a.zip").write_bytes(b"PK\x03\x04 and no more")
+    (tmp_path / "b.tgz").write_bytes(b"nothing")
+    for name in ("a.zip", "b.tgz"):
+        with pytest.raises(DatasetError, match=rf"cannot unpack .*{name}: ") as caught:
+            open_dataset(tmp_path / name, unpack=True)
+        assert "\n" not in str(caught.value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zip", "b.tgz"]
+
+
+@pytest.mark.parametrize("name", ["..\\..\\out.txt", "/etc/out.txt", "C:\\out.txt"])
+def test_an_archive_cannot_write_beside_its_folder(tmp_path, name):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as packed:
+        packed.writestr("in.txt", "x")
+        packed.writestr(name, "x")
+    with pytest.raises(DatasetError, match=r"cannot unpack .*a\.zip: .*leads out of the archive's folder"):
+        open_dataset(tmp_path / "a.zip", unpack=True)
+    assert [path.name for path in tmp_path.rglob("*")] == ["a.zip"]
+
+
+def test_a_file_stands_for_its_folder(tmp_path):
+    root = tum(tmp_path / "desk")
+    (root / "groundtruth.txt").write_text("".join(f"{t / 30:.4f} {t} 0 0 0 0 0 1\n" for t in range(3)))
+    for name in ("depth.txt", "groundtruth.txt", "rgb.txt"):
+        assert open_dataset(root / name).name == "TUM desk"
+    with pytest.raises(DatasetError, match=r"0\.png is not a folder, nor a file that stands for a dataset"):
+        open_dataset(root / "depth" / "0.png")
+    (tmp_path / "scene.sens").write_text("x")
+    with pytest.raises(DatasetError, match=r"scene\.sens is a ScanNet recording; export it .* SensReader"):
+        open_dataset(tmp_path / "scene.sens")
+
+
+def test_two_layouts_in_one_folder_are_told(tmp_path, caplog):
+    root = tum(tmp_path / "both")
+    seven_scenes(root)
+    with caplog.at_level(logging.WARNING):
+        found = find(root)
+    assert (found.layout.name, found.also) == ("7-Scenes", ("TUM RGB-D",))
+    assert f"{root} is taken for 7-Scenes; it fits TUM RGB-D too" in caplog.text
+
+
+def test_more_special_layouts_are_not_taken_for_plain_folders(tmp_path):
+    for name, make in (("ScanNet", written_recordings.scannet), ("Replica", written_recordings.replica)):
+        found = find(make(tmp_path / name))
+        assert (found.layout.name, found.also) == (name, ())
+    found = find(written_recordings.transforms(tmp_path / "capture"))
+    assert (found.layout.name, found.also) == ("nerfstudio", ())
+
+
+PLUGIN = """
+from pathlib import Path
+from tsfusion.datasets import Layout, Synthetic
+
+def recognises(path):
+    if path.name == "cursed":
+        raise RuntimeError("no")
+    return (path / "theirs.txt").is_file()
+
+def opened(path, *, width=None):
+    return Synthetic(count=2, width=width)
+
+layout = Layout("Theirs", "theirs.txt", recognises, opened)
+"""
+
+
+@pytest.fixture
+def plugin(tmp_path, monkeypatch):
+    """An installed package with two layouts, one of which cannot be loaded."""
+    place = tmp_path / "site-packages"
+    info = place / "theirs-1.0.dist-info"
+    info.mkdir(parents=True)
+    (place / "theirs_layout.py").write_text(PLUGIN)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[tsfusion.datasets]\ntheirs = theirs_layout:layout\nbroken = theirs_layout:gone\n"
+    )
+    monkeypatch.syspath_prepend(place)
+    return place
+
+
+@pytest.mark.usefixtures("plugin")
+def test_other_packages_bring_layouts(tmp_path, caplog):
+    root = tmp_path / "recording"
+    root.mkdir()
+    (root / "theirs.txt").write_text("")
+    dataset = open_dataset(root, width=64, posed=False)
+    assert (len(dataset), dataset[0].shape) == (2, (48, 64))
+    assert find(root).layout.name == "Theirs"
+    assert "Theirs" in [layout.name for layout in layouts()]
+    assert "the dataset layout broken = theirs_layout:gone cannot be used" in caplog.text
+    with pytest.raises(DatasetError, match=r"^a Theirs dataset takes no `sequence`$"):
+        open_dataset(root, sequence="06")
+
+
+@pytest.mark.usefixtures("plugin")
+def test_another_packages_fault_is_not_ours(tmp_path, caplog):
+    seven_scenes(tmp_path / "cursed")
+    assert open_dataset(tmp_path / "cursed").name == "7-Scenes cursed"
+    assert "the layout Theirs failed to look at" in caplog.text
+
+
+def test_no_layout_fails_on_any_file_or_folder(tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "depth").write_text("a file where a folder is expected")
+    for name in ("a.log", "a.json", "a.txt", "depth.txt", "mav0", "traj.txt"):
+        (tmp_path / "folder" / name).write_bytes(b"\xff\x00")
+    for path in [*tmp_path.rglob("*"), tmp_path]:
+        for layout in layouts():
+            assert layout.recognises(path) in (True, False)
+        with pytest.raises(DatasetError) as caught:
+            open_dataset(path)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_depth_image_of_the_wrong_kind_is_named(tmp_path):
+    root = redwood(tmp_path, [0], [0])
+    cv2.imwrite(str(root / "depth" / "00000.png"), np.zeros((6, 8), np.uint8))
+    with pytest.raises(DatasetError, match="must hold one 16-bit channel"):
+        open_dataset(root)[0]
+
+
+def test_what_macos_puts_beside_files_is_no_recording(tmp_path):
+    redwood(tmp_path, [0, 1], [0, 1])
+    for path in [path for path in tmp_path.rglob("*") if path.is_file()]:
+        path.with_name(f"._{path.name}").write_bytes(b"\0\5\x16\7")
+    assert len(list(open_dataset(tmp_path))) == 2
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as packed:
+        for path in sorted(tmp_path.rglob("*.*")):
+            if path.suffix != ".zip":
+                place = "__MACOSX/depth" if path.name.startswith("._") else "recording"
+                packed.write(path, f"{place}/{path.relative_to(tmp_path)}")
+    assert len(open_dataset(tmp_path / "a.zip", unpack=True)) == 2
+
+
+@pytest.mark.parametrize("side", [20_000, 100_000])
+def test_an_image_that_claims_to_be_huge_is_named(tmp_path, side):
+    root = redwood(tmp_path, [0], [0])
+    depth = root / "depth" / "00000.png"
+    content = bytearray(depth.read_bytes())
+    struct.pack_into(">2I", content, 16, side, side)
+    struct.pack_into(">I", content, 29, zlib.crc32(content[12:29]))
+    depth.write_bytes(content)
+    with pytest.raises(DatasetError, match=r"00000\.png cannot be decoded; expected a 16-bit depth image"):
+        open_dataset(root)[0]
+
+
+def test_a_depth_image_of_another_size_is_named(tmp_path):
+    dataset = open_dataset(redwood(tmp_path, [0, 1], [0, 1]))
+    assert dataset[0].shape == (6, 8)
+    for name, pixels in (("depth", np.ones((12, 16), np.uint16)), ("color", np.zeros((12, 16, 3), np.uint8))):
+        cv2.imwrite(str(tmp_path / name / "00001.png"), pixels)
+    with pytest.raises(DatasetError, match=r"00001\.png is 16×12, others are 8×6; expected one size"):
+        dataset[1]
+
+
+def command(*words: object) -> tuple[int, str, str]:
+    """Exit status, output and messages of a command line."""
+    done = subprocess.run(
+        [sys.executable, "-m", "tsfusion", *map(str, words)],
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_the_command_lists_layouts_and_datasets(tmp_path):
+    status, listed, _ = command("datasets")
+    assert (status, listed) == command("datasets", "list")[:2]
+    rows = dict(line.split("  ", 1) for line in listed.splitlines())
+    assert list(rows) == [*(layout.name for layout in layouts()), "synthetic"]
+    written_recordings.scannet(tmp_path / "a" / "scene0000_00")
+    expected = f"{tmp_path}/a  ScanNet scene0000_00  kinect  4 keyframes\n"
+    assert command("datasets", tmp_path) == (0, expected, "")
+    assert json.loads(command("datasets", tmp_path, "--json")[1])[0]["name"] == "ScanNet scene0000_00"
+    tum(tmp_path / "b" / "rgbd")
+    status, listed, _ = command("datasets", tmp_path / "b")
+    assert (status, listed.split("  ", 1)[1]) == (
+        0,
+        "TUM rgbd  kinect  3 frames without poses, for `tsfusion scan`\n",
+    )
+
+
+def test_replay_says_what_it_found(tmp_path):
+    written_recordings.scannet(tmp_path / "scene0000_00", lost=(2,))
+    shutil.make_archive(str(tmp_path / "scan"), "zip", tmp_path, "scene0000_00")
+    status, _, said = command("replay", tmp_path / "scan.zip", "--unpack", "--sensor", "sonar")
+    assert status == 1
+    first, second = said.splitlines()
+    assert first == "found: ScanNet scene0000_00, 3 RGB-D frames 160×120, all with poses"
+    assert "sonar" in second
+    assert (tmp_path / "scan" / "scene0000_00").is_dir()
+
+
+@pytest.mark.parametrize(
+    ("option", "expected"),
+    [
+        ({"depth_scale": "x"}, "`depth_scale` must be a number, got 'x'"),
+        ({"depth_scale": True}, "`depth_scale` must be a number, got True"),
+        ({"color": "False"}, "`color` must be true or false, got 'False'"),
+        ({"trajectory": ["a"]}, "`trajectory` must be text, got "),
+        ({"intrinsics": [1, 2]}, r"`intrinsics` must be four numbers, \[fx, fy, cx, cy\], got "),
+        ({"intrinsics": ["a", 2, 3, 4]}, "intrinsics must be four numbers"),
+    ],
+)
+def test_an_option_of_the_wrong_type_is_one_clear_line(tmp_path, option, expected):
+    with pytest.raises(DatasetError, match=expected) as caught:
+        open_dataset(redwood(tmp_path, [0], [0]), **option)
+    assert "\n" not in str(caught.value)
+
+
+def test_options_are_taken_as_they_were_meant(tmp_path):
+    redwood(tmp_path / "5", [0], [0])
+    dataset = open_dataset(tmp_path / "5", intrinsics=[500, 500, 3.5, 2.5], depth_scale=1)
+    assert dataset[0].intrinsics == Intrinsics(500, 500, 3.5, 2.5)
+    assert dataset[0].depth_scale == 1.0
+    with pytest.raises(DatasetError, match=r"5/17 is missing"):
+        open_dataset(tmp_path / "5", trajectory=17)
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["[" * 200_000, '{"intrinsic_matrix": [%s, 0, 0, 0, 1, 0, 3, 3, 1]}' % ("1" * 400),
+     '{"camera": {"w": 1e999, "h": 6, "fx": 1, "fy": 1, "cx": 1, "cy": 1, "scale": 1}}',
+     '{"camera": {"w": 0, "h": 0, "fx": 1, "fy": 1, "cx": 1, "cy": 1, "scale": 1}}'],
+)  # fmt: skip
+def test_a_broken_camera_file_is_one_clear_line(tmp_path, content):
+    redwood(tmp_path / "redwood", [0], [0])
+    (tmp_path / "redwood" / "camera_intrinsic.json").write_text(content)
+    written_recordings.replica(tmp_path / "replica")
+    (tmp_path / "replica" / "cam_params.json").write_text(content)
+    for place in ("redwood", "replica"):
+        with pytest.raises(DatasetError, match=r"\.json must ") as caught:
+            open_dataset(tmp_path / place)
+        assert "\n" not in str(caught.value)

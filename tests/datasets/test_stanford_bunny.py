@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: MIT
+"""The bunny's scans: their poses meet the reference, and their rays are the scanner's."""
+
+import numpy as np
+import pytest
+from geometry_checks import move
+
+from tsfusion.datasets.formats import stanford_bunny
+
+scipy_spatial = pytest.importorskip("scipy.spatial")
+
+
+def test_scans_lie_on_the_reference(data):
+    place = data("stanford_bunny")
+    tree = scipy_spatial.cKDTree(stanford_bunny.reference(place)[0])
+    scans = list(stanford_bunny.scans(place))
+    assert len(scans) == 6
+    for keyframe in scans[::2]:
+        world = move(keyframe.T_world_camera, keyframe.points[::9].astype(np.float64))
+        assert np.median(tree.query(world)[0]) < 0.0006
+        assert keyframe.sensor == "scanner"
+
+
+def test_one_row_is_seen_through_one_plane(data):
+    """The rays fitted: a scan line's points and the lens lie in one plane, though the lines bend."""
+    path = data("stanford_bunny") / "data" / "bun000.ply"
+    points = stanford_bunny.read_points(path).astype(np.float64)
+    slope = (points[:, 1] - stanford_bunny.LENS_Y) / (stanford_bunny.LENS_Z - points[:, 2])
+    row = stanford_bunny.read_rows(path)
+    spread = [slope[row == r].std() for r in range(40, 200, 20)]
+    sideways = [points[row == r, 1].std() / stanford_bunny.LENS_Z for r in range(40, 200, 20)]
+    assert np.median(spread) < 0.1 * np.median(sideways)

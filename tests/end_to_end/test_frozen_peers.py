@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: MIT
+"""Peers that stand still, double, speak another version or live in another time: each has a named outcome."""
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import pytest
+from delivery_verdict import VOXEL_SIZE, verify
+from keyframes_and_servers import DEADLINE, Server, connected, serving, until, wall
+from scanner_process import Plan, Report, journals, numbers
+from supervisors import SCANNER
+
+from tsfusion import Client, Volume, journal
+from tsfusion.core.config import ClientConfig
+from tsfusion.core.errors import FlushTimeout, ServerUnreachable, TransportError
+from tsfusion.delivery import spool
+from tsfusion.wire import codec, messages, sockets
+from tsfusion.wire.keyframe_header import VERSION
+from tsfusion.wire.queries import fetch_status
+
+FREEZE = 6.0  # seconds: longer than any timeout of client and server
+SHORT_FREEZE = 3.0  # where the gateway lives, and would have noticed by then
+QUICK = ClientConfig(policy="spool_all", stall_timeout=0.5)
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with serving(tmp_path_factory.mktemp("shared")) as server:
+        yield server
+
+
+@contextmanager
+def frozen(pid: int) -> Iterator[None]:
+    """A process stands still for as long as the block lasts."""
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
+def stream(client: Client, numbers: range, seconds: float) -> threading.Thread:
+    """Send them over so many seconds, in a thread."""
+    pause = threading.Event()
+
+    def send() -> None:
+        for i in numbers:
+            client.send(wall(i, captured_ns=time.monotonic_ns()))
+            pause.wait(seconds / len(numbers))
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    return thread
+
+
+def outcome(server: Server, keyframes: int, state: Path) -> list[str]:
+    """What is wrong after it has stopped."""
+    until(lambda: fetch_status(server.address).keyframes_fused >= keyframes)
+    status = fetch_status(server.address)
+    assert server.terminate() == 0
+    return verify(state, keyframes, status.map_hash)
+
+
+# --- standing still ---
+
+
+def test_a_frozen_server_is_missed_and_catches_up(tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    with serving(state) as server, Client(server.address, config=QUICK) as client:
+        client.send(wall(0))
+        client.flush(timeout=DEADLINE)
+        sending = stream(client, range(1, 41), FREEZE)
+        with frozen(server.process.pid):
+            until(lambda: not client.connected)
+            with pytest.raises(FlushTimeout, match="nothing was heard from the server"):
+                client.flush(timeout=FREEZE)
+        sending.join(DEADLINE)
+        client.wait_fused(timeout=DEADLINE)
+        assert client.connected
+        assert client.stats.fused == 41
+        assert outcome(server, 41, state) == []
+
+
+def test_a_frozen_scanner_holds_nobody_up(tmp_path: Path) -> None:
+    state, report = tmp_path / "state", tmp_path / "report"
+    with serving(state) as server, Client(server.address, config=QUICK) as client:
+        plan = Plan(
+            address=server.address,
+            spool=str(tmp_path / "spool"),
+            state=str(state),
+            count=60,
+            rate=30,
+            report=str(report),
+        )
+        scanner = subprocess.Popen([sys.executable, str(SCANNER), msgspec.json.encode(plan).decode()])
+        until(lambda: fetch_status(server.address).keyframes_durable > 10)
+        with frozen(scanner.pid):
+            ends = time.monotonic() + SHORT_FREEZE
+            for i in range(60, 10_000):
+                client.send(wall(i))
+                client.wait_fused(timeout=SHORT_FREEZE)
+                if time.monotonic() > ends:
+                    break
+        assert scanner.wait(DEADLINE) == 0
+        told = msgspec.json.decode(report.read_bytes(), type=Report)
+        assert (told.fused, told.refused, told.rejected) == (60, {}, {})
+        assert outcome(server, i + 1, state) == []
+
+
+def test_a_frozen_fuser_is_waited_for(tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    with serving(state) as server, Client(server.address, config=QUICK) as client:
+        client.send(wall(0))
+        client.wait_fused(timeout=DEADLINE)
+        with frozen(server.fuser_pid()):
+            sending = stream(client, range(1, 31), SHORT_FREEZE)
+            sending.join(DEADLINE)
+            client.flush(timeout=SHORT_FREEZE)
+        client.wait_fused(timeout=DEADLINE)
+        assert fetch_status(server.address).fuser_restarts == 0
+        assert outcome(server, 31, state) == []
+
+
+def test_a_fuser_that_stands_still_is_replaced(tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    with (
+        serving(state, fuser_timeout=0.5, checkpoint_every=3) as server,
+        Client(server.address, config=QUICK) as client,
+    ):
+        sending = stream(client, range(10), 1.0)
+        sending.join(DEADLINE)
+        client.wait_fused(timeout=DEADLINE)
+        os.kill(server.fuser_pid(), signal.SIGSTOP)  # and never goes on
+        stream(client, range(10, 20), 1.0).join(DEADLINE)
+        client.wait_fused(timeout=DEADLINE)
+        assert fetch_status(server.address).fuser_restarts == 1
+        assert outcome(server, 20, state) == []
+
+
+# --- one session, twice ---
+
+
+def test_a_copied_spool_is_one_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its keyframes count once, and who comes with lower numbers is told why they are not taken."""
+    monkeypatch.setattr(spool, "_RESTART_SPREAD", 1)  # here: who comes second
+    state, spools = tmp_path / "state", [tmp_path / name for name in ("spool", "copy")]
+    with Client("tcp://127.0.0.1:1", spool=spools[0]) as client:
+        for i in range(6):
+            client.send(wall(i))
+    shutil.copytree(*spools)
+    with serving(state) as server:
+        with Client(server.address, spool=spools[0], config=QUICK) as first:
+            assert first.send(wall(6)) > 6
+            first.wait_fused(timeout=DEADLINE)
+            with Client(server.address, spool=spools[1], config=QUICK) as second:
+                second.send(wall(7))
+                with pytest.raises(FlushTimeout, match="another scanner works with a copy of"):
+                    second.flush(timeout=2.0)
+                assert second.stats.waiting > 0
+            first.send(wall(7))
+            first.wait_fused(timeout=DEADLINE)
+        assert fetch_status(server.address).sessions == 1
+        assert outcome(server, 8, state) == []
+    assert 7 in numbers(spools[1]), "what was not taken stays in its spool"
+
+
+def test_two_that_share_a_session_at_once_spoil_nothing(tmp_path: Path) -> None:
+    """They go on with numbers of their own; the lower ones are not taken, which is told: nothing is lost."""
+    state, spools = tmp_path / "state", [tmp_path / name for name in ("spool", "copy")]
+    with Client("tcp://127.0.0.1:1", spool=spools[0]) as client:
+        client.send(wall(0))
+    shutil.copytree(*spools)
+    with serving(state) as server:
+        scanners = [Client(server.address, spool=folder, config=QUICK) for folder in spools]
+        sending = [stream(scanner, range(i, 41, 2), 1.0) for i, scanner in enumerate(scanners, start=1)]
+        for thread in sending:
+            thread.join(DEADLINE)
+        for scanner in scanners:
+            with contextlib.suppress(FlushTimeout):
+                scanner.flush(timeout=2.0)
+            scanner.close()
+        until(lambda: (status := fetch_status(server.address)).keyframes_fused == status.keyframes_durable)
+        told = fetch_status(server.address)
+        assert server.terminate() == 0
+    (folder,) = journals(state)
+    found = numbers(folder)
+    assert found[0] == 0
+    assert len(found) == len(set(found)) == told.keyframes_fused
+    kept = {number for folder in spools if journal.segments(folder) for number in numbers(folder)}
+    assert {*found, *kept} == set(range(41))
+    volume = Volume(voxel_size=VOXEL_SIZE, threads=1)
+    for i in found:
+        volume.integrate(wall(i))
+    assert volume.map_hash() == told.map_hash
+
+
+# --- another version ---
+
+
+def test_another_version_is_named(shared: Server) -> None:
+    before = fetch_status(shared.address)
+    hello = messages.Hello(os.urandom(16), VERSION + 1)
+    with connected(sockets.dealer, shared.control) as stranger:
+        stranger.send(messages.encode(hello))
+        assert stranger.poll(10_000)
+        answer = messages.decode_to_client(stranger.recv())
+    assert isinstance(answer, messages.Denied)
+    assert answer.reason == "version"
+    frames = codec.encode(wall(), session=hello.session, seq=1, jpeg_quality=90)
+    newer = [b"TSF" + bytes([VERSION + 1]) + frames[0][4:], *frames[1:]]
+    with connected(sockets.push, shared.address) as push:
+        assert push.poll(10_000, 2)
+        push.send_multipart(newer)
+        until(
+            lambda: (
+                fetch_status(shared.address).messages_refused.get("version", 0)
+                == before.messages_refused.get("version", 0) + 1
+            )
+        )
+    assert fetch_status(shared.address).keyframes_durable == before.keyframes_durable
+
+
+def test_a_client_of_another_version_says_so(shared: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(codec, "VERSION", VERSION + 1)
+    with (
+        Client(shared.address) as client,
+        pytest.raises(ServerUnreachable, match=r"version 1 of the wire format, this client 2"),
+    ):
+        client.connect(timeout=2.0)
+
+
+# --- another time ---
+
+_JUMPING = """
+import time as _time
+_now, _now_ns, _began = _time.time, _time.time_ns, _time.monotonic()
+def _jump():  # a day back after a second, and back again after two, and so on
+    return 86400 * (int(_time.monotonic() - _began) % 2)
+_time.time = lambda: _now() - _jump()
+_time.time_ns = lambda: _now_ns() - _jump() * 10**9
+"""
+
+
+def test_a_clock_that_jumps_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: real() - 86400 * 10**9 * (time.monotonic_ns() // 10**9 % 2))
+    state = tmp_path / "state"
+    with serving(state, code=_JUMPING) as server, Client(server.address, config=QUICK) as client:
+        stream(client, range(30), 3.0).join(DEADLINE)
+        client.wait_fused(timeout=DEADLINE)
+        delays = [times.fused_ns - times.captured_ns for times in client.records]
+        assert all(0 < delay < 60e9 for delay in delays), delays
+        server.kill()
+    with serving(state, code=_JUMPING) as server:
+        assert outcome(server, 30, state) == []
+    (folder,) = journals(state)
+    logged = [
+        record.logged_ns
+        for number in journal.segments(folder)
+        for record in journal.records(journal.segment_path(folder, number))
+    ]
+    assert logged != sorted(logged), "the clock has not jumped"
+
+
+def test_status_of_a_frozen_server_is_a_clear_error(shared: Server) -> None:
+    with (
+        frozen(shared.process.pid),
+        pytest.raises(TransportError, match=r"no server answered at tcp://.* within 0\.5 s"),
+    ):
+        fetch_status(shared.address, timeout=0.5)

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: MIT
+"""Mutated messages, segments and saved maps, a few thousand each run. The long form: `scripts/fuzz.py`."""
+
+import contextlib
+import random
+import tracemalloc
+
+import fuzz_mutate
+import pytest
+from fuzz_engine import fuzz
+from fuzz_targets import TARGETS
+
+from tsfusion.wire import codec
+from tsfusion.wire.keyframe_header import Refused
+
+CASES = {"message": 6000, "control": 20_000, "corrections": 3000, "journal": 2000, "checkpoint": 1000}
+_CHECK_BYTES = 1 << 20  # besides the message itself
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_only_named_errors_come_out(name: str) -> None:
+    found = fuzz(name, CASES[name], seed=1)
+    assert found.cases == CASES[name]
+    assert len(found.outcomes) > 10, found
+
+
+def test_the_door_allocates_next_to_nothing() -> None:
+    """Whatever a message announces; decoding is for the fuser, which has a memory limit."""
+    target, rng = TARGETS["message"], random.Random(1)
+    corpus = target.seeds()
+    tracemalloc.start()
+    try:
+        for _ in range(3000):
+            frames = fuzz_mutate.split(target.mutate(rng.choice(corpus), rng, corpus))
+            tracemalloc.reset_peak()
+            before, _ = tracemalloc.get_traced_memory()
+            with contextlib.suppress(Refused):
+                codec.check(frames)
+            assert tracemalloc.get_traced_memory()[1] - before < _CHECK_BYTES, frames
+    finally:
+        tracemalloc.stop()

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: MIT
+"""A server under attack lives, keeps its memory bound, fuses what others send. Long: `scripts/hostile.py`."""
+
+from pathlib import Path
+
+import pytest
+from attacks import ATTACKS
+from hostile_run import run, table
+
+from tsfusion.core import process
+from tsfusion.gateway.memory_guard import MemoryBound
+
+
+def test_memory_that_does_not_come_back_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else every connection would be dropped for ever."""
+    held = 0
+    monkeypatch.setattr(process, "rss_bytes", lambda: held)
+    bound = MemoryBound(800)
+    told = []
+    for held in (700, 800, 850, 900, 950, 960, 980, 1080, 1090, 400, 790, 810):  # noqa: B007
+        told.append(bound.excess(elsewhere=0))
+    assert told == [0, 0, 850, 0, 0, 960, 0, 1080, 0, 0, 0, 810]
+    assert bound.excess(elsewhere=100) == 0
+
+
+def test_memory_that_was_freed_counts_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    held = [900]
+    monkeypatch.setattr(process, "rss_bytes", lambda: held[0])
+    monkeypatch.setattr(process, "give_back_memory", lambda: held.__setitem__(0, 500))
+    assert MemoryBound(800).excess(elsewhere=0) == 0
+
+
+WITHOUT_KEYS = (
+    "lies",
+    "tiny",
+    "unfinished",
+    "knocking",
+    "half open",
+    "slow loris",
+)  # what gets as far as that
+
+
+@pytest.mark.parametrize(
+    ("attacks", "keys"), [(tuple(ATTACKS), False), (WITHOUT_KEYS, True)], ids=["open", "keys"]
+)
+def test_attacks_harm_nobody(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], attacks: tuple[str, ...], keys: bool
+) -> None:
+    outcome = run(tmp_path, 1.0, attacks, keys=keys)
+    with capsys.disabled():
+        print(f"\n{table(outcome)}")
+    assert not outcome.problems, outcome

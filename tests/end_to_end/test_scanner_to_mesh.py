@@ -1,0 +1,383 @@
+# SPDX-License-Identifier: MIT
+"""Scanner, gateway and fuser as real processes over real sockets and files."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zmq
+from keyframes_and_servers import DEADLINE, Server, alive, pose, serving, until, wall
+
+import tsfusion
+from tsfusion import Client, Keyframe
+from tsfusion.core.config import ClientConfig
+from tsfusion.core.errors import (
+    FlushTimeout,
+    InvalidKeyframe,
+    KeyframeRefused,
+    ServerUnreachable,
+    TransportError,
+)
+from tsfusion.fuser import messages as fuser_messages
+from tsfusion.journal import state_folder
+from tsfusion.journal.recording import read_keyframes
+from tsfusion.wire import codec, messages, sockets
+from tsfusion.wire.messages import Command
+from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_status, request
+
+COUNT = 8
+QUICK = ClientConfig(stall_timeout=0.5)
+
+
+@pytest.fixture(scope="module")
+def offline_hash() -> str:
+    """The map of walls 0 to 7, fused by file in another order."""
+    volume = tsfusion.Volume(voxel_size=0.04, threads=1)
+    for i in reversed(range(COUNT)):
+        volume.integrate(wall(i))
+    return volume.map_hash()
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """One server for the tests that leave it as it was or do not care what it holds."""
+    with serving(tmp_path_factory.mktemp("shared"), max_frame_bytes=30_000) as server:
+        yield server
+
+
+def fused(address: str) -> int:
+    return fetch_status(address).keyframes_fused
+
+
+def send_all(client: Client, numbers: range) -> None:
+    for i in numbers:
+        client.send(wall(i, captured_ns=time.monotonic_ns()))
+
+
+def test_five_lines_reach_the_map(tmp_path: Path, offline_hash: str) -> None:
+    with serving(tmp_path / "state") as server:
+        with Client(server.address, spool=tmp_path / "spool") as client:
+            client.connect()
+            assert [client.send(wall(i, captured_ns=time.monotonic_ns())) for i in range(COUNT)] == [
+                *range(1, 9)
+            ]
+            client.flush(timeout=DEADLINE)
+            client.wait_fused(timeout=DEADLINE)
+            client.wait_meshed(timeout=DEADLINE)
+            stats, records = client.stats, client.records
+        status = fetch_status(server.address)
+        mesh = fetch_mesh(server.address, min_weight=0.5)
+        assert server.terminate() == 0
+    assert (stats.sent, stats.durable, stats.fused, stats.refused, stats.rejected) == (
+        COUNT,
+        COUNT,
+        COUNT,
+        {},
+        {},
+    )
+    assert (status.keyframes_durable, status.keyframes_fused, status.map_hash) == (COUNT, COUNT, offline_hash)
+    assert (status.fuser, status.sessions, status.duplicates) == ("idle", 1, 0)
+    assert status.delay_ms.count == COUNT
+    assert 0 < status.delay_ms.mean < 1e4
+    assert len(mesh.faces) > 100
+    assert mesh.colors is not None
+    for times in records:
+        stages = [times.captured_ns, times.sent_ns, times.received_ns, times.durable_ns, times.fuse_start_ns,
+                  times.fused_ns, times.meshed_ns]  # fmt: skip
+        assert all(b - a >= -2 * times.clock_bound_ns for a, b in pairwise(stages)), times
+        assert 0 < times.clock_bound_ns < 5e7
+    assert list((tmp_path / "spool").glob("*.mcap")) == []
+    assert [keyframe.timestamp_ns for keyframe in read_keyframes(tmp_path / "state")] == [
+        10**9 + i for i in range(COUNT)
+    ]
+
+
+def test_a_killed_server_loses_nothing_acknowledged(tmp_path: Path, offline_hash: str) -> None:
+    """The server dies without warning, with a checkpoint behind it; its fuser goes with it."""
+    state = tmp_path / "state"
+    with Client("tcp://127.0.0.1:1", spool=tmp_path / "nowhere") as early:
+        with pytest.raises(ServerUnreachable, match="no server answers at"):
+            early.connect(timeout=0.1)
+        early.send(wall(0))
+        with pytest.raises(
+            FlushTimeout, match=r"1 keyframes are not acknowledged after 0\.1 s: no server answers"
+        ):
+            early.flush(timeout=0.1)
+    with serving(state, checkpoint_every=3) as server, Client(server.address, config=QUICK) as client:
+        send_all(client, range(5))
+        client.flush(timeout=DEADLINE)
+        until(lambda: fused(server.address) >= 3)
+        fuser = server.fuser_pid()
+        server.kill()
+        until(lambda: not alive(fuser))
+        send_all(client, range(5, COUNT))
+        with serving(state, listen=server.address) as again:
+            client.flush(timeout=DEADLINE)
+            client.wait_fused(timeout=DEADLINE)
+            status = fetch_status(again.address)
+            assert again.terminate() == 0
+        assert client.stats.fused == COUNT
+    assert (status.keyframes_durable, status.keyframes_fused, status.map_hash) == (COUNT, COUNT, offline_hash)
+    assert tsfusion.Volume.load(state_folder.folder(state, "default") / "map.tsf").map_hash() == offline_hash
+
+
+def test_a_stop_drains_and_a_start_goes_on(tmp_path: Path, offline_hash: str) -> None:
+    """Two clients at once, SIGTERM with most of it unfused, and another start."""
+
+    def scan(numbers: range) -> None:
+        with Client(server.address) as client:
+            send_all(client, numbers)
+            client.flush(timeout=DEADLINE)
+
+    with serving(tmp_path) as server:
+        scanners = [threading.Thread(target=scan, args=(range(start, COUNT, 2),)) for start in (0, 1)]
+        for scanner in scanners:
+            scanner.start()
+        for scanner in scanners:
+            scanner.join(DEADLINE)
+        server.process.send_signal(signal.SIGTERM)  # as `timeout` does: to the process, and to its group
+        assert server.terminate() == 0
+    with serving(tmp_path) as server:
+        status = fetch_status(server.address)
+        assert (status.sessions, status.keyframes_fused, status.map_hash) == (2, COUNT, offline_hash)
+        assert server.terminate() == 0
+    for segment in (state_folder.folder(tmp_path, "default") / "journal").iterdir():  # somebody makes room
+        segment.unlink()
+    with serving(tmp_path) as server:
+        with Client(server.address) as client:
+            client.send(wall(COUNT))
+            client.flush(timeout=DEADLINE)
+        server.kill()
+    with serving(tmp_path) as server:
+        until(lambda: fused(server.address) == COUNT + 1)
+
+
+def test_a_dead_fuser_is_replaced(tmp_path: Path, offline_hash: str) -> None:
+    with serving(tmp_path) as server, Client(server.address) as client:
+        send_all(client, range(4))
+        client.wait_fused(timeout=DEADLINE)
+        os.kill(server.fuser_pid(), signal.SIGKILL)
+        send_all(client, range(4, COUNT))
+        client.flush(timeout=DEADLINE)  # acknowledged while there is no fuser
+        client.wait_fused(timeout=DEADLINE)
+        until(lambda: _hash(server.address) == offline_hash)
+        assert fetch_status(server.address).fuser_restarts == 1
+        assert server.terminate() == 0
+
+
+def _hash(address: str) -> str:
+    try:
+        return fetch_status(address).map_hash
+    except TransportError:  # "the fuser restarts; ask again"
+        return ""
+
+
+def test_a_dead_clients_spool_is_sent_by_the_next(tmp_path: Path, shared: Server) -> None:
+    before = fused(shared.address)
+    with Client("tcp://127.0.0.1:1", spool=tmp_path) as dead:
+        send_all(dead, range(3))
+    with Client(shared.address, spool=tmp_path) as client:
+        assert client.send(wall(3)) > 3
+        client.wait_fused(timeout=DEADLINE)
+        assert client.stats.durable == 4
+    assert fused(shared.address) == before + 4
+
+
+def test_the_same_keyframe_counts_once(shared: Server) -> None:
+    before = fetch_status(shared.address)
+    frames = codec.encode(wall(), session=os.urandom(16), seq=1, jpeg_quality=90)
+    with raw_push(shared.address) as push:
+        for _ in range(5):
+            push.send_multipart(frames)
+        until(lambda: fetch_status(shared.address).duplicates == before.duplicates + 4)
+    until(lambda: fused(shared.address) == before.keyframes_fused + 1)
+
+
+def test_what_is_journaled_is_not_refused_when_it_comes_again(shared: Server) -> None:
+    """Damaged on its second way, or after a limit was lowered: it is a duplicate before all else."""
+    before = fetch_health(shared.address)
+    frames = codec.encode(wall(), session=os.urandom(16), seq=1, jpeg_quality=90)
+    with raw_push(shared.address) as push:
+        push.send_multipart(frames)
+        push.send_multipart([frames[0], frames[1][:-1] + b"x", frames[2]])
+        until(lambda: fetch_health(shared.address).duplicates == before.duplicates + 1)
+    assert fetch_health(shared.address).refused == before.refused
+
+
+def test_a_refused_keyframe_is_told_and_the_rest_goes_on(shared: Server) -> None:
+    noise = np.random.default_rng(0).integers(0, 65536, (200, 200)).astype(np.uint16)
+    with Client(shared.address) as client:
+        client.send(wall(0))
+        client.send(Keyframe(depth=noise, intrinsics=wall().intrinsics, T_world_camera=pose()))
+        client.send(wall(1))
+        with pytest.raises(KeyframeRefused, match=r"keyframe 2 was refused \(size\)"):
+            client.flush(timeout=DEADLINE)
+        client.wait_fused(timeout=DEADLINE)
+        client.flush(timeout=DEADLINE)
+        assert client.stats.refused == {"size": 1}
+        assert client.stats.fused == 2
+
+
+def test_a_keyframe_the_map_cannot_take_is_counted_and_skipped(shared: Server) -> None:
+    before = fetch_status(shared.address)
+    with Client(shared.address) as client:
+        client.send(wall(0))
+        client.send(wall(1, sensor="sonar"))
+        client.send(wall(2))
+        client.wait_fused(timeout=DEADLINE)
+        status = fetch_status(shared.address)
+        assert client.stats.rejected == status.keyframes_rejected == {"InvalidConfig": 1}
+        assert (client.stats.durable, client.stats.fused) == (3, 2)
+        assert status.keyframes_durable == before.keyframes_durable + 3
+        assert status.keyframes_fused == before.keyframes_fused + 2
+
+
+def test_send_does_not_wait_for_the_network(tmp_path: Path) -> None:
+    with Client("tcp://127.0.0.1:1", spool=tmp_path, policy="spool_all") as client:
+        started = time.monotonic()
+        send_all(client, range(30))
+        assert time.monotonic() - started < 5.0
+        assert client.stats.sent == 30
+        assert not client.connected
+
+
+def test_a_closed_client_says_so(tmp_path: Path) -> None:
+    client = Client("tcp://127.0.0.1:1", spool=tmp_path)
+    client.close()
+    client.close()
+    with pytest.raises(TransportError, match="closed"):
+        client.send(wall())
+    with pytest.raises(TransportError, match="closed"):
+        client.connect()
+    with pytest.raises(InvalidKeyframe):
+        Keyframe(depth=np.zeros((2, 2), np.int8), T_world_camera=pose())
+
+
+def test_viewers_get_what_changed(shared: Server) -> None:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    viewer = sockets.subscriber(context)
+    try:
+        viewer.connect(shared.publish)
+        with Client(shared.address) as client:
+            i = 0
+            while not viewer.poll(100):  # until the subscription has arrived
+                client.send(wall(i))
+                client.wait_meshed(timeout=DEADLINE)
+                i += 1
+                assert i < 100
+        topic, head, cells, vertices, faces, *_ = viewer.recv_multipart()
+    finally:
+        viewer.close()
+        context.term()
+    meshed = fuser_messages.to_gateway.decode(head)
+    assert isinstance(meshed, fuser_messages.Meshed)
+    assert meshed.layout is not None
+    assert (topic, len(vertices), len(faces)) == (
+        b"mesh/default/",
+        12 * meshed.layout.vertices,
+        12 * meshed.layout.faces,
+    )
+    assert len(cells) % 12 == 0
+
+
+# --- hostile ---
+
+
+class raw_push:  # noqa: N801  a context manager, used as a function
+    def __init__(self, address: str) -> None:
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = sockets.push(self._context)
+        self._socket.setsockopt(zmq.SNDTIMEO, 10_000)
+        self._socket.connect(address)
+
+    def __enter__(self) -> zmq.Socket[bytes]:
+        return self._socket
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+        self._context.term()
+
+
+def test_rubbish_is_counted_and_the_server_lives(shared: Server) -> None:
+    before = fetch_status(shared.address)
+    good = codec.encode(wall(), session=os.urandom(16), seq=1, jpeg_quality=90)
+    rubbish = {
+        "frames": [good[0]],
+        "magic": [b"GET / HTTP/1.1", b""],
+        "version": [b"TSF\x09" + good[0][4:], *good[1:]],
+        "header": [b"TSF\x01" + b"\xc1" * 50, *good[1:]],
+        "limits": good[:2],
+        "size": [good[0], good[1] + b"x", good[2]],
+        "crc": [good[0], good[1][:-1] + b"x", good[2]],
+        "gap": codec.encode(wall(), session=os.urandom(16), seq=9, previous=8, jpeg_quality=90),
+    }
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    link = sockets.dealer(context)
+    with raw_push(shared.address) as push:
+        for message in rubbish.values():
+            push.send_multipart(message)
+        link.connect(shared.control)
+        assert link.poll(10_000, zmq.POLLOUT)
+        for message in (b"", b"rubbish", b"\xc1" * 1000, messages.encode(Command(name="ping"))[:-3]):
+            link.send_multipart([message, b"", b"x"])
+
+        def refused(reason: str) -> int:
+            return fetch_status(shared.address).messages_refused.get(reason, 0)
+
+        for reason in rubbish:
+            until(lambda reason=reason: refused(reason) == before.messages_refused.get(reason, 0) + 1)
+        until(lambda: refused("control") >= before.messages_refused.get("control", 0) + 4)
+    link.close()
+    context.term()
+    after = fetch_status(shared.address)
+    assert after.keyframes_durable == before.keyframes_durable
+    with Client(shared.address) as client:
+        client.send(wall())
+        client.wait_fused(timeout=DEADLINE)
+
+
+def test_questions_are_answered(shared: Server) -> None:
+    assert request(shared.control, Command(name="ping"), timeout=DEADLINE)[0].name == "ping"
+    with pytest.raises(TransportError, match="min_weight must be"):
+        fetch_mesh(shared.address, min_weight=-1.0)
+
+
+# --- starting ---
+
+
+def refusal(*arguments: object, **settings: object) -> str:
+    with pytest.raises(RuntimeError) as refused:
+        serving(*arguments, **settings).__enter__()  # type: ignore[arg-type]
+    return str(refused.value)
+
+
+def test_a_busy_port_a_busy_folder_and_a_bad_folder_are_one_clear_line(
+    shared: Server, tmp_path: Path
+) -> None:
+    assert refusal(tmp_path, listen=shared.address) == (
+        f"TransportError: cannot listen on {shared.address}: Address already in use"
+    )
+    state = str(Path(fetch_status(shared.address).state).parent.parent)
+    assert refusal(Path(state)) == f"JournalError: the state folder {state} is in use by another server"
+    (tmp_path / "file").write_text("")
+    assert refusal(tmp_path / "file") == (
+        f"JournalError: cannot write the state folder {tmp_path / 'file'}: File exists"
+    )
+    assert "InvalidConfig: " in refusal(tmp_path, listen="tcp://0.0.0.0:5555")
+
+
+def test_the_scanner_and_the_gateway_never_import_taichi() -> None:
+    code = """
+import sys, tsfusion.client, tsfusion.server, tsfusion.recording, tsfusion.codec
+tsfusion.Client, tsfusion.Keyframe
+sys.exit("taichi" in sys.modules)
+"""
+    assert subprocess.run([sys.executable, "-c", code], timeout=DEADLINE, check=False).returncode == 0

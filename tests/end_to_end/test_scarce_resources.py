@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: MIT
+"""What a server and a client lack: file descriptors, room on the disk, files that were there before."""
+
+import errno
+import os
+import resource
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+from keyframes_and_servers import DEADLINE, Server, alive, connected, serving, until, wall
+
+from tsfusion import Client, Volume, VolumeConfig, journal
+from tsfusion.core.config import ClientConfig
+from tsfusion.core.errors import InvalidKeyframe, JournalError, KeyframeRefused
+from tsfusion.datasets import Synthetic
+from tsfusion.delivery.spool import Spool
+from tsfusion.journal import Journal
+from tsfusion.wire import messages, sockets
+from tsfusion.wire.messages import Command
+from tsfusion.wire.queries import fetch_health
+
+QUICK = ClientConfig(stall_timeout=0.5)
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with serving(tmp_path_factory.mktemp("shared")) as server:
+        yield server
+
+
+# --- scarce file descriptors, a full or vanishing disk ---
+
+
+def test_a_server_out_of_file_descriptors_lives(tmp_path: Path) -> None:
+    with serving(tmp_path / "state") as server, Client(server.address, config=QUICK) as client:
+        client.send(wall(0))
+        client.wait_fused(timeout=DEADLINE)
+        pid = server.process.pid
+        before = resource.prlimit(pid, resource.RLIMIT_NOFILE)
+        with connected(sockets.dealer, server.control) as link:
+            assert link.poll(10_000, zmq.POLLOUT)
+            used = sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir())
+            resource.prlimit(pid, resource.RLIMIT_NOFILE, (used, before[1]))
+            link.send(messages.encode(Command(name="status")))
+            assert link.poll(10_000)
+            reply = messages.decode_to_client(link.recv())
+        assert isinstance(reply, messages.Reply)
+        assert reply.status is not None
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, before)
+        client.send(wall(1))
+        client.wait_fused(timeout=DEADLINE)
+        assert server.terminate() == 0
+
+
+def seqs(folder: Path) -> list[int]:
+    found = Journal(folder, 1 << 20)
+    found.close()
+    return [record.seq for record in found.found]
+
+
+def test_a_keyframe_the_disk_refused_does_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its number is used again: found by a later scan, it would stand in the other's place."""
+    writer = Journal(tmp_path, 1 << 20)
+    writer.append([b"head", b"body"], session=bytes(16), seq=1)
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fdatasync", full)
+    with pytest.raises(JournalError, match="No space left on device"):
+        writer.append([b"head", b"body"], session=bytes(16), seq=2)
+    monkeypatch.undo()
+    assert seqs(tmp_path) == [1]
+    writer.append([b"head", b"body"], session=bytes(16), seq=3)
+    writer.close()
+    assert seqs(tmp_path) == [1, 3]
+
+
+def test_a_disk_that_stays_full_leaves_no_heap_of_segments(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = Journal(tmp_path, 1 << 20)
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fdatasync", full)
+    for _ in range(20):
+        with pytest.raises(JournalError):
+            writer.append([b"head", b"body"], session=bytes(16), seq=1)
+    assert len(journal.segments(tmp_path)) <= 1
+    monkeypatch.undo()
+    position = writer.append([b"head", b"body"], session=bytes(16), seq=1)
+    assert journal.read(tmp_path, position).seq == 1
+    writer.close()
+
+
+def test_a_segment_that_cannot_be_closed_does_not_take_its_last_keyframe_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = Journal(tmp_path, 1)  # each keyframe fills a segment
+
+    def full(_: Journal) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Journal, "rotate", full)
+    first = writer.append([b"head", b"body"], session=bytes(16), seq=1)
+    monkeypatch.undo()
+    second = writer.append([b"head", b"body"], session=bytes(16), seq=2)
+    writer.close()
+    assert (first.segment, second.segment) == (1, 2)
+    assert seqs(tmp_path) == [1, 2]
+
+
+def test_a_journal_whose_folder_vanishes_is_a_clear_error(tmp_path: Path) -> None:
+    writer = Journal(tmp_path / "journal", 1)
+    writer.append([b"head", b"body"], session=bytes(16), seq=1)
+    (tmp_path / "journal" / "000001.mcap").unlink()
+    (tmp_path / "journal").rmdir()
+    with pytest.raises(JournalError, match="No such file"):
+        writer.append([b"head", b"body"], session=bytes(16), seq=2)
+
+
+def test_a_client_survives_the_loss_of_its_spool_files(shared: Server, tmp_path: Path) -> None:
+    small = ClientConfig(segment_bytes=1 << 16, stall_timeout=0.5, policy="spool_all")
+    with Client("tcp://127.0.0.1:1", spool=tmp_path, config=small) as early:
+        for i in range(40):
+            early.send(wall(i))
+    lost = sorted(tmp_path.glob("*.mcap"))[0]
+    with Client(shared.address, spool=tmp_path, config=small) as client:
+        lost.unlink()
+        client.send(wall(41))
+        client.wait_fused(timeout=DEADLINE)
+        assert client.stats.durable + sum(client.stats.refused.values()) == 41
+
+
+# --- memory ---
+
+
+@pytest.mark.slow
+def test_a_map_that_outgrows_its_memory_refuses_keyframes_and_lives(tmp_path: Path) -> None:
+    """The map has what fitted, exactly; the rest is kept aside, and the fuser does not die of it."""
+    room = Synthetic("room", sensor="kinect", count=12, seed=0)
+    fine = VolumeConfig(voxel_size=0.004, threads=1)
+    with (
+        serving(tmp_path, fine, fuser_memory_bytes=1 << 28) as server,
+        Client(server.address, policy="spool_all") as client,
+    ):
+        for i in range(12):
+            client.send(room[i])
+        client.flush(timeout=DEADLINE)
+        client.wait_fused(timeout=DEADLINE)
+        health = fetch_health(server.address).maps["default"]
+        assert 0 < client.stats.rejected["memory"] == health.rejected["memory"] == health.quarantined < 12
+        assert health.fuser_restarts == 0
+        assert server.terminate() == 0
+    saved = Volume.load(tmp_path / "maps/default/map.tsf")
+    kept = {int(path.name.split("-")[1]) for path in (tmp_path / "maps/default/quarantine").iterdir()}
+    volume = Volume(fine)
+    for i in set(range(12)) - {seq - 1 for seq in kept}:
+        volume.integrate(room[i])
+    assert volume.map_hash() == saved.map_hash()
+
+
+# --- keyframes that cannot travel ---
+
+
+def test_a_sensor_that_has_no_name_is_refused_at_once(tmp_path: Path) -> None:
+    with pytest.raises(InvalidKeyframe, match=r"sensor must be a name of 1 to 32 characters, got 'xxxx"):
+        wall(sensor="x" * 33)
+    with pytest.raises(InvalidKeyframe, match="sensor must be a name"):
+        wall(sensor=5)
+
+
+def test_a_spooled_message_that_is_none_is_given_up(shared: Server, tmp_path: Path) -> None:
+    spool = Spool(tmp_path, 1 << 20)
+    spool.add(spool.write([b"rubbish", b"x"]))
+    spool.close()
+    with Client(shared.address, spool=tmp_path) as client:
+        client.send(wall(5))
+        with pytest.raises(KeyframeRefused, match=r"1 was refused \(spool\)"):
+            client.flush(timeout=DEADLINE)
+        client.wait_fused(timeout=DEADLINE)
+
+
+# --- a server that is killed ---
+
+
+def test_a_killed_server_leaves_no_socket_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with tempfile.TemporaryDirectory(prefix="t", dir="/tmp") as short:  # a socket's path has to be short
+        monkeypatch.setenv("TMPDIR", short)
+        with serving(tmp_path / "state") as server:
+            assert len(list(Path(short).iterdir())) == 1
+            fuser = server.fuser_pid()
+            server.kill()
+            until(lambda: not alive(fuser))
+        assert list(Path(short).iterdir()) == []

@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: MIT
+"""One server, several maps and several scanners: real processes and sockets."""
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+from keyframes_and_servers import DEADLINE, Server, connected, serving, until, wall
+
+import tsfusion
+from tsfusion import Client
+from tsfusion.core import config
+from tsfusion.core import config as core_config
+from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.core.errors import JournalError, ServerUnreachable, TransportError
+from tsfusion.gateway import map_registry
+from tsfusion.gateway.map_registry import Atlas
+from tsfusion.gateway.quotas import Quotas
+from tsfusion.journal import state_folder
+from tsfusion.journal.recording import Recording
+from tsfusion.wire import codec, messages, sockets
+from tsfusion.wire.keyframe_header import VERSION, Refused, unpack
+from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_status
+
+
+def fused_hash(numbers: range) -> str:
+    volume = tsfusion.Volume(voxel_size=0.04, threads=1)
+    for i in numbers:
+        volume.integrate(wall(i))
+    return volume.map_hash()
+
+
+def scan(address: str, map_name: str, numbers: range) -> None:
+    with Client(address, map=map_name, policy="spool_all") as client:
+        for i in numbers:
+            client.send(wall(i, captured_ns=time.monotonic_ns()))
+        client.flush(timeout=DEADLINE)
+        client.wait_fused(timeout=DEADLINE)
+
+
+def test_two_scanners_two_maps(tmp_path: Path) -> None:
+    with serving(tmp_path) as server:
+        numbers = {"default": range(6), "yard-2": range(4, 12)}
+        scanners = [
+            threading.Thread(target=scan, args=(server.address, name, which))
+            for name, which in numbers.items()
+        ]
+        for scanner in scanners:
+            scanner.start()
+        for scanner in scanners:
+            scanner.join(DEADLINE)
+        for name, which in numbers.items():
+            status = fetch_status(server.address, map_name=name)
+            assert (status.map, status.keyframes_fused) == (name, len(which))
+            assert status.map_hash == fused_hash(which)
+            assert status.delay_bound_ms > 0
+        health = fetch_health(server.address)
+        assert health.ready
+        assert {name: one.keyframes_fused for name, one in health.maps.items()} == {
+            "default": 6,
+            "yard-2": 8,
+        }
+        assert {client.map for client in health.clients} == set(numbers)
+        assert len(fetch_mesh(server.address, map_name="yard-2", min_weight=0.5).faces) > 100
+        with pytest.raises(TransportError, match="no map attic is open"):
+            fetch_status(server.address, map_name="attic")
+        assert server.terminate() == 0
+    assert state_folder.names(tmp_path) == ["default", "yard-2"]
+    with pytest.raises(JournalError, match=r"has several maps \(default, yard-2\): choose one with --map"):
+        Recording(tmp_path)
+    assert len(Recording(tmp_path, "yard-2")) == len(Recording(tmp_path / "maps/yard-2")) == 8
+    with serving(tmp_path) as server:  # both are taken up again, without anybody asking
+        until(lambda: set(fetch_health(server.address).maps) == set(numbers))
+        assert fetch_status(server.address, map_name="yard-2").map_hash == fused_hash(numbers["yard-2"])
+        assert server.terminate() == 0
+
+
+def test_a_server_opens_only_so_many_maps(tmp_path: Path) -> None:
+    refused = pytest.raises(ServerUnreachable, match=r"map attic cannot be opened: .* open \(max_maps\)")
+    with serving(tmp_path, max_maps=1) as server, Client(server.address, map="attic") as client, refused:
+        client.connect(timeout=5)
+    assert state_folder.names(tmp_path) == ["default"]
+
+
+def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise JournalError("no room")
+
+    monkeypatch.setattr(map_registry, "HostedMap", fail)
+    found: Any = Atlas(zmq.Context.instance(), ServerConfig(state=str(tmp_path)), None)  # type: ignore[arg-type]
+    found._volumes = {"default": VolumeConfig()}
+    for i in range(200):
+        assert found.open_for_client(f"map{i}") is None
+    assert len(found.health()[1]) == 64
+    assert found.why_not("map199") == "no room"
+
+
+def test_a_map_takes_only_so_many_sessions(tmp_path: Path) -> None:
+    code = "import tsfusion.gateway.sessions; tsfusion.gateway.sessions._MAX_SESSIONS = 2\n"
+    with contextlib.closing(Server(tmp_path, code=code)) as server:
+        for i in range(2):
+            scan(server.address, "default", range(i, i + 1))
+        refused = pytest.raises(ServerUnreachable, match="map default has 2 sessions and takes no new one")
+        with Client(server.address) as client, refused:
+            client.connect(timeout=5)
+        with connected(sockets.push, server.address) as push:  # without a greeting neither
+            push.send_multipart(codec.encode(wall(), session=b"s" * 16, seq=1, jpeg_quality=90))
+            until(lambda: fetch_health(server.address).refused.get("session", 0) == 1)
+        assert fetch_health(server.address).maps["default"].sessions == 2
+        assert server.terminate() == 0
+
+
+@pytest.mark.parametrize("name", ["../up", "a/b", "", "A", "a" * 33, "a\n", "a\0", "ä", "."])
+def test_a_name_is_never_a_path(name: str) -> None:
+    with pytest.raises(tsfusion.InvalidConfig):
+        config.make(config.ClientConfig, {"map": name})
+    hello = messages.encode(messages.Hello(bytes(16), VERSION, map=name))
+    with pytest.raises(tsfusion.DecodeError):
+        messages.decode_to_server(hello)
+    frames = codec.encode(wall(), session=bytes(16), seq=1, map_name=name, jpeg_quality=90)
+    with pytest.raises(Refused):
+        unpack(frames[0])
+
+
+def test_maps_have_settings_of_their_own(tmp_path: Path) -> None:
+    path = tmp_path / "tsfusion.toml"
+    path.write_text('[volume]\nvoxel_size = 0.05\n[maps.yard]\nvoxel_size = 0.2\nsensor = "lidar"\n')
+    loaded = config.load(path)
+    assert loaded.volumes() == {"yard": VolumeConfig(voxel_size=0.2, sensor="lidar")}
+    path.write_text(core_config.dumps(loaded))
+    assert config.load(path) == loaded
+    path.write_text("[maps.yard]\nvoxel_size = -1.0\n")
+    with pytest.raises(tsfusion.InvalidConfig, match=r"\[maps\.yard\]: voxel_size must be > 0, got -1\.0"):
+        config.load(path)
+
+
+# --- fairness and quotas ---
+
+
+def test_a_flood_does_not_hold_up_another_scanner(tmp_path: Path) -> None:
+    """400 keyframes of one client are journaled before the other's first: that is fused soon all the same."""
+    with serving(tmp_path) as server:
+        with Client(server.address, policy="spool_all") as flood:
+            for i in range(400):
+                flood.send(wall(i % 8))
+            flood.flush(timeout=DEADLINE)
+            with Client(server.address) as other:
+                other.send(wall(1))
+                other.wait_fused(timeout=DEADLINE)
+                waiting = fetch_health(server.address).maps["default"].waiting
+            flood.wait_fused(timeout=DEADLINE)
+        assert fetch_status(server.address).keyframes_fused == 401
+    assert waiting > 100, "the flood was over too early to tell"
+
+
+def test_who_sends_too_much_has_to_wait_and_loses_nothing(tmp_path: Path) -> None:
+    with serving(tmp_path, quota_keyframes=10.0) as server:
+        started = time.monotonic()
+        scan(server.address, "default", range(23))
+        scan(server.address, "default", range(23, 45))  # a new session is no way around it
+        assert time.monotonic() - started > 2.0  # 20 at once, then ten a second
+        health = fetch_health(server.address)
+        assert health.refused["held"] > 0
+        assert health.maps["default"].keyframes_fused == 45
+
+
+def test_too_many_points_or_too_far_is_refused() -> None:
+    quotas = Quotas(ServerConfig(quota_points=3000, quota_extent=100.0))
+    far = wall()
+    header = unpack(codec.encode(far, session=bytes(16), seq=1, jpeg_quality=90)[0])
+    with pytest.raises(Refused, match="a keyframe may have 3000 points, got 3072"):
+        quotas.check(header)
+    pose = wall().T_world_camera.copy()
+    pose[:3, 3] = 80, 80, 0
+    header = unpack(codec.encode(wall(T_world_camera=pose), session=bytes(16), seq=1, jpeg_quality=90)[0])
+    with pytest.raises(Refused, match="a sensor may be 100 m from the origin, got 113 m"):
+        Quotas(ServerConfig(quota_extent=100.0)).check(header)
+
+
+def test_quotas_are_of_each_client_and_forget_strangers() -> None:
+    quotas = Quotas(ServerConfig(quota_keyframes=10.0, quota_bytes=1 << 20))
+    assert [quotas.wait("a", 1000, 0.0) for _ in range(20)] == [0.0] * 20
+    assert quotas.wait("a", 1000, 0.0) == pytest.approx(0.1)
+    assert quotas.wait("b", 1000, 0.0) == 0.0
+    assert quotas.wait("a", 1000, 0.2) == 0.0
+    assert quotas.wait("c", 1 << 30, 0.0) == 0.0  # more than the bucket holds passes when it is full
+    assert quotas.wait("c", 1, 0.0) > 0
+    for i in range(5000):
+        quotas.wait(str(i), 1, 0.0)
+    assert len(quotas._clients) == 4096
+
+
+# --- the disk ---
+
+
+def test_a_full_disk_is_said_and_waited_for(tmp_path: Path) -> None:
+    """Nothing is lost: the client keeps what the server's disk has no room for."""
+    most = 1 << 40
+    with serving(tmp_path / "state", min_free_bytes=most) as server, Client(server.address) as client:
+        client.connect()
+        client.send(wall())
+        until(lambda: not fetch_health(server.address).ready)
+        health = fetch_health(server.address)
+        assert "must stay so" in health.problems[0]
+        until(lambda: any(one.held == "disk" for one in fetch_health(server.address).clients))
+        with pytest.raises(tsfusion.FlushTimeout, match="must stay so"):
+            client.flush(timeout=1.0)
+        assert (client.stats.waiting, client.stats.skipped) == (1, {})
+
+
+def test_a_full_disk_with_room_again(small_disk: Callable[[int], Path]) -> None:
+    folder = small_disk(24)
+    with (
+        serving(folder, min_free_bytes=4 << 20) as server,
+        Client(server.address, policy="spool_all") as client,
+    ):
+        scan(server.address, "default", range(3))
+        filler = folder / "filler"
+        filler.write_bytes(bytes(20 << 20))
+        sent = 3
+
+        def noticed() -> bool:  # the disk is looked at once a second
+            nonlocal sent
+            client.send(wall(sent))
+            sent += 1
+            return "must stay so" in " ".join(fetch_health(server.address).problems)
+
+        until(noticed)
+        filler.unlink()
+        client.wait_fused(timeout=DEADLINE)
+        assert fetch_health(server.address).ready
+        assert fetch_status(server.address).map_hash == fused_hash(range(sent))
+        assert server.terminate() == 0
+
+
+def test_a_journal_keeps_to_its_limit(tmp_path: Path) -> None:
+    """What two checkpoints hold goes; a restart knows all the same what was fused."""
+    limit = 1 << 20
+    settings = {"journal_bytes": limit, "segment_bytes": 1 << 16, "checkpoint_every": 40}
+    with serving(tmp_path, **settings) as server:
+        scan(server.address, "default", range(1200))
+        until(lambda: fetch_health(server.address).maps["default"].journal_bytes < 2 * limit)
+        server.kill()
+    assert len(Recording(tmp_path)) < 1200
+    with serving(tmp_path, **settings) as server:
+        until(lambda: fetch_health(server.address).maps["default"].keyframes_fused == 1200)
+        scan(server.address, "default", range(1200, 1210))
+        assert fetch_status(server.address).map_hash == fused_hash(range(1210))
+        assert server.terminate() == 0
+
+
+def test_nobody_but_the_maps_viewers_gets_its_triangles(tmp_path: Path) -> None:
+    assert sockets.mesh_topic("yard") == b"mesh/yard/"
+    assert not sockets.mesh_topic("yard2").startswith(sockets.mesh_topic("yard"))
+    with serving(tmp_path) as server, connected(sockets.subscriber, server.publish) as viewer:
+        with Client(server.address, map="yard", policy="spool_all") as client:
+            for i in range(3):
+                client.send(wall(i))
+                client.wait_meshed(timeout=DEADLINE)
+        assert not viewer.poll(200, zmq.POLLIN)

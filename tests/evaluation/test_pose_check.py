@@ -1,0 +1,334 @@
+# SPDX-License-Identifier: MIT
+"""Genuine datasets pass the check; the usual mistakes are named, those that nobody could see are not."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tsfusion import cli
+from tsfusion.datasets import Dataset, Selection, Synthetic, open_dataset, select
+from tsfusion.datasets.dataset import Frames, frame_of
+from tsfusion.evaluation.pose_check import check
+from tsfusion.geometry import se3
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.trajectory import Pose, quaternion, rigid
+
+Data = Callable[[str], Path]
+MIRROR, OPENGL = np.diag([1.0, -1, 1, 1]), np.diag([1.0, -1, -1, 1])
+BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+OTHER_WORLD = se3.exp(np.array([0.3, 0.1, -0.2, 0.5, -1.2, 0.8]))
+
+
+class Corrupted(Frames):
+    """Another dataset with its poses changed, its frames changed, or poses of `late` frames before."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        pose: Callable[[Pose], NDArray[np.float64]] = np.asarray,
+        frame: Callable[[Frame], dict[str, object]] = lambda _: {},
+        late: int = 0,
+    ) -> None:
+        self.name, self.sensor, self.skipped = dataset.name, dataset.sensor, {}
+        self.timestamps_ns = dataset.timestamps_ns
+        self._frame_of = cache(lambda index: frame_of(dataset, index))
+        self._pose, self._change, self._late, self._count = pose, frame, late, len(dataset)
+
+    def __len__(self) -> int:
+        return self._count - abs(self._late)
+
+    def _frame(self, index: int) -> Frame:
+        seen = self._frame_of(index + max(0, self._late))
+        posed = self._frame_of(index + max(0, -self._late))
+        fields = {field.name: getattr(seen, field.name) for field in dataclasses.fields(seen) if field.init}
+        assert posed.T_world_camera is not None
+        changed = {"T_world_camera": self._pose(posed.T_world_camera), **self._change(seen)}
+        return Frame(**{**fields, **changed})
+
+
+def stretched(factor: float) -> Callable[[Pose], Pose]:
+    def change(T: Pose) -> Pose:
+        moved: Pose = np.array(T)
+        moved[:3, 3] *= factor
+        return moved
+
+    return change
+
+
+def reordered(order: list[int]) -> Callable[[Pose], Pose]:
+    return lambda T: rigid(quaternion(T[:3, :3])[order], T[:3, 3])
+
+
+def transposed(T: Pose) -> Pose:
+    turned: Pose = np.array(T)
+    turned[:3, :3] = T[:3, :3].T
+    return turned
+
+
+def deeper(factor: float) -> Callable[[Frame], dict[str, object]]:
+    return lambda frame: {"depth_scale": frame.depth_scale * factor}
+
+
+def negative_fy(frame: Frame) -> dict[str, object]:
+    K = frame.intrinsics
+    assert K is not None
+    return {"intrinsics": Intrinsics(K.fx, -K.fy, K.cx, K.cy)}
+
+
+POSES: dict[str, tuple[Callable[[Pose], NDArray[np.float64]], str]] = {
+    "inverse": (se3.inverse, "inverse"),
+    "opengl": (lambda T: T @ OPENGL, "opengl"),
+    "view matrix": (lambda T: OPENGL @ se3.inverse(T), "inverse opengl"),
+    "left-handed": (lambda T: MIRROR @ T @ MIRROR, "mirror"),
+    "body axes": (lambda T: T @ BODY, "body axes"),
+    "camera axes": (lambda T: T @ BODY.T, "camera axes"),
+    "quaternion wxyz": (reordered([3, 0, 1, 2]), "quaternion wxyz"),
+    "quaternion xyzw": (reordered([1, 2, 3, 0]), "quaternion xyzw"),
+    "conjugate": (transposed, "conjugate"),
+}
+FOLDERS = {
+    "7scenes": "7scenes/redkitchen",
+    "hololens": "hololens/000",
+    "redwood": "redwood_livingroom1",
+    "open3d": "open3d_rgbd",
+    "3dmatch": "3dmatch",
+    "icl": "icl_nuim_tum",
+}
+WHOLE = (
+    "7scenes",
+    "hololens",
+    pytest.param("redwood", marks=pytest.mark.slow),
+    pytest.param("open3d", marks=pytest.mark.slow),
+)
+
+
+@cache
+def opened(place: Path, **options: Any) -> Dataset:
+    """The dataset, each frame read once for all tests."""
+    return Corrupted(open_dataset(place, **options))
+
+
+@cache
+def synthetic(world: str, sensor: str) -> Dataset:
+    return Corrupted(Synthetic(world, sensor, count=18))
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_genuine_folders_pass(name: str, data: Data) -> None:
+    report = check(opened(data(FOLDERS[name])))
+    assert report.verdict == ("cannot tell" if name == "icl" else "agree")  # whose three frames hardly move
+    assert report.mistake is None
+
+
+@pytest.mark.parametrize(
+    ("sequence", "poses"), [("06", None), ("00", "poses_estimated/00_ORB.txt")], ids=["stereo", "lidar"]
+)
+def test_genuine_kitti_passes(sequence: str, poses: str | None, data: Data) -> None:
+    options = {"sequence": sequence} | ({} if poses is None else {"poses": poses})
+    assert check(opened(data("kitti_odometry"), **options)).verdict == "agree"
+
+
+@pytest.mark.parametrize(
+    ("world", "sensor"),
+    [
+        ("room", "kinect"),
+        ("room", "stereo"),
+        pytest.param("room", "lidar", marks=pytest.mark.slow),
+        pytest.param("street", "lidar", marks=pytest.mark.slow),
+    ],
+)
+def test_synthetic_worlds_pass(world: str, sensor: str) -> None:
+    assert check(synthetic(world, sensor)).verdict == "agree"
+
+
+@pytest.mark.parametrize("mistake", POSES)
+@pytest.mark.parametrize("name", WHOLE)
+def test_misread_poses_are_named(name: str, mistake: str, data: Data) -> None:
+    change, expected = POSES[mistake]
+    report = check(Corrupted(opened(data(FOLDERS[name])), change))
+    assert report.verdict == "disagree"
+    assert report.mistake == expected
+    assert report.tried[expected] > 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mistake", POSES)
+def test_misread_poses_of_a_lidar_are_named(mistake: str) -> None:
+    change, expected = POSES[mistake]
+    report = check(Corrupted(synthetic("room", "lidar"), change))
+    assert expected in (report.mistake, *report.alternatives)
+
+
+def test_kitti_scans_without_tr_are_named(data: Data) -> None:
+    root = data("kitti_odometry")
+    scans = opened(root, sequence="00", poses="poses_estimated/00_ORB.txt")
+    report = check(Corrupted(scans, lambda T: BODY @ T @ BODY.T))  # of the camera, up to the world's axes
+    assert report.mistake == "camera axes"
+    assert "Tr" in report.text
+
+
+def test_what_straight_driving_cannot_tell_apart_is_said(data: Data) -> None:
+    report = check(Corrupted(opened(data("kitti_odometry"), sequence="06"), se3.inverse))
+    assert report.mistake == "inverse"
+    assert "opengl" in report.alternatives
+    assert "opengl" in report.text
+
+
+@pytest.mark.parametrize("name", WHOLE)
+@pytest.mark.parametrize(("factor", "words"), [(1000, "millimetres"), (100, "centimetres")], ids=["mm", "cm"])
+def test_units_of_translations_are_named(name: str, factor: float, words: str, data: Data) -> None:
+    report = check(Corrupted(opened(data(FOLDERS[name])), stretched(factor)))
+    assert report.mistake == "scale"
+    assert report.factor == pytest.approx(1 / factor)
+    assert words in report.text
+
+
+@pytest.mark.parametrize("name", WHOLE)
+@pytest.mark.parametrize("factor", [0.2, 1.31, 5.0])
+def test_wrong_depth_scale_is_measured(name: str, factor: float, data: Data) -> None:
+    report = check(Corrupted(opened(data(FOLDERS[name])), frame=deeper(factor)))
+    assert report.mistake == "scale"
+    assert report.factor == pytest.approx(factor, rel=0.04)
+    small = factor < 1
+    size = f"{1 / factor if small else factor:.3g} times too {'small' if small else 'large'}"
+    assert factor == 1.31 or f"depth is {size}" in report.text
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_wrong_sign_of_fy_is_named(name: str, data: Data) -> None:
+    report = check(Corrupted(opened(data(FOLDERS[name])), frame=negative_fy))
+    assert report.mistake == "mirror"
+    assert "fy" in report.text
+
+
+@pytest.mark.parametrize("late", [-1, 1, 2])
+@pytest.mark.parametrize("name", ["7scenes", "hololens"])
+def test_poses_of_other_frames_are_noticed(name: str, late: int, data: Data) -> None:
+    report = check(Corrupted(opened(data(FOLDERS[name])), late=late))
+    assert report.mistake == "time"
+    assert report.shift == late
+
+
+def test_shift_is_told_in_milliseconds(data: Data) -> None:
+    moved = Corrupted(opened(data(FOLDERS["7scenes"])), late=1)
+    moved.timestamps_ns = np.arange(len(moved), dtype=np.int64) * 133_000_000
+    assert "1 frame (133 ms) late" in check(moved).text
+
+
+def test_what_agrees_and_cannot_be_told_apart_is_said(data: Data) -> None:
+    report = check(opened(data(FOLDERS["3dmatch"])))
+    assert report.verdict == "agree"
+    assert set(report.alternatives) == {"mirror", "conjugate"}
+    assert "mirror, conjugate" in report.text
+    assert "tell them apart" in report.text
+    sure = check(opened(data(FOLDERS["7scenes"])))
+    assert sure.text == "poses and depth agree"
+    assert sure.alternatives == ()
+
+
+@pytest.mark.parametrize("name", ["7scenes", "hololens", "3dmatch"])
+def test_axes_of_the_world_do_not_matter(name: str, data: Data) -> None:
+    assert check(Corrupted(opened(data(FOLDERS[name])), lambda T: OTHER_WORLD @ T)).verdict == "agree"
+
+
+@pytest.mark.parametrize("name", ["7scenes", "hololens"])
+def test_what_nothing_explains_is_said(name: str, data: Data) -> None:
+    rng = np.random.default_rng(4)
+    noisy = Corrupted(opened(data(FOLDERS[name])), lambda T: se3.exp(rng.normal(size=6) * 0.05) @ T)
+    report = check(noisy)
+    assert report.verdict == "disagree"
+    assert report.mistake == "unexplained"
+
+
+def test_kittis_wrong_ground_truth_is_flagged(data: Data) -> None:
+    report = check(opened(data("kitti_odometry"), sequence="00"))
+    assert report.verdict == "disagree"
+    assert report.mistake == "scale"  # of the first scans: 0.86 m a frame, ORB-SLAM has 0.70
+    assert report.factor == pytest.approx(0.82, abs=0.04)
+    assert "no usual unit" in report.text
+
+
+def test_frames_that_share_nothing_cannot_tell(data: Data) -> None:
+    apart = select(opened(data(FOLDERS["hololens"])), start=5, stride=32)
+    assert check(apart).verdict == "cannot tell"
+
+
+def test_a_sensor_that_stands_still_cannot_tell(data: Data) -> None:
+    kitchen = opened(data(FOLDERS["7scenes"]))
+    still = Corrupted(Selection(kitchen, [0] * 20), lambda _: np.eye(4))
+    assert check(still).verdict == "cannot tell"
+
+
+def test_one_frame_cannot_tell(data: Data) -> None:
+    assert check(select(opened(data(FOLDERS["7scenes"])), limit=1)).verdict == "cannot tell"
+
+
+def test_frames_without_depth_cannot_tell(data: Data) -> None:
+    def blind(frame: Frame) -> dict[str, object]:
+        return {"depth": np.zeros(frame.shape, np.uint16)}
+
+    assert check(Corrupted(opened(data(FOLDERS["open3d"])), frame=blind)).verdict == "cannot tell"
+
+
+def test_points_that_no_lidar_measures_are_no_matter() -> None:
+    scans = synthetic("room", "lidar")
+
+    def beyond(frame: Frame) -> dict[str, object]:
+        assert frame.points is not None
+        return {"points": np.vstack([[[3e38, 0, 0]], frame.points[1:]]).astype(np.float32)}
+
+    assert check(Corrupted(scans, frame=beyond)).verdict == "agree"
+
+
+def run(*arguments: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(list(arguments))
+    return int(ended.value.code or 0)
+
+
+def test_verb_says_what_it_found(data: Data, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    place = data(FOLDERS["open3d"])
+    assert run("check", str(place)) == 0
+    assert "poses and depth agree" in capsys.readouterr().out
+    assert run("check", str(place), "--json") == 0
+    assert json.loads(capsys.readouterr().out)["verdict"] == "agree"
+    assert run("check", str(inverted(place, tmp_path))) == 1
+    assert "world-to-camera" in capsys.readouterr().out
+    assert run("check", str(place), "--option", "depth_scale=0.0002") == 1
+    assert "depth is 5 times too small" in capsys.readouterr().out
+
+
+def inverted(place: Path, folder: Path) -> Path:
+    """A copy whose trajectory is world-to-camera."""
+    from tsfusion.datasets.trajectory_files import read_log
+
+    copy = folder / "wrong"
+    copy.mkdir()
+    for name in ("depth", "color"):
+        (copy / name).symlink_to(place / name)
+    text = ""
+    for index, T in read_log(place / "trajectory.log"):
+        rows = "\n".join(" ".join(repr(float(value)) for value in row) for row in se3.inverse(T))
+        text += f"{index} {index} {index + 1}\n{rows}\n"
+    (copy / "trajectory.log").write_text(text)
+    return copy
+
+
+def test_replay_warns(data: Data, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from tsfusion.cli import replay
+
+    wrong = inverted(data(FOLDERS["open3d"]), tmp_path)
+    replay._warn(open_dataset(wrong))
+    assert capsys.readouterr().err.startswith(
+        "warning: poses and depth disagree: the poses are world-to-camera"
+    )
+    replay._warn(open_dataset(data(FOLDERS["open3d"])))
+    assert capsys.readouterr().err == ""

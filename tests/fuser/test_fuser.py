@@ -1,0 +1,377 @@
+# SPDX-License-Identifier: MIT
+"""What the fuser does with each message, in this process; its link is a list."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from keyframes_and_servers import DEADLINE, alive, serving, until, wall
+
+import tsfusion
+from tsfusion import VolumeConfig
+from tsfusion.core.errors import CheckpointError, InvalidConfig, MapError
+from tsfusion.core.folder_lock import hold
+from tsfusion.fuser import messages as fuser_messages
+from tsfusion.fuser.fuser import Fuser
+from tsfusion.fuser.saved_map import SavedMap
+from tsfusion.journal import Journal, Position
+from tsfusion.journal.state_folder import MAP_FILE, PREVIOUS_FILE
+from tsfusion.wire import codec
+from tsfusion.wire.messages import Command
+from tsfusion.wire.queries import fetch_health
+
+VOLUME = VolumeConfig(voxel_size=0.04, threads=1)
+
+
+class Link:
+    """Takes what the fuser sends."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[fuser_messages.ToGateway, list[Any]]] = []
+
+    def send_multipart(self, frames: list[Any], copy: bool) -> None:
+        assert not copy
+        self.sent.append((fuser_messages.to_gateway.decode(frames[0]), frames[1:]))
+
+    def last(self) -> Any:
+        return self.sent[-1][0]
+
+    def done(self) -> fuser_messages.Done:
+        return [message for message, _ in self.sent if isinstance(message, fuser_messages.Done)][-1]
+
+
+SESSION = bytes(16)
+
+
+def order(index: int, position: Position, skip: str | None = None) -> fuser_messages.Fuse:
+    return fuser_messages.Fuse(index, position, SESSION, index + 1, "robot", skip)
+
+
+def fill(state: Path, count: int) -> list[Position]:
+    journal = Journal(state / "journal", 1 << 20)
+    session = SESSION
+    positions = [
+        journal.append(
+            codec.encode(wall(i), session=session, seq=i + 1, jpeg_quality=90), session=session, seq=i + 1
+        )
+        for i in range(count)
+    ]
+    journal.close()
+    return positions
+
+
+def opened(state: Path, volume: VolumeConfig = VOLUME, **settings: Any) -> tuple[Fuser, Link]:
+    link = Link()
+    working = state / "working"
+    working.write_bytes(bytes(8))
+    usual = {"mesh_interval": 0.0, "checkpoint_every": 0, "keep_previous": False, "memory_bytes": 1 << 40}
+    begin = fuser_messages.Begin(str(state), volume, working=str(working), **{**usual, **settings})
+    return Fuser(link, begin), link  # type: ignore[arg-type]
+
+
+def status(fuser: Fuser, link: Link) -> fuser_messages.FuserStatus:
+    fuser.take(fuser_messages.Ask(1, Command(name="status")))
+    answer = link.last()
+    assert answer.status is not None
+    return msgspec.structs.replace(answer.status, peak_rss_bytes=0)  # of this whole process
+
+
+def test_keyframes_are_fused_meshed_and_checkpointed(tmp_path: Path) -> None:
+    positions = fill(tmp_path, 3)
+    fuser, link = opened(tmp_path)
+    assert fuser.ready().done == {}
+    assert not fuser.mesh_due(idle=True)
+    for index, position in enumerate(positions):
+        fuser.take(order(index, position))
+        done = link.last()
+        assert (done.index, done.reason, done.fused_ns > done.fuse_start_ns > 0) == (index, None, True)
+    assert fuser.mesh_due(idle=True)
+    fuser.mesh()
+    assert (link.last().count, link.sent[-1][1]) == (3, [])
+    fuser.take(fuser_messages.Finish())
+    assert fuser.exit_status == 0
+    again, link_again = opened(tmp_path)
+    assert again.ready().done == {SESSION: fuser_messages.Progress(3, "robot")}
+    assert status(again, link_again) == status(fuser, link)
+
+
+def test_watchers_get_the_triangles(tmp_path: Path) -> None:
+    (position,) = fill(tmp_path, 1)
+    fuser, link = opened(tmp_path)
+    fuser.take(fuser_messages.Publish(True))
+    fuser.take(order(0, position))
+    fuser.mesh()
+    meshed, frames = link.sent[-1]
+    assert isinstance(meshed, fuser_messages.Meshed)
+    assert meshed.layout is not None
+    assert [memoryview(frame).nbytes % 3 for frame in frames] == [0] * 5
+
+
+def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tsfusion.fuser.fuser._REFINED_AT_ONCE", 10)
+    (position,) = fill(tmp_path, 1)
+    fuser, link = opened(tmp_path)
+    fuser.take(fuser_messages.Publish(True))
+    fuser.take(order(0, position))
+    fuser.mesh()
+    before = len(link.sent)
+    while fuser.refine_due:
+        fuser.refine()
+    refined = link.sent[before:]
+    assert len(refined) > 1
+    whole = fuser._volume.extract_mesh()
+    assert sum(meshed.layout.faces for meshed, _ in refined) == len(whole.faces) > 0
+    cells = np.concatenate([np.frombuffer(frames[0], np.int32).reshape(-1, 3) for _, frames in refined])
+    assert len(np.unique(cells, axis=0)) == len(cells)
+    fuser.mesh()
+    fuser.take(fuser_messages.Publish(False))
+    assert not fuser.refine_due
+
+
+def test_what_cannot_be_fused_is_counted_also_after_a_restart(tmp_path: Path) -> None:
+    positions = fill(tmp_path, 2)
+    fuser, link = opened(tmp_path, checkpoint_every=1)
+    fuser.take(order(0, Position(7, 42)))
+    assert link.done().reason == "JournalError"
+    fuser.take(order(1, positions[0], skip="crash"))
+    assert link.done().reason == "crash"
+    rejected = {"JournalError": 1, "crash": 1}
+    assert status(fuser, link).keyframes_rejected == rejected
+    assert status(*opened(tmp_path)).keyframes_rejected == rejected
+
+
+def saved(state: Path) -> Path:
+    volume = tsfusion.Volume(VOLUME)
+    volume.integrate(wall())
+    return volume.save(state / MAP_FILE, meta={"done": {SESSION.hex(): [1, ""]}, "rejected": {}})
+
+
+def test_a_map_of_other_settings_is_one_clear_error(tmp_path: Path) -> None:
+    saved(tmp_path)
+    with pytest.raises(
+        InvalidConfig, match=r"was made with voxel_size = 0\.04, got 0\.05: use another"
+    ) as raised:
+        opened(tmp_path, VolumeConfig(voxel_size=0.05))
+    assert "remove" not in str(raised.value)  # the journal may not go back to the start
+    opened(tmp_path, VolumeConfig(voxel_size=0.04, threads=2, max_blocks=10_000))
+
+
+def test_a_damaged_checkpoint_is_set_aside_and_the_journal_fused_anew(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = saved(tmp_path)
+    stored = bytearray(path.read_bytes())
+    stored[len(stored) // 2] ^= 1
+    for name in ("map.damaged", "map.damaged2"):  # nothing that was set aside is overwritten
+        path.write_bytes(stored)
+        fuser, _ = opened(tmp_path)
+        assert fuser.ready().done == {}
+        assert "built again from the journal" in caplog.text
+        assert (tmp_path / name).read_bytes() == stored
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("code", [errno.EMFILE, errno.EIO, errno.EACCES, errno.ENOMEM])
+def test_a_checkpoint_that_cannot_be_read_now_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    path = saved(tmp_path)
+    real = Path.open
+
+    def refused(self: Path, *arguments: Any, **more: Any) -> Any:
+        if self == path:
+            raise OSError(code, os.strerror(code))
+        return real(self, *arguments, **more)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "open", refused)
+        with pytest.raises(CheckpointError, match=os.strerror(code)):
+            opened(tmp_path)
+    assert opened(tmp_path)[0].ready().done == {SESSION: fuser_messages.Progress(1, "")}
+
+
+def test_a_checkpoint_without_memory_for_it_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(tmp_path)
+
+    def none_left(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("tsfusion.tsdf.volume.Volume.load", none_left)
+    with pytest.raises(CheckpointError, match="does not fit"):
+        opened(tmp_path)
+    assert path.exists()
+
+
+def test_a_keyframe_that_the_map_has_is_not_fused_again(tmp_path: Path) -> None:
+    positions = fill(tmp_path, 2)
+    fuser, link = opened(tmp_path)
+    for index in (0, 1, 0):
+        fuser.take(order(index, positions[index]))
+    assert (link.last().index, link.last().reason) == (0, None)
+    assert status(fuser, link).keyframes_fused == 2
+
+
+def test_a_checkpoint_on_request_keeps_the_one_before(tmp_path: Path) -> None:
+    """The journal forgets what both hold, so a damaged one is made good by the other."""
+    positions = fill(tmp_path, 3)
+    fuser, link = opened(tmp_path, keep_previous=True)
+    fuser.take(fuser_messages.Save())
+    assert link.last() == fuser_messages.Saved(written=False)
+    for index in (0, 1):
+        fuser.take(order(index, positions[index]))
+        fuser.take(fuser_messages.Save())
+        assert link.last() == fuser_messages.Saved(written=True)
+    assert (tmp_path / PREVIOUS_FILE).exists()
+    (tmp_path / MAP_FILE).write_bytes(b"")
+    again, _ = opened(tmp_path, keep_previous=True)
+    assert again.ready().done == {SESSION: fuser_messages.Progress(1, "robot")}
+
+
+@pytest.mark.parametrize("keep_previous", [False, True])
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_checkpoint_that_fails_leaves_the_old_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str, keep_previous: bool
+) -> None:
+    folder = tmp_path / "map"
+    folder.mkdir()
+    written = SavedMap(folder, VOLUME, keep_previous=keep_previous)
+    for seq in (1, 2):
+        written.done = {SESSION: fuser_messages.Progress(seq, "robot")}
+        assert written.save()
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert sorted(before) == ([PREVIOUS_FILE] if keep_previous else []) + [MAP_FILE]
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, call, full)
+        assert not written.save()
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    (folder / "map.new.tsf").write_bytes(b"by one that was killed")
+    assert SavedMap(folder, VOLUME, keep_previous=keep_previous).done == written.done
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_map_of_many_sessions_comes_back(tmp_path: Path) -> None:
+    written = SavedMap(tmp_path, VOLUME, keep_previous=False)
+    written.done = {
+        number.to_bytes(16): fuser_messages.Progress(number, "robot") for number in range(1, 40_001)
+    }
+    assert written.save()
+    assert opened(tmp_path)[0].ready().done == written.done
+
+
+def test_what_it_works_at_shows_from_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (position,) = fill(tmp_path, 1)
+    fuser, link = opened(tmp_path)
+
+    def decoder_bug(_: object) -> None:
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(codec, "decode", decoder_bug)
+    with pytest.raises(RuntimeError):
+        fuser.take(order(0, position))
+    assert (tmp_path / "working").read_bytes() == bytes(8)
+    monkeypatch.undo()
+    fuser.take(order(0, position))
+    assert link.last().reason is None
+    assert (tmp_path / "working").read_bytes() == b"\xff" * 8
+
+
+@pytest.mark.parametrize("code", [errno.EIO, errno.EMFILE, errno.ENOMEM])
+def test_a_record_that_cannot_be_read_now_is_left_to_another_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    (position,) = fill(tmp_path, 1)
+    fuser, link = opened(tmp_path)
+
+    def refused(*_: object) -> bytes:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "pread", refused)
+    fuser.take(order(0, position))
+    assert (fuser.exit_status, link.sent, fuser.ready().done) == (1, [], {})
+    assert (tmp_path / "working").read_bytes() == bytes(8)  # it was at this one
+    monkeypatch.undo()
+    again, link = opened(tmp_path)
+    again.take(order(0, position))
+    assert link.done().reason is None
+
+
+def test_no_memory_for_a_keyframe_is_no_crash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (position,) = fill(tmp_path, 1)
+    fuser, link = opened(tmp_path)
+
+    def too_large(_: object) -> None:
+        raise MemoryError("no room for 9 GB")
+
+    monkeypatch.setattr(codec, "decode", too_large)
+    fuser.take(order(0, position))
+    assert (link.last().reason, link.last().message) == ("memory", "no memory to fuse it: no room for 9 GB")
+
+
+@pytest.mark.parametrize("min_weight", [float("nan"), float("inf"), 1e308, 1e20, -1.0])
+def test_no_question_ends_the_fuser(tmp_path: Path, min_weight: float) -> None:
+    (position,) = fill(tmp_path, 1)
+    fuser, link = opened(tmp_path)
+    fuser.take(order(0, position))
+    fuser.take(fuser_messages.Ask(1, Command(name="mesh", min_weight=min_weight)))
+    assert "min_weight must be" in link.last().error
+
+
+# --- one fuser a map ---
+
+
+def started(code: str) -> tuple[subprocess.Popen[str], str]:
+    """A process, and its first word."""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    return process, process.stdout.readline()
+
+
+def test_a_map_has_one_fuser_for_as_long_as_it_lives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tsfusion.core.folder_lock._PATIENCE", 0.1)
+    code = "import time; from pathlib import Path; from tsfusion.core.folder_lock import hold;"
+    code += f"hold(Path({str(tmp_path)!r})); print('held', flush=True); time.sleep(600)"
+    with started(code)[0] as other:
+        with pytest.raises(MapError, match=rf"in use by another fuser \(pid {other.pid}\)"):
+            hold(tmp_path)
+        other.send_signal(signal.SIGSTOP)  # stopped or not
+        with pytest.raises(MapError, match="in use"):
+            hold(tmp_path)
+        other.kill()
+        monkeypatch.setattr("tsfusion.core.folder_lock._PATIENCE", DEADLINE)
+        os.close(hold(tmp_path))
+    with pytest.raises(MapError, match=r"cannot lock .*No such file"):
+        hold(tmp_path / "missing")
+
+
+def test_a_stopped_fuser_does_not_outlive_its_gateway(tmp_path: Path) -> None:
+    with serving(tmp_path) as server:
+        until(lambda: fetch_health(server.address).ready)
+        fuser = server.fuser_pid()
+        os.kill(fuser, signal.SIGSTOP)
+        server.kill()
+        until(lambda: not alive(fuser))
+
+
+def test_a_process_at_work_ends_with_the_one_that_started_it() -> None:
+    child = "from tsfusion.core import process; import signal, time; process.on_parent_end(signal.SIGKILL); "
+    child += "print(1, flush=True); time.sleep(600)"
+    code = "import subprocess, sys, time; "
+    code += f"p = subprocess.Popen([sys.executable, '-c', {child!r}], stdout=subprocess.PIPE); "
+    code += "p.stdout.readline(); print(p.pid, flush=True); time.sleep(600)"
+    parent, word = started(code)
+    with parent:
+        parent.kill()
+        until(lambda: not alive(int(word)))

@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: MIT
+"""The gateway with fusers that misbehave, in this process; and real scans by file and by socket."""
+
+import errno
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+from keyframes_and_servers import DEADLINE, Server, serving, until
+
+import tsfusion
+from tsfusion import Client, Keyframe, VolumeConfig, journal
+from tsfusion.core.config import ServerConfig
+from tsfusion.core.errors import InvalidConfig, MapError
+from tsfusion.datasets import open_dataset
+from tsfusion.fuser import messages as fuser_messages
+from tsfusion.gateway import fuser_process, fuser_supervisor
+from tsfusion.gateway.access_control import Door
+from tsfusion.gateway.gateway import Gateway
+from tsfusion.gateway.ports import Ports
+from tsfusion.journal import Journal, state_folder
+from tsfusion.wire.health import MapHealth
+from tsfusion.wire.queries import fetch_status
+
+_FAKE = """
+import os, struct, sys, time, zmq
+from tsfusion.fuser import messages as fuser_messages
+from tsfusion.wire import sockets
+
+link = sockets.pair(zmq.Context())
+link.connect(sys.argv[1])
+
+def say(message):
+    link.send(fuser_messages.encode(message))
+
+def at(index):
+    with open(begin.working, "r+b") as file:
+        file.write(struct.pack("<q", index))
+
+say(fuser_messages.Started())
+while True:
+    message = fuser_messages.to_fuser.decode(link.recv())
+    if isinstance(message, fuser_messages.Begin):
+        begin = message
+    {body}
+"""
+_FUSES = """
+    if isinstance(message, fuser_messages.Begin):
+        say(fuser_messages.Ready({}))
+    if isinstance(message, fuser_messages.Fuse):
+        reason = message.skip
+        if reason is None:
+            at(message.index)
+            special(message)
+            at(-1)
+        say(fuser_messages.Done(message.index, 1, 2, reason))
+"""
+
+
+def fusing(line: str) -> str:
+    """A fuser that runs this line on each keyframe."""
+    return _FUSES.replace("special(message)", line)
+
+
+_CRASHES_ON_2 = fusing("if message.index == 2: sys.exit(7)")
+_DIES = "sys.exit(9)"
+_FAILS = "say(fuser_messages.Failed('InvalidConfig', 'no such setting')); link.recv()"
+_CANNOT_COME_BACK = """
+    import pathlib
+    mark = pathlib.Path(begin.folder) / "once"
+    if mark.exists():
+        sys.exit(9)
+    mark.touch()
+    say(fuser_messages.Ready({}))
+    link.recv()
+    sys.exit(7)
+"""
+
+Start = Callable[..., Gateway]
+
+
+@pytest.fixture
+def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
+    """A gateway over five journaled records, with a fuser that runs the given lines on each message."""
+    with ExitStack() as stack:
+
+        def begin(body: str, **settings: Any) -> Gateway:
+            command = (sys.executable, "-c", _FAKE.replace("{body}", body))
+            monkeypatch.setattr(fuser_process, "COMMAND", command)
+            monkeypatch.setattr(fuser_supervisor, "_END_DEADLINE", 0.1)
+            writer = Journal(state_folder.folder(tmp_path, "default") / "journal", 1 << 20)
+            for i in range(5):
+                writer.append([b"head", b"body"], session=bytes(16), seq=i + 1)
+            writer.close()
+            server = ServerConfig(state=str(tmp_path), **settings)
+            context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+            stack.callback(context.term)
+            door = Door(context, None)
+            ports = Ports(context, server)
+            stack.callback(ports.close)
+            gateway = Gateway(context, server, ports, door)
+            stack.callback(gateway.maps.close)
+            gateway.maps.begin({"default": VolumeConfig()})
+            return gateway
+
+        yield begin
+
+
+def stepped(gateway: Gateway, reached: Callable[[], bool]) -> None:
+    def step() -> bool:
+        gateway.step()
+        return reached()
+
+    until(step)
+
+
+def default(gateway: Gateway) -> MapHealth:
+    return gateway.health().maps["default"]
+
+
+def test_a_keyframe_that_kills_the_fuser_twice_is_quarantined(
+    start: Start, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    gateway = start(_CRASHES_ON_2)
+    stepped(gateway, lambda: gateway.maps.drained)
+    health = default(gateway)
+    assert (health.fuser_restarts, health.rejected, health.quarantined) == (2, {"crash": 1}, 1)
+    assert (health.keyframes_fused, health.keyframes_durable) == (4, 5)
+    said = caplog.records[-1]
+    assert said.getMessage() == "a keyframe is not in the map: crash"
+    assert {"map": "default", "seq": 3, "reason": "crash"}.items() <= vars(said)["about"].items()
+    (kept,) = (state_folder.folder(tmp_path, "default") / "quarantine").iterdir()
+    assert kept.name == "00000000-3-crash.mcap"
+    (record,) = journal.records(kept)
+    assert (record.seq, [bytes(frame) for frame in record.frames]) == (3, [b"head", b"body"])
+
+
+def test_a_fuser_that_is_killed_is_not_the_keyframes_fault(start: Start, tmp_path: Path) -> None:
+    """Somebody kills it three times at the same keyframe: that says nothing about the keyframe."""
+    body = fusing(
+        f"""
+            with open({str(tmp_path / "kills")!r}, "a+") as kills:
+                kills.seek(0)
+                if message.index == 2 and len(kills.read()) < 3:
+                    kills.write("x")
+                    kills.close()
+                    os.kill(os.getpid(), 9)
+        """.strip()
+    )
+    gateway = start(body)
+    stepped(gateway, lambda: gateway.maps.drained)
+    health = default(gateway)
+    assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (3, {}, 5)
+
+
+def test_a_death_between_keyframes_is_nobodys_fault(start: Start, tmp_path: Path) -> None:
+    died = tmp_path / "died"
+    body = f"""{fusing("pass")}
+        if message.index == 2 and not os.path.exists({str(died)!r}):
+            open({str(died)!r}, "w").close()
+            sys.exit(3)
+"""
+    gateway = start(body)
+    stepped(gateway, lambda: gateway.maps.drained)
+    assert default(gateway).rejected == {}
+
+
+def test_a_fuser_that_hangs_at_a_keyframe_is_replaced(start: Start) -> None:
+    gateway = start(fusing("if message.index == 1: time.sleep(3600)"), fuser_timeout=0.3)
+    stepped(gateway, lambda: gateway.maps.drained)
+    health = default(gateway)
+    assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (2, {"crash": 1}, 4)
+
+
+def test_a_fuser_that_cannot_start_is_one_clear_error(start: Start) -> None:
+    gateway = start(_DIES)
+    with pytest.raises(MapError, match="ended with status 9 before it was ready"):
+        stepped(gateway, lambda: gateway.maps.warm)
+
+
+def test_why_the_map_cannot_be_opened_is_passed_on(start: Start) -> None:
+    gateway = start(_FAILS)
+    with pytest.raises(InvalidConfig, match="no such setting"):
+        stepped(gateway, lambda: gateway.maps.warm)
+
+
+def test_a_fuser_that_does_not_come_back_is_tried_ever_more_rarely(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The gateway goes on receiving: what is in the journal is fused when the fuser can be mended."""
+    monkeypatch.setattr(fuser_supervisor, "_LONGEST_PAUSE", 0.05)
+    gateway = start(_CANNOT_COME_BACK)
+    stepped(gateway, lambda: default(gateway).state == "failed")
+    assert default(gateway).fuser_restarts >= 2
+    assert "its fuser process ended" in default(gateway).problem
+    assert not gateway.health().ready
+    monkeypatch.setattr(
+        fuser_process, "COMMAND", (sys.executable, "-c", _FAKE.replace("{body}", fusing("pass")))
+    )
+    stepped(gateway, lambda: gateway.maps.drained)
+    assert default(gateway).problem == ""
+
+
+def test_poison_costs_two_deaths_each(start: Start) -> None:
+    gateway = start(fusing("if message.index in (1, 2, 3): sys.exit(7)"))
+    stepped(gateway, lambda: gateway.maps.drained)
+    health = default(gateway)
+    assert (health.fuser_restarts, health.rejected, health.quarantined) == (6, {"crash": 3}, 3)
+
+
+def test_no_room_for_a_new_fuser_is_waited_out(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    gateway = start(_CRASHES_ON_2)
+    real = subprocess.Popen
+
+    def refused(*_: object, **__: object) -> None:
+        raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(subprocess, "Popen", refused)
+    stepped(gateway, lambda: "cannot be started" in default(gateway).problem)
+    gateway.step()
+    monkeypatch.setattr(subprocess, "Popen", real)
+    stepped(gateway, lambda: gateway.maps.drained)
+    assert default(gateway).problem == ""
+
+
+def test_a_vanished_scratch_folder_is_made_anew(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "scratch"))
+    (tmp_path / "scratch").mkdir()
+    gateway = start(_CRASHES_ON_2)
+    stepped(gateway, lambda: gateway.maps.warm)
+    shutil.rmtree(next((tmp_path / "scratch").iterdir()))
+    stepped(gateway, lambda: gateway.maps.drained)
+
+
+def test_the_last_words_of_a_dead_fuser_are_not_heard(start: Start) -> None:
+    """ZeroMQ may deliver them late, when its keyframes are handed out anew."""
+    gateway = start(_CANNOT_COME_BACK)
+    (hosted,) = gateway.maps
+    stepped(gateway, lambda: hosted.fuser._restart_at > time.monotonic() + 0.5)
+    late = zmq.Context.instance().socket(zmq.PAIR)
+    try:
+        endpoint = hosted.fuser.socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        late.connect(endpoint)
+        late.send(fuser_messages.encode(fuser_messages.Done(0, 1, 2)))
+        until(lambda: hosted.fuser.socket.poll(10) > 0)
+        assert hosted.fuser.receive() is None
+        gateway.step()
+    finally:
+        late.close(linger=0)
+
+
+# --- real scans ---
+
+
+def by_file(volume: VolumeConfig, keyframes: list[Keyframe]) -> str:
+    fused = tsfusion.Volume(volume)
+    for keyframe in keyframes:
+        fused.integrate(keyframe)
+    return fused.map_hash()
+
+
+def by_socket(server: Server, keyframes: list[Keyframe]) -> str:
+    with Client(server.address) as client:
+        for keyframe in keyframes:
+            client.send(keyframe)
+        client.flush(timeout=DEADLINE)
+        client.wait_fused(timeout=DEADLINE)
+    return fetch_status(server.address).map_hash
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "volume"),
+    [
+        ("7scenes/redkitchen", {}, VolumeConfig(voxel_size=0.04)),
+        (
+            "kitti_odometry",
+            {"sequence": "00", "modality": "lidar"},
+            VolumeConfig(voxel_size=0.5, sensor="lidar"),
+        ),
+    ],
+    ids=["7scenes", "kitti-lidar"],
+)
+def test_a_real_scan_makes_the_same_map_by_file_and_by_socket(
+    data: Callable[[str], Path], tmp_path: Path, name: str, options: dict[str, str], volume: VolumeConfig
+) -> None:
+    dataset = open_dataset(data(name), **options)
+    keyframes = [dataset[i] for i in range(0, min(len(dataset), 40), 8)]
+    with serving(tmp_path, volume) as server:
+        assert by_socket(server, keyframes) == by_file(volume, keyframes)
+        assert server.terminate() == 0

@@ -1,0 +1,360 @@
+# SPDX-License-Identifier: MIT
+"""What goes wrong around a server: strangers, full disks, missing files. Its other clients do not notice."""
+
+import os
+import sys
+import threading
+import time
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import zmq
+from keyframes_and_servers import DEADLINE, Server, connected, serving, until, wall
+
+from tsfusion import Client, VolumeConfig
+from tsfusion.core import config
+from tsfusion.core.config import ServerConfig
+from tsfusion.core.errors import InvalidConfig, JournalError, ServerUnreachable, TransportError
+from tsfusion.delivery.spool import Spool
+from tsfusion.fuser import messages as fuser_messages
+from tsfusion.gateway import fuser_process
+from tsfusion.gateway.client_routes import Routes
+from tsfusion.gateway.fuser_queries import Questions
+from tsfusion.gateway.fuser_supervisor import FuserLink
+from tsfusion.journal import Position
+from tsfusion.wire import codec, health, messages, queries, sockets
+from tsfusion.wire.keyframe_header import Refused, pack, unpack
+from tsfusion.wire.messages import Command
+from tsfusion.wire.queries import fetch_mesh, fetch_status, request
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with serving(tmp_path_factory.mktemp("shared")) as server:
+        yield server
+
+
+# --- strangers ---
+
+
+def xsub(context: "zmq.Context[Any]") -> sockets.AnySocket:
+    made: sockets.AnySocket = context.socket(zmq.XSUB)
+    made.setsockopt(zmq.LINGER, 1000)
+    return made
+
+
+def test_a_stranger_cannot_unsubscribe_a_viewer(shared: Server) -> None:
+    with connected(sockets.subscriber, shared.publish) as viewer, Client(shared.address) as client:
+        with connected(xsub, shared.publish) as stranger:
+            stranger.send(b"\x01mes")
+            for message in (b"\x05mesh", b"", b"\x02", b"rubbish"):
+                stranger.send(message)
+            client.send(wall(1))
+            client.wait_fused(timeout=DEADLINE)
+            assert viewer.poll(10_000)
+        while viewer.poll(500):
+            viewer.recv_multipart()
+        client.send(wall(2))
+        assert viewer.poll(10_000)
+
+
+def test_strangers_do_not_push_out_a_client_that_is_heard() -> None:
+    routes = Routes()
+    client = routes.connect(b"client", "default", b"1")
+    assert client is not None
+    for number in range(3000):
+        routes.connect(number.to_bytes(16, "big"), "default", b"2")
+        if number % 500 == 0:
+            routes.heard(client)
+    assert routes.get(b"client") is client
+
+
+def test_a_client_goes_on_after_a_flood_of_greetings(shared: Server) -> None:
+    with Client(shared.address) as client, connected(sockets.dealer, shared.control) as stranger:
+        client.connect()
+        for _ in range(1100):
+            stranger.send(messages.encode(messages.Hello(os.urandom(16), 1)))
+        asked = time.monotonic()
+        request(shared.control, Command(name="ping"), timeout=DEADLINE)
+        until(lambda: time.monotonic() - asked > 1.0)  # two pings
+        client.send(wall(3))
+        client.wait_meshed(timeout=10)
+
+
+def test_a_jpeg_of_a_million_segments_does_not_hold_the_gateway_up() -> None:
+    good = codec.encode(wall(), session=bytes(16), seq=1, jpeg_quality=90)
+    header = unpack(good[0])
+    evil = b"\xff\xd8" + b"\xff\xe0\x00\x02" * (4 << 20)
+    color = msgspec.structs.replace(header.buffers[1], bytes=len(evil), crc32=zlib.crc32(evil))
+    head = pack(msgspec.structs.replace(header, buffers=(header.buffers[0], color)))
+    started = time.process_time()
+    with pytest.raises(Refused, match="without a frame header"):
+        codec.check([head, good[1], evil])
+    assert time.process_time() - started < 0.1
+
+
+def test_who_does_not_fetch_a_mesh_gets_no_second_one(shared: Server) -> None:
+    """Else each would wait in the server's memory."""
+
+    def one_at_a_time(context: "zmq.Context[Any]") -> sockets.AnySocket:
+        made = sockets.dealer(context)
+        made.setsockopt(zmq.RCVHWM, 1)
+        made.setsockopt(zmq.RCVBUF, 4096)
+        return made
+
+    with Client(shared.address) as client:
+        client.send(wall(4))
+        client.wait_fused(timeout=DEADLINE)
+    replies = []
+    with connected(one_at_a_time, shared.control) as stranger:
+        for _ in range(60):
+            stranger.send(messages.encode(Command(name="mesh", min_weight=0.0)))
+            request(shared.control, Command(name="status"), timeout=DEADLINE)
+        until(lambda: fetch_status(shared.address).fuser != "busy")
+        while stranger.poll(1000):
+            replies.append(messages.decode_to_client(stranger.recv_multipart()[0]))
+    errors = [reply.error for reply in replies if isinstance(reply, messages.Reply) and reply.error]
+    assert any("still on its way" in error for error in errors)
+
+
+class Map:
+    """As `Questions` sees one: what its fuser was asked, and whether keyframes come."""
+
+    ready, failed = True, ""
+
+    def __init__(self) -> None:
+        self.fuser: Any = self
+        self.asked: list[fuser_messages.Ask] = []
+        self.is_calm = True
+
+    def send(self, ask: fuser_messages.Ask) -> bool:
+        self.asked.append(ask)
+        return True
+
+    def calm(self, since: float) -> bool:
+        return self.is_calm
+
+
+class Asking:
+    """Questions about a map, and the errors that they were answered with."""
+
+    def __init__(self, most_bytes: int = 1 << 30) -> None:
+        self.map = Map()
+        self.errors: list[str | None] = []
+        self.frames: list[Any] = []
+        self.questions = Questions(self._on_answer, most_bytes)
+
+    def _on_answer(self, identity: bytes, message: messages.ToClient, frames: Any = ()) -> None:
+        assert isinstance(message, messages.Reply)
+        self.errors.append(message.error)
+        self.frames += frames  # which nobody reads
+
+    def ask(self, identity: bytes, client: str = "", map_name: str = "default") -> bool:
+        """Whether the mesh was passed on."""
+        before = len(self.map.asked)
+        self.questions.ask(identity, Command(name="mesh", map=map_name), self.map, client)
+        return len(self.map.asked) > before
+
+    def make(self, nbytes: int) -> None:
+        """The one that was asked for last."""
+        layout = health.MeshLayout(vertices=0, faces=0, colors=False)
+        frames = [zmq.Frame(bytes(nbytes // 2)), zmq.Frame(bytes(nbytes // 2))]
+        self.questions.answered(fuser_messages.Answer(self.map.asked[-1].number, layout=layout), None, frames)
+
+
+def test_a_fuser_makes_one_mesh_at_a_time() -> None:
+    asking = Asking()
+    assert asking.ask(b"1")
+    assert not asking.ask(b"2")
+    assert asking.errors == ["another mesh is being made; ask again"]
+    assert asking.ask(b"3", map_name="yard")
+    asking.questions.give_up("default")
+    assert asking.ask(b"2")
+
+
+def test_a_client_gets_one_mesh_at_a_time_over_all_its_connections() -> None:
+    asking = Asking()
+    assert asking.ask(b"1", "robot")
+    assert not asking.ask(b"2", "robot", "yard")
+    asking.make(100)
+    assert not asking.ask(b"3", "robot", "yard")  # not read yet
+    assert asking.ask(b"4", "cart", "yard")
+    assert all(error is None or "still on its way" in error for error in asking.errors)
+
+
+def test_after_a_mesh_it_is_the_keyframes_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    asking = Asking()
+    asking.map.is_calm = False
+    assert asking.ask(b"1")
+    now[0] = 102.0
+    asking.make(100)
+    now[0] = 107.9
+    assert not asking.ask(b"2")
+    assert asking.errors[-1] == "a mesh was just made, now it is the keyframes' turn; ask again"
+    asking.map.is_calm = True  # nobody scans: nobody has to wait
+    assert asking.ask(b"2")
+    asking.make(100)
+    asking.map.is_calm = False
+    now[0] = 108.0
+    assert asking.ask(b"3")
+
+
+def test_meshes_that_nobody_reads_are_few() -> None:
+    asking = Asking(most_bytes=1000)
+    for identity in (b"1", b"2", b"3"):
+        assert asking.ask(identity)
+        asking.make(300)
+    assert not asking.ask(b"4")
+    assert "do not read" in (asking.errors[-1] or "")
+    assert asking.questions.nbytes == 900
+    asking.frames.clear()
+    until(lambda: asking.questions.nbytes == 0)
+    assert asking.ask(b"5")
+    asking.make(5000)  # one may be larger than all should be
+    assert asking.questions.nbytes == 5000
+    assert not asking.ask(b"6")
+
+
+# --- orders to a fuser that has no room for them ---
+
+_SLOW = """
+import sys, time, zmq
+from tsfusion.journal import Position
+from tsfusion.wire import sockets
+
+link = sockets.pair(zmq.Context())
+link.connect(sys.argv[1])
+link.send(fuser_messages.encode(fuser_messages.Started()))
+while True:
+    message = fuser_messages.to_fuser.decode(link.recv())
+    if isinstance(message, fuser_messages.Begin):
+        link.send(fuser_messages.encode(fuser_messages.Ready({})))
+        time.sleep(1)
+    if isinstance(message, fuser_messages.Fuse):
+        link.send(fuser_messages.encode(fuser_messages.Done(message.index, 1, 2)))
+    if isinstance(message, fuser_messages.Publish):
+        time.sleep(0.0001)
+    if isinstance(message, fuser_messages.Finish):
+        sys.exit(0)
+"""
+
+
+def test_orders_that_find_no_room_are_given_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fuser_process, "COMMAND", (sys.executable, "-c", _SLOW))
+    context: zmq.Context[Any] = zmq.Context()
+    link = FuserLink(context, tmp_path, ServerConfig(state=str(tmp_path)), VolumeConfig())
+    try:
+
+        def heard() -> bool:
+            link.receive()
+            return link.ready
+
+        until(heard)
+        while link.send(fuser_messages.Publish(True)):
+            pass
+        order = fuser_messages.Fuse(0, Position(1, 8), bytes(16), 1)
+        assert not link.fuse(order)
+        assert list(link.in_flight) == []
+        until(lambda: link.fuse(order))
+        assert list(link.in_flight) == [0]
+        link.finish()
+        while link.send(fuser_messages.Publish(True)):
+            pass
+        until(lambda: link.receive() is not None)
+        until(lambda: link.ended() or link.finish() is not None)
+        assert link.finished_well
+    finally:
+        link.close()
+        context.term()
+
+
+# --- settings and addresses ---
+
+
+def test_a_configuration_that_is_not_text_is_one_clear_error(tmp_path: Path) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_bytes(b"\xff\xfe[[[")
+    with pytest.raises(InvalidConfig, match="is not TOML: "):
+        config.load(path)
+
+
+@pytest.mark.parametrize(
+    "address", ["tcp://a b:5555", "tcp://127.0.0.1:5555?x", "tcp://u@127.0.0.1:5", "tcp://\0:5"]
+)
+def test_an_address_that_is_none_is_refused(address: str) -> None:
+    with pytest.raises(InvalidConfig, match="an address looks like"):
+        sockets.split(address)
+
+
+def test_the_last_port_has_no_next_one() -> None:
+    with pytest.raises(InvalidConfig, match=r"65535 has no next port for control"):
+        sockets.control_address("tcp://127.0.0.1:65535")
+    with pytest.raises(InvalidConfig, match="needs a port"):
+        request("tcp://127.0.0.1:0", Command(name="ping"), timeout=1.0)
+
+
+def test_a_patience_of_ages_is_no_error(shared: Server) -> None:
+    reply, _ = request(shared.control, Command(name="ping"), timeout=1e300)
+    assert reply.name == "ping"
+
+
+def test_a_state_folder_that_cannot_be_named(tmp_path: Path) -> None:
+    with pytest.raises(JournalError, match="cannot write the spool folder"):
+        Spool(f"{tmp_path}/a\0b", 1 << 20)
+
+
+def test_a_port_that_speaks_something_else(shared: Server) -> None:
+    with pytest.raises(TransportError, match="no server answered"):
+        request(shared.publish, Command(name="ping"), timeout=0.3)
+
+
+@contextmanager
+def answering(*answers: bytes) -> Iterator[str]:
+    """The data address of a control socket that answers one after the other so, the last for ever."""
+    left = list(answers)
+    context: zmq.Context[Any] = zmq.Context()
+    router = sockets.router(context)
+    port = router.bind_to_random_port("tcp://127.0.0.1")
+    stop = threading.Event()
+
+    def answer_all() -> None:
+        while not stop.is_set():
+            if router.poll(20):
+                router.send_multipart([router.recv_multipart()[0], left.pop(0) if len(left) > 1 else left[0]])
+
+    thread = threading.Thread(target=answer_all)
+    thread.start()
+    try:
+        yield f"tcp://127.0.0.1:{port - 1}"
+    finally:
+        stop.set()
+        thread.join()
+        router.close()
+        context.term()
+
+
+def test_who_answers_with_nonsense_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    with answering(b"nonsense") as address:
+        with pytest.raises(TransportError, match=r"what answers at tcp://.* is no tsfusion server"):
+            fetch_status(address)
+        with Client(address) as client, pytest.raises(ServerUnreachable, match="is no tsfusion server"):
+            client.connect(timeout=0.5)
+    assert caplog.text == ""
+
+
+def test_a_mesh_is_asked_for_again_when_the_server_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(queries, "_AGAIN_INTERVAL", 0.01)
+    again, settled = (
+        messages.encode(messages.Reply(name="mesh", error=error)) for error in ("busy; ask again", "no room")
+    )
+    with answering(again, again, settled) as address, pytest.raises(TransportError, match="no room"):
+        fetch_mesh(address, timeout=5.0)
+    with answering(again) as address, pytest.raises(TransportError, match="busy; ask again"):
+        fetch_mesh(address, timeout=0.3)

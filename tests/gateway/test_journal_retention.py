@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: MIT
+"""What may go of a journal: only what two checkpoints hold, whatever became of those who wrote them."""
+
+from typing import Any, cast
+
+from tsfusion.fuser import messages as fuser_messages
+from tsfusion.gateway.fuser_supervisor import FuserLink
+from tsfusion.gateway.journal_retention import Retention
+from tsfusion.gateway.keyframe_index import KeyframeIndex
+from tsfusion.gateway.sessions import Session, Sessions
+from tsfusion.journal import Journal, Position
+
+
+class Folder:
+    """A journal of ten segments that is always too large; notes what may go."""
+
+    nbytes, first, segment = 1 << 40, 1, 11
+
+    def __init__(self) -> None:
+        self.below = 0
+
+    def retire(self, below: int, limit: int) -> int:
+        assert limit == 1
+        self.below = below
+        return 0
+
+
+class Fuser:
+    """Takes what it is told."""
+
+    ready = True
+    in_flight = ()
+
+    def __init__(self) -> None:
+        self.asked: list[Any] = []
+
+    def send(self, message: Any) -> bool:
+        self.asked.append(message)
+        return True
+
+
+def ten_segments() -> tuple[Retention, Folder, Session]:
+    """One session of ten keyframes, a segment each."""
+    sessions, index, folder = Sessions(), KeyframeIndex(), Folder()
+    session = sessions.open(bytes(16))
+    for seq in range(1, 11):
+        index.add(Position(seq, 8), session, seq)
+    return Retention(cast(Journal, folder), index, sessions, 1), folder, session
+
+
+def let_go(retention: Retention, folder: Folder, fuser: Fuser) -> int:
+    retention.step(cast(FuserLink, fuser), ())
+    return folder.below
+
+
+def test_what_two_checkpoints_hold_may_go() -> None:
+    retention, folder, session = ten_segments()
+    fuser = Fuser()
+    retention.on_ready()
+    assert let_go(retention, folder, fuser) == 0
+    assert fuser.asked == [fuser_messages.Save()]
+    session.in_map = 4
+    retention.on_saved(fuser_messages.Saved(written=True))
+    assert let_go(retention, folder, fuser) == 1  # the checkpoint before this one was empty
+    session.in_map = 7
+    retention.on_saved(fuser_messages.Saved(written=False))
+    assert let_go(retention, folder, fuser) == 1  # nothing was written
+    retention.on_saved(fuser_messages.Saved(written=True))
+    assert let_go(retention, folder, fuser) == 5
+
+
+def test_what_a_dead_fuser_had_covers_nothing() -> None:
+    """It had fused all ten; the checkpoint has four, and the next fuser begins there."""
+    retention, folder, session = ten_segments()
+    retention.on_ready()
+    session.in_map = 4
+    retention.on_saved(fuser_messages.Saved(written=True))
+    session.in_map = session.fused = 10
+    session.in_map = 4  # as the next fuser says
+    retention.on_ready()
+    session.in_map = 5
+    retention.on_saved(fuser_messages.Saved(written=True))
+    assert let_go(retention, folder, Fuser()) == 5

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: MIT
+"""The figures, parsed as Prometheus does it, and the health checks."""
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from health_snapshots import MIB, client, health, map_health
+from http_requests import get
+from prometheus_client.parser import text_string_to_metric_families
+
+from tsfusion.core.config import ServerConfig
+from tsfusion.gateway import metrics_families
+from tsfusion.gateway.metrics import BUCKETS, FRESH, STAGES, Metrics
+
+HOSTILE = 'x" } evil 1\n\\'
+Figures = dict[tuple[str, ...], float]
+
+
+@pytest.fixture
+def metrics() -> Iterator[Metrics]:
+    made = Metrics()
+    yield made
+    made.close()
+
+
+class Clock:
+    """A clock that stands until it is moved."""
+
+    now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def figures(metrics: Metrics) -> Figures:
+    """(name, label values in the order of their names) → value, by way of the page."""
+    status, body, _ = get(metrics.serve("127.0.0.1:0"), "/metrics")
+    metrics.close()
+    assert status == 200
+    return {
+        (sample.name, *(value for _, value in sorted(sample.labels.items()))): sample.value
+        for family in text_string_to_metric_families(body)
+        for sample in family.samples
+    }
+
+
+def test_delays_become_histograms(metrics: Metrics) -> None:
+    for seconds in (0.0005, 0.02, 0.02, 40.0, -1.0):
+        metrics.observe("yard", "total", seconds)
+    found = figures(metrics)
+    name = "tsfusion_keyframe_delay_seconds"
+    counts = [found[f"{name}_bucket", str(most), "yard", "total"] for most in BUCKETS]
+    assert counts == [2.0] * 4 + [4.0] * 10
+    assert found[f"{name}_bucket", "+Inf", "yard", "total"] == found[f"{name}_count", "yard", "total"] == 5
+    assert found[f"{name}_sum", "yard", "total"] == pytest.approx(40.0405)
+    assert STAGES == ("encode", "wire", "journal", "queue", "fuse", "mesh", "total")
+
+
+def test_a_snapshot_becomes_figures() -> None:
+    clock = Clock()
+    metrics = Metrics(clock=clock)
+    metrics.health = health(
+        client("cart", waiting=2, skipped={"thinned": 3}, held="disk", heard_s=7.0),
+        client("cart", waiting=1, skipped={"thinned": 1, "spool": 5}),
+        client("drone"),
+        client("drone", waiting=50, held="disk", heard_s=metrics_families.HEARD + 1),
+        refused={"header": 4}, duplicates=9, problems=("disk full",), ready=False,
+        maps={
+            "yard": map_health(state="busy", waiting=2, fuser_restarts=1, corrections=4),
+            "shed": map_health(last_keyframe_s=None),
+        },
+    )  # fmt: skip
+    clock.now += 3.0
+    found = figures(metrics)
+    wanted = {
+        ("tsfusion_up",): 1, ("tsfusion_ready",): 0, ("tsfusion_problems",): 1,
+        ("tsfusion_snapshot_age_seconds",): 3, ("tsfusion_uptime_seconds",): 3728,
+        ("tsfusion_gateway_resident_bytes",): 60 * MIB,
+        ("tsfusion_messages_refused_total", "header"): 4, ("tsfusion_duplicates_total",): 9,
+        ("tsfusion_keyframes_durable", "yard"): 6, ("tsfusion_keyframes_fused", "yard"): 5,
+        ("tsfusion_keyframes_waiting", "yard"): 2, ("tsfusion_keyframes_waiting", "shed"): 0,
+        ("tsfusion_keyframes_rejected", "yard", "MapFull"): 1, ("tsfusion_keyframes_quarantined", "yard"): 1,
+        ("tsfusion_journal_bytes", "yard"): 3 * MIB, ("tsfusion_map_bytes", "yard"): 10 * MIB,
+        ("tsfusion_map_blocks", "yard"): 1234, ("tsfusion_corrections_total", "yard"): 4,
+        ("tsfusion_fuser_restarts_total", "yard"): 1,
+        ("tsfusion_last_keyframe_age_seconds", "yard"): 5, ("tsfusion_delay_bound_seconds", "yard"): 0.0005,
+        ("tsfusion_map_state", "yard", "busy"): 1, ("tsfusion_map_state", "yard", "idle"): 0,
+        ("tsfusion_client_sessions", "cart"): 2, ("tsfusion_client_waiting_keyframes", "cart"): 3,
+        ("tsfusion_client_skipped_keyframes", "cart", "thinned"): 4,
+        ("tsfusion_client_skipped_keyframes", "cart", "spool"): 5,
+        ("tsfusion_client_waiting_keyframes", "drone"): 0,
+        ("tsfusion_client_held_sessions", "cart"): 1, ("tsfusion_client_held_sessions", "drone"): 0,
+        ("tsfusion_client_received_bytes", "cart"): 6 * MIB,
+        ("tsfusion_client_silence_seconds", "cart"): 3.25,
+    }  # fmt: skip
+    assert {key: found.get(key) for key in wanted} == wanted
+    assert ("tsfusion_last_keyframe_age_seconds", "shed") not in found
+    assert [key for key in found if key[0] == "tsfusion_build_info"]
+
+
+def test_every_figure_is_ours_and_explained(metrics: Metrics) -> None:
+    metrics.observe("yard", "fuse", 0.1)
+    metrics.health = health(client())
+    _, body, headers = get(metrics.serve("127.0.0.1:0"), "/metrics")
+    assert headers["Content-Type"] == "text/plain; version=0.0.4; charset=utf-8"
+    for family in text_string_to_metric_families(body):
+        assert family.name.startswith("tsfusion_")
+        assert family.documentation
+        assert family.type in ("gauge", "counter", "histogram")
+
+
+def test_the_disk_shows_what_is_left_and_the_limits(tmp_path: Path) -> None:
+    server = ServerConfig(state=str(tmp_path), journal_bytes=5 * MIB, min_free_bytes=7)
+    found = figures(Metrics(server))
+    assert found["tsfusion_journal_limit_bytes",] == 5 * MIB
+    assert found["tsfusion_disk_reserve_bytes",] == 7
+    assert found["tsfusion_disk_free_bytes",] > 0
+    gone = figures(Metrics(ServerConfig(state=str(tmp_path / "gone"))))
+    assert ("tsfusion_disk_free_bytes",) not in gone
+    assert gone["tsfusion_up",] == 0
+
+
+def test_labels_stay_few_whatever_peers_say(metrics: Metrics) -> None:
+    sessions = [client("", session=f"{i:08x}", skipped={f"reason{i}": 1, "thinned": 1}) for i in range(500)]
+    named = [client(f"robot{i:04}") for i in range(300)]
+    metrics.health = health(*sessions, *named)
+    for i in range(1000):
+        metrics.observe(f"map{i}", "total", 0.1)
+    found = figures(metrics)
+    names = {key[1] for key in found if key[0] == "tsfusion_client_sessions"}
+    assert len(names) == metrics_families.MAX_CLIENTS + 1
+    assert found["tsfusion_client_sessions", metrics_families.NAMELESS] == 500
+    assert found["tsfusion_client_sessions", metrics_families.OTHERS] == 300 - (
+        metrics_families.MAX_CLIENTS - 1
+    )
+    skipped = {key[2]: value for key, value in found.items() if key[0] == "tsfusion_client_skipped_keyframes"}
+    assert skipped == {"thinned": 500, "other": 500}
+    counts = {key[1]: v for key, v in found.items() if key[0] == "tsfusion_keyframe_delay_seconds_count"}
+    assert len(counts) == 257
+    assert counts[metrics_families.OTHERS] == 1000 - 256
+
+
+def test_nothing_in_a_label_breaks_the_page(metrics: Metrics) -> None:
+    metrics.health = health(refused={HOSTILE: 1}, maps={"default": map_health(rejected={HOSTILE: 2})})
+    found = figures(metrics)
+    assert found["tsfusion_messages_refused_total", HOSTILE] == 1
+    assert found["tsfusion_keyframes_rejected", "default", HOSTILE] == 2
+
+
+def test_health_checks() -> None:
+    clock = Clock()
+    metrics = Metrics(clock=clock)
+    address = metrics.serve("127.0.0.1:0")
+    assert get(address, "/livez")[:2] == (503, "the gateway is starting\n")
+    assert get(address, "/readyz")[:2] == (503, "the gateway is starting\n")
+    metrics.health = health(ready=False)
+    assert get(address, "/livez")[:2] == (200, "alive\n")
+    assert get(address, "/readyz")[:2] == (503, "not ready\n")
+    metrics.health = health(ready=False, problems=("map yard: disk full", "map shed:\n\x1b[2J"))
+    assert get(address, "/readyz")[:2] == (503, "map yard: disk full\nmap shed:\\n\\x1b[2J\n")
+    metrics.health = health(problems=("map shed cannot be opened",))
+    assert get(address, "/readyz?verbose")[:2] == (200, "ready\n")
+    clock.now += FRESH + 1
+    silent = f"the gateway has done nothing for {FRESH + 1:.0f} s\n"
+    assert get(address, "/livez")[:2] == (503, silent)
+    assert get(address, "/readyz")[:2] == (503, silent)
+    metrics.close()
+
+
+def test_writing_and_reading_do_not_mind_each_other(metrics: Metrics) -> None:
+    address = metrics.serve("127.0.0.1:0")
+    failed: list[Exception] = []
+    end = threading.Event()
+
+    def write() -> None:
+        i = 0
+        while not end.is_set():
+            i += 1
+            metrics.observe(f"map{i % 5}", "fuse", 0.01)
+            metrics.health = health(client(f"robot{i % 7}"), maps={f"map{i % 5}": map_health()})
+
+    def check(path: str) -> Callable[[], None]:
+        def ask() -> None:
+            try:
+                for _ in range(20):
+                    assert get(address, path)[0] in (200, 503)
+            except Exception as error:  # noqa: BLE001  told to the test's own thread
+                failed.append(error)
+
+        return ask
+
+    writer = threading.Thread(target=write)
+    readers = [threading.Thread(target=check(path)) for path in ("/metrics", "/readyz") * 2]
+    writer.start()
+    for reader in readers:
+        reader.start()
+    for reader in readers:
+        reader.join()
+    end.set()
+    writer.join()
+    assert not failed

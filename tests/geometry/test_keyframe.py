@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: MIT
+"""The door: what a keyframe must be, and what is said when it is not."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tsfusion import Intrinsics, Keyframe
+from tsfusion.core.errors import InvalidKeyframe
+from tsfusion.geometry.keyframe import check_pose
+
+CAMERA = Intrinsics(500.0, 500.0, 320.0, 240.0)
+DEPTH = np.ones((4, 5), np.uint16)
+POINTS = np.zeros((3, 3), np.float32)
+
+
+TINY = np.eye(4)  # numbers so small that NumPy divides by zero in its determinant
+TINY[:3, :3] = [[1.0, 0.0, 0.5], [1e-310, 0.0, 1e-310], [1e-310, 1e-310, 1e-310]]
+
+
+def turned(angle: float, scale: float = 1.0) -> np.ndarray:
+    T = np.eye(4)
+    T[:2, :2] = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    T[:3, :3] *= scale
+    return T
+
+
+def test_each_measurement_is_accepted_and_normalised() -> None:
+    strided = np.ones((8, 10), np.uint16)[::2, ::2]
+    keyframe = Keyframe(depth=strided, intrinsics=CAMERA, T_world_camera=np.eye(4).tolist())
+    assert (keyframe.kind, keyframe.shape) == ("depth", (4, 5))
+    assert keyframe.measurement.flags.c_contiguous
+    assert keyframe.T_world_camera.dtype == np.float64
+    narrow = Intrinsics(np.float32(500), 500, np.float32(320), 240)
+    camera = Keyframe(depth=DEPTH, intrinsics=narrow, T_world_camera=np.eye(4)).intrinsics
+    assert camera == CAMERA
+    assert type(camera.fx) is float
+    stereo = Keyframe(disparity=DEPTH, baseline_fx=380.0, intrinsics=CAMERA, T_world_camera=np.eye(4))
+    assert stereo.kind == "disparity"
+    cloud = Keyframe(points=POINTS, origins=np.zeros(3, np.float32), T_world_camera=np.eye(4))
+    assert (cloud.kind, cloud.shape) == ("points", (3,))
+    wide = Keyframe(points=POINTS.astype(np.float64), T_world_camera=np.eye(4))
+    assert wide.measurement.dtype == np.float32
+    assert np.isinf(Keyframe(points=np.full((1, 3), 1e300), T_world_camera=np.eye(4)).measurement).all()
+    assert (
+        Keyframe(depth=DEPTH.astype(">u2"), intrinsics=CAMERA, T_world_camera=np.eye(4)).measurement.max()
+        == 1
+    )
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({}, "exactly one of depth, disparity and points must be given, got none"),
+        ({"depth": DEPTH, "points": POINTS}, "got depth and points"),
+        ({"depth": DEPTH.astype(np.float64)}, "depth must be uint16 or float32, got float64"),
+        ({"depth": DEPTH[0]}, r"depth must have shape \(\*, \*\), got \(5,\)"),
+        ({"depth": np.zeros((0, 5), np.uint16)}, "depth must not be empty"),
+        ({"depth": np.zeros((1, 9000), np.uint16)}, "at most 8192"),
+        ({"depth": DEPTH, "intrinsics": None}, "intrinsics must be given with depth"),
+        ({"depth": DEPTH, "intrinsics": Intrinsics(-5.0, 5.0, 1.0, 1.0)}, "fx > 0"),
+        ({"depth": DEPTH, "intrinsics": Intrinsics(5.0, 0.0, 1.0, 1.0)}, "fy != 0"),
+        ({"depth": DEPTH, "intrinsics": Intrinsics(5.0, 5.0, np.nan, 1.0)}, "finite"),
+        ({"depth": DEPTH, "intrinsics": Intrinsics("a", 5.0, 1.0, 1.0)}, "four numbers"),
+        ({"depth": DEPTH, "depth_scale": 0.0}, "depth_scale must be finite and > 0, got 0.0"),
+        ({"depth": DEPTH, "depth_scale": "x"}, "depth_scale must be a number"),
+        ({"depth": DEPTH, "color": np.zeros((4, 5), np.uint8)}, r"color must have shape \(4, 5, 3\)"),
+        ({"depth": DEPTH, "confidence": np.zeros((5, 4), np.uint8)}, "confidence must have shape"),
+        ({"depth": DEPTH, "origins": np.zeros(3, np.float32)}, "origins go with points"),
+        ({"depth": DEPTH, "timestamp_ns": -1}, "timestamp_ns must be an integer"),
+        ({"depth": DEPTH, "captured_ns": 1.5}, "captured_ns must be an integer"),
+        ({"disparity": DEPTH}, "baseline_fx must be given"),
+        ({"disparity": DEPTH, "baseline_fx": np.inf}, "baseline_fx must be finite"),
+        ({"points": POINTS.astype(np.int32)}, "points must be float32 or float64, got int32"),
+        ({"points": [[1.0, 2.0, 3.0], [1.0]]}, "points must be an array, got list"),
+        ({"points": POINTS, "intrinsics": CAMERA}, "intrinsics go with images"),
+        ({"points": POINTS[:, :2]}, "points must have shape"),
+        ({"points": POINTS, "origins": np.zeros((2, 3), np.float32)}, "origins must have shape"),
+        ({"points": POINTS, "origins": np.full(3, np.nan, np.float32)}, "origins must be finite"),
+        ({"points": np.zeros((2_000_001, 3), np.float32)}, "at most 2000000"),
+        ({"depth": DEPTH, "T_world_camera": np.eye(3)}, r"shape \(4, 4\), got \(3, 3\)"),
+        ({"depth": DEPTH, "T_world_camera": "pose"}, "matrix of numbers"),
+        ({"depth": DEPTH, "T_world_camera": np.full((4, 4), np.nan)}, "must be finite"),
+        ({"depth": DEPTH, "T_world_camera": turned(0.3, 1.01)}, "must hold a rotation"),
+        ({"depth": DEPTH, "T_world_camera": np.diag([1.0, 1.0, -1.0, 1.0])}, "det > 0"),
+        ({"depth": DEPTH, "T_world_camera": TINY}, "must hold a rotation"),
+        ({"depth": DEPTH, "T_world_camera": np.eye(4) + np.diag([2e6] * 3, 1)}, "T_world_camera"),
+        ({"depth": DEPTH, "T_world_camera": np.eye(4).T + np.eye(4)[::-1] * 0.5}, "T_world_camera"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_named(fields: dict[str, Any], message: str) -> None:
+    given = {"intrinsics": CAMERA, "T_world_camera": np.eye(4), **fields}
+    if "points" in fields and "intrinsics" not in fields and "depth" not in fields:
+        given.pop("intrinsics")
+    with pytest.raises(InvalidKeyframe, match=message):
+        Keyframe(**given)
+
+
+def test_a_far_translation_is_refused() -> None:
+    T = np.eye(4)
+    T[0, 3] = 2e6
+    with pytest.raises(InvalidKeyframe, match="translate by at most"):
+        check_pose(T)
+
+
+def test_a_nearly_proper_rotation_is_made_exact_once_and_for_all() -> None:
+    T = turned(0.7, 1.0 + 1e-4)
+    fixed = check_pose(T)
+    assert np.abs(fixed[:3, :3].T @ fixed[:3, :3] - np.eye(3)).max() < 1e-12
+    assert (check_pose(fixed) == fixed).all()
+    exact = turned(0.7)
+    assert (check_pose(exact) == exact).all()
+
+
+def test_scaled_intrinsics_project_to_scaled_pixels() -> None:
+    half = CAMERA.scaled(0.5)
+    u = 500.0 * 0.2 + 320.0
+    assert half.fx * 0.2 + half.cx == pytest.approx((u + 0.5) * 0.5 - 0.5)
+    assert CAMERA.matrix[0, 0] == 500.0

@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: MIT
+"""What was acknowledged is read back, after any end of the process and beside any damage."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from keyframes_and_servers import DEADLINE, wall
+from mcap.reader import make_reader
+
+from tsfusion import journal
+from tsfusion.core.errors import JournalError
+from tsfusion.delivery.spool import Spool
+from tsfusion.journal import Journal, Position, segment_path
+from tsfusion.journal.recording import Recording, read_keyframes
+from tsfusion.wire import codec
+
+SESSION = bytes(16)
+BIG = 1 << 30
+
+
+def fill(log: Journal, count: int, first: int = 1) -> list[Position]:
+    return [
+        log.append([b"head", bytes([i]) * 1000, b""], session=SESSION, seq=first + i) for i in range(count)
+    ]
+
+
+def write(folder: Path, count: int) -> list[Position]:
+    log = Journal(folder, BIG)
+    positions = fill(log, count)
+    log.close()
+    return positions
+
+
+def test_records_are_read_where_append_says(tmp_path: Path) -> None:
+    log = Journal(tmp_path, BIG)
+    for i, position in enumerate(fill(log, 5)):
+        record = journal.read(tmp_path, position)  # while the segment is open
+        assert (record.session, record.seq, record.position) == (SESSION, i + 1, position)
+        assert [bytes(frame) for frame in record.frames] == [b"head", bytes([i]) * 1000, b""]
+        assert record.nbytes == 1004
+    log.close()
+
+
+def test_a_new_start_finds_everything_and_begins_a_segment(tmp_path: Path) -> None:
+    first = write(tmp_path, 3)
+    log = Journal(tmp_path, BIG)
+    assert [found.position for found in log.found] == first
+    second = fill(log, 2, first=4)
+    log.close()
+    assert {position.segment for position in first} != {position.segment for position in second}
+    assert [found.seq for found in Journal(tmp_path, BIG).found] == [1, 2, 3, 4, 5]
+    assert sorted([*first, *second]) == [*first, *second]
+
+
+def test_an_unused_journal_leaves_no_segment(tmp_path: Path) -> None:
+    Journal(tmp_path, BIG).close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_segments_rotate_and_can_be_forgotten(tmp_path: Path) -> None:
+    log = Journal(tmp_path, 4000)
+    positions = fill(log, 10)
+    numbers = journal.segments(tmp_path)
+    assert len(numbers) > 2
+    assert log.nbytes == sum(path.stat().st_size for path in tmp_path.iterdir())
+    log.forget(numbers[0])
+    log.close()
+    assert [found.position for found in Journal(tmp_path, BIG).found] == [
+        position for position in positions if position.segment != numbers[0]
+    ]
+
+
+def test_closed_segments_open_in_mcap_tools(tmp_path: Path) -> None:
+    write(tmp_path, 4)
+    with segment_path(tmp_path, 1).open("rb") as file:
+        messages = list(make_reader(file, validate_crcs=True).iter_messages("/keyframes"))
+    assert [message.sequence for _, _, message in messages] == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.3, 0.99])
+def test_a_torn_tail_costs_only_itself(tmp_path: Path, kept: float) -> None:
+    last = write(tmp_path, 4)[-1]
+    path = segment_path(tmp_path, 1)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: last.offset + int(kept * 1000)])
+    log = Journal(tmp_path, BIG)
+    assert [found.seq for found in log.found] == [1, 2, 3]
+    assert log.damaged == 0
+    with pytest.raises(JournalError, match="no whole keyframe"):
+        journal.read(tmp_path, last)
+
+
+def test_a_flipped_bit_costs_one_record_and_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    positions = write(tmp_path, 5)
+    path = segment_path(tmp_path, 1)
+    stored = bytearray(path.read_bytes())
+    stored[positions[2].offset + 500] ^= 4
+    path.write_bytes(stored)
+    log = Journal(tmp_path, BIG)
+    assert [found.seq for found in log.found] == [1, 2, 4, 5]
+    assert log.damaged == 1
+    assert f"byte {positions[2].offset}: keyframe 3 of session 00000000 is damaged" in caplog.text
+    with pytest.raises(JournalError):
+        journal.read(tmp_path, positions[2])
+
+
+def test_a_damaged_length_costs_one_record_and_is_told(tmp_path: Path) -> None:
+    positions = write(tmp_path, 5)
+    path = segment_path(tmp_path, 1)
+    stored = bytearray(path.read_bytes())
+    stored[positions[2].offset + 5] = 255
+    path.write_bytes(stored)
+    log = Journal(tmp_path, BIG)
+    assert [found.seq for found in log.found] == [1, 2, 4, 5]
+    assert log.damaged == 1
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_garbage_is_survived(tmp_path: Path, seed: int) -> None:
+    write(tmp_path, 6)
+    rng = np.random.default_rng(seed)
+    path = segment_path(tmp_path, 1)
+    stored = np.frombuffer(path.read_bytes(), np.uint8).copy()
+    stored[rng.integers(0, len(stored), 40)] = rng.integers(0, 256, 40)
+    path.write_bytes(stored.tobytes())
+    for found in Journal(tmp_path, BIG).found:
+        record = journal.read(tmp_path, found.position)
+        assert bytes(record.frames[1]) == bytes([found.seq - 1]) * 1000
+
+
+def test_kill_9_loses_nothing_that_was_acknowledged(tmp_path: Path) -> None:
+    code = f"""
+from pathlib import Path
+from tsfusion.journal import Journal
+log = Journal(Path({str(tmp_path)!r}), 1 << 30)
+for i in range(10**6):
+    log.append([b"head", bytes(50_000)], session=bytes(16), seq=i + 1)
+    print(i + 1, flush=True)
+"""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    acknowledged = [int(process.stdout.readline()) for _ in range(20)][-1]
+    process.send_signal(signal.SIGKILL)
+    acknowledged = max(
+        [acknowledged, *(int(line) for line in process.communicate(timeout=DEADLINE)[0].split())]
+    )
+    found = [record.seq for record in Journal(tmp_path, BIG).found]
+    assert found == list(range(1, len(found) + 1))
+    assert len(found) >= acknowledged
+
+
+def test_an_unwritable_folder_is_one_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(JournalError, match=r"cannot create the journal .*file"):
+        Journal(tmp_path / "file", BIG)
+
+
+def test_a_full_disk_is_an_error_and_not_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = Journal(tmp_path, BIG)
+    fill(log, 2)
+
+    def full(_descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fdatasync", full)
+        with pytest.raises(JournalError, match="No space left"):
+            fill(log, 1, first=3)
+    position = log.append([b"head", b"x"], session=SESSION, seq=3)
+    assert bytes(journal.read(tmp_path, position).frames[1]) == b"x"
+    log.close()
+
+
+# --- recordings ---
+
+
+def record(folder: Path, count: int) -> None:
+    log = Journal(folder, 5_000)
+    for i in range(count):
+        frames = codec.encode(wall(i), session=SESSION, seq=i + 1, jpeg_quality=90)
+        log.append(frames, session=SESSION, seq=i + 1)
+        if i == 1:
+            log.append(frames, session=SESSION, seq=i + 1)  # written twice by a crash
+    log.close()
+
+
+def test_a_journal_is_a_dataset_of_its_keyframes(tmp_path: Path) -> None:
+    record(tmp_path / "journal", 6)
+    recording = Recording(tmp_path)
+    assert len(recording) == 6
+    for i, keyframe in enumerate(recording):
+        assert np.array_equal(keyframe.depth, wall(i).depth)
+    assert len(list(read_keyframes(tmp_path / "journal"))) == 6
+    assert 0 < len(Recording(segment_path(tmp_path / "journal", 1))) < 6
+
+
+def test_an_empty_recording_is_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(JournalError, match="no keyframes in"):
+        Recording(tmp_path)
+    with pytest.raises(JournalError, match="does not exist"):
+        Recording(tmp_path / "nothing.mcap")
+
+
+# --- spools ---
+
+
+def put(spool: Spool, count: int) -> None:
+    for _ in range(count):
+        spool.add(spool.write([b"head", bytes(30_000)]))
+
+
+def test_a_spool_gives_back_what_was_not_dropped(tmp_path: Path) -> None:
+    spool = Spool(tmp_path, 100_000)
+    put(spool, 10)
+    assert spool.drop(7) == [1, 2, 3, 4, 5, 6, 7]
+    session = spool.session
+    assert len(journal.segments(tmp_path)) <= 2
+    spool.close()
+    again = Spool(tmp_path, 100_000)
+    assert again.session == session
+    assert [entry.seq for entry in again.waiting][-3:] == [8, 9, 10]
+    assert again.next_seq > 11  # no number is used twice, whatever a power cut took
+    assert bytes(again.read(again.waiting[-1])[0]) == b"head"
+    again.close()
+
+
+def test_an_emptied_spool_starts_a_new_session(tmp_path: Path) -> None:
+    spool = Spool(tmp_path, 100_000)
+    put(spool, 5)
+    spool.drop(5)
+    session = spool.session
+    spool.close()
+    assert journal.segments(tmp_path) == []
+    again = Spool(tmp_path, 100_000)
+    assert (again.session != session, again.next_seq) == (True, 1)
+    again.close()
+
+
+def test_a_temporary_spool_goes_away() -> None:
+    spool = Spool(None, 100_000)
+    put(spool, 2)
+    assert spool.folder.is_dir()
+    spool.close()
+    assert not spool.folder.exists()
+
+
+def test_a_spool_has_one_user(tmp_path: Path) -> None:
+    spool = Spool(tmp_path, 100_000)
+    with pytest.raises(JournalError, match="in use by another scanner"):
+        Spool(tmp_path, 100_000)
+    spool.close()
+    Spool(tmp_path, 100_000).close()
+
+
+def test_an_entry_in_the_middle_can_be_removed(tmp_path: Path) -> None:
+    spool = Spool(tmp_path, 100_000)
+    put(spool, 3)
+    spool.remove(1)
+    assert [entry.seq for entry in spool.waiting] == [1, 3]
+    spool.close()

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: MIT
+"""The kernels before marching cubes, against their twins: values, blocks around, crossed cells and edges."""
+
+import kernel_twins
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tsfusion.kernels import block_hash, marching_tables, runtime, surface_cells
+from tsfusion.tsdf.block_store import cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.mesh_extraction import MeshScratch
+from tsfusion.tsdf.surface_values import Layers, values_of
+
+PATCH = np.array([(x, y, z) for x in (-2, -1, 0) for y in (-1, 0) for z in (-1, 0, 1) if x + y + z], np.int32)
+
+
+def layers_of(coordinates: NDArray[np.int32], sums: NDArray[np.int64], correction: NDArray | None) -> Layers:
+    """A map whose block i is in slot i."""
+    runtime.start(2)
+    hash_keys, hash_slots = np.zeros(256, np.int64), np.zeros(256, np.int32)
+    block_hash.insert_blocks(pack_keys(coordinates), 0, len(coordinates), 0, hash_keys, hash_slots)
+    no_color = np.zeros((1, 512), np.int32)
+    return Layers(sums, None, no_color, correction, hash_keys, hash_slots, len(coordinates), 1.0)
+
+
+@pytest.mark.parametrize("smoothed", [False, True])
+def test_values_equal_the_twin(smoothed: bool) -> None:
+    random = np.random.default_rng(5)
+    weight = random.integers(0, 60, (len(PATCH), 512)) << random.integers(0, 20, (len(PATCH), 512))
+    sums = (weight * random.integers(-1023, 1024, weight.shape) << 27) + weight
+    sums[0, :2] = ((1 << 36) - 1 << 27) + 77, (-(1 << 36) << 27) + 99
+    correction = random.normal(0, 99, weight.shape).astype(np.float32) if smoothed else None
+    layers = layers_of(PATCH, sums, correction)
+    absent = pack_keys(np.array([[7, 7, 7]], np.int32))
+    found = values_of(np.concatenate([pack_keys(PATCH), absent]), layers, 2.0)
+    distance, weight = (sums >> 27).astype(np.float32), (sums & 0x7FFFFFF).astype(np.float32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moved = distance if correction is None else distance + correction
+        expected = np.where(weight >= 32, moved / weight, np.nan)
+    assert found.dtype == np.float32
+    assert np.array_equal(found[:-1], expected, equal_nan=True)
+    assert np.isnan(found[-1]).all()
+
+
+def test_a_lane_becomes_the_nearest_float() -> None:
+    """The two halves a lane is converted in round once, like the whole."""
+    lane = np.random.default_rng(6).integers(-(1 << 36), 1 << 36, (1, 512))
+    layers = layers_of(PATCH[:1], (lane << 27) + 1, None)
+    assert np.array_equal(values_of(pack_keys(PATCH[:1]), layers, 0.0), lane.astype(np.float32))
+
+
+@pytest.mark.parametrize("wanted", [0, 1, 2, 4, len(PATCH)])
+def test_the_blocks_around_equal_the_twin(wanted: int) -> None:
+    layers = layers_of(PATCH, np.zeros((len(PATCH), 512), np.int64), None)
+    chosen = np.random.default_rng(wanted).permutation(PATCH)[:wanted]
+    around = (chosen[:, None] + np.array([*np.ndindex(3, 3, 3)]) - 1).reshape(-1, 3)
+    expected = {tuple(b) for b in around.tolist()} & {tuple(b) for b in PATCH.tolist()}
+    found = MeshScratch().keys_around(np.sort(pack_keys(chosen)), layers)
+    assert (np.diff(found) > 0).all()
+    assert {tuple(b) for b in unpack_keys(found).tolist()} == expected
+
+
+@pytest.mark.parametrize("known", [1.0, 0.9])
+@pytest.mark.parametrize("wanted", [1, 3, len(PATCH)])
+def test_cells_and_edges_equal_the_twin(known: float, wanted: int) -> None:
+    random = np.random.default_rng(8)
+    order = np.argsort(pack_keys(PATCH))
+    keys, coordinates = pack_keys(PATCH)[order], PATCH[order]
+    count = len(keys)
+    rows = random.normal(size=(count, 512)).astype(np.float32)
+    rows[random.random(rows.shape) > known] = np.nan
+    rows[3] = np.abs(rows[3])  # a block without a sign change of its own
+    chosen = np.sort(random.permutation(count)[:wanted])
+    runtime.start(2)
+    scratch = MeshScratch()
+    scratch.reserve(count)
+    s = {name: getattr(scratch, name).array for name in
+         ("around", "seen", "inside", "active", "edges", "starts", "state", "first")}  # fmt: skip
+    table = scratch.table(count)
+    block_hash.insert_blocks(keys, 0, count, 0, *table)
+    surface_cells.find_cells(
+        count, keys, wanted, keys[chosen], *table, rows, marching_tables.TRIANGLE_COUNT, *s.values()
+    )  # fmt: skip
+
+    voxels = (coordinates[:, None] * 8 + np.array([*np.ndindex(8, 8, 8)])).reshape(-1, 3)
+    known_values = {
+        tuple(v): x for v, x in zip(voxels.tolist(), rows.ravel().tolist(), strict=True) if x == x
+    }
+    meshed = {tuple(b) for b in coordinates[chosen].tolist()}
+    active, edges, triangles = kernel_twins.crossed_cells(known_values, meshed)
+    for r, corner in enumerate(coordinates.tolist()):
+        first, end = s["first"][r], s["first"][r + 1]
+        here = {v for v in active if [c >> 3 for c in v] == corner}
+        assert voxels_in(s["active"][r], corner) == here
+        assert end[1] - first[1] == sum(triangles[v] for v in here)
+        mine = {(v, axis) for v, axis in edges if [c >> 3 for c in v] == corner}
+        assert end[0] - first[0] == len(mine)
+        if mine:
+            planes = s["edges"][r].reshape(8, 3)
+            assert {(v, a) for a in range(3) for v in voxels_in(planes[:, a], corner)} == mine
+            per_plane = [bin(int(p)).count("1") for p in s["edges"][r]]
+            assert s["starts"][r].tolist() == [0, *np.cumsum(per_plane)[:-1].tolist()]
+    assert s["first"][count].tolist() == [len(edges), sum(triangles.values())]
+
+
+def voxels_in(planes: NDArray[np.uint64], corner: list[int]) -> set[kernel_twins.Voxel]:
+    """The voxels of a block whose bits are set in eight planes."""
+    bits = [(x, j >> 3, j & 7) for x in range(8) for j in range(64) if int(planes[x]) >> j & 1]
+    return {tuple(8 * c + o for c, o in zip(corner, b, strict=True)) for b in bits}  # type: ignore[misc]
+
+
+def test_no_blocks_have_no_cells() -> None:
+    layers = layers_of(PATCH, np.zeros((len(PATCH), 512), np.int64), None)
+    assert len(MeshScratch().keys_around(np.zeros(0, np.int64), layers)) == 0
+    assert cells_of(np.zeros((0, 3), np.int32)).shape == (0, 3)
+
+
+def test_the_scratch_gives_the_memory_of_a_large_mesh_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tsfusion.tsdf.mesh_extraction._KEEP", 100)
+    scratch = MeshScratch()
+    scratch.reserve(50)
+    small = scratch.nbytes
+    scratch.release()
+    assert scratch.nbytes == small
+    scratch.reserve(500)
+    assert scratch.nbytes > small
+    scratch.release()
+    assert scratch.nbytes < small

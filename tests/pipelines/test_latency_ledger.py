@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: MIT
+"""Figures, files and plot of the latency ledger."""
+
+import csv
+
+import cv2
+import numpy as np
+import pytest
+
+from tsfusion.pipelines import latency_ledger
+from tsfusion.wire import keyframe_times
+from tsfusion.wire.keyframe_times import KeyframeTimes
+
+MS = 1_000_000
+
+
+def record(seq: int, delay_ms: int, *, captured_ms: int = 1000) -> KeyframeTimes:
+    """Stages of 1, 2, 3 and 4 ms, then fusing until `delay_ms`, then 5 ms to the mesh."""
+    at = (captured_ms + 250 * seq) * MS
+    return KeyframeTimes(
+        seq=seq,
+        timestamp_ns=7,
+        captured_ns=at,
+        sent_ns=at + 1 * MS,
+        received_ns=at + 3 * MS,
+        durable_ns=at + 6 * MS,
+        fuse_start_ns=at + 10 * MS,
+        fused_ns=at + delay_ms * MS,
+        meshed_ns=at + (delay_ms + 5) * MS,
+        clock_bound_ns=40_000,
+    )
+
+
+def test_summary() -> None:
+    summary = latency_ledger.summarise([record(i, 100 + i) for i in range(1, 102)])
+    delay = summary.delay_ms
+    assert (delay.count, delay.mean, delay.p50, delay.max) == (101, 151.0, 151.0, 201.0)
+    assert delay.p95 == pytest.approx(196.0)
+    assert delay.p99 == pytest.approx(200.0)
+    assert summary.slope_ms_per_keyframe == pytest.approx(1.0)
+    stages = {name: spread.mean for name, spread in summary.stages_ms.items()}
+    assert stages == {"encode": 1, "wire": 2, "journal": 3, "queue": 4, "fuse": 141, "mesh": 5}
+    assert summary.clock_bound_ms == 0.04
+
+
+def test_stages_add_up_to_the_delay() -> None:
+    records = [record(i, 90) for i in range(5)]
+    parts = [
+        latency_ledger.durations_ms(records, *ends)
+        for name, ends in keyframe_times.STAGES.items()
+        if name != "mesh"
+    ]
+    assert np.sum(parts, axis=0) == pytest.approx(latency_ledger.durations_ms(records, *keyframe_times.DELAY))
+
+
+def test_unknown_stamps_are_left_out() -> None:
+    lost = KeyframeTimes(seq=3, captured_ns=5 * MS, sent_ns=6 * MS)
+    summary = latency_ledger.summarise([record(1, 50), lost, record(2, 50)])
+    assert summary.delay_ms.count == 2
+    assert summary.stages_ms["encode"].count == 3
+    assert summary.stages_ms["mesh"].max == 5
+
+
+@pytest.mark.parametrize("records", [[], [KeyframeTimes(seq=1)], [record(1, 80)]])
+def test_few_records_make_no_trouble(records: list[KeyframeTimes], tmp_path) -> None:
+    summary = latency_ledger.summarise(records)
+    assert summary.slope_ms_per_keyframe == 0
+    assert summary.delay_ms.mean in (0, 80)
+    latency_ledger.plot(records, tmp_path / "delay.png")
+    latency_ledger.write_csv(records, tmp_path / "delay.csv")
+
+
+def test_csv_holds_stamps_and_stages(tmp_path) -> None:
+    latency_ledger.write_csv([record(1, 60), KeyframeTimes(seq=2, captured_ns=1)], tmp_path / "delay.csv")
+    with (tmp_path / "delay.csv").open(encoding="utf-8") as file:
+        first, second = csv.DictReader(file)
+    assert (first["seq"], first["delay_ms"], first["wire_ms"]) == ("1", "60.000", "2.000")
+    assert int(first["fused_ns"]) - int(first["captured_ns"]) == 60 * MS
+    assert (second["captured_ns"], second["fused_ns"], second["delay_ms"]) == ("1", "0", "")
+
+
+def test_plot_is_a_picture(tmp_path) -> None:
+    latency_ledger.plot([record(i, 80 + 3 * i) for i in range(40)], tmp_path / "delay.png")
+    image = cv2.imread(str(tmp_path / "delay.png"))
+    assert image.shape[0] > 300
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 8

@@ -1,0 +1,359 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion scan` as users run it: processes, sockets, files, Ctrl-C."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from command_processes import end, environment, eventually, read_until, server, started, tsfusion
+from small_recordings import seven_scenes
+
+from tsfusion import open_dataset
+from tsfusion.core.config import ScanConfig, VolumeConfig
+from tsfusion.core.errors import InvalidConfig, InvalidKeyframe
+from tsfusion.datasets.trajectory_files import read_tum, write_tum
+from tsfusion.evaluation.held_out_views import compare_scans
+from tsfusion.geometry.frame import Frame
+from tsfusion.journal.recording import Recording
+from tsfusion.pipelines import scan as pipelines_scan
+from tsfusion.pipelines import target_server
+from tsfusion.scanner.scanner import ScanState
+from tsfusion.scanner.sources.source import Live
+from tsfusion.wire.queries import fetch_status
+
+VOXEL = 0.05
+SOURCE = "synthetic:room"
+# As on a robot without Taichi: importing it fails.
+BARE = "import sys; sys.modules['taichi'] = None; from tsfusion.__main__ import main; main(sys.argv[1:])"
+
+
+def recording(folder: Path, count: int = 12, *, broken: int | None = None) -> Path:
+    """The room's first frames of a slow walk, as a TUM recording with its true poses."""
+    room = open_dataset(SOURCE, count=150)
+    for name in ("depth", "rgb"):
+        (folder / name).mkdir(parents=True)
+    lists: dict[str, list[str]] = {"depth": [], "rgb": []}
+    stamps = [10**9 + index * 10**8 for index in range(count)]
+    for index, stamp in enumerate(stamps):
+        keyframe, seconds = room[index], f"{stamp / 1e9:.6f}"
+        depth = (keyframe.measurement // 2).astype(np.uint16)  # 0.1 mm to the layout's 0.2 mm
+        cv2.imwrite(str(folder / f"depth/{seconds}.png"), depth)
+        cv2.imwrite(str(folder / f"rgb/{seconds}.png"), keyframe.color)
+        for name, lines in lists.items():
+            lines.append(f"{seconds} {name}/{seconds}.png\n")
+    for name, lines in lists.items():
+        (folder / f"{name}.txt").write_text("".join(lines))
+    write_tum(folder / "groundtruth.txt", stamps, [room[index].T_world_camera for index in range(count)])
+    (folder / "camera-intrinsics.txt").write_text("292.5 0 159.5\n0 292.5 119.5\n0 0 1\n")
+    if broken is not None:
+        (folder / lists["depth"][broken].split()[1]).write_bytes(b"\x89PNG, but cut")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recording(tmp_path_factory.mktemp("walk") / "room")
+
+
+def figures(done: "subprocess.CompletedProcess[str]") -> dict[str, Any]:
+    assert done.returncode == 0, done.stderr
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def scan(*arguments: object) -> "subprocess.CompletedProcess[str]":
+    return tsfusion("scan", "--voxel-size", VOXEL, *arguments)
+
+
+def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run = figures(scan("--source", walk, "--localizer", "rgbd", "--out", out, "--json"))
+    assert {path.name for path in out.iterdir()} == {
+        "mesh.ply", "mesh.glb", "preview.png", "delay.csv", "delay.png", "run.json", "trajectory.txt",
+        "keyframes.txt",
+    }  # fmt: skip
+    assert run == json.loads((out / "run.json").read_text())
+    assert (run["frames"], run["frames_tracked"], run["complete"], run["left"]) == (12, 12, True, 0)
+    assert run["localizer"] == "rgbd"
+    assert run["keyframes_sent"] == run["keyframes_fused"] == sum(run["keyframes_by_rule"].values()) >= 3
+    (found,) = run["maps"]
+    assert found["mesh"]["triangles"] > 1000
+    assert found["trajectory_error"]["rmse"] < 0.005
+    assert len(read_tum(out / "trajectory.txt").timestamps_ns) == 12
+    assert len(read_tum(out / "keyframes.txt").timestamps_ns) == run["keyframes_sent"]
+    assert cv2.imread(str(out / "preview.png")).std() > 5
+    shown = scan("--source", walk, "--localizer", "given", "--out", tmp_path / "given")
+    assert "12/12 localised by given" in shown.stdout
+    assert "rmse" in shown.stdout
+
+
+def test_without_taichi_to_a_server_elsewhere(walk: Path, tmp_path: Path) -> None:
+    with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, process):
+        command = ["scan", "--source", walk, "--connect", address, "--map", "hall",
+                   "--spool", tmp_path / "spool", "--out", tmp_path / "out", "--json"]  # fmt: skip
+        done = subprocess.run(
+            [sys.executable, "-c", BARE, *map(str, command)], capture_output=True, text=True, timeout=120,
+            env=environment(), check=False,
+        )  # fmt: skip
+        run = figures(done)
+        assert run["keyframes_durable"] == run["keyframes_sent"] >= 3
+        assert run["left"] == 0
+        assert not (tmp_path / "out" / "mesh.ply").exists()
+        assert run["peak_rss_bytes"]["client"] < 200e6
+        eventually(lambda: fetch_status(address, map_name="hall").keyframes_fused == run["keyframes_sent"])
+        sent = read_tum(tmp_path / "out" / "keyframes.txt")
+        again = tsfusion(
+            "scan", "--source", walk, "--connect", address, "--map", "hall", "--max-frames", 1,
+            "--spool", tmp_path / "spool", "--out", tmp_path / "out",
+        )  # fmt: skip
+        assert "give it a map of its own (--map NAME)" in again.stderr
+        assert end(process) == 0
+    stamps = [keyframe.timestamp_ns for keyframe in Recording(tmp_path / "state", "hall")]
+    assert stamps == [*sent.timestamps_ns, stamps[0]]
+
+
+def test_ctrl_c_without_a_server_keeps_all_for_the_next_scan(walk: Path, tmp_path: Path) -> None:
+    spool, nobody = tmp_path / "spool", "tcp://127.0.0.1:9"
+    process = started(
+        "scan", "--source", SOURCE, "--rate", 3, "--connect", nobody, "--spool", spool,
+        "--out", tmp_path / "out",
+    )  # fmt: skip
+    read_until(process, "no server answers")
+    assert end(process, signal.SIGINT) == 0
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert not run["complete"]
+    assert 0 < run["frames"] < 40
+    assert run["left"] == run["keyframes_sent"] >= 1
+    assert "no server answers" in run["link"]
+    assert len(Recording(spool / "default")) == run["left"]
+    with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, _):
+        more = figures(
+            tsfusion(
+                "scan", "--source", walk, "--max-frames", 3, "--connect", address, "--map", "walk",
+                "--spool", spool, "--out", tmp_path / "more", "--json",
+            )
+        )  # fmt: skip
+        assert more["left"] == 0
+        eventually(lambda: fetch_status(address).keyframes_durable == run["left"])
+
+
+def test_ctrl_c_ends_a_scan_with_its_results(tmp_path: Path) -> None:
+    process = started("scan", "--source", SOURCE, "--rate", 4, "--voxel-size", 0.1, "--out", tmp_path / "out")
+    read_until(process, "frames ")
+    read_until(process, "frames ")
+    process.send_signal(signal.SIGINT)
+    read_until(process, "ending: what is on its way is finished")
+    process.wait(60)
+    assert end(process) == 0
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert 0 < run["frames"] < 40
+    assert run["keyframes_fused"] == run["keyframes_sent"]
+    assert (tmp_path / "out" / "mesh.ply").exists()
+    assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_a_recording_that_breaks_off_keeps_what_came_before(tmp_path: Path) -> None:
+    folder = recording(tmp_path / "broken", broken=7)
+    done = scan("--source", folder, "--out", tmp_path / "out")
+    assert done.returncode == 1
+    assert "cannot be decoded" in done.stderr.splitlines()[-1]
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert (run["frames"], run["complete"]) == (7, False)
+    assert (tmp_path / "out" / "mesh.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (["--source", "nowhere"], 1, "nowhere does not exist"),
+        (["--source", SOURCE, "--localizer", "trajectory"], 1, "needs --trajectory FILE"),
+        (["--source", SOURCE, "--localizer", "gps"], 1, "localizer must be one of auto, rgbd"),
+        (["--source", SOURCE, "--localizer", "lidar"], 1, "points"),
+        (["--source", SOURCE, "--spool", "spool"], 1, "--spool has no effect without --connect"),
+        (["--source", SOURCE, "--connect", "tcp://127.0.0.1:9", "--voxel-size", "1"], 1, "tsfusion serve"),
+        (["--source", "realsense", "--rate", "2"], 1, "--rate is for recordings"),
+        (["--source", SOURCE, "--calibration", "a.yaml"], 1, "--calibration is for a live camera"),
+        (["--source", "folder:nowhere"], 1, "nowhere"),
+        ([], 2, "--source"),
+    ],
+)
+def test_what_cannot_be_scanned_is_one_clear_line(
+    tmp_path: Path, arguments: list[str], status: int, words: str
+) -> None:
+    done = tsfusion("scan", *arguments, "--out", tmp_path / "out")
+    assert done.returncode == status
+    assert words in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_sensor_that_is_never_localised(tmp_path: Path) -> None:
+    seven_scenes(tmp_path / "flat", 4, (48, 64))  # no texture, nothing near enough to be seen
+    done = scan(
+        "--source", tmp_path / "flat", "--trajectory", tmp_path / "none.txt", "--out", tmp_path / "out"
+    )
+    assert done.returncode == 1
+    (tmp_path / "late.txt").write_text("5000 0 0 0 0 0 0 1\n5001 0 0 0 0 0 0 1\n")
+    done = scan(
+        "--source", tmp_path / "flat", "--trajectory", tmp_path / "late.txt", "--out", tmp_path / "out"
+    )
+    assert done.returncode == 1
+    assert "was not localised in any of 4 frames" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_client_is_light() -> None:
+    """What a scanner loads before its first frame; without the optional packages."""
+    program = (
+        "import resource, tsfusion.client; used = resource.getrusage(resource.RUSAGE_SELF);"
+        "from tsfusion.core import process; print(used.ru_utime + used.ru_stime, process.peak_rss_bytes())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+    )  # fmt: skip
+    _, rss = map(float, done.stdout.split())
+    assert rss < 100e6
+
+
+@pytest.mark.slow
+def test_a_mesh_with_poses_of_its_own_is_as_good_as_with_the_true_ones(data, tmp_path: Path) -> None:
+    kitchen = data("7scenes/redkitchen")
+    for name in ("rgbd", "given"):
+        run = figures(
+            tsfusion(
+                "scan", "--source", kitchen, "--localizer", name, "--voxel-size", 0.02,
+                "--out", tmp_path / name, "--json", timeout=400,
+            )
+        )  # fmt: skip
+        assert run["frames_tracked"] == 125
+    assert run["maps"][0]["trajectory_error"]["rmse"] < 1e-9
+    own, given = compare_scans(
+        open_dataset(kitchen), [tmp_path / "rgbd", tmp_path / "given"], voxel_size=0.02
+    )
+    assert own["median_mm"] <= 1.3 * given["median_mm"]
+    assert own["p90_mm"] <= 1.3 * given["p90_mm"]
+    assert own["predicted"] > 95
+
+
+class Told:
+    """keeps what a scan tells."""
+
+    def stage(self, text: str) -> None:
+        pass
+
+    def scan(self, state: ScanState, length: int | None) -> None:
+        self.state = state
+
+
+class Frames(Live):
+    """Frames from a list."""
+
+    def __init__(self, frames: list[Frame], *, live: bool = False) -> None:
+        super().__init__("a list", "kinect")
+        self._frames, self.live, self.length = frames, live, None if live else len(frames)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self._frames)
+
+
+def unposed(count: int) -> list[Frame]:
+    """The room's first frames, without their poses."""
+    room = open_dataset(SOURCE, count=150)
+    return [
+        dataclasses.replace(room.frame(index), T_world_camera=None, timestamp_ns=(index + 1) * 10**8)
+        for index in range(count)
+    ]
+
+
+@pytest.mark.parametrize(("count", "gap_ns", "taken"), [(1, 0, 1), (3, 0, 3), (3, 3 * 10**9, 2)])
+def test_a_live_sources_first_frame_is_taken_unless_it_is_old(
+    count: int, gap_ns: int, taken: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipelines_scan, "_LINGER", 0.2)
+    first, *others = unposed(count)
+    later = [dataclasses.replace(frame, timestamp_ns=frame.timestamp_ns + gap_ns) for frame in others]
+    result = pipelines_scan.scan(
+        Frames([first, *later], live=True), tmp_path / "out", config=ScanConfig(), volume=VolumeConfig(),
+        connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Told(),
+    )  # fmt: skip
+    assert (result.frames, result.frames_tracked) == (taken, taken)
+
+
+def test_what_waits_for_the_map_is_of_another_world(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(pipelines_scan, "_LINGER", 0.2)
+    for left in (1, 2):
+        assert "of an earlier scan" not in caplog.text
+        result = pipelines_scan.scan(
+            Frames(unposed(1)), tmp_path / "out", config=ScanConfig(), volume=VolumeConfig(),
+            connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Told(),
+        )  # fmt: skip
+        assert result.left == left
+    assert "of an earlier scan wait for the map default" in caplog.text
+
+
+def test_a_frame_that_cannot_be_followed_keeps_what_came_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipelines_scan, "_LINGER", 0.2)
+    points = Frame(sensor="lidar", points=np.ones((9, 3), np.float32), timestamp_ns=10**9)
+    with pytest.raises(InvalidKeyframe, match="needs a depth"):
+        pipelines_scan.scan(
+            Frames([*unposed(4), points]), tmp_path / "out", config=ScanConfig(loop_closure=False),
+            volume=VolumeConfig(), connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Told(),
+        )  # fmt: skip
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert (run["frames_tracked"], run["complete"]) == (4, False)
+    assert len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) == 4
+    with pytest.raises(InvalidConfig, match="rgbd follows depth images, and this source gives points"):
+        pipelines_scan.scan(
+            Frames([points]), tmp_path / "none", config=ScanConfig(localizer="rgbd"),
+            volume=VolumeConfig(), connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Told(),
+        )  # fmt: skip
+    assert not (tmp_path / "none").exists()
+
+
+def test_keyframes_that_are_refused_do_not_cost_the_results(walk: Path, tmp_path: Path) -> None:
+    settings = tmp_path / "server.toml"
+    settings.write_text("[server]\nquota_extent = 0.001\n")
+    with server(tmp_path / "state", "--config", settings) as (address, _):
+        run = figures(
+            tsfusion(
+                "scan", "--source", walk, "--localizer", "given", "--connect", address,
+                "--spool", tmp_path / "spool", "--out", tmp_path / "out", "--json",
+            )
+        )  # fmt: skip
+    assert run["keyframes_rejected"] == {"quota": run["keyframes_sent"]}
+    assert run["left"] == 0
+    assert len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) == 12
+
+
+def test_a_map_without_a_surface_keeps_the_trajectory(walk: Path, tmp_path: Path) -> None:
+    done = scan("--source", walk, "--max-frames", 2, "--min-weight", 1000, "--out", tmp_path / "out")
+    assert done.returncode == 1
+    assert "the map has no surface to write: 1 keyframes fused" in done.stderr.splitlines()[-1]
+    assert len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) == 2
+    assert not (tmp_path / "out" / "mesh.ply").exists()
+
+
+@pytest.mark.parametrize(("live", "policy"), [(True, "thin"), (False, "spool_all")])
+def test_only_what_cannot_wait_is_thinned_out(live: bool, policy: str, tmp_path: Path) -> None:
+    """Also where nobody knows how many frames there will be, as in a folder or a camera's recording."""
+    source = Frames([], live=live)
+    source.length = None
+    with ExitStack() as stack:
+        place = target_server.elsewhere(None, "tcp://127.0.0.1:9", tmp_path / "spool")
+        _, connect = target_server.opener(stack, place, source)
+        assert connect("hall")._config.policy == policy

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: MIT
+"""Imports go down the table of ARCHITECTURE.md, and what must stay light stays light."""
+
+import ast
+import re
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+from repository import ROOT
+
+PACKAGE = ROOT / "tsfusion"
+
+# Top to bottom. A wing imports from the rows below its own, and nothing from its neighbours in the row.
+ROWS = (
+    ("__main__",),
+    ("cli",),
+    ("pipelines",),
+    ("scanner", "server"),
+    ("gateway", "client", "evaluation"),
+    ("fuser", "delivery", "datasets"),
+    ("journal",),
+    ("tsdf", "wire"),
+    ("kernels", "geometry"),
+    ("core",),
+)
+
+# All others run where there is no Taichi, and answer while kernels run.
+MAY_REACH_TAICHI = (
+    "kernels",
+    "tsdf",
+    "fuser",
+    "datasets.synthetic",
+    "evaluation",
+    "pipelines",
+    "cli",
+    "__main__",
+)
+TAICHI_FREE = ("fuser.messages",)
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Dotted name inside the package → file."""
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        found[".".join(part for part in parts if part != "__init__")] = path
+    return found
+
+
+@cache
+def imports(name: str, *, loading: bool = False) -> frozenset[str]:
+    """Every absolute name it imports, type-only ones left out; `loading`: those inside functions too."""
+    tree = ast.parse(modules()[name].read_text(encoding="utf-8"))
+    left_out = {
+        id(inner)
+        for node in ast.walk(tree)
+        if (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test))
+        or (loading and isinstance(node, ast.FunctionDef))
+        for statement in node.body
+        for inner in ast.walk(statement)
+    }
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if id(node) in left_out:
+            continue
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"tsfusion.{name} imports relatively: {ast.unparse(node)}"
+            assert node.module is not None
+            found.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return frozenset(found)
+
+
+def own_imports(name: str, *, loading: bool = False) -> set[str]:
+    """The package's modules it imports, by dotted name inside the package."""
+    found = set()
+    for target in imports(name, loading=loading):
+        head, *parts = target.split(".")
+        if head != "tsfusion":
+            continue
+        while parts and ".".join(parts) not in modules():
+            parts.pop()
+        found.add(".".join(parts))
+    return found - {"", name}  # the package itself holds the version and loads names on demand
+
+
+def wing(name: str) -> str:
+    """The folder of a module, or the module itself where it stands at the root."""
+    return name.partition(".")[0]
+
+
+def row(name: str) -> int:
+    """Index of the wing's row; 0 is the top."""
+    rows = [index for index, wings in enumerate(ROWS) if wing(name) in wings]
+    assert rows, f"tsfusion.{name} has no row: add its wing here and in ARCHITECTURE.md"
+    return rows[0]
+
+
+def may_reach_taichi(name: str) -> bool:
+    inside = any(name == place or name.startswith(f"{place}.") for place in MAY_REACH_TAICHI)
+    return inside and name not in TAICHI_FREE
+
+
+INSIDE = sorted(name for name in modules() if name)
+
+
+def test_architecture_shows_every_wing() -> None:
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    shown = set(re.findall(r"^  (\w+)(?:/|\.py) ", text, re.MULTILINE))
+    assert shown >= {one for wings in ROWS for one in wings} - {"__main__"}
+
+
+@pytest.mark.parametrize("name", INSIDE)
+def test_imports_go_down(name: str) -> None:
+    upward = {
+        target for target in own_imports(name) if wing(target) != wing(name) and row(target) <= row(name)
+    }
+    assert not upward, f"tsfusion.{name} imports {', '.join(sorted(upward))}, which is not below it"
+
+
+def test_package_root_imports_nothing() -> None:
+    assert own_imports("") == set()
+
+
+def test_no_cycles() -> None:
+    finished: set[str] = set()
+
+    def visit(name: str, path: tuple[str, ...]) -> None:
+        assert name not in path, " → ".join((*path[path.index(name) :], name))
+        if name not in finished:
+            for target in own_imports(name, loading=True):
+                visit(target, (*path, name))
+            finished.add(name)
+
+    for name in INSIDE:
+        visit(name, ())
+
+
+def test_light_modules_reach_no_kernel() -> None:
+    for name in INSIDE:
+        if not may_reach_taichi(name):
+            reached, waiting = set(), [name]
+            while waiting:
+                at = waiting.pop()
+                if at not in reached:
+                    reached.add(at)
+                    waiting.extend(own_imports(at, loading=name.startswith("datasets")))
+            heavy = {at for at in reached if wing(at) in {"kernels", "tsdf"}}
+            assert not heavy, f"tsfusion.{name} reaches {', '.join(sorted(heavy))}"
+            assert not any(target.split(".")[0] == "taichi" for at in reached for target in imports(at))
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["client", "server", "scanner.scanner", "wire.codec", "journal", "journal.recording", "datasets", "cli"],
+)
+def test_import_leaves_taichi_out(name: str) -> None:
+    program = (
+        f"import sys, tsfusion.{name}; "
+        "sys.exit(', '.join({'taichi', 'pykitti', 'open3d', 'matplotlib'} & set(sys.modules)) or 0)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, f"import tsfusion.{name} also imports {done.stderr}"
+
+
+@pytest.mark.parametrize("name", INSIDE)
+def test_header_and_docstring(name: str) -> None:
+    text = modules()[name].read_text(encoding="utf-8")
+    assert text.startswith("# SPDX-License-Identifier: MIT\n")
+    assert name == "kernels" or ast.get_docstring(ast.parse(text)), f"tsfusion.{name} has no docstring"

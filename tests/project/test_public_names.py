@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: MIT
+"""What `import tsfusion` offers."""
+
+import inspect
+import subprocess
+import sys
+
+import pytest
+
+import tsfusion
+from tsfusion.core import errors
+
+
+def test_every_name_offered_is_there() -> None:
+    assert sorted(tsfusion.__all__) == dir(tsfusion)
+    for name in tsfusion.__all__:
+        assert getattr(tsfusion, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'Volumes'"):
+        tsfusion.Volumes
+
+
+def test_the_public_surface() -> None:
+    """A name more or less here is a change that users see: CHANGELOG."""
+    tree = {name for name, value in vars(errors).items() if inspect.isclass(value)}
+    assert set(tsfusion.__all__) - tree == {
+        "Client", "Config", "Intrinsics", "Keyframe", "Mesh", "Volume", "VolumeConfig", "__version__",
+        "open_dataset",
+    }  # fmt: skip
+    assert tree <= set(tsfusion.__all__)
+    assert all(issubclass(getattr(errors, name), tsfusion.TsfusionError) for name in tree)
+    assert all(name in (errors.__doc__ or "") for name in tree)
+
+
+def test_a_scanner_imports_no_taichi() -> None:
+    program = (
+        "import sys, tsfusion; tsfusion.FlushTimeout, tsfusion.InvalidKeyframe; "
+        "tsfusion.Client, tsfusion.Keyframe; sys.exit('taichi' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: MIT
+"""Following a LiDAR."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tsfusion.core.errors import InvalidKeyframe
+from tsfusion.datasets import open_dataset
+from tsfusion.datasets.dataset import frame_of
+from tsfusion.datasets.synthetic.dataset import Synthetic
+from tsfusion.evaluation.trajectory_error import absolute_error
+from tsfusion.geometry import se3
+from tsfusion.geometry.frame import Frame
+from tsfusion.scanner.localization.localizer import Lost, Pose
+
+pytest.importorskip("kiss_icp", reason="no kiss-icp: pip install 'tsfusion[lidar]'")
+
+from tsfusion.scanner.localization.lidar import Lidar
+
+Data = Callable[[str], Path]
+
+
+@pytest.fixture
+def kitti(data: Data) -> list[Frame]:
+    dataset = open_dataset(
+        data("kitti_odometry"), sequence="00", modality="lidar", poses="poses_estimated/00_ORB.txt"
+    )
+    return [frame_of(dataset, index) for index in range(6)]
+
+
+@pytest.fixture(scope="module")
+def street() -> list[Frame]:
+    dataset = Synthetic("street", "lidar", count=30, color=False)
+    return [dataset.frame(index) for index in range(30)]
+
+
+def scan(points: np.ndarray) -> Frame:
+    return Frame(sensor="lidar", points=points.astype(np.float32))
+
+
+def pose_of(frame: Frame) -> np.ndarray:
+    assert frame.T_world_camera is not None
+    return frame.T_world_camera
+
+
+def away(found: list[Pose | Lost], frames: list[Frame]) -> list[float]:
+    """Metres between each pose and the frame's own, first upon first."""
+    poses = [pose.T_world_camera for pose in found if isinstance(pose, Pose)]
+    first = se3.inverse(pose_of(frames[0]))
+    pairs = zip(poses, frames, strict=True)
+    return [se3.distance(se3.inverse(first @ pose_of(frame)) @ T) for T, frame in pairs]
+
+
+def test_kitti_agrees_with_orb(kitti: list[Frame]) -> None:
+    lidar, found, spent = Lidar(), [], []
+    for frame in kitti:
+        before = time.process_time()
+        found.append(lidar.track(frame))
+        spent.append(time.process_time() - before)
+    assert max(away(found, kitti)) < 0.10  # the bar is 0.15
+    assert all(pose.quality > 0.9 for pose in found if isinstance(pose, Pose))
+    assert np.median(spent) < 0.15  # of 124,000 points; seen: 0.045
+
+
+def test_street_from_a_rolling_start(street: list[Frame]) -> None:
+    """KISS-ICP alone takes the first two metres for none: rings on the ground look the same everywhere."""
+    lidar = Lidar()
+    found = [lidar.track(frame) for frame in street]
+    errors = away(found, street)
+    assert max(errors[:4]) < 0.15
+    poses = np.array([pose.T_world_camera for pose in found if isinstance(pose, Pose)])
+    error = absolute_error(poses, np.array([frame.T_world_camera for frame in street]))
+    assert error.rmse < 0.08
+    assert error.drift_percent < 0.5
+
+
+def test_room() -> None:
+    dataset = Synthetic("room", "lidar", count=40, color=False)
+    frames = [dataset.frame(index) for index in range(20)]
+    lidar = Lidar()
+    assert max(away([lidar.track(frame) for frame in frames], frames)) < 0.08
+
+
+def test_equal_scans_give_equal_poses(street: list[Frame]) -> None:
+    runs = []
+    for _ in range(2):
+        lidar = Lidar()
+        found = [lidar.track(frame) for frame in street[:5]]
+        runs.append([pose.T_world_camera for pose in found if isinstance(pose, Pose)])
+    np.testing.assert_array_equal(runs[0], runs[1])
+
+
+def turned(frame: Frame) -> Frame:
+    assert frame.points is not None
+    return scan(frame.points[:, [1, 0, 2]] * (1, -1, 1))
+
+
+def garbage(_: Frame) -> Frame:
+    return scan(np.random.default_rng(0).uniform(-40, 40, (5000, 3)))
+
+
+def nearly_nothing(frame: Frame) -> Frame:
+    assert frame.points is not None
+    return scan(frame.points[:20])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [(turned, "of the points lie"), (garbage, "of the points lie"), (nearly_nothing, "after thinning")],
+)
+def test_a_bad_scan_is_lost_and_leaves_no_trace(
+    street: list[Frame], spoil: Callable[[Frame], Frame], reason: str
+) -> None:
+    lidar = Lidar()
+    found = [
+        lidar.track(spoil(frame) if index in (6, 7) else frame) for index, frame in enumerate(street[:12])
+    ]
+    lost = [pose for pose in found if isinstance(pose, Lost)]
+    assert [isinstance(pose, Lost) for pose in found] == [index in (6, 7) for index in range(12)]
+    assert all(reason in pose.reason for pose in lost)
+    good = [frame for index, frame in enumerate(street[:12]) if index not in (6, 7)]
+    assert max(away([pose for pose in found if isinstance(pose, Pose)], good)) < 0.2
+
+
+def test_another_street_is_no_motion(kitti: list[Frame], data: Data) -> None:
+    lidar = Lidar()
+    for frame in kitti[:4]:
+        assert isinstance(lidar.track(frame), Pose)
+    for index in range(3):
+        path = data("kitti07_lidar_keyframes") / f"{index:06d}" / "points.bin"
+        assert isinstance(lidar.track(scan(np.fromfile(path, np.float32).reshape(-1, 3))), Lost)
+
+
+def test_reset_begins_a_new_world(street: list[Frame]) -> None:
+    lidar = Lidar()
+    before = [pose for pose in (lidar.track(frame) for frame in street[:3]) if isinstance(pose, Pose)]
+    lidar.reset()
+    after = lidar.track(street[3])
+    assert isinstance(after, Pose)
+    np.testing.assert_array_equal(after.T_world_camera, np.eye(4))
+    assert after.starts_anchor
+    assert after.anchor == before[-1].anchor + 1
+    assert lidar.corrections() is None
+    assert not lidar.absolute
+
+
+def drive(street: list[Frame], count: int) -> list[Frame]:
+    """Scans stamped at their beginning, of a sensor that goes and turns while it spins, faster and faster."""
+    truths = [pose_of(frame) for frame in street]
+    cloud = np.vstack(
+        [se3.apply(T, f.points) for T, f in zip(truths, street, strict=True) if f.points is not None]
+    )
+    T, slots = truths[0], 180
+    rng = np.random.default_rng(5)
+    made = []
+    for index in range(count):
+        world = cloud[rng.choice(len(cloud), 25_000, replace=False)]
+        step = np.array([1.0, 0, 0, 0, 0, np.radians(1.5)]) * (1 + index / 4)
+        beams = [T @ se3.exp(step * (slot + 0.5) / slots) for slot in range(slots)]
+        local = se3.apply(se3.inverse(T), world)
+        for _ in range(3):  # which beam sees a point depends on where the sensor is then
+            share = (np.arctan2(local[:, 1], local[:, 0]) / (2 * np.pi)) % 1.0
+            slot_of = np.minimum((share * slots).astype(int), slots - 1)
+            for slot, beam in enumerate(beams):
+                local[slot_of == slot] = se3.apply(se3.inverse(beam), world[slot_of == slot])
+        made.append(
+            Frame(
+                sensor="lidar",
+                T_world_camera=T,
+                timestamp_ns=1 + index * 100_000_000,
+                points=local.astype(np.float32),
+                point_times_s=(share * 0.1).astype(np.float32),
+            )
+        )
+        T = T @ se3.exp(step)
+    return made
+
+
+def test_deskewed_scans_are_placed_where_they_began(street: list[Frame]) -> None:
+    frames = drive(street, 9)
+    worst = {}
+    for deskew in (True, False):
+        lidar = Lidar(deskew=deskew)
+        worst[deskew] = max(away([lidar.track(frame) for frame in frames], frames))
+    assert worst[True] < 0.3
+    assert 2 * worst[True] < worst[False]
+
+
+def test_images_are_refused() -> None:
+    with pytest.raises(InvalidKeyframe, match="follows points, got depth"):
+        Lidar().track(Synthetic("room", "kinect", count=1, color=False).frame(0))
+
+
+def test_too_little_to_begin_with() -> None:
+    lost = Lidar().track(scan(np.ones((5, 3))))
+    assert isinstance(lost, Lost)
+    assert lost.reason == "only 5 points to begin with"
+
+
+def test_without_kiss_icp_the_command_is_named() -> None:
+    program = (
+        "import sys; sys.modules['kiss_icp'] = None\n"
+        "from tsfusion.scanner.localization.lidar import Lidar\n"
+        "from tsfusion.core.errors import MissingDependency\n"
+        "try: Lidar()\n"
+        'except MissingDependency as error: sys.exit("tsfusion[lidar]" not in str(error))\n'
+        "sys.exit(2)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], timeout=60, check=False)
+    assert done.returncode == 0

@@ -1,0 +1,351 @@
+# SPDX-License-Identifier: MIT
+"""What strangers might do to a server, for some seconds, in a process of its own; bounded, loopback only.
+
+python tests/support/attacks.py NAME DATA CONTROL PUBLISH SERVER_KEY SECONDS
+
+It prints `begun`, and in the end how many messages, connections or bytes it came to.
+"""
+
+import contextlib
+import dataclasses
+import itertools
+import os
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import msgspec
+import numpy as np
+import zmq
+from hostile_messages import Frames, bad_values, bombs, hostile_corrections, lies
+from keyframes_and_servers import connected, wall
+
+from tsfusion.wire import codec, corrections, messages, sockets
+from tsfusion.wire.corrections import SessionCorrections
+from tsfusion.wire.curve import ClientKeys
+from tsfusion.wire.keyframe_header import VERSION
+from tsfusion.wire.messages import Command
+
+_HALF_OPEN = 1000
+_UNFINISHED = 400  # parts
+_PART_BYTES = 900_000
+_LORISES = 50
+_READERS, _DEAF = 16, 16
+_PAUSE = 0.002  # between hostile messages: they shall be checked, not only queued
+
+
+class Target(msgspec.Struct, frozen=True):
+    """Where, and until when."""
+
+    data: str
+    control: str
+    publish: str
+    server_key: str  # its public one; empty = it asks for none
+    end: float
+
+    @property
+    def over(self) -> bool:
+        return time.monotonic() >= self.end
+
+
+def _push(target: Target, made: Callable[[], Iterator[Frames]]) -> int:
+    sent = 0
+    with connected(sockets.push, target.data) as push:
+        while not target.over:
+            for frames in made():
+                if target.over or not push.poll(1000, zmq.POLLOUT):
+                    break
+                push.send_multipart(frames)
+                sent += 1
+                time.sleep(_PAUSE)
+    return sent
+
+
+def oversized(target: Target) -> int:
+    """Frames larger than a server takes, each on a new connection: the last one was closed for it."""
+    sent, huge = 0, bytes(33 << 20)
+    while not target.over:
+        with connected(sockets.push, target.data) as push:
+            if push.poll(1000, zmq.POLLOUT):
+                push.send_multipart([b"TSF\x01", huge], copy=False)
+                sent += 1
+                time.sleep(0.05)
+    return sent
+
+
+# --- control ---
+
+
+def rubbish(target: Target) -> int:
+    """Deep, wrong and lying msgpack, and greetings of nobody."""
+    hello = messages.encode(messages.Hello(bytes(16), VERSION))
+    wrong = [
+        b"", b"\xc1" * 1000, b"\x91" * 60_000, b"\x81" * 60_000, b"\xdf\xff\xff\xff\xff",
+        b"\xdd\xff\xff\xff\xff",
+        b"\xdb\xff\xff\xff\xffx", b"\xc6\xff\xff\xff\xff", hello[:-3], hello + b"\0", os.urandom(60_000),
+        messages.encode(Command(name="ping"))[:-1], msgspec.msgpack.encode({"type": "ping", "session": 7}),
+        msgspec.msgpack.encode({"type": "command", "name": "mesh", "map": "../x"}),
+        msgspec.msgpack.encode({"type": "hello", "session": bytes(16), "version": 1, "map": "a" * 60_000}),
+        msgspec.msgpack.encode({"type": "ping", "session": b"", "sent_ns": 1 << 63, "skipped": {"a": -1}}),
+        messages.encode(messages.Ping(bytes(16), 1, skipped={f"r{i}": 1 << 62 for i in range(16)})),
+    ]  # fmt: skip
+    sent = 0
+    with connected(sockets.dealer, target.control) as link:
+        for message in itertools.cycle(wrong):
+            if target.over or not link.poll(1000, zmq.POLLOUT):
+                break
+            link.send_multipart([message, b"x"] if sent % 7 == 0 else [message])
+            sent += 1
+            time.sleep(_PAUSE / 2)
+    return sent
+
+
+def wrong_corrections(target: Target) -> int:
+    """Poses for a session of its own that are none; and good ones as fast as they go, now and then huge."""
+    session, sent = os.urandom(16), 0
+    many = {1 + i: np.eye(4) for i in range(corrections.MAX_KEYFRAMES)}
+    seqs, poses = corrections.checked(many)
+    huge = SessionCorrections(session=session, seqs=seqs, poses=poses)
+    last = corrections.MAX_KEYFRAMES
+    keyframe = codec.encode(wall(), session=session, seq=last, previous=0, jpeg_quality=90)
+    with connected(sockets.push, target.data) as push, connected(sockets.dealer, target.control) as link:
+        if push.poll(1000, zmq.POLLOUT):
+            push.send_multipart(keyframe)
+        for revision in itertools.count(1):
+            said = hostile_corrections(session, revision)
+            content = huge if revision % 10 == 0 else huge.up_to(20)
+            said.append(("good", "", corrections.pack(dataclasses.replace(content, revision=revision))))
+            for _, _, frames in said:
+                if target.over or not link.poll(1000, zmq.POLLOUT):
+                    return sent
+                link.send_multipart(frames)
+                while link.poll(0):
+                    link.recv_multipart()
+                sent += 1
+                time.sleep(_PAUSE)
+    return sent
+
+
+def greetings(target: Target) -> int:
+    """Sessions without end, for maps without end."""
+    sent = 0
+    with connected(sockets.dealer, target.control) as link:
+        while not target.over and link.poll(1000, zmq.POLLOUT):
+            link.send(messages.encode(messages.Hello(os.urandom(16), VERSION, f"map{sent % 1000}")))
+            sent += 1
+            time.sleep(_PAUSE / 4)
+    return sent
+
+
+def sessions(target: Target) -> int:
+    """Sessions without end for the map that is open: each would be told how it is doing."""
+    sent = 0
+    with connected(sockets.dealer, target.control) as link:
+        while not target.over and link.poll(1000, zmq.POLLOUT):
+            link.send(messages.encode(messages.Hello(os.urandom(16), VERSION)))
+            while link.poll(0):
+                link.recv()
+            sent += 1
+    return sent
+
+
+def mesh_flood(target: Target) -> int:
+    """Meshes asked for over many connections: some read theirs and ask again, some never read."""
+    question = messages.encode(Command(name="mesh", min_weight=0.0))
+    asked = 0
+    with ExitStack() as stack:
+        readers = [stack.enter_context(connected(sockets.dealer, target.control)) for _ in range(_READERS)]
+        deaf = [stack.enter_context(contextlib.closing(raw(target.control, b"DEALER"))) for _ in range(_DEAF)]
+        while not target.over:
+            for one in deaf:
+                with contextlib.suppress(OSError):
+                    one.setblocking(False)
+                    one.send(b"\x00" + bytes([len(question)]) + question)
+                    asked += 1
+            for link in readers:
+                while link.poll(0):
+                    link.recv_multipart()
+                with contextlib.suppress(zmq.Again):
+                    link.send(question, zmq.NOBLOCK)
+                    asked += 1
+            time.sleep(0.02)
+    return asked
+
+
+def tiny(target: Target) -> int:
+    """As many small messages as go through, on both ports."""
+    sent = 0
+    with connected(sockets.push, target.data) as push, connected(sockets.dealer, target.control) as link:
+        while not target.over and sent < 2_000_000:
+            for one in (push, link):
+                with contextlib.suppress(zmq.Again):
+                    for _ in range(100):
+                        one.send(b"x", zmq.NOBLOCK)
+                        sent += 1
+    return sent
+
+
+def subscriptions(target: Target) -> int:
+    """Topics without end, long and short."""
+
+    def xsub(context: "zmq.Context[Any]") -> sockets.AnySocket:
+        made: sockets.AnySocket = context.socket(zmq.XSUB)
+        made.setsockopt(zmq.LINGER, 0)
+        return made
+
+    sent = 0
+    with connected(xsub, target.publish) as stranger:
+        while not target.over and stranger.poll(1000, zmq.POLLOUT):
+            more = 60_000 if sent % 500 == 499 else 400 if sent % 5 == 0 else 0
+            topic = os.urandom(8) + bytes(more)
+            stranger.send(b"\x01" + topic)
+            sent += 1
+            time.sleep(_PAUSE / 20)
+    return sent
+
+
+def knocking(target: Target) -> int:
+    """Connections made and left at once, with keys that nobody knows where keys are asked for."""
+    knocks = 0
+    context: zmq.Context[Any] = zmq.Context()
+    while not target.over:
+        links = []
+        for address, kind in ((target.data, sockets.push), (target.control, sockets.dealer)):
+            keys = None
+            if target.server_key:
+                public, secret = (half.decode() for half in zmq.curve_keypair())
+                keys = ClientKeys(public, secret, target.server_key)
+            link = kind(context, keys)
+            link.connect(address)
+            links.append(link)
+        time.sleep(10 * _PAUSE)  # long enough to be turned away
+        for link in links:
+            link.close()
+            knocks += 1
+    context.term()
+    return knocks
+
+
+# --- below the messages: ZMTP 3.1 by hand ---
+
+_GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"NULL".ljust(20, b"\0") + bytes(32)
+
+
+def _command(name: bytes, body: bytes) -> bytes:
+    content = bytes([len(name)]) + name + body
+    return b"\x04" + bytes([len(content)]) + content
+
+
+def _property(name: bytes, value: bytes) -> bytes:
+    return bytes([len(name)]) + name + struct.pack(">I", len(value)) + value
+
+
+def raw(address: str, kind: bytes) -> socket.socket:
+    """A connection over which a handshake as a socket of this kind was made."""
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    made = socket.create_connection((host, int(port)), timeout=5.0)
+    made.sendall(
+        _GREETING + _command(b"READY", _property(b"Socket-Type", kind) + _property(b"Identity", b""))
+    )
+    return made
+
+
+def part(content: bytes) -> bytes:
+    """A frame after which more are to come."""
+    return b"\x03" + struct.pack(">Q", len(content)) + content
+
+
+def _parts(target: Target, address: str, kind: bytes, *, most: int, size: int, links: int) -> int:
+    """So many parts of that many messages that never end; who is cut off begins anew."""
+    sent, content, open_links = 0, part(bytes(size)), list[socket.socket]()
+    while not target.over and sent < most:
+        try:
+            if len(open_links) < links:
+                open_links.append(raw(address, kind))
+            open_links[sent % len(open_links)].sendall(content)
+            sent += 1
+        except OSError:
+            while open_links:
+                open_links.pop().close()
+        time.sleep(_PAUSE / 4)
+    while not target.over:
+        time.sleep(0.05)
+    for link in open_links:
+        link.close()
+    return sent
+
+
+def unfinished(target: Target) -> int:
+    """Messages that go on and on: ZeroMQ keeps their parts until the last one comes."""
+    return _parts(target, target.data, b"PUSH", most=_UNFINISHED, size=_PART_BYTES, links=4)
+
+
+def unfinished_control(target: Target) -> int:
+    """The same on the control port, whose frames are small."""
+    return _parts(target, target.control, b"DEALER", most=10 * _UNFINISHED, size=60_000, links=1)
+
+
+def half_open(target: Target) -> int:
+    """Connections that say nothing, or the beginning of a greeting."""
+    with ExitStack() as stack:
+        made = 0
+        addresses = itertools.cycle((target.data, target.control, target.publish))
+        while not target.over and made < _HALF_OPEN:
+            host, _, port = next(addresses).removeprefix("tcp://").rpartition(":")
+            with contextlib.suppress(OSError):
+                link = stack.enter_context(socket.create_connection((host, int(port)), timeout=5.0))
+                link.sendall(_GREETING[: made % 12])
+                made += 1
+        while not target.over:
+            time.sleep(0.05)
+    return made
+
+
+def slow_loris(target: Target) -> int:
+    """A byte now and then, for ever."""
+    said = 0
+    with ExitStack() as stack:
+        links = []
+        for address in (target.data, target.control, target.publish):
+            host, _, port = address.removeprefix("tcp://").rpartition(":")
+            for _ in range(_LORISES):
+                links.append(stack.enter_context(socket.create_connection((host, int(port)), timeout=5.0)))
+        for byte in _GREETING:
+            if target.over:
+                break
+            for link in links:
+                with contextlib.suppress(OSError):
+                    link.send(bytes([byte]))
+                    said += 1
+            time.sleep(min(1.0, max(target.end - time.monotonic(), 0)))
+    return said
+
+
+ATTACKS: dict[str, Callable[[Target], int]] = {
+    "bombs": lambda target: _push(target, bombs),
+    "bad values": lambda target: _push(target, bad_values),
+    "lies": lambda target: _push(target, lies),
+    "oversized": oversized,
+    "rubbish": rubbish,
+    "corrections": wrong_corrections,
+    "greetings": greetings,
+    "sessions": sessions,
+    "mesh flood": mesh_flood,
+    "tiny": tiny,
+    "subscriptions": subscriptions,
+    "unfinished": unfinished,
+    "unfinished control": unfinished_control,
+    "knocking": knocking,
+    "half open": half_open,
+    "slow loris": slow_loris,
+}
+
+
+if __name__ == "__main__":
+    name, *where, seconds = sys.argv[1:]
+    print("begun", flush=True)
+    print(ATTACKS[name](Target(*where, time.monotonic() + float(seconds))))

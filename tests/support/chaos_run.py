@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: MIT
+"""Scanner, gateway and fuser killed at seeded moments over a bad network; and what must be true afterwards.
+
+The plan depends on the seed alone. What meets what depends on the machine: that is the point.
+"""
+
+import contextlib
+import functools
+import random
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+
+from bad_network import Proxy
+from chaos_plan import KINDS, Attack, Kind, fault, on_scanners, on_server
+from delivery_verdict import client_problems, server_problems, verify
+from keyframes_and_servers import UNSECURED, Secured, secured, until, wall
+from msgspec import Struct
+from scanner_process import Plan, journals
+from supervisors import PATIENCE, Daemon, Scanner
+
+from tsfusion import journal
+from tsfusion.core.config import ClientConfig, override
+from tsfusion.core.errors import TransportError, TsfusionError
+from tsfusion.wire import codec
+from tsfusion.wire.health import Status
+from tsfusion.wire.queries import fetch_health, fetch_status
+
+_RECORD_OVERHEAD = 300  # bytes of MCAP a keyframe
+
+# Small files and frequent checkpoints: more moments at which a kill can hurt. What piled up comes faster than
+# the quota, so clients are held, too.
+SERVER = {"checkpoint_every": 20, "segment_bytes": 1 << 18, "quota_keyframes": 60.0}
+CLIENT = ClientConfig(policy="spool_all", stall_timeout=0.4, segment_bytes=1 << 16)
+
+
+class Kill(Struct, frozen=True):
+    at: float
+    kind: Kind
+    ready: bool  # the server had been
+    journaled: int  # keyframes, about
+
+
+class Result(Struct, kw_only=True):
+    """One seed's outcome. `problems` is empty when every promise was kept."""
+
+    seed: int
+    keys: bool
+    scanners: int
+    problems: list[str]
+    keyframes: int
+    rate: float
+    seconds: float
+    kills: dict[str, int]
+    before_ready: int  # kills of server or fuser while it started
+    kill_times: list[Kill]
+    link_faults: list[str]
+    server_exits: list[str]  # of its own accord; it was started again
+    sessions: int
+    segments: int
+    duplicates: int  # keyframes that came again, and were known
+    refused: dict[str, int]  # messages that were not journaled
+    carried_per_journaled: float  # bytes over the link / bytes in the journal
+
+
+class Weather:
+    """One fault after the other, in a thread of its own."""
+
+    def __init__(self, rng: random.Random, proxy: Proxy) -> None:
+        self.faults: list[str] = []
+        self._rng, self._proxy = rng, proxy
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._blow)
+        self._thread.start()
+
+    def _blow(self) -> None:
+        while not self._over.is_set():
+            one = fault(self._rng)
+            self.faults.append(one.what)
+            method = getattr(self._proxy, one.what)
+            method(*([] if one.value is None else [one.value]))
+            self._over.wait(one.lasts)
+            self._proxy.heal()
+            self._over.wait(one.pause)
+
+    def end(self) -> None:
+        """A good network from here on."""
+        self._over.set()
+        self._thread.join()
+
+
+class Watch:
+    """Asks the server all the time how it is doing, past the bad network: its counts die with it."""
+
+    def __init__(self, daemon: Daemon, keys: Secured) -> None:
+        self._daemon, self._keys = daemon, keys
+        self._seen: dict[str, tuple[int, dict[str, int]]] = {}  # by server process
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._look)
+        self._thread.start()
+
+    def _look(self) -> None:
+        while not self._over.wait(0.1):
+            server = self._daemon.server
+            with contextlib.suppress(TsfusionError):
+                if server.address:
+                    health = fetch_health(server.address, keys=self._keys.keys, timeout=0.5)
+                    self._seen[server.address] = (health.duplicates, health.refused)
+
+    @property
+    def duplicates(self) -> int:
+        """Of all servers so far."""
+        return sum(duplicates for duplicates, _ in self._seen.values())
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Of all servers so far, by reason."""
+        found = Counter[str]()
+        for _, refused in self._seen.values():
+            found.update(refused)
+        return dict(found)
+
+    def end(self) -> None:
+        """What it has seen stays."""
+        self._over.set()
+        self._thread.join()
+
+
+class Killer:
+    """Works through attacks, and notes what it did. Call `work` in any thread."""
+
+    def __init__(self, daemon: Daemon, scanners: list[Scanner], proxy: Proxy, started: float) -> None:
+        self.kills: list[Kill] = []
+        self._proxy = proxy
+        self._daemon = daemon
+        self._scanners = scanners
+        self._started = started
+
+    def work(self, attacks: list[Attack]) -> None:
+        """One after the other."""
+        for number, attack in enumerate(attacks):
+            scanner = self._scanners[number % len(self._scanners)]
+            until(lambda attack=attack, scanner=scanner: self._is_time(attack, scanner), PATIENCE)
+            time.sleep(attack.wait)
+            if attack.hold:
+                self._proxy.freeze(True)
+                time.sleep(attack.hold)
+            ready, at = self._daemon.ready, round(time.monotonic() - self._started, 2)
+            if self._kill(attack.kind, scanner):
+                self.kills.append(Kill(at, attack.kind, ready, journaled(self._daemon.state)))
+            if attack.hold:
+                self._proxy.freeze(False)
+
+    def _is_time(self, attack: Attack, scanner: Scanner) -> bool:
+        if attack.kind == "scanner":
+            return scanner.finished or scanner.taken * len(self._scanners) >= attack.keyframes
+        if all(scanner.finished for scanner in self._scanners):
+            return self._daemon.ready or not attack.ready
+        return journaled(self._daemon.state) >= attack.keyframes and (self._daemon.ready or not attack.ready)
+
+    def _kill(self, kind: Kind, scanner: Scanner) -> bool:
+        """Whether there was somebody to kill."""
+        if kind == "server":
+            self._daemon.kill()
+        elif kind == "fuser":
+            self._daemon.kill_fuser()
+        elif scanner.finished:
+            return False
+        else:
+            scanner.kill()
+        return True
+
+
+def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Result:
+    """One seed in an empty folder; every other one with keys, and every other two with two scanners."""
+    keys = secured(folder / "keys") if seed % 2 == 0 else UNSECURED
+    count = 1 + seed // 2 % 2
+    rng = random.Random(seed)
+    rate = rng.uniform(20, 40)
+    third = kills // 3
+    early, late = on_scanners(rng, keyframes, third), on_server(rng, keyframes, kills - third)
+    started = time.monotonic()
+    state = folder / "state"
+    with contextlib.ExitStack() as stack:
+        proxy = stack.enter_context(Proxy())
+        daemon = Daemon(state, proxy, **SERVER, **keys.server)
+        stack.callback(daemon.close)
+        scanners = [
+            Scanner(_plan(folder, proxy.address, range(first, keyframes, count), rate / count, keys))
+            for first in range(count)
+        ]
+        for scanner in scanners:
+            stack.callback(scanner.close)
+        watch = Watch(daemon, keys)
+        stack.callback(watch.end)
+        weather = Weather(random.Random(-seed - 1), proxy)
+        stack.callback(weather.end)
+        killer = Killer(daemon, scanners, proxy, started)
+        other = threading.Thread(target=killer.work, args=(early,))
+        other.start()
+        killer.work(late)
+        other.join()
+        weather.end()
+        for scanner in scanners:
+            scanner.wait()
+        problems = [scanner.problem for scanner in scanners if scanner.problem]
+        watch.end()
+        status = _status(daemon, keys)
+        problems += [] if status else ["the server says nothing of itself"]
+        if not problems and (code := daemon.stop()):
+            problems.append(f"the server ended with status {code} when told to")
+    seconds = time.monotonic() - started
+    if len(killer.kills) < kills - 2:  # a scanner that has finished cannot be killed
+        problems.append(f"only {len(killer.kills)} of {kills} were killed")
+    if status and not problems:
+        problems += server_problems(status, keyframes)
+        problems += [problem for scanner in scanners for problem in client_problems(scanner.report())]
+        problems += verify(state, keyframes, status.map_hash)
+    return Result(
+        seed=seed,
+        keys=keys is not UNSECURED,
+        scanners=count,
+        problems=problems,
+        keyframes=keyframes,
+        rate=round(rate, 1),
+        seconds=round(seconds, 1),
+        kills={kind: sum(kill.kind == kind for kill in killer.kills) for kind in KINDS},
+        before_ready=sum(not kill.ready and kill.kind != "scanner" for kill in killer.kills),
+        kill_times=killer.kills,
+        link_faults=weather.faults,
+        server_exits=daemon.exits,
+        sessions=status.sessions if status else 0,
+        segments=sum(len(journal.segments(one)) for one in journals(state)),
+        duplicates=watch.duplicates,
+        refused=watch.refused,
+        carried_per_journaled=round(proxy.carried / max(_bytes(state), 1), 2),
+    )
+
+
+@functools.cache
+def _keyframe_bytes() -> int:
+    sizes = [
+        sum(map(len, codec.encode(wall(i), session=bytes(16), seq=1, jpeg_quality=CLIENT.jpeg_quality)))
+        for i in range(0, 300, 15)
+    ]
+    return sum(sizes) // len(sizes) + _RECORD_OVERHEAD
+
+
+def _bytes(state: Path) -> int:
+    return sum(path.stat().st_size for folder in journals(state) for path in folder.glob("*.mcap"))
+
+
+def journaled(state: Path) -> int:
+    """About how many keyframes the journal has: looked at often, so by its size."""
+    with contextlib.suppress(OSError):
+        return _bytes(state) // _keyframe_bytes()
+    return 0
+
+
+def _plan(folder: Path, address: str, numbers: range, rate: float, keys: Secured) -> Plan:
+    return Plan(
+        address=address,
+        spool=str(folder / f"spool-{numbers.start}"),
+        state=str(folder / "state"),
+        count=numbers.stop,
+        first=numbers.start,
+        step=numbers.step,
+        rate=rate,
+        log=str(folder / f"taken-{numbers.start}"),
+        report=str(folder / f"report-{numbers.start}.json"),
+        patience=PATIENCE,
+        client=override(CLIENT, **keys.client),
+    )
+
+
+def _status(daemon: Daemon, keys: Secured) -> Status | None:
+    found: list[Status] = []
+
+    def answered() -> bool:
+        with contextlib.suppress(TransportError):
+            found.append(fetch_status(daemon.server.address, timeout=5.0, keys=keys.keys))
+        return bool(found) and found[-1].fuser == "idle"  # the last one may have been killed in the end
+
+    with contextlib.suppress(AssertionError):
+        until(lambda: daemon.ready and answered())
+    return found[-1] if found else None

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: MIT
+"""What must be true of journal, map and counts in the end: `wire.wall`s 0 to n - 1, each once."""
+
+import functools
+from pathlib import Path
+
+from keyframes_and_servers import NUMBERED_NS, wall
+from scanner_process import Report, journals
+
+from tsfusion import journal
+from tsfusion.wire.health import Status
+from tsfusion.wire.keyframe_header import unpack
+
+VOXEL_SIZE = 0.04  # as `wire.Server`'s map
+
+
+def server_problems(status: Status, keyframes: int) -> list[str]:
+    problems = []
+    counted = (status.keyframes_durable, status.keyframes_fused)
+    if counted != (keyframes, keyframes):
+        problems.append(f"durable and fused are {counted}, not {keyframes}")
+    if status.keyframes_rejected or set(status.messages_refused) - {"gap"}:
+        problems.append(f"rejected {status.keyframes_rejected}, refused {status.messages_refused}")
+    if status.journal_damaged:
+        problems.append(f"{status.journal_damaged} records are damaged")
+    return problems
+
+
+def client_problems(report: Report) -> list[str]:
+    lost = {**report.refused, **report.rejected, **report.skipped}
+    return [f"the scanner counts lost keyframes: {lost}"] if lost else []
+
+
+def verify(state: Path, keyframes: int, map_hash: str) -> list[str]:
+    """What is wrong with the files and the map that a stopped server left; empty = nothing."""
+    problems = []
+    last: dict[bytes, tuple[int, int]] = {}
+    found = []
+    for folder in journals(state):
+        for number in journal.segments(folder):
+            path = journal.segment_path(folder, number)
+            if damaged := journal.scan(path)[1]:
+                problems.append(f"{damaged} damaged records in {path.name}")
+            for record in journal.records(path):
+                i = unpack(record.frames[0]).timestamp_ns - NUMBERED_NS
+                if (record.seq, i) <= last.get(record.session, (0, -1)) or i < last.get(
+                    record.session, (0, -1)
+                )[1]:
+                    problems.append(f"keyframe {i} (seq {record.seq}) comes after {last[record.session]}")
+                last[record.session] = (record.seq, i)
+                found.append(i)
+    if sorted(found) != list(range(keyframes)):
+        missing = sorted(set(range(keyframes)) - set(found))
+        twice = sorted({i for i in found if found.count(i) > 1})
+        problems.append(f"the journal has {len(found)} keyframes: missing {missing}, twice {twice}")
+    return problems + _map_problems(state, keyframes, map_hash)
+
+
+def _map_problems(state: Path, keyframes: int, map_hash: str) -> list[str]:
+    from tsfusion import Volume
+
+    (path,) = [*state.glob("maps/*/map.tsf"), *state.glob("map.tsf")]
+    hashes = {
+        "undisturbed": undisturbed_hash(keyframes),
+        "told": map_hash,
+        "saved": Volume.load(path).map_hash(),
+    }
+    return [] if len(set(hashes.values())) == 1 else [f"the map's hashes differ: {hashes}"]
+
+
+@functools.cache
+def undisturbed_hash(keyframes: int) -> str:
+    """Of the map that nothing happened to."""
+    from tsfusion import Volume
+
+    volume = Volume(voxel_size=VOXEL_SIZE, threads=1)
+    for i in range(keyframes):
+        volume.integrate(wall(i))
+    return volume.map_hash()

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: MIT
+"""A control socket that says of a server what a test wants it to say."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import zmq
+
+from tsfusion.wire import messages, sockets
+from tsfusion.wire.health import Health, Status
+from tsfusion.wire.keyframe_times import Spread
+from tsfusion.wire.messages import Command, Reply
+
+Answer = Callable[[Command], Reply | None]
+
+
+def status(**fields: Any) -> Status:
+    """What a fuser says of a map that is well."""
+    return Status(**{
+        "epoch": "abc", "map": "default", "state": "state/maps/default", "fuser": "idle", "uptime_s": 3.0,
+        "keyframes_durable": 6, "keyframes_fused": 5, "keyframes_rejected": {}, "messages_refused": {},
+        "duplicates": 0, "sessions": 1, "blocks": 10, "voxels": 100, "map_bytes": 1000, "map_hash": "1f" * 16,
+        "color_hash": "2f" * 16, "journal_bytes": 100, "journal_damaged": 0, "fuser_restarts": 0,
+        "peak_rss_bytes": {"server": 1, "fuser": 2}, "delay_ms": Spread(), "delay_bound_ms": 0.1,
+        "config": {"volume": {"voxel_size": 0.04, "sensor": "kinect"}}, "versions": {}, **fields,
+    })  # fmt: skip
+
+
+def saying(health: Health | Callable[[], Health], *, error: str = "") -> Answer:
+    """Answers `health` with this, and `status` with one or with an error."""
+
+    def answer(command: Command) -> Reply | None:
+        if command.name == "health":
+            return Reply(name="health", health=health if isinstance(health, Health) else health())
+        if error:
+            return Reply(name=command.name, error=error)
+        return Reply(name=command.name, status=status(map=command.map))
+
+    return answer
+
+
+@contextmanager
+def serving(answer: Answer) -> Iterator[tuple[str, list[Command]]]:
+    """The control address of a server that answers so (None = not at all), and what it was asked."""
+    context: zmq.Context[Any] = zmq.Context()
+    router = sockets.router(context)
+    port = router.bind_to_random_port("tcp://127.0.0.1")
+    end = threading.Event()
+    asked: list[Command] = []
+
+    def serve() -> None:
+        while not end.is_set():
+            if router.poll(20):
+                identity, frame = router.recv_multipart()
+                command = messages.decode_to_server(frame)
+                assert isinstance(command, Command)
+                asked.append(command)
+                reply = answer(command)
+                if reply is not None:
+                    router.send_multipart([identity, messages.encode(reply)])
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield f"tcp://127.0.0.1:{port}", asked
+    finally:
+        end.set()
+        thread.join()
+        router.close()
+        context.term()

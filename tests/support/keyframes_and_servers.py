@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: MIT
+"""Keyframes and server processes for the tests of the wire."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+import zmq
+
+from tsfusion import Intrinsics, Keyframe
+from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.wire import key_folder, sockets
+from tsfusion.wire.curve import ClientKeys, client_keys
+
+DEADLINE = 60.0
+CAMERA = Intrinsics(40.0, 40.0, 31.5, 23.5)
+SHAPE = (48, 64)
+NUMBERED_NS = 10**9  # `timestamp_ns` of `wall(0)`; that of `wall(i)` is i more
+_SERVE = """
+import sys, msgspec
+from tsfusion import server
+from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.core.errors import TsfusionError
+config = msgspec.json.decode(sys.argv[1], type=ServerConfig)
+volume = msgspec.json.decode(sys.argv[2], type=VolumeConfig)
+try:
+    sys.exit(server.run(config, volume, lambda a: print(a.data, a.control, a.publish, flush=True)))
+except TsfusionError as error:
+    sys.exit(f"{type(error).__name__}: {error}")
+"""
+
+
+def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = x, y, z
+    return T
+
+
+def wall(i: int = 0, **fields: Any) -> Keyframe:
+    """A wavy wall a good metre away, seen from a place that depends on `i`."""
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    depth = (1200 + 40 * np.sin(u / 9 + i) + 3 * v).astype(np.uint16)
+    depth[:2] = 0
+    color = np.dstack([u * 3, v * 4, np.full(SHAPE, (37 * i) % 256)]).astype(np.uint8)
+    given = {"T_world_camera": pose(0.03 * i), "timestamp_ns": NUMBERED_NS + i, **fields}
+    return Keyframe(depth=depth, color=color, intrinsics=CAMERA, **given)
+
+
+def until(reached: Callable[[], bool], deadline: float = DEADLINE) -> None:
+    """Poll; fails the test when it is not reached in time."""
+    end = time.monotonic() + deadline
+    while not reached():
+        assert time.monotonic() < end, "deadline"
+        time.sleep(0.005)
+
+
+class Secured(NamedTuple):
+    """What makes a server ask for keys, and a client show them."""
+
+    server: dict[str, str]  # settings
+    client: dict[str, str]
+
+    @property
+    def keys(self) -> ClientKeys | None:
+        """For who asks questions."""
+        return client_keys(self.client.get("key"), self.client.get("server_key"))
+
+
+UNSECURED = Secured({}, {})
+
+
+def secured(folder: Path) -> Secured:
+    """A server's keys, and those of a robot that it lets in."""
+    key_folder.create(folder / "server", "server")
+    key_folder.allow(folder / "server", "robot", key_folder.create(folder / "robot", "robot").public)
+    public = folder / "server" / "server.key"
+    return Secured(
+        {"keys": str(folder / "server")},
+        {"key": str(folder / "robot" / "robot.key_secret"), "server_key": str(public)},
+    )
+
+
+class Server:
+    """`server.run` in a process of its own.
+
+    Args:
+        wait: until it is ready; else call `wait_ready` before anything that needs its addresses.
+        code: run before it, in its process.
+    """
+
+    def __init__(
+        self,
+        state: Path,
+        volume: VolumeConfig | None = None,
+        *,
+        wait: bool = True,
+        code: str = "",
+        **settings: Any,
+    ) -> None:
+        config = ServerConfig(**{"listen": "tcp://127.0.0.1:0", "state": str(state), **settings})
+        volume = volume or VolumeConfig(voxel_size=0.04, threads=1)
+        arguments = [msgspec.json.encode(one).decode() for one in (config, volume)]
+        self._words = tempfile.TemporaryFile("w+")  # noqa: SIM115  a pipe that nobody reads would fill up
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", code + _SERVE, *arguments],
+            stdout=subprocess.PIPE,
+            stderr=self._words,
+            text=True,
+        )
+        self.address = self.control = self.publish = ""
+        if wait:
+            self.wait_ready()
+
+    def wait_ready(self) -> bool:
+        """Wait until it has said where it listens; False when it ended instead."""
+        assert self.process.stdout is not None
+        self.address, self.control, self.publish = (self.process.stdout.readline().split() or [""] * 3)[:3]
+        return bool(self.address)
+
+    def terminate(self) -> int:
+        """SIGTERM; the exit status."""
+        self.process.send_signal(signal.SIGTERM)
+        return self.process.wait(DEADLINE)
+
+    def kill(self) -> None:
+        """SIGKILL, as the kernel does it when memory runs out."""
+        self.process.kill()
+        self.process.wait(DEADLINE)
+
+    def said(self) -> str:
+        """Its last words, once it has ended."""
+        self.process.wait(DEADLINE)
+        self._words.seek(0)
+        return self._words.read().strip()
+
+    def close(self) -> None:
+        """End it, if need be, and let go of its files."""
+        if self.process.poll() is None:
+            self.kill()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        self._words.close()
+
+    def fuser_pid(self) -> int:
+        """The fuser, its only child."""
+        children = self.children()
+        assert len(children) == 1, children
+        return children[0]
+
+    def children(self) -> list[int]:
+        """The fusers, one for each map that is open."""
+        pids = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        return [int(pid) for pid in pids]
+
+
+@contextmanager
+def serving(state: Path, volume: VolumeConfig | None = None, **settings: Any) -> Iterator[Server]:
+    """A ready server, gone afterwards whatever happens."""
+    server = Server(state, volume, **settings)
+    try:
+        if not server.address:
+            raise RuntimeError(server.said())
+        yield server
+    finally:
+        server.close()
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs (a zombie does not)."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return Path(f"/proc/{pid}/stat").read_text().split(")")[1].split()[0] != "Z"
+
+
+@contextmanager
+def connected(kind: Callable[..., sockets.AnySocket], address: str) -> Iterator[sockets.AnySocket]:
+    """A socket of this kind at an address, gone afterwards."""
+    context: zmq.Context[Any] = zmq.Context()
+    made = kind(context)
+    try:
+        made.connect(address)
+        yield made
+    finally:
+        made.close()
+        context.term()

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: MIT
+"""A scanner as a process of its own, that may be killed at any moment and started again.
+
+    python tests/support/scanner_process.py '{"address": …, "spool": …}'
+
+Keyframe number i carries i in its `timestamp_ns`. A scanner that comes back decides by looking which ones
+were taken: what is in the spool or in the server's journal was, whatever its predecessor lived to say of it.
+"""
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from keyframes_and_servers import NUMBERED_NS, wall
+from msgspec import Struct
+
+from tsfusion import Client, Intrinsics, Keyframe, journal
+from tsfusion.core.config import ClientConfig
+from tsfusion.wire.keyframe_header import unpack
+from tsfusion.wire.keyframe_times import KeyframeTimes
+
+LOST = 3  # exit status
+
+
+class Plan(Struct, kw_only=True):
+    """What a scanner is to do.
+
+    Attributes:
+        address, control: of the server.
+        spool: its folder.
+        state: the server's folder, to see what was taken before.
+        count: keyframes to send, all lives together.
+        first, step: which numbers below `count` are this scanner's; the others have others.
+        rate: of sending, a second; None = as fast as `send` returns (`block`: as the map follows).
+        log: a line is on the disk here for each `send` that returned.
+        report: where the `Report` goes when all is fused.
+        room: a file of `save_room`, seen again and again; None = `wire.wall`s, each elsewhere.
+        until: sends no more once this file is there.
+        patience: seconds to wait for the map in the end.
+    """
+
+    address: str
+    spool: str
+    state: str
+    count: int
+    first: int = 0
+    step: int = 1
+    control: str | None = None
+    rate: float | None = None
+    log: str | None = None
+    report: str | None = None
+    room: str | None = None
+    until: str | None = None
+    patience: float = 120.0
+    client: ClientConfig = ClientConfig()
+
+
+class Report(Struct, kw_only=True):
+    """How it went, in the life that saw the end."""
+
+    sent: int
+    durable: int
+    fused: int
+    refused: dict[str, int]
+    rejected: dict[str, int]
+    skipped: dict[str, int]
+    seconds: float
+    cpu_seconds: float
+    times: list[KeyframeTimes]
+
+
+def numbers(folder: Path) -> list[int]:
+    """Which keyframes lie in a spool or journal folder, in its order."""
+    found = []
+    for number in journal.segments(folder):
+        for record in journal.records(journal.segment_path(folder, number)):
+            found.append(unpack(record.frames[0]).timestamp_ns - NUMBERED_NS)
+    return found
+
+
+def journals(state: Path) -> list[Path]:
+    """The journal folders of a state folder, one a map."""
+    return [*state.glob("maps/*/journal"), *state.glob("journal")]
+
+
+def save_room(path: Path, count: int, width: int) -> None:
+    """Views of the synthetic room, so that it is rendered once and not by each scanner."""
+    from tsfusion.datasets.synthetic.dataset import Synthetic
+
+    views = list(Synthetic("room", count=count, width=width, path="tour"))
+    np.savez(
+        path,
+        depth=np.stack([view.depth for view in views]),
+        color=np.stack([view.color for view in views]),
+        pose=np.stack([view.T_world_camera for view in views]),
+        camera=np.array(msgspec.structs.astuple(views[0].intrinsics)),
+        scale=np.array(views[0].depth_scale),
+    )
+
+
+def source(room: str | None) -> Callable[[int], Keyframe]:
+    """Keyframes by number."""
+    if room is None:
+        return wall
+    with np.load(room) as file:
+        depth, color, pose, camera, scale = (
+            file[name] for name in ("depth", "color", "pose", "camera", "scale")
+        )
+
+    def view(i: int, captured_ns: int = 0) -> Keyframe:
+        at = i % len(depth)
+        return Keyframe(
+            depth=depth[at],
+            color=color[at],
+            T_world_camera=pose[at],
+            intrinsics=Intrinsics(*camera.tolist()),
+            depth_scale=float(scale),
+            timestamp_ns=NUMBERED_NS + i,
+            captured_ns=captured_ns,
+        )
+
+    return view
+
+
+def unsent(plan: Plan) -> range:
+    """The numbers to go on with; ends the process when something that was taken is nowhere any more."""
+    own = range(plan.first, plan.count, plan.step)
+    taken = set(numbers(Path(plan.spool))) if Path(plan.spool).is_dir() else set()
+    for folder in journals(Path(plan.state)):
+        taken.update(numbers(folder))
+    taken &= set(own)
+    said = {int(line) for line in _lines(plan.log)}
+    if said - taken or taken != set(own[: len(taken)]):
+        sys.stderr.write(f"taken {sorted(taken)}, but said {sorted(said)}\n")
+        sys.exit(LOST)
+    return own[len(taken) :]
+
+
+def _lines(log: str | None) -> list[str]:
+    if log is None or not Path(log).exists():
+        return []
+    return [line for line in Path(log).read_text().split("\n")[:-1] if line]  # the last one may be torn
+
+
+def scan(plan: Plan) -> Report:
+    """Send what is left and see it fused."""
+    left, keyframe = unsent(plan), source(plan.room)
+    with (
+        Path(os.devnull if plan.log is None else plan.log).open("ab", buffering=0) as log,
+        Client(plan.address, spool=plan.spool, control=plan.control, config=plan.client) as client,
+    ):
+        started = due = time.monotonic()
+        for i in left:
+            if plan.until is not None and Path(plan.until).exists():
+                break
+            if plan.rate is not None:
+                due = max(due + 1 / plan.rate, time.monotonic())
+                time.sleep(max(due - time.monotonic(), 0))
+            if client.send(keyframe(i, captured_ns=time.monotonic_ns())) is None:
+                continue  # skipped, by its policy: the report counts it
+            log.write(f"\n{i}\n".encode())  # a torn line ends at the next one's beginning
+            if plan.log is not None:
+                os.fdatasync(log.fileno())
+        client.wait_fused(timeout=plan.patience)
+        stats, times = client.stats, client.records
+        seconds = time.monotonic() - started
+    return Report(
+        sent=stats.sent,
+        durable=stats.durable,
+        fused=stats.fused,
+        refused=stats.refused,
+        rejected=stats.rejected,
+        skipped=stats.skipped,
+        seconds=seconds,
+        cpu_seconds=time.process_time(),
+        times=times,
+    )
+
+
+def main() -> None:
+    plan = msgspec.json.decode(sys.argv[1], type=Plan)
+    report = scan(plan)
+    if plan.report is not None:
+        Path(plan.report).write_bytes(msgspec.json.encode(report))
+
+
+if __name__ == "__main__":
+    main()

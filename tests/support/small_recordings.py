@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: MIT
+"""Folders of real recordings, and small copies of their layouts."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tsfusion.core.errors import DatasetError
+
+P0 = "700 0 40 0 0 700 24 0 0 0 1 0"
+P1 = "700 0 40 -350 0 700 24 0 0 0 1 0"
+TR = "0 -1 0 0.1 0 0 -1 0.2 1 0 0 0.3"
+Change = Callable[[Path], object]
+POSE = "1 0 0 0.5\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
+ROW = POSE.replace("\n", " ")
+
+
+def seven_scenes(root: Path, count: int = 3, shape: tuple[int, int] = (6, 8)) -> Path:
+    """A tiny genuine layout: depth of (100 + frame) mm."""
+    root.mkdir(parents=True, exist_ok=True)
+    for frame in range(count):
+        stem = root / f"frame-{frame:06d}"
+        cv2.imwrite(f"{stem}.depth.png", np.full(shape, 100 + frame, np.uint16))
+        cv2.imwrite(f"{stem}.color.png", np.full((*shape, 3), 10 * frame, np.uint8))
+        Path(f"{stem}.pose.txt").write_text("1 0 0 0.5\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    return root
+
+
+def kitti(root: Path, count: int = 4) -> Path:
+    """A tiny genuine layout: random texture, 8 px of disparity; the car drives 1 m a frame."""
+    place = root / "sequences" / "06"
+    for name in ("image_0", "image_1", "velodyne"):
+        (place / name).mkdir(parents=True)
+    (root / "poses").mkdir()
+    rng = np.random.default_rng(3)
+    for frame in range(count):
+        left, right = textured_pair(rng, (48, 160), 8)
+        cv2.imwrite(str(place / "image_0" / f"{frame:06d}.png"), left)
+        cv2.imwrite(str(place / "image_1" / f"{frame:06d}.png"), right)
+        rng.normal(size=(100, 4)).astype(np.float32).tofile(place / "velodyne" / f"{frame:06d}.bin")
+    (place / "calib.txt").write_text(f"P0: {P0}\nP1: {P1}\nP2: {P0}\nP3: {P1}\nTr: {TR}\n")
+    (place / "times.txt").write_text("".join(f"{frame / 10:e}\n" for frame in range(count)))
+    rows = (f"1 0 0 0 0 1 0 0 0 0 1 {frame}\n" for frame in range(count))
+    (root / "poses" / "06.txt").write_text("".join(rows))
+    return root
+
+
+def hololens(root: Path, count: int = 3) -> Path:
+    for name in ("depth", "images"):
+        (root / name).mkdir(parents=True)
+        for frame in range(count):
+            pixels = (
+                np.full((6, 8), 7 + frame, np.uint16) if name == "depth" else np.zeros((6, 8, 3), np.uint8)
+            )
+            cv2.imwrite(str(root / name / f"{frame:05d}.png"), pixels)
+    (root / "K.txt").write_text("5 0 4\n0 5 3\n0 0 1\n")
+    (root / "poses.txt").write_text((ROW + "\n") * count)
+    return root
+
+
+def redwood(root: Path, stems: list[int], poses: list[int]) -> Path:
+    for name, pixels in (("depth", np.ones((6, 8), np.uint16)), ("color", np.zeros((6, 8, 3), np.uint8))):
+        (root / name).mkdir(parents=True)
+        for stem in stems:
+            cv2.imwrite(str(root / name / f"{stem:05d}.png"), pixels)
+    text = (f"{i} {i} {i + 1}\n" + POSE.replace("0.5", str(i)) for i in poses)
+    (root / "trajectory.log").write_text("".join(text))
+    return root
+
+
+def corbs(root: Path, *, shape: tuple[int, int] = (480, 640)) -> Path:
+    """Five frames as CoRBS ships them: Windows paths, CRLF, comments, the trajectory in a folder of its own.
+
+    Depth at 0, 0.1 … 0.4 s, colour 4 ms later except the third; poses every 50 ms up to 0.3 s.
+    """
+    place = root / "D1_pre_registereddata"
+    lists: dict[str, list[str]] = {"depth": [], "rgb": []}
+    for name in lists:
+        (place / name).mkdir(parents=True)
+    for frame in range(5):
+        seconds = 1000 + frame / 10
+        cv2.imwrite(str(place / "depth" / f"{frame}.png"), np.full(shape, 5000 * (frame + 1), np.uint16))
+        cv2.imwrite(str(place / "rgb" / f"{frame}.png"), np.full((*shape, 3), frame, np.uint8))
+        lists["depth"].append(f"{seconds:.6f} depth\\{frame}.png")
+        lists["rgb"].append(f"{seconds + (0.03 if frame == 2 else 0.004):.6f} rgb\\{frame}.png")
+    for name, lines in lists.items():
+        text = "\r\n".join(["# recorded", "# timestamp filename", *lines, ""])
+        (place / f"{name}.txt").write_bytes(text.encode())
+    (root / "D1_Trajectory").mkdir()
+    poses = [f"{1000.01 + 0.05 * i:.4f} {i} 0 0 0 0 0 1" for i in range(-1, 7)]
+    (root / "D1_Trajectory" / "groundtruth.txt").write_bytes(
+        "\r\n".join(["# t x y z q", *poses, ""]).encode()
+    )
+    return place
+
+
+def put(name: str, text: str) -> Change:
+    return lambda root: (root / name).write_text(text)
+
+
+def one_line(opened: Callable[[], object], match: str) -> None:
+    with pytest.raises(DatasetError, match=match) as caught:
+        opened()
+    assert "\n" not in str(caught.value)
+
+
+def textured_pair(rng: np.random.Generator, shape: tuple[int, int], disparity: int):
+    wide = rng.integers(0, 256, (shape[0], shape[1] + disparity)).astype(np.uint8)
+    wide = cv2.GaussianBlur(wide, (0, 0), 0.8)
+    left, right = wide[:, : shape[1]], wide[:, disparity:]
+    return np.ascontiguousarray(left), np.ascontiguousarray(right)

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: MIT
+"""A server and a scanner that are started again whenever they end, as an init system would."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from bad_network import Proxy
+from keyframes_and_servers import Server, until
+from scanner_process import LOST, Plan, Report
+
+SCANNER = Path(__file__).with_name("scanner_process.py")
+PATIENCE = 180.0  # seconds; for everything to be fused after all
+
+
+class Daemon:
+    """Keeps a server running, as an init system would, and shows the proxy where it is."""
+
+    def __init__(self, state: Path, proxy: Proxy, **settings: Any) -> None:
+        self.exits: list[str] = []
+        self.ready = False
+        self.state, self._proxy, self._settings = state, proxy, settings
+        self._ended = False
+        self._killed = False
+        self.server = self._start()
+        self._thread = threading.Thread(target=self._keep)
+        self._thread.start()
+
+    def _start(self) -> Server:
+        return Server(self.state, wait=False, **self._settings)
+
+    def _keep(self) -> None:
+        while True:
+            if self.server.wait_ready():
+                self._proxy.target(self.server.address, self.server.control)
+                self.ready = True
+                self.server.process.wait()
+            self.ready = False
+            self._proxy.target(None)
+            if self._ended:
+                return
+            if not self._killed:
+                self.exits.append(self.server.said()[-500:])
+            self._killed = False
+            self.server.close()
+            self.server = self._start()
+
+    def kill(self) -> None:
+        """SIGKILL, ready or not. A fuser that still runs dies with it."""
+        server = self.server
+        self._killed = True
+        server.process.kill()
+        until(lambda: self.server is not server)
+
+    def kill_fuser(self) -> None:
+        """SIGKILL to the fuser, once there is one."""
+
+        def killed() -> bool:
+            with contextlib.suppress(OSError, AssertionError):
+                os.kill(self.server.fuser_pid(), signal.SIGKILL)
+                return True
+            return False
+
+        until(killed)
+
+    def stop(self) -> int:
+        """SIGTERM: drain, checkpoint, end. The exit status."""
+        until(lambda: self.ready, PATIENCE)
+        self._ended = True
+        self.server.process.terminate()
+        return self.server.process.wait(PATIENCE)
+
+    def close(self) -> None:
+        self._ended = True
+        self.server.process.kill()
+        self._thread.join()
+        self.server.close()
+
+
+class Scanner:
+    """Starts a scanner again and again until one has seen everything fused."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self.problem = ""
+        self._done = threading.Event()
+        self._ended = self._killed = False
+        self._process = self._start()
+        self._thread = threading.Thread(target=self._keep)
+        self._thread.start()
+
+    def _start(self) -> "subprocess.Popen[str]":
+        command = [sys.executable, str(SCANNER), msgspec.json.encode(self.plan).decode()]
+        return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+
+    def _keep(self) -> None:
+        while True:
+            _, words = self._process.communicate()
+            if self._process.returncode == 0 or self._ended:
+                break
+            if not self._killed or self._process.returncode == LOST:
+                self.problem = f"the scanner ended with status {self._process.returncode}: {words[-1000:]}"
+                break
+            self._killed = False
+            self._process = self._start()
+        self._done.set()
+
+    def kill(self) -> None:
+        """SIGKILL; it is started again. One that has finished cannot be killed."""
+        process = self._process
+        self._killed = True
+        process.kill()
+        until(lambda: self._process is not process or self._done.is_set())
+
+    @property
+    def taken(self) -> int:
+        """How many keyframes it said it took, in all its lives."""
+        assert self.plan.log is not None
+        log = Path(self.plan.log)
+        return len(log.read_bytes().split()) if log.exists() else 0
+
+    @property
+    def finished(self) -> bool:
+        """Whether there will be no more of it."""
+        return self._done.is_set()
+
+    def wait(self) -> None:
+        """Until everything is fused, or something is wrong."""
+        if not self._done.wait(PATIENCE):
+            self.problem = f"not everything was fused in {PATIENCE:.0f} s"
+
+    def report(self) -> Report:
+        """Of the life that saw the end."""
+        assert self.plan.report is not None
+        return msgspec.json.decode(Path(self.plan.report).read_bytes(), type=Report)
+
+    def close(self) -> None:
+        self._ended = True
+        self._process.kill()
+        self._thread.join()

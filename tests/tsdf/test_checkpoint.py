@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: MIT
+"""A saved map comes back to the byte, or says why not."""
+
+import errno
+import hashlib
+import os
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import formula_scenes
+import msgspec
+import numpy as np
+import pytest
+import small_disk
+
+from tsfusion import Volume
+from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, WeightOverflow
+from tsfusion.tsdf import checkpoint
+
+VIEWS = formula_scenes.sphere_views(0.4, 4)
+
+
+def small(**settings: object) -> Volume:
+    volume = Volume(**{"voxel_size": 0.03, **settings})
+    for keyframe in VIEWS[:3]:
+        volume.integrate(keyframe)
+    return volume
+
+
+@pytest.mark.parametrize("settings", [{}, {"regularizer": "ray"}, {"color": False}])
+def test_a_map_comes_back_and_goes_on_as_if_never_saved(tmp_path: Path, settings: dict) -> None:
+    volume = small(**settings)
+    path = volume.save(tmp_path / "map.tsf", meta={"journal": 17})
+    loaded = Volume.load(path)
+    assert loaded.map_hash() == volume.map_hash()
+    assert loaded.color_hash() == volume.color_hash()
+    assert loaded.meta == {"journal": 17}
+    assert loaded.stats().keyframes == 3
+    assert loaded.config.voxel_size == 0.03
+    for either in (volume, loaded):
+        either.integrate(VIEWS[3])
+        either.retract(VIEWS[0])
+    assert loaded.map_hash() == volume.map_hash()
+    assert (loaded.extract_mesh().vertices == volume.extract_mesh().vertices).all()
+
+
+def test_blocks_emptied_by_retraction_are_not_saved(tmp_path: Path) -> None:
+    volume = small()
+    for keyframe in VIEWS[:3]:
+        volume.retract(keyframe)
+    path = volume.save(tmp_path / "map.tsf")
+    assert Volume.load(path).stats().blocks == 0
+
+
+def test_the_same_map_gives_the_same_file(tmp_path: Path) -> None:
+    a = small().save(tmp_path / "a.tsf").read_bytes()
+    assert a == small().save(tmp_path / "b.tsf").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return small().save(tmp_path_factory.mktemp("saved") / "map.tsf")
+
+
+def test_a_file_cut_anywhere_is_refused(saved: Path, tmp_path: Path) -> None:
+    whole, path = saved.read_bytes(), tmp_path / "map.tsf"
+    for cut in [*range(40), *(len(whole) * i // 200 for i in range(200)), len(whole) - 1]:
+        path.write_bytes(whole[:cut])
+        with pytest.raises(DamagedCheckpoint):
+            Volume.load(path)
+
+
+def test_a_file_with_a_flipped_bit_is_refused(saved: Path, tmp_path: Path) -> None:
+    whole, path = saved.read_bytes(), tmp_path / "map.tsf"
+    head = 12 + int.from_bytes(whole[8:12], "little") + 12  # magic, header, start of the first chunk
+    some = range(head, len(whole), max(1, len(whole) // 200))
+    for at in [*range(head), *some, *range(len(whole) - 16, len(whole))]:
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1 << at % 8]) + whole[at + 1 :])
+        with pytest.raises(CheckpointError):
+            Volume.load(path)
+
+
+def test_a_file_that_goes_on_behind_its_end_is_refused(saved: Path, tmp_path: Path) -> None:
+    path = tmp_path / "map.tsf"
+    for more in (b"\0", bytes(4096), saved.read_bytes()):
+        path.write_bytes(saved.read_bytes() + more)
+        with pytest.raises(DamagedCheckpoint):
+            Volume.load(path)
+
+
+def forge(path: Path, content: bytes) -> None:
+    """A file whose digest agrees, as only somebody who means it writes."""
+    path.write_bytes(content + hashlib.blake2b(content, digest_size=16).digest())
+
+
+def test_a_forged_file_is_refused_before_it_asks_for_memory(saved: Path, tmp_path: Path) -> None:
+    whole, path = saved.read_bytes()[:-16], tmp_path / "map.tsf"
+    size = int.from_bytes(whole[8:12], "little")
+    header = msgspec.msgpack.decode(whole[12 : 12 + size], type=checkpoint.Header)
+    for change in ({"blocks": 3_000_000}, {"blocks": -1}, {"layers": ["sums", "sums2"]}, {"layers": []}):
+        altered = msgspec.msgpack.encode(msgspec.structs.replace(header, **change))
+        forge(path, whole[:8] + struct.pack("<I", len(altered)) + altered + whole[12 + size :])
+        with pytest.raises(CheckpointError):
+            checkpoint.read(path)
+    for length in (0, 1 << 20, 2**32 - 1):
+        forge(path, whole[:8] + struct.pack("<I", length) + whole[12:])
+        with pytest.raises(CheckpointError):
+            checkpoint.read(path)
+        forge(path, whole[: 12 + size] + struct.pack("<I", length) + whole[16 + size :])
+        with pytest.raises(CheckpointError):
+            checkpoint.read(path)
+    forge(path, whole[: 16 + size] + bytes(len(whole) - 16 - size))
+    with pytest.raises(CheckpointError):
+        checkpoint.read(path)
+
+
+def test_a_map_of_another_version_or_that_cannot_be_read_now_is_not_damaged(
+    saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, path = saved.read_bytes()[:-16], tmp_path / "map.tsf"
+    forge(path, b"TSFMAP2\n" + whole[8:])
+    with pytest.raises(CheckpointError, match="not a tsfusion map of version 1") as raised:
+        Volume.load(path)
+    assert raised.type is CheckpointError
+    altered = msgspec.msgpack.encode({"blocks": 3})
+    forge(path, whole[:8] + struct.pack("<I", len(altered)) + altered)
+    with pytest.raises(CheckpointError, match="of another version") as raised:
+        Volume.load(path)
+    assert raised.type is CheckpointError
+    for error in (OSError(errno.EMFILE, "Too many open files"), OSError(errno.EIO, "bad"), MemoryError()):
+        monkeypatch.setattr(checkpoint, "_check_digest", failing(error))
+        with pytest.raises(CheckpointError) as raised:
+            Volume.load(saved)
+        assert raised.type is CheckpointError
+
+
+def failing(error: Exception) -> Callable[..., Any]:
+    def fail(*_: object) -> None:
+        raise error
+
+    return fail
+
+
+def test_a_missing_file_and_an_unwritable_place_are_named(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match=r"none\.tsf"):
+        Volume.load(tmp_path / "none.tsf")
+    with pytest.raises(CheckpointError, match="cannot write"):
+        small().save(tmp_path / "missing" / "map.tsf")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EROFS])
+def test_a_failed_save_keeps_the_old_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str, code: int
+) -> None:
+    volume = small()
+    path = volume.save(tmp_path / "map.tsf")
+    before = path.read_bytes()
+    volume.integrate(VIEWS[3])
+
+    def fail(*_: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, call, fail)
+        with pytest.raises(CheckpointError, match=os.strerror(code)):
+            volume.save(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+    volume.save(path)
+    assert Volume.load(path).map_hash() == volume.map_hash()
+
+
+def test_a_disk_that_really_fills_up_keeps_the_old_file(tmp_path: Path) -> None:
+    code = """
+import sys
+from pathlib import Path
+import numpy as np
+from tsfusion.tsdf import checkpoint
+from tsfusion.core.config import VolumeConfig
+from tsfusion.core.errors import CheckpointError
+folder = Path(sys.argv[1])
+def save(blocks):
+    keys = np.arange(blocks, dtype=np.int64)
+    sums = np.random.default_rng(0).integers(0, 1 << 40, (blocks, 512))
+    header = checkpoint.Header(config=VolumeConfig(), keyframes=blocks, map_hash="", layers=["sums"], meta={})
+    checkpoint.write(folder / "map.tsf", header, keys, keys, {"sums": sums})
+save(100)
+before = (folder / "map.tsf").read_bytes()
+try:
+    save(2000)
+except CheckpointError as error:
+    assert "No space left on device" in str(error), error
+    assert (folder / "map.tsf").read_bytes() == before
+    assert [path.name for path in folder.iterdir()] == ["map.tsf"]
+save(120)
+print(checkpoint.read(folder / "map.tsf")[0].keyframes)
+"""
+    assert small_disk.run(tmp_path / "disk", "2m", code) == "120\n"
+
+
+def test_an_interrupted_save_leaves_no_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    volume = small()
+    path = volume.save(tmp_path / "map.tsf")
+
+    def interrupted(_: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        volume.save(path)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_writer_left_is_neither_read_nor_kept(tmp_path: Path) -> None:
+    volume = small()
+    path = volume.save(tmp_path / "map.tsf")
+    left = tmp_path / ".map.tsf.partial"
+    left.write_bytes(path.read_bytes()[:1000])
+    assert Volume.load(path).map_hash() == volume.map_hash()
+    volume.save(path)
+    assert list(tmp_path.iterdir()) == [path]
+    assert Volume.load(path).map_hash() == volume.map_hash()
+
+
+def test_the_file_is_on_the_disk_before_its_name_and_its_name_before_it_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    volume, happened = small(), []
+    fsync, replace = os.fsync, os.replace
+
+    def watched_fsync(descriptor: int) -> None:
+        happened.append(("fsync", Path(os.readlink(f"/proc/self/fd/{descriptor}")).name))
+        fsync(descriptor)
+
+    def watched_replace(old: Path, new: Path) -> None:
+        happened.append(("rename", new.name))
+        replace(old, new)
+
+    monkeypatch.setattr(os, "fsync", watched_fsync)
+    monkeypatch.setattr(os, "replace", watched_replace)
+    volume.save(tmp_path / "map.tsf")
+    assert happened == [("fsync", ".map.tsf.partial"), ("rename", "map.tsf"), ("fsync", tmp_path.name)]
+
+
+def test_a_loaded_map_knows_how_full_its_voxels_are(tmp_path: Path) -> None:
+    volume = Volume(voxel_size=0.02)
+    view = formula_scenes.sphere_views(0.4, 1)[0]
+    volume.integrate(view)
+    slot, voxel = np.argwhere(volume._store.sums != 0)[0]
+    volume._store.sums[slot, voxel] |= (1 << 26) - 1
+    loaded = Volume.load(volume.save(tmp_path / "full.tsf"))
+    with pytest.raises(WeightOverflow):
+        loaded.integrate(view)
+
+
+def test_a_saved_map_can_be_read_with_another_surface_but_not_with_another_voxel_size(tmp_path: Path) -> None:
+    volume = Volume(voxel_size=0.02, surface="raw")
+    volume.integrate(formula_scenes.sphere_views(0.4, 1)[0])
+    path = volume.save(tmp_path / "map.tsf")
+    again, other = Volume.load(path), Volume.load(path, surface="field", min_weight=None)
+    assert (again.config.surface, other.config.surface) == ("raw", "field")
+    assert again.map_hash() == other.map_hash()
+    assert not np.array_equal(again.extract_mesh().vertices, other.extract_mesh().vertices)
+    with pytest.raises(InvalidConfig, match="voxel_size"):
+        Volume.load(path, voxel_size=0.01)

@@ -1,0 +1,295 @@
+# SPDX-License-Identifier: MIT
+"""Marching cubes: closed, manifold, without cracks or duplicates, and where the surface is."""
+
+import signal
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import formula_scenes
+import kernel_twins
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from tsfusion import Mesh, Volume
+from tsfusion.core.errors import InvalidConfig, OutputError
+from tsfusion.datasets.formats import stanford_bunny
+from tsfusion.kernels import block_hash, runtime
+from tsfusion.tsdf.block_store import cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.mesh_extraction import MeshScratch, extract
+from tsfusion.tsdf.surface_values import Layers
+
+
+def edge_uses(faces: NDArray[np.int32]) -> NDArray[np.int64]:
+    """How many triangles use each edge."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    return np.unique(edges, axis=0, return_counts=True)[1]
+
+
+def check_sound(mesh: Mesh) -> None:
+    assert edge_uses(mesh.faces).max() <= 2
+    assert len(np.unique(mesh.faces)) == len(mesh.vertices)  # none unused
+    assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)  # none twice
+    assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-5)
+
+
+def random_layers(
+    seed: int, known: float
+) -> tuple[
+    Layers, NDArray[np.int64], dict[kernel_twins.Voxel, float], dict[kernel_twins.Voxel, tuple[float, ...]]
+]:
+    """A 3×2×2 patch of blocks around the origin: noise in all 256 cases, a share of voxels unseen, a third
+    coloured. Returns the layers, the keys, and values and colours by voxel."""
+    runtime.start(2)
+    random = np.random.default_rng(seed)
+    coordinates = np.array([(x, y, z) for x in (-2, -1, 0) for y in (-1, 0) for z in (-1, 0)], np.int32)
+    keys = pack_keys(coordinates)
+    distance = random.integers(-500, 500, (12, 512))
+    weight = 160 * (random.random((12, 512)) < known)
+    sums = (distance * weight << 27) + weight
+    votes = random.integers(1, 9, (12, 512)) * (random.random((12, 512)) < 0.33)
+    channels = random.integers(0, 256, (3, 12, 512)) * votes
+    rgn = (channels[0] << 40) + (channels[1] << 16) + votes
+    hash_keys, hash_slots = np.zeros(64, np.int64), np.zeros(64, np.int32)
+    block_hash.insert_blocks(keys, 0, 12, 0, hash_keys, hash_slots)
+    values, colors = {}, {}
+    for slot, offset in np.ndindex(12, 512):
+        voxel = coordinates[slot] * 8 + (offset >> 6, offset >> 3 & 7, offset & 7)
+        key = (int(voxel[0]), int(voxel[1]), int(voxel[2]))
+        if weight[slot, offset]:
+            values[key] = float(distance[slot, offset])
+        if votes[slot, offset]:
+            colors[key] = tuple(channels[:, slot, offset] / votes[slot, offset])
+    layers = Layers(sums, rgn, channels[2].astype(np.int32), None, hash_keys, hash_slots, 12, 1.0)
+    return layers, keys, values, colors
+
+
+def triangles_of(mesh: Mesh) -> Counter:
+    """Triangles by their exact corners."""
+    return Counter(frozenset(map(tuple, t)) for t in mesh.vertices[mesh.faces].tolist())
+
+
+def summary(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Centre and area vector of (n, 3, 3) triangles."""
+    a, b, c = triangles.transpose(1, 0, 2)
+    return np.hstack([(a + b + c) / 3, np.cross(b - a, c - a)])
+
+
+@pytest.mark.parametrize("known", [1.0, 0.9])
+def test_extraction_equals_the_twin_on_noise(known: float) -> None:
+    layers, keys, values, colors = random_layers(3, known)
+    mesh = extract(np.sort(keys), layers, 1.0)
+    expected = np.array(kernel_twins.marching_cubes(values))
+    found = mesh.vertices[mesh.faces].astype(np.float64)
+    assert found.shape == expected.shape
+    # the same triangle may start at another corner: compare centres, areas and normals
+    distance, partner = cKDTree(summary(expected)).query(summary(found))
+    assert distance.max() < 1e-4
+    assert len(np.unique(partner)) == len(found)
+    check_sound(mesh)
+    for i in range(0, len(mesh.vertices), 29):
+        normal, rgb = kernel_twins.vertex(values, colors, mesh.vertices[i].astype(np.float64))
+        assert np.allclose(mesh.normals[i], normal, atol=1e-3)
+        assert mesh.colors is not None
+        assert np.abs(mesh.colors[i] - rgb).max() <= 1
+
+
+def test_noise_gives_a_manifold_with_a_border_only_where_the_map_ends() -> None:
+    layers, keys, _, _ = random_layers(4, 1.0)
+    mesh = extract(np.sort(keys), layers, 1.0)
+    edges = np.sort(
+        np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1
+    )
+    unique, uses = np.unique(edges, axis=0, return_counts=True)
+    ends = mesh.vertices[unique[uses == 1]]  # (n, 2, 3)
+    low, high = np.array([-15.5, -7.5, -7.5]), np.array([7.5, 7.5, 7.5])
+    on_border = (np.isclose(ends, low) | np.isclose(ends, high)).all(axis=1).any(axis=1)
+    assert on_border.all()
+
+
+def test_a_sphere_is_closed_with_the_right_radius_and_normals() -> None:
+    radius, voxel_size = 0.4, 0.02
+    volume = Volume(voxel_size=voxel_size)
+    for keyframe in formula_scenes.sphere_views(radius):
+        volume.integrate(keyframe)
+    mesh = volume.extract_mesh(min_weight=2)
+    check_sound(mesh)
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert solid.is_watertight
+    assert solid.is_winding_consistent
+    assert solid.euler_number == 2
+    distance = np.linalg.norm(mesh.vertices, axis=1)
+    assert abs(distance - radius).max() < voxel_size / 2
+    assert abs(distance.mean() - radius) < voxel_size / 10
+    outward = mesh.vertices / distance[:, None]
+    assert (mesh.normals * outward).sum(axis=1).min() > 0.9
+    assert (solid.face_normals * outward[mesh.faces[:, 0]]).sum(axis=1).min() > 0
+    assert mesh.colors is not None
+    assert (mesh.colors == (220, 120, 20)).all()
+
+
+@pytest.mark.parametrize("regularizer", ["off", "ray", "paper"])
+def test_a_plane_is_flat_to_a_tenth_of_a_voxel(regularizer: str) -> None:
+    normal = np.array([0.3, -0.2, 0.93])
+    normal /= np.linalg.norm(normal)
+    volume = Volume(voxel_size=0.02, regularizer=regularizer)
+    for x, y in ((0.0, 0.0), (0.5, 0.2), (-0.4, 0.3), (0.1, -0.6)):
+        T = formula_scenes.look_at(np.array([x, y, 1.5]), np.array([0.1, 0.0, 0.0]))
+        volume.integrate(formula_scenes.plane_keyframe(T, normal, 0.1))
+    mesh = volume.extract_mesh()
+    error = mesh.vertices @ normal - 0.1
+    # a border cell's corners were seen from one side only
+    assert np.sqrt(np.mean(error**2)) < 0.1 * 0.02
+    check_sound(mesh)
+
+
+def test_tiles_of_dirty_blocks_make_up_the_whole_mesh() -> None:
+    views = formula_scenes.sphere_views(0.4, 6)
+    volume = Volume(voxel_size=0.02)
+    tiles: Counter = Counter()
+    for keyframe in views[:5]:
+        volume.integrate(keyframe)
+    volume.take_dirty()
+    whole = triangles_of(volume.extract_mesh(min_weight=1))
+    volume.integrate(views[5])
+    changed = cells_of(volume.take_dirty())
+    kept = volume.extract_mesh(
+        min_weight=1, blocks=np.array([b for b in blocks_of(volume) if b not in as_set(changed)])
+    )
+    tiles = triangles_of(volume.extract_mesh(min_weight=1, blocks=changed)) + triangles_of(kept)
+    assert tiles == triangles_of(volume.extract_mesh(min_weight=1))
+    assert tiles != whole
+
+
+def test_the_mesh_does_not_depend_on_where_blocks_lie_in_memory() -> None:
+    views = formula_scenes.sphere_views(0.4, 4)
+    meshes = []
+    for keyframes in (views, views[::-1]):
+        volume = Volume(voxel_size=0.02)
+        for keyframe in keyframes:
+            volume.integrate(keyframe)
+        meshes.append(volume.extract_mesh(min_weight=1))
+    a, b = meshes
+    for name in ("vertices", "faces", "normals", "colors"):
+        assert getattr(a, name).tobytes() == getattr(b, name).tobytes(), name
+
+
+@pytest.mark.parametrize("known", [1.0, 0.9])
+def test_a_part_equals_the_same_cells_of_the_whole(known: float) -> None:
+    layers, keys, _, _ = random_layers(5, known)
+    keys = np.sort(keys)
+    whole = extract(keys, layers, 1.0)
+    assert whole.colors is not None
+    looks = {tuple(v): (*n, *c) for v, n, c in zip(
+        whole.vertices.tolist(), whole.normals.tolist(), whole.colors.tolist(), strict=True)}  # fmt: skip
+    scratch = MeshScratch()  # what an earlier mesh left in it must not show
+    total: Counter = Counter()
+    for part in (keys[:0], keys[:1], keys[1:8], keys[8:9], keys[9:]):
+        mesh = extract(part, layers, 1.0, scratch)
+        assert mesh.colors is not None
+        total += triangles_of(mesh)
+        for v, n, c in zip(mesh.vertices.tolist(), mesh.normals.tolist(), mesh.colors.tolist(), strict=True):
+            assert looks[tuple(v)] == (*n, *c)
+        again = extract(part, layers, 1.0)
+        assert again.faces.tobytes() == mesh.faces.tobytes()
+        assert again.vertices.tobytes() == mesh.vertices.tobytes()
+    assert total == triangles_of(whole)
+
+
+def blocks_of(volume: Volume) -> list[tuple[int, ...]]:
+    return [tuple(int(c) for c in b) for b in unpack_keys(volume._store.keys[volume._store.used()])]
+
+
+def as_set(blocks: NDArray[np.int32]) -> set[tuple[int, ...]]:
+    return {tuple(int(c) for c in b) for b in blocks}
+
+
+@pytest.mark.parametrize("weight", [-1.0, float("nan"), float("inf"), 1e308])
+def test_an_impossible_weight_is_named(weight: float) -> None:
+    with pytest.raises(InvalidConfig, match="min_weight must be from 0 to"):
+        Volume(voxel_size=0.02).extract_mesh(min_weight=weight)
+
+
+def test_blocks_that_do_not_exist_give_an_empty_mesh() -> None:
+    volume = Volume(voxel_size=0.02)
+    volume.integrate(formula_scenes.sphere_views(0.4, 2)[0])
+    assert len(volume.extract_mesh(blocks=np.array([[500, 0, 0]], np.int32)).faces) == 0
+    assert len(volume.extract_mesh(blocks=np.zeros((0, 3), np.int32)).faces) == 0
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
+def test_a_saved_mesh_reads_back(tmp_path: Path, suffix: str) -> None:
+    volume = Volume(voxel_size=0.02)
+    for keyframe in formula_scenes.sphere_views(0.4, 6):
+        volume.integrate(keyframe)
+    mesh = volume.extract_mesh()
+    loaded = trimesh.load(mesh.save(tmp_path / f"m{suffix}"), force="mesh", process=False)
+    assert loaded.faces.shape == mesh.faces.shape
+    assert np.allclose(np.sort(loaded.vertices, axis=0), np.sort(mesh.vertices, axis=0), atol=1e-6)
+    assert list(tmp_path.iterdir()) == [tmp_path / f"m{suffix}"]
+
+
+def test_a_mesh_that_cannot_be_saved_says_why_and_leaves_nothing(tmp_path: Path) -> None:
+    empty = Volume(voxel_size=0.02).extract_mesh()
+    with pytest.raises(OutputError, match="no triangles"):
+        empty.save(tmp_path / "m.ply")
+    volume = Volume(voxel_size=0.02)
+    volume.integrate(formula_scenes.sphere_views(0.4, 2)[0])
+    mesh = volume.extract_mesh()
+    with pytest.raises(OutputError, match=r"\.ply, \.glb, \.obj"):
+        mesh.save(tmp_path / "m.stl")
+    with pytest.raises(OutputError, match="cannot write"):
+        mesh.save(tmp_path / "missing" / "m.ply")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("regularizer", ["off", "ray"])
+def test_the_bunny_lies_within_a_millimetre_of_its_reference(
+    data: Callable[[str], Path], regularizer: str
+) -> None:
+    folder = data("stanford_bunny")
+    volume = Volume(voxel_size=0.001, sensor="scanner", regularizer=regularizer)
+    for keyframe in stanford_bunny.scans(folder):
+        volume.integrate(keyframe)
+    mesh = volume.extract_mesh()
+    surface = trimesh.load(folder / "reconstruction" / "bun_zipper.ply", process=False)
+    samples, _ = trimesh.sample.sample_surface(surface, 200_000, seed=0)
+    distance = cKDTree(samples).query(mesh.vertices)[0]
+    assert np.median(distance) < 0.5e-3
+    assert np.percentile(distance, 95) < 1e-3
+    assert len(mesh.vertices) > 50_000
+
+
+_PRESSED_WHILE_IT_LOADS = """
+import os, signal, sys
+import numpy as np
+from tsfusion import Mesh
+
+class Pressing:
+    def find_spec(self, name, *_):
+        if name == "scipy.spatial":
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), int(sys.argv[1]))
+
+sys.meta_path.insert(0, Pressing())
+signal.signal(signal.SIGTERM, lambda *_: sys.exit("terminated"))
+floats = np.eye(3, dtype=np.float32)
+try:
+    Mesh(floats, np.array([[0, 1, 2]], dtype=np.int32), floats, None).encode(".ply")
+except KeyboardInterrupt:
+    sys.exit("interrupted")
+"""
+
+
+@pytest.mark.parametrize(("number", "word"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")])
+def test_who_wants_it_to_end_is_heard_while_trimesh_loads(number: signal.Signals, word: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _PRESSED_WHILE_IT_LOADS, str(int(number))],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr.strip()) == (1, word)

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: MIT
+"""What should not be in the map: lone pixels, and things that have moved on. And what should: thin things."""
+
+from dataclasses import replace
+
+import formula_scenes
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tsfusion import Keyframe, Volume
+from tsfusion.core.errors import InvalidConfig
+from tsfusion.datasets import Synthetic
+from tsfusion.tsdf.block_store import unpack_keys
+
+WALL = formula_scenes.plane_keyframe(np.eye(4), np.array([0.0, 0.0, 1.0]), 2.0)
+
+
+def with_depth(depth: NDArray[np.float32]) -> Keyframe:
+    return replace(WALL, depth=depth)
+
+
+def passer_by() -> Keyframe:
+    """Somebody, a disc 60 cm wide, before the wall."""
+    v, u = np.mgrid[: formula_scenes.SHAPE[0], : formula_scenes.SHAPE[1]]
+    depth = WALL.measurement.copy()
+    depth[
+        np.hypot(u - formula_scenes.CAMERA.cx, v - formula_scenes.CAMERA.cy)
+        < 0.3 * formula_scenes.CAMERA.fx / 1.2
+    ] = 1.2
+    return with_depth(depth)
+
+
+def mesh_depths(keyframes: list[Keyframe], **settings: object) -> NDArray[np.float32]:
+    """z of every vertex."""
+    volume = Volume(**{"voxel_size": 0.03, "threads": 2, "color": False, **settings})
+    for keyframe in keyframes:
+        volume.integrate(keyframe)
+    return volume.extract_mesh().vertices[:, 2]
+
+
+def test_lone_pixels_are_dropped_and_counted() -> None:
+    random = np.random.default_rng(3)
+    depth = WALL.measurement.copy()
+    lone = np.zeros(depth.shape, bool)
+    lone[3::8, 3::8] = True
+    depth[lone] = random.uniform(0.5, 1.6, lone.sum())
+    nearest = []
+    for chosen in (False, True):
+        volume = Volume(voxel_size=0.03, threads=2, color=False, outlier_filter=chosen)
+        stats = volume.integrate(with_depth(depth))
+        assert stats.invalid == (lone.sum() if chosen else 0)
+        nearest.append(unpack_keys(volume._store.keys)[:, 2].min() * 8 * 0.03)
+    assert nearest[0] < 0.6
+    assert nearest[1] > 1.5
+
+
+@pytest.mark.parametrize("bundle", [True, False])
+def test_the_filter_costs_a_clean_view_nothing(bundle: bool) -> None:
+    for keyframe in (WALL, passer_by()):
+        stats = Volume(voxel_size=0.03, bundle=bundle).integrate(keyframe)
+        assert stats.samples == np.count_nonzero(keyframe.measurement)
+
+
+def test_carving_removes_who_has_left_and_keeps_the_wall() -> None:
+    keyframes = [passer_by()] * 4 + [WALL] * 20
+    ghost, carved = (
+        mesh_depths(keyframes, space_carving=chosen, regularizer="off") for chosen in (False, True)
+    )
+    assert (ghost < 1.5).sum() > 100
+    assert (carved < 1.5).sum() == 0
+    wall = mesh_depths([WALL] * 20, regularizer="off")
+    assert (carved > 1.9).sum() >= 0.98 * len(wall)
+    assert np.abs(carved - 2).mean() <= np.abs(wall - 2).mean() + 0.001
+
+
+def test_carving_is_a_sum_like_everything_else() -> None:
+    volumes = []
+    for order in (1, -1):
+        volume = Volume(voxel_size=0.03, threads=2, space_carving=True, regularizer="off")
+        for keyframe in [passer_by(), WALL][::order]:
+            volume.integrate(keyframe)
+        volumes.append(volume)
+    assert volumes[0].map_hash() == volumes[1].map_hash()
+    volumes[0].retract(passer_by())
+    alone = Volume(voxel_size=0.03, threads=2, space_carving=True, regularizer="off")
+    alone.integrate(WALL)
+    assert volumes[0].map_hash() == alone.map_hash()
+
+
+def test_carving_and_smoothing_along_rays_exclude_each_other() -> None:
+    with pytest.raises(InvalidConfig, match="exclude each other"):
+        Volume(space_carving=True, regularizer="ray")
+
+
+def plate_views(thickness: float) -> list[Keyframe]:
+    """A plate across z = 0, seen from both sides, straight and aslant."""
+    views = []
+    for side in (-1, 1):
+        for x in (-0.6, -0.3, 0.0, 0.3, 0.6):
+            eye = np.array([x, 0.1 * x, side * 1.0])
+            T = formula_scenes.look_at(eye, np.zeros(3))
+            normal = np.array([0.0, 0.0, float(side)])
+            keyframe = formula_scenes.plane_keyframe(T, normal, thickness / 2)
+            d = formula_scenes.directions(T) * keyframe.measurement[..., None] + eye
+            inside = (np.abs(d[..., 0]) < 0.3) & (np.abs(d[..., 1]) < 0.3)
+            views.append(
+                replace(keyframe, depth=np.where(inside, keyframe.measurement, 0).astype(np.float32))
+            )
+    return views
+
+
+@pytest.mark.parametrize("voxels", [1.5, 3.0, 8.0])
+def test_a_plate_seen_from_both_sides_is_no_worse_than_without_bundling(voxels: float) -> None:
+    """Bands of opposite sides overlap in a plate thinner than two of them: each side pushes the other
+    outward, as in any fusion that averages. Bundling, planes and the filter must add next to nothing."""
+    size, thickness = 0.02, voxels * 0.02
+    errors = []
+    for settings in ({"bundle": True}, {"bundle": False, "outlier_filter": False}):
+        volume = Volume(voxel_size=size, threads=2, color=False, regularizer="off", **settings)
+        for keyframe in plate_views(thickness):
+            volume.integrate(keyframe)
+        vertices = volume.extract_mesh().vertices
+        middle = vertices[(np.abs(vertices[:, :2]) < 0.25).all(axis=1)]
+        both = (middle[:, 2] > 0).any() and (middle[:, 2] < 0).any()
+        errors.append((np.abs(np.abs(middle[:, 2]) - thickness / 2).mean() / size, both, len(middle)))
+    (ours, ours_both, ours_count), (plain, plain_both, plain_count) = errors
+    assert ours <= 1.1 * plain
+    assert ours_both == plain_both
+    assert ours_count >= 0.95 * plain_count
+
+
+def test_gross_outliers_do_not_reach_the_surface() -> None:
+    room = Synthetic(world="room", sensor="kinect", count=8)
+    random = np.random.default_rng(6)
+    errors = []
+    keyframes = []
+    for i in range(len(room)):
+        depth = room[i].measurement.copy()
+        wrong = random.random(depth.shape) < 0.03
+        depth[wrong] = random.uniform(0.5 / room[i].depth_scale, 3 / room[i].depth_scale, wrong.sum())
+        keyframes.append(replace(room[i], depth=depth))
+    for chosen in (False, True):
+        volume = Volume(voxel_size=0.03, threads=2, color=False, outlier_filter=chosen)
+        for keyframe in keyframes:
+            volume.integrate(keyframe)
+        vertices = volume.extract_mesh().vertices.astype(np.float64)
+        errors.append(np.abs(room.distance(vertices)).mean() * 1e3)
+    assert errors[0] > 20.0
+    assert errors[1] < 3.0

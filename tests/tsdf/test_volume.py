@@ -1,0 +1,412 @@
+# SPDX-License-Identifier: MIT
+"""Laws of the map: it is a sum, whatever the order, the threads or the history."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import formula_scenes
+import kernel_twins
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from repository import SUPPORT
+
+from tsfusion import Keyframe, Volume
+from tsfusion.core.errors import InvalidConfig, MapError, MapFull, WeightOverflow
+from tsfusion.kernels.integrate import QUANTA_PER_VOXEL
+from tsfusion.tsdf.block_store import cells_of, unpack_keys
+
+VIEWS = formula_scenes.sphere_views(0.4, 8)
+
+
+def volume_of(keyframes: list[Keyframe], **settings: object) -> Volume:
+    volume = Volume(**{"voxel_size": 0.02, "threads": 2, **settings})
+    for keyframe in keyframes:
+        volume.integrate(keyframe)
+    return volume
+
+
+def bytes_of(volume: Volume) -> dict[str, bytes]:
+    used = volume._store.used()
+    return {name: layer[used].tobytes() for name, layer in volume._store.layers().items()}
+
+
+@pytest.mark.parametrize("bundle", [True, False])
+def test_the_volume_holds_exactly_the_twins_sums(bundle: bool) -> None:
+    depth = np.zeros(formula_scenes.SHAPE, np.float32)
+    depth[40:70, 60:95] = VIEWS[0].measurement[40:70, 60:95]
+    keyframe = Keyframe(depth=depth, intrinsics=formula_scenes.CAMERA, T_world_camera=VIEWS[0].T_world_camera)
+    volume = volume_of([keyframe, keyframe], bundle=bundle)
+    scratch = volume._scratch
+    rays = np.vstack([scratch.rays[start : start + count] for start, count in scratch.bands[:, :2]])
+    expected = kernel_twins.integrate(rays, QUANTA_PER_VOXEL)
+    found = {}
+    for slot, corner in enumerate(unpack_keys(volume._store.keys) * 8):
+        for o in np.flatnonzero(volume._store.sums[slot]):
+            found[tuple((corner + (o >> 6, o >> 3 & 7, o & 7)).tolist())] = int(volume._store.sums[slot, o])
+    assert found == {voxel: 2 * ((s << 27) + w) for voxel, (s, w) in expected.items()}
+
+
+@pytest.mark.parametrize("regularizer", ["off", "paper", "ray"])
+def test_any_order_gives_the_same_hash(regularizer: str) -> None:
+    hashes = {volume_of(VIEWS, regularizer=regularizer).map_hash() for _ in range(2)}
+    hashes.add(volume_of(VIEWS[::-1], regularizer=regularizer).map_hash())
+    hashes.add(volume_of(VIEWS[4:] + VIEWS[:4], regularizer="off").map_hash())
+    assert len(hashes) == 1
+
+
+def test_one_thread_gives_the_hash_of_two() -> None:
+    here = SUPPORT
+    script = (
+        "import scenes; from tsfusion import Volume\n"
+        "for regularizer in ('off', 'ray'):\n"
+        "    v = Volume(voxel_size=0.02, threads={}, regularizer=regularizer)\n"
+        "    [v.integrate(k) for k in scenes.sphere_views(0.4, 4)]\n"
+        "    layers = v._store.layers().values()\n"
+        "    print(v.map_hash(), v.color_hash(), [hash(layer.tobytes()) for layer in layers])\n"
+    )
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", script.format(threads)],
+            cwd=here, env={"PYTHONPATH": str(here), "PYTHONHASHSEED": "0"},
+            capture_output=True, text=True, check=True, timeout=120,
+        ).stdout
+        for threads in (1, 2)
+    }  # fmt: skip
+    assert len(found) == 1
+
+
+@pytest.mark.parametrize("bundle", [True, False])
+def test_retract_restores_the_bytes(bundle: bool) -> None:
+    volume = volume_of(VIEWS[:3], bundle=bundle)
+    before, map_hash, color_hash = bytes_of(volume), volume.map_hash(), volume.color_hash()
+    for keyframe in VIEWS[3:6]:
+        volume.integrate(keyframe)
+    assert volume.map_hash() != map_hash
+    for keyframe in VIEWS[3:6]:
+        volume.retract(keyframe)
+    assert (volume.map_hash(), volume.color_hash()) == (map_hash, color_hash)
+    assert bytes_of(volume) == before
+    assert volume.stats().keyframes == 3
+
+
+def test_a_moved_keyframe_is_a_retraction_and_an_addition() -> None:
+    volume = volume_of(VIEWS[:4])
+    volume.retract(VIEWS[1])
+    volume.integrate(VIEWS[6])
+    assert volume.map_hash() == volume_of([VIEWS[0], VIEWS[2], VIEWS[3], VIEWS[6]]).map_hash()
+
+
+def test_what_the_map_does_not_hold_cannot_be_retracted() -> None:
+    volume = volume_of(VIEWS[:2])
+    before = bytes_of(volume)
+    with pytest.raises(MapError, match="does not hold"):
+        volume.retract(VIEWS[5])
+    assert bytes_of(volume) == before
+
+
+def test_colour_that_was_never_added_cannot_be_retracted() -> None:
+    plain = replace(VIEWS[0], color=None)
+    volume = volume_of([plain, VIEWS[1]])
+    before = bytes_of(volume)
+    with pytest.raises(MapError, match="does not hold"):
+        volume.retract(VIEWS[0])
+    assert bytes_of(volume) == before
+    volume.retract(plain)
+    volume.integrate(VIEWS[0])
+
+
+def test_an_empty_map_has_nothing_to_retract() -> None:
+    nothing = Keyframe(points=np.zeros((0, 3), np.float32), T_world_camera=np.eye(4))
+    with pytest.raises(MapError, match="holds none"):
+        Volume(voxel_size=0.02).retract(nothing)
+
+
+@pytest.mark.parametrize("blocks", [np.zeros((2, 2), np.int32), np.zeros((1, 3)), np.zeros(3, np.int32)])
+def test_blocks_to_mesh_must_be_integer_triples(blocks: NDArray) -> None:
+    with pytest.raises(InvalidConfig, match="blocks must be"):
+        Volume(voxel_size=0.02).extract_mesh(blocks=blocks)
+
+
+def test_a_shift_by_whole_blocks_shifts_the_map() -> None:
+    shift = np.array([3, -2, 5])
+    moved = []
+    for keyframe in VIEWS[:3]:
+        T = keyframe.T_world_camera.copy()
+        T[:3, 3] += shift * 8 * 0.0625  # powers of two: the sums round alike
+        moved.append(Keyframe(depth=keyframe.depth, intrinsics=keyframe.intrinsics, T_world_camera=T))
+    here = [
+        Keyframe(depth=k.depth, intrinsics=k.intrinsics, T_world_camera=k.T_world_camera) for k in VIEWS[:3]
+    ]
+    a, b = volume_of(here, voxel_size=0.0625), volume_of(moved, voxel_size=0.0625)
+    rows = [dict(zip(map(tuple, unpack_keys(v._store.keys)), v._store.sums, strict=False)) for v in (a, b)]
+    shifted = {tuple(np.array(key) + shift): row for key, row in rows[0].items()}
+    assert shifted.keys() == rows[1].keys()
+    equal = sum((row == rows[1][key]).sum() for key, row in shifted.items())
+    assert equal > 0.999 * 512 * len(shifted)  # a last bit of a back-projected point may round the other way
+
+
+def test_no_smoothness_equals_plain_fusion() -> None:
+    volume = volume_of(VIEWS, regularizer="ray", smoothness=0.0)
+    used = volume._store.used()
+    sums, correction = volume._store.sums[used], volume._store.correction[used]
+    weight = sums & ((1 << 27) - 1)
+    assert np.abs(correction / np.maximum(weight, 1)).max() <= 1 / 16
+
+
+def test_dirty_blocks_are_reported_once() -> None:
+    volume = volume_of(VIEWS[:1])
+    dirty = volume.take_dirty()
+    assert {tuple(b) for b in dirty} == {tuple(b) for b in unpack_keys(volume._store.keys)}
+    assert len(volume.take_dirty()) == 0
+    stats = volume.integrate(VIEWS[1])
+    assert len(volume.take_dirty()) == stats.blocks
+
+
+def test_cells_of_a_block_reach_one_block_down_each_axis() -> None:
+    cells = cells_of(np.array([[0, 0, 0], [0, 0, 1]], np.int32))
+    assert len(cells) == 12
+    assert {tuple(c) for c in cells} >= {(0, 0, 0), (-1, -1, -1), (-1, -1, 1)}
+
+
+def test_an_empty_keyframe_changes_nothing() -> None:
+    volume = volume_of(VIEWS[:1])
+    before = volume.map_hash()
+    empty = np.zeros(formula_scenes.SHAPE, np.uint16)
+    stats = volume.integrate(
+        Keyframe(depth=empty, intrinsics=formula_scenes.CAMERA, T_world_camera=np.eye(4))
+    )
+    assert (stats.samples, stats.rays, stats.updates, stats.blocks) == (0, 0, 0, 0)
+    assert stats.invalid == empty.size
+    volume.integrate(Keyframe(points=np.zeros((0, 3), np.float32), T_world_camera=np.eye(4)))
+    assert volume.map_hash() == before
+    assert Volume(voxel_size=0.02).extract_mesh().faces.shape == (0, 3)
+
+
+def test_points_far_outside_the_reach_of_keys_are_dropped_and_counted() -> None:
+    points = np.array([[0, 0, 50.0], [0, 0, 2.0]], np.float32)
+    T = np.eye(4)
+    T[0, 3] = 9e5
+    volume = Volume(voxel_size=0.02, sensor="lidar")
+    assert volume.integrate(Keyframe(points=points, T_world_camera=T)).invalid == 2
+    assert volume.stats().blocks == 0
+
+
+def test_confidence_zero_is_no_return_and_half_is_less() -> None:
+    keyframe, full = VIEWS[0], volume_of(VIEWS[:1])
+    for value, check in ((0, lambda w: w == 0), (128, lambda w: 0 < w < weights(full))):
+        doubted = Keyframe(
+            depth=keyframe.depth, intrinsics=keyframe.intrinsics, T_world_camera=keyframe.T_world_camera,
+            confidence=np.full(formula_scenes.SHAPE, value, np.uint8),
+        )  # fmt: skip
+        assert check(weights(volume_of([doubted])))
+
+
+def weights(volume: Volume) -> int:
+    return int((volume._store.sums & ((1 << 27) - 1)).sum())
+
+
+def test_the_limits_hold_and_leave_the_map_alone() -> None:
+    volume = volume_of(VIEWS[:1])
+    small = volume_of(VIEWS[:1], max_blocks=volume.stats().blocks)
+    before = bytes_of(small)
+    with pytest.raises(MapFull, match="max_blocks"):
+        small.integrate(VIEWS[4])
+    assert bytes_of(small) == before
+    with pytest.raises(MapFull, match="max_blocks_per_keyframe"):
+        volume_of(VIEWS[:1], max_blocks_per_keyframe=3)
+
+
+def test_full_voxels_refuse_more_and_lose_nothing() -> None:
+    volume = volume_of(VIEWS[:1])
+    slot, voxel = np.argwhere(volume._store.sums != 0)[0]
+    volume._store.sums[slot, voxel] = (1 << 26) - 1
+    volume._store.bounds[slot] = (1 << 26) - 1
+    before, blocks = bytes_of(volume), volume.stats().blocks
+    with pytest.raises(WeightOverflow):
+        volume.integrate(VIEWS[0])
+    moved = VIEWS[0].T_world_camera.copy()
+    moved[:3, 3] += 0.1  # needs blocks that must not stay either
+    with pytest.raises(WeightOverflow):
+        volume.integrate(replace(VIEWS[0], T_world_camera=moved))
+    assert bytes_of(volume) == before
+    assert volume.stats().blocks == blocks
+    volume.retract(VIEWS[0])  # making room is always allowed
+
+
+def test_a_bound_that_is_too_cautious_is_looked_up() -> None:
+    volume = volume_of(VIEWS[:1])
+    volume._store.bounds[:] = (1 << 26) - 1
+    volume.integrate(VIEWS[1])
+    assert volume.map_hash() == volume_of(VIEWS[:2]).map_hash()
+    weight = (volume._store.sums & ((1 << 27) - 1)).max(axis=1)
+    touched = volume._scratch.touched_slots
+    assert (volume._store.bounds[touched] == weight[touched]).all()
+
+
+def test_a_settled_colour_takes_no_more_votes() -> None:
+    volume = volume_of(VIEWS[:1])
+    voted = volume._store.color_rgn != 0
+    volume._store.color_rgn[voted] |= 1 << 15
+    before = volume._store.color_rgn.copy()
+    volume.integrate(VIEWS[0])
+    assert (volume._store.color_rgn[voted[: len(before)]] == before[voted]).all()
+
+
+def test_settled_colours_do_not_stop_a_retraction() -> None:
+    volume = volume_of(VIEWS[:2])
+    before = volume.map_hash()
+    volume.integrate(VIEWS[2])
+    voted = volume._store.color_rgn[: volume.stats().blocks] != 0
+    volume._store.color_rgn[: len(voted)][voted] |= 1 << 15
+    settled = volume._store.color_rgn[: len(voted)][voted].copy()
+    volume.retract(VIEWS[2])
+    assert volume.map_hash() == before
+    assert (volume._store.color_rgn[: len(voted)][voted] == settled).all()
+
+
+@pytest.mark.parametrize("where", ["_smooth", "reserve_touched", "largest_weights"])
+def test_whatever_fails_leaves_the_map_as_it_was(monkeypatch: pytest.MonkeyPatch, where: str) -> None:
+    volume = volume_of(VIEWS[:2], regularizer="ray")
+    before, stats = bytes_of(volume), volume.stats()
+    volume._store.bounds[:] = (1 << 26) - 1  # so that the weights are looked at
+
+    def fail(*_: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        if where == "_smooth":
+            patched.setattr(volume, "_smooth", fail)
+        elif where == "reserve_touched":
+            first = [True]
+            usual = volume._scratch.reserve_touched
+            patched.setattr(volume._scratch, "reserve_touched", lambda n: usual(n) if first.pop() else fail())
+            first.insert(0, False)
+        else:
+            patched.setattr("tsfusion.kernels.integrate.largest_weights", fail)
+        with pytest.raises(MemoryError):
+            volume.integrate(VIEWS[5])
+    assert bytes_of(volume) == before
+    assert (volume.stats().blocks, volume.keyframes) == (stats.blocks, 2)
+    volume.integrate(VIEWS[5])
+    assert volume.map_hash() == volume_of([*VIEWS[:2], VIEWS[5]]).map_hash()
+
+
+def test_an_interrupt_waits_for_the_keyframe() -> None:
+    import signal
+
+    volume = volume_of(VIEWS[:1])
+    usual = volume._integrator._check
+
+    def interrupted(part: tuple[int, int], sign: int) -> None:
+        signal.raise_signal(signal.SIGINT)
+        usual(part, sign)
+
+    volume._integrator._check = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        volume.integrate(VIEWS[1])
+    assert volume.keyframes == 2
+    assert volume.map_hash() == volume_of(VIEWS[:2]).map_hash()
+
+
+def test_a_still_camera_can_carve_for_long() -> None:
+    T = np.eye(4)
+    wall = formula_scenes.plane_keyframe(T, np.array([0.0, 0.0, 1.0]), 1.5)
+    volume = Volume(voxel_size=0.02, threads=2, space_carving=True)
+    volume.integrate(wall)
+    heaviest = int((volume._store.sums & ((1 << 27) - 1)).max())
+    assert heaviest * 10_000 < 1 << 26
+
+
+def test_a_surface_that_does_not_exist_is_refused() -> None:
+    with pytest.raises(InvalidConfig, match="surface must be one of"):
+        volume_of(VIEWS[:1]).extract_mesh(surface="fild")  # type: ignore[arg-type]
+
+
+def test_blocks_out_of_reach_have_no_mesh() -> None:
+    far = np.array([[-1, -1, (1 << 21) + 1], [1 << 30, 0, 0]], np.int32)
+    assert len(volume_of(VIEWS[:1]).extract_mesh(blocks=far).faces) == 0
+
+
+def test_a_keyframe_too_heavy_for_one_go_gives_the_same_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = volume_of(VIEWS[:3])
+    monkeypatch.setattr("tsfusion.tsdf.integrator.PART_WEIGHT", 20_000)
+    parts = volume_of(VIEWS[:3])
+    assert len(list(parts._integrator._parts())) > 3
+    assert parts.map_hash() == whole.map_hash()
+    parts.retract(VIEWS[2])
+    assert parts.map_hash() == volume_of(VIEWS[:2]).map_hash()
+
+
+def test_a_full_set_of_missing_blocks_is_grown_and_loses_nothing() -> None:
+    volume = Volume(voxel_size=0.005, threads=2)
+    volume._scratch.missing = np.zeros(64, np.int64)
+    volume.integrate(VIEWS[0])
+    assert len(volume._scratch.missing) > 64
+    assert volume.map_hash() == volume_of(VIEWS[:1], voxel_size=0.005).map_hash()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"voxel_size": 0.0}, "voxel_size"),
+        ({"voxel_size": float("nan")}, "voxel_size"),
+        ({"voxel_size": float("inf")}, "voxel_size"),
+        ({"sensor": "sonar"}, "sensor"),
+        ({"regularizer": "tv"}, "regularizer"),
+        ({"voxelsize": 0.02}, "voxelsize"),
+        ({"min_range": 5.0, "max_range": 2.0}, "min_range"),
+        ({"min_support": 9.0, "max_support": 4.0}, "min_support"),
+    ],
+)
+def test_a_bad_setting_is_named(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(InvalidConfig, match=message):
+        Volume(**settings)
+
+
+def test_memory_grows_without_losing_a_bit() -> None:
+    volume = volume_of(VIEWS, voxel_size=0.004)
+    assert volume.stats().blocks > 2048  # past two growths of every array
+    backwards = volume_of(VIEWS[::-1], voxel_size=0.004)
+    assert volume.map_hash() == backwards.map_hash()
+    assert volume.stats().bytes_per_block <= 12_300
+
+
+def test_kernels_stay_in_bounds(tmp_path: Path) -> None:
+    """Taichi's debug mode checks every array access; it needs a process of its own."""
+    script = (
+        "import numpy as np, scenes\n"
+        "from tsfusion.kernels import runtime\n"
+        "from tsfusion import Volume, Keyframe\n"
+        "import taichi as ti\n"
+        "ti.init(arch=ti.cpu, debug=True, offline_cache=False, log_level=ti.ERROR)\n"
+        "runtime._started_threads = 2\n"
+        "v = Volume(voxel_size=0.04, regularizer='ray')\n"
+        "for k in scenes.sphere_views(0.4, 2): v.integrate(k)\n"
+        "r = np.random.default_rng(0).uniform(-3, 3, (700, 3)).astype(np.float32)\n"
+        "v.integrate(Keyframe(points=r, T_world_camera=np.eye(4)))\n"
+        "v.retract(Keyframe(points=r, T_world_camera=np.eye(4)))\n"
+        "assert len(v.extract_mesh(min_weight=0).faces)\n"
+        "assert len(v.extract_mesh(min_weight=0, blocks=v.take_dirty()[::3]).faces)\n"
+    )
+    here = SUPPORT
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=here, env={"PYTHONPATH": str(here)},
+        capture_output=True, text=True, timeout=240, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def random_cloud(seed: int, count: int) -> NDArray[np.float32]:
+    return np.random.default_rng(seed).uniform(-4, 4, (count, 3)).astype(np.float32)
+
+
+def test_points_in_any_order_of_keyframes_and_two_sensors() -> None:
+    keyframes = [
+        Keyframe(points=random_cloud(i, 3000), T_world_camera=np.eye(4), sensor="lidar") for i in range(3)
+    ]
+    a = volume_of([*VIEWS[:2], *keyframes])
+    b = volume_of([*keyframes[::-1], *VIEWS[1::-1]])
+    assert a.map_hash() == b.map_hash()

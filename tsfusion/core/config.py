@@ -1,0 +1,377 @@
+# SPDX-License-Identifier: MIT
+"""Every setting, its default, its unit and its bounds. Nothing else in the package holds a default.
+
+A TOML file has one table a struct (`[volume]`, `[server]`, `[client]`, `[scan]`); unknown keys are errors.
+"""
+
+import inspect
+import json
+import math
+import re
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+import numpy as np
+from msgspec import Meta, Struct
+
+from tsfusion.core.errors import InvalidConfig
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:  # pragma: no cover
+    import tomli as tomllib
+
+Regularizer = Literal["off", "paper", "ray"]
+Surface = Literal["raw", "normal", "field"]
+SensorName = Literal["kinect", "tof", "realsense", "stereo", "lidar", "scanner"]
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
+Smoothness = Annotated[float, Meta(ge=0, le=1e9)]
+LocalizerName = Literal["auto", "rgbd", "stereo", "lidar", "given", "trajectory", "feed"]
+Policy = Literal["thin", "block", "drop_oldest", "spool_all"]
+LogFormat = Literal["text", "json"]
+LogLevel = Literal["debug", "info", "warning", "error"]
+DEFAULT_MAP = "default"
+MAP_NAME_LENGTH = 32
+# Becomes a folder's name, so it is no path: \A and \Z, because `$` would let a newline through.
+MapName = Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9_-]{0,31}\Z")]
+ClientName = Annotated[str, Meta(pattern=r"\A[A-Za-z0-9][A-Za-z0-9_.-]{0,31}\Z")]
+Bytes = Annotated[int, Meta(ge=1 << 20)]
+Port = Annotated[int, Meta(ge=0, le=65535)]
+
+
+class Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What all settings have in common: no infinity, no NaN (both are legal TOML)."""
+
+    def __post_init__(self) -> None:
+        for key in self.__struct_fields__:
+            value = getattr(self, key)
+            if isinstance(value, float) and not math.isfinite(value):
+                raise ValueError(f"{key} must be finite, got {value}")
+
+
+class SensorModel(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Depth noise of a sensor, and what follows from it.
+
+    σ(z) = sigma_floor + sigma_slope · (z − sigma_z0)², metres; z = depth along the optical axis
+    (ray length for points). With a known baseline·fx, `disparity_sigma` px replaces the slope:
+    σ(z) = sigma_floor + disparity_sigma · z² / baseline_fx.
+    The support half-width of a ray is `3 σ(z)`, held between `min_support` and `max_support` voxels.
+    """
+
+    sigma_floor: NonNegative
+    sigma_slope: NonNegative = 0.0
+    sigma_z0: float = 0.0
+    disparity_sigma: NonNegative = 0.0
+    min_range: NonNegative = 0.1
+    max_range: Positive = 10.0
+    min_support: Annotated[float, Meta(ge=1, le=16)] = 3.0
+    max_support: Annotated[float, Meta(ge=1, le=16)] = 6.0
+    regularizer: Regularizer = "off"
+    smoothness: Smoothness = 1.0
+    feedback: bool = False
+    min_weight: NonNegative = 0.25
+    surface: Surface = "field"
+    field_smoothness: Smoothness = 30.0
+    field_edge: Positive = 0.02
+    field_reweightings: Annotated[int, Meta(ge=0, le=16)] = 4
+
+
+# Kinect v1: Nguyen, Izadi and Lovell 2012 (axial noise). Stereo: Δz = z² Δd / (b·f). Streets are seen at
+# grazing angles, where a band along the ray is thin across the surface: stereo and LiDAR need longer ones
+# (KITTI 06 at 15 cm: with 3 voxels the road has slits, with 6 it has none).
+SENSORS: dict[str, SensorModel] = {
+    "kinect": SensorModel(sigma_floor=0.0012, sigma_slope=0.0019, sigma_z0=0.4, max_range=5.0),
+    "tof": SensorModel(sigma_floor=0.0015, sigma_slope=0.0005, max_range=8.0),
+    "realsense": SensorModel(sigma_floor=0.001, sigma_slope=0.0025, disparity_sigma=0.08, max_range=6.0),
+    "stereo": SensorModel(
+        sigma_floor=0.005,
+        sigma_slope=0.0026,
+        disparity_sigma=0.5,
+        min_range=0.3,
+        max_range=30.0,
+        min_support=6.0,
+        max_support=10.0,
+        smoothness=10.0,
+        feedback=True,
+        min_weight=0.5,
+        field_smoothness=1000.0,
+        field_edge=0.05,
+    ),
+    "lidar": SensorModel(sigma_floor=0.02, min_range=1.0, max_range=100.0, min_support=4.0),
+    "scanner": SensorModel(sigma_floor=0.0002, min_range=0.0, max_range=100.0),
+}
+
+
+class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The map and how keyframes enter it. None = what the sensor preset says."""
+
+    voxel_size: Positive = 0.02  # metres
+    sensor: SensorName = "kinect"
+    regularizer: Regularizer | None = None
+    smoothness: Smoothness | None = None  # λ of eq. 3
+    min_support: Annotated[float, Meta(ge=1, le=16)] | None = None  # voxels
+    max_support: Annotated[float, Meta(ge=1, le=16)] | None = None  # voxels
+    min_range: NonNegative | None = None  # metres
+    max_range: Positive | None = None  # metres
+    min_weight: NonNegative | None = None  # full-confidence samples a voxel needs to be meshed
+    feedback: bool | None = None  # smooth the smoothed values again (recursion) or the raw ones
+    surface: Surface | None = None  # what is meshed: values as fused, smoothed along normals, or the field
+    field_smoothness: Smoothness | None = None  # λ of the field, against full-confidence samples
+    field_edge: Positive | None = None  # voxels; a field that bends more than this counts as an edge
+    field_reweightings: Annotated[int, Meta(ge=0, le=16)] | None = None
+    bundle: bool = True  # rays of a neighbourhood that end in one voxel become one
+    outlier_filter: bool = True  # drop pixels that no neighbour supports: flying pixels, speckle
+    space_carving: bool = False  # rays also vote for the free space before their band
+    color: bool = True
+    threads: Annotated[int, Meta(ge=1, le=256)] | None = None  # None = all cores
+    max_blocks: Annotated[int, Meta(ge=1, le=4_000_000)] = 4_000_000
+    max_blocks_per_keyframe: Annotated[int, Meta(ge=1, le=1 << 19)] = 1 << 17
+
+    def model(self, sensor: str | None = None) -> SensorModel:
+        """The sensor model of a keyframe (default: the map's), with this config's own choices on top."""
+        name = sensor or self.sensor
+        if name not in SENSORS:
+            raise InvalidConfig(f"sensor must be one of {', '.join(SENSORS)}, got {name!r}")
+        chosen = {
+            key: value
+            for key in SensorModel.__struct_fields__
+            if (value := getattr(self, key, None)) is not None
+        }
+        return msgspec.structs.replace(SENSORS[name], **chosen)
+
+
+# Settings of a map that change nothing stored in it (smoothness: unless it smooths along rays): a saved one
+# can be read with others.
+VIEW_SETTINGS = (
+    "min_weight", "surface", "smoothness", "field_smoothness", "field_edge", "field_reweightings"
+)  # fmt: skip
+
+
+class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The server daemon."""
+
+    listen: str = "tcp://127.0.0.1:5555"
+    control: str | None = None  # None = the port after `listen`'s
+    state: str = "tsfusion-state"  # folder: maps/NAME/journal/, maps/NAME/map.tsf
+    keys: str | None = None  # folder of `tsfusion keys`; None = no keys, reachable from this machine only
+    max_maps: Annotated[int, Meta(ge=1, le=64)] = 4  # open at once; each has a fuser process
+    metrics: str | None = None  # loopback address of Prometheus' page and health checks: 127.0.0.1:9464
+    max_frame_bytes: Annotated[int, Meta(ge=1024, le=32 << 20)] = 32 << 20  # the fuser takes no larger one
+    segment_bytes: Annotated[int, Meta(ge=1 << 16)] = 256 << 20
+    window_keyframes: Annotated[int, Meta(ge=1, le=1024)] = 8  # credit: unacknowledged keyframes a client
+    window_bytes: Annotated[int, Meta(ge=1 << 16)] = 16 << 20
+    checkpoint_every: Annotated[int, Meta(ge=0)] = 500  # keyframes; 0 = only at shutdown
+    mesh_interval: NonNegative = 0.2  # seconds between incremental meshes while busy
+    journal_bytes: Bytes | None = None  # per map; what a checkpoint has goes first; None = keep all
+    min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left on the disk: below, keyframes have to wait
+    quarantine_bytes: Bytes = 256 << 20  # per map; keyframes that could not be fused, the oldest go first
+    memory_bytes: Bytes = 512 << 20  # of the gateway; above, all connections are dropped and made anew
+    fuser_memory_bytes: Annotated[int, Meta(ge=1 << 28)] | None = (
+        None  # of each fuser; None = three quarters of the machine's
+    )
+    fuser_timeout: Positive = 60.0  # seconds on one keyframe before a fuser counts as stuck
+    quota_bytes: Bytes = 256 << 20  # a second, of each client
+    quota_keyframes: Positive = 1000.0  # a second, of each client
+    quota_points: Annotated[int, Meta(ge=1)] = 8 << 20  # points or pixels a keyframe
+    quota_extent: Positive = 100_000.0  # metres from the map's origin to a sensor
+    log_format: LogFormat = "text"  # of what goes to stderr: lines, or one JSON object a line
+    log_level: LogLevel = "info"  # what is less than that is left out
+
+
+class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The scanner's sending side."""
+
+    address: str = "tcp://127.0.0.1:5555"
+    control: str | None = None
+    map: MapName = DEFAULT_MAP
+    key: str | None = None  # own secret key, a file of `tsfusion keys new`; None = no keys
+    server_key: str | None = None  # the server's public key: a file, or the 40 characters
+    policy: Policy = "thin"  # when keyframes come faster than the server takes them
+    backlog: Annotated[int, Meta(ge=1, le=10_000)] = 8  # keyframes behind at which the policy begins to act
+    spool_bytes: Bytes = 8 << 30  # of the disk; what comes then is skipped and counted
+    min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left on the spool's disk
+    jpeg_quality: Annotated[int, Meta(ge=1, le=100)] = 90
+    segment_bytes: Annotated[int, Meta(ge=1 << 16)] = 64 << 20
+    connect_timeout: Positive = 10.0  # seconds
+    stall_timeout: Positive = 2.0  # seconds without progress before everything unacknowledged is resent
+
+
+class ScanConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The scanner: how poses are found, and which frames become keyframes."""
+
+    localizer: LocalizerName = "auto"  # auto: by what the source gives
+    trajectory: str | None = None  # for the localizer `trajectory`: a TUM or KITTI file
+    feed: str | None = None  # for the localizer `feed`: address where another process publishes poses
+    max_gap: Positive = 0.2  # seconds between two given poses; across a longer gap there is none
+    time_offset: float = 0.0  # seconds to add to a frame's time before its pose is looked up
+    loop_closure: bool = True  # look for places seen before, and correct the poses since
+    min_overlap: Annotated[float, Meta(ge=0, le=1)] = 0.8  # of the last keyframe's view; below: a new one
+    distance: Positive | None = None  # metres to the next keyframe; None = 0.1, for stereo and LiDAR 2
+    angle: Positive = 10.0  # degrees to the next keyframe
+    max_rate: Positive | None = None  # keyframes a second, at most
+    patience: NonNegative = 1.0  # seconds lost before a new submap begins
+
+
+class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A whole configuration file."""
+
+    volume: VolumeConfig = VolumeConfig()
+    server: ServerConfig = ServerConfig()
+    client: ClientConfig = ClientConfig()
+    scan: ScanConfig = ScanConfig()
+    maps: dict[MapName, dict[str, Any]] = {}  # [maps.NAME]: what differs there from [volume]
+
+    def volumes(self) -> dict[str, VolumeConfig]:
+        """The settings of the maps that have some of their own.
+
+        Raises:
+            InvalidConfig: for an unknown key or a bad value.
+        """
+        found = {}
+        for name, settings in self.maps.items():
+            try:
+                found[name] = override(self.volume, **settings)
+            except InvalidConfig as error:
+                raise InvalidConfig(f"[maps.{name}]: {error}") from error
+        return found
+
+
+AnyStruct = TypeVar("AnyStruct", bound=Struct)
+
+_KINDS = {
+    "float": "a number",
+    "int": "a whole number",
+    "str": "text",
+    "bool": "true or false",
+    "object": "a table",
+}
+_NAME = "1 to 32 of a-z, 0-9, - and _, a letter or digit first"  # MapName, the one pattern in a configuration
+
+
+def make(struct: type[AnyStruct], settings: dict[str, Any]) -> AnyStruct:
+    """Build a config struct, checking names, types and bounds.
+
+    Raises:
+        InvalidConfig: naming the key and what was expected.
+    """
+    plain = {key: v.item() if isinstance(v, np.generic) else v for key, v in settings.items()}
+    try:
+        return msgspec.convert(plain, struct)
+    except msgspec.ValidationError as error:
+        raise InvalidConfig(_explain(struct, plain, str(error))) from error
+
+
+def _explain(struct: type[Struct], settings: dict[str, Any], problem: str) -> str:
+    """msgspec's message in our words: `voxel_size must be > 0, got -0.05`; of a file, with the table."""
+    problem, _, place = problem.partition(" - at `$.")
+    *tables, key = place.rstrip("`").split(".")
+    if unknown := re.search(r"unknown field `(.+)`", problem):
+        return f"unknown setting {'.'.join(filter(None, (place.rstrip('`'), unknown[1])))}"
+    wanted = re.match(
+        r"Expected `(\w+)[^`]*`(?: ([<>]=? \S+?)(?:\.0)?)?(?:,|$)|Invalid enum|.* matching regex", problem
+    )
+    if wanted is None:
+        return problem
+    value: Any = settings
+    for table in tables:
+        struct, value = struct.__annotations__[table], value[table]
+    words = ", ".join(re.findall(r"(?<!class )'(\w+)'", str(struct.__annotations__[key])))
+    must_be = f"one of {words}" if words else wanted[2] or _KINDS.get(wanted[1], wanted[1]) or _NAME
+    return f"{'.'.join((*tables, key))} must be {must_be}, got {value[key]!r}"
+
+
+def load(path: str | Path | None, **volume: Any) -> Config:
+    """Read a TOML file; None gives the defaults.
+
+    Args:
+        volume: settings of the map that hold where the file says nothing of them.
+
+    Raises:
+        InvalidConfig: when the file is missing, not TOML, or holds an unknown key or a bad value.
+    """
+    if path is None:
+        return Config(volume=make(VolumeConfig, volume))
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise InvalidConfig(f"cannot read the configuration {path}: {error.strerror}") from error
+    try:
+        tables = tomllib.loads(content.decode("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InvalidConfig(f"{path} is not TOML: {error}") from error
+    if isinstance(given := tables.get("volume", {}), dict):
+        tables["volume"] = {**volume, **given}
+    try:
+        made = make(Config, tables)
+        made.volumes()
+        return made
+    except InvalidConfig as error:
+        raise InvalidConfig(f"{path}: {error}") from error
+
+
+def override(config: AnyStruct, **changes: Any) -> AnyStruct:
+    """`config` with every change that is not None, checked again."""
+    settings = msgspec.structs.asdict(config)
+    settings.update({key: value for key, value in changes.items() if value is not None})
+    return make(type(config), settings)
+
+
+# A long line as the formatter breaks it: the value and its comment in brackets of their own.
+_BROKEN = re.compile(r"= \(\n +(.+)\n +\)$", re.MULTILINE)
+_FIELD = re.compile(r"^    (\w+): .*?(?:  # (?P<comment>.+))?$")
+
+
+def dumps(config: Config) -> str:
+    """TOML that `config.load` reads back as an equal Config; settings at None are commented out."""
+    tables = [table(name, getattr(config, name)) for name in ("volume", "server", "client", "scan")]
+    for name, settings in config.maps.items():
+        lines = (f"{key} = {_literal(value)}\n" for key, value in settings.items())
+        tables.append("".join((f"[maps.{name}]\n", *lines)))
+    return "\n".join(tables)
+
+
+def table(name: str, struct: Struct) -> str:
+    """One `[name]` table, a line a setting with its bounds and meaning."""
+    summary = inspect.cleandoc(type(struct).__doc__ or "").splitlines()[0]
+    lines = [f"# {summary}", f"[{name}]"]
+    comments = _comments(type(struct))
+    for field in msgspec.inspect.type_info(type(struct)).fields:  # type: ignore[attr-defined]
+        value = getattr(struct, field.name)
+        setting = f"# {field.name} =" if value is None else f"{field.name} = {_literal(value)}"
+        notes = [note for note in (_allowed(field.type), comments.get(field.name)) if note]
+        lines.append(setting + (f"  # {'; '.join(notes)}" if notes else ""))
+    return "\n".join(lines) + "\n"
+
+
+def _literal(value: Any) -> str:
+    if isinstance(value, float):
+        return repr(value)
+    return json.dumps(value, ensure_ascii=False)  # booleans, integers and strings are written alike
+
+
+def _allowed(kind: msgspec.inspect.Type) -> str:
+    """The bounds of a number or the list of words, in words."""
+    if isinstance(kind, msgspec.inspect.UnionType):
+        return "; ".join(note for note in map(_allowed, kind.types) if note)
+    if isinstance(kind, msgspec.inspect.LiteralType):
+        return " | ".join(map(str, kind.values))
+    signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
+    bounds = [
+        f"{sign} {getattr(kind, name)}"
+        for name, sign in signs.items()
+        if getattr(kind, name, None) is not None
+    ]
+    return ", ".join(bounds)
+
+
+def _comments(struct: type[Struct]) -> dict[str, str]:
+    """The comments beside the fields in config.py, so that no setting is explained twice."""
+    try:
+        source = inspect.getsource(struct)
+    except OSError:  # installed without sources
+        return {}
+    matches = filter(None, map(_FIELD.match, _BROKEN.sub(r"= \1", source).splitlines()))
+    return {match[1]: match["comment"] for match in matches if match["comment"]}

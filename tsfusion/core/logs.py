@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: MIT
+"""Log lines on stderr: as text, or one JSON object a line; a flood of one message is cut short."""
+
+import json
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterator
+from datetime import datetime, timezone
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from tsfusion.core.config import LogFormat, LogLevel
+
+if TYPE_CHECKING:
+    _Handler = logging.StreamHandler[Any]
+else:
+    _Handler = logging.StreamHandler  # takes no type before Python 3.11
+
+
+ABOUT = ("map", "session", "seq", "client", "reason")  # what a line may say it is about
+MESSAGE_CHARACTERS = 2000  # messages quote what peers sent
+TRACE_CHARACTERS = 20_000
+MOST, PERIOD = 20, 60.0  # lines from one place in the code, in so many seconds
+
+log = logging.getLogger(__name__)
+
+
+def configure(format: LogFormat, level: LogLevel, process: str = "server", *, map: str | None = None) -> None:
+    """Log to stderr from now on; `process` (server or fuser) stands in every line.
+
+    Args:
+        map: what every line is about that does not say otherwise.
+
+    Only tsfusion's own loggers are set to `level`; other packages log warnings and errors.
+    """
+    formatter = (JsonFormatter if format == "json" else TextFormatter)(process, map)
+    for handler in logging.root.handlers[:]:
+        if isinstance(handler, Stderr):
+            logging.root.removeHandler(handler)
+            handler.close()
+    made = Stderr(Limiter())
+    made.setFormatter(formatter)
+    logging.root.addHandler(made)
+    logging.getLogger("tsfusion").setLevel(level.upper())
+    sys.excepthook = _log_unexpected if format == "json" else sys.__excepthook__
+
+
+def about(
+    *,
+    map: str | None = None,
+    session: bytes | str | None = None,
+    seq: int | None = None,
+    client: str | None = None,
+    reason: str | None = None,
+) -> dict[str, Any]:
+    """What a line is about: `log.warning("…", extra=logs.about(session=key, seq=7))`.
+
+    A session is shown by its first 8 hexadecimal digits; whatever is None or empty is left out.
+    """
+    shown = session.hex() if isinstance(session, bytes) else session
+    given = {"map": map, "session": shown and shown[:8], "seq": seq, "client": client, "reason": reason}
+    return {"about": {key: value for key, value in given.items() if value not in (None, "")}}
+
+
+def tell_left_out() -> None:
+    """Say how many lines were left out, once their period is over. Call it about once a second."""
+    for handler in logging.root.handlers:
+        if isinstance(handler, Stderr):
+            handler.tell_left_out()
+
+
+def printable(text: str, most: int = MESSAGE_CHARACTERS) -> str:
+    """The text on one line, without terminal commands: what cannot be printed is escaped; `…` if cut."""
+    cut = text if len(text) <= most else text[:most] + "…"
+    if cut.isprintable():
+        return cut
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in cut)
+
+
+class TextFormatter(logging.Formatter):
+    """`tsfusion: WARNING: a message is refused (map yard, session 1a2b3c4d, seq 7)`."""
+
+    def __init__(self, process: str, map: str | None = None) -> None:
+        super().__init__()
+        self._map = map
+        self._name = "tsfusion" if process == "server" else f"tsfusion {process}"
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One line; a traceback follows on lines of its own."""
+        subject = ", ".join(f"{key} {value}" for key, value in _about(record, self._map).items())
+        line = f"{self._name}: {record.levelname}: {printable(record.getMessage())}"
+        trace = _trace(record)
+        return line + (f" ({subject})" if subject else "") + (f"\n{trace}" if trace else "")
+
+
+class JsonFormatter(logging.Formatter):
+    """An object a line: time (UTC), level, process, logger, message, what it is about, exception."""
+
+    def __init__(self, process: str, map: str | None = None) -> None:
+        super().__init__()
+        self._map = map
+        self._process = process
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One line, ASCII: nothing in it breaks a line or a terminal."""
+        at = datetime.fromtimestamp(record.created, timezone.utc).isoformat(timespec="milliseconds")
+        fields = {
+            "time": at.replace("+00:00", "Z"),
+            "level": record.levelname.lower(),
+            "process": self._process,
+            "logger": record.name,
+            "message": printable(record.getMessage()),
+            **_about(record, self._map),
+        }
+        if trace := _trace(record):
+            fields["exception"] = trace
+        return json.dumps(fields)
+
+
+def _about(record: logging.LogRecord, map: str | None) -> dict[str, Any]:
+    given = about(map=map)["about"] | getattr(record, "about", {})
+    shown = {key: given[key] for key in ABOUT if key in given}
+    return {key: value if isinstance(value, int) else printable(str(value)) for key, value in shown.items()}
+
+
+def _trace(record: logging.LogRecord) -> str:
+    text = logging.Formatter().formatException(record.exc_info) if record.exc_info else ""
+    return text if len(text) <= TRACE_CHARACTERS else "…" + text[-TRACE_CHARACTERS:]
+
+
+class Stderr(_Handler):
+    """Standard error, by leave of a limiter."""
+
+    def __init__(self, limiter: "Limiter") -> None:
+        super().__init__(sys.stderr)
+        self._limiter = limiter
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write it, unless there were too many like it; the handler's lock is held."""
+        self._write(self._limiter.over())
+        if self._limiter.allows(record):
+            super().emit(record)
+
+    def tell_left_out(self) -> None:
+        """Write what `Limiter.over` has to say."""
+        with self.lock:  # type: ignore[union-attr]
+            self._write(self._limiter.over())
+
+    def close(self) -> None:
+        """Say what was left out, however young."""
+        self._write(self._limiter.over(everything=True))
+        super().close()
+
+    def _write(self, records: Iterator[logging.LogRecord]) -> None:
+        for record in records:
+            super().emit(record)
+
+
+class Limiter:
+    """Lets through so many lines a period from each place in the code, and counts the rest.
+
+    Errors always pass: they may tell of lost data.
+    """
+
+    def __init__(
+        self, most: int = MOST, period: float = PERIOD, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._most, self._period, self._clock = most, period, clock
+        # The place and not the message is the key: its number is bounded, whatever peers send.
+        self._places: dict[tuple[str, int], _Place] = {}
+
+    def allows(self, record: logging.LogRecord) -> bool:
+        """Whether to write it; if not, it is counted."""
+        if record.levelno >= logging.ERROR:
+            return True
+        place = self._places.setdefault((record.pathname, record.lineno), _Place(self._clock()))
+        place.count += 1
+        if place.count <= self._most:
+            return True
+        place.last = record
+        return False
+
+    def over(self, *, everything: bool = False) -> Iterator[logging.LogRecord]:
+        """A line for each place that had to leave some out and whose period is over; then it begins anew."""
+        before = self._clock() - self._period
+        for key, place in list(self._places.items()):
+            if everything or place.began <= before:
+                del self._places[key]
+                if place.last is not None:
+                    yield _summary(place.last, place.count - self._most, self._period)
+
+
+class _Place:
+    def __init__(self, began: float) -> None:
+        self.began = began
+        self.count = 0
+        self.last: logging.LogRecord | None = None
+
+
+def _summary(last: logging.LogRecord, count: int, period: float) -> logging.LogRecord:
+    message = f"{count} more like this were left out in {period:.0f} s: {last.getMessage()}"
+    return logging.makeLogRecord(
+        {**last.__dict__, "msg": message, "args": None, "exc_info": None, "created": time.time(), "about": {}}
+    )
+
+
+def _log_unexpected(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """An error that nobody handled, as one object a line like everything else."""
+    log.critical("unexpected: %s", error or kind.__name__, exc_info=(kind, error, trace))

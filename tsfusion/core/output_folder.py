@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: MIT
+"""The folder a run leaves behind: whole, or not there."""
+
+import fcntl
+import os
+import secrets
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from tsfusion.core.errors import OutputError
+
+RECORD = "run.json"
+
+
+@contextmanager
+def building(out: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary folder whose files move to the folder `out` when the block ends without an error.
+
+    A new `out` appears in one rename. In an existing one each file replaces its namesake and everything else
+    stays; its old `run.json` goes first and the new one comes last, so a `run.json` always describes its
+    neighbours. An error leaves nothing, no parent folder either; what a killed run left goes with the next.
+
+    Raises:
+        OutputError: at once, when `out` cannot be written.
+    """
+    out = Path(out).expanduser().absolute()
+    if os.path.exists(out) and not out.is_dir():
+        raise OutputError(f"cannot write to {out}: it is not a folder")
+    with _parents(out), _workplace(out) as work:
+        yield work
+        _move(work, out)
+
+
+@contextmanager
+def _parents(out: Path) -> Iterator[None]:
+    """The folders above `out`; those made here go when the block fails and nothing else came into them."""
+    missing = [parent for parent in out.parents if not os.path.exists(parent)]  # innermost first
+    try:
+        try:
+            out.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot write to {out}: {error.strerror}") from error
+        yield
+    except BaseException:
+        for parent in missing:
+            with suppress(OSError):
+                parent.rmdir()
+        raise
+
+
+@contextmanager
+def _workplace(out: Path) -> Iterator[Path]:
+    """A folder on the file system of `out`, locked while the block runs: inside `out` if that exists."""
+    prefix = f".{out.name}.partial-"
+    for place in (out, out.parent):
+        _sweep(place, prefix)
+    work = (out if out.is_dir() else out.parent) / (prefix + secrets.token_hex(4))
+    try:
+        work.mkdir()
+        lock = _lock(work)
+    except OSError as error:
+        raise OutputError(f"cannot write to {out}: {error.strerror}") from error
+    try:
+        yield work
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+        os.close(lock)
+
+
+def _lock(folder: Path) -> int:
+    """A handle that holds the folder until it is closed, by us or by our death; raises OSError."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(handle)
+        raise
+    return handle
+
+
+def _sweep(place: Path, prefix: str) -> None:
+    """Remove the work folders whose owner is dead."""
+    with suppress(OSError):
+        for path in [path for path in place.iterdir() if path.name.startswith(prefix)]:
+            with suppress(OSError):  # somebody is at work there, or it is not ours to remove
+                lock = _lock(path)
+                shutil.rmtree(path, ignore_errors=True)
+                os.close(lock)
+
+
+def _move(work: Path, out: Path) -> None:
+    try:
+        if not out.exists():
+            work.rename(out)
+            return
+        (out / RECORD).unlink(missing_ok=True)
+        for path in sorted(work.iterdir(), key=lambda path: path.name == RECORD):
+            path.replace(out / path.name)
+    except OSError as error:
+        raise OutputError(f"cannot write to {out}: {error.strerror}") from error
+
+
+def check_writable(path: str | os.PathLike[str], endings: tuple[str, ...]) -> None:
+    """Raise OutputError unless a file could be made at `path` and it ends so; leaves nothing there."""
+    path = Path(path)
+    if path.suffix.lower() not in endings:
+        raise OutputError(f"cannot write {path}: expected a name ending in {', '.join(endings)}")
+    try:
+        with tempfile.NamedTemporaryFile(prefix=f".{path.name}.", dir=path.parent):
+            pass
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    if path.is_dir():
+        raise OutputError(f"cannot write {path}: it is a folder")

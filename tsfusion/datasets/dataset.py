@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: MIT
+"""What a dataset is, and how its files are read with one clear error each."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError, InvalidKeyframe
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import Keyframe
+
+SCAN = "`tsfusion scan --source PATH` finds poses by itself"
+_T = TypeVar("_T")
+
+
+@runtime_checkable
+class Dataset(Protocol):
+    """Keyframes by index: what `replay` needs, and all it needs.
+
+    One that a localizer can follow has `frame(index)` too, as `Frames` gives it.
+
+    Attributes:
+        name: what to call it in a report.
+        sensor: name of the sensor model (`kinect`, `tof`, `stereo`, `lidar`).
+        timestamps_ns: (n,) int64 nanoseconds of the sensor's clock; None where none were recorded.
+        skipped: frames left out at opening, by reason.
+    """
+
+    name: str
+    sensor: str
+    timestamps_ns: NDArray[np.int64] | None
+    skipped: dict[str, int]
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> Keyframe: ...
+
+    def __iter__(self) -> Iterator[Keyframe]: ...
+
+
+class Frames(ABC):
+    """Indexing and iteration over `_frame(index)`; files are opened there, not before."""
+
+    name: str
+    sensor: str
+    timestamps_ns: NDArray[np.int64] | None = None
+    skipped: dict[str, int]
+    _poses: Sequence[NDArray[np.float64] | None] = ()
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def _frame(self, index: int) -> Frame: ...
+
+    def frame(self, index: int) -> Frame:
+        """The measurement alone; `T_world_camera` where the recording has a pose for it."""
+        index = self._checked(index)
+        try:
+            return self._frame(index)
+        except InvalidKeyframe as error:
+            raise DatasetError(f"keyframe {index} of {self.name}: {error}") from error
+
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        """(4, 4) T_world_camera as recorded, None where it is not; no image is read where that can be."""
+        index = self._checked(index)
+        return self._poses[index] if self._poses else self.frame(index).T_world_camera
+
+    def __getitem__(self, index: int) -> Keyframe:
+        frame = self.frame(index)
+        if frame.T_world_camera is None:
+            raise DatasetError(f"frame {self._checked(index)} of {self.name} has no pose; {SCAN}")
+        return frame.keyframe(frame.T_world_camera)
+
+    def __iter__(self) -> Iterator[Keyframe]:
+        return (self[index] for index in range(len(self)))
+
+    def _checked(self, index: int) -> int:
+        count = len(self)
+        if not -count <= index < count:
+            raise IndexError(f"{self.name} has {count} keyframes, got index {index}")
+        return index % count
+
+    def _stamp(self, index: int) -> int:
+        return 0 if self.timestamps_ns is None else int(self.timestamps_ns[index])
+
+
+class Selection(Frames):
+    """Some keyframes of another dataset, in the order given; `select` makes one.
+
+    Has the other's `distance` where it has one: the measure of a world whose surface is known.
+    """
+
+    distance: Callable[[NDArray[np.floating]], NDArray[np.float64]]
+
+    def __init__(self, dataset: Dataset, indices: Sequence[int]) -> None:
+        self.name, self.sensor, self.skipped = dataset.name, dataset.sensor, dataset.skipped
+        self._dataset, self._indices = dataset, list(indices)
+        if hasattr(dataset, "distance"):
+            self.distance = dataset.distance
+        if dataset.timestamps_ns is not None:
+            self.timestamps_ns = dataset.timestamps_ns[self._indices]
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def pose(self, index: int) -> NDArray[np.float64] | None:
+        return pose_of(self._dataset, self._indices[self._checked(index)])
+
+    def _frame(self, index: int) -> Frame:
+        return frame_of(self._dataset, self._indices[index])
+
+    def __getitem__(self, index: int) -> Keyframe:
+        return self._dataset[self._indices[self._checked(index)]]
+
+
+def frame_of(dataset: Dataset, index: int) -> Frame:
+    """Frame `index` of any dataset: without its pose's help where the dataset has frames of its own."""
+    own: Callable[[int], Frame] | None = getattr(dataset, "frame", None)
+    return own(index) if own is not None else Frame.of(dataset[index], dataset.sensor)
+
+
+def pose_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:
+    """Frame `index`'s (4, 4) T_world_camera as recorded, of any dataset; None where there is none."""
+    own: Callable[[int], NDArray[np.float64] | None] | None = getattr(dataset, "pose", None)
+    return own(index) if own is not None else dataset[index].T_world_camera
+
+
+def kept(
+    files: Sequence[_T],
+    poses: Sequence[NDArray[np.float64] | None],
+    *,
+    posed: bool,
+    skipped: dict[str, int],
+    reason: str = "without a pose",
+) -> tuple[list[_T], list[NDArray[np.float64] | None]]:
+    """The frames to offer: with `posed` only those with a pose; the others are counted in `skipped`."""
+    pairs = [pair for pair in zip(files, poses, strict=True) if pair[1] is not None or not posed]
+    if len(pairs) < len(files):
+        skipped[reason] = skipped.get(reason, 0) + len(files) - len(pairs)
+    return [file for file, _ in pairs], [pose for _, pose in pairs]
+
+
+def select(
+    dataset: Dataset, *, start: int = 0, stop: int | None = None, stride: int = 1, limit: int | None = None
+) -> Selection:
+    """Every `stride`-th keyframe of `dataset[start:stop]`, at most `limit` of them.
+
+    Raises:
+        DatasetError: when none is left.
+    """
+    if stride < 1:
+        raise DatasetError(f"stride must be >= 1, got {stride}")
+    if limit is not None and limit < 1:
+        raise DatasetError(f"limit must be >= 1, got {limit}")
+    indices = range(len(dataset))[start:stop:stride][:limit]
+    if not indices:
+        kept = f"after the first {start}" if stop is None else f"from {start} up to {stop}"
+        raise DatasetError(f"{dataset.name} has {len(dataset)} keyframes, none {kept}")
+    return Selection(dataset, indices)
+
+
+def folder(path: str | Path, layout: str) -> Path:
+    """`path` as an existing folder."""
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise DatasetError(f"{path} does not exist; expected a folder in the {layout} layout")
+    if not path.is_dir():
+        raise DatasetError(f"{path} is not a folder; expected a folder in the {layout} layout")
+    return path
+
+
+def require_frames(count: int, path: Path, expected: str, skipped: dict[str, int]) -> None:
+    """Raise unless at least one frame is left."""
+    if count:
+        return
+    reasons = "; ".join(f"{number} {reason}" for reason, number in skipped.items() if number)
+    raise DatasetError(
+        f"{path} holds no usable frames; expected {expected}" + (f" ({reasons})" if reasons else "")
+    )
+
+
+NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a second

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Public recordings: where they are, fetched and checked."""

@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: MIT
+"""Fetching a recording of the catalogue: checked, resumable, unpacked whole or not at all.
+
+pooch checks what has come; the bytes come by `fetching`, which goes on where it was interrupted.
+"""
+
+import logging
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tsfusion.core.errors import DatasetError, MissingDependency, OutputError
+from tsfusion.datasets.download import archives, http
+from tsfusion.datasets.download.catalogue import File, Recording
+from tsfusion.datasets.download.http import Watcher
+
+_INSTALL = "downloads need pooch; install it with: pip install 'tsfusion[download]'"
+ENDING = ".sha256"
+
+
+class Checked(NamedTuple):
+    """One file of a recording.
+
+    Attributes:
+        sha256: of what is there.
+        known: whether a checksum was known before; otherwise this one has been recorded beside it.
+        fetched: whether it came just now.
+    """
+
+    path: Path
+    sha256: str
+    known: bool
+    fetched: bool
+
+
+class Fetched(NamedTuple):
+    """A recording on the disk; `path` is what to open. Archives that were removed are not in `files`."""
+
+    path: Path
+    files: list[Checked]
+
+
+def fetch(recording: Recording, to: Path, watch: Watcher, *, base: str | None = None) -> Fetched:
+    """Have a recording in `to`: its archives, and the folder `to/NAME` they are unpacked to.
+
+    Args:
+        base: of a mirror, that has the files by their names.
+
+    Raises:
+        MissingDependency: without pooch.
+        DatasetError: it has to be fetched by hand, cannot be fetched, or is not what it should be.
+        OutputError: it cannot be written.
+    """
+    if not recording.files:
+        raise DatasetError(f"{recording.title}: {recording.note}: {recording.page}")
+    folder = to / recording.name
+    files = []
+    for file in recording.files:
+        path = to / file.name
+        if path.exists() or not folder.exists():
+            files.append(_have(file, path, watch, base))
+    if not folder.exists():
+        _unpack(recording, to, folder)
+    return Fetched(folder / recording.opens if recording.opens else folder, files)
+
+
+def check(recording: Recording, to: Path) -> list[Checked]:
+    """The files of a recording that are in `to`, each compared with the checksum known of it.
+
+    Raises:
+        DatasetError: one is not what it was.
+    """
+    paths = [(file, to / file.name) for file in recording.files]
+    return [_verified(file, path) for file, path in paths if path.exists()]
+
+
+def _have(file: File, path: Path, watch: Watcher, base: str | None) -> Checked:
+    if path.exists():
+        return _verified(file, path)
+    url = f"{base.rstrip('/')}/{file.name}" if base else file.url
+    known = _known(file, path)
+    _retrieve(url, path, known, watch)
+    return _recorded(path, known=known is not None, fetched=True)
+
+
+def _retrieve(url: str, path: Path, known: str | None, watch: Watcher) -> None:
+    pooch = _pooch()
+    part = path.with_name(f"{path.name}.part")
+
+    def downloader(url: str, output: str, _pooch: object) -> None:
+        http.download(url, part, watch)
+        part.replace(output)
+
+    try:
+        pooch.retrieve(url, known_hash=known, fname=path.name, path=path.parent, downloader=downloader)
+    except ValueError as error:
+        raise DatasetError(
+            f"{url} is not what it should be, and was not kept: expected {known} (a changed or a broken "
+            "file, or not the same one)"
+        ) from error
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def _pooch() -> Any:
+    try:
+        import pooch
+    except ImportError as error:
+        raise MissingDependency(_INSTALL) from error
+    pooch.get_logger().setLevel(logging.ERROR)
+    return pooch
+
+
+def _known(file: File, path: Path) -> str | None:
+    """The checksum of the catalogue, or the one recorded when it was first seen."""
+    if file.checksum is not None:
+        return file.checksum
+    try:
+        words = path.with_name(path.name + ENDING).read_text(encoding="ascii").split()
+    except (OSError, UnicodeDecodeError):
+        return None
+    return f"sha256:{words[0]}" if words else None
+
+
+def _verified(file: File, path: Path) -> Checked:
+    known = _known(file, path)
+    if known is not None:
+        kind, _, expected = known.partition(":")
+        found = _hash(path, kind)
+        if found != expected.lower():
+            raise DatasetError(
+                f"{path} is not what it should be: {kind} {found}, expected {expected}; remove it (and "
+                f"{path.name}{ENDING} if it was meant to change) to fetch it again"
+            )
+    return _recorded(path, known=known is not None, fetched=False)
+
+
+def _recorded(path: Path, *, known: bool, fetched: bool) -> Checked:
+    """The file with its checksum, which is put down beside it as `sha256sum --check` reads it."""
+    sha256 = _hash(path, "sha256")
+    beside = path.with_name(path.name + ENDING)
+    try:
+        if not beside.exists():
+            beside.write_text(f"{sha256}  {path.name}\n", encoding="ascii")
+    except OSError as error:
+        raise OutputError(f"cannot write {beside}: {error.strerror}") from error
+    return Checked(path, sha256, known, fetched)
+
+
+def _hash(path: Path, kind: str) -> str:
+    try:
+        return str(_pooch().file_hash(str(path), alg=kind)).lower()
+    except OSError as error:
+        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
+
+
+def _extract(archive: Path, into: Path) -> None:
+    try:
+        archives.extract(archive, into, nested=True)
+    except DatasetError as error:
+        raise DatasetError(f"{error}; remove {archive} to fetch it again") from error
+
+
+def _unpack(recording: Recording, to: Path, folder: Path) -> None:
+    try:
+        with tempfile.TemporaryDirectory(prefix=".unpacking-", dir=to) as place:
+            partial = Path(place) / folder.name
+            partial.mkdir()
+            for file in recording.files:
+                if archives.is_archive(Path(file.name)):
+                    _extract(to / file.name, partial / file.into)
+                else:
+                    shutil.copyfile(to / file.name, partial / file.name)
+            partial.rename(folder)
+    except OSError as error:
+        raise OutputError(f"cannot unpack to {folder}: {error.strerror or error}") from error

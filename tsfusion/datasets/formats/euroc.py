@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: MIT
+"""EuRoC micro aerial vehicle recordings, and others in the ASL layout: stereo pairs with a body's poses."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
+from tsfusion.datasets.dataset import SCAN, Frames, folder, kept, require_frames
+from tsfusion.datasets.readers import read_image, read_lines
+from tsfusion.datasets.trajectory_files import read_euroc
+from tsfusion.geometry.calibration import Rectifier
+from tsfusion.geometry.calibration_files import read_rig, read_tree
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import check_pose
+from tsfusion.geometry.trajectory import Pose, Trajectory
+
+EXPECTED = "mav0/{cam0,cam1}/{data.csv,sensor.yaml,data/*.png} and mav0/state_groundtruth_estimate0/data.csv"
+_TRUTH = "state_groundtruth_estimate0/data.csv"
+_NO_HALF = "without their other half"
+
+
+def recognises(path: Path) -> bool:
+    """Whether the folder has `mav0/cam0/data.csv`, or is `mav0` itself."""
+    return any((root / "cam0" / "data.csv").is_file() for root in (path / "mav0", path))
+
+
+class EuRoC(Frames):
+    """Stereo pairs in the ASL layout, undistorted and rectified by `sensor.yaml`.
+
+    https://projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets. Frames are grey pairs in the
+    axes of the rectified left camera; `radial-tangential` and `equidistant` lenses. The ground truth is of
+    the body: a frame's pose is T_world_body · T_BS · T_cam0_rectified, interpolated at the left image's
+    stamp. Images without their other half (not listed, or listed and not there) are left out and counted.
+
+    Args:
+        path: the sequence's folder (it holds `mav0`), or `mav0`.
+        max_difference_s: between the two stamps of a pair, seconds.
+        max_gap_s: between the two poses interpolated, seconds; across a longer gap there is no pose.
+        time_offset_s: added to an image's stamp before its pose is looked up, seconds.
+        posed: leave out pairs without a pose; else they are kept, with `T_world_camera` None.
+
+    Raises:
+        DatasetError: no such folder, no pairs, a malformed line, a calibration that cannot be used.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        max_difference_s: float = 0.002,
+        max_gap_s: float = 0.1,
+        time_offset_s: float = 0.0,
+        sensor: str = "stereo",
+        color: bool = True,
+        posed: bool = True,
+    ) -> None:
+        root = folder(path, "EuRoC")
+        place = root / "mav0" if (root / "mav0").is_dir() else root
+        self.name, self.sensor, self.skipped = f"EuRoC {place.absolute().parent.name}", sensor, {}
+        pairs = _pairs(place, round(max_difference_s * 1e9), self.skipped)
+        require_frames(len(pairs), place, EXPECTED, self.skipped)
+        self._rectifier, T_body_camera = _calibrated(place)
+        trajectory = _trajectory(place, required=posed)
+        gap, offset = round(max_gap_s * 1e9), round(time_offset_s * 1e9)
+        poses = [_pose(trajectory, stamp + offset, gap, T_body_camera) for stamp, _, _ in pairs]
+        self._pairs, self._poses = kept(
+            pairs, poses, posed=posed, skipped=self.skipped, reason="without a pose in time"
+        )
+        require_frames(len(self._pairs), place, EXPECTED, self.skipped)
+        self.timestamps_ns = np.array([stamp for stamp, _, _ in self._pairs], dtype=np.int64)
+        self.intrinsics, self.baseline_fx = self._rectifier.intrinsics, self._rectifier.baseline_fx
+        self._with_color = color
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def _frame(self, index: int) -> Frame:
+        _, left_file, right_file = self._pairs[index]
+        try:
+            left, right = self._rectifier.pair(_grey(left_file), _grey(right_file))
+        except InvalidConfig as error:
+            raise DatasetError(f"{left_file} or its right image: {error}") from error
+        return Frame(
+            left=left,
+            right=right,
+            baseline_fx=self.baseline_fx,
+            intrinsics=self.intrinsics,
+            color=np.repeat(left[:, :, None], 3, axis=2) if self._with_color else None,
+            T_world_camera=self._poses[index],
+            sensor=self.sensor,
+            timestamp_ns=self._stamp(index),
+        )
+
+
+def _pairs(place: Path, max_difference_ns: int, skipped: dict[str, int]) -> list[tuple[int, Path, Path]]:
+    """(left's stamp, left, right) of images that are there and near in time; a right image serves once."""
+    left, right = (_listed(place / camera) for camera in ("cam0", "cam1"))
+    stamps = np.array([stamp for stamp, _ in right], dtype=np.int64)
+    pairs: list[tuple[int, Path, Path]] = []
+    taken: set[int] = set()
+    for stamp, file in left:
+        nearest = int(np.abs(stamps - stamp).argmin()) if len(stamps) else -1
+        near = nearest >= 0 and abs(int(stamps[nearest]) - stamp) <= max_difference_ns
+        if near and nearest not in taken:
+            taken.add(nearest)
+            pairs.append((stamp, file, right[nearest][1]))
+    there = [pair for pair in pairs if pair[1].is_file() and pair[2].is_file()]
+    alone = max(len(left), len(right)) - len(there)
+    if alone:
+        skipped[_NO_HALF] = alone
+    return there
+
+
+def _listed(camera: Path) -> list[tuple[int, Path]]:
+    path, content = camera / "data.csv", "`ns,file` a line"
+    images = []
+    for number, line in read_lines(path, content):
+        words = [word.strip() for word in line.split(",")]
+        if len(words) != 2 or not words[0].isdecimal() or int(words[0]) >= 2**63:
+            raise DatasetError(f"{path}:{number}: {line!r}; expected {content}")
+        images.append((int(words[0]), camera / "data" / words[1]))
+    return sorted(images)
+
+
+def _calibrated(place: Path) -> tuple[Rectifier, Pose]:
+    """The rectification, and T_body_rectified of the left camera."""
+    files = [place / camera / "sensor.yaml" for camera in ("cam0", "cam1")]
+    try:
+        rectifier = Rectifier(read_rig(*files))
+        T_BS = np.array(read_tree(files[0])["T_BS"]["data"], dtype=np.float64)
+        return rectifier, check_pose(T_BS.reshape(4, 4)) @ rectifier.T_left_rectified
+    except (InvalidConfig, InvalidKeyframe, KeyError, TypeError, ValueError) as error:
+        raise DatasetError(f"{files[0]} and cam1's: {error}") from error
+
+
+def _trajectory(place: Path, *, required: bool) -> Trajectory | None:
+    path = place / _TRUTH
+    if path.exists():
+        return read_euroc(path)
+    if required:
+        raise DatasetError(f"{path} is missing; expected `ns,px,py,pz,qw,qx,qy,qz,…` a line; {SCAN}")
+    return None
+
+
+def _pose(trajectory: Trajectory | None, stamp_ns: int, max_gap_ns: int, T_body_camera: Pose) -> Pose | None:
+    T_world_body = None if trajectory is None else trajectory.at(stamp_ns, max_gap_ns=max_gap_ns)
+    return None if T_world_body is None else T_world_body @ T_body_camera
+
+
+def _grey(path: Path) -> NDArray[np.uint8]:
+    image = read_image(path, "a grey image")
+    if image.dtype != np.uint8:
+        raise DatasetError(f"{path} must be an 8-bit image, got {image.dtype}")
+    if image.ndim == 3:
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    grey: NDArray[np.uint8] = np.ascontiguousarray(image)
+    return grey

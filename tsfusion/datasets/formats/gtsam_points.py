@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: MIT
+"""Keyframes of a LiDAR map with their pose graph, as gtsam_points has them."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import SCAN, Frames, folder, kept, require_frames
+from tsfusion.datasets.readers import numbers, read_lines
+from tsfusion.datasets.trajectory_files import check_quaternion
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.trajectory import Pose, rigid
+
+EXPECTED = "NNNNNN/points.bin (float32 x, y, z) and graph.txt (`vK tx ty tz qx qy qz qw` a line)"
+_BYTES = 12  # a point
+
+
+def recognises(path: Path) -> bool:
+    """Whether the folder has numbered folders with `points.bin`."""
+    return any(file.parent.name.isdecimal() for file in path.glob("*/points.bin"))
+
+
+class LidarDump(Frames):
+    """Clouds in the LiDAR's axes with the pose of each in the world's.
+
+    https://github.com/koide3/gtsam_points, `data/kitti_07_dump`. Folder K belongs to line `vK`; other lines
+    (edges) are ignored. No timestamps.
+
+    Args:
+        posed: leave out clouds without a pose; else they are kept, with `T_world_camera` None.
+
+    Raises:
+        DatasetError: no such folder, no clouds, a malformed line or file.
+    """
+
+    def __init__(self, path: str | Path, *, sensor: str = "lidar", posed: bool = True) -> None:
+        root = folder(path, "LiDAR keyframes")
+        self.name, self.sensor, self.skipped = f"LiDAR keyframes {root.name}", sensor, {}
+        files = [file for file in sorted(root.glob("*/points.bin")) if file.parent.name.isdecimal()]
+        graph = _read_graph(root / "graph.txt", required=posed)
+        self._files, self._poses = kept(
+            files, [graph.get(int(file.parent.name)) for file in files], posed=posed, skipped=self.skipped
+        )
+        require_frames(len(self._files), root, EXPECTED, self.skipped)
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def _frame(self, index: int) -> Frame:
+        return Frame(
+            points=_read_points(self._files[index]), T_world_camera=self._poses[index], sensor=self.sensor
+        )
+
+
+def _read_graph(path: Path, *, required: bool) -> dict[int, Pose]:
+    if not path.exists():
+        if required:
+            raise DatasetError(f"{path} is missing; expected {EXPECTED}; {SCAN}")
+        return {}
+    content = "`vK tx ty tz qx qy qz qw` a line"
+    poses = {}
+    for number, line in read_lines(path, content):
+        name, *words = line.split()
+        if not name.startswith("v"):
+            continue
+        if not name[1:].isdecimal():
+            raise DatasetError(f"{path}:{number}: {name!r}; expected {content}")
+        values = np.array(numbers(path, number, words, 7, content))
+        check_quaternion(values[3:], path, number)
+        poses[int(name[1:])] = rigid(values[3:] / np.linalg.norm(values[3:]), values[:3])
+    return poses
+
+
+def _read_points(path: Path) -> NDArray[np.float32]:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
+    if not content or len(content) % _BYTES:
+        raise DatasetError(f"{path} has {len(content)} bytes; expected 12 a point: float32 x, y, z")
+    return np.frombuffer(content, dtype="<f4").reshape(-1, 3).astype(np.float32)

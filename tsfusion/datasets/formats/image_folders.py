@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: MIT
+"""Depth images in one folder, colour images of the same names in another: common to many layouts."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import Frames
+from tsfusion.datasets.readers import checked_intrinsics, read_color, read_depth
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.trajectory import Pose
+
+SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+class DepthImages(Frames):
+    """A depth image a frame, with colour and a pose where there are any.
+
+    Args:
+        depth: files of 16-bit depth.
+        color: as many, None where there is no colour; or an empty list.
+        poses: as many.
+        depth_scale: metres per unit.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        sensor: str,
+        depth: Sequence[Path],
+        color: Sequence[Path | None],
+        poses: Sequence[Pose | None],
+        intrinsics: Intrinsics,
+        skipped: dict[str, int],
+        depth_scale: float = 0.001,
+        timestamps_ns: NDArray[np.int64] | None = None,
+    ) -> None:
+        self.name, self.sensor, self.skipped, self.intrinsics = name, sensor, skipped, intrinsics
+        self.depth_scale, self.timestamps_ns = depth_scale, timestamps_ns
+        self._depth, self._color, self._poses = depth, color, poses
+        self._size: tuple[int, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self._depth)
+
+    def _frame(self, index: int) -> Frame:
+        depth = read_depth(self._depth[index])
+        self._size = self._size or depth.shape
+        if depth.shape != self._size:
+            raise DatasetError(
+                f"{self._depth[index]} is {depth.shape[1]}×{depth.shape[0]}, others are "
+                f"{self._size[1]}×{self._size[0]}; expected one size, as there is one camera"
+            )
+        color = self._color[index] if self._color else None
+        return Frame(
+            depth=depth,
+            depth_scale=self.depth_scale,
+            color=None if color is None else self._registered(color, depth),
+            intrinsics=self.intrinsics,
+            T_world_camera=self._poses[index],
+            sensor=self.sensor,
+            timestamp_ns=self._stamp(index),
+        )
+
+    def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
+        """The colour of each depth pixel."""
+        return read_color(color, depth.shape)
+
+
+def seen_by(
+    color: NDArray[np.uint8], own: Intrinsics, other: Intrinsics, shape: tuple[int, ...]
+) -> NDArray[np.uint8]:
+    """An image resampled for another camera in the same place: (h, w, 3) uint8 → (*shape, 3).
+
+    Shrinking averages; beyond the image its border is repeated.
+    """
+    factor = other.fx / own.fx
+    if factor < 1:
+        size = [max(1, round(pixels * factor)) for pixels in (color.shape[1], color.shape[0])]
+        factor_x, factor_y = size[0] / color.shape[1], size[1] / color.shape[0]
+        color = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
+        own = Intrinsics(
+            own.fx * factor_x,
+            own.fy * factor_y,
+            (own.cx + 0.5) * factor_x - 0.5,
+            (own.cy + 0.5) * factor_y - 0.5,
+        )
+    x, y = own.fx / other.fx, own.fy / other.fy
+    affine = np.array([[x, 0, own.cx - x * other.cx], [0, y, own.cy - y * other.cy]])
+    seen: NDArray[np.uint8] = cv2.warpAffine(
+        color,
+        affine,
+        (shape[1], shape[0]),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return seen
+
+
+def images(where: Path, expected: str, pattern: str = "[!.]*") -> list[Path]:
+    """The images in a folder: by number where all names are numbers, else by name; no hidden ones (macOS)."""
+    if not where.is_dir():
+        raise DatasetError(f"{where} is missing; expected {expected}")
+    found = sorted(path for path in where.glob(pattern) if path.suffix.lower() in SUFFIXES)
+    return sorted(found, key=lambda path: int(path.stem)) if _numbered(found) else found
+
+
+def read_open3d_camera(path: Path) -> Intrinsics:
+    """Intrinsics of Open3D's `camera_intrinsic.json`."""
+    try:
+        K = json.loads(path.read_text(encoding="utf-8"))["intrinsic_matrix"]  # column-major
+        return checked_intrinsics(Intrinsics(float(K[0]), float(K[4]), float(K[6]), float(K[7])), path)
+    except (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
+        raise DatasetError(
+            f"{path} must be an Open3D camera with a 9-number intrinsic_matrix: {error}"
+        ) from error
+
+
+def matched(depth: list[Path], where: Path, expected: str) -> list[Path]:
+    """The colour image of each depth image, by file name."""
+    by_stem = {path.stem: path for path in images(where, expected)}
+    for image in depth:
+        if image.stem not in by_stem:
+            raise DatasetError(
+                f"{where / image.stem}.png or .jpg is missing, but {image} is there; expected {expected}"
+            )
+    return [by_stem[image.stem] for image in depth]
+
+
+def by_number(files: list[Path], poses: list[tuple[int, Pose]], source: Path) -> list[Pose | None]:
+    """Each image's pose: the k-th one's where there are as many, else by the number that is its name."""
+    if len(files) == len(poses):
+        return [pose for _, pose in poses]
+    if not _numbered(files):
+        raise DatasetError(
+            f"{source} has {len(poses)} poses for {len(files)} depth images, "
+            "whose names are not frame numbers; "
+            "expected as many poses as images, or images named by frame number"
+        )
+    found = dict(poses)
+    return [found.get(int(path.stem)) for path in files]
+
+
+def _numbered(files: list[Path]) -> bool:
+    return all(path.stem.isdecimal() for path in files)

@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: MIT
+"""KITTI odometry: rectified grey stereo pairs or Velodyne scans, with poses.
+
+Files are read by pykitti's readers, but chosen here: pykitti pairs files by their place in a sorted list,
+so that one missing image shifts all later ones unnoticed. A file's name is its frame number, and a frame's
+pose and time are the lines of that number.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError, InvalidKeyframe
+from tsfusion.datasets.dataset import Frames, folder, kept, require_frames
+from tsfusion.datasets.readers import checked_intrinsics, read_lines
+from tsfusion.datasets.trajectory_files import nanoseconds, read_kitti
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import Intrinsics, check_pose
+from tsfusion.geometry.trajectory import Pose
+
+EXPECTED = "sequences/NN/{calib.txt,times.txt,image_0,image_1,velodyne} and poses/NN.txt"
+_COLUMNS = 12  # numbers of a 3×4 matrix
+
+
+def recognises(path: Path) -> bool:
+    """Whether the folder is the benchmark's root or one of its sequences."""
+    return any((path / "sequences").glob("*/calib.txt")) or _is_sequence(path)
+
+
+def open_kitti(
+    root: str | Path,
+    *,
+    sequence: str | None = None,
+    modality: str | None = None,
+    poses: str | Path | None = None,
+    color: bool = True,
+    posed: bool = True,
+) -> "KITTI":
+    """Open the root or a sequence's own folder; sequence and modality may be left out where one exists."""
+    root = Path(root)
+    if sequence is None and _is_sequence(root):
+        root, sequence = root.resolve().parents[1], root.resolve().name
+    if sequence is None:
+        sequence = _only_sequence(root)
+    if modality is None:
+        modality = "stereo" if (root / "sequences" / sequence / "image_0").is_dir() else "lidar"
+    return KITTI(root, sequence, modality=modality, poses=poses, color=color, posed=posed)
+
+
+class Drive(Frames):
+    """Stereo pairs or Velodyne scans of the KITTI car, by frame number."""
+
+    intrinsics: Intrinsics | None
+    baseline_fx: float | None
+    _frames: list[int]
+    _poses: list[Pose | None]
+    _left: dict[int, Path]  # or the scans
+    _right: dict[int, Path]
+    _with_color: bool
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def _frame(self, index: int) -> Frame:
+        number = self._frames[index]
+        common: dict[str, Any] = {
+            "T_world_camera": self._poses[index],
+            "sensor": self.sensor,
+            "timestamp_ns": self._stamp(index),
+        }
+        if self.sensor == "lidar":
+            return Frame(points=read_scan(self._left[number]), **common)
+        left, right = read_pair(self._left[number], self._right[number])
+        return Frame(
+            left=left,
+            right=right,
+            baseline_fx=self.baseline_fx,
+            intrinsics=self.intrinsics,
+            color=self._color(number, left) if self._with_color else None,
+            **common,
+        )
+
+    def _color(self, number: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(H, W, 3) uint8 BGR of the left camera: here the grey image."""
+        return np.repeat(left[:, :, None], 3, axis=2)
+
+
+class KITTI(Drive):
+    """One sequence as stereo disparity (`modality="stereo"`) or as Velodyne scans (`"lidar"`).
+
+    Stereo: the left camera's frame, disparity in 1/16 px by semi-global matching at each access; colour is
+    the grey image. LiDAR: points in the Velodyne's axes (x forward, z up), pose inv(Tr)·P·Tr; scans are as
+    recorded, not corrected for the car's motion.
+
+    Args:
+        root: the benchmark's folder, holding `sequences/` and `poses/`.
+        sequence: "00" … "21".
+        poses: another poses file in KITTI's format, from here or from `root`; default `poses/NN.txt`.
+        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
+
+    Raises:
+        DatasetError: no such folder, files or calibration; unequal image pairs; a malformed line.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        sequence: str,
+        modality: str = "stereo",
+        poses: str | Path | None = None,
+        *,
+        color: bool = True,
+        posed: bool = True,
+    ) -> None:
+        if modality not in ("stereo", "lidar"):
+            raise DatasetError(f"modality of KITTI must be stereo or lidar, got {modality!r}")
+        root = folder(root, "KITTI odometry")
+        place = folder(root / "sequences" / sequence, "KITTI odometry (sequences/NN)")
+        self.name, self.sensor, self.skipped = f"KITTI {sequence} {modality}", modality, {}
+        self._left, self._right = _stereo_files(place) if modality == "stereo" else (_scan_files(place), {})
+        calibration = _read_calibration(
+            place / "calib.txt", ("P0", "P1") if modality == "stereo" else ("Tr",)
+        )
+        trajectory = _trajectory(root, sequence, poses, posed=posed)
+        self._frames, found = kept(
+            list(self._left), [trajectory.get(n) for n in self._left], posed=posed, skipped=self.skipped
+        )
+        require_frames(len(self._frames), place, EXPECTED, self.skipped)
+        self.timestamps_ns = _read_times(place / "times.txt", self._frames)
+        self._with_color = color
+        if modality == "stereo":
+            self.intrinsics, self.baseline_fx = _stereo_camera(calibration, place / "calib.txt")
+        else:
+            T_cam0_velo = _transform(calibration["Tr"], place / "calib.txt")
+            T_velo_cam0 = np.linalg.inv(T_cam0_velo)
+            found = [None if T is None else T_velo_cam0 @ T @ T_cam0_velo for T in found]
+        self._poses = found
+
+
+def _is_sequence(path: Path) -> bool:
+    return (path / "calib.txt").is_file() and path.resolve().parent.name == "sequences"
+
+
+def _only_sequence(root: Path) -> str:
+    places = sorted(path.parent for path in (root / "sequences").glob("*/calib.txt"))
+    found = [path.name for path in places if (path / "image_0").is_dir() or (path / "velodyne").is_dir()]
+    if len(found) != 1:
+        raise DatasetError(
+            f"{root} holds {len(found)} KITTI sequences with data ({', '.join(found)}); "
+            "name one with --sequence, or give its own path"
+        )
+    return found[0]
+
+
+def numbered(place: Path, suffix: str) -> dict[int, Path]:
+    """Frame number → file, in order."""
+    files = sorted(place.glob(f"*{suffix}"))
+    for path in files:
+        if not path.stem.isdigit():
+            raise DatasetError(f"{path} is not named by a frame number; expected NNNNNN{suffix}")
+    return {int(path.stem): path for path in files}
+
+
+def _stereo_files(place: Path) -> tuple[dict[int, Path], dict[int, Path]]:
+    left, right = numbered(place / "image_0", ".png"), numbered(place / "image_1", ".png")
+    if not left or not right:
+        raise DatasetError(f"{place} has {len(left)} left and {len(right)} right images; expected {EXPECTED}")
+    alone = sorted(left.keys() ^ right.keys())
+    if alone:
+        side = "image_1" if alone[0] in left else "image_0"
+        raise DatasetError(
+            f"{place / side / f'{alone[0]:06d}.png'} is missing: "
+            f"{len(left)} left and {len(right)} right images, {len(alone)} without their other half; "
+            "expected pairs of equal name"
+        )
+    return left, right
+
+
+def _scan_files(place: Path) -> dict[int, Path]:
+    scans = numbered(place / "velodyne", ".bin")
+    if not scans:
+        raise DatasetError(f"{place / 'velodyne'} has no scans (*.bin); expected {EXPECTED}")
+    return scans
+
+
+def _trajectory(root: Path, sequence: str, poses: str | Path | None, *, posed: bool) -> dict[int, Pose]:
+    """Frame number → pose; without `posed` the benchmark's own file may be missing, as it is from 11 on."""
+    path = root / "poses" / f"{sequence}.txt"
+    if poses is not None:
+        path = Path(poses) if Path(poses).is_file() else root / poses
+    elif not posed and not path.exists():
+        return {}
+    return dict(enumerate(read_kitti(path)))
+
+
+def _read_calibration(path: Path, wanted: tuple[str, ...]) -> Mapping[str, NDArray[np.float64]]:
+    import pykitti.utils  # a second to import: pandas and matplotlib come with it
+
+    lines = read_lines(path, f"KITTI's calibration with the lines {', '.join(wanted)}")
+    for number, line in lines:
+        if ":" not in line:
+            raise DatasetError(f"{path}:{number}: {line!r}; expected `name: 12 numbers`")
+    try:
+        found: dict[str, NDArray[np.float64]] = pykitti.utils.read_calib_file(path)
+    except ValueError as error:
+        raise DatasetError(f"{path}: {error}; expected `name: 12 numbers` a line") from error
+    for name in wanted:
+        values = found.get(name)
+        if values is None or len(values) != _COLUMNS or not np.isfinite(values).all():
+            state = "no" if values is None else f"no usable ({len(values)} numbers)"
+            raise DatasetError(f"{path} has {state} line {name}; expected `{name}:` and 12 finite numbers")
+    return found
+
+
+def _stereo_camera(calibration: Mapping[str, NDArray[np.float64]], path: Path) -> tuple[Intrinsics, float]:
+    P0, P1 = calibration["P0"].reshape(3, 4), calibration["P1"].reshape(3, 4)
+    baseline_fx = float(P0[0, 3] - P1[0, 3])
+    if baseline_fx <= 0:
+        raise DatasetError(
+            f"{path}: P1 must lie to the right of P0 (P1[0,3] < P0[0,3]), got {-baseline_fx} px·m"
+        )
+    camera = Intrinsics(float(P0[0, 0]), float(P0[1, 1]), float(P0[0, 2]), float(P0[1, 2]))
+    return checked_intrinsics(camera, path), baseline_fx
+
+
+def _transform(row: NDArray[np.float64], path: Path) -> Pose:
+    try:
+        return check_pose(np.vstack([row.reshape(3, 4), (0, 0, 0, 1)]))
+    except InvalidKeyframe as error:
+        raise DatasetError(f"{path}: Tr: {error}") from error
+
+
+def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
+    """Nanoseconds of each frame, by line number; None where the file is absent."""
+    if not path.exists():
+        return None
+    stamps = [
+        nanoseconds(line, path, number) for number, line in read_lines(path, "seconds, one frame a line")
+    ]
+    if frames[-1] >= len(stamps):
+        raise DatasetError(
+            f"{path} has {len(stamps)} lines, but there is a frame {frames[-1]}; expected a line a frame"
+        )
+    return np.array([stamps[number] for number in frames], dtype=np.int64)
+
+
+def read_pair(left_file: Path, right_file: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Two (H, W) grey images of one size."""
+    left, right = _read_grey(left_file), _read_grey(right_file)
+    if left.shape != right.shape:
+        raise DatasetError(
+            f"{right_file} has shape {right.shape}, its left image {left.shape}; expected equal sizes"
+        )
+    return left, right
+
+
+def _read_grey(path: Path) -> NDArray[np.uint8]:
+    """(H, W), a colour image's luminance."""
+    import pykitti.utils
+    from PIL import Image
+
+    try:
+        return np.asarray(pykitti.utils.load_image(path, "L"), dtype=np.uint8)
+    except (OSError, SyntaxError, Image.DecompressionBombError) as error:  # a broken PNG is either of two
+        raise DatasetError(f"{path} cannot be decoded; expected a grey image ({error})") from error
+
+
+def read_scan(path: Path) -> NDArray[np.float32]:
+    """(n, 3) metres in the Velodyne's axes, without the reflectance."""
+    import pykitti.utils
+
+    try:
+        scan: NDArray[np.float32] = pykitti.utils.load_velo_scan(path)
+    except (OSError, ValueError) as error:
+        raise DatasetError(
+            f"{path} is not a Velodyne scan; expected float32 x, y, z, reflectance ({error})"
+        ) from error
+    if not len(scan):
+        raise DatasetError(f"{path} is empty; expected float32 x, y, z, reflectance")
+    return np.ascontiguousarray(scan[:, :3])

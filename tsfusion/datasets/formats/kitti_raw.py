@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: MIT
+"""KITTI's raw recordings: rectified stereo pairs or Velodyne scans, with poses of the GPS/IMU unit.
+
+Calibration and GPS packets are read by pykitti's functions; files are chosen here, by the frame number in
+their names: `pykitti.raw` goes by their place in a sorted list, and several drives lack some scans.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError, InvalidKeyframe
+from tsfusion.datasets.dataset import folder, kept, require_frames
+from tsfusion.datasets.formats.kitti import Drive, numbered
+from tsfusion.datasets.readers import checked_intrinsics, read_color, read_lines, read_numbers
+from tsfusion.geometry.keyframe import Intrinsics, check_pose
+from tsfusion.geometry.se3 import inverse
+from tsfusion.geometry.trajectory import Pose
+
+EXPECTED = "DATE/DATE_drive_NNNN_sync/{image_00..03,velodyne_points,oxts}/data and DATE/calib_*.txt"
+_CAMERAS = {"grey": ("00", "01"), "color": ("02", "03")}
+_PACKET = 30  # numbers of an oxts line
+
+
+def recognises(path: Path) -> bool:
+    """Whether it is a drive, or a day's folder that holds some."""
+    return _is_drive(path) or bool(_drives(path))
+
+
+class KITTIRaw(Drive):
+    """One synchronised and rectified drive (`…_sync`) as stereo disparity or as Velodyne scans.
+
+    https://www.cvlibs.net/datasets/kitti/raw_data.php. A frame's pose comes from the GPS/IMU packet of its
+    number: east, north, up from the drive's first packet; stereo is posed at the left camera, LiDAR at the
+    Velodyne. Scans are as recorded, not corrected for the car's motion.
+
+    Args:
+        path: the drive's folder, or the day's where it holds one drive.
+        modality: `stereo` or `lidar`; default stereo where there are images.
+        cameras: `grey` (image_00, image_01) or `color` (image_02, image_03); default grey where it is there.
+        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
+
+    Raises:
+        DatasetError: no such folder, files or calibration; an unsynchronised drive; a malformed line.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        modality: str | None = None,
+        cameras: str | None = None,
+        color: bool = True,
+        posed: bool = True,
+    ) -> None:
+        if modality not in (None, "stereo", "lidar") or cameras not in (None, *_CAMERAS):
+            raise DatasetError(
+                "modality of KITTI raw must be stereo or lidar, cameras grey or color, "
+                f"got {modality!r} and {cameras!r}"
+            )
+        drive = _only_drive(folder(path, "KITTI raw"))
+        chosen = _cameras(drive, cameras)
+        if modality is None:
+            modality = "stereo" if (drive / f"image_{chosen[0]}").is_dir() else "lidar"
+        self.name, self.sensor, self.skipped = f"KITTI raw {drive.name} {modality}", modality, {}
+        left, self._right = _files(drive, modality, chosen, self.skipped)
+        require_frames(len(left), drive, EXPECTED, self.skipped)
+        body = _imu_poses(drive / "oxts" / "data", required=posed)
+        rig = _rig(drive.parent, None if modality == "lidar" else chosen, imu=bool(body))
+        poses = [body[n] @ rig.T_imu_sensor if n in body else None for n in left]
+        self._frames, self._poses = kept(list(left), poses, posed=posed, skipped=self.skipped)
+        require_frames(len(self._frames), drive, EXPECTED, self.skipped)
+        self._left, self._colored, self._with_color = left, chosen[0] == "02", color
+        self.intrinsics, self.baseline_fx = rig.intrinsics, rig.baseline_fx
+        times = (
+            drive / (f"image_{chosen[0]}" if modality == "stereo" else "velodyne_points") / "timestamps.txt"
+        )
+        self.timestamps_ns = _read_times(times, self._frames)
+
+    def _color(self, number: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return read_color(self._left[number], left.shape) if self._colored else super()._color(number, left)
+
+
+class _Rig(NamedTuple):
+    T_imu_sensor: Pose
+    intrinsics: Intrinsics | None = None
+    baseline_fx: float | None = None
+
+
+def _rig(day: Path, cameras: tuple[str, str] | None, *, imu: bool) -> _Rig:
+    """The pinhole model of a pair, and where its left camera (without `cameras`, the Velodyne) sits.
+
+    Args:
+        imu: without it nobody asks where; then the calibration of the GPS/IMU unit may be missing.
+    """
+    T_velo_imu = _rigid(day / "calib_imu_to_velo.txt") if imu else np.eye(4)
+    if cameras is None:
+        return _Rig(inverse(T_velo_imu))
+    T_cam0_velo = _rigid(day / "calib_velo_to_cam.txt") if imu else np.eye(4)
+    path = day / "calib_cam_to_cam.txt"
+    found = _read_calibration(path, {"R_rect_00": 9, **{f"P_rect_{camera}": 12 for camera in cameras}})
+    left, right = (found[f"P_rect_{camera}"].reshape(3, 4) for camera in cameras)
+    rectified, shift = np.eye(4), np.eye(4)
+    rectified[:3, :3] = found["R_rect_00"].reshape(3, 3)
+    shift[0, 3] = left[0, 3] / left[0, 0]  # the camera's place beside camera 0
+    T_imu_camera = inverse(_checked(shift @ rectified @ T_cam0_velo @ T_velo_imu, path))
+    K = Intrinsics(*map(float, (left[0, 0], left[1, 1], left[0, 2], left[1, 2])))
+    baseline_fx = float(left[0, 3] - right[0, 3])
+    if baseline_fx <= 0:
+        raise DatasetError(f"{path}: P_rect_{cameras[1]} must lie to the right of P_rect_{cameras[0]}")
+    return _Rig(T_imu_camera, checked_intrinsics(K, path), baseline_fx)
+
+
+def _is_drive(path: Path) -> bool:
+    sensors = ("image_00", "image_02", "velodyne_points")
+    return "_drive_" in path.name and any((path / sensor / "data").is_dir() for sensor in sensors)
+
+
+def _drives(day: Path) -> list[Path]:
+    return sorted(path for path in day.glob("*_drive_*") if _is_drive(path))
+
+
+def _only_drive(path: Path) -> Path:
+    path = path.absolute()
+    drives = [path] if _is_drive(path) else _drives(path)
+    if len(drives) != 1:
+        names = ", ".join(drive.name for drive in drives)
+        raise DatasetError(f"{path} holds {len(drives)} KITTI drives ({names}); give the path of one")
+    if drives[0].name.endswith("_extract"):
+        raise DatasetError(
+            f"{drives[0]} is not rectified; expected the drive's synchronised and rectified …_sync"
+        )
+    return drives[0]
+
+
+def _cameras(drive: Path, cameras: str | None) -> tuple[str, str]:
+    if cameras is None:
+        grey = (drive / "image_00").is_dir() or not (drive / "image_02").is_dir()
+        cameras = "grey" if grey else "color"
+    return _CAMERAS[cameras]
+
+
+def _files(
+    drive: Path, modality: str, cameras: tuple[str, str], skipped: dict[str, int]
+) -> tuple[dict[int, Path], dict[int, Path]]:
+    """Frame number → left image or scan, and → right image; pairs alone are left out and counted."""
+    if modality == "lidar":
+        return numbered(drive / "velodyne_points" / "data", ".bin"), {}
+    left, right = (numbered(drive / f"image_{camera}" / "data", ".png") for camera in cameras)
+    alone = left.keys() ^ right.keys()
+    if alone:
+        skipped["without their other half"] = len(alone)
+    both = left.keys() & right.keys()
+    return {n: file for n, file in left.items() if n in both}, right
+
+
+def _imu_poses(place: Path, *, required: bool) -> dict[int, Pose]:
+    """Frame number → T_world_imu, by pykitti's Mercator projection; the first packet is the origin."""
+    from pykitti.utils import OxtsPacket, pose_from_oxts_packet
+
+    files = numbered(place, ".txt")
+    if required and not files:
+        raise DatasetError(f"{place} has no packets (*.txt); expected {EXPECTED}")
+    poses: dict[int, Pose] = {}
+    scale, origin = None, None
+    for number, file in files.items():
+        packet = OxtsPacket(*read_numbers(file, "30 numbers of a GPS/IMU packet", columns=_PACKET)[0])
+        scale = np.cos(np.radians(packet.lat)) if scale is None else scale
+        R, t = pose_from_oxts_packet(packet, scale)
+        origin = t if origin is None else origin
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, t - origin
+        poses[number] = T
+    return poses
+
+
+def _rigid(path: Path) -> Pose:
+    found = _read_calibration(path, {"R": 9, "T": 3})
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = found["R"].reshape(3, 3), found["T"]
+    return _checked(T, path)
+
+
+def _checked(T: Pose, path: Path) -> Pose:
+    try:
+        return check_pose(T)
+    except InvalidKeyframe as error:
+        raise DatasetError(f"{path}: {error}") from error
+
+
+def _read_calibration(path: Path, wanted: dict[str, int]) -> Mapping[str, NDArray[np.float64]]:
+    from pykitti.utils import read_calib_file
+
+    for number, line in read_lines(path, f"KITTI's calibration with the lines {', '.join(wanted)}"):
+        if ":" not in line:
+            raise DatasetError(f"{path}:{number}: {line!r}; expected `name: numbers`")
+    found: dict[str, NDArray[np.float64]] = read_calib_file(path)
+    for name, count in wanted.items():
+        values = found.get(name)
+        if values is None or len(values) != count or not np.isfinite(values).all():
+            raise DatasetError(
+                f"{path} has no usable line {name}; expected `{name}:` and {count} finite numbers"
+            )
+    return found
+
+
+def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:
+    """Nanoseconds since 1970 of each frame, by line number; None where the file is absent.
+
+    The clock is the car's, of no zone. A scan that is missing has an empty line.
+    """
+    if not path.exists():
+        return None
+    try:
+        lines = path.read_text(encoding="ascii").splitlines()
+        stamps = np.array([lines[number].strip().replace(" ", "T") for number in frames], "datetime64[ns]")
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{path}: {error}; expected `year-month-day hour:minute:second` a line") from error
+    except IndexError as error:
+        raise DatasetError(
+            f"{path} has {len(lines)} lines, but there is a frame {frames[-1]}; expected a line a frame"
+        ) from error
+    if np.isnat(stamps).any():
+        empty = frames[int(np.isnat(stamps).argmax())]
+        raise DatasetError(f"{path}:{empty + 1} is empty, but there is a frame {empty}")
+    nanoseconds: NDArray[np.int64] = stamps.astype(np.int64)
+    return nanoseconds

@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: MIT
+"""Captures described by a `transforms.json`: nerfstudio, instant-ngp, and the apps that export for them."""
+
+import json
+from dataclasses import dataclass
+from math import pi, tan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
+from tsfusion.datasets.dataset import Frames, kept, require_frames
+from tsfusion.datasets.formats.image_folders import seen_by
+from tsfusion.datasets.readers import read_color, read_image
+from tsfusion.geometry.calibration import Camera, Undistorter
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import check_pose
+from tsfusion.geometry.trajectory import Pose
+
+EXPECTED = "transforms.json with fl_x, cx, … and frames of file_path, depth_file_path, transform_matrix"
+DEPTH_SCALE = 0.001  # metres per unit, where the file does not say
+_LARGEST = 1e15
+_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes: OpenGL's y up, z back → OpenCV's
+_MODELS = {
+    "PINHOLE": (), "SIMPLE_PINHOLE": (), "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
+    "SIMPLE_RADIAL": ("k1", "k2", "p1", "p2", "k3"), "RADIAL": ("k1", "k2", "p1", "p2", "k3"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _View:
+    depth: Path
+    color: Path | None
+    size: tuple[int, int] | None  # (height, width) that the camera is given for; None = the images' own
+    camera: dict[str, Any]  # of the frame, over the capture's
+    where: str
+
+
+def recognises(path: Path) -> bool:
+    """Whether it is such a file, or a folder with a `transforms.json`."""
+    if path.is_file():
+        return path.suffix == ".json" and "transforms" in path.name
+    return (path / "transforms.json").is_file()
+
+
+class Nerfstudio(Frames):
+    """Frames with depth of a nerfstudio or instant-ngp capture.
+
+    https://docs.nerf.studio/quickstart/data_conventions.html. Poses are camera-to-world with OpenGL axes, in
+    `applied_scale` units a metre (default 1); pixel centres lie at halves. Depth is along the optical axis,
+    a 16-bit image (0 = none) or a `.npy`, of `depth_file_path` (nerfstudio) or `depth_path` (instant-ngp,
+    NeRFCapture). Distorted images are undistorted, depth by the nearest pixel. Where depth has another size
+    than colour, colour is resampled to it. No timestamps.
+
+    Args:
+        path: the folder, or the `.json` file in it.
+        depth_scale: metres per unit; default the file's `depth_unit_scale_factor` or `integer_depth_scale`,
+            else 0.001.
+        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
+
+    Raises:
+        DatasetError: no such file, no frame with depth, a missing image, a camera that cannot be used.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        depth_scale: float | None = None,
+        sensor: str = "kinect",
+        color: bool = True,
+        posed: bool = True,
+    ) -> None:
+        path = Path(path).expanduser()
+        file = path if path.is_file() else path / "transforms.json"
+        capture = _read(file)
+        self.name, self.sensor, self.skipped = f"nerfstudio {file.absolute().parent.name}", sensor, {}
+        self.depth_scale = _depth_scale(capture, file) if depth_scale is None else depth_scale
+        applied = _scale(capture, "applied_scale", file) if "applied_scale" in capture else 1.0
+        views, poses = [], []
+        for number, frame in enumerate(capture["frames"]):
+            where = f"{file}, frame {number}"
+            view = _view(file.parent, capture, frame, where, color=color)
+            if view is not None:
+                views.append(view)
+                poses.append(_pose(frame, applied, where))
+        if not views:
+            raise DatasetError(
+                f"{file} has {len(capture['frames'])} frames, none with depth_file_path or depth_path; "
+                "expected depth images: colour alone cannot be fused"
+            )
+        if len(views) < len(capture["frames"]):
+            self.skipped["without depth"] = len(capture["frames"]) - len(views)
+        self._views, self._poses = kept(views, poses, posed=posed, skipped=self.skipped)
+        require_frames(len(self._views), file, EXPECTED, self.skipped)
+        self._undistorters: dict[Camera, Undistorter] = {}
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def _frame(self, index: int) -> Frame:
+        view = self._views[index]
+        depth, scale = _read_depth(view.depth, self.depth_scale)
+        color = None if view.color is None else read_color(view.color, None)
+        size = view.size or (depth if color is None else color).shape[:2]
+        camera = _camera(view, size)
+        fitted = _resized(camera, depth.shape[:2], view.where)
+        if color is not None and color.shape != (*depth.shape, 3):
+            own = _resized(camera, color.shape[:2], view.where)
+            color = seen_by(color, own.intrinsics, fitted.intrinsics, depth.shape)
+        intrinsics = fitted.intrinsics
+        if fitted.model != "pinhole":
+            undistorter = self._undistorter(fitted)
+            intrinsics, depth = undistorter.intrinsics, undistorter.depth(depth)
+            color = None if color is None else undistorter.image(color)
+        return Frame(
+            depth=depth,
+            depth_scale=scale,
+            color=color,
+            intrinsics=intrinsics,
+            T_world_camera=self._poses[index],
+            sensor=self.sensor,
+        )
+
+    def _undistorter(self, camera: Camera) -> Undistorter:
+        if camera not in self._undistorters:
+            self._undistorters.clear()  # cameras of their own for each frame would fill the memory
+            self._undistorters[camera] = Undistorter(camera)
+        return self._undistorters[camera]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        capture = json.loads(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError as error:
+        raise DatasetError(f"{path} is missing; expected {EXPECTED}") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise DatasetError(f"{path} cannot be read: {error}; expected {EXPECTED}") from error
+    frames = capture.get("frames") if isinstance(capture, dict) else None
+    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+        raise DatasetError(f"{path} has no list of frames; expected {EXPECTED}")
+    found: dict[str, Any] = capture
+    return found
+
+
+def _view(
+    root: Path, capture: dict[str, Any], frame: dict[str, Any], where: str, *, color: bool
+) -> _View | None:
+    camera = {**capture, **frame}
+    depth = frame.get("depth_file_path") or frame.get("depth_path")
+    if not depth:
+        return None
+    size = None
+    if "w" in camera and "h" in camera:
+        size = (int(_number(camera, "h", where)), int(_number(camera, "w", where)))
+    listed = frame.get("file_path") if color else None
+    return _View(root / str(depth), _image(root / str(listed)) if listed else None, size, camera, where)
+
+
+def _image(path: Path) -> Path:
+    """Blender's captures leave the suffix out."""
+    return path if path.suffix or not path.with_suffix(".png").exists() else path.with_suffix(".png")
+
+
+def _pose(frame: dict[str, Any], applied_scale: float, where: str) -> Pose | None:
+    if frame.get("transform_matrix") is None:
+        return None
+    try:
+        matrix = np.array(frame["transform_matrix"], dtype=np.float64)
+        T = np.eye(4)
+        T[: len(matrix)] = matrix
+        T[:3, 3] /= applied_scale
+        return check_pose(T @ _OPENCV)
+    except (ValueError, TypeError, InvalidKeyframe) as error:
+        raise DatasetError(f"{where}: transform_matrix: {error}") from error
+
+
+def _camera(view: _View, size: tuple[int, ...]) -> Camera:
+    """The camera that a frame's keys give for images of (height, width) `size`."""
+    given, where = view.camera, view.where
+    model = str(given.get("camera_model", "OPENCV"))
+    if model not in _MODELS:
+        raise DatasetError(f"{where}: camera_model must be one of {', '.join(_MODELS)}, got {model!r}")
+    fx = _focal_length(given, "x", size[1], where)
+    if fx is None:
+        raise DatasetError(f"{where} has neither fl_x nor camera_angle_x; expected {EXPECTED}")
+    fy = _focal_length(given, "y", size[0], where) or fx
+    cx = _number(given, "cx", where) if "cx" in given else size[1] / 2
+    cy = _number(given, "cy", where) if "cy" in given else size[0] / 2
+    distortion = [_number(given, key, where) if key in given else 0.0 for key in _MODELS[model]]
+    kind = "fisheye" if model == "OPENCV_FISHEYE" else "radtan" if distortion else "pinhole"
+    try:
+        return Camera.named((fx, fy, cx - 0.5, cy - 0.5), (size[0], size[1]), kind, distortion)
+    except InvalidConfig as error:
+        raise DatasetError(f"{where}: {error}") from error
+
+
+def _focal_length(given: dict[str, Any], axis: str, side: int, where: str) -> float | None:
+    """Pixels, as given or by the angle of view over `side` pixels; None where there is neither."""
+    if f"fl_{axis}" in given:
+        return _number(given, f"fl_{axis}", where)
+    name = f"camera_angle_{axis}"
+    if name not in given:
+        return None
+    angle = _number(given, name, where)
+    if not 0 < angle < pi:
+        raise DatasetError(f"{where}: {name} must be radians between 0 and pi, got {angle}")
+    return side / 2 / tan(angle / 2)
+
+
+def _resized(camera: Camera, shape: tuple[int, ...], where: str) -> Camera:
+    """The camera for images of another size."""
+    if abs(shape[0] / camera.size[0] - shape[1] / camera.size[1]) > 0.01:
+        raise DatasetError(
+            f"{where}: image {shape[1]}×{shape[0]}, but camera {camera.size[1]}×{camera.size[0]}; "
+            "expected the same shape"
+        )
+    intrinsics = camera.intrinsics.scaled(shape[1] / camera.size[1])
+    return Camera(intrinsics, (shape[0], shape[1]), camera.model, camera.distortion)
+
+
+def _number(given: dict[str, Any], key: str, where: str) -> float:
+    value = given[key]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
+        raise DatasetError(f"{where}: {key} must be a number, got {value!r}")
+    return float(value)
+
+
+def _depth_scale(capture: dict[str, Any], file: Path) -> float:
+    for key in ("depth_unit_scale_factor", "integer_depth_scale"):
+        if key in capture:
+            return _scale(capture, key, file)
+    return DEPTH_SCALE
+
+
+def _scale(capture: dict[str, Any], key: str, file: Path) -> float:
+    scale = _number(capture, key, str(file))
+    if scale <= 0:
+        raise DatasetError(f"{file}: {key} must be > 0, got {scale}")
+    return scale
+
+
+def _read_depth(path: Path, scale: float) -> tuple[NDArray[Any], float]:
+    """Depth, and metres per unit: of `.npy`, metres."""
+    if path.suffix == ".npy":
+        try:
+            depth = np.array(
+                np.lib.format.open_memmap(path, mode="r")
+            )  # its size is compared with what is there
+        except (OSError, ValueError, EOFError) as error:
+            raise DatasetError(
+                f"{path} cannot be read; expected an (H, W) array of depth ({error})"
+            ) from error
+    else:
+        depth = read_image(path, "a depth image")
+        if depth.dtype == np.uint16 and depth.ndim == 2:
+            return depth, scale
+    if depth.ndim != 2 or depth.dtype.kind not in "fu" or depth.dtype == np.uint8:
+        raise DatasetError(
+            f"{path} must hold one channel of uint16 or floats, got shape {depth.shape} of {depth.dtype}"
+        )
+    return (depth * scale).astype(np.float32), 1.0

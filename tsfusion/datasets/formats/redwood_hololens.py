@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: MIT
+"""RGB-D folders with one pose file: HoloLens recordings and Redwood / Open3D reconstructions."""
+
+from pathlib import Path
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import SCAN, folder, kept, require_frames
+from tsfusion.datasets.formats.image_folders import (
+    DepthImages,
+    by_number,
+    images,
+    matched,
+    read_open3d_camera,
+)
+from tsfusion.datasets.readers import checked_intrinsics, read_intrinsics
+from tsfusion.datasets.trajectory_files import read_log, read_matrix_rows
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.trajectory import Pose
+
+HOLOLENS_EXPECTED = "K.txt, poses.txt, depth/*.png and images/*.png"
+REDWOOD_EXPECTED = "depth/*.png, image/, color/ or rgb/, and trajectory.log, odometry.log or *-traj.txt"
+PLAIN_EXPECTED = "depth/*.png and image/, color/ or rgb/, of equal names; without poses, so for a scan only"
+PRIMESENSE = Intrinsics(525.0, 525.0, 319.5, 239.5)  # Open3D's PrimeSenseDefault
+_LOGS = ("trajectory.log", "scene/trajectory.log", "odometry.log")  # by preference
+_LOG_NAMES = ("*traj*.log", "*-traj.txt")
+_COLOR = ("image", "color", "rgb")
+
+
+def recognises_hololens(path: Path) -> bool:
+    """Whether the folder has `K.txt`, `depth/`, and `poses.txt` or `images/`."""
+    if not (path / "K.txt").is_file() or not (path / "depth").is_dir():
+        return False
+    return (path / "poses.txt").is_file() or (path / "images").is_dir()
+
+
+def recognises_redwood(path: Path) -> bool:
+    """Whether the folder has depth images and a trajectory; or the file is a `.log` of such a folder."""
+    if path.is_file():
+        return path.suffix == ".log" and _root_of(path) is not None
+    return bool(_depth_folders(path)) and _log(path) is not None
+
+
+def recognises_plain(path: Path) -> bool:
+    """Whether the folder has one of depth images and one of colour images."""
+    return bool(_depth_folders(path)) and _color_folder(path) is not None
+
+
+class HoloLens(DepthImages):
+    """HoloLens RGB-D as in deep-video-mvs: line k of `poses.txt` belongs to the k-th image by name.
+
+    https://github.com/ardaduz/deep-video-mvs. Time-of-flight depth in uint16 millimetres, registered to
+    colour; no timestamps.
+
+    Args:
+        posed: `poses.txt` must be there; else frames come without a pose where it is not.
+
+    Raises:
+        DatasetError: no such folder, no frames, unequal numbers of images and poses, a malformed line.
+    """
+
+    def __init__(
+        self, path: str | Path, *, sensor: str = "tof", color: bool = True, posed: bool = True
+    ) -> None:
+        root = folder(path, "HoloLens")
+        depth = images(root / "depth", HOLOLENS_EXPECTED)
+        require_frames(len(depth), root / "depth", HOLOLENS_EXPECTED, {})
+        poses: list[Pose | None] = [None] * len(depth)
+        if posed or (root / "poses.txt").exists():
+            poses = [*read_matrix_rows(root / "poses.txt")]
+        if len(poses) != len(depth):
+            raise DatasetError(
+                f"{root / 'poses.txt'} has {len(poses)} poses for {len(depth)} depth images; "
+                "expected as many: line k belongs to the k-th image"
+            )
+        super().__init__(
+            f"HoloLens {root.name}",
+            sensor=sensor,
+            depth=depth,
+            color=matched(depth, root / "images", HOLOLENS_EXPECTED) if color else [],
+            poses=poses,
+            intrinsics=read_intrinsics(root / "K.txt"),
+            skipped={},
+        )
+
+
+class Redwood(DepthImages):
+    """Redwood's data sets and Open3D's reconstructions: a `.log` of poses, depth in uint16 millimetres.
+
+    http://redwood-data.org and Open3D's reconstruction system: `depth/` beside `image/`, `color/` or `rgb/`,
+    or Redwood's own `NAME-depth-clean/`, `NAME-color/`, `NAME-traj.txt`. With as many poses as images the
+    k-th pose is the k-th image's; otherwise a pose's number is its image's file name. Poses without an image
+    are ignored. No timestamps.
+
+    Args:
+        path: the folder, or the `.log` in it to take the poses from.
+        trajectory: default `trajectory.log`, `scene/trajectory.log`, `odometry.log` or the one file named
+            `*traj*.log` or `*-traj.txt`.
+        intrinsics: default `camera_intrinsic.json` or `intrinsic.json` (Open3D's) in the folder, else 525,
+            525, 319.5, 239.5.
+        depth_scale: metres per unit.
+        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
+
+    Raises:
+        DatasetError: no such folder, no frames, a missing image, a malformed trajectory.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        trajectory: str | Path | None = None,
+        intrinsics: Intrinsics | None = None,
+        depth_scale: float = 0.001,
+        sensor: str = "kinect",
+        color: bool = True,
+        posed: bool = True,
+    ) -> None:
+        path = Path(path).expanduser()
+        if path.is_file():
+            path, trajectory = _root_of(path) or path.parent, trajectory or path.absolute()
+        root = folder(path, "Redwood")
+        files = images(_depth_folder(root), REDWOOD_EXPECTED)
+        log = _log(root) if trajectory is None else _given(root, trajectory)
+        if log is None and posed:
+            raise DatasetError(f"{root} has no trajectory; expected {REDWOOD_EXPECTED}; {SCAN}")
+        skipped: dict[str, int] = {}
+        found = [None] * len(files) if log is None else by_number(files, read_log(log), log)
+        depth, poses = kept(files, found, posed=posed, skipped=skipped)
+        require_frames(len(depth), root, REDWOOD_EXPECTED, skipped)
+        where = _color_folder(root)
+        super().__init__(
+            f"Redwood {root.name}",
+            sensor=sensor,
+            depth=depth,
+            color=matched(depth, where, REDWOOD_EXPECTED) if color and where else [],
+            poses=poses,
+            intrinsics=checked_intrinsics(intrinsics or _open3d_intrinsics(root), "intrinsics"),
+            skipped=skipped,
+            depth_scale=depth_scale,
+        )
+
+
+def _root_of(log: Path) -> Path | None:
+    """The recording that a trajectory lies in: `scene/trajectory.log` is one folder down."""
+    log = log.absolute()
+    return next((place for place in (log.parent, log.parent.parent) if _depth_folders(place)), None)
+
+
+def _depth_folders(root: Path) -> list[Path]:
+    if (root / "depth").is_dir():
+        return [root / "depth"]
+    return sorted(path for path in root.glob("*-depth*") if path.is_dir())
+
+
+def _depth_folder(root: Path) -> Path:
+    found = _depth_folders(root)
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found)
+        raise DatasetError(f"{root} holds {len(found)} depth folders ({names}); name the one to use depth/")
+    return found[0] if found else root / "depth"
+
+
+def _color_folder(root: Path) -> Path | None:
+    places = [*(root / name for name in _COLOR), *sorted(root.glob("*-color"))]
+    return next((place for place in places if place.is_dir()), None)
+
+
+def _log(root: Path) -> Path | None:
+    known = [root / name for name in _LOGS if (root / name).is_file()]
+    named = [path for pattern in _LOG_NAMES for path in sorted(root.glob(pattern)) if path.is_file()]
+    return next((path for path in [*known, *named] if not path.name.startswith(".")), None)
+
+
+def _given(root: Path, trajectory: str | Path) -> Path:
+    return Path(trajectory) if Path(trajectory).is_file() else root / trajectory
+
+
+def _open3d_intrinsics(root: Path) -> Intrinsics:
+    names = ("camera_intrinsic.json", "intrinsic.json")
+    path = next((root / name for name in names if (root / name).exists()), None)
+    return PRIMESENSE if path is None else read_open3d_camera(path)

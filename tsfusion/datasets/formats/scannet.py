@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: MIT
+"""ScanNet scenes exported to folders."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import folder, kept, require_frames
+from tsfusion.datasets.formats.image_folders import DepthImages, images, matched, seen_by
+from tsfusion.datasets.readers import checked_intrinsics, read_color, read_lines, read_numbers
+from tsfusion.datasets.trajectory_files import read_matrix
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.trajectory import Pose
+
+EXPECTED = "color/N.jpg, depth/N.png, pose/N.txt and intrinsic/intrinsic_{depth,color}.txt"
+_PLACES = ("intrinsic/intrinsic_{}.txt", "intrinsics_{}.txt", "intrinsic_{}.txt")
+
+
+def recognises(path: Path) -> bool:
+    """Whether the folder has `depth/` and the depth camera's 4×4 matrix."""
+    return (path / "depth").is_dir() and _camera_file(path, "depth") is not None
+
+
+class ScanNet(DepthImages):
+    """A scene as ScanNet's SensReader exports it, or one of `scannet_frames_25k`.
+
+    http://www.scan-net.org. Depth in uint16 millimetres; the colour camera stands beside the depth camera
+    and has other pixels: colour is resampled by both cameras' matrices, as if they stood in one place.
+    Frames that the authors' tracker lost have poses of -inf: they count as frames without a pose. No
+    timestamps (nominally 30 Hz).
+
+    Args:
+        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
+
+    Raises:
+        DatasetError: no such folder, no frames, a missing image, a malformed pose or camera file.
+    """
+
+    def __init__(
+        self, path: str | Path, *, sensor: str = "kinect", color: bool = True, posed: bool = True
+    ) -> None:
+        root = folder(path, "ScanNet")
+        skipped: dict[str, int] = {}
+        files = images(root / "depth", EXPECTED)
+        depth, poses = kept(
+            files, [_pose(root / "pose" / f"{file.stem}.txt") for file in files], posed=posed, skipped=skipped
+        )
+        require_frames(len(depth), root, EXPECTED, skipped)
+        self.color_intrinsics = _intrinsics(root, "color") if color else None
+        super().__init__(
+            f"ScanNet {root.name}",
+            sensor=sensor,
+            depth=depth,
+            color=matched(depth, root / "color", EXPECTED) if color else [],
+            poses=poses,
+            intrinsics=_required(root),
+            skipped=skipped,
+        )
+
+    def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
+        if self.color_intrinsics is None:
+            return read_color(color, depth.shape)
+        return seen_by(read_color(color, None), self.color_intrinsics, self.intrinsics, depth.shape)
+
+
+def _camera_file(root: Path, camera: str) -> Path | None:
+    return next((root / p.format(camera) for p in _PLACES if (root / p.format(camera)).is_file()), None)
+
+
+def _intrinsics(root: Path, camera: str) -> Intrinsics | None:
+    path = _camera_file(root, camera)
+    if path is None:
+        return None
+    K = read_numbers(path, "a 4×4 or 3×3 camera matrix")
+    if K.shape not in ((4, 4), (3, 3)):
+        raise DatasetError(f"{path} must hold a 4×4 or 3×3 camera matrix, got {K.shape[0]}×{K.shape[1]}")
+    return checked_intrinsics(Intrinsics(*map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))), path)
+
+
+def _required(root: Path) -> Intrinsics:
+    intrinsics = _intrinsics(root, "depth")
+    if intrinsics is None:
+        raise DatasetError(f"{root / _PLACES[0].format('depth')} is missing; expected {EXPECTED}")
+    return intrinsics
+
+
+def _pose(path: Path) -> Pose | None:
+    if not path.exists():
+        return None
+    lost = any("inf" in line.lower() for _, line in read_lines(path, "a 4×4 camera-to-world matrix"))
+    return None if lost else read_matrix(path)

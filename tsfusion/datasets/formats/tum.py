@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: MIT
+"""TUM RGB-D recordings, and what shares their layout: CoRBS (pre-registered) and ICL-NUIM."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import SCAN, folder, kept, require_frames
+from tsfusion.datasets.formats.image_folders import DepthImages
+from tsfusion.datasets.formats.tum_lists import ASSOCIATIONS, read_recording
+from tsfusion.datasets.readers import checked_intrinsics, read_depth, read_intrinsics
+from tsfusion.datasets.trajectory_files import read_tum
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.trajectory import Pose
+
+EXPECTED = (
+    "groundtruth.txt or *.gt.freiburg, and the images that depth.txt and rgb.txt, or associations.txt, list"
+)
+DEPTH_SCALE = 1 / 5000  # metres per unit
+CALIBRATED_SIZE = (480, 640)  # height, width of the cameras below
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """Cameras of published recordings, told by the folder's name."""
+
+    name: str
+    folder: str  # regular expression, searched in the last two folder names
+    intrinsics: Intrinsics
+    sensor: str = "kinect"
+
+
+_CORBS = _Camera(
+    "CoRBS", r"corbs|pre[-_]?registered", Intrinsics(468.60, 468.61, 318.27, 243.99), sensor="tof"
+)
+_ICL = _Camera(
+    "ICL-NUIM",
+    r"icl[-_]?nuim|(living|office)_room_traj|traj\d\w?_(frei|loop)",
+    Intrinsics(481.2, -480.0, 319.5, 239.5),
+)
+_CAMERAS = (
+    _CORBS,
+    _ICL,
+    _Camera("TUM", r"freiburg1", Intrinsics(517.3, 516.5, 318.6, 255.3)),
+    _Camera("TUM", r"freiburg2", Intrinsics(520.9, 521.0, 325.1, 249.7)),
+    _Camera("TUM", r"freiburg3", Intrinsics(535.4, 539.2, 320.1, 247.6)),
+)
+_UNKNOWN = _Camera("TUM", "", Intrinsics(525.0, 525.0, 319.5, 239.5))  # the benchmark's ROS default
+
+
+def recognises(path: Path) -> bool:
+    """Whether the folder has `depth.txt` or one of the lists of pairs."""
+    return any((path / name).is_file() for name in ("depth.txt", *ASSOCIATIONS))
+
+
+class TUM(DepthImages):
+    """Lists of time-stamped images and a trajectory, associated by time.
+
+    Reads the lists (`timestamp path`) of https://cvg.cit.tum.de/data/datasets/rgbd-dataset and of CoRBS
+    (http://corbs.dfki.uni-kl.de: backslashes, CRLF), and ICL-NUIM's as published
+    (https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html: `associations.txt`, `*.gt.freiburg`). Each depth
+    image takes the nearest colour image and the pose interpolated at its own time; those without a colour
+    image are kept and counted in `uncolored`.
+
+    Args:
+        path: folder with `depth.txt` or `associations.txt`.
+        trajectory: default `groundtruth.txt` in the folder, or in a sibling `*_Trajectory` folder (CoRBS);
+            or `*.gt.freiburg` in the folder, or beside it under ICL-NUIM's own name.
+        intrinsics: default `camera-intrinsics.txt` or `K.txt` in the folder; else by the folder's name
+            (freiburg1-3, CoRBS, ICL-NUIM, scaled to the image size); else the benchmark's ROS default.
+        depth_scale: metres per unit.
+        max_difference_s: between a depth image and its colour image, seconds.
+        max_gap_s: between the two poses interpolated, seconds; across a longer gap there is no pose.
+        time_offset_s: added to an image's stamp before its pose is looked up, seconds.
+        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
+
+    Raises:
+        DatasetError: no such folder, no frames, a listed image is missing, a malformed line.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        trajectory: str | Path | None = None,
+        intrinsics: Intrinsics | None = None,
+        depth_scale: float = DEPTH_SCALE,
+        max_difference_s: float = 0.02,
+        max_gap_s: float = 0.1,
+        time_offset_s: float = 0.0,
+        sensor: str | None = None,
+        color: bool = True,
+        posed: bool = True,
+    ) -> None:
+        root = folder(path, "TUM RGB-D")
+        listed = read_recording(root, max_difference_ns=round(max_difference_s * 1e9))
+        camera = _camera(root, listed.windows)
+        skipped: dict[str, int] = {}
+        poses = _poses_at(
+            listed.timestamps_ns,
+            _trajectory(root, trajectory, posed=posed),
+            max_gap_ns=round(max_gap_s * 1e9),
+            offset_ns=round(time_offset_s * 1e9),
+        )
+        chosen, poses = kept(
+            range(len(poses)), poses, posed=posed, skipped=skipped, reason="without a pose in time"
+        )
+        require_frames(len(chosen), root, EXPECTED, skipped)
+        depth = [listed.depth[i] for i in chosen]
+        if intrinsics is None:
+            intrinsics = _intrinsics(root, camera, read_depth(depth[0]).shape)
+        super().__init__(
+            f"{camera.name} {root.name}",
+            sensor=sensor or camera.sensor,
+            depth=depth,
+            color=[listed.color[i] for i in chosen] if color and listed.color else [],
+            poses=poses,
+            intrinsics=checked_intrinsics(intrinsics, "intrinsics"),
+            skipped=skipped,
+            depth_scale=depth_scale,
+            timestamps_ns=np.array([listed.timestamps_ns[i] for i in chosen], dtype=np.int64),
+        )
+        self.uncolored = list(self._color).count(None)
+
+
+def _poses_at(
+    stamps_ns: list[int], trajectory: Path | None, *, max_gap_ns: int, offset_ns: int
+) -> list[Pose | None]:
+    if trajectory is None:
+        return [None] * len(stamps_ns)
+    poses = read_tum(trajectory)
+    return [poses.at(stamp + offset_ns, max_gap_ns=max_gap_ns) for stamp in stamps_ns]
+
+
+def _trajectory(root: Path, given: str | Path | None, *, posed: bool) -> Path | None:
+    if given is not None:
+        return Path(given) if Path(given).exists() else root / given
+    found = [path for path in (root / "groundtruth.txt", *_corbs(root), *_icl(root)) if path.is_file()]
+    if not found and posed:
+        raise DatasetError(
+            f"{root / 'groundtruth.txt'} is missing; expected `timestamp tx ty tz qx qy qz qw` a line "
+            f"(one elsewhere: --poses FILE, in Python trajectory=FILE); {SCAN}"
+        )
+    return found[0] if found else None
+
+
+def _corbs(root: Path) -> list[Path]:
+    """Several CoRBS recordings side by side: D1_pre_registereddata belongs to D1_Trajectory.
+
+    An archive that was unpacked into a folder of its own leaves it one level further up.
+    """
+    own = root.name.split("_")[0]
+    places = [place for up in root.absolute().parents[:2] for place in sorted(up.glob("*_Trajectory*"))]
+    return [
+        file
+        for place in places
+        if place.name.split("_")[0] == own
+        for file in (place / "groundtruth.txt", place / place.name / "groundtruth.txt")
+    ]
+
+
+def _icl(root: Path) -> list[Path]:
+    """`*.gt.freiburg` in the folder; or `livingRoom2.gt.freiburg` beside `living_room_traj2_frei_png`."""
+    number = re.search(r"traj(\d)", root.name)
+    if number is None:
+        return sorted(root.glob("[!.]*.gt.freiburg"))
+    room = "livingRoom" if "living" in root.name else "traj"
+    return [*sorted(root.glob("[!.]*.gt.freiburg")), root.parent / f"{room}{number[1]}.gt.freiburg"]
+
+
+def _camera(root: Path, windows: bool) -> _Camera:
+    names = "/".join(root.resolve().parts[-2:]).lower()
+    for camera in _CAMERAS:
+        if re.search(camera.folder, names):
+            return camera
+    if any(root.glob("*.gt.*")):
+        return _ICL
+    return _CORBS if windows else _UNKNOWN
+
+
+def _intrinsics(root: Path, camera: _Camera, shape: tuple[int, ...]) -> Intrinsics:
+    for name in ("camera-intrinsics.txt", "K.txt"):
+        if (root / name).exists():
+            return read_intrinsics(root / name)
+    scale = shape[1] / CALIBRATED_SIZE[1]
+    if shape[0] / CALIBRATED_SIZE[0] != scale:
+        raise DatasetError(
+            f"{root} has depth images of {shape[1]}×{shape[0]}, but the {camera.name} camera is known for "
+            "640×480 only; expected that shape, or a 3×3 matrix in camera-intrinsics.txt"
+        )
+    return camera.intrinsics.scaled(scale)

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: MIT
+"""Lists of time-stamped images in text files, as TUM's tools write them, and matching them by time."""
+
+from pathlib import Path, PureWindowsPath
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.readers import read_lines
+from tsfusion.datasets.trajectory_files import nanoseconds
+
+ASSOCIATIONS = ("associations.txt", "association.txt", "associated.txt")
+
+
+class Listed(NamedTuple):
+    """Images of a recording in time order.
+
+    Attributes:
+        timestamps_ns: of the depth images.
+        depth: their files.
+        color: as many, None where there is none near in time; empty where the recording has no colour.
+        windows: whether the paths were Windows paths.
+    """
+
+    timestamps_ns: list[int]
+    depth: list[Path]
+    color: list[Path | None]
+    windows: bool
+
+
+def read_recording(root: Path, *, max_difference_ns: int) -> Listed:
+    """`depth.txt` with `rgb.txt` where it exists, or a list of pairs in one of `ASSOCIATIONS` alone.
+
+    Raises:
+        DatasetError: a malformed line, an empty list, a listed image that is missing.
+    """
+    pairs = next((root / name for name in ASSOCIATIONS if (root / name).is_file()), None)
+    if pairs is not None and not (root / "depth.txt").exists():
+        return _read_pairs(pairs)
+    depth, windows = _read_list(root / "depth.txt")
+    stamps, files = [stamp for stamp, _ in depth], [path for _, path in depth]
+    if not (root / "rgb.txt").exists():
+        return Listed(stamps, files, [], windows)
+    color = _nearest(_read_list(root / "rgb.txt")[0], np.array(stamps, dtype=np.int64), max_difference_ns)
+    return Listed(stamps, files, color, windows)
+
+
+def _nearest(
+    listed: list[tuple[int, Path]], stamps_ns: NDArray[np.int64], max_difference_ns: int
+) -> list[Path | None]:
+    """The image nearest to each stamp, None where it is too far in time."""
+    own = np.array([stamp for stamp, _ in listed], dtype=np.int64)
+    nearest = [int(np.abs(own - stamp).argmin()) for stamp in stamps_ns]
+    near = np.abs(own[nearest] - stamps_ns) <= max_difference_ns
+    return [listed[i][1] if ok else None for i, ok in zip(nearest, near, strict=True)]
+
+
+def _read_list(path: Path) -> tuple[list[tuple[int, Path]], bool]:
+    """(timestamp_ns, image) in time order, and whether the paths were Windows paths."""
+    content = "`timestamp path` a line"
+    images: list[tuple[int, Path]] = []
+    windows = False
+    for number, line in read_lines(path, content):
+        words = line.split(maxsplit=1)
+        if len(words) != 2:
+            raise DatasetError(f"{path}:{number}: {line!r}; expected {content}")
+        windows |= "\\" in words[1]
+        images.append((nanoseconds(words[0], path, number), _beside(path, words[1])))
+    _check(path, [image for _, image in images], content)
+    return sorted(images), windows
+
+
+def _read_pairs(path: Path) -> Listed:
+    """`stamp path stamp path` (ICL-NUIM, TUM's `associate.py`); `depth` in a path tells which it is."""
+    content = "`timestamp depth/… timestamp rgb/…` a line, in either order"
+    rows: list[tuple[int, Path, Path]] = []
+    windows = False
+    for number, line in read_lines(path, content):
+        words = line.split()
+        if len(words) != 4 or ("depth" in words[1].lower()) == ("depth" in words[3].lower()):
+            raise DatasetError(f"{path}:{number}: {line!r}; expected {content}")
+        depth, color = (0, 2) if "depth" in words[1].lower() else (2, 0)
+        windows |= "\\" in line
+        stamp = nanoseconds(words[depth], path, number)
+        rows.append((stamp, _beside(path, words[depth + 1]), _beside(path, words[color + 1])))
+    _check(path, [file for row in rows for file in row[1:]], content)
+    rows.sort()
+    return Listed([row[0] for row in rows], [row[1] for row in rows], [row[2] for row in rows], windows)
+
+
+def _beside(path: Path, listed: str) -> Path:
+    return path.parent / PureWindowsPath(listed).as_posix()
+
+
+def _check(path: Path, images: list[Path], content: str) -> None:
+    if not images:
+        raise DatasetError(f"{path} lists no images; expected {content}")
+    missing = [image for image in images if not image.is_file()]
+    if missing:
+        raise DatasetError(
+            f"{missing[0]} is missing ({len(missing)} of {len(images)} images that {path} lists)"
+        )

@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: MIT
+"""Which layouts there are, and which one a path is in.
+
+Another package adds one by an entry point in the group `tsfusion.datasets` that names a `Layout`; it is asked
+before those here.
+"""
+
+import inspect
+import logging
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import Dataset
+from tsfusion.datasets.download import archives
+from tsfusion.datasets.formats import (
+    euroc,
+    gtsam_points,
+    kitti,
+    kitti_raw,
+    nerfstudio,
+    redwood_hololens,
+    replica,
+    scannet,
+    sevenscenes,
+    tum,
+)
+from tsfusion.datasets.rosbag import dataset as rosbag_dataset
+from tsfusion.geometry.keyframe import Intrinsics
+
+GROUP = "tsfusion.datasets"
+
+_log = logging.getLogger(__name__)
+_MAC = "__MACOSX"  # what macOS puts into archives beside the recording
+_TYPES = {
+    bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path",
+    Intrinsics: "four numbers, [fx, fy, cx, cy]",
+}  # fmt: skip
+_INDEX = (".txt", ".json", ".yaml", ".csv", ".freiburg")  # a file of these is taken for its folder
+
+
+class Layout(NamedTuple):
+    """A way recordings lie on disk.
+
+    Attributes:
+        name: as reports call it.
+        description: what is expected, one line.
+        recognises: whether a folder or a file is in this layout; quick, reads no images, raises nothing.
+        open: `open(path, **options)` → a dataset; takes `posed` where frames may lack a pose.
+    """
+
+    name: str
+    description: str
+    recognises: Callable[[Path], bool]
+    open: Callable[..., Dataset]
+
+
+class Found(NamedTuple):
+    """What `find` made of a path.
+
+    Attributes:
+        path: the folder or file to open: the one given, or the only dataset in it.
+        also: names of less specific layouts that fit too.
+    """
+
+    path: Path
+    layout: Layout
+    also: tuple[str, ...]
+
+    def open(self, **options: Any) -> Dataset:
+        """The dataset; options that are None are left out.
+
+        Raises:
+            DatasetError: naming what was found wrong, or an option that the layout does not have.
+        """
+        return opened(self.layout.name, self.layout.open, (self.path,), options)
+
+
+# The first that fits is taken: the more specific stand first.
+BUILT_IN = (
+    Layout("EuRoC", euroc.EXPECTED, euroc.recognises, euroc.EuRoC),
+    Layout("KITTI odometry", kitti.EXPECTED, kitti.recognises, kitti.open_kitti),
+    Layout("KITTI raw", kitti_raw.EXPECTED, kitti_raw.recognises, kitti_raw.KITTIRaw),
+    Layout("7-Scenes", sevenscenes.EXPECTED, sevenscenes.recognises, sevenscenes.SevenScenes),
+    Layout("ScanNet", scannet.EXPECTED, scannet.recognises, scannet.ScanNet),
+    Layout("Replica", replica.EXPECTED, replica.recognises, replica.Replica),
+    Layout("nerfstudio", nerfstudio.EXPECTED, nerfstudio.recognises, nerfstudio.Nerfstudio),
+    Layout("LiDAR keyframes", gtsam_points.EXPECTED, gtsam_points.recognises, gtsam_points.LidarDump),
+    Layout("TUM RGB-D", f"{tum.EXPECTED} (also CoRBS, ICL-NUIM)", tum.recognises, tum.TUM),
+    Layout("HoloLens", redwood_hololens.HOLOLENS_EXPECTED, redwood_hololens.recognises_hololens,
+           redwood_hololens.HoloLens),
+    Layout("Redwood", redwood_hololens.REDWOOD_EXPECTED, redwood_hololens.recognises_redwood,
+           redwood_hololens.Redwood),
+    Layout("ROS bag", rosbag_dataset.EXPECTED, rosbag_dataset.recognises, rosbag_dataset.Bag),
+)  # fmt: skip
+# Asked where none of those fits.
+PLAIN = (
+    Layout(
+        "RGB-D folders",
+        redwood_hololens.PLAIN_EXPECTED,
+        redwood_hololens.recognises_plain,
+        redwood_hololens.Redwood,
+    ),
+)
+SYNTHETIC = (
+    "synthetic",
+    "no files: synthetic:WORLD, or synthetic:WORLD:SENSOR; worlds: room (also -untextured, -plain, -bare), "
+    "street, corridor, rooms; sensors: kinect, stereo, lidar",
+)
+
+
+def layouts() -> list[Layout]:
+    """Every layout there is, in the order in which they are asked."""
+    return [*_plugins(), *BUILT_IN, *PLAIN]
+
+
+def find(path: str | Path, *, unpack: bool = False) -> Found:
+    """What a path is: a dataset's folder, a folder that holds exactly one, or a file that stands for one.
+
+    Args:
+        unpack: an archive is unpacked beside itself; else that is refused, with the command to type.
+
+    Raises:
+        DatasetError: naming the path and what would have been recognised.
+    """
+    root = Path(path).expanduser()
+    if not root.exists():
+        raise DatasetError(f"{root} does not exist; expected a dataset or synthetic:room, synthetic:street")
+    if root.is_file() and archives.is_archive(root):
+        root = _unpacked(root, unpack=unpack)
+    found = _match([root])
+    if not found and root.is_file():
+        found = _match([root.absolute().parent]) if root.suffix.lower() in _INDEX else []
+    elif not found:
+        found = _match(_folders_in(root))
+    if len(found) != 1:
+        raise DatasetError(_unrecognised(root, [place.path for place in found]))
+    if found[0].also:
+        _log.warning(
+            "%s is taken for %s; it fits %s too",
+            found[0].path, found[0].layout.name, ", ".join(found[0].also),
+        )  # fmt: skip
+    return found[0]
+
+
+def opened(
+    name: str, opener: Callable[..., Dataset], places: tuple[Path, ...], options: dict[str, Any]
+) -> Dataset:
+    """Call an opener with the options it has: `posed` is dropped where it has none, `poses` may be its
+    `trajectory`; another it does not have is a DatasetError, and one that is None is left out."""
+    options = {key: value for key, value in options.items() if value is not None}
+    known = list(inspect.signature(opener).parameters)[len(places) :]
+    if "posed" not in known:
+        options.pop("posed", None)
+    if "poses" not in known and "trajectory" in known and "poses" in options:
+        options["trajectory"] = options.pop("poses")
+    unknown = sorted(set(options) - set(known))
+    if unknown:
+        raise DatasetError(f"a {name} dataset takes no `{unknown[0]}`")
+    parameters = inspect.signature(opener).parameters
+    given = {key: _typed(key, value, parameters[key].annotation) for key, value in options.items()}
+    return opener(*places, **given)
+
+
+def _typed(key: str, value: Any, annotation: Any) -> Any:
+    """An option as its parameter wants it: a number may be a name, four numbers may be intrinsics.
+
+    Raises:
+        DatasetError: it cannot be that; a parameter whose type is none of `_TYPES` takes anything.
+    """
+    wanted = [kind for kind in get_args(annotation) or (annotation,) if kind is not type(None)]
+    if not all(kind in _TYPES for kind in wanted):
+        return value
+    if isinstance(value, tuple(wanted)) and isinstance(value, bool) == (bool in wanted):
+        return value
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if float in wanted:
+            return float(value)
+        if str in wanted:
+            return str(value)
+    if Intrinsics in wanted and isinstance(value, list | tuple) and len(value) == 4:
+        return Intrinsics(*value)
+    raise DatasetError(f"`{key}` must be {_TYPES[wanted[0]]}, got {value!r}")
+
+
+def describe(dataset: Dataset) -> str:
+    """One line: how many frames of what, their size, rate, and how many have a pose; reads one frame."""
+    from tsfusion.datasets.dataset import frame_of, pose_of
+
+    first = frame_of(dataset, 0)
+    words = {"pair": "stereo pairs", "points": "scans", "disparity": "disparity images"}
+    kind = words.get(first.kind) or ("depth images" if first.color is None else "RGB-D frames")
+    size = "" if first.kind == "points" else f" {first.shape[1]}×{first.shape[0]}"
+    stamps = dataset.timestamps_ns
+    rate = ""
+    if stamps is not None and len(stamps) > 1 and stamps[-1] > stamps[0]:
+        rate = f" at {(len(stamps) - 1) / (stamps[-1] - stamps[0]) * 1e9:.3g} Hz"
+    posed = sum(pose_of(dataset, index) is not None for index in range(len(dataset)))
+    poses = "no poses" if not posed else "all with poses" if posed == len(dataset) else f"poses for {posed}"
+    uncolored = getattr(dataset, "uncolored", 0)
+    color = f", {uncolored} without colour in time" if uncolored else ""
+    return f"{dataset.name}, {len(dataset)} {kind}{size}{rate}, {poses}{color}"
+
+
+def _unpacked(path: Path, *, unpack: bool) -> Path:
+    into = archives.destination(path)
+    if into.is_dir():
+        return into
+    if unpack:
+        return archives.unpack(path)
+    raise DatasetError(
+        f"{path} is an archive; unpack it with: {archives.command(path)}, then open {into} "
+        "(or let --unpack do so; in Python unpack=True)"
+    )
+
+
+def _match(places: Iterable[Path]) -> list[Found]:
+    ranked = [*_plugins(), *BUILT_IN]
+    found = []
+    for place in places:
+        fitting = [layout for layout in ranked if _recognises(layout, place)]
+        fitting = fitting or [layout for layout in PLAIN if layout.recognises(place)]
+        if fitting:
+            found.append(Found(place, fitting[0], tuple(layout.name for layout in fitting[1:])))
+    return found
+
+
+def _recognises(layout: Layout, place: Path) -> bool:
+    if layout in BUILT_IN:
+        return layout.recognises(place)
+    try:
+        return layout.recognises(place)
+    except Exception as error:  # noqa: BLE001 - another package's code
+        _log.warning("the layout %s failed to look at %s: %r", layout.name, place, error)
+        return False
+
+
+def _plugins() -> list[Layout]:
+    from importlib.metadata import entry_points
+
+    found = []
+    for point in entry_points(group=GROUP):
+        try:
+            name, description, recognises, opener = point.load()
+        except Exception as error:  # noqa: BLE001 - another package's code
+            _log.warning("the dataset layout %s = %s cannot be used: %r", point.name, point.value, error)
+        else:
+            found.append(Layout(name, description, recognises, opener))
+    return found
+
+
+def _folders_in(root: Path) -> list[Path]:
+    try:
+        return sorted(
+            child
+            for child in root.iterdir()
+            if child.is_dir() and not child.name.startswith(".") and child.name != _MAC
+        )
+    except OSError as error:
+        raise DatasetError(f"cannot read {root}: {error.strerror}") from error
+
+
+def _unrecognised(root: Path, several: list[Path]) -> str:
+    if several:
+        return f"{root} holds {len(several)} datasets; open one of them: {', '.join(map(str, several))}"
+    if root.suffix == ".sens":
+        return f"{root} is a ScanNet recording; export it to folders first with ScanNet's SensReader"
+    if root.is_file():
+        return (
+            f"{root} is not a folder, nor a file that stands for a dataset (an archive, a transforms.json, "
+            "a trajectory.log, a file of a recognised folder)"
+        )
+    known = ", ".join(layout.name for layout in layouts())
+    return f"{root} is in no layout known here: {known}; `tsfusion datasets` says what each expects"

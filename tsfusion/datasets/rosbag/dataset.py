@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: MIT
+"""ROS 1 bags, ROS 2 bags (SQLite or MCAP) and MCAP files as datasets, without ROS.
+
+Topics and poses are found by type and name, or told; `Bag` says how.
+"""
+
+import logging
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import Frames, require_frames
+from tsfusion.datasets.rosbag import messages
+from tsfusion.datasets.rosbag.messages import MILLIMETRES
+from tsfusion.datasets.rosbag.poses import PoseFinder, pose_streams
+from tsfusion.datasets.rosbag.reader import ENDINGS, Message, Place, Recording, is_journal, recording
+from tsfusion.datasets.rosbag.topics import Chooser, Modality, recorded_scale
+from tsfusion.geometry.depth_registration import Registration
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.trajectory import Pose
+
+log = logging.getLogger(__name__)
+
+EXPECTED = "a .bag, .mcap or .db3 file, or a folder with metadata.yaml: depth, stereo or points, and poses"
+_MODALITIES = ("depth", "stereo", "lidar")
+_DIFFERENCE_S = {"depth": 0.02, "stereo": 0.005, "lidar": 0.0}
+
+
+def recognises(path: Path) -> bool:
+    """Whether it is a ROS recording or a folder with one. A tsfusion journal, MCAP too, is none."""
+    return recording(path) is not None
+
+
+class Bag(Frames):
+    """Depth images, stereo pairs or point clouds of a ROS recording, in the order of their header stamps.
+
+    Colour goes with the depth image nearest in time; where it is not registered to it (in the same frame, or
+    `aligned`/`registered` in the depth topic's name), /tf_static and its CameraInfo register it here. Depth
+    without colour is kept and counted in `uncolored`. Poses come from
+    /tf where a transform between the sensor's frame and the root of its tree changes, else from odometry,
+    transform, pose or path messages, carried to the sensor by /tf_static. A time without poses around it
+    gives none. Broken messages, pairs that miss an image, and (`posed`) frames without a pose are counted in
+    `skipped`.
+
+    Opening reads the recording once; a frame is read from the disk at each access.
+
+    Args:
+        path: a file, or a folder with exactly one recording.
+        modality: `depth`, `stereo` or `lidar`; default the first of them that is there.
+        info_topic: CameraInfo of the images; default the one beside or above their topic.
+        pose_topic: default by type, as above.
+        world_frame: default the root of the sensor's tree, or the frame of the pose topic.
+        body_frame: the frame whose poses the pose topic tells; default its `child_frame_id`, or the sensor's.
+        intrinsics: instead of a CameraInfo's.
+        depth_scale: metres per unit of 16-bit depth; default 0.001 (REP 118), or as a RealSense recorded it.
+        rectified: whether the images are rectified, so that `P` is theirs; default where the topic's name
+            has `rect`. Others are undistorted or rectified here (colour by its depth's camera).
+        max_difference_s: between a depth image and its colour (default 20 ms), or left and right (5 ms).
+        max_gap_s: between the two poses interpolated, seconds.
+        time_offset_s: added to a frame's stamp before its pose is looked up, seconds.
+        posed: leave out frames without a pose; otherwise they have `T_world_camera` None.
+
+    Raises:
+        MissingDependency: without rosbags.
+        DatasetError: it cannot be read, or the topics cannot be chosen (the message lists them).
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        modality: Modality | None = None,
+        depth_topic: str | None = None,
+        color_topic: str | None = None,
+        info_topic: str | None = None,
+        points_topic: str | None = None,
+        left_topic: str | None = None,
+        right_topic: str | None = None,
+        pose_topic: str | None = None,
+        world_frame: str | None = None,
+        body_frame: str | None = None,
+        intrinsics: Intrinsics | None = None,
+        depth_scale: float | None = None,
+        rectified: bool | None = None,
+        max_difference_s: float | None = None,
+        max_gap_s: float = 0.25,
+        time_offset_s: float = 0.0,
+        sensor: str | None = None,
+        color: bool = True,
+        posed: bool = True,
+    ) -> None:
+        place = _place(Path(path).expanduser())
+        if modality not in (None, *_MODALITIES):
+            raise DatasetError(
+                f"modality of a ROS recording must be {', '.join(_MODALITIES)}; got {modality!r}"
+            )
+        self._recording = Recording(place)
+        topics = {
+            "depth_topic": depth_topic, "color_topic": color_topic, "info_topic": info_topic,
+            "points_topic": points_topic, "left_topic": left_topic, "right_topic": right_topic,
+        }  # fmt: skip
+        chosen = Chooser(self._recording, topics, intrinsics=intrinsics, rectified=rectified).choose(modality)
+        self._chosen = chosen
+        self.name, self.sensor, self.skipped = f"ROS {place.name}", sensor or chosen.sensor, {}
+        self._with_color = color
+        self.depth_scale = depth_scale or recorded_scale(self._recording, chosen.main) or MILLIMETRES
+        self.uncolored = 0
+        poses = PoseFinder(
+            place, chosen.frame, pose_streams(self._recording, pose_topic),
+            told=pose_topic is not None, world_frame=world_frame, body_frame=body_frame, max_gap_s=max_gap_s,
+        )  # fmt: skip
+        mains, others = self._index(poses)
+        difference_s = _DIFFERENCE_S[chosen.modality] if max_difference_s is None else max_difference_s
+        self._pair(mains, others, round(difference_s * 1e9))
+        self._pose(poses.finish(required=posed), round(time_offset_s * 1e9), posed)
+        self._registration = self._register(poses)
+        require_frames(len(self._mains), place, EXPECTED, self.skipped)
+
+    def __len__(self) -> int:
+        return len(self._mains)
+
+    def _index(self, poses: PoseFinder) -> tuple[dict[int, Place], dict[int, Place]]:
+        """Places by time of the main and the other messages, from one pass over the recording."""
+        chosen = self._chosen
+        used = [chosen.main] + ([chosen.other] if chosen.other and self._with_other else [])
+        check = _CHECKS.get(chosen.main.kind)
+        places: dict[str, list[Place]] = {one.topic: [] for one in used}
+        broken: Counter[str] = Counter()
+        for message in self._recording.messages([*used, *poses.streams]):
+            if not isinstance(message, Message):
+                broken[message.topic] += message in used
+            elif message.stream in used:
+                try:
+                    if check is not None and message.stream.kind == chosen.main.kind:
+                        check(message.content)
+                        chosen.check_size(message.stream, (message.content.height, message.content.width))
+                    places[message.stream.topic].append(message.place)
+                except DatasetError as error:
+                    broken[message.stream.topic] += 1
+                    log.debug("%s: %s %s", self._recording.path, message.stream.topic, error)
+            else:
+                poses.add(message)
+        for topic, count in broken.items():
+            if count:
+                self.skipped[f"of {topic} that are broken"] = count
+        found = [_by_time(places[one.topic]) for one in used]
+        if repeated := len(places[chosen.main.topic]) - len(found[0]):
+            self.skipped[f"of {chosen.main.topic} with another's time"] = repeated
+        return found[0], found[1] if len(found) > 1 else {}
+
+    @property
+    def _with_other(self) -> bool:
+        return self._with_color or self._chosen.modality == "stereo"
+
+    def _pair(self, mains: dict[int, Place], others: dict[int, Place], max_difference_ns: int) -> None:
+        """Give each main message the nearest other one."""
+        stamps = np.array(sorted(mains), dtype=np.int64)
+        there = np.array(sorted(others), dtype=np.int64)
+        nearest = _nearest(there, stamps) if len(there) else np.zeros_like(stamps)
+        near = np.abs(there[nearest] - stamps) <= max_difference_ns if len(there) else stamps < 0
+        if self._chosen.modality == "stereo":
+            if not near.all():
+                self.skipped["without a right image in time"] = int((~near).sum())
+            stamps, nearest, near = stamps[near], nearest[near], near[near]
+        elif self._chosen.other is not None and self._with_color:
+            self.uncolored = int((~near).sum())
+        self.timestamps_ns = stamps
+        self._mains = [mains[stamp] for stamp in stamps.tolist()]
+        self._others = [others[int(there[i])] if ok else None for i, ok in zip(nearest, near, strict=True)]
+
+    def _pose(self, at: Callable[[int], Pose | None], offset_ns: int, posed: bool) -> None:
+        """Find the frames' poses; leave out those without."""
+        assert self.timestamps_ns is not None
+        self._poses = [at(stamp + offset_ns) for stamp in self.timestamps_ns.tolist()]
+        rig = self._chosen.rig
+        if rig is not None and rig.rectifier is not None:
+            turned = rig.rectifier.T_left_rectified
+            self._poses = [None if pose is None else pose @ turned for pose in self._poses]
+        kept = [i for i, pose in enumerate(self._poses) if pose is not None or not posed]
+        if len(kept) < len(self._poses):
+            self.skipped["without a pose in time"] = len(self._poses) - len(kept)
+            self.timestamps_ns = self.timestamps_ns[kept]
+            self._mains = [self._mains[i] for i in kept]
+            self._others = [self._others[i] for i in kept]
+            self._poses = [self._poses[i] for i in kept]
+
+    def _register(self, poses: PoseFinder) -> Registration | None:
+        """What brings the colour of a camera of its own onto the depth; else such colour is left out."""
+        chosen = self._chosen
+        if chosen.apart is None or chosen.view is None or not len(self):
+            return None
+        T_color_depth = poses.between(chosen.apart.frame, chosen.frame, self._stamp(0))
+        if T_color_depth is None:
+            log.warning(
+                "%s: no transforms lead from %r to %r, so that colour cannot be registered and is left out",
+                self._recording.path, chosen.frame, chosen.apart.frame,
+            )  # fmt: skip
+            self._others = [None] * len(self)
+            return None
+        return Registration(
+            chosen.view.intrinsics, chosen.apart.view.intrinsics, T_color_depth, chosen.size,
+            color_size=chosen.apart.size,
+        )  # fmt: skip
+
+    def _frame(self, index: int) -> Frame:
+        chosen, place = self._chosen, self._mains[index]
+        common: dict[str, Any] = {
+            "sensor": self.sensor, "timestamp_ns": self._stamp(index), "T_world_camera": self._poses[index],
+        }  # fmt: skip
+        content = self._recording.read(place)
+        try:
+            if chosen.modality == "lidar":
+                found = messages.cloud(content, self._stamp(index))
+                return Frame(
+                    points=found.points, point_times_s=found.times_s,
+                    color=found.color if self._with_color else None, **common,
+                )  # fmt: skip
+            other = self._others[index]
+            beside = None if other is None else self._recording.read(other)
+            if chosen.modality == "stereo":
+                return self._pair_frame(content, beside, common)
+            return self._depth_frame(content, beside, common)
+        except DatasetError as error:
+            raise DatasetError(
+                f"{self._recording.path}: message {index} of {chosen.main.topic} {error}"
+            ) from error
+
+    def _depth_frame(self, content: Any, beside: Any, common: dict[str, Any]) -> Frame:
+        view = self._chosen.view
+        assert view is not None
+        depth = messages.depth(content)
+        self._chosen.check_size(self._chosen.main, depth.shape)
+        color = None if beside is None else messages.color(beside)
+        color_view = view if self._chosen.apart is None else self._chosen.apart.view
+        if view.undistorter is not None:
+            depth = view.undistorter.depth(depth)
+        if color is not None and color_view.undistorter is not None:
+            color = color_view.undistorter.image(color)
+        if color is not None and self._registration is not None:
+            metres = np.nan_to_num(depth * (1.0 if depth.dtype == np.float32 else self.depth_scale))
+            color = self._registration.color_of_depth(color, metres.astype(np.float32))
+        return Frame(
+            depth=depth, depth_scale=self.depth_scale, color=color, intrinsics=view.intrinsics, **common
+        )  # fmt: skip
+
+    def _pair_frame(self, left: Any, right: Any, common: dict[str, Any]) -> Frame:
+        rig = self._chosen.rig
+        assert rig is not None
+        pair = messages.gray(left), messages.gray(right)
+        color = messages.color(left) if self._with_color else None
+        if rig.rectifier is not None:
+            if color is not None:
+                color = rig.rectifier.pair(color, color)[0]
+            pair = rig.rectifier.pair(*pair)
+        return Frame(
+            left=pair[0], right=pair[1], color=color,
+            intrinsics=rig.intrinsics, baseline_fx=rig.baseline_fx, **common,
+        )  # fmt: skip
+
+
+_CHECKS: dict[str, Callable[[Any], None]] = {
+    messages.IMAGE: messages.check_image,
+    messages.CLOUD: messages.check_cloud,
+}
+
+
+def _place(path: Path) -> Path:
+    found = recording(path)
+    if found is not None:
+        return found
+    if not path.exists():
+        raise DatasetError(f"{path} does not exist; expected {EXPECTED}")
+    if is_journal(path):
+        raise DatasetError(f"{path} is a journal of tsfusion, no ROS recording: `tsfusion replay` takes it")
+    if path.is_file():
+        raise DatasetError(f"{path} does not begin as a ROS recording; expected {EXPECTED}")
+    several = sorted(str(child) for child in path.glob("*.*") if child.suffix in ENDINGS)
+    holds = f"holds {len(several)} files ({', '.join(several[:8])})" if several else "holds no ROS recording"
+    raise DatasetError(f"{path} {holds}; expected {EXPECTED}")
+
+
+def _by_time(places: list[Place]) -> dict[int, Place]:
+    """Messages by their header's stamp, or by the recorder's clock where a header says nothing."""
+    return {place.stamp_ns or place.log_ns: place for place in places}
+
+
+def _nearest(there: NDArray[np.int64], stamps: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Index in `there`, sorted, of the time nearest to each of `stamps`."""
+    right = np.clip(np.searchsorted(there, stamps), 1, max(1, len(there) - 1))
+    right = np.minimum(right, len(there) - 1)
+    left = np.maximum(right - 1, 0)
+    return np.where(np.abs(there[left] - stamps) <= np.abs(there[right] - stamps), left, right)

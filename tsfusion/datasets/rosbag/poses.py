@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: MIT
+"""The pose of a recording's sensor at a time: from its transforms, or from a topic of poses."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import SCAN
+from tsfusion.datasets.rosbag.reader import Message, Recording, Stream
+from tsfusion.datasets.rosbag.transforms import OLD_TF, PATH, POSE_KINDS, TF, Told, Track, Transforms
+from tsfusion.geometry.trajectory import Pose
+
+
+def pose_streams(recording: Recording, pose_topic: str | None) -> list[Stream]:
+    """The transforms, and the topic of poses that was named or all of them.
+
+    Raises:
+        DatasetError: when the named one is none.
+    """
+    transforms = [one for one in recording.streams if one.kind in (TF, OLD_TF)]
+    poses = [one for one in recording.streams if one.kind in POSE_KINDS]
+    if pose_topic is None:
+        return transforms + poses
+    named = [one for one in poses if one.topic.strip("/") == pose_topic.strip("/")]
+    if not named:
+        raise DatasetError(
+            f"{recording.path}: pose_topic={pose_topic!r} is no topic of poses; {recording.listing()}"
+        )
+    return transforms + named[:1]
+
+
+class PoseFinder:
+    """Takes in the messages about poses, and then finds the sensor's.
+
+    Args:
+        frame: of the sensor.
+        streams: of `pose_streams`.
+        told: the topic of poses was named, so that it goes before the transforms.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        frame: str,
+        streams: list[Stream],
+        *,
+        told: bool,
+        world_frame: str | None,
+        body_frame: str | None,
+        max_gap_s: float,
+    ) -> None:
+        self.streams = streams
+        self._path, self._frame, self._told = path, frame, told
+        self._world, self._body = world_frame, body_frame
+        self._max_gap_ns = round(max_gap_s * 1e9)
+        self._transforms = Transforms(self._max_gap_ns)
+        self._told_by: dict[Stream, Told] = {}
+
+    def add(self, message: Message) -> None:
+        """Take in one of `streams`."""
+        if message.stream.kind in (TF, OLD_TF):
+            self._transforms.add(message.content, static=message.stream.topic.endswith("static"))
+        else:
+            if message.stream.kind == PATH or message.stream not in self._told_by:
+                self._told_by[message.stream] = Told()  # each path holds all that were before
+            self._told_by[message.stream].add(message.content, message.stream.kind)
+
+    def finish(self, *, required: bool) -> Callable[[int], Pose | None]:
+        """What gives `T_world_sensor` at a time, None where it is not known.
+
+        Raises:
+            DatasetError: `required`, and nothing tells poses; or frames that were named are not connected.
+        """
+        self._transforms.finish()
+        if not self._told and self._transforms.moves(self._frame):
+            return self._by_transforms()
+        found = self._track()
+        if found is not None:
+            return self._by_track(found)
+        if self._transforms.told(self._frame):
+            return self._by_transforms()
+        if required:
+            raise DatasetError(
+                f"{self._path} tells no poses of {self._frame!r}: no changing transform and no topic of "
+                f"poses leads to it; {SCAN}"
+            )
+        return lambda _stamp: None
+
+    def between(self, target: str, source: str, stamp: int) -> Pose | None:
+        """`T_target_source` at a time by the transforms, after `finish`; None where they do not tell it."""
+        return self._transforms.at(target, source, stamp)
+
+    def _by_transforms(self) -> Callable[[int], Pose | None]:
+        world = self._transforms.ancestors(self._frame)[-1] if self._world is None else self._world
+        if not self._transforms.connected(world, self._frame):
+            chain = " ← ".join(self._transforms.ancestors(self._frame))
+            raise DatasetError(
+                f"{self._path}: no transforms lead from {world!r} to {self._frame!r} ({chain})"
+            )
+        return lambda stamp: self._transforms.at(world, self._frame, stamp)
+
+    def _track(self) -> Track | None:
+        """The poses of the most telling kind of topic."""
+        for kind in POSE_KINDS:
+            tracks = {
+                stream.topic: found
+                for stream, told in self._told_by.items()
+                if stream.kind == kind and (found := told.track()) is not None
+            }
+            fitting = {topic: one for topic, one in tracks.items() if self._leads(one)}
+            if len(fitting) == 1:
+                return next(iter(fitting.values()))
+            if fitting:
+                raise DatasetError(
+                    f"{self._path}: several topics tell poses ({', '.join(fitting)}); choose with pose_topic"
+                )
+            if tracks and self._told:
+                body = next(iter(tracks.values())).body
+                raise DatasetError(
+                    f"{self._path}: {next(iter(tracks))} tells poses of {body!r}, and no transforms lead "
+                    f"from there to {self._frame!r}; body_frame={self._frame!r} takes them for the sensor's"
+                )
+        return None
+
+    def _leads(self, found: Track) -> bool:
+        body = self._body or found.body
+        return body in ("", self._frame) or self._transforms.connected(body, self._frame)
+
+    def _by_track(self, found: Track) -> Callable[[int], Pose | None]:
+        body = self._body or found.body or self._frame
+        world = self._world or found.world
+
+        def at(stamp: int) -> Pose | None:
+            T = found.trajectory.at(stamp, max_gap_ns=self._max_gap_ns)
+            T_body_sensor = self._transforms.at(body, self._frame, stamp)
+            T_world = np.eye(4) if world == found.world else self._transforms.at(world, found.world, stamp)
+            if T is None or T_body_sensor is None or T_world is None:
+                return None
+            posed: Pose = T_world @ T @ T_body_sensor
+            return posed
+
+        return at

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: MIT
+"""ROS 1 and ROS 2 recordings as messages that can be read again by their place, without ROS.
+
+A recording is a `.bag`, a ROS 2 folder (`metadata.yaml` beside `.db3` or `.mcap` files), or one such file.
+"""
+
+import logging
+import threading
+import weakref
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tsfusion.core.errors import DatasetError, MissingDependency
+from tsfusion.journal.mcap_layout import MAGIC, OPENING
+
+log = logging.getLogger(__name__)
+
+ENDINGS = (".bag", ".db3", ".mcap")
+METADATA = "metadata.yaml"
+_INSTALL = "ROS recordings are read by rosbags; install it with: pip install 'tsfusion[ros]'"
+_HINTS = {
+    "not indexed": "it was not closed when recording ended: `rosbag reindex FILE` repairs it",
+    "File end magic": "it was not closed when recording ended: `mcap recover FILE -o NEW` repairs it",
+    "Profile is not ros2": "only MCAP files of the profile ros2 are read",
+}
+
+
+class Stream(NamedTuple):
+    """One topic, of one type."""
+
+    topic: str
+    kind: str  # such as sensor_msgs/msg/Image, of ROS 1 too
+    messages: int
+
+
+class Place(NamedTuple):
+    """Where a message is: enough to read it again."""
+
+    connection: int
+    log_ns: int
+    stamp_ns: int  # as its header says; 0 = it says nothing
+
+
+class Message(NamedTuple):
+    """One message that was read.
+
+    Attributes:
+        content: the fields, by ROS's names.
+    """
+
+    stream: Stream
+    place: Place
+    content: Any
+
+
+def is_journal(path: Path) -> bool:
+    """Whether a file is a segment of tsfusion's own journal, which is MCAP too."""
+    return bool(_opening(path) == OPENING)
+
+
+def recording(path: Path) -> Path | None:
+    """What is to be opened of a path: itself, or the one recording in a folder; None = there is none.
+
+    A file is told by its first bytes, an `.mcap` that is a journal's is none.
+    """
+    if path.is_file():
+        return path if _is_bag(path) else None
+    if not path.is_dir():
+        return None
+    if (path / METADATA).is_file():
+        return path
+    found = sorted(child for child in path.glob("*.*") if child.suffix in ENDINGS and _is_bag(child))
+    return found[0] if len(found) == 1 else None
+
+
+def _is_bag(path: Path) -> bool:
+    start = _opening(path)
+    if path.suffix == ".bag":
+        return start.startswith(b"#ROSBAG")
+    if path.suffix == ".db3":
+        return start.startswith(b"SQLite format 3")
+    whole = len(start) == len(OPENING) and bool(start != OPENING)
+    return path.suffix == ".mcap" and whole and start.startswith(bytes(MAGIC))
+
+
+def _opening(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(len(OPENING))
+    except OSError:
+        return b""
+
+
+class Recording:
+    """The messages of a recording. Its files stay open until it is no longer used.
+
+    Raises:
+        MissingDependency: without rosbags.
+        DatasetError: when it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = threading.Lock()
+        with self._errors():
+            self._reader = _reader(path)
+            self._reader.open()
+        weakref.finalize(self, self._reader.close)
+        self._is2 = bool(self._reader.is2)
+        self._usual = _usual_types(self._is2)
+        self._connections: list[Any] = [
+            one
+            for one in self._reader.connections
+            if not self._is2 or one.ext.serialization_format in ("cdr", "")
+        ]
+        counts: dict[tuple[str, str], int] = {}
+        for one in self._connections:
+            counts[one.topic, one.msgtype] = counts.get((one.topic, one.msgtype), 0) + one.msgcount
+        self.streams = [Stream(*key, count) for key, count in sorted(counts.items()) if count]
+        self._warn_if_unindexed()
+
+    def listing(self) -> str:
+        """Every topic with its type and number of messages, for an error."""
+        shown = ", ".join(
+            f"{one.topic} ({one.kind.replace('/msg/', '/')}, {one.messages})" for one in self.streams
+        )
+        return f"its topics: {shown}" if shown else "it holds no messages"
+
+    def messages(self, streams: Collection[Stream]) -> Iterator[Message | Stream]:
+        """Every message of some streams in the order of recording; its stream alone where it is broken.
+
+        Raises:
+            DatasetError: when the file ends or is damaged before the last one.
+        """
+        wanted = {(one.topic, one.kind): one for one in streams}
+        numbers = {
+            i: wanted[one.topic, one.msgtype]
+            for i, one in enumerate(self._connections)
+            if (one.topic, one.msgtype) in wanted
+        }
+        by_id: dict[int, dict[int, int]] = {id(self._connections[i].owner): {} for i in numbers}
+        for i in numbers:
+            by_id[id(self._connections[i].owner)][self._connections[i].id] = i
+        if not numbers:
+            return
+        with self._errors():
+            for connection, log_ns, raw in self._reader.messages([self._connections[i] for i in numbers]):
+                number = by_id[id(connection.owner)][connection.id]
+                stream = numbers[number]
+                content = self._content(raw, stream.kind)
+                if content is None:
+                    yield stream
+                else:
+                    yield Message(stream, Place(number, log_ns, stamp_ns(content)), content)
+
+    def first(self, stream: Stream) -> Any:
+        """The first message of a stream that can be read; None = there is none."""
+        for message in self.messages([stream]):
+            if isinstance(message, Message):
+                return message.content
+        return None
+
+    def read(self, place: Place) -> Any:
+        """The message at a place.
+
+        Raises:
+            DatasetError: when it is not there any more.
+        """
+        connection = self._connections[place.connection]
+        with self._lock, self._errors():
+            for _, _, raw in self._reader.messages([connection], place.log_ns, place.log_ns + 1):
+                content = self._content(raw, connection.msgtype)
+                if content is not None and stamp_ns(content) == place.stamp_ns:
+                    return content
+        raise DatasetError(f"{self.path}: the message of {connection.topic} at {place.log_ns} ns is gone")
+
+    def _content(self, raw: bytes, kind: str) -> Any:
+        """The message of some bytes, by the recording's own definition or else the usual one."""
+        store = self._reader.typestore
+        if kind not in store.fielddefs:
+            store = self._usual
+        try:
+            return store.deserialize_cdr(raw, kind) if self._is2 else store.deserialize_ros1(raw, kind)
+        except Exception as error:  # noqa: BLE001  generated code: what it meets in foreign bytes, it raises
+            log.debug("%s: a message of %s: %s", self.path, kind, error)
+            return None
+
+    def _warn_if_unindexed(self) -> None:
+        for reader in self._reader.readers if self._is2 else ():
+            storage = reader.storage
+            for one in getattr(storage, "storages", [storage]):
+                if hasattr(one, "chunks") and not one.chunks and self.streams:
+                    log.warning(
+                        "%s has no index: each frame is looked for from its start; "
+                        "`mcap recover FILE -o NEW` makes one",
+                        one.path,
+                    )
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        """rosbags lets through whatever its parts (SQLite, YAML, zstd, lz4, struct) raise."""
+        try:
+            yield
+        except (DatasetError, MissingDependency):
+            raise
+        except Exception as error:
+            said = " ".join(str(error).split())[:300] or type(error).__name__
+            hint = next((hint for words, hint in _HINTS.items() if words in said), None)
+            raise DatasetError(
+                f"{self.path} cannot be read as a ROS recording: {said}" + (f" ({hint})" if hint else "")
+            ) from error
+
+
+def stamp_ns(content: Any) -> int:
+    """Nanoseconds of a message's header; 0 = it has none, or says nothing."""
+    stamp = getattr(getattr(content, "header", None), "stamp", None)
+    return 0 if stamp is None else max(0, stamp.sec * 10**9 + stamp.nanosec)
+
+
+def frame_id(content: Any) -> str:
+    """The frame that a message's header names, without ROS 1's leading slash."""
+    return str(content.header.frame_id).strip("/")
+
+
+def _reader(path: Path) -> Any:
+    try:
+        from rosbags.highlevel import AnyReader
+    except ImportError as error:
+        raise MissingDependency(_INSTALL) from error
+    return AnyReader([path], default_typestore=_usual_types(path.suffix != ".bag"))
+
+
+def _usual_types(is2: bool) -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE if is2 else Stores.ROS1_NOETIC)

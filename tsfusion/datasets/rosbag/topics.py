@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: MIT
+"""Which topics of a recording are a depth camera, a stereo pair or a LiDAR: as told, or by type and name."""
+
+import logging
+import re
+from itertools import takewhile
+from typing import Any, Literal, NamedTuple
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.rosbag import messages
+from tsfusion.datasets.rosbag.cameras import RECTIFIED, Cameras, Picture, Rig, View, picture
+from tsfusion.datasets.rosbag.messages import CAMERA, CLOUD, COMPRESSED, IMAGE
+from tsfusion.datasets.rosbag.reader import Recording, Stream, frame_id
+from tsfusion.geometry.keyframe import Intrinsics
+
+log = logging.getLogger(__name__)
+
+Modality = Literal["depth", "stereo", "lidar"]
+OPTIONS = ("depth_topic", "color_topic", "info_topic", "points_topic", "left_topic", "right_topic")
+_OF_MODALITY: dict[Modality, tuple[str, ...]] = {
+    "depth": ("depth_topic", "color_topic"),
+    "stereo": ("left_topic", "right_topic"),
+    "lidar": ("points_topic",),
+}
+_REGISTERED = re.compile(r"aligned|registered")
+_LEFT_OF = (("right", "left"), ("infra2", "infra1"), ("infra_2", "infra_1"), ("cam1", "cam0"),
+            ("image_1", "image_0"), ("image_3", "image_2"), ("camera_1", "camera_0"))  # fmt: skip
+_SENSORS = (
+    (r"realsense|aligned_depth|d4[0-9]5|l515|^/device_\d+/sensor_\d+/", "realsense"),
+    (r"k4a|kinect2|azure|tof", "tof"),
+)
+
+
+class Apart(NamedTuple):
+    """A colour camera that is not the depth camera."""
+
+    frame: str
+    view: View
+    size: tuple[int, int]
+
+
+class Chosen(NamedTuple):
+    """What to read.
+
+    Attributes:
+        main: depth images, left images or point clouds.
+        other: colour images of the depth, or right images; None = none.
+        frame: that `main` is in; empty = it does not say.
+        size: height and width of an image of `main`.
+        view, rig: the camera of depth images, or those of a pair.
+        apart: the camera of `other`, where these colour images are yet to be registered.
+    """
+
+    modality: Modality
+    main: Stream
+    other: Stream | None
+    sensor: str
+    frame: str
+    size: tuple[int, int]
+    view: View | None = None
+    rig: Rig | None = None
+    apart: Apart | None = None
+
+    def check_size(self, stream: Stream, size: tuple[int, ...]) -> None:
+        """Raise DatasetError for an image of a stream that has not the size its camera was found for."""
+        expected = self.apart.size if self.apart is not None and stream == self.other else self.size
+        if self.modality != "lidar" and size != expected:
+            raise DatasetError(f"is {size[1]}×{size[0]}, the first {expected[1]}×{expected[0]}")
+
+
+class Chooser:
+    """Chooses among the topics of one recording.
+
+    Args:
+        given: topics by the names of `OPTIONS`, None where one is to be found.
+        intrinsics: of all images, instead of a CameraInfo's.
+        rectified: whether images have been rectified already; None = by the topic's name.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        given: dict[str, str | None],
+        *,
+        intrinsics: Intrinsics | None,
+        rectified: bool | None,
+    ) -> None:
+        self._recording, self._given = recording, given
+        info = self._named("info_topic", (CAMERA,))
+        self._cameras = Cameras(recording, info and info.topic, intrinsics, rectified)
+        self._found: list[Picture] | None = None
+
+    def choose(self, modality: Modality | None) -> Chosen:
+        """The sensor to read; of several kinds depth goes before stereo before LiDAR.
+
+        Raises:
+            DatasetError: there is none, or no single one; lists the topics.
+        """
+        told = [kind for kind, names in _OF_MODALITY.items() if any(self._given[name] for name in names)]
+        if len(told) > 1 or (modality and told and modality != told[0]):
+            raise DatasetError(f"{self._path}: topics of {' and '.join(told)} given; expected those of one")
+        wanted = modality or (told[0] if told else None)
+        for kind, find in (("depth", self._depth), ("stereo", self._stereo), ("lidar", self._lidar)):
+            if wanted in (None, kind) and (chosen := find()) is not None:
+                return chosen
+        raise self._error(f"no {wanted or 'depth images, stereo pair or point clouds'} found")
+
+    @property
+    def _path(self) -> object:
+        return self._recording.path
+
+    def _error(self, what: str) -> DatasetError:
+        return DatasetError(f"{self._path}: {what}; {self._recording.listing()}")
+
+    def _named(self, option: str, kinds: tuple[str, ...]) -> Stream | None:
+        """The stream that an option names."""
+        topic = self._given[option]
+        if topic is None:
+            return None
+        for stream in self._recording.streams:
+            if stream.topic.strip("/") == topic.strip("/") and stream.kind in kinds:
+                return stream
+        wanted = " or ".join(kind.rpartition("/")[2] for kind in kinds)
+        raise self._error(f"{option}={topic!r} is no topic of {wanted}")
+
+    def _pictures(self) -> list[Picture]:
+        """Every topic of images that can be read."""
+        if self._found is None:
+            streams = [one for one in self._recording.streams if one.kind in (IMAGE, COMPRESSED)]
+            found = [picture(self._recording, one) for one in streams]
+            self._found = [one for one in found if one is not None]
+        return self._found
+
+    def _picture(self, option: str) -> Picture | None:
+        stream = self._named(option, (IMAGE, COMPRESSED))
+        if stream is None:
+            return None
+        found = next((one for one in self._pictures() if one.stream == stream), None)
+        if found is None:
+            raise self._error(f"the images of {stream.topic} cannot be decoded")
+        return found
+
+    def _depth(self) -> Chosen | None:
+        main = self._picture("depth_topic") or self._only(
+            [one for one in self._pictures() if one.is_depth],
+            lambda one: (bool(_REGISTERED.search(one.base)), bool(RECTIFIED.search(one.base))),
+            "depth_topic",
+        )
+        if main is None:
+            return None
+        other, apart = self._color_of(main)
+        sensor = next((name for pattern, name in _SENSORS if re.search(pattern, main.base)), "kinect")
+        view = self._cameras.view(main)
+        return Chosen("depth", main.stream, other, sensor, main.frame, main.size, view, apart=apart)
+
+    def _color_of(self, depth: Picture) -> tuple[Stream | None, Apart | None]:
+        """The colour images of a depth camera, and their own camera where they are not registered to it.
+
+        Registered are images told by a depth that says so in its name, or in the depth's frame, of its size.
+        """
+        given, found = self._picture("color_topic"), [one for one in self._pictures() if one.is_color]
+        best = given or max(found, key=lambda one: _closeness(one, depth), default=None)
+        if best is None:
+            return None, None
+        fits = best.frame == depth.frame or bool(_REGISTERED.search(depth.base))
+        if fits and best.size == depth.size:
+            return best.stream, None
+        if (view := self._cameras.own_view(best)) is not None:
+            return best.stream, Apart(best.frame, view, best.size)
+        if given is not None and best.size == depth.size:
+            return best.stream, None
+        sizes = (
+            f"{best.stream.topic} is {best.size[1]}×{best.size[0]}, its depth {depth.size[1]}×{depth.size[0]}"
+        )
+        if given is not None:
+            raise DatasetError(f"{self._path}: {sizes}; expected equal sizes, or a CameraInfo of each")
+        log.warning("%s: %s has no CameraInfo and is left out (%s)", self._path, best.stream.topic, sizes)
+        return None, None
+
+    def _stereo(self) -> Chosen | None:
+        left, right = self._picture("left_topic"), self._picture("right_topic")
+        if left is None and right is None:
+            pairs = [pair for one in self._pictures() if (pair := self._pair(one)) is not None]
+            right = self._only(
+                [pair[1] for pair in pairs],
+                lambda one: (bool(RECTIFIED.search(one.base)), not one.is_color or one.is_gray),
+                "left_topic and right_topic",
+            )
+            left = next((pair[0] for pair in pairs if pair[1] == right), None)
+        if left is None and right is None:
+            return None
+        if left is None or right is None:
+            raise self._error("left_topic and right_topic go together")
+        return Chosen(
+            "stereo",
+            left.stream,
+            right.stream,
+            "stereo",
+            left.frame,
+            left.size,
+            rig=self._cameras.rig(left, right),
+        )
+
+    def _pair(self, right: Picture) -> tuple[Picture, Picture] | None:
+        """The left and the right images, if these are some of a right camera."""
+        if messages.is_depth(right.first):
+            return None
+        camera = self._cameras.find(right)
+        if camera is None or not camera.P[0, 3] < 0:
+            return None
+        for word, other in _LEFT_OF:
+            if word in right.stream.topic:
+                topic = other.join(right.stream.topic.rsplit(word, right.stream.topic.count(word)))
+                for left in self._pictures():
+                    if left.stream.topic == topic:
+                        return left, right
+        return None
+
+    def _lidar(self) -> Chosen | None:
+        stream = self._named("points_topic", (CLOUD,))
+        if stream is None:
+            found = [one for one in self._recording.streams if one.kind == CLOUD]
+            if len(found) > 1:
+                raise self._error("several topics of point clouds: choose one with points_topic")
+            stream = found[0] if found else None
+        if stream is None:
+            return None
+        first = self._recording.first(stream)
+        if first is None:
+            raise self._error(f"no point cloud of {stream.topic} can be read")
+        return Chosen("lidar", stream, None, "lidar", frame_id(first), (0, 0))
+
+    def _only(self, found: list[Picture], rank: Any, option: str) -> Picture | None:
+        """The one that ranks highest; of the transports of one topic the fullest, then the raw one."""
+        if not found:
+            return None
+        highest = max(map(rank, found))
+        best = [one for one in found if rank(one) == highest]
+        if len({one.base for one in best}) > 1:
+            topics = ", ".join(sorted({one.base for one in best}))
+            raise self._error(f"several fit ({topics}): choose with {option}")
+        return max(best, key=lambda one: (one.stream.messages, one.stream.kind == IMAGE))
+
+
+def recorded_scale(recording: Recording, depth: Stream) -> float | None:
+    """Metres per unit of a depth that librealsense itself recorded; None = it is somebody else's."""
+    device = re.match(r"/device_\d+/sensor_\d+", depth.topic)
+    for stream in recording.streams if device else ():
+        if re.fullmatch(rf"{device and device[0]}/option/Depth[_ ]Units/value", stream.topic):
+            try:
+                return float(recording.first(stream).data)
+            except (AttributeError, TypeError, ValueError):
+                return None
+    return None
+
+
+def _closeness(color: Picture, depth: Picture) -> tuple[object, ...]:
+    """How likely colour images belong to the depth images: by frame, name and rectification."""
+    return (
+        color.frame == depth.frame,
+        bool(re.search(r"colou?r|rgb", color.base)),
+        not color.is_gray,
+        _shared(color.base, depth.base),
+        bool(RECTIFIED.search(color.base)) == bool(RECTIFIED.search(depth.base)),
+        color.stream.messages,
+        color.stream.kind == IMAGE,
+    )
+
+
+def _shared(one: str, other: str) -> int:
+    """How many names two topics have in common from the left."""
+    pairs = zip(one.split("/"), other.split("/"), strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))

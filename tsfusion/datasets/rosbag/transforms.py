@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: MIT
+"""Where frames are: the tree of ROS transforms, and poses that other topics tell."""
+
+from array import array
+from collections import defaultdict
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.datasets.rosbag.reader import frame_id, stamp_ns
+from tsfusion.geometry import se3
+from tsfusion.geometry.trajectory import Pose, Trajectory, rigid
+
+TF = "tf2_msgs/msg/TFMessage"
+OLD_TF = "tf/msg/tfMessage"
+PATH = "nav_msgs/msg/Path"
+ODOMETRY = "nav_msgs/msg/Odometry"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
+POSE = "geometry_msgs/msg/PoseStamped"
+POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+POSE_KINDS = (ODOMETRY, TRANSFORM, POSE, POSE_WITH_COVARIANCE, PATH)  # the most telling first
+_SAME = 1e-9  # metres, and quaternion components: a transform that is sent again and again
+
+
+class Samples:
+    """Poses as they come in: 64 bytes each, for a robot may tell a thousand a second."""
+
+    def __init__(self) -> None:
+        self._stamps, self._values = array("q"), array("d")
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def add(self, stamp: int, t: Any, q: Any) -> None:
+        """A translation and a quaternion at a time; left out where they are not finite, or no rotation."""
+        values = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
+        length = float(np.linalg.norm(values[3:]))
+        if np.isfinite(values).all() and 0.5 < length < 2:
+            values[3:] /= length
+            self._stamps.append(stamp)
+            self._values.extend(values.tolist())
+
+    def trajectory(self) -> Trajectory:
+        """All of them in time order, of equal times the first."""
+        stamps, order = np.unique(np.array(self._stamps, np.int64), return_index=True)
+        table: NDArray[np.float64] = np.array(self._values).reshape(-1, 7)[order]
+        return Trajectory(stamps, table[:, :3], table[:, 3:])
+
+
+class _Edge(NamedTuple):
+    parent: str
+    trajectory: Trajectory
+    is_constant: bool
+
+    def at(self, stamp: int, max_gap_ns: int) -> Pose | None:
+        if self.is_constant:
+            return rigid(self.trajectory.quaternions[0], self.trajectory.translations[0])
+        return self.trajectory.at(stamp, max_gap_ns=max_gap_ns)
+
+
+class Transforms:
+    """The tree of frames that /tf and /tf_static tell, each transform over time.
+
+    A frame has one parent: of several, the one named most often.
+
+    Args:
+        max_gap_ns: between the two transforms interpolated; across a longer gap there is none.
+    """
+
+    def __init__(self, max_gap_ns: int) -> None:
+        self._max_gap_ns = max_gap_ns
+        self._samples: dict[tuple[str, str], Samples] = defaultdict(Samples)
+        self._dynamic: set[tuple[str, str]] = set()
+        self._edges: dict[str, _Edge] = {}
+
+    def add(self, message: Any, *, static: bool) -> None:
+        """Take in a TFMessage; transforms that are not finite are left out."""
+        for one in message.transforms:
+            key = frame_id(one), str(one.child_frame_id).strip("/")
+            if key[0] != key[1]:
+                self._samples[key].add(stamp_ns(one), one.transform.translation, one.transform.rotation)
+                if not static:
+                    self._dynamic.add(key)
+
+    def finish(self) -> None:
+        """Make the tree of what has been taken in."""
+        for (parent, child), samples in sorted(self._samples.items(), key=lambda item: len(item[1])):
+            if not samples:
+                continue
+            trajectory = samples.trajectory()
+            rows = np.hstack([trajectory.translations, trajectory.quaternions])
+            constant = (parent, child) not in self._dynamic or bool((np.ptp(rows, axis=0) < _SAME).all())
+            self._edges[child] = _Edge(parent, trajectory, constant)
+        self._samples.clear()
+
+    def ancestors(self, frame: str) -> list[str]:
+        """The frame itself, its parent, and so on to the root."""
+        chain = [frame]
+        while (edge := self._edges.get(chain[-1])) is not None and edge.parent not in chain:
+            chain.append(edge.parent)
+        return chain
+
+    def moves(self, frame: str) -> bool:
+        """Whether a transform between the frame and its root changes."""
+        return any(not self._edges[one].is_constant for one in self.ancestors(frame)[:-1])
+
+    def told(self, frame: str) -> bool:
+        """Whether /tf itself, not only /tf_static, tells of the way between the frame and its root."""
+        chain = self.ancestors(frame)
+        return any((parent, child) in self._dynamic for child, parent in pairwise(chain))
+
+    def connected(self, one: str, other: str) -> bool:
+        """Whether the two are in one tree."""
+        return self.ancestors(one)[-1] == self.ancestors(other)[-1]
+
+    def at(self, target: str, source: str, stamp: int) -> Pose | None:
+        """`T_target_source` at a time; None where it is not known then."""
+        if target == source:
+            return np.eye(4)
+        up_target, up_source = self.ancestors(target), self.ancestors(source)
+        common = next((frame for frame in up_source if frame in up_target), None)
+        if common is None:
+            return None
+        T_common_source = self._down(up_source[: up_source.index(common)], stamp)
+        T_common_target = self._down(up_target[: up_target.index(common)], stamp)
+        if T_common_source is None or T_common_target is None:
+            return None
+        return se3.inverse(T_common_target) @ T_common_source
+
+    def _down(self, frames: list[str], stamp: int) -> Pose | None:
+        """The pose of the first frame in the parent of the last."""
+        T: Pose = np.eye(4)
+        for frame in frames:
+            step = self._edges[frame].at(stamp, self._max_gap_ns)
+            if step is None:
+                return None
+            T = step @ T
+        return T
+
+
+class Track(NamedTuple):
+    """Poses of one frame in another, of a topic.
+
+    Attributes:
+        body: the frame whose pose it is; empty = the topic does not say.
+    """
+
+    world: str
+    body: str
+    trajectory: Trajectory
+
+
+class Told:
+    """What one topic tells, message by message.
+
+    Attributes:
+        world, body: frames, of the first message; an empty body = the topic does not say.
+    """
+
+    def __init__(self) -> None:
+        self.world, self.body = "", ""
+        self._samples, self._began = Samples(), False
+
+    def add(self, message: Any, kind: str) -> None:
+        """Take in a message of a kind of `POSE_KINDS`."""
+        for one in message.poses if kind == PATH else [message]:
+            if not self._began:
+                self.world, self._began = frame_id(one), True
+                self.body = str(getattr(one, "child_frame_id", "")).strip("/")
+            if kind == TRANSFORM:
+                where = one.transform.translation, one.transform.rotation
+            else:
+                pose = one.pose if kind in (POSE, PATH) else one.pose.pose
+                where = pose.position, pose.orientation
+            self._samples.add(stamp_ns(one), *where)
+
+    def track(self) -> Track | None:
+        """The poses; None = there is none."""
+        return Track(self.world, self.body, self._samples.trajectory()) if self._samples else None

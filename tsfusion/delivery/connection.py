@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: MIT
+"""A socket that connects, watched: it says why it cannot, and is made anew when ZeroMQ has given up on it."""
+
+from collections.abc import Callable
+from typing import Any
+
+import zmq
+
+from tsfusion.wire import sockets
+from tsfusion.wire.connection_monitor import Monitor
+from tsfusion.wire.curve import ClientKeys
+
+_RETRY_INTERVAL = 2.0  # seconds; an allowed key is let in soon, a forbidden one is no burden
+
+
+class Connection:
+    """One of a client's two. For one thread.
+
+    Args:
+        make: `sockets.push` or `sockets.dealer`.
+
+    Attributes:
+        socket: the present one.
+        problem: why there is no connection; empty = there is one, or nothing is known.
+    """
+
+    def __init__(
+        self,
+        context: "zmq.Context[Any]",
+        make: Callable[["zmq.Context[Any]", ClientKeys | None], sockets.AnySocket],
+        address: str,
+        keys: ClientKeys | None,
+    ) -> None:
+        self.problem = ""
+        self._context = context
+        self._make = make
+        self._address = address
+        self._keys = keys
+        self._retry_due = 0.0
+        self._open()
+
+    def _open(self) -> None:
+        self.socket = self._make(self._context, self._keys)
+        self._monitor = Monitor(self.socket, self._address, self._keys)
+        self._lost = 0
+        self.socket.connect(self._address)
+
+    @property
+    def events(self) -> sockets.AnySocket:
+        """Readable when `look` has something to find."""
+        return self._monitor.socket
+
+    @property
+    def made(self) -> bool:
+        """Whether it stands."""
+        return self._monitor.connected
+
+    @property
+    def refused(self) -> bool:
+        """Whether the server has certainly turned us away."""
+        return self._monitor.refused
+
+    @property
+    def due(self) -> float:
+        """When `look` should be called next, whatever happens; 0 = whenever."""
+        return self._retry_due
+
+    def reopen(self) -> None:
+        """Connect anew; what the old connection held is lost."""
+        self.close()
+        self._open()
+
+    def look(self, now: float) -> tuple[str | None, bool]:
+        """What is new: the problem (empty = it is over, None = nothing), and whether a connection ended."""
+        news = self._monitor.problem()
+        ended, self._lost = self._monitor.lost > self._lost, self._monitor.lost
+        if news == self.problem:
+            news = None
+        self.problem = self.problem if news is None else news
+        if self._retry_due and now >= self._retry_due:
+            self._retry_due = 0.0
+            self.reopen()
+        elif self._monitor.gave_up and not self._retry_due:
+            self._retry_due = now + _RETRY_INTERVAL
+        return news, ended
+
+    def close(self) -> None:
+        """Close it; nothing lingers."""
+        self._monitor.close()
+        self.socket.close()

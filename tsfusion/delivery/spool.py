@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: MIT
+"""The scanner's own disk: every keyframe waits here until the server has it on its disk.
+
+A spool is one session: what a dead scanner left in it is resent under the session and numbers that the
+server may already know, and a spool that was emptied starts a new session. Reading back from the page
+cache costs less than holding the queue in memory, and bounds it.
+"""
+
+import logging
+import os
+import secrets
+import shutil
+import tempfile
+from collections import deque
+from pathlib import Path
+
+from msgspec import Struct
+
+from tsfusion import journal
+from tsfusion.core.config import DEFAULT_MAP
+from tsfusion.core.errors import DecodeError, JournalError
+from tsfusion.core.folder_lock import lock_folder
+from tsfusion.delivery.tombstones import Gone
+from tsfusion.wire.keyframe_header import unpack
+
+log = logging.getLogger(__name__)
+
+# A restarted scanner skips numbers: those of records that a power cut took must never be used again. How many
+# is drawn, so that two scanners with copies of one spool do not go on with the same: then each would take the
+# answer to the other's keyframe for its own, and lose one in silence.
+_RESTART_GAP = 1024
+_RESTART_SPREAD = 1 << 24
+_SESSION_BYTES = 16
+_MANY_GONE = 65536  # numbers before those of deleted files are forgotten
+_RECORD_OVERHEAD = 512  # what MCAP adds to a keyframe, its share of the index at the end included
+
+
+class Waiting(Struct, frozen=True, gc=False):
+    """A keyframe the server does not have yet."""
+
+    seq: int
+    position: journal.Position
+    nbytes: int
+
+
+class Segment(Struct):
+    """One file of the spool: its size on the disk, how many of its keyframes wait, and which are gone."""
+
+    nbytes: int = 0
+    waiting: int = 0
+    gone: list[int] = []
+
+
+class Spool:
+    """A folder of unacknowledged keyframes, oldest first. One process at a time.
+
+    Threads: `write` and `tidy` may run in one while another does anything else; the rest is not thread-safe.
+
+    Args:
+        folder: None = a temporary folder that goes away at `close`, with what is still in it.
+        map_name: the map that new keyframes are for.
+
+    Attributes:
+        waiting: the keyframes, oldest first.
+        waiting_bytes: the bytes of their messages.
+        used_bytes: of the disk; keyframes that have left the queue but share a file with others count.
+        next_seq: the number of the next keyframe.
+        left: the last number that an earlier scanner is known to have used; 0 = there was none.
+        pinned: there is more to say of its session: an empty spool keeps it, too.
+
+    Raises:
+        JournalError: when the folder cannot be used, another scanner uses it, or it waits for another map.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str] | None,
+        segment_bytes: int,
+        *,
+        map_name: str = DEFAULT_MAP,
+    ) -> None:
+        self.temporary = folder is None
+        self.map_name = map_name
+        self.pinned = False
+        self.folder = _temporary_folder() if folder is None else Path(folder)
+        self._lock = lock_folder(self.folder, "spool", "scanner")
+        try:
+            self._open(segment_bytes, map_name)
+        except JournalError:
+            self._lock.close()
+            raise
+
+    def _open(self, segment_bytes: int, map_name: str) -> None:
+        self._journal = journal.Journal(self.folder, segment_bytes, sync=not self.temporary)
+        found, self._journal.found = self._journal.found, []
+        sessions = {record.session for record in found} or {secrets.token_bytes(_SESSION_BYTES)}
+        if len(sessions) > 1:
+            raise JournalError(f"{self.folder} holds keyframes of {len(sessions)} sessions: not one spool")
+        self.session = sessions.pop()
+        self._gone = Gone(self.folder, self.session)
+        self._many_gone = 2 * self._gone.written + _MANY_GONE
+        self._segments = {number: Segment(self._size(number)) for number in journal.segments(self.folder)}
+        self.waiting: deque[Waiting] = deque()
+        for record in found:
+            segment = self._segments[record.position.segment]
+            if record.seq in self._gone.numbers:
+                segment.gone.append(record.seq)
+            else:
+                segment.waiting += 1
+                self.waiting.append(Waiting(record.seq, record.position, record.nbytes))
+        self.waiting_bytes = sum(entry.nbytes for entry in self.waiting)
+        last = max([record.seq for record in found] + [*self._gone.numbers], default=0)
+        self.left = last
+        self.next_seq = last + _RESTART_GAP + secrets.randbelow(_RESTART_SPREAD) if last else 1
+        self._idle = {number for number, segment in self._segments.items() if not segment.waiting}
+        self.used_bytes = sum(segment.nbytes for segment in self._segments.values())
+        left_for = self._left_for()
+        if left_for not in (None, map_name):
+            raise JournalError(
+                f"{self.folder} holds {len(self.waiting)} keyframes for the map {left_for}, not for "
+                f"{map_name}: send them first (a client with map={left_for!r}), or use another spool folder"
+            )
+
+    def _size(self, number: int) -> int:
+        try:
+            return journal.segment_path(self.folder, number).stat().st_size
+        except OSError:
+            return 0
+
+    def _left_for(self) -> str | None:
+        """The map of what a dead scanner left: that of the first keyframe that can be read."""
+        for entry in self.waiting:
+            try:
+                return unpack(self.read(entry)[0]).map
+            except (JournalError, DecodeError, IndexError):
+                continue  # found again, and told, when it is to be sent
+        return None
+
+    def write(self, frames: list[bytes]) -> Waiting:
+        """Put the keyframe that was encoded as `next_seq` on the disk; `add` then makes it count.
+
+        Raises:
+            JournalError: when the disk refuses. The number is not used again: where the disk did not even
+                let the failed record be taken back, it must not be found in the place of another.
+        """
+        seq = self.next_seq
+        self.next_seq += 1
+        try:
+            position = self._journal.append(frames, session=self.session, seq=seq)
+        except JournalError:
+            self._gone.add(seq)
+            raise
+        return Waiting(seq, position, sum(map(len, frames)))
+
+    def add(self, entry: Waiting) -> None:
+        """Queue a written keyframe."""
+        self.waiting.append(entry)
+        self.waiting_bytes += entry.nbytes
+        number = entry.position.segment
+        segment = self._segments.setdefault(number, Segment())
+        segment.waiting += 1
+        end = entry.position.offset + entry.nbytes + _RECORD_OVERHEAD
+        self.used_bytes += end - segment.nbytes
+        segment.nbytes = end
+        self._idle.discard(number)
+
+    def read(self, entry: Waiting) -> list[memoryview]:
+        """The frames of a keyframe.
+
+        Raises:
+            JournalError: when the disk has lost it.
+        """
+        return journal.read(self.folder, entry.position).frames
+
+    def drop(self, durable: int) -> list[int]:
+        """Let go of everything up to `durable`; the numbers of what was waiting."""
+        dropped = []
+        while self.waiting and self.waiting[0].seq <= durable:
+            dropped.append(self.waiting[0].seq)
+            self._let_go(0)
+        if dropped:
+            self._delete_segments()
+        return dropped
+
+    def remove(self, place: int) -> None:
+        """Let go of one keyframe that the server does not have, by its place in the queue."""
+        entry = self._let_go(place)
+        self._segments[entry.position.segment].gone.append(entry.seq)
+        self._gone.add(entry.seq)
+        self._delete_segments()
+        if self._gone.written > self._many_gone:
+            self._gone.keep(seq for segment in self._segments.values() for seq in segment.gone)
+            self._many_gone = 2 * self._gone.written + _MANY_GONE
+
+    def tidy(self) -> None:
+        """Delete what `drop` had to leave. For the thread that writes, when it does not."""
+        self._delete_segments(self._journal.segment)
+
+    def _let_go(self, place: int) -> Waiting:
+        entry = self.waiting[place]
+        del self.waiting[place]
+        self.waiting_bytes -= entry.nbytes
+        segment = self._segments[entry.position.segment]
+        segment.waiting -= 1
+        if not segment.waiting:
+            self._idle.add(entry.position.segment)
+        return entry
+
+    def _delete_segments(self, below: int | None = None) -> None:
+        # The newest stays: a keyframe that `write` has just put there may not be queued yet.
+        newest = next(reversed(self._segments), 0)
+        for number in [n for n in self._idle if n < (newest if below is None or self.pinned else below)]:
+            self._forget(number)
+
+    def _forget(self, number: int) -> None:
+        """Delete a segment; one that stays is only sent once more, and recognised."""
+        self.used_bytes -= self._segments.pop(number).nbytes
+        self._idle.discard(number)
+        try:
+            self._journal.forget(number)
+        except JournalError as error:
+            log.warning("%s", error)
+
+    def close(self) -> None:
+        """Release the folder. An empty spool takes its files with it: the next starts a new session."""
+        try:
+            self._journal.close()
+        except JournalError as error:  # it lacks only its index
+            log.warning("%s", error)
+        if self.temporary:
+            shutil.rmtree(self.folder, ignore_errors=True)
+        elif not self.waiting and not self.pinned:
+            for number in list(self._segments):
+                self._forget(number)
+            self._gone.clear()
+        self._lock.close()
+
+
+def _temporary_folder() -> Path:
+    try:
+        return Path(tempfile.mkdtemp(prefix="tsfusion-spool-"))
+    except OSError as error:
+        raise JournalError(f"cannot make a temporary spool: {error.strerror}; name a folder") from error

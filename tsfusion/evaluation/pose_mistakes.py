@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: MIT
+"""What is usually wrong with poses, as the pose that was meant: each is tried against the depth."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.geometry.trajectory import Pose, quaternion, rigid
+
+_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_CAMERA_BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])  # x forward, z up
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """One way to misread poses.
+
+    Attributes:
+        name: short, for programs.
+        text: what it is and what to do.
+        meant: the pose meant by a given one, up to the choice of the world's axes; may be a reflection, of
+            which only `inv(meant_j) @ meant_i`, a rigid motion, is used.
+    """
+
+    name: str
+    text: str
+    meant: Callable[[Pose], NDArray[np.float64]]
+
+
+def _turned(order: list[int]) -> Callable[[Pose], Pose]:
+    def meant(T: Pose) -> Pose:
+        return rigid(quaternion(T[:3, :3])[order], T[:3, 3])
+
+    return meant
+
+
+def _conjugated(T: Pose) -> Pose:
+    meant: Pose = np.array(T)
+    meant[:3, :3] = T[:3, :3].T
+    return meant
+
+
+def _inverse(T: Pose) -> NDArray[np.float64]:
+    return np.asarray(np.linalg.inv(T), np.float64)
+
+
+MISTAKES: tuple[Mistake, ...] = (
+    Mistake(
+        "inverse",
+        "the poses are world-to-camera; camera-to-world is expected: invert each",
+        _inverse,
+    ),
+    Mistake(
+        "opengl",
+        "the poses are of a camera with OpenGL axes (y up, z back), not OpenCV's (y down, z forward): "
+        "multiply each from the right by diag(1, -1, -1, 1)",
+        lambda T: np.asarray(T @ _OPENGL),
+    ),
+    Mistake(
+        "inverse opengl",
+        "the poses are world-to-camera and of a camera with OpenGL axes (a view matrix): invert each, then "
+        "multiply from the right by diag(1, -1, -1, 1)",
+        lambda T: np.asarray(_inverse(T) @ _OPENGL),
+    ),
+    Mistake(
+        "mirror",
+        "one of depth and poses is mirrored up-down: fy should have the other sign (ICL-NUIM's is negative), "
+        "or the poses are left-handed (Unity)",
+        lambda T: np.asarray(T @ _MIRROR),
+    ),
+    Mistake(
+        "inverse mirror",
+        "the poses are world-to-camera and mirrored up-down: invert each; fy should have the other sign, or "
+        "they are left-handed (Unity)",
+        lambda T: np.asarray(_inverse(T) @ _MIRROR),
+    ),
+    Mistake(
+        "body axes",
+        "the poses are of a body with x forward and z up, the measurement of a camera with z forward: "
+        "multiply each pose from the right by the camera's pose in the body",
+        lambda T: np.asarray(T @ _CAMERA_BODY.T),
+    ),
+    Mistake(
+        "camera axes",
+        "the poses are of a camera with z forward, the measurement of a sensor with x forward and z up: "
+        "multiply each pose from the right by the sensor's pose in the camera (KITTI: Tr)",
+        lambda T: np.asarray(T @ _CAMERA_BODY),
+    ),
+    Mistake(
+        "quaternion wxyz",
+        "the quaternions are in the order w x y z and were read as x y z w: reorder them",
+        _turned([1, 2, 3, 0]),
+    ),
+    Mistake(
+        "quaternion xyzw",
+        "the quaternions are in the order x y z w and were read as w x y z: reorder them",
+        _turned([3, 0, 1, 2]),
+    ),
+    Mistake(
+        "conjugate",
+        "the rotations are transposed (conjugate quaternions), the translations are right: transpose them",
+        _conjugated,
+    ),
+)  # fmt: skip
+
+# By what the translations must be multiplied; a depth that much smaller would do as well.
+SCALES: tuple[tuple[float, str], ...] = (
+    (0.001, "the translations are in millimetres, metres are expected: divide them by 1000"),
+    (0.01, "the translations are in centimetres, metres are expected: divide them by 100"),
+    (0.1, "depth is ten times too small, or the translations too large: check the depth scale"),
+    (0.2, "depth is 5 times too small: its unit is 1 mm (1/1000) where 1/5000 was taken"),
+    (1000 / 6553.5, "depth is 6.55 times too small: its unit is 1 mm (1/1000) where 1/6553.5 was taken"),
+    (5.0, "depth is 5 times too large: its unit is 1/5000 m (TUM) where 1 mm (1/1000) was taken"),
+    (6.5535, "depth is 6.55 times too large: its unit is 1/6553.5 m where 1 mm (1/1000) was taken"),
+    (10.0, "depth is ten times too large: its unit is 0.1 mm where 1 mm was taken"),
+    (100.0, "the translations are 100 times too small, or depth is in centimetres where metres were taken"),
+    (1000.0, "depth is 1000 times too large (millimetres taken for metres), or the translations too small"),
+)  # fmt: skip
+
+
+def scale_text(factor: float) -> str:
+    """What a factor on the translations says, and what to do."""
+    known = dict(SCALES)
+    if factor in known:
+        return f"poses and depth disagree: {known[factor]}"
+    size = f"{1 / factor:.3g} times too large" if factor < 1 else f"{factor:.3g} times too small"
+    return (
+        f"poses and depth disagree: the translations are {size} for the depth (no usual unit): check "
+        "the depth scale, the intrinsics and where the poses come from"
+    )
+
+
+def or_text(alternatives: tuple[str, ...]) -> str:
+    """The other mistakes that a disagreement may come from; empty without any."""
+    return f" (these would fit as well: {', '.join(alternatives)})" if alternatives else ""
+
+
+def untold_text(alternatives: tuple[str, ...]) -> str:
+    """The mistakes that an agreement does not rule out; empty without any."""
+    if not alternatives:
+        return ""
+    return (
+        f", but so would poses that are wrong in one of these ways: {', '.join(alternatives)}; the sensor "
+        "moves too little or too straight here to tell them apart"
+    )

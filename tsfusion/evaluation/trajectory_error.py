@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: MIT
+"""Error of an estimated trajectory (Sturm et al., "A benchmark for RGB-D SLAM systems", 2012)."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, pose_of
+from tsfusion.datasets.readers import read_lines
+from tsfusion.datasets.trajectory_files import read_kitti, read_log, read_tum
+from tsfusion.geometry.trajectory import rigid
+
+Poses = NDArray[np.float64]  # (n, 4, 4) T_world_camera
+
+
+class TrajectoryError(msgspec.Struct, frozen=True, kw_only=True):
+    """Absolute trajectory error, metres, over `count` poses; and how it grows with the way.
+
+    Attributes:
+        length: of the reference's path.
+        drift_percent: distance between the ends of both paths when their beginnings lie upon each other, in
+            percent of `length`; 0 where there is no path.
+        rotation_deg: mean angle between the two orientations after the same alignment.
+    """
+
+    count: int
+    min: float
+    max: float
+    mean: float
+    median: float
+    std: float
+    rmse: float
+    length: float
+    drift_percent: float
+    rotation_deg: float
+
+
+def umeyama(
+    source: NDArray[np.floating], target: NDArray[np.floating], *, with_scale: bool = False
+) -> tuple[NDArray[np.float64], float]:
+    """The rigid motion that brings (n, 3) points nearest to others (Umeyama 1991, eq. 34-43).
+
+    Returns:
+        (4, 4) rotation and translation, and the scale (1 without `with_scale`): target ≈ scale·R·source + t.
+
+    """
+    mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
+    centered = source - mean_source
+    U, S, Vt = np.linalg.svd((target - mean_target).T @ centered / len(source))
+    sign = np.array([1.0, 1.0, 1.0 if np.linalg.det(U) * np.linalg.det(Vt) > 0 else -1.0])
+    R = U @ np.diag(sign) @ Vt
+    variance = float((centered**2).sum() / len(source))
+    scale = float((S * sign).sum() / variance) if with_scale and variance > 0 else 1.0
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, mean_target - scale * R @ mean_source
+    return T, scale
+
+
+def absolute_error(estimate: Poses, reference: Poses, *, align: bool = True) -> TrajectoryError:
+    """ATE of poses in pairs, after the best rigid motion (`align`): the paper's table, `evo_ape -a`.
+
+    Raises:
+        DatasetError: for fewer than 2 pairs, or unequal numbers.
+    """
+    if len(estimate) != len(reference) or len(estimate) < 2:
+        raise DatasetError(
+            f"two positions or more are needed of each trajectory, got {len(estimate)} and {len(reference)}"
+        )
+    aligned = aligned_to(estimate, reference) if align else estimate
+    error = np.linalg.norm(aligned[:, :3, 3] - reference[:, :3, 3], axis=1)
+    traces = np.einsum("nij,nij->n", aligned[:, :3, :3], reference[:, :3, :3])
+    angles = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
+    length = float(np.linalg.norm(np.diff(reference[:, :3, 3], axis=0), axis=1).sum())
+    return TrajectoryError(
+        count=len(error),
+        min=float(error.min()),
+        max=float(error.max()),
+        mean=float(error.mean()),
+        median=float(np.median(error)),
+        std=float(error.std()),
+        rmse=float(np.sqrt(np.mean(error**2))),
+        length=length,
+        drift_percent=100 * _end_error(estimate, reference) / length if length > 0 else 0.0,
+        rotation_deg=float(angles.mean()),
+    )
+
+
+def aligned_to(estimate: Poses, reference: Poses) -> Poses:
+    """The estimate, moved so that its positions lie nearest to the reference's."""
+    T, _ = umeyama(estimate[:, :3, 3], reference[:, :3, 3])
+    moved: Poses = T @ estimate
+    return moved
+
+
+def _end_error(estimate: Poses, reference: Poses) -> float:
+    """Metres between the last positions, seen from the first poses."""
+    ends = [np.linalg.solve(poses[0], poses[-1]) for poses in (estimate, reference)]
+    return float(np.linalg.norm(ends[0][:3, 3] - ends[1][:3, 3]))
+
+
+def associate(
+    first_ns: NDArray[np.int64], second_ns: NDArray[np.int64], max_difference_ns: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices of poses that belong together by time: each of the shorter list with the nearest of the other.
+
+    Raises:
+        DatasetError: when none are within `max_difference_ns`.
+    """
+    swapped = len(first_ns) > len(second_ns)
+    few, many = (second_ns, first_ns) if swapped else (first_ns, second_ns)
+    right = np.clip(np.searchsorted(many, few), 1, max(len(many) - 1, 1))
+    right = np.minimum(right, len(many) - 1)
+    left = np.maximum(right - 1, 0)
+    nearest = np.where(np.abs(many[left] - few) <= np.abs(many[right] - few), left, right)
+    kept = np.flatnonzero(np.abs(many[nearest] - few) <= max_difference_ns)
+    if not len(kept):
+        raise DatasetError(
+            f"no two poses are within {max_difference_ns / 1e9:g} s of each other: the trajectories cover "
+            f"{_span(first_ns)} and {_span(second_ns)}"
+        )
+    return (nearest[kept], kept) if swapped else (kept, nearest[kept])
+
+
+def _span(stamps_ns: NDArray[np.int64]) -> str:
+    return f"{stamps_ns[0] / 1e9:.3f} to {stamps_ns[-1] / 1e9:.3f} s"
+
+
+def read(path: Path) -> tuple[NDArray[np.int64] | None, Poses]:
+    """A trajectory file by its looks: TUM (8 numbers a line), KITTI (12) or Redwood's `.log`.
+
+    Returns:
+        (n,) timestamps in nanoseconds, None where the format has none; (n, 4, 4) poses.
+
+    Raises:
+        DatasetError: for a missing file, or one of another format.
+    """
+    lines = read_lines(path, "a trajectory: TUM, KITTI or .log")
+    columns = len(lines[0][1].replace(",", " ").split()) if lines else 0
+    if columns == 8:
+        tum = read_tum(path)
+        poses = [rigid(q, t) for q, t in zip(tum.quaternions, tum.translations, strict=True)]
+        return tum.timestamps_ns, np.array(poses)
+    if columns == 12:
+        return None, np.array(read_kitti(path))
+    if columns == 3:
+        return None, np.array([T for _, T in read_log(path)])
+    raise DatasetError(
+        f"{path} is no trajectory: expected 8 numbers a line (TUM), 12 (KITTI) or a Redwood .log, "
+        f"got {columns}"
+    )
+
+
+def of_dataset(dataset: Dataset) -> tuple[NDArray[np.int64], Poses]:
+    """The poses a recording has; its times, or where it has none those that `tsfusion scan` counts.
+
+    Returns:
+        (n,) timestamps in nanoseconds and (n, 4, 4) poses, of the frames that have one.
+
+    Raises:
+        DatasetError: when no frame has.
+    """
+    found = [(index, T) for index in range(len(dataset)) if (T := pose_of(dataset, index)) is not None]
+    if not found:
+        raise DatasetError(f"{dataset.name} has no poses to compare with")
+    stamps = dataset.timestamps_ns
+    times = [(index + 1) * NOMINAL_NS if stamps is None else int(stamps[index]) for index, _ in found]
+    return np.array(times, dtype=np.int64), np.array([T for _, T in found])
+
+
+def paired(
+    estimate: Path, reference: Path | Dataset, *, max_difference_s: float = 0.01
+) -> tuple[Poses, Poses]:
+    """The poses of two files (or a file and a recording) that belong together: by time, else by line.
+
+    Raises:
+        DatasetError: when nothing can be paired, or without times for unequal numbers.
+    """
+    stamps, poses = read(estimate)
+    reference_stamps, references = read(reference) if isinstance(reference, Path) else of_dataset(reference)
+    if stamps is not None and reference_stamps is not None:
+        a, b = associate(stamps, reference_stamps, round(max_difference_s * 1e9))
+        return poses[a], references[b]
+    if len(poses) != len(references):
+        name = reference if isinstance(reference, Path) else reference.name
+        both = ((estimate, stamps), (name, reference_stamps))
+        timeless = " and ".join(str(each) for each, times in both if times is None)
+        raise DatasetError(
+            f"{estimate} has {len(poses)} poses and {name} {len(references)}, to be paired line by line as "
+            f"there are no times in {timeless}: give an estimate with times (TUM's format), and as reference "
+            "a file with times or the dataset's folder"
+        )
+    return poses, references
+
+
+_NARROWEST = 0.4  # of the view's longer side
+
+
+def draw(estimate: Poses, reference: Poses, path: Path, *, align: bool = True) -> None:
+    """Write a .png, .pdf or .svg of (n, 4, 4) poses in pairs.
+
+    It is looked at along the direction in which the reference moves least.
+    """
+    from matplotlib.figure import Figure
+
+    aligned = aligned_to(estimate, reference) if align else estimate
+    positions, truth = aligned[:, :3, 3], reference[:, :3, 3]
+    error = np.linalg.norm(positions - truth, axis=1)
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth, axis=0), axis=1))])
+    center = truth.mean(axis=0)
+    axes = np.linalg.svd(truth - center, full_matrices=False)[2][:2]
+    a, b = (positions - center) @ axes.T, (truth - center) @ axes.T
+    factor, unit = (1000, "mm") if error.max() < 1 else (1, "m")
+
+    figure = Figure(figsize=(11, 4.5), layout="constrained")
+    view, course = figure.subplots(1, 2)
+    view.plot(*b.T, color="0.75", linewidth=3, label="reference", zorder=1)
+    drawn = view.scatter(*a.T, c=error * factor, s=6, cmap="viridis", label="estimate", zorder=2)
+    figure.colorbar(drawn, ax=view, label=f"error, {unit}")
+    both = np.vstack([a, b])
+    (left, low), (right, high) = _limits(both.min(axis=0), both.max(axis=0))
+    view.set(aspect="equal", xlim=(left, right), ylim=(low, high), xlabel="m", ylabel="m")
+    view.set_title("trajectory, seen across its widest plane")
+    view.legend(loc="best")
+    course.plot(along, error * factor, linewidth=1)
+    rmse = float(np.sqrt(np.mean(error**2)))
+    course.axhline(rmse * factor, color="0.5", linestyle="--", label=f"RMSE {rmse * factor:.3g} {unit}")
+    course.set(xlabel="way, m", ylabel=f"error, {unit}", title="absolute error along the way", ylim=(0, None))
+    course.legend(loc="best")
+    figure.savefig(path, dpi=110)
+
+
+def _limits(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lower and upper limits, (2, 2), with a margin; a straight way is still seen in a window, not a slit."""
+    extent = high - low
+    wanted = np.maximum(1.1 * extent, _NARROWEST * extent.max() or 1.0)
+    middle = (low + high) / 2
+    return np.array([middle - wanted / 2, middle + wanted / 2])

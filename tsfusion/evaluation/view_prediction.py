@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: MIT
+"""What a mesh says that a camera sees, and how far from what it saw."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.geometry.keyframe import Intrinsics, Keyframe
+from tsfusion.geometry.mesh import Mesh
+
+NEAR = 0.05  # metres in front of the eye where the view starts
+
+
+def depth_metres(keyframe: Keyframe) -> NDArray[np.float64]:
+    """(H, W) float64 z of a depth or disparity keyframe; 0 = no return."""
+    if keyframe.disparity is not None:
+        d = keyframe.disparity * keyframe.disparity_scale
+        z = np.divide(keyframe.baseline_fx or 0.0, d, out=np.zeros(keyframe.shape), where=d > 0)
+    else:
+        z = keyframe.measurement.astype(np.float64)
+        if keyframe.measurement.dtype == np.uint16:
+            z *= keyframe.depth_scale
+    return np.where(np.isfinite(z) & (z > 0), z, 0.0)
+
+
+def points_camera(keyframe: Keyframe) -> NDArray[np.float64]:
+    """(n, 3) float64 of the valid pixels, or of the points, in the sensor's frame."""
+    if keyframe.points is not None:
+        return keyframe.points.astype(np.float64)
+    z, K = depth_metres(keyframe), keyframe.intrinsics
+    assert K is not None  # a keyframe with an image has a camera
+    v, u = np.nonzero(z)
+    z = z[v, u]
+    return np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z], axis=1)
+
+
+def points_world(keyframe: Keyframe) -> NDArray[np.float64]:
+    """`points_camera`, moved by the keyframe's pose."""
+    T = keyframe.T_world_camera
+    moved: NDArray[np.float64] = points_camera(keyframe) @ T[:3, :3].T + T[:3, 3]
+    return moved
+
+
+def predicted_depth(
+    mesh: Mesh, T_world_camera: NDArray[np.float64], intrinsics: Intrinsics, shape: tuple[int, int]
+) -> NDArray[np.float32]:
+    """(H, W) float32 metres along the optical axis to the first front side; 0 = none.
+
+    The rasteriser knows one focal length and a centred image. A shear of space that keeps z makes any
+    pinhole camera such a one.
+    """
+    from tsfusion.kernels import runtime
+
+    runtime.start()
+    from tsfusion.kernels import rasterizer
+
+    height, width = shape
+    K, focal = intrinsics, intrinsics.fx
+    p = (mesh.vertices.astype(np.float64) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+    p[:, 0] += (K.cx - 0.5 * (width - 1)) / focal * p[:, 2]
+    p[:, 1] = K.fy / focal * p[:, 1] + (K.cy - 0.5 * (height - 1)) / focal * p[:, 2]
+    faces = np.ascontiguousarray(mesh.faces if K.fy > 0 else mesh.faces[:, ::-1], np.int32)
+    seen = np.full(shape, rasterizer.EMPTY, np.int64)
+    rasterizer.rasterise(seen, np.ascontiguousarray(p, np.float32), faces, focal, NEAR)
+    depth = (seen >> 32).astype(np.int32).view(np.float32)
+    return np.where(seen == rasterizer.EMPTY, np.float32(0), depth)
+
+
+def compare_views(
+    mesh: Mesh, keyframes: list[Keyframe], *, max_range: float, voxel_size: float
+) -> dict[str, Any]:
+    """Predicted against measured depth, over every pixel measured nearer than `max_range` metres.
+
+    Returns:
+        `median_mm` and `p90_mm` of the difference where a depth is predicted, which flatters a mesh with
+        holes in the difficult places; `all_p90_mm`: with what is not predicted as infinitely off (infinite
+        with fewer than 90 % predicted); `within_voxel`: percent of the pixels measured that are predicted
+        to a voxel; `predicted`: percent predicted at all.
+    """
+    errors = [np.empty(0)]
+    for keyframe in keyframes:
+        z, K = depth_metres(keyframe), keyframe.intrinsics
+        assert K is not None  # checked by Keyframe
+        guess = predicted_depth(mesh, keyframe.T_world_camera, K, (z.shape[0], z.shape[1]))
+        valid = (z > 0) & (z < max_range)
+        errors.append(np.where(guess > 0, np.abs(guess - z), np.inf)[valid])
+    error = np.sort(np.concatenate(errors))
+    count = int(np.isfinite(error).sum())
+    median, p90 = np.percentile(error[:count], (50, 90)) * 1e3 if count else (np.nan, np.nan)
+    share = 100 / max(len(error), 1)
+    return {
+        "median_mm": float(median), "p90_mm": float(p90),
+        "all_p90_mm": float(error[int(0.9 * len(error))]) * 1e3 if len(error) else np.nan,
+        "within_voxel": float((error <= voxel_size).sum() * share), "predicted": count * share,
+    }  # fmt: skip

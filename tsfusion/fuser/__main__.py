@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: MIT
+"""The process loop: python -m tsfusion.fuser."""
+
+import select
+import signal
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, cast
+
+import zmq
+
+from tsfusion.core import logs, process
+from tsfusion.core.config import LogFormat, LogLevel
+from tsfusion.core.errors import TsfusionError
+from tsfusion.core.folder_lock import hold
+from tsfusion.fuser import messages as fuser_messages
+from tsfusion.fuser.fuser import Fuser
+from tsfusion.wire import sockets
+
+
+def run(endpoint: str) -> int:
+    """Serve the gateway at `endpoint` until it says so or goes away; the exit status."""
+    context: zmq.Context[Any] = zmq.Context()
+    link = sockets.pair(context)
+    try:
+        link.connect(endpoint)
+        link.send(fuser_messages.encode(fuser_messages.Started()))
+        return _serve(link)
+    finally:
+        link.close(linger=1000)
+        context.term()
+        _remove(endpoint)
+
+
+def _remove(endpoint: str) -> None:
+    """Clear up behind a gateway that was killed; one that lives has use for the folder, or removes it."""
+    if select.select([sys.stdin], [], [], 0)[0]:
+        file = Path(endpoint.removeprefix("ipc://"))
+        with suppress(OSError):
+            for left in (file, file.parent / fuser_messages.WORKING_FILE):
+                left.unlink(missing_ok=True)
+            file.parent.rmdir()
+
+
+def _serve(link: sockets.AnySocket) -> int:
+    poller = zmq.Poller()
+    poller.register(link, zmq.POLLIN)
+    poller.register(sys.stdin.fileno(), zmq.POLLIN)
+    fuser: Fuser | None = None
+    while fuser is None or fuser.exit_status is None:
+        idle = not poller.poll(0)
+        if fuser is not None and fuser.mesh_due(idle):
+            fuser.mesh()
+            continue
+        if idle and fuser is not None and fuser.refine_due:
+            fuser.refine()
+            continue
+        process.on_parent_end(signal.SIGCONT)  # were it stopped, it could not see the gateway go
+        events = dict(poller.poll())
+        if sys.stdin.fileno() in events:  # nothing is ever written there: the gateway has gone
+            return 1
+        message = fuser_messages.to_fuser.decode(link.recv())
+        if isinstance(message, fuser_messages.Begin):
+            fuser = _begin(link, message)
+            if fuser is None:
+                return 1
+        elif fuser is not None:
+            process.on_parent_end(signal.SIGKILL)
+            fuser.take(message)
+    return fuser.exit_status
+
+
+def _begin(link: sockets.AnySocket, message: fuser_messages.Begin) -> Fuser | None:
+    try:
+        process.end_first()
+        hold(Path(message.folder))
+        fuser = Fuser(link, message)
+    except TsfusionError as error:
+        name = next(
+            kind.__name__ for kind in type(error).__mro__ if kind.__module__ == "tsfusion.core.errors"
+        )
+        link.send(fuser_messages.encode(fuser_messages.Failed(name, str(error))))
+        return None
+    link.send(fuser_messages.encode(fuser.ready()))
+    return fuser
+
+
+def main() -> int:
+    """`python -m tsfusion.fuser ENDPOINT FORMAT LEVEL MAP`, as the gateway starts it."""
+    endpoint, format_, level, map_name = sys.argv[1:]
+    logs.configure(cast("LogFormat", format_), cast("LogLevel", level), "fuser", map=map_name)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # a terminal or supervisor signals all; the gateway decides
+    return run(endpoint)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

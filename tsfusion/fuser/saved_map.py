@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: MIT
+"""A map on a server's disk: its last checkpoint, the one before, and how far each session was in it."""
+
+import logging
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tsfusion.core import durable_files
+from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig
+from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
+from tsfusion.fuser.messages import Progress
+from tsfusion.journal import state_folder
+
+if TYPE_CHECKING:
+    from tsfusion.tsdf.volume import Volume
+
+
+# Settings that may differ between a map and the server that goes on with it: none changes the sums.
+_FREE_SETTINGS = ("threads", "max_blocks", "max_blocks_per_keyframe", *VIEW_SETTINGS)
+_NEW_FILE = "map.new.tsf"
+
+log = logging.getLogger(__name__)
+
+
+class SavedMap:
+    """The checkpoints in a map's folder.
+
+    Args:
+        keep_previous: the journal may not go back to the start, so keep the checkpoint before the last, too.
+
+    Attributes:
+        volume: the map; as of the last checkpoint when it was opened.
+        done: how far it is, by session.
+        rejected: keyframes that it could not take: reason → count.
+
+    Raises:
+        InvalidConfig: when the map was made with other settings.
+        CheckpointError: when it is not a server's, cannot be read now or is of another version. What is
+            damaged is set aside.
+    """
+
+    def __init__(self, folder: Path, config: VolumeConfig, *, keep_previous: bool) -> None:
+        from tsfusion.tsdf.volume import Volume
+
+        self._path, self._previous = folder / state_folder.MAP_FILE, folder / state_folder.PREVIOUS_FILE
+        self._new = folder / _NEW_FILE
+        with suppress(OSError):  # of a process that was killed
+            self._new.unlink()
+        self._keep_previous = keep_previous
+        self.done: dict[bytes, Progress] = {}
+        self.rejected: dict[str, int] = {}
+        self.volume = _resume(self._path, config) or _resume(self._previous, config) or Volume(config)
+        if meta := self.volume.meta:
+            self.done = {bytes.fromhex(key): Progress(*progress) for key, progress in meta["done"].items()}
+            self.rejected = dict(meta["rejected"])
+
+    def save(self) -> bool:
+        """Write a checkpoint; False when that failed, which is logged.
+
+        Nothing is lost then: the next start fuses the journal from the checkpoint before this one. Until the
+        new one is on the disk, the old ones keep their names.
+        """
+        done = {key.hex(): [progress.seq, progress.client] for key, progress in self.done.items()}
+        try:
+            self.volume.save(self._new, meta={"done": done, "rejected": self.rejected})
+            if self._keep_previous:
+                with suppress(FileNotFoundError):
+                    self._path.replace(self._previous)
+            self._new.replace(self._path)
+            durable_files.sync_folder(self._path.parent)
+        except (TsfusionError, OSError, MemoryError) as error:
+            log.error("no checkpoint: %s", error)
+            return False
+        return True
+
+
+def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
+    """The volume that was saved there; None when there is none, or it is damaged.
+
+    Nothing else is None: what cannot be read now is good when it can be, and must not be begun anew.
+    """
+    from tsfusion.tsdf.volume import Volume
+
+    try:
+        volume = Volume.load(path, wanted.threads, **{name: getattr(wanted, name) for name in VIEW_SETTINGS})
+    except DamagedCheckpoint as error:
+        _set_aside(path, error)
+        return None
+    except CheckpointError as error:
+        if isinstance(error.__cause__, FileNotFoundError):
+            return None
+        raise
+    except MemoryError as error:
+        raise CheckpointError(f"the map {path} does not fit into this machine's memory") from error
+    if "done" not in volume.meta:
+        raise CheckpointError(f"{path} was not saved by a server: it does not say which keyframes it holds")
+    for name in VolumeConfig.__struct_fields__:
+        here, there = getattr(wanted, name), getattr(volume.config, name)
+        if name not in _FREE_SETTINGS and here != there:
+            raise InvalidConfig(
+                f"the map in {path.parent} was made with {name} = {there}, got {here}: use another state "
+                f"folder or map (only a journal that is whole can build this one anew)"
+            )
+    return volume
+
+
+def _set_aside(path: Path, error: DamagedCheckpoint) -> None:
+    """Out of the way, beside what was set aside before."""
+    names = (path.with_name(f"{path.stem}.damaged{number}") for number in ("", *range(2, 1_000_000)))
+    try:
+        aside = next(name for name in names if not os.path.lexists(name))
+        path.rename(aside)
+    except OSError as refusal:
+        raise CheckpointError(f"{error}, and it cannot be set aside: {refusal.strerror}") from refusal
+    log.error(
+        "%s; it is kept as %s, and the map is built again from the journal, or goes on from the checkpoint "
+        "before it", error, aside,
+    )  # fmt: skip

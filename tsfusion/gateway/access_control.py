@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: MIT
+"""Who may come in: keys and the allow-list, checked when a connection is made and again at every message."""
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import zmq
+from zmq.utils import z85
+
+from tsfusion.core.errors import InvalidConfig
+from tsfusion.wire.curve import DOMAIN, ServerKeys, server_keys
+from tsfusion.wire.key_folder import AllowList
+
+log = logging.getLogger(__name__)
+
+
+class Door:
+    """The allow-list of one server; without a folder of keys everybody who can reach it may come in.
+
+    Args:
+        folder: made by `tsfusion keys`; None = no keys.
+
+    Attributes:
+        keys: the server's own pair, for its sockets.
+        poll: the sockets that `step` wants to be called for.
+
+    Raises:
+        InvalidConfig: when the folder has no usable keys or allow-list.
+    """
+
+    def __init__(self, context: "zmq.Context[Any]", folder: str | None) -> None:
+        self.keys: ServerKeys | None = None
+        self._allowed: AllowList | None = None
+        self._zap: Zap | None = None
+        self._revoked = False
+        if folder is not None:
+            self.keys = server_keys(folder)
+            self._allowed = AllowList(Path(folder))
+            if self._allowed.problem:  # who starts a server is there to mend it; later, nobody is let in
+                raise InvalidConfig(self._allowed.problem)
+            self._zap = Zap(context, self._allowed.name_of, self._allowed.why_not)
+        self.poll = [] if self._zap is None else [self._zap.socket]
+
+    @property
+    def problem(self) -> str:
+        """Why nobody at all is let in; empty = the allow-list can be read."""
+        return "" if self._allowed is None else self._allowed.problem
+
+    @property
+    def refused(self) -> Counter[str]:
+        """Connections that were turned away, by reason."""
+        return Counter() if self._zap is None else self._zap.refused
+
+    def step(self) -> bool:
+        """Answer who knocks. True when somebody no longer may: all connections have to be made anew."""
+        if self._allowed is None or self._zap is None:
+            return False
+        self._revoked |= self._allowed.refresh()
+        self._zap.answer_all()
+        revoked, self._revoked = self._revoked, False
+        return revoked
+
+    def client_of(self, frame: zmq.Frame) -> str | None:
+        """The name its sender's key is allowed under: empty without keys, None when it is (no longer)."""
+        if self._allowed is None:
+            return ""
+        self._revoked |= self._allowed.refresh()  # it may have been since the last step
+        key = sender_of(frame)
+        return None if key is None else self._allowed.name_of(key)
+
+    def close(self) -> None:
+        """Nobody is answered any more."""
+        if self._zap is not None:
+            self._zap.close()
+
+
+_ENDPOINT = "inproc://zeromq.zap.01"
+_QUESTIONS_A_STEP = 100
+_LOG_EVERY = 60.0  # seconds; the same refusal is logged once, and few of them: keys cost nothing to make
+_LOGGED_AT_MOST = 20
+_KEY_BYTES = 32
+Allow = Callable[[str], str | None]
+
+
+class Zap:
+    """Answers for one context. Make it before the sockets with keys bind; close it after them.
+
+    Args:
+        allow: the client's name by its public key (40 characters); None = it may not connect.
+        why_not: a word for the refusal, for the log and for `refused`.
+    """
+
+    def __init__(
+        self, context: "zmq.Context[Any]", allow: Allow, why_not: Callable[[str], str] = lambda _: "unknown"
+    ) -> None:
+        self.refused: Counter[str] = Counter()  # connections, by reason
+        self._allow = allow
+        self._why_not = why_not
+        self._logged: set[tuple[str, str]] = set()
+        self._logged_since = 0.0
+        self.socket: zmq.Socket[Any] = context.socket(zmq.ROUTER)
+        self.socket.setsockopt(zmq.LINGER, 0)
+        self.socket.bind(_ENDPOINT)
+
+    def answer_all(self) -> None:
+        """Answer what has been asked, up to a limit: then the other sockets get their turn. Never waits."""
+        for _ in range(_QUESTIONS_A_STEP):
+            try:
+                frames = self.socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            self._answer(frames)
+
+    def close(self) -> None:
+        """Stop answering: nobody can connect any more."""
+        self.socket.close()
+
+    def _answer(self, frames: Sequence[bytes]) -> None:
+        """Frames: asker, nothing, version, request, domain, address, identity, mechanism, credentials."""
+        if len(frames) < 4:  # nothing that an answer could refer to
+            self.refused["malformed"] += 1
+            return
+        asker, delimiter, version, number, *question = frames
+        if delimiter or version != b"1.0" or len(question) < 4:
+            key, reason = "", "malformed"
+        else:
+            key, reason = self._judge(question)
+        if reason:
+            self._note(key, reason, question[1] if len(question) > 1 else b"")
+        verdict = [b"400", reason.encode(), b"", b""] if reason else [b"200", b"OK", key.encode(), b""]
+        try:
+            self.socket.send_multipart([asker, b"", b"1.0", number, *verdict], zmq.NOBLOCK)
+        except zmq.ZMQError as error:  # the connection has gone meanwhile
+            log.debug("an answer about a connection was not sent: %s", error)
+
+    def _judge(self, question: Sequence[bytes]) -> tuple[str, str]:
+        """The key, and why it may not connect; an empty reason = it may."""
+        domain, _address, _identity, mechanism, *credentials = question
+        if domain != DOMAIN:
+            return "", "domain"
+        if mechanism != b"CURVE":
+            return "", "mechanism"
+        if len(credentials) != 1 or len(credentials[0]) != _KEY_BYTES:
+            return "", "malformed"
+        key = z85.encode(credentials[0]).decode("ascii")
+        return key, "" if self._allow(key) is not None else self._why_not(key)
+
+    def _note(self, key: str, reason: str, address: bytes) -> None:
+        self.refused[reason] += 1
+        now = time.monotonic()
+        if now - self._logged_since > _LOG_EVERY:
+            self._logged.clear()
+            self._logged_since = now
+        if (key, reason) not in self._logged and len(self._logged) < _LOGGED_AT_MOST:
+            self._logged.add((key, reason))
+            place = address[:64].decode("ascii", "replace")
+            log.warning("a connection from %s is refused (%s): key %s", place, reason, key or "none")
+
+
+def sender_of(frame: zmq.Frame) -> str | None:
+    """The public key (40 characters) of the client that sent this frame, received with `copy=False`.
+
+    Only of a socket with keys: one without takes whatever the other side claims.
+    """
+    try:
+        return str(frame.get("User-Id"))
+    except (zmq.ZMQError, UnicodeDecodeError):
+        return None

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: MIT
+"""Todo."""
+
+from array import array
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable
+
+from msgspec import Struct
+
+from tsfusion.gateway.sessions import Session, Sessions
+from tsfusion.journal import Position, Scan
+from tsfusion.wire.keyframe_times import Stamps
+
+
+class Entry(Struct, frozen=True):
+    """One journaled keyframe."""
+
+    index: int
+    position: Position
+    session: int
+    stamps: Stamps
+    captured_ns: int
+
+
+_COLUMNS = (
+    *("segment", "offset", "session", "seq", "captured_ns"),
+    *("received_ns", "durable_ns", "fuse_start_ns", "fused_ns"),  # as in Stamps
+)
+
+
+class KeyframeIndex:
+    """Every keyframe of the journal in order: 72 bytes each. Stamps are 0 for those of earlier runs.
+
+    An index stays what it is when the keyframes before it are forgotten.
+    """
+
+    def __init__(self) -> None:
+        self._columns = {name: array("q") for name in _COLUMNS}
+        self._first = 0  # index that is not forgotten
+
+    def __len__(self) -> int:
+        return len(self._columns["seq"])
+
+    def recover(self, found: Iterable[Scan], sessions: Sessions) -> None:
+        """Take over what the journal's scan found. A keyframe journaled twice counts once.
+
+        (The disk refused, the client sent it again, and the first copy had been written after all.)
+        """
+        for record in found:
+            session = sessions.open(record.session, record.client)
+            if record.seq > session.durable:
+                session.durable = record.seq
+                self.add(record.position, session, record.seq)
+
+    def add(
+        self,
+        position: Position,
+        session: Session,
+        seq: int,
+        *,
+        captured_ns: int = 0,
+        received_ns: int = 0,
+        durable_ns: int = 0,
+    ) -> int:
+        """Append a keyframe; its index."""
+        place = (position.segment, position.offset, session.number, seq, captured_ns)
+        values = (*place, received_ns, durable_ns, 0, 0)
+        for column, value in zip(self._columns.values(), values, strict=True):
+            column.append(value)
+        index = self._first + len(self) - 1
+        session.entries.append(index)
+        return index
+
+    def forget(self, before_segment: int, sessions: Sessions, needed: Iterable[int] = ()) -> None:
+        """Let go of the keyframes whose segment is gone, up to the first that is still to be handed out.
+
+        Args:
+            needed: indices that somebody will ask for.
+        """
+        if not bisect_left(self._columns["segment"], before_segment):
+            return
+        stop = self._first + bisect_left(self._columns["segment"], before_segment)
+        waiting = (one.entries[one.handed] for one in sessions if one.handed < len(one.entries))
+        stop = min(stop, min(waiting, default=stop), min(needed, default=stop))
+        for session in sessions:
+            gone = bisect_left(session.entries, stop)
+            del session.entries[:gone]
+            session.handed -= gone
+        for column in self._columns.values():
+            del column[: stop - self._first]
+        self._first = stop
+
+    def fused(self, index: int, fuse_start_ns: int, fused_ns: int) -> None:
+        """Note when a keyframe entered the map."""
+        self._columns["fuse_start_ns"][index - self._first] = fuse_start_ns
+        self._columns["fused_ns"][index - self._first] = fused_ns
+
+    def __getitem__(self, index: int) -> Entry:
+        segment, offset, session, seq, captured, *stamps = (
+            column[index - self._first] for column in self._columns.values()
+        )
+        return Entry(index, Position(segment, offset), session, Stamps(seq, *stamps), captured)
+
+    def after(self, session: Session, seq: int) -> int:
+        """How many keyframes of a session, of those not forgotten, have a number up to `seq`."""
+        seqs, first = self._columns["seq"], self._first
+        return bisect_right(session.entries, seq, key=lambda index: seqs[index - first])
+
+    def segment(self, index: int) -> int:
+        """The segment that holds a keyframe."""
+        return self._columns["segment"][index - self._first]

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: MIT
+"""A server's figures for Prometheus, and its health checks.
+
+The gateway's thread writes (`observe`, `health`), a thread of its own answers HTTP; neither waits for the
+other.
+"""
+
+import platform
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from prometheus_client import CollectorRegistry, Histogram, generate_latest
+from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from tsfusion import __version__
+from tsfusion.core.config import ServerConfig
+from tsfusion.core.logs import printable
+from tsfusion.gateway import metrics_families
+from tsfusion.gateway.metrics_http import Answer, Page
+from tsfusion.wire.health import Health
+from tsfusion.wire.keyframe_times import STAGES as LEDGER_STAGES
+
+STAGES = (*LEDGER_STAGES, "total")
+BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)  # seconds
+FRESH = 10.0  # seconds; a gateway renews its snapshot every second
+_TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
+_MAX_MAPS = 256  # that have a label of their own; those beyond share `families.OTHERS`
+
+__all__ = ["BUCKETS", "FRESH", "STAGES", "Metrics"]
+
+
+class Metrics(Collector):
+    """The figures of one server.
+
+    Args:
+        server: adds the limits and the room that is left in its state folder.
+
+    Attributes:
+        registry: every figure.
+    """
+
+    def __init__(
+        self, server: ServerConfig | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._server = server
+        self._clock = clock
+        self._seen: tuple[Health, float] | None = None
+        self._maps: set[str] = set()
+        self._page: Page | None = None
+        self.registry = CollectorRegistry()
+        self._delay = Histogram(
+            "tsfusion_keyframe_delay_seconds",
+            "How long a keyframe took from one stamp to the next; total = captured to fused.",
+            ("map", "stage"),
+            buckets=BUCKETS,
+            registry=self.registry,
+        )
+        self.registry.register(self)
+
+    def observe(self, map_name: str, stage: str, seconds: float) -> None:
+        """A keyframe took so long for a stage of `STAGES`."""
+        if map_name not in self._maps:
+            if len(self._maps) >= _MAX_MAPS:
+                map_name = metrics_families.OTHERS
+            else:
+                self._maps.add(map_name)
+        self._delay.labels(map_name, stage).observe(max(seconds, 0.0))
+
+    @property
+    def health(self) -> Health | None:
+        """The gateway's last snapshot."""
+        return self._seen[0] if self._seen else None
+
+    @health.setter
+    def health(self, snapshot: Health) -> None:
+        self._seen = (snapshot, self._clock())
+
+    def serve(self, address: str) -> str:
+        """Answer HTTP at HOST:PORT (port 0 = a random one) until `close`; the real address.
+
+        Raises:
+            InvalidConfig: when others than this machine could reach it.
+            TransportError: when the port is taken.
+        """
+        self._page = Page(address, {"/metrics": self._figures, "/livez": self._alive, "/readyz": self._ready})
+        return self._page.address
+
+    def close(self) -> None:
+        """Answer no more."""
+        if self._page is not None:
+            self._page.close()
+            self._page = None
+
+    # --- pages ---
+
+    def _figures(self) -> Answer:
+        return Answer(200, generate_latest(self.registry), _TEXT_FORMAT)
+
+    def _alive(self) -> Answer:
+        _, silence = self._fresh()
+        return Answer(503, silence) if silence else Answer(200, "alive")
+
+    def _ready(self) -> Answer:
+        health, silence = self._fresh()
+        if health is None:
+            return Answer(503, silence)
+        problems = "\n".join(map(printable, health.problems))
+        return Answer(200, "ready") if health.ready else Answer(503, problems or "not ready")
+
+    def _fresh(self) -> tuple[Health | None, str]:
+        """The snapshot, or why there is none."""
+        if self._seen is None:
+            return None, "the gateway is starting"
+        health, then = self._seen
+        age = self._clock() - then
+        if age > FRESH:
+            return None, f"the gateway has done nothing for {age:.0f} s"
+        return health, ""
+
+    # --- figures ---
+
+    def describe(self) -> list[Metric]:
+        """Nothing: what there is depends on the snapshot."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """Everything but the delays, of the last snapshot."""
+        build = GaugeMetricFamily("tsfusion_build_info", "Versions.", labels=("version", "python"))
+        build.add_metric((__version__, platform.python_version()), 1)
+        yield build
+        seen = self._seen
+        age = self._clock() - seen[1] if seen else None
+        up = age is not None and age <= FRESH
+        yield GaugeMetricFamily("tsfusion_up", "Whether the gateway does its rounds.", value=up)
+        ready = up and seen is not None and seen[0].ready
+        yield GaugeMetricFamily("tsfusion_ready", "Whether keyframes are taken and fused.", value=ready)
+        if self._server is not None:
+            yield from metrics_families.of_disk(Path(self._server.state), self._server)
+        if seen is not None and age is not None:
+            yield from metrics_families.of_health(seen[0], age)

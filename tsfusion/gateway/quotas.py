@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: MIT
+"""What one client may send: bytes and keyframes a second (what is over it waits), points and place of a
+keyframe (what is over it is refused)."""
+
+import math
+from collections import OrderedDict
+
+import numpy as np
+
+from tsfusion.core.config import ServerConfig
+from tsfusion.wire.codec import measurement
+from tsfusion.wire.keyframe_header import Header, Refused
+
+_BURST = 2.0  # seconds' worth that may come at once
+_MAX_CLIENTS = 4096
+
+
+class Bucket:
+    """A token bucket: `rate` a second on average, `_BURST` seconds of it at once."""
+
+    def __init__(self, rate: float, now: float) -> None:
+        self._rate = rate
+        self._level = self._most = _BURST * rate
+        self._then = now
+
+    def wait(self, amount: float, now: float) -> float:
+        """Seconds until `amount` may pass; more than the bucket holds passes when it is full."""
+        self._level = min(self._level + (now - self._then) * self._rate, self._most)
+        self._then = now
+        return max(min(amount, self._most) - self._level, 0.0) / self._rate
+
+    def take(self, amount: float) -> None:
+        """It passed."""
+        self._level -= amount
+
+
+class Quotas:
+    """The buckets of every client."""
+
+    def __init__(self, server: ServerConfig) -> None:
+        self._server = server
+        self._clients: OrderedDict[str, tuple[Bucket, Bucket]] = OrderedDict()
+
+    def wait(self, owner: str, nbytes: int, now: float) -> float:
+        """Seconds that a client has to wait before a message of so many bytes; 0 = it passes, and counts.
+
+        `owner`: its name. Without keys all are one: sessions cost nothing, and would evade it.
+        """
+        buckets = self._clients.get(owner)
+        if buckets is None:
+            server = self._server
+            buckets = self._clients[owner] = (
+                Bucket(server.quota_keyframes, now),
+                Bucket(server.quota_bytes, now),
+            )
+            if len(self._clients) > _MAX_CLIENTS:
+                self._clients.popitem(last=False)
+        self._clients.move_to_end(owner)
+        keyframes, data = buckets
+        seconds = max(keyframes.wait(1.0, now), data.wait(nbytes, now))
+        if not seconds:
+            keyframes.take(1.0)
+            data.take(nbytes)
+        return seconds
+
+    def check(self, header: Header) -> None:
+        """Raise Refused (`quota`) for a keyframe of too many points, or taken too far away."""
+        server = self._server
+        shape = next(buffer.shape for buffer in header.buffers if buffer.name == measurement(header))
+        points = shape[0] if len(shape) == 2 and measurement(header) == "points" else int(np.prod(shape))
+        if points > server.quota_points:
+            raise Refused("quota", f"a keyframe may have {server.quota_points} points, got {points}")
+        away = math.dist(header.pose[3::4], (0.0, 0.0, 0.0))
+        if away > server.quota_extent:
+            raise Refused(
+                "quota", f"a sensor may be {server.quota_extent:g} m from the origin, got {away:.0f} m"
+            )

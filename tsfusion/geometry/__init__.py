@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Keyframes, frames, cameras, rigid transforms, trajectories and meshes. NumPy and OpenCV, no Taichi."""

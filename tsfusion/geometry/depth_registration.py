@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: MIT
+"""Depth and colour of two cameras brought together, either way, and a measure of how well they fit."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import InvalidConfig
+from tsfusion.geometry.keyframe import Intrinsics, check_pose
+
+Size = tuple[int, int]  # height, width
+_FAR = np.float32(65.535)  # metres: where a pixel without depth is taken to be
+_OVERLAP = 1.2  # how much wider than its share a depth pixel is drawn: no gaps on slanted surfaces
+_OCCLUDED = np.float32(1.03)  # behind what the colour camera sees, times its depth
+_EDGE = 0.05  # a depth edge: jump between neighbours, times depth
+
+
+class Registration:
+    """A depth and a colour camera that stand still to each other, both without distortion.
+
+    Args:
+        depth, color: their intrinsics.
+        size, color_size: (height, width) of their images; `color_size` None = the same.
+        T_color_depth: (4, 4), `p_color = T_color_depth @ p_depth`, metres.
+
+    Raises:
+        InvalidKeyframe: `T_color_depth` is not rigid.
+    """
+
+    def __init__(
+        self,
+        depth: Intrinsics,
+        color: Intrinsics,
+        T_color_depth: NDArray[np.float64],
+        size: Size,
+        *,
+        color_size: Size | None = None,
+    ) -> None:
+        T = check_pose(T_color_depth)
+        self.size, self.color_size = size, color_size or size
+        v, u = (np.arange(side, dtype=np.float64) for side in size)
+        turned = color.matrix @ T[:3, :3] @ np.linalg.inv(depth.matrix)
+        at_infinity = (
+            turned[:, 0, None, None] * u + turned[:, 1, None, None] * v[:, None] + turned[:, 2, None, None]
+        )
+        # A pixel at depth z lies at z · at_infinity + moved in the colour camera (homogeneous).
+        self._at_infinity = at_infinity.astype(np.float32)
+        self._moved = (color.matrix @ T[:3, 3]).astype(np.float32)
+        self._reach = _OVERLAP / 2 * np.array([color.fx / depth.fx, abs(color.fy / depth.fy)])
+
+    def color_of_depth(self, color: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """The colour of every depth pixel: (H, W, 3) uint8 of the depth's size.
+
+        A pixel without depth (0) gets what lies far away there; one beyond the colour image's border, the
+        border's; one that the colour camera cannot see, what hides it: `visible` tells.
+        """
+        u, v, _ = self._pixels(np.where(depth_m > 0, depth_m, _FAR))
+        if color.shape[:2] != self.color_size:
+            raise InvalidConfig(f"color must be of size {self.color_size}, got {color.shape[:2]}")
+        seen: NDArray[np.uint8] = cv2.remap(color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return seen
+
+    def visible(self, depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(H, W): the pixel has depth, and the colour camera sees its point with nothing before it."""
+        u, v, z = self._pixels(np.where(depth_m > 0, depth_m, _FAR))
+        height, width = self.color_size
+        column, row = np.rint(u), np.rint(v)
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (depth_m > 0) & (z > 0)
+        nearest = self.depth_of_color(depth_m)
+        seen = np.zeros(self.size, bool)
+        at = row[inside].astype(np.intp), column[inside].astype(np.intp)
+        seen[inside] = z[inside] <= nearest[at] * _OCCLUDED
+        return seen
+
+    def depth_of_color(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The depth of every colour pixel: (H, W) float32 metres of the colour's size, 0 = none.
+
+        Each depth pixel is drawn as large as it is there and a fifth larger, the nearest in front.
+        """
+        u, v, z = self._pixels(np.where(depth_m > 0, depth_m, np.float32(0)))
+        height, width = self.color_size
+        valid = (depth_m > 0) & (z > 0)
+        u, v, z = u[valid], v[valid], z[valid]
+        nearest = np.full(height * width, np.inf, np.float32)
+        reach_u, reach_v = (np.float32(reach) for reach in self._reach)
+        first_u, last_u = np.ceil(u - reach_u), np.floor(u + reach_u)
+        first_v, last_v = np.ceil(v - reach_v), np.floor(v + reach_v)
+        for down in range(int(2 * reach_v) + 1):
+            for right in range(int(2 * reach_u) + 1):
+                column, row = first_u + right, first_v + down
+                drawn = (column <= last_u) & (row <= last_v)
+                drawn &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
+                at = (row[drawn] * width + column[drawn]).astype(np.intp)
+                np.minimum.at(nearest, at, z[drawn])
+        nearest[np.isinf(nearest)] = 0
+        return nearest.reshape(height, width)
+
+    def _pixels(self, z: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
+        """Column, row and depth in the colour camera of every depth pixel."""
+        if z.shape != self.size:
+            raise InvalidConfig(f"depth must be of size {self.size}, got {z.shape}")
+        x, y, there = (z * each + moved for each, moved in zip(self._at_infinity, self._moved, strict=True))
+        behind = there <= 0
+        there[behind] = 1
+        return x / there, y / there, np.where(behind, np.float32(0), there)
+
+
+def edge_fit(color: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> float:
+    """How well two images are registered: the colour's gradient under depth edges, in multiples of its mean.
+
+    About 1 when they have nothing to do with each other, 2 to 4 on real pairs that fit; NaN without edges.
+    """
+    gradient, edges = _gradient(color), _depth_edges(depth_m)
+    return float(gradient[edges].mean() / gradient.mean()) if edges.any() and gradient.any() else float("nan")
+
+
+def _gradient(color: NDArray[np.uint8]) -> NDArray[np.float32]:
+    gray = cv2.cvtColor(color, cv2.COLOR_BGR2GRAY) if color.ndim == 3 else color
+    blurred = cv2.GaussianBlur(gray, (0, 0), 1.0)
+    across, down = (cv2.Sobel(blurred, cv2.CV_32F, dx, dy) for dx, dy in ((1, 0), (0, 1)))
+    return np.asarray(cv2.magnitude(across, down), np.float32)
+
+
+def _depth_edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """The near side of every jump in depth."""
+    edges = np.zeros(depth_m.shape, bool)
+    for axis in (0, 1):
+        for way in (1, -1):
+            other = np.roll(depth_m, way, axis=axis)
+            edges |= (depth_m > 0) & (other > depth_m * (1 + _EDGE))
+    edges[[0, -1]] = edges[:, [0, -1]] = False
+    return edges

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: MIT
+"""The frame: what a sensor measured at one moment, before anyone knows from where."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import InvalidKeyframe
+from tsfusion.geometry.keyframe import Intrinsics, Keyframe
+from tsfusion.geometry.stereo_matching import UNITS, Matcher
+
+Kind = Literal["depth", "disparity", "points", "pair"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Frame:
+    """One measurement without a pose. Give one of `depth`, `disparity`, `points`, or `left` and `right`.
+
+    Fields that a `Keyframe` has too mean the same and are checked the same way, at construction.
+
+    Attributes:
+        sensor: name of the sensor model (`kinect`, `tof`, `realsense`, `stereo`, `lidar`, `scanner`).
+        timestamp_ns: the sensor's clock; 0 = unknown.
+        captured_ns: `time.monotonic_ns()` at capture; 0 = unknown.
+        T_world_camera: (4, 4) float64, what the source itself says of the pose (ground truth, another
+            SLAM); None = nothing. Only the localizer `given` looks at it.
+        left, right: (H, W) uint8 grey, rectified, with `intrinsics` of both and `baseline_fx`.
+        color: (H, W, 3) uint8 BGR of the depth or of the left image, or (N, 3) of the points.
+        point_times_s: (N,) float32 seconds from `timestamp_ns` of each point; None = all at once.
+
+    Raises:
+        InvalidKeyframe: naming the field, its value and what was expected.
+    """
+
+    sensor: str
+    timestamp_ns: int = 0
+    captured_ns: int = 0
+    T_world_camera: NDArray[np.float64] | None = None
+    depth: NDArray[Any] | None = None
+    depth_scale: float = 0.001
+    disparity: NDArray[np.uint16] | None = None
+    disparity_scale: float = 1 / UNITS
+    baseline_fx: float | None = None
+    left: NDArray[np.uint8] | None = None
+    right: NDArray[np.uint8] | None = None
+    points: NDArray[np.float32] | None = None
+    point_times_s: NDArray[np.float32] | None = None
+    color: NDArray[np.uint8] | None = None
+    confidence: NDArray[np.uint8] | None = None
+    intrinsics: Intrinsics | None = None
+    kind: Kind = field(init=False)
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__  # the dataclass is frozen for everyone else
+        pair = self.left is not None or self.right is not None
+        if pair:
+            self._check_pair()
+        checked = self._at(np.eye(4) if self.T_world_camera is None else self.T_world_camera)
+        put(self, "kind", "pair" if pair else checked.kind)
+        for name in ("depth", "disparity", "points", "color", "confidence", "intrinsics"):
+            if not (pair and name == "disparity"):
+                put(self, name, getattr(checked, name))
+        if self.T_world_camera is not None:
+            put(self, "T_world_camera", checked.T_world_camera)
+        if self.point_times_s is not None:
+            times = np.asarray(self.point_times_s, dtype=np.float32)
+            if self.points is None or times.shape != (len(self.points),) or not np.isfinite(times).all():
+                raise InvalidKeyframe(f"point_times_s must be finite, one a point, got shape {times.shape}")
+            put(self, "point_times_s", times)
+
+    @classmethod
+    def of(cls, keyframe: Keyframe, sensor: str) -> "Frame":
+        """A keyframe's measurement; its pose becomes what the source says."""
+        names = {f.name for f in dataclasses.fields(cls) if f.init} & {
+            f.name for f in dataclasses.fields(keyframe) if f.init
+        }
+        fields = {name: getattr(keyframe, name) for name in names}
+        return cls(**{**fields, "sensor": keyframe.sensor or sensor})
+
+    def keyframe(self, T_world_camera: NDArray[np.float64]) -> Keyframe:
+        """The frame as a keyframe; of a stereo pair the disparity is matched here, at full resolution."""
+        if self.kind != "pair":
+            return self._at(T_world_camera)
+        assert self.left is not None
+        assert self.right is not None
+        return self._at(T_world_camera, disparity=Matcher()(self.left, self.right))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(H, W) of the image, or (N,) of the points."""
+        for array in (self.depth, self.disparity, self.left):
+            if array is not None:
+                return tuple(array.shape)
+        assert self.points is not None
+        return (len(self.points),)
+
+    @cached_property
+    def gray(self) -> NDArray[np.uint8] | None:
+        """(H, W) uint8: the left image, or the colour's luminance; None where there is no image."""
+        if self.left is not None:
+            return self.left
+        if self.color is None or self.points is not None:
+            return None
+        gray: NDArray[np.uint8] = cv2.cvtColor(self.color, cv2.COLOR_BGR2GRAY)
+        return gray
+
+    @cached_property
+    def depth_m(self) -> NDArray[np.float32] | None:
+        """(H, W) float32 metres along the optical axis, 0 = none; None for points and stereo pairs."""
+        if self.depth is not None:
+            if self.depth.dtype == np.uint16:
+                metres: NDArray[np.float32] = self.depth * np.float32(self.depth_scale)
+                return metres
+            with np.errstate(invalid="ignore"):
+                valid = np.isfinite(self.depth) & (self.depth > 0)
+            return np.where(valid, self.depth, np.float32(0)).astype(np.float32)
+        if self.disparity is None or self.baseline_fx is None:
+            return None
+        scale = np.float32(self.baseline_fx / self.disparity_scale)
+        depth = np.zeros(self.disparity.shape, np.float32)
+        np.divide(scale, self.disparity, out=depth, where=self.disparity > 0)
+        return depth
+
+    def _check_pair(self) -> None:
+        others = [name for name in ("depth", "disparity", "points") if getattr(self, name) is not None]
+        if others or self.left is None or self.right is None:
+            given = [name for name in ("left", "right") if getattr(self, name) is not None] + others
+            raise InvalidKeyframe(
+                f"exactly one of depth, disparity, points and left with right must be given, got {given}"
+            )
+        for name in ("left", "right"):
+            image = getattr(self, name)
+            if image.dtype != np.uint8 or image.ndim != 2 or image.shape != self.left.shape:
+                raise InvalidKeyframe(
+                    f"{name} must be a grey (H, W) uint8 image of the other's size, got {image.shape} of "
+                    f"{image.dtype} beside {self.left.shape}"
+                )
+
+    def _at(self, T: NDArray[np.float64], disparity: NDArray[np.uint16] | None = None) -> Keyframe:
+        if self.left is not None and disparity is None:  # stands for the one that is matched when needed
+            disparity = np.broadcast_to(np.uint16(0), self.left.shape)
+        return Keyframe(
+            T_world_camera=T,
+            depth=self.depth,
+            depth_scale=self.depth_scale,
+            disparity=self.disparity if disparity is None else disparity,
+            disparity_scale=self.disparity_scale,
+            baseline_fx=self.baseline_fx,
+            points=self.points,
+            color=self.color,
+            confidence=self.confidence,
+            intrinsics=self.intrinsics,
+            sensor=self.sensor,
+            timestamp_ns=self.timestamp_ns,
+            captured_ns=self.captured_ns,
+        )

@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: MIT
+"""The keyframe: one posed measurement, of any sensor, checked once at the door."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import InvalidKeyframe
+
+Kind = Literal["depth", "disparity", "points"]
+
+MAX_IMAGE_SIDE = 8192
+MAX_POINTS = 2_000_000
+MAX_TRANSLATION = 1e6
+MAX_SENSOR_NAME = 32
+_ROTATION_TOLERANCE = 1e-3
+_ROTATION_EXACT = 1e-9
+
+
+class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
+    """Pinhole intrinsics in pixels: `u = fx·x/z + cx`, `v = fy·y/z + cy`.
+
+    `fx > 0`; `fy` may be negative (an image stored bottom-up, as in ICL-NUIM).
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The 3×3 float64 camera matrix K."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def scaled(self, factor: float) -> "Intrinsics":
+        """The same camera with its image resized by `factor` (pixel centres at integers)."""
+        return Intrinsics(
+            self.fx * factor,
+            self.fy * factor,
+            (self.cx + 0.5) * factor - 0.5,
+            (self.cy + 0.5) * factor - 0.5,
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Keyframe:
+    """One posed measurement. Give exactly one of `depth`, `disparity` and `points`.
+
+    Arrays are read, never written; they are made contiguous and native, and float64 points become float32
+    (0.01 mm at 100 m). Pixels or points without a return are not errors: depth 0, NaN or negative,
+    disparity 0, a point with a non-finite coordinate.
+
+    Attributes:
+        T_world_camera: (4, 4) float64, `p_world = T_world_camera @ p_camera`; OpenCV camera axes
+            (x right, y down, z forward). For `points` it is the pose of the sensor frame.
+        depth: (H, W) uint16 in units of `depth_scale` metres, or (H, W) float32 metres; z, not ray length.
+        depth_scale: metres per unit of a uint16 depth image.
+        disparity: (H, W) uint16; `depth = baseline_fx / (disparity · disparity_scale)`.
+        disparity_scale: pixels per unit of disparity (OpenCV's SGBM: 1/16).
+        baseline_fx: stereo baseline times fx, metre · pixels. Also allowed with `depth` from a stereo
+            camera, where it drives the noise model.
+        points: (N, 3) float32 metres in the sensor frame.
+        origins: where each ray starts, in the sensor frame: (3,) or (N, 3) float32 metres; default the
+            frame's origin. For scanners whose rays do not meet in one point.
+        color: (H, W, 3) uint8 BGR, registered to the depth image, or (N, 3) uint8 BGR for points.
+        confidence: (H, W) or (N,) uint8; 255 = full weight, 0 = do not use.
+        intrinsics: pinhole camera; required for depth and disparity.
+        sensor: name of the sensor model that sets noise and support (`kinect`, `stereo`, `lidar`, …);
+            None = the volume's own.
+        timestamp_ns: the sensor's clock.
+        captured_ns: `time.monotonic_ns()` of the scanner at capture; 0 = unknown. Starts the delay clock.
+
+    Raises:
+        InvalidKeyframe: naming the field, its value and what was expected.
+    """
+
+    T_world_camera: NDArray[np.float64]
+    depth: NDArray[Any] | None = None
+    depth_scale: float = 0.001
+    disparity: NDArray[np.uint16] | None = None
+    disparity_scale: float = 1 / 16
+    baseline_fx: float | None = None
+    points: NDArray[np.float32] | None = None
+    origins: NDArray[np.float32] | None = None
+    color: NDArray[np.uint8] | None = None
+    confidence: NDArray[np.uint8] | None = None
+    intrinsics: Intrinsics | None = None
+    sensor: str | None = None
+    timestamp_ns: int = 0
+    captured_ns: int = 0
+    kind: Kind = field(init=False)
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__  # the dataclass is frozen for everyone else
+        put(self, "kind", self._one_measurement())
+        put(self, "T_world_camera", check_pose(self.T_world_camera))
+        getattr(self, f"_check_{self.kind}")()
+        if self.color is not None:
+            put(self, "color", _array("color", self.color, (np.uint8,), (*self.shape, 3)))
+        if self.confidence is not None:
+            put(self, "confidence", _array("confidence", self.confidence, (np.uint8,), self.shape))
+        if self.sensor is not None and not (
+            isinstance(self.sensor, str) and 0 < len(self.sensor) <= MAX_SENSOR_NAME
+        ):
+            raise InvalidKeyframe(
+                f"sensor must be a name of 1 to {MAX_SENSOR_NAME} characters, got {self.sensor!r}"
+            )
+        if self.baseline_fx is not None:
+            put(self, "baseline_fx", _positive("baseline_fx", self.baseline_fx))
+        for name in ("timestamp_ns", "captured_ns"):
+            stamp = getattr(self, name)
+            if not isinstance(stamp, (int, np.integer)) or not 0 <= stamp < 2**63:
+                raise InvalidKeyframe(f"{name} must be an integer of nanoseconds in [0, 2^63), got {stamp!r}")
+            put(self, name, int(stamp))
+
+    @cached_property
+    def shape(self) -> tuple[int, ...]:
+        """(H, W) of the image, or (N,) of the points."""
+        if self.points is not None:
+            return (len(self.points),)
+        return tuple(self.measurement.shape)
+
+    @property
+    def measurement(self) -> NDArray[Any]:
+        """The one array that was given: depth, disparity or points."""
+        for array in (self.depth, self.disparity, self.points):
+            if array is not None:
+                return array
+        raise AssertionError("checked at construction")
+
+    def _one_measurement(self) -> Kind:
+        kinds: tuple[Kind, ...] = ("depth", "disparity", "points")
+        given = [kind for kind in kinds if getattr(self, kind) is not None]
+        if len(given) != 1:
+            got = " and ".join(given) or "none"
+            raise InvalidKeyframe(f"exactly one of depth, disparity and points must be given, got {got}")
+        return given[0]
+
+    def _check_depth(self) -> None:
+        depth = _array("depth", self.depth, (np.uint16, np.float32), (None, None))
+        object.__setattr__(self, "depth", depth)
+        object.__setattr__(self, "depth_scale", _positive("depth_scale", self.depth_scale))
+        self._check_camera()
+
+    def _check_disparity(self) -> None:
+        disparity = _array("disparity", self.disparity, (np.uint16,), (None, None))
+        object.__setattr__(self, "disparity", disparity)
+        object.__setattr__(self, "disparity_scale", _positive("disparity_scale", self.disparity_scale))
+        if self.baseline_fx is None:
+            raise InvalidKeyframe(
+                "baseline_fx must be given with disparity (baseline in metres × fx in pixels)"
+            )
+        self._check_camera()
+
+    def _check_points(self) -> None:
+        if self.intrinsics is not None:
+            raise InvalidKeyframe(f"intrinsics go with images, not with points; got {self.intrinsics!r}")
+        points = _single("points", self.points, (None, 3))
+        object.__setattr__(self, "points", points)
+        if len(points) > MAX_POINTS:
+            raise InvalidKeyframe(f"points must be at most {MAX_POINTS}, got {len(points)}")
+        if self.origins is not None:
+            one = np.ndim(self.origins) == 1
+            shape = (3,) if one else (len(points), 3)
+            origins = _single("origins", self.origins, shape)
+            if not np.isfinite(origins).all():
+                raise InvalidKeyframe("origins must be finite, got NaN or infinity")
+            object.__setattr__(self, "origins", origins)
+
+    def _check_camera(self) -> None:
+        if self.origins is not None:
+            raise InvalidKeyframe("origins go with points only: the rays of an image start at the camera")
+        if max(self.shape) > MAX_IMAGE_SIDE:
+            raise InvalidKeyframe(
+                f"{self.kind} must be at most {MAX_IMAGE_SIDE} pixels a side, got {self.shape}"
+            )
+        if not isinstance(self.intrinsics, Intrinsics):
+            raise InvalidKeyframe(
+                f"intrinsics must be given with {self.kind} as Intrinsics(fx, fy, cx, cy), "
+                f"got {self.intrinsics!r}"
+            )
+        object.__setattr__(self, "intrinsics", check_intrinsics(self.intrinsics))
+
+
+def check_intrinsics(intrinsics: Intrinsics) -> Intrinsics:
+    """The four as Python floats; raises InvalidKeyframe unless they are finite, `fx > 0` and `fy != 0`."""
+    try:
+        fx, fy, cx, cy = map(float, msgspec.structs.astuple(intrinsics))
+    except (TypeError, ValueError) as error:
+        raise InvalidKeyframe(f"intrinsics must be four numbers, got {intrinsics}") from error
+    if not np.isfinite([fx, fy, cx, cy]).all() or fx <= 0 or fy == 0:
+        raise InvalidKeyframe(f"intrinsics must be finite with fx > 0 and fy != 0, got {intrinsics}")
+    return Intrinsics(fx, fy, cx, cy)
+
+
+def check_pose(pose: Any) -> NDArray[np.float64]:
+    """A proper rigid transform as (4, 4) float64; a rotation within 1e-3 is made exact.
+
+    Idempotent to the bit, so that a keyframe checked at both ends of a wire keeps its map.
+    """
+    try:
+        T = np.array(pose, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidKeyframe(f"T_world_camera must be a (4, 4) matrix of numbers, got {pose!r}") from error
+    if T.shape != (4, 4):
+        raise InvalidKeyframe(f"T_world_camera must have shape (4, 4), got {T.shape}")
+    if not np.isfinite(T).all():
+        raise InvalidKeyframe(f"T_world_camera must be finite, got {T.tolist()}")
+    R, t = T[:3, :3], T[:3, 3]
+    if np.abs(R).max() > 2:  # so far off that RᵀR could overflow
+        raise InvalidKeyframe(f"T_world_camera must hold a rotation, got entries up to {np.abs(R).max():.3g}")
+    deviation = float(np.abs(R.T @ R - np.eye(3)).max())
+    with np.errstate(divide="ignore"):  # entries too small to divide by
+        det = float(np.linalg.det(R))
+    if deviation > _ROTATION_TOLERANCE or det <= 0:
+        raise InvalidKeyframe(
+            f"T_world_camera must hold a rotation (RᵀR = I within {_ROTATION_TOLERANCE}, det > 0), "
+            f"got |RᵀR - I| = {deviation:.3g}, det = {det:.3g}"
+        )
+    if np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-9:
+        raise InvalidKeyframe(f"T_world_camera must end with the row 0 0 0 1, got {T[3].tolist()}")
+    if np.abs(t).max() > MAX_TRANSLATION:
+        raise InvalidKeyframe(
+            f"T_world_camera must translate by at most {MAX_TRANSLATION:.0e} m, got {t.tolist()}"
+        )
+    if deviation > _ROTATION_EXACT:
+        U, _, Vt = np.linalg.svd(R)
+        T[:3, :3] = U @ Vt
+    T[3] = (0, 0, 0, 1)
+    return T
+
+
+def _array(name: str, value: Any, dtypes: tuple[type, ...], shape: tuple[int | None, ...]) -> NDArray[Any]:
+    expected = " or ".join(np.dtype(dtype).name for dtype in dtypes)
+    try:
+        array = np.asarray(value)
+    except ValueError as error:  # rows of unequal length
+        raise InvalidKeyframe(f"{name} must be an array, got {type(value).__name__}: {error}") from error
+    if array.dtype.type not in dtypes:
+        raise InvalidKeyframe(f"{name} must be {expected}, got {array.dtype}")
+    if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
+        wanted = "(" + ", ".join("*" if n is None else str(n) for n in shape) + ")"
+        raise InvalidKeyframe(f"{name} must have shape {wanted}, got {array.shape}")
+    if array.size == 0 and name in ("depth", "disparity"):
+        raise InvalidKeyframe(f"{name} must not be empty, got shape {array.shape}")
+    return np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("="))
+
+
+def _single(name: str, value: Any, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
+    """float32 from float32 or float64; what is too large for it becomes infinite, which is no return."""
+    with np.errstate(over="ignore"):
+        return _array(name, value, (np.float32, np.float64), shape).astype(np.float32, copy=False)
+
+
+def _positive(name: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise InvalidKeyframe(f"{name} must be a number, got {value!r}") from error
+    if not np.isfinite(number) or number <= 0:
+        raise InvalidKeyframe(f"{name} must be finite and > 0, got {value!r}")
+    return number

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: MIT
+"""Todo."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Pose = NDArray[np.float64]  # (4, 4) T_world_camera
+
+_EXACT_NS = 1_000_000  # a pose this near in time needs no neighbour
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses in time order.
+
+    Attributes:
+        timestamps_ns: (n,) int64, strictly increasing.
+        translations: (n, 3) float64, metres.
+        quaternions: (n, 4) float64, x y z w, unit length.
+    """
+
+    timestamps_ns: NDArray[np.int64]
+    translations: NDArray[np.float64]
+    quaternions: NDArray[np.float64]
+
+    def at(self, timestamp_ns: int, *, max_gap_ns: int) -> Pose | None:
+        """The pose at a time: SLERP and linear between the neighbours, never beyond the ends.
+
+        None when the neighbours are more than `max_gap_ns` apart, unless one is within a millisecond.
+        """
+        stamps = self.timestamps_ns
+        right = int(np.searchsorted(stamps, timestamp_ns))
+        nearest = min(
+            (i for i in (right - 1, right) if 0 <= i < len(stamps)),
+            key=lambda i: abs(int(stamps[i]) - timestamp_ns),
+        )
+        if right in (0, len(stamps)) or stamps[right] - stamps[right - 1] > max_gap_ns:
+            near = abs(int(stamps[nearest]) - timestamp_ns) <= _EXACT_NS
+            return rigid(self.quaternions[nearest], self.translations[nearest]) if near else None
+        share = (timestamp_ns - stamps[right - 1]) / (stamps[right] - stamps[right - 1])
+        t = (1 - share) * self.translations[right - 1] + share * self.translations[right]
+        return rigid(slerp(self.quaternions[right - 1], self.quaternions[right], share), t)
+
+
+def slerp(q0: NDArray[np.float64], q1: NDArray[np.float64], share: float) -> NDArray[np.float64]:
+    """The unit quaternion `share` of the way from `q0` to `q1`, the short way round."""
+    cosine = float(q0 @ q1)
+    if cosine < 0:
+        q1, cosine = -q1, -cosine
+    if cosine > 0.9999995:  # the sine below would lose its digits
+        mixed = (1 - share) * q0 + share * q1
+    else:
+        angle = np.arccos(cosine)
+        mixed = (np.sin((1 - share) * angle) * q0 + np.sin(share * angle) * q1) / np.sin(angle)
+    unit: NDArray[np.float64] = mixed / np.linalg.norm(mixed)
+    return unit
+
+
+def rigid(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> Pose:
+    """(4, 4) from a unit quaternion (x y z w) and a translation."""
+    x, y, z, w = quaternion
+    T = np.eye(4)
+    T[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    T[:3, 3] = translation
+    return T
+
+
+def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) rotation → (4,) unit quaternion x y z w with w >= 0."""
+    # The largest of the four squares is at least 1/4: dividing by its root loses no digits.
+    squares = np.array(
+        [
+            1 + R[0, 0] - R[1, 1] - R[2, 2],
+            1 - R[0, 0] + R[1, 1] - R[2, 2],
+            1 - R[0, 0] - R[1, 1] + R[2, 2],
+            1 + R[0, 0] + R[1, 1] + R[2, 2],
+        ]
+    )
+    k = int(squares.argmax())
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
+    rows = ((squares[0], xy, xz, x), (xy, squares[1], yz, y), (xz, yz, squares[2], z), (x, y, z, squares[3]))
+    unit: NDArray[np.float64] = np.array(rows[k]) / np.linalg.norm(rows[k])
+    return -unit if unit[3] < 0 else unit

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: MIT
+"""The bytes of a segment: an MCAP file with one uncompressed chunk (and its CRC) a keyframe.
+
+    opening | chunk "segment" | index | (chunk "keyframe" | index) … | end of data | summary | footer | magic
+
+The first chunk holds the segment's identity, random bytes that every record repeats. A reader that lost its
+place takes only what carries them: a keyframe may contain whatever its sender likes, other records too.
+All lengths of a keyframe's chunk stand in it several times over, so a damaged one shows.
+"""
+
+import struct
+import zlib
+from collections.abc import Sequence
+from functools import cache
+from io import BytesIO
+from typing import IO, Any, NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from msgspec import Struct
+
+from tsfusion.core.errors import JournalError
+
+TOPIC = "/keyframes"
+ENCODING = "x-tsfusion"
+IDENTITY_BYTES = 8
+CLIENT_BYTES = 32
+_SESSION_BYTES = 16
+_LAYOUT = b"""tsfusion journal record, little-endian:
+segment: 8 bytes, the identity of the segment; session: 16 bytes; seq: u64;
+client: 32 bytes, the name its key is allowed under, UTF-8, zeros after it;
+frame count: u8; length of each frame: u32; the frames of the wire message."""
+_SEGMENT_LAYOUT = b"tsfusion journal segment: TSFSEG1 and a zero, then the identity of the segment, 8 bytes"
+_SEGMENT_MAGIC = b"TSFSEG1\0"
+_KEYFRAMES, _SEGMENT = 1, 2  # channels
+
+_CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, first and last time, size, CRC, compression, stored
+_MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log and publish time
+_IDENTITY = struct.Struct(f"<8s{IDENTITY_BYTES}s")
+_RECORD = struct.Struct(f"<{IDENTITY_BYTES}s{_SESSION_BYTES}sQ{CLIENT_BYTES}sB")
+_HEAD = struct.Struct(_CHUNK.format + _MESSAGE.format[1:] + _RECORD.format[1:])
+_INDEX = struct.Struct("<BQHIQQ")  # opcode, length, channel, bytes that follow, time, offset in the chunk
+_LENGTH_BYTES = 9  # opcode and length, which no length counts
+_MAX_CHUNK_BYTES = 1 << 30
+
+LIBRARY = b"tsfusion"
+OPENING = MCAP0_MAGIC + struct.pack("<BQII", Opcode.HEADER, 8 + len(LIBRARY), 0, len(LIBRARY)) + LIBRARY
+END_OF_DATA = struct.pack("<BQI", Opcode.DATA_END, 4, 0)
+MAGIC = MCAP0_MAGIC
+HEAD_BYTES = _HEAD.size
+INDEX_BYTES = _INDEX.size
+INDEX_START = struct.pack("<BQHI", Opcode.MESSAGE_INDEX, INDEX_BYTES - _LENGTH_BYTES, _KEYFRAMES, 16)
+
+
+class Position(Struct, frozen=True, order=True, array_like=True):
+    """Where a record starts: the segment's number and the byte in it. Positions sort in journal order."""
+
+    segment: int
+    offset: int
+
+
+class Record(Struct, frozen=True):
+    """One journaled keyframe message."""
+
+    position: Position
+    session: bytes
+    seq: int
+    client: str  # that the key was allowed under which it came; empty = no keys
+    logged_ns: int  # wall clock
+    frames: list[memoryview]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the message."""
+        return sum(frame.nbytes for frame in self.frames)
+
+
+class Head(NamedTuple):
+    """The first bytes of a keyframe's chunk, up to its table of frames."""
+
+    opcode: int
+    length: int
+    first_ns: int
+    last_ns: int
+    size: int
+    crc32: int
+    compression: int
+    stored: int
+    message_opcode: int
+    message_length: int
+    channel: int
+    sequence: int
+    logged_ns: int
+    published_ns: int
+    segment: bytes
+    session: bytes
+    seq: int
+    client: bytes
+    frame_count: int
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the whole chunk."""
+        return _LENGTH_BYTES + self.length
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether this can be the head of a keyframe's chunk: all its lengths agree."""
+        table = _RECORD.size + 4 * self.frame_count
+        return (
+            self.opcode == Opcode.CHUNK
+            and self.length == _CHUNK.size - _LENGTH_BYTES + self.stored
+            and self.size == self.stored == _LENGTH_BYTES + self.message_length
+            and self.message_length >= _MESSAGE.size - _LENGTH_BYTES + table
+            and (self.compression, self.message_opcode, self.channel) == (0, Opcode.MESSAGE, _KEYFRAMES)
+            and self.nbytes <= _MAX_CHUNK_BYTES
+        )
+
+    @property
+    def message_index(self) -> bytes:
+        """What the writer puts behind the chunk."""
+        return _index(_KEYFRAMES, self.logged_ns, 0)
+
+
+def _index(channel: int, logged_ns: int, offset: int) -> bytes:
+    return _INDEX.pack(Opcode.MESSAGE_INDEX, _INDEX.size - _LENGTH_BYTES, channel, 16, logged_ns, offset)
+
+
+def start(stream: IO[bytes], identity: bytes, now_ns: int) -> Any:
+    """Begin a segment; returns the MCAP writer for `add`."""
+    writer = Writer(stream, chunk_size=1, compression=CompressionType.NONE)
+    writer.start(library=LIBRARY.decode())
+    schema = writer.register_schema("tsfusion.keyframe", "", _LAYOUT)
+    writer.register_channel(TOPIC, ENCODING, schema)
+    schema = writer.register_schema("tsfusion.segment", "", _SEGMENT_LAYOUT)
+    writer.register_channel("/segment", ENCODING, schema)
+    writer.add_message(_SEGMENT, now_ns, _IDENTITY.pack(_SEGMENT_MAGIC, identity), now_ns)
+    return writer
+
+
+def add(writer: Any, payload: bytes, seq: int, now_ns: int) -> None:
+    """Write one record that `pack` made."""
+    writer.add_message(_KEYFRAMES, now_ns, payload, now_ns, sequence=seq % 2**32)
+
+
+def pack(frames: Sequence[Any], identity: bytes, session: bytes, seq: int, client: str) -> bytes:
+    """The message of one record.
+
+    Raises:
+        JournalError: for a name that is too long, rather than cut it to another one's.
+    """
+    name = client.encode()
+    if len(name) > CLIENT_BYTES:
+        raise JournalError(f"a client's name must be at most {CLIENT_BYTES} bytes, got {client!r}")
+    views = [memoryview(frame).cast("B") for frame in frames]
+    lengths = struct.pack(f"<{len(views)}I", *(view.nbytes for view in views))
+    return b"".join([_RECORD.pack(identity, session, seq, name, len(views)), lengths, *views])
+
+
+def head(raw: bytes) -> Head | None:
+    """The head of a keyframe's chunk; None when this is none."""
+    if len(raw) < HEAD_BYTES:
+        return None
+    parsed = Head(*_HEAD.unpack_from(raw))
+    return parsed if parsed.is_sound else None
+
+
+def unpack(raw: bytes, position: Position) -> Record | None:
+    """The record in a chunk; None unless all of it is there and its CRC agrees."""
+    parsed = head(raw)
+    if parsed is None or len(raw) != parsed.nbytes:
+        return None
+    body = memoryview(raw)
+    if zlib.crc32(body[_CHUNK.size :]) != parsed.crc32:
+        return None
+    lengths = struct.unpack_from(f"<{parsed.frame_count}I", raw, HEAD_BYTES)
+    at = HEAD_BYTES + 4 * parsed.frame_count
+    if at + sum(lengths) != len(raw):
+        return None
+    frames = []
+    for length in lengths:
+        frames.append(body[at : at + length])
+        at += length
+    try:
+        client = parsed.client.rstrip(b"\0").decode()
+    except UnicodeDecodeError:
+        return None
+    return Record(position, parsed.session, parsed.seq, client, parsed.logged_ns, frames)
+
+
+class Intro(NamedTuple):
+    """The first chunk of a segment."""
+
+    layout: bytes
+    identity: bytes
+    end: int
+    message_index: bytes  # what the writer puts behind the chunk
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether this module can read the rest."""
+        return self.layout == _SEGMENT_MAGIC
+
+
+def find_intro(raw: bytes) -> Intro | None:
+    """The segment's own chunk, from the start of a file; None when it is not there or damaged."""
+    at = len(OPENING)
+    if len(raw) < at + _CHUNK.size:
+        return None
+    opcode, length, first_ns, last_ns, size, crc32, compression, stored = _CHUNK.unpack_from(raw, at)
+    end = at + _LENGTH_BYTES + length
+    inner, message = at + _CHUNK.size, end - _MESSAGE.size - _IDENTITY.size
+    if (opcode, compression, size, end) != (Opcode.CHUNK, 0, stored, inner + stored):
+        return None
+    if not inner <= message or end > len(raw) or zlib.crc32(raw[inner:end]) != crc32:
+        return None
+    _, _, channel, _, logged_ns, _ = _MESSAGE.unpack_from(raw, message)
+    magic, identity = _IDENTITY.unpack_from(raw, message + _MESSAGE.size)
+    if (channel, magic[:6]) != (_SEGMENT, _SEGMENT_MAGIC[:6]) or not first_ns == last_ns == logged_ns:
+        return None
+    return Intro(magic, identity, end, _index(channel, logged_ns, message - inner))
+
+
+@cache
+def intro_bytes() -> int:
+    """Bytes of a segment before its first keyframe."""
+    stream = BytesIO()
+    start(stream, bytes(IDENTITY_BYTES), 0)
+    return len(stream.getvalue())

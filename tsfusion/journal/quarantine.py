@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: MIT
+"""Keyframes that could not be fused, each a file of its own, so that a person can look into why.
+
+They are in the journal too, but that may be pruned; and a file here can be sent to whoever can help.
+"""
+
+import logging
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from tsfusion import journal
+from tsfusion.core import durable_files, logs
+from tsfusion.core.errors import JournalError
+
+log = logging.getLogger(__name__)
+
+_MAX_FILES = 1000
+
+
+class Quarantine:
+    """A folder of `SESSION-SEQ-REASON.mcap` files; the oldest go beyond `max_bytes`, or a thousand.
+
+    The folder is read once: what a person takes away later counts until it would have gone anyway.
+    """
+
+    def __init__(self, folder: Path, max_bytes: int) -> None:
+        self.folder = folder
+        self._max_bytes = max_bytes
+        self._files = dict(_by_age(folder))  # sizes, oldest first
+        self._nbytes = sum(self._files.values())
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def keep(
+        self, frames: Sequence[Any], *, session: bytes, seq: int, client: str = "", reason: str
+    ) -> Path | None:
+        """Put a keyframe message aside; its file, or None when the disk refuses (which is logged)."""
+        path = self.folder / f"{session[:4].hex()}-{seq}-{reason}.mcap"
+        try:
+            durable_files.make_folder(self.folder)
+            journal.write_file(path, frames, session=session, seq=seq, client=client)
+            size = path.stat().st_size
+        except (JournalError, OSError) as error:
+            subject = logs.about(session=session, seq=seq, client=client, reason=reason)
+            log.error("a keyframe could not be put into quarantine: %s", error, extra=subject)
+            return None
+        self._nbytes += size - self._files.pop(path, 0)
+        self._files[path] = size
+        self._prune()
+        return path
+
+    def _prune(self) -> None:
+        while len(self) > 1 and (self._nbytes > self._max_bytes or len(self) > _MAX_FILES):
+            path = next(iter(self._files))
+            self._nbytes -= self._files.pop(path)
+            with suppress(OSError):
+                path.unlink()
+
+
+def _by_age(folder: Path) -> list[tuple[Path, int]]:
+    """The files of a folder and their sizes, oldest first."""
+    found = []
+    for path in folder.glob("*.mcap"):
+        with suppress(OSError):  # a person took it away just now
+            stat = path.stat()
+            found.append((stat.st_mtime_ns, path, stat.st_size))
+    return [(path, size) for _, path, size in sorted(found)]

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: MIT
+"""From record to record through a segment, over whatever lies between.
+
+Behind a damaged place the walk searches for the next chunk by its shape, its segment's identity and its CRC,
+so damage costs the records it hit and no other.
+"""
+
+import errno
+import os
+import re
+from collections.abc import Generator, Iterator
+from pathlib import Path
+
+from msgspec import Struct
+
+from tsfusion.core.errors import JournalError
+from tsfusion.journal import mcap_layout, segment_file
+from tsfusion.journal.mcap_layout import Position, Record
+from tsfusion.journal.segment_file import Source
+
+_WINDOW_BYTES = 1 << 20
+_MAX_INTRO_BYTES = 1 << 16
+# Bytes that a search may spend on chunks whose CRC then differs, in sizes of the file: a made-up file could
+# have each byte begin a chunk that ends with the file.
+_PATIENCE = 64
+# The head of a keyframe's chunk, with lengths under 2^40 (see `layout.Head`).
+_HEAD_SHAPE = re.compile(
+    rb"\x06(?=.{5}\0{3}.{16}.{5}\0{3}.{4}\0{4}.{5}\0{3}\x05.{5}\0{3}\x01\0)", re.DOTALL
+)  # fmt: skip
+
+
+class Damage(Struct, frozen=True):
+    """A stretch of a segment that is not as it was written.
+
+    Attributes:
+        lost: keyframes that are gone with it, at least; 0 = it only held what readers can do without.
+        torn: the end of the last write, cut off before it was acknowledged: nothing that counted is gone.
+    """
+
+    position: Position
+    nbytes: int
+    lost: int
+    what: str
+    torn: bool = False
+
+
+def walk(path: Path) -> Iterator[Record | Damage]:
+    """All that a segment file holds, in order of place; reads one record at a time.
+
+    Raises:
+        JournalError: when the file cannot be opened or read.
+    """
+    try:
+        with Source(path) as source:
+            yield from _Walk(source, segment_number(path)).steps()
+    except OSError as error:
+        raise failed("read", path, error) from error
+
+
+def segment_number(path: Path) -> int:
+    """The number a segment file is named for; 0 = it is named otherwise."""
+    return int(path.stem) if re.fullmatch(r"[0-9]{6,9}", path.stem) else 0
+
+
+def failed(verb: str, path: Path, error: OSError) -> JournalError:
+    """The error for something the disk refused."""
+    return JournalError(f"cannot {verb} {path}: {error.strerror or error}")
+
+
+def _was_index(raw: bytes) -> bool:
+    """Whether these bytes, one of them perhaps damaged, are an index and not the start of a record."""
+    return mcap_layout.INDEX_START[:1] == raw[:1] or mcap_layout.INDEX_START[1:9] == raw[1:9]
+
+
+class _Walk:
+    def __init__(self, source: Source, number: int) -> None:
+        self._source = source
+        self._number = number
+        self._seal = segment_file.read(source)
+        self._end = source.size if self._seal.data_end is None else self._seal.data_end
+        self._identity: bytes | None = None
+        self._next: tuple[int, int | None] | None = None  # the last search: from where, what it found
+        self._patience = _PATIENCE * source.size
+        self._found = self._lost = 0
+
+    def steps(self) -> Iterator[Record | Damage]:
+        at = yield from self._opening()
+        while at < self._end and not self._is_end_of_data(at):
+            found = self._record_at(at)
+            if found is None:
+                damage = self._damage(at)
+                self._lost += damage.lost
+                yield damage
+                at += damage.nbytes
+                continue
+            record, head = found
+            self._found += 1
+            yield record
+            if not head.first_ns == head.last_ns == head.logged_ns:
+                yield self._note(at, mcap_layout.HEAD_BYTES, "the times of its chunk differ from its own")
+            at = self._behind(at + head.nbytes, head.message_index)
+        yield from self._closing(at)
+
+    def _note(self, at: int, nbytes: int, what: str, *, lost: int = 0, torn: bool = False) -> Damage:
+        return Damage(Position(self._number, at), nbytes, lost, what, torn)
+
+    def _behind(self, end: int, index: bytes) -> int:
+        """Where the next record starts. A damaged index is met there, as a place without a record."""
+        return end + len(index) if self._source.read(end, len(index), self._end) == index else end
+
+    def _is_end_of_data(self, at: int) -> bool:
+        marker = mcap_layout.END_OF_DATA
+        return self._seal.data_end is None and self._source.read(at, len(marker)) == marker
+
+    def _record_at(self, at: int) -> tuple[Record, mcap_layout.Head] | None:
+        head = mcap_layout.head(self._source.read(at, mcap_layout.HEAD_BYTES, self._end))
+        if head is None or at + head.nbytes > self._end:
+            return None
+        if self._identity is not None and head.segment != self._identity:
+            return None
+        record = mcap_layout.unpack(self._source.read(at, head.nbytes), Position(self._number, at))
+        if record is None:
+            self._patience -= head.nbytes
+            return None
+        self._identity = head.segment  # of a segment whose own chunk is damaged: that of the first record
+        return record, head
+
+    # --- the start ---
+
+    def _opening(self) -> Generator[Damage, None, int]:
+        """Returns where the first record starts."""
+        expected, size = mcap_layout.OPENING, self._source.size
+        opening = self._source.read(0, len(expected))
+        if self._seal.state == "open" and size < mcap_layout.intro_bytes():
+            if size:
+                yield self._note(0, size, "its first write was cut off", torn=True)
+            return size
+        known = mcap_layout.find_intro(self._source.read(0, _MAX_INTRO_BYTES, self._end))
+        if known is not None and not known.is_ours:
+            raise JournalError(f"cannot read {self._source.path}: another version of tsfusion wrote it")
+        first = self._search(len(expected)) if known is None else None
+        if self._source.failed and not self._source.answered:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))  # the disk is away, rather than bad in places
+        if opening != expected and known is None and first is None:
+            self._lost += 1
+            yield self._note(0, size, "no segment of tsfusion, or damaged from end to end", lost=1)
+            return size
+        if opening != expected:
+            yield self._note(0, len(expected), "its opening is damaged")
+        if known is not None:
+            self._identity = known.identity
+            return self._behind(known.end, known.message_index)
+        end = self._end if first is None else first
+        lost = int(end != mcap_layout.intro_bytes())
+        self._lost += lost
+        yield self._note(len(expected), end - len(expected), "the segment's own chunk is damaged", lost=lost)
+        return end
+
+    # --- between records ---
+
+    def _damage(self, at: int) -> Damage:
+        """What is wrong at a place where a record should start, and how far it reaches."""
+        raw = self._source.read(at, mcap_layout.HEAD_BYTES, self._end)
+        head = mcap_layout.head(raw)
+        end = at + head.nbytes if head is not None else None
+        is_open = self._seal.state == "open"
+        if is_open and end is not None and end > self._end:
+            return self._torn(at)  # no search in there: all its lengths agree, it was cut off
+        following = self._search(at + 1)
+        stop = self._end if following is None else following
+        if stop - at == mcap_layout.INDEX_BYTES and (stop < self._source.size or _was_index(raw)):
+            return self._note(at, stop - at, "the index of the keyframe before it is damaged")
+        if is_open and following is None and (stop - at < mcap_layout.HEAD_BYTES or self._is_zero(at)):
+            return self._torn(at)
+        what = "nothing can be read here"
+        if head is not None and end is not None and end <= stop:
+            stop = self._over_index(end)
+            what = f"keyframe {head.seq} of session {head.session.hex()[:8]} is damaged"
+        if is_open and stop == self._end:
+            what += " (the last write; perhaps it was never acknowledged)"
+        return self._note(at, stop - at, what, lost=1)
+
+    def _torn(self, at: int) -> Damage:
+        return self._note(at, self._end - at, "the last write was cut off", torn=True)
+
+    def _over_index(self, end: int) -> int:
+        start, behind = mcap_layout.INDEX_START, end + mcap_layout.INDEX_BYTES
+        is_there = self._source.read(end, len(start), self._end) == start
+        return behind if is_there and behind <= self._end else end
+
+    def _is_zero(self, at: int) -> bool:
+        """Whether nothing was ever written there: a file may grow before its bytes reach the disk."""
+        starts = range(at, self._end, _WINDOW_BYTES)
+        rest = any(self._source.read(start, _WINDOW_BYTES, self._end).strip(b"\0") for start in starts)
+        return not rest and not self._source.failed
+
+    def _search(self, start: int) -> int | None:
+        """Where the next whole record starts, at or behind `start`."""
+        if self._next is not None:
+            begun, found = self._next
+            if begun <= start and (found is None or start <= found):
+                return found
+        found = next((at for at in self._candidates(start) if self._record_at(at) is not None), None)
+        self._next = start, found
+        return found
+
+    def _candidates(self, start: int) -> Iterator[int]:
+        for window_at in range(start, self._end, _WINDOW_BYTES):
+            window = self._source.read(window_at, _WINDOW_BYTES + mcap_layout.HEAD_BYTES, self._end)
+            for match in _HEAD_SHAPE.finditer(window):
+                if match.start() >= _WINDOW_BYTES or self._patience <= 0:
+                    break
+                yield window_at + match.start()
+
+    # --- the end ---
+
+    def _closing(self, at: int) -> Iterator[Damage]:
+        seal_, size = self._seal, self._source.size
+        if seal_.keyframes is not None and seal_.keyframes > self._found + self._lost:
+            missing = seal_.keyframes - self._found - self._lost
+            yield self._note(at, 0, f"its index counts {seal_.keyframes} keyframes", lost=missing)
+        if seal_.data_end is not None:
+            marker = mcap_layout.END_OF_DATA
+            if self._source.read(seal_.data_end, len(marker)) != marker:
+                yield self._note(seal_.data_end, len(marker), "the mark after the last keyframe is damaged")
+        if seal_.state == "broken":
+            yield self._note(at, size - at, "its index is damaged")
+        elif seal_.state == "open" and at < size:
+            yield self._note(at, size - at, "its index was cut off", torn=True)

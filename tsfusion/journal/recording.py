@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: MIT
+"""A journal, spool or segment as a dataset of keyframes: what was scanned live can be replayed offline."""
+
+import logging
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion import journal
+from tsfusion.core.config import VolumeConfig
+from tsfusion.core.errors import DecodeError, JournalError
+from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.journal import state_folder
+from tsfusion.wire import codec
+
+log = logging.getLogger(__name__)
+
+
+class Recording:
+    """The keyframes of a state folder (of one map, or of the one named), a map's folder or its `journal`, a
+    spool folder or one `.mcap` segment.
+
+    Each once and in journal order, also when a crash left a second copy. Keyframes the map had to reject
+    are among them.
+
+    Raises:
+        JournalError: when there is no keyframe.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], map_name: str | None = None) -> None:
+        place = state_folder.find(Path(path), map_name)
+        self.name = str(place.path)
+        self._places = _places(place)
+        if not self._places:
+            raise JournalError(
+                f"no keyframes in {place.path} (a state folder, a spool folder or an .mcap file)"
+            )
+        first = self[0]
+        self.sensor = first.sensor or VolumeConfig().sensor
+        self.timestamps_ns: NDArray[np.int64] | None = None
+        self.skipped: dict[str, int] = {}
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, index: int) -> Keyframe:
+        """A keyframe; raises JournalError when it cannot be read any more."""
+        path, offset = self._places[index]
+        try:
+            return codec.decode(journal.read_at(path, offset).frames)
+        except DecodeError as error:
+            raise JournalError(f"{path}: keyframe {index} is of no use: {error}") from error
+
+    def __iter__(self) -> Iterator[Keyframe]:
+        return (self[index] for index in range(len(self)))
+
+
+def read_keyframes(path: str | os.PathLike[str]) -> Iterator[Keyframe]:
+    """The keyframes of a `Recording`, one after the other."""
+    return iter(Recording(path))
+
+
+def _places(place: state_folder.Place) -> list[tuple[Path, int]]:
+    """Segment file and offset of each keyframe."""
+    found, last = [], dict[bytes, int]()
+    for file, step in place.steps():
+        if isinstance(step, journal.Damage):
+            log.log(logging.WARNING if step.torn else logging.ERROR, "%s: %s", file, step.what)
+        elif step.seq > last.get(step.session, 0):
+            last[step.session] = step.seq
+            found.append((file, step.position.offset))
+    return found

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: MIT
+"""Everything that is whole in a damaged journal, as a new one."""
+
+import os
+from contextlib import closing, suppress
+from pathlib import Path
+
+from msgspec import Struct
+
+from tsfusion.core import durable_files
+from tsfusion.core.errors import JournalError, OutputError
+from tsfusion.core.output_folder import building
+from tsfusion.journal.inspection import Problem, problem
+from tsfusion.journal.record_scan import Damage
+from tsfusion.journal.state_folder import Place, Watcher
+from tsfusion.journal.writer import Journal
+
+
+class Recovery(Struct, kw_only=True):
+    """What was saved. `copies`: keyframes that stood in the journal twice and are in the new one once."""
+
+    path: str
+    keyframes: int
+    copies: int
+    segments: int
+    nbytes: int
+    lost: int
+    problems: list[Problem]
+
+
+def recover(place: Place, out: Path, segment_bytes: int, watch: Watcher) -> Recovery:
+    """Write every whole keyframe of a journal into the new folder `out`, in order, in closed segments.
+
+    The journal itself is only read. `out` appears when all of it is on the disk, and not at all otherwise.
+
+    Raises:
+        OutputError: `out` is not empty, inside the journal, or cannot be written.
+        JournalError: nothing can be saved, or the disk refuses.
+    """
+    _check(place, out)
+    problems, copies, seen = [], 0, set[tuple[bytes, int]]()
+    with suppress(OSError):  # an empty one: a whole folder then takes its place in one step
+        out.rmdir()
+    with building(out) as work, closing(Journal(work, segment_bytes, sync=False)) as new:
+        for path, step in place.steps(watch):
+            if isinstance(step, Damage):
+                problems.append(problem(path, step))
+            elif (step.session, step.seq) in seen:
+                copies += 1
+            else:
+                seen.add((step.session, step.seq))
+                new.append(
+                    step.frames,
+                    session=step.session,
+                    seq=step.seq,
+                    client=step.client,
+                    logged_ns=step.logged_ns,
+                )
+        new.close()
+        if not seen:
+            raise JournalError(f"{place.path} holds no keyframe that could be saved")
+        segments = _sync(work)
+    durable_files.sync_folder(out.absolute().parent)
+    return Recovery(
+        path=str(out),
+        keyframes=len(seen),
+        copies=copies,
+        segments=segments,
+        nbytes=new.nbytes,
+        lost=sum(one.lost for one in problems),
+        problems=problems,
+    )
+
+
+def _check(place: Place, out: Path) -> None:
+    try:
+        is_used = out.is_dir() and any(out.iterdir())
+    except OSError as error:
+        raise OutputError(f"cannot write to {out}: {error.strerror}") from error
+    if is_used:
+        raise OutputError(f"cannot write to {out}: it is not empty; give a folder that does not exist yet")
+    source = place.path.resolve()
+    if out.resolve().is_relative_to(source if source.is_dir() else source / out.name):
+        raise OutputError(f"cannot write to {out}: it is inside the journal that is read")
+
+
+def _sync(folder: Path) -> int:
+    """Wait until the files of a folder are on the disk; how many there are."""
+    files = list(folder.iterdir())
+    for path in files:
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
+    durable_files.sync_folder(folder)
+    return len(files)

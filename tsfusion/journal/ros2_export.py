@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: MIT
+"""Writing the messages of a journal into one MCAP file of the profile `ros2`."""
+
+import os
+import re
+from collections import Counter
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Any
+
+from mcap.writer import CompressionType, Writer
+from msgspec import Struct
+
+from tsfusion.core import durable_files
+from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError, MissingDependency, OutputError
+from tsfusion.core.output_folder import check_writable
+from tsfusion.journal.inspection import Problem, problem
+from tsfusion.journal.mcap_layout import Record
+from tsfusion.journal.record_scan import Damage
+from tsfusion.journal.ros2_messages import Converter, Outgoing
+from tsfusion.journal.state_folder import Place, Watcher
+from tsfusion.wire import codec
+from tsfusion.wire.keyframe_header import unpack
+
+_INSTALL = "export needs rosbags: pip install 'tsfusion[ros]'"
+_LAST_SECOND = 2**31 - 1  # of a ROS 2 time stamp
+
+
+class Export(Struct, kw_only=True):
+    """What was written. `lost`: keyframes that are not in it because they are damaged."""
+
+    path: str
+    nbytes: int
+    keyframes: int
+    lost: int
+    messages: dict[str, int]  # by topic
+    problems: list[Problem]
+
+
+def export(place: Place, out: Path, watch: Watcher) -> Export:
+    """Write every keyframe of a journal as ROS 2 messages; `out` appears when it is whole.
+
+    Raises:
+        MissingDependency: without rosbags.
+        OutputError: `out` is no .mcap file, is one of the journal's, or cannot be written.
+        JournalError: there is no keyframe.
+    """
+    store = _type_store()
+    check_writable(out, (".mcap",))
+    if (
+        out.resolve() in {path.resolve() for path in place.files()}
+        or out.resolve().parent == place.path.resolve()
+    ):
+        raise OutputError(f"cannot write {out}: it is in the journal that is read")
+    partial = out.with_name(f".{out.name}.partial")
+    try:
+        with partial.open("wb") as stream:
+            exporter = _Exporter(_Bag(stream, store), Converter(store.types))
+            exporter.run(place, watch)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(partial, out)
+        durable_files.sync_folder(out.absolute().parent)
+    except BaseException as error:  # an interrupted one leaves no part either
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise OutputError(f"cannot write {out}: {error.strerror}") from error
+        raise
+    return exporter.result(out)
+
+
+def _type_store() -> Any:
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise MissingDependency(_INSTALL) from error
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+class _Bag:
+    """An MCAP file whose channels appear as they are used."""
+
+    def __init__(self, stream: IO[bytes], store: Any) -> None:
+        self._store = store
+        self._writer: Any = Writer(stream, compression=CompressionType.ZSTD)
+        self._writer.start(profile="ros2", library="tsfusion")
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self.messages: Counter[str] = Counter()
+
+    def write(self, message: Outgoing, stamp_ns: int) -> None:
+        """Add a message."""
+        content = bytes(self._store.serialize_cdr(message.content, message.kind))
+        self._writer.add_message(
+            self._channel(message), stamp_ns, content, stamp_ns, sequence=self.messages[message.topic]
+        )
+        self.messages[message.topic] += 1
+
+    def _channel(self, message: Outgoing) -> int:
+        if message.kind not in self._schemas:
+            text = self._store.generate_msgdef(message.kind, ros_version=2)[0]
+            self._schemas[message.kind] = self._writer.register_schema(message.kind, "ros2msg", text.encode())
+        if message.topic not in self._channels:
+            self._channels[message.topic] = self._writer.register_channel(
+                message.topic, "cdr", self._schemas[message.kind], {"offered_qos_profiles": ""}
+            )
+        return self._channels[message.topic]
+
+    def finish(self) -> None:
+        """Write the index."""
+        self._writer.finish()
+
+
+class _Exporter:
+    def __init__(self, bag: _Bag, converter: Converter) -> None:
+        self._bag = bag
+        self._converter = converter
+        self._names: dict[bytes, str] = {}
+        self._has_clock: dict[bytes, bool] = {}  # by session
+        self._held: dict[bytes, tuple[Path, Record]] = {}
+        self._seen: set[tuple[bytes, int]] = set()
+        self._problems: list[Problem] = []
+        self._keyframes = 0
+
+    def run(self, place: Place, watch: Watcher) -> None:
+        """Everything that is whole, each keyframe once."""
+        for path, step in place.steps(watch):
+            if isinstance(step, Damage):
+                self._problems.append(problem(path, step))
+            elif (step.session, step.seq) not in self._seen:
+                self._seen.add((step.session, step.seq))
+                self._take(path, step)
+        for path, record in self._held.values():
+            self._write(path, record)
+        if not self._keyframes:
+            raise JournalError(f"no keyframes in {place.path}")
+        self._bag.finish()
+
+    def _take(self, path: Path, record: Record) -> None:
+        """Write a keyframe, once it is known whether its session has a sensor's clock.
+
+        One that says 0 and is a session's first may come from a clock that started with it, or from none.
+        """
+        try:
+            has_stamp = unpack(record.frames[0]).timestamp_ns > 0
+        except (DecodeError, IndexError) as error:
+            self._refuse(path, record, error)
+            return
+        held = self._held.pop(record.session, None)
+        if record.session not in self._has_clock:
+            if not has_stamp and held is None:
+                self._held[record.session] = path, record
+                return
+            self._has_clock[record.session] = has_stamp
+        if held is not None:
+            self._write(*held)
+        self._write(path, record)
+
+    def _write(self, path: Path, record: Record) -> None:
+        try:
+            keyframe = codec.decode(record.frames)
+        except (DecodeError, InvalidKeyframe) as error:
+            self._refuse(path, record, error)
+            return
+        stamp_ns = keyframe.timestamp_ns if self._has_clock.get(record.session) else record.logged_ns
+        if stamp_ns // 10**9 > _LAST_SECOND:
+            stamp_ns = min(record.logged_ns, _LAST_SECOND * 10**9)
+        header = unpack(record.frames[0])
+        for message in self._converter.convert(keyframe, header, record, self._name(record), stamp_ns):
+            self._bag.write(message, stamp_ns)
+        self._keyframes += 1
+
+    def _refuse(self, path: Path, record: Record, error: Exception) -> None:
+        at = record.position.offset
+        self._problems.append(Problem("damage", path.name, at, record.nbytes, 1, f"no keyframe: {error}"))
+
+    def _name(self, record: Record) -> str:
+        """A name for the session that ROS takes: its client's, numbered from the second session on."""
+        if record.session not in self._names:
+            base = re.sub(r"[^A-Za-z0-9_]", "_", record.client) or "scanner"
+            base = base if base[0].isalpha() else f"scanner_{base}"
+            taken, number, name = set(self._names.values()), 1, base
+            while name in taken:
+                number += 1
+                name = f"{base}_{number}"
+            self._names[record.session] = name
+        return self._names[record.session]
+
+    def result(self, out: Path) -> Export:
+        """What has been written to `out`."""
+        return Export(
+            path=str(out),
+            nbytes=out.stat().st_size,
+            keyframes=self._keyframes,
+            lost=sum(one.lost for one in self._problems),
+            messages=dict(sorted(self._bag.messages.items())),
+            problems=self._problems,
+        )
+
+
+__all__ = ["Export", "export"]

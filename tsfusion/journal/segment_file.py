@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: MIT
+"""A segment file as bytes by offset, bad sectors included."""
+
+import errno
+import logging
+import os
+import struct
+import zlib
+from pathlib import Path
+from types import TracebackType
+from typing import Literal
+
+from mcap.opcode import Opcode
+from msgspec import Struct
+
+from tsfusion.journal.mcap_layout import END_OF_DATA, MAGIC
+
+_SECTOR_BYTES = 1 << 16
+
+log = logging.getLogger(__name__)
+
+
+class Source:
+    """A file as it is now: what a writer adds later is not seen.
+
+    Attributes:
+        failed: whether some of it could not be read.
+        answered: whether any of it could.
+
+    Raises:
+        OSError: as `open` does.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = path.open("rb", buffering=0)
+        self.size = os.fstat(self._file.fileno()).st_size
+        self.failed = self.answered = False
+
+    def __enter__(self) -> "Source":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
+        self._file.close()
+
+    def read(self, at: int, count: int, end: int | None = None) -> bytes:
+        """Up to `count` bytes, none of them at or behind `end` (default: the file's).
+
+        What the disk cannot read is zeros: it fails the CRC of the record it was in, and no other.
+        """
+        count = min(count, (self.size if end is None else end) - at)
+        if count <= 0:
+            return b""
+        try:
+            return self._pread(at, count)
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+        if not self.failed:
+            self.failed = True
+            log.error("%s: the disk cannot read all of it", self.path)
+        return b"".join(self._sector(one, at + count) for one in range(at, at + count, _SECTOR_BYTES))
+
+    def _sector(self, at: int, end: int) -> bytes:
+        count = min(_SECTOR_BYTES, end - at)
+        try:
+            return self._pread(at, count)
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+            return bytes(count)
+
+    def _pread(self, at: int, count: int) -> bytes:
+        content = os.pread(self._file.fileno(), count, at)
+        self.answered = True
+        return content
+
+
+_FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, start of its offsets, CRC
+_RECORD = struct.Struct("<BQ")
+_COUNT = struct.Struct("<Q")
+_MAX_SUMMARY_BYTES = 1 << 28
+
+
+class Seal(Struct, frozen=True):
+    """What the end of a segment says.
+
+    `open`: it was never closed, or the cut went through its end. `broken`: closed, and damaged since.
+    """
+
+    state: Literal["whole", "broken", "open"]
+    data_end: int | None = None  # where the last record ends
+    keyframes: int | None = None  # that the segment held when it was closed
+
+
+def read(source: Source) -> Seal:
+    """Look at the end of a segment."""
+    closing = (
+        source.read(source.size - len(MAGIC), len(MAGIC)) == MAGIC if source.size > len(MAGIC) else False
+    )
+    at = source.size - len(MAGIC) - _FOOTER.size
+    summary = _summary(source, at) if at > 0 else None
+    if summary is None:
+        return Seal("broken" if closing else "open")
+    start, content = summary
+    keyframes = _keyframes(content)
+    return Seal("whole" if closing else "broken", start - len(END_OF_DATA), keyframes)
+
+
+def _summary(source: Source, footer_at: int) -> tuple[int, bytes] | None:
+    """Where the summary starts, and its bytes; None unless its CRC agrees."""
+    footer = source.read(footer_at, _FOOTER.size)
+    opcode, length, start, _, crc32 = _FOOTER.unpack(footer)
+    if (opcode, length) != (Opcode.FOOTER, _FOOTER.size - _RECORD.size):
+        return None
+    if not len(END_OF_DATA) + len(MAGIC) < start <= footer_at or footer_at - start > _MAX_SUMMARY_BYTES:
+        return None
+    content = source.read(start, footer_at - start)
+    return (start, content) if zlib.crc32(footer[:-4], zlib.crc32(content)) == crc32 else None
+
+
+def _keyframes(summary: bytes) -> int | None:
+    """The keyframes that the statistics count: all messages but the segment's own first one."""
+    at = 0
+    while at + _RECORD.size + _COUNT.size <= len(summary):
+        opcode, length = _RECORD.unpack_from(summary, at)
+        if opcode == Opcode.STATISTICS:
+            return int(_COUNT.unpack_from(summary, at + _RECORD.size)[0]) - 1
+        at += _RECORD.size + length
+    return None

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: MIT
+"""The hash from block key to slot of the whole map, and the set of blocks that a keyframe finds missing.
+
+The set is the phase-concurrent, history-independent table of Shun and Blelloch (SPAA 2014): a larger key
+displaces a smaller one onward with `atomic_max`, so the table's content, and with it every slot given out
+from it, does not depend on which thread came first. No locks, no compare-and-swap.
+"""
+
+import taichi as ti
+
+from tsfusion.kernels.voxel_traversal import hash_key
+
+MAX_PROBES = 256
+
+
+@ti.func
+def set_insert(table: ti.template(), mask, key):
+    """Insert `key` (> 0) into the set; returns 1 when it is too full."""
+    full = 0
+    carried = key
+    i = hash_key(key) & mask
+    probes = 0
+    while carried != 0:
+        if table[i] == carried:
+            carried = ti.i64(0)
+        else:
+            before = ti.atomic_max(table[i], carried)
+            if before == carried:
+                carried = ti.i64(0)
+            elif before < carried:
+                carried = before
+        i = (i + 1) & mask
+        probes += 1
+        if probes > MAX_PROBES:
+            full = 1
+            carried = ti.i64(0)
+    return full
+
+
+@ti.func
+def map_find(keys: ti.template(), slots: ti.template(), mask, key):
+    """Slot of block `key` in the map, -1 if absent. The table is never more than half full."""
+    i = hash_key(key) & mask
+    slot = -1
+    probes = 0
+    while probes <= mask:
+        k = keys[i]
+        if k == key:
+            slot = slots[i]
+            probes = mask
+        elif k == 0:
+            probes = mask
+        i = (i + 1) & mask
+        probes += 1
+    return slot
+
+
+@ti.kernel
+def insert_blocks(
+    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    first: ti.i32,
+    count: ti.i32,
+    first_slot: ti.i32,
+    map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    map_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """Give `keys[first + i]` the slot `first_slot + i`. Serial; the caller keeps the table half empty and
+    the keys distinct and new."""
+    mask = map_keys.shape[0] - 1
+    ti.loop_config(serialize=True)
+    for n in range(count):
+        i = hash_key(keys[first + n]) & mask
+        probes = 0
+        while map_keys[i] != 0 and probes <= mask:
+            i = (i + 1) & mask
+            probes += 1
+        map_keys[i] = keys[first + n]
+        map_slots[i] = first_slot + n
+
+
+@ti.kernel
+def find_blocks(
+    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    map_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """Slots of block keys, -1 where absent."""
+    mask = map_keys.shape[0] - 1
+    for i in range(keys.shape[0]):
+        slots[i] = map_find(map_keys, map_slots, mask, keys[i])

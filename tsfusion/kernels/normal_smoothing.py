@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: MIT
+"""Smoothing along normals: the 1-D solve of paper eq. 3 on the field sampled along its gradient.
+
+Nothing is kept a keyframe: each voxel near the surface samples the values before and behind it and takes
+the centre row of (I + λ D2ᵀD2)⁻¹, as many samples a side as were seen.
+"""
+
+import taichi as ti
+
+from tsfusion.kernels.integrate import CUBE
+from tsfusion.kernels.voxel_traversal import RUN, vec3i
+
+vec3f = ti.types.vector(3, ti.f32)
+
+
+@ti.func
+def value_at(values: ti.template(), around: ti.template(), b, p):
+    """Value of the voxel with block-relative coordinates p, NaN where unseen."""
+    row = around[b, ((p[0] >> 3) + 1) * 9 + ((p[1] >> 3) + 1) * 3 + (p[2] >> 3) + 1]
+    value = ti.math.nan
+    if row >= 0:
+        value = values[row, ((p[0] & 7) << 6) | ((p[1] & 7) << 3) | (p[2] & 7)]
+    return value
+
+
+@ti.func
+def interpolate(values: ti.template(), around: ti.template(), b, p):
+    """Trilinear value at block-relative p (voxel centres at integers), NaN unless all corners were seen."""
+    low = vec3i(0)
+    share = vec3f(0.0)
+    for a in ti.static(range(3)):
+        low[a] = ti.cast(ti.floor(p[a]), ti.i32)
+        share[a] = p[a] - ti.cast(low[a], ti.f32)
+    total = ti.f32(0.0)
+    for c in ti.static(range(8)):
+        weight = ti.f32(1.0)
+        for a in ti.static(range(3)):
+            weight *= ti.select(c >> a & 1 == 1, share[a], 1.0 - share[a])
+        total += weight * value_at(values, around, b, low + vec3i(c & 1, c >> 1 & 1, c >> 2 & 1))
+    return total
+
+
+@ti.kernel
+def smooth_along_normals(
+    rows: ti.types.ndarray(dtype=ti.i32, ndim=1),  # the blocks to write; −1 = none there
+    around: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (rows, 27): rows of `values`, −1 = none
+    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    reach: ti.f32,  # quanta
+    centre: ti.types.ndarray(dtype=ti.f32, ndim=2),  # (most + 1, most + 1): centre[n, k], k from the centre
+    smoothed: ti.types.ndarray(dtype=ti.f32, ndim=2),
+):
+    """Replace the values within `reach` of the surface."""
+    for run in range(rows.shape[0] * RUN):
+        if run % RUN == 0:
+            r = run // RUN
+            for o in range(CUBE):
+                here = ti.math.nan
+                if rows[r] >= 0:
+                    here = values[rows[r], o]
+                result = here
+                if abs(here) <= reach:
+                    p = vec3i(o >> 6, (o >> 3) & 7, o & 7)
+                    normal = vec3f(0.0)
+                    for a in ti.static(range(3)):
+                        step = vec3i(0)
+                        step[a] = 1
+                        normal[a] = value_at(values, around, r, p + step) - value_at(
+                            values, around, r, p - step
+                        )
+                    length = normal.norm()
+                    if length > 0.0:  # never true of NaN
+                        sums = ti.Vector([here, here, here, here])  # with 0 … 3 samples a side
+                        for n in ti.static(range(4)):
+                            sums[n] = centre[n, 0] * here
+                        seen = 0
+                        for k in ti.static(range(1, 4)):
+                            ahead = ti.cast(p, ti.f32) + (k / length) * normal
+                            behind = ti.cast(p, ti.f32) - (k / length) * normal
+                            both = interpolate(values, around, r, ahead) + interpolate(
+                                values, around, r, behind
+                            )
+                            if both == both and seen == k - 1:
+                                seen = k
+                                for n in ti.static(range(k, 4)):
+                                    sums[n] += centre[n, k] * both
+                        result = sums[0]
+                        for n in ti.static(range(1, 4)):
+                            if seen == n:
+                                result = sums[n]
+                smoothed[r, o] = result

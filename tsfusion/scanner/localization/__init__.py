@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Localizers: where the sensor is, frame by frame."""

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: MIT
+"""Poses from a trajectory file that another SLAM has written: TUM's or KITTI's format."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.readers import read_lines
+from tsfusion.datasets.trajectory_files import nanoseconds, read_kitti, read_tum
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.trajectory import Trajectory, quaternion
+from tsfusion.scanner.localization.localizer import Corrections, Lost, Pose
+from tsfusion.scanner.localization.tracking_keyframes import Anchors
+
+_TUM_COLUMNS, _KITTI_COLUMNS = 8, 12
+
+
+class FromFile:
+    """`Localizer` that looks poses up by the frame's stamp and interpolates between neighbours.
+
+    A file in KITTI's format has no times. They are read from `times.txt` (seconds, a line a pose), which is
+    looked for beside the file and, for `poses/NN.txt`, in `sequences/NN` as the benchmark has it. Frames are
+    not counted instead: one that a sensor drops would move all later ones.
+
+    Args:
+        path: `timestamp tx ty tz qx qy qz qw` or 12 numbers a line, poses of the sensor whose frames are
+            followed (not of a robot's body).
+        max_gap_s: seconds between two poses; between those farther apart there is none.
+        time_offset_s: seconds to add to a frame's stamp before its pose is looked up.
+
+    Raises:
+        DatasetError: for a file that is missing, malformed, or without times.
+    """
+
+    absolute = True
+
+    def __init__(self, path: str | Path, *, max_gap_s: float, time_offset_s: float = 0.0) -> None:
+        self._trajectory = read_trajectory(Path(path).expanduser())
+        self._max_gap_ns = round(max_gap_s * 1e9)
+        self._offset_ns = round(time_offset_s * 1e9)
+        self._anchors = Anchors()
+        self._begun = False
+
+    def track(self, frame: Frame) -> Pose | Lost:
+        """The trajectory's pose at the frame's stamp; Lost in gaps and beyond the ends."""
+        stamp = frame.timestamp_ns + self._offset_ns
+        # A recording's first frame may be its time 0; 0 again is a source without times.
+        known = bool(frame.timestamp_ns) or not self._begun
+        self._begun = True
+        T = self._trajectory.at(stamp, max_gap_ns=self._max_gap_ns) if known else None
+        if T is None:
+            return Lost(reason=self._missing(frame.timestamp_ns, stamp), timestamp_ns=frame.timestamp_ns)
+        return self._anchors.pose(T, frame.timestamp_ns)
+
+    def corrections(self) -> Corrections | None:
+        """None: the file says what it says."""
+        return None
+
+    def reset(self) -> None:
+        """The world stays the trajectory's."""
+        self._anchors.reset()
+
+    def _missing(self, own: int, stamp: int) -> str:
+        stamps = self._trajectory.timestamps_ns
+        first, last = int(stamps[0]), int(stamps[-1])
+        if not own:
+            return "the frame has no time, so that no pose can be looked up"
+        if stamp < first or stamp > last:
+            side, away = ("before", first - stamp) if stamp < first else ("after", stamp - last)
+            end = "begins" if stamp < first else "ends"
+            hint = ": are these the same clock?" if away > last - first else ""
+            return f"the frame is {away / 1e9:.3f} s {side} the trajectory {end}{hint}"
+        right = int(np.searchsorted(stamps, stamp))
+        gap = (stamps[right] - stamps[right - 1]) / 1e9
+        return (
+            f"the trajectory has a gap of {gap:.3f} s here (at most {self._max_gap_ns / 1e9:g} s is bridged)"
+        )
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """A TUM or KITTI file, told apart by its columns. Raises DatasetError."""
+    lines = read_lines(path, "a trajectory in TUM's or KITTI's format")
+    if not lines:
+        raise DatasetError(f"{path} holds no poses")
+    number, first = lines[0]
+    columns = len(first.replace(",", " ").split())
+    if columns == _TUM_COLUMNS:
+        return read_tum(path)
+    if columns != _KITTI_COLUMNS:
+        raise DatasetError(
+            f"{path}:{number}: {columns} numbers; expected TUM's 8 (`timestamp tx ty tz qx qy qz qw`) or "
+            "KITTI's 12"
+        )
+    poses = read_kitti(path)
+    times_path = _times_of(path)
+    times = [nanoseconds(line, times_path, n) for n, line in read_lines(times_path, "seconds, a pose a line")]
+    if len(times) < len(poses):
+        raise DatasetError(f"{times_path} has {len(times)} lines, {path} has {len(poses)} poses")
+    return _in_time(times[: len(poses)], poses, times_path)
+
+
+def _times_of(path: Path) -> Path:
+    beside = path.with_name("times.txt")
+    benchmark = path.parent.parent / "sequences" / path.stem / "times.txt"
+    for candidate in (beside, benchmark):
+        if candidate.is_file():
+            return candidate
+    raise DatasetError(
+        f"{path} has no times (KITTI's format); put them beside it as {beside}, seconds, a line a pose, or "
+        "give a trajectory in TUM's format"
+    )
+
+
+def _in_time(stamps: Sequence[int], poses: Sequence[np.ndarray], path: Path) -> Trajectory:
+    times = np.array(stamps, dtype=np.int64)
+    if (np.diff(times) <= 0).any():
+        line = int(np.argmax(np.diff(times) <= 0)) + 2
+        raise DatasetError(f"{path}: time {line} is not after the one before it")
+    translations = np.array([T[:3, 3] for T in poses])
+    return Trajectory(times, translations, np.array([quaternion(T[:3, :3]) for T in poses]))
+
+
+class Given:
+    """`Localizer` that believes `frame.T_world_camera`."""
+
+    absolute = True
+
+    def __init__(self) -> None:
+        self._anchors = Anchors()
+
+    def track(self, frame: Frame) -> Pose | Lost:
+        """The frame's own pose; Lost where it has none."""
+        if frame.T_world_camera is None:
+            return Lost(reason="the source gives no pose for this frame", timestamp_ns=frame.timestamp_ns)
+        return self._anchors.pose(frame.T_world_camera, frame.timestamp_ns)
+
+    def corrections(self) -> Corrections | None:
+        """None: what is given is not corrected."""
+        return None
+
+    def reset(self) -> None:
+        """The world stays the source's."""
+        self._anchors.reset()

@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: MIT
+"""Following a LiDAR with KISS-ICP (Vizzo et al. 2023): point-to-point ICP against a local map.
+
+Its steps are called one by one, so that a scan that does not fit is kept out of the map.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import InvalidKeyframe, MissingDependency
+from tsfusion.geometry import se3
+from tsfusion.geometry.frame import Frame
+from tsfusion.scanner.localization.localizer import Corrections, Lost, Matrix, Pose
+from tsfusion.scanner.localization.tracking_keyframes import Anchors
+
+Points = NDArray[np.float64]  # (n, 3) metres
+
+_INSTALL = "the localizer lidar needs kiss-icp; install it with: pip install 'tsfusion[lidar]'"
+_FEWEST = 30  # points left after thinning
+_FEWEST_UPRIGHT = 50
+_OVERLAP = 0.6  # of the points; 0.88 and more in real scans and synthetic ones, 0.5 in another street
+_FARTHEST = 3.0  # adaptive thresholds from the expected place: beyond them ICP has not looked
+_TURN = np.radians(45)  # from the expected direction
+_SETTLING = 4  # scans until the motion is known
+_COLUMN, _UPRIGHT = 1.0, 0.5  # voxels: width of a column, and the height that makes it upright
+_FINE = 0.5  # voxels: threshold once the upright points are aligned
+_LARGEST_RANGE = 100.0  # metres; with a hundredth of it as voxel, KISS-ICP's own defaults
+_OUTDOORS = 20.0  # metres: farthest hundredth of the points
+_POINTS_A_VOXEL = 20
+_PATIENCE = 5  # scans without a pose through which the sensor is thought to go on moving
+_ANCHOR = 2.0  # voxels to the next tracking keyframe
+
+
+class Lidar:
+    """`Localizer` of point clouds, z up. Needs the extra `lidar`.
+
+    A beginning in full motion is what KISS-ICP alone gets wrong: rings on the ground look the same wherever
+    the sensor is, and hold it back. As long as the motion is not known, upright points are aligned first.
+
+    Args:
+        max_range: metres; farther points are left out. None = 100 outdoors, by the first scan indoors.
+        voxel_size: metres, of the local map. None = by the first scan: 1 outdoors, a tenth of the median
+            distance indoors.
+        deskew: take the sensor's own motion out of scans whose points have times of their own.
+        threads: 1 gives equal poses for equal scans.
+    """
+
+    absolute = False
+
+    def __init__(
+        self,
+        *,
+        max_range: float | None = None,
+        voxel_size: float | None = None,
+        deskew: bool = True,
+        threads: int = 1,
+    ) -> None:
+        try:
+            import kiss_icp.kiss_icp
+        except ImportError as error:
+            raise MissingDependency(_INSTALL) from error
+        self._make: Any = kiss_icp.kiss_icp.KissICP
+        self._max_range, self._voxel_size = max_range, voxel_size
+        self._deskew, self._threads = deskew, threads
+        self._anchors = Anchors()
+        self.reset()
+
+    def track(self, frame: Frame) -> Pose | Lost:
+        """Where the sensor was at the frame's stamp, seen from the first one."""
+        if frame.points is None:
+            raise InvalidKeyframe(f"the localizer lidar follows points, got {frame.kind}")
+        if self._icp is None:
+            if len(frame.points) < _FEWEST:
+                return _lost(frame, f"only {len(frame.points)} points to begin with")
+            self._begin(frame.points)
+        icp = self._icp
+        thin, map_points = icp.voxelize(self._straightened(frame, icp.last_delta))
+        if len(thin) < _FEWEST:
+            return self._fail(frame, f"only {len(thin)} points after thinning")
+        T, quality = np.eye(4), 1.0
+        if not icp.local_map.empty():
+            T = self._align(thin)
+            if not np.isfinite(T).all():
+                return self._fail(frame, "the alignment failed")
+            quality = _overlap(se3.apply(T, thin), icp.local_map.point_cloud(), self._voxel)
+            problem = self._problem(T, quality)
+            if problem:
+                return self._fail(frame, problem)
+        T = se3.nearest(self._accept(T, map_points, frame))
+        return self._anchors.pose(T, frame.timestamp_ns, quality=quality)
+
+    def corrections(self) -> Corrections | None:
+        """None: odometry closes no loops."""
+        return None
+
+    def reset(self) -> None:
+        """Begin a new world at the next frame."""
+        self._icp: Any = None
+        self._first: Frame | None = None
+        self._T_first_map = np.eye(4)
+        self._settling, self._missed = _SETTLING, 0
+        self._anchors.reset()
+
+    def _begin(self, points: NDArray[np.float32]) -> None:
+        from kiss_icp.config import KISSConfig
+        from kiss_icp.config.config import (
+            AdaptiveThresholdConfig,
+            DataConfig,
+            MappingConfig,
+            RegistrationConfig,
+        )
+
+        near, far = np.percentile(np.linalg.norm(points, axis=1), [50, 99])
+        indoors = far < _OUTDOORS
+        voxel = self._voxel_size or (max(float(near) / 10, 0.1) if indoors else _LARGEST_RANGE / 100)
+        max_range = self._max_range or (float(2 * far) if indoors else _LARGEST_RANGE)
+        self._icp = self._make(
+            KISSConfig(
+                data=DataConfig(max_range=max_range, min_range=0.0, deskew=self._deskew),
+                mapping=MappingConfig(voxel_size=voxel, max_points_per_voxel=_POINTS_A_VOXEL),
+                registration=RegistrationConfig(max_num_threads=self._threads),
+                adaptive_threshold=AdaptiveThresholdConfig(
+                    initial_threshold=2 * voxel, min_motion_th=voxel / 10
+                ),
+            )
+        )
+        self._voxel = voxel
+        self._anchors.distance = _ANCHOR * voxel
+
+    def _expected(self) -> Matrix:
+        """Where the motion leads, scans without a pose counted; after many of those, the last pose."""
+        steps = self._missed + 1 if self._missed < _PATIENCE else 0
+        T: Matrix = self._icp.last_pose @ se3.exp(se3.log(self._icp.last_delta) * steps)
+        return T
+
+    def _align(self, thin: Points) -> Matrix:
+        icp = self._icp
+        guess, threshold = self._expected(), icp.adaptive_threshold.get_threshold()
+        if self._settling:
+            upright, around = thin[_is_upright(thin, self._voxel)], self._upright_map()
+            if len(upright) >= _FEWEST_UPRIGHT and not around.empty():
+                guess = icp.registration.align_points_to_map(upright, around, guess, 3 * threshold, threshold)
+                threshold = _FINE * self._voxel
+        T: Matrix = icp.registration.align_points_to_map(thin, icp.local_map, guess, 3 * threshold, threshold)
+        return T
+
+    def _upright_map(self) -> Any:
+        from kiss_icp.mapping import VoxelHashMap
+
+        cloud = self._icp.local_map.point_cloud()
+        made = VoxelHashMap(self._voxel, self._icp.config.data.max_range, _POINTS_A_VOXEL)
+        made.add_points(cloud[_is_upright(cloud, self._voxel)])
+        return made
+
+    def _problem(self, T: Matrix, overlap: float) -> str:
+        """Why the pose is not believed; empty = it is."""
+        if overlap < _OVERLAP:
+            return f"{overlap:.0%} of the points lie where some were before"
+        surprise = se3.inverse(self._expected()) @ T
+        reach = _FARTHEST * self._icp.adaptive_threshold.get_threshold()
+        if se3.distance(surprise) > reach or se3.angle(surprise) > _TURN:
+            return (
+                f"a jump of {se3.distance(surprise):.2f} m and {np.degrees(se3.angle(surprise)):.0f}° from "
+                "where the motion led"
+            )
+        return ""
+
+    def _straightened(self, frame: Frame, motion: Matrix) -> Points:
+        """The points in reach, seen from where the sensor was at the scan's end."""
+        assert frame.points is not None
+        scan: Points = self._icp.preprocessor.preprocess(
+            frame.points.astype(np.float64), self._times(frame), motion
+        )
+        return scan
+
+    def _times(self, frame: Frame) -> NDArray[np.float64]:
+        """(N,) seconds of its points, or (0,) where the sensor's own motion is not to be taken out."""
+        times = frame.point_times_s
+        if not self._deskew or times is None or np.ptp(times) <= 0:
+            return np.zeros(0)
+        return times.astype(np.float64)
+
+    def _from_stamp(self, frame: Frame) -> Matrix:
+        """The sensor at the scan's end, seen from where it was at the frame's stamp."""
+        times = self._times(frame)
+        share = float(np.clip(-times.min() / np.ptp(times), 0, 1)) if len(times) else 1.0
+        return se3.exp((1 - share) * se3.log(self._icp.last_delta))
+
+    def _accept(self, T: Matrix, map_points: Points, frame: Frame) -> Matrix:
+        """Put the scan into the map; the sensor's pose at the frame's stamp."""
+        icp = self._icp
+        moved = se3.exp(se3.log(se3.inverse(icp.last_pose) @ T) / (self._missed + 1))
+        if icp.local_map.empty():
+            self._first = frame
+        else:
+            icp.adaptive_threshold.update_model_deviation(se3.inverse(self._expected()) @ T)
+        icp.last_delta, before, icp.last_pose = moved, icp.last_pose, T
+        if self._first is not None and self._first is not frame:
+            if len(self._times(self._first)):  # both were taken for scans of a sensor at rest
+                icp.local_map.clear()
+                icp.local_map.update(icp.voxelize(self._straightened(self._first, moved))[1], before)
+                map_points = icp.voxelize(self._straightened(frame, moved))[1]
+                self._T_first_map = self._from_stamp(self._first)
+            self._first = None
+        icp.local_map.update(map_points, T)
+        self._missed, self._settling = 0, max(0, self._settling - 1)
+        return self._T_first_map @ T @ se3.inverse(self._from_stamp(frame))
+
+    def _fail(self, frame: Frame, reason: str) -> Lost:
+        """The next scan is sought around the last good one."""
+        self._missed += 1
+        self._settling = _SETTLING
+        return _lost(frame, reason)
+
+
+def _lost(frame: Frame, reason: str) -> Lost:
+    return Lost(reason=reason, timestamp_ns=frame.timestamp_ns)
+
+
+def _is_upright(points: Points, voxel: float) -> NDArray[np.bool_]:
+    """(n,) points in columns that are higher than a ground is."""
+    cells = np.floor(points[:, :2] / (_COLUMN * voxel)).astype(np.int64)
+    _, column = np.unique(cells, axis=0, return_inverse=True)
+    lowest, highest = np.full(len(points), np.inf), np.full(len(points), -np.inf)
+    np.minimum.at(lowest, column.ravel(), points[:, 2])
+    np.maximum.at(highest, column.ravel(), points[:, 2])
+    upright: NDArray[np.bool_] = (highest - lowest)[column.ravel()] > _UPRIGHT * voxel
+    return upright
+
+
+def _overlap(points: Points, around: Points, voxel: float) -> float:
+    """The share of points in a voxel that has some of the map's, or beside one."""
+    occupied = np.unique(_keys(around, voxel))
+    keys = _keys(points, voxel)
+    hit = np.zeros(len(keys), bool)
+    for step in (0, 1, -1, 1 << 21, -(1 << 21), 1 << 42, -(1 << 42)):
+        place = np.minimum(np.searchsorted(occupied, keys + step), len(occupied) - 1)
+        hit |= occupied[place] == keys + step
+    return float(hit.mean())
+
+
+def _keys(points: Points, voxel: float) -> NDArray[np.int64]:
+    """A number a voxel: 21 bits an axis."""
+    cells = np.floor(points / voxel).astype(np.int64) + (1 << 20)
+    keys: NDArray[np.int64] = (cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2]
+    return keys

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: MIT
+"""Two views' depth images against each other: how far they agree, and the pose at which they agree best."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.geometry import se3, twists
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.scanner.localization.loop_closure.place_index import View
+
+_STEPS = 8
+_EVERY = 3  # depth pixels, to find the pose; all of them to judge it
+_SLACK = 0.01  # metres of error that do not grow with distance
+_DENSE_WORTH = 3000  # measurements in a whole depth image
+_PIXEL = 5.0  # error of a match, pixels at 640 of width: colour and depth may not be registered
+
+
+@dataclass(frozen=True, kw_only=True)
+class Agreement:
+    """Shares of one view's depth pixels projected into the other, the worse of both directions.
+
+    Attributes:
+        overlap: of all with depth, those that fall on a pixel with depth.
+        agree: of these, those where the depth is the expected one.
+        through: of these, those where the other camera saw farther: it looked through the surface.
+    """
+
+    overlap: float
+    agree: float
+    through: float
+
+
+def agreement(old: View, new: View, T_old_new: se3.Transform) -> Agreement:
+    """How the depths agree if the new camera stood at `T_old_new` (4, 4) in the old one's axes."""
+    one, two = _into(new, old, T_old_new), _into(old, new, se3.inverse(T_old_new))
+    return Agreement(
+        overlap=min(one.overlap, two.overlap),
+        agree=min(one.agree, two.agree),
+        through=max(one.through, two.through),
+    )
+
+
+def refined(
+    old: View,
+    new: View,
+    T_old_new: se3.Transform,
+    first: NDArray[np.int64],
+    second: NDArray[np.int64],
+) -> se3.Transform:
+    """The pose that suits matched features (`first` of the old view, `second` of the new) and depths best.
+
+    Gauss-Newton over reprojection both ways, and for depth cameras over distances to the old view's planes.
+    """
+    T = T_old_new
+    target = _Surface(old) if old.measured and new.measured else None
+    points = _points(new)[::_EVERY]
+    for _ in range(_STEPS):
+        H, g = np.zeros((6, 6)), np.zeros(6)
+        backward = se3.inverse(T)
+        terms = [
+            _reprojection(backward, old.points[first], new.pixels[second], new, towards_old=False),
+            _reprojection(T, new.points[second], old.pixels[first], old, towards_old=True),
+        ]
+        if target is not None:
+            terms.append(target.planes(T, points, max(old.noise, new.noise)))
+        for J, r, w in terms:
+            H += (J * w[:, None]).T @ J
+            g -= (J * w[:, None]).T @ r
+        step = np.linalg.solve(H + 1e-9 * np.eye(6), g)
+        T = se3.exp(step) @ T
+        if np.abs(step).max() < 1e-4:
+            break
+    return se3.nearest(T)
+
+
+Term = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]  # Jacobian, residual, weight
+
+
+def _reprojection(
+    T: se3.Transform,
+    points: NDArray[np.float32],
+    pixels: NDArray[np.float32],
+    camera: View,
+    *,
+    towards_old: bool,
+) -> Term:
+    """Pixels of error of points seen by the other camera; the step is a twist in the old view's axes."""
+    known = np.isfinite(points[:, 2])
+    p, pixels = points[known].astype(np.float64), pixels[known]
+    q = se3.apply(T, p)
+    ahead = q[:, 2] > 0.05
+    p, q, pixels = p[ahead], q[ahead], pixels[ahead]
+    K = camera.intrinsics
+    x, y, z = q.T
+    r = np.stack([K.fx * x / z + K.cx - pixels[:, 0], K.fy * y / z + K.cy - pixels[:, 1]], axis=1)
+    projection = np.zeros((len(q), 2, 3))
+    projection[:, 0, 0], projection[:, 0, 2] = K.fx / z, -K.fx * x / z**2
+    projection[:, 1, 1], projection[:, 1, 2] = K.fy / z, -K.fy * y / z**2
+    # q = exp(step) T p there, or T' exp(-step) p where T' leads from the old view to the new one.
+    motion = np.zeros((len(q), 3, 6))
+    motion[:, :, :3] = np.eye(3)
+    motion[:, :, 3:] = -twists.hat(q if towards_old else p)
+    if not towards_old:
+        motion = -T[:3, :3] @ motion
+    J = (projection @ motion).reshape(-1, 6)
+    sigma = _PIXEL * camera.size[0] / 640
+    size = np.linalg.norm(r, axis=1) / sigma
+    w = np.minimum(1.0, 2.0 / np.maximum(size, 1e-9)) / sigma**2
+    return J, r.ravel(), np.repeat(w, 2)
+
+
+class _Surface:
+    """A view's depth as points with normals."""
+
+    def __init__(self, view: View) -> None:
+        self._view = view
+        z = view.depth_mm.astype(np.float64) / 1000
+        self._points = _lift(z, view.small)
+        across, down = np.gradient(self._points, axis=1), np.gradient(self._points, axis=0)
+        normals = np.cross(across, down)
+        length = np.linalg.norm(normals, axis=2)
+        low, high = _window(z)
+        whole = (low > 0) & (high - low < 0.08 * high) & (length > 0)
+        self._normals = np.where(whole[:, :, None], normals / np.maximum(length, 1e-12)[:, :, None], 0)
+
+    def planes(self, T: se3.Transform, points: NDArray[np.float64], noise: float) -> Term:
+        """Metres from the tangent plane at the pixel each point falls on."""
+        q = se3.apply(T, points)
+        rows, columns, inside = _pixels(q, self._view)
+        q = q[inside]
+        p, n = self._points[rows, columns], self._normals[rows, columns]
+        r = ((q - p) * n).sum(axis=1)
+        sigma = _SLACK + 2 * noise * p[:, 2] ** 2
+        near = (np.abs(r) < 5 * sigma) & ((n != 0).any(axis=1))
+        q, n, r, sigma = q[near], n[near], r[near], sigma[near]
+        J = np.concatenate([n, np.cross(q, n)], axis=1)
+        w = np.minimum(1.0, 1.5 * sigma / np.maximum(np.abs(r), 1e-12)) / sigma**2
+        return J, r, w * (_DENSE_WORTH * _EVERY / self._view.depth_mm.size)
+
+
+def _into(source: View, target: View, T: se3.Transform) -> Agreement:
+    """One direction of `agreement`: `T` leads from the source's axes to the target's."""
+    points = _points(source)
+    low, high = _window(target.depth_mm.astype(np.float32) / 1000)
+    q = se3.apply(T, points)
+    rows, columns, inside = _pixels(q, target)
+    z = q[inside, 2]
+    low, high = low[rows, columns], high[rows, columns]
+    seen = high > 0
+    low, high, z = low[seen], high[seen], z[seen]
+    tolerance = 2 * _SLACK + 3 * (source.noise + target.noise) * z**2
+    count = max(len(z), 1)
+    through = float((z < low - tolerance).sum()) / count
+    hidden = float((z > high + tolerance).sum()) / count
+    return Agreement(overlap=len(z) / max(len(points), 1), agree=1 - through - hidden, through=through)
+
+
+def _points(view: View) -> NDArray[np.float64]:
+    """(n, 3) of all depth pixels."""
+    z = view.depth_mm.astype(np.float64) / 1000
+    return _lift(z, view.small)[z > 0]
+
+
+def _lift(z: NDArray[np.float64], K: Intrinsics) -> NDArray[np.float64]:
+    """(h, w) metres → (h, w, 3)."""
+    v, u = np.mgrid[: z.shape[0], : z.shape[1]]
+    return np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z], axis=2)
+
+
+def _pixels(
+    points: NDArray[np.float64], view: View
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Row and column of the small depth pixel of those points that have one, and which do."""
+    K, (height, width) = view.small, view.depth_mm.shape
+    z = np.maximum(points[:, 2], 1e-6)
+    u, v = np.rint(points[:, 0] / z * K.fx + K.cx), np.rint(points[:, 1] / z * K.fy + K.cy)
+    inside = (points[:, 2] > 0.05) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    return v[inside].astype(np.int64), u[inside].astype(np.int64), inside
+
+
+def _window(z: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Smallest and largest of 3×3 pixels; 0 where the middle one has none."""
+    far = np.where(z > 0, z, np.inf).astype(np.float32)
+    kernel = np.ones((3, 3), np.uint8)
+    low, high = cv2.erode(far, kernel), cv2.dilate(z.astype(np.float32), kernel)
+    return np.where(z > 0, low, 0), np.where(z > 0, high, 0)

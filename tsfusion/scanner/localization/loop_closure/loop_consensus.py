@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: MIT
+"""Which loops to believe: those that odometry allows, that stand alone, and that support each other."""
+
+import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from tsfusion.geometry import se3
+from tsfusion.scanner.localization.loop_closure.odometry_drift import Chain
+from tsfusion.scanner.localization.loop_closure.pose_graph import Edge, Matrix, information
+
+GATE = 6.0  # standard deviations by which a loop may contradict what was known
+_AMBIGUOUS = 12.0  # deviations up to which another explanation is not ruled out
+_SUPPORT = 3  # keyframes whose loops must agree before the first is believed,
+_EXPECTED = 3.0  # or one less within so many deviations
+_WINDOW = 15  # keyframes for which a loop waits for support
+_TWINS = 4  # look-alikes remembered of a place
+_ROTATION = 0.005  # radians of error of a loop
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """The keyframe `new` stands at `T_old_new` in the axes of `old`, give or take `sigma` metres."""
+
+    old: int
+    new: int
+    T_old_new: Matrix
+    sigma: float
+
+    @property
+    def edge(self) -> Edge:
+        """For the pose graph."""
+        return Edge(self.old, self.new, self.T_old_new, information(self.sigma, _ROTATION), robust=True)
+
+    @property
+    def covariance(self) -> Matrix:
+        """(6, 6), as a twist in the axes of `new`."""
+        return np.diag([self.sigma**2] * 3 + [_ROTATION**2] * 3)
+
+
+class Consensus:
+    """Takes loops that look right one by one, and says which are to be believed.
+
+    1. The loop must not contradict the odometry, taken over the shortest way: from the start of the loop to
+       its end, or through a loop believed before.
+    2. No other explanation may remain: a view that also fits a place elsewhere, or whose place was seen to
+       look like another one (a *twin*), is believed only where odometry rules the other out.
+    3. Loops of three keyframes near each other must agree pairwise (Mangelson et al., "Pairwise Consistent
+       Measurement Set Maximization", 2018) before any is, or of two where odometry expects them there;
+       later ones nearby need only agree with one of those.
+    """
+
+    def __init__(self, chain: Chain) -> None:
+        self._chain = chain
+        self.believed: list[Loop] = []
+        self._ends = np.empty((0, 2))  # ways of the believed loops' ends
+        self._waiting: list[Loop] = []
+        self._twins: dict[int, list[tuple[int, Matrix]]] = {}  # place → (another, T_another_place) by looks
+        self.refused: dict[str, int] = {}
+
+    def hear(self, loops: list[Loop]) -> list[Loop]:
+        """Those to be believed now, out of one keyframe's loops and those that wait."""
+        if not loops:
+            return []
+        deviations = [self.deviation(loop.old, loop.new, loop.T_old_new, loop.covariance) for loop in loops]
+        allowed = [loop for loop, d in zip(loops, deviations, strict=True) if d <= GATE]
+        for loop, d in zip(loops, deviations, strict=True):
+            if d > GATE:
+                self._count("contradicts the odometry")
+                self._remember_twin(loop, allowed)
+        if not allowed:
+            return []
+        if self._doubtful(allowed) or min((d for d in deviations if d > GATE), default=np.inf) < _AMBIGUOUS:
+            self._count("fits another place too")
+            return []
+        return [found for loop in allowed for found in self._supported(loop)]
+
+    def deviation(self, old: int, new: int, T_old_new: Matrix, covariance: Matrix) -> float:
+        """Standard deviations (the root of χ²) between a claim and what was known."""
+        T, known = self._known(old, new)
+        error = se3.log(se3.inverse(T_old_new) @ T)
+        return float(np.sqrt(error @ np.linalg.solve(known + covariance, error)))
+
+    def unique(self, place: int) -> bool:
+        """Whether nothing was seen that looks like this place."""
+        return place not in self._twins
+
+    def disown(self, loop: Loop) -> None:
+        """The pose graph found it wrong."""
+        self.believed.remove(loop)
+        self._count_ends()
+        self._count("contradicts other loops")
+
+    def _known(self, old: int, new: int) -> tuple[Matrix, Matrix]:
+        """`T_old_new` and covariance over the shortest way."""
+        ways = self._chain.ways
+        direct = abs(ways[new] - ways[old])
+        if self.believed:
+            over = np.abs(self._ends - (ways[old], ways[new])).sum(axis=1)
+            best = int(over.argmin())
+            if over[best] < direct:
+                return self._through(self.believed[best], old, new)
+        return self._chain.between(old, new)
+
+    def _through(self, loop: Loop, old: int, new: int) -> tuple[Matrix, Matrix]:
+        """`T_old_new` and covariance by odometry to a loop, over it, and on."""
+        first, first_covariance = self._chain.between(old, loop.old)
+        last, covariance = self._chain.between(loop.new, new)
+        for behind, known in ((last, loop.covariance), (loop.T_old_new @ last, first_covariance)):
+            A = se3.adjoint(se3.inverse(behind))
+            covariance = covariance + A @ known @ A.T
+        return first @ loop.T_old_new @ last, covariance
+
+    def _supported(self, loop: Loop) -> list[Loop]:
+        """The loop, and those that wait and agree with it, once they are enough."""
+        if self.believed and any(self._near(loop, other) for other in self.believed):
+            self._believe([loop])
+            return [loop]
+        self._waiting = [w for w in self._waiting if self._age(w, loop) <= _WINDOW]
+        friends: list[Loop] = []
+        for other in reversed(self._waiting):
+            if all(self._agree(other, friend) for friend in [loop, *friends]):
+                friends.insert(0, other)
+        expected = self.deviation(loop.old, loop.new, loop.T_old_new, loop.covariance) <= _EXPECTED
+        if len({loop.new, *(friend.new for friend in friends)}) < _SUPPORT - expected:
+            self._waiting.append(loop)
+            return []
+        self._waiting = [w for w in self._waiting if w not in friends]
+        self._believe([*friends, loop])
+        return [*friends, loop]
+
+    def _believe(self, loops: list[Loop]) -> None:
+        self.believed += loops
+        self._count_ends()
+
+    def _count_ends(self) -> None:
+        ways = self._chain.ways
+        self._ends = np.array([(ways[loop.old], ways[loop.new]) for loop in self.believed]).reshape(-1, 2)
+
+    def _near(self, loop: Loop, other: Loop) -> bool:
+        return self._age(other, loop) <= _WINDOW and self._agree(other, loop)
+
+    def _age(self, earlier: Loop, later: Loop) -> int:
+        return abs(later.new - earlier.new)
+
+    def _agree(self, one: Loop, two: Loop) -> bool:
+        T, known = self._through(one, two.old, two.new)
+        error = se3.log(se3.inverse(two.T_old_new) @ T)
+        return bool(error @ np.linalg.solve(known + two.covariance, error) <= GATE**2)
+
+    def _remember_twin(self, wrong: Loop, right: Iterable[Loop]) -> None:
+        """`wrong.old` looks like the place of `new`: seen from there, or from the place it truly is."""
+        self._add_twin(wrong.new, wrong.old, wrong.T_old_new)
+        for loop in right:
+            self._add_twin(loop.old, wrong.old, wrong.T_old_new @ se3.inverse(loop.T_old_new))
+
+    def _add_twin(self, place: int, other: int, T_other_place: Matrix) -> None:
+        for a, b, T in ((place, other, T_other_place), (other, place, se3.inverse(T_other_place))):
+            twins = self._twins.setdefault(a, [])
+            twins.append((b, T))
+            del twins[:-_TWINS]
+
+    def _doubtful(self, loops: list[Loop]) -> bool:
+        """Whether one keyframe's loops leave open where it is."""
+        for one, two in itertools.combinations(loops, 2):
+            if not self._agree(one, two):
+                self._remember_twin(two, [one])
+                return True
+        return any(self._has_twin(loop) for loop in loops)
+
+    def _has_twin(self, loop: Loop) -> bool:
+        """Whether the loop's place looks like another one where the keyframe could as well be."""
+        for other, T_other_old in self._twins.get(loop.old, []):
+            claim = T_other_old @ loop.T_old_new
+            if other != loop.new and self.deviation(other, loop.new, claim, 2 * loop.covariance) < _AMBIGUOUS:
+                return True
+        return False
+
+    def _count(self, reason: str) -> None:
+        self.refused[reason] = self.refused.get(reason, 0) + 1

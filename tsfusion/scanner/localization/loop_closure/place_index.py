@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: MIT
+"""What is kept of a keyframe to know the place again, and which kept places look most like a new one."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.scanner.localization.features import bilinear, lifted
+
+FEATURES = 500
+CAPACITY = 1000  # places remembered
+
+_SMALLEST = 32  # pixels of an image's shorter side
+_SMALL = 4800  # pixels of the kept depth image, about
+_TABLES, _BITS = 8, 14
+_DEPTH_NOISE = 0.002  # metres at one metre (Khoshelham and Elberink 2012: 0.0014)
+_DISPARITY_NOISE = 0.5  # pixels
+_COMMON = 0.3  # share of the places from which on a key tells nothing
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class View:
+    """A keyframe's looks: 36 KB with 500 features.
+
+    Attributes:
+        descriptors: (n, 32) uint8, ORB (Rublee et al. 2011).
+        pixels: (n, 2) float32.
+        points: (n, 3) float32 in the camera's axes, metres; NaN where there is no depth.
+        depth_mm: (h, w) uint16 millimetres, 0 = none: medians over blocks of the image.
+        intrinsics: of `pixels`.
+        small: intrinsics of `depth_mm`.
+        size: width and height of the image, pixels.
+        noise: metres of depth error at one metre; it grows with the square.
+        measured: whether a depth camera saw the depth, rather than a stereo matcher.
+    """
+
+    descriptors: NDArray[np.uint8]
+    pixels: NDArray[np.float32]
+    points: NDArray[np.float32]
+    depth_mm: NDArray[np.uint16]
+    intrinsics: Intrinsics
+    small: Intrinsics
+    size: tuple[int, int]
+    noise: float
+    measured: bool
+
+
+def view(frame: Frame, depth_m: NDArray[np.float32]) -> View | None:
+    """Of a frame with its (H, W) depth in metres; None where there is no camera, or no image to speak of."""
+    gray, K = frame.gray, frame.intrinsics
+    if gray is None or K is None or min(gray.shape) < _SMALLEST:
+        return None
+    orb = cv2.ORB_create(nfeatures=FEATURES, fastThreshold=10)  # type: ignore[attr-defined]
+    keypoints, descriptors = orb.detectAndCompute(gray, None)
+    if descriptors is None:
+        keypoints, descriptors = (), np.empty((0, 32), np.uint8)
+    pixels = np.array([point.pt for point in keypoints], np.float32).reshape(-1, 2)
+    z = bilinear(depth_m, pixels)
+    factor = max(1, round(float(np.sqrt(depth_m.size / _SMALL))))
+    return View(
+        descriptors=descriptors,
+        pixels=pixels,
+        points=lifted(pixels, np.where(z > 0, z, np.nan), K).astype(np.float32),
+        depth_mm=_medians(np.where(depth_m < 65, depth_m * 1000, 0).astype(np.uint16), factor),
+        intrinsics=K,
+        small=K.scaled(1 / factor),
+        size=(gray.shape[1], gray.shape[0]),
+        noise=_DEPTH_NOISE if frame.baseline_fx is None else _DISPARITY_NOISE / frame.baseline_fx,
+        measured=frame.kind == "depth",
+    )
+
+
+def _medians(depth: NDArray[np.uint16], factor: int) -> NDArray[np.uint16]:
+    """Every `factor`-th pixel: the median of nine of its block, where five or more of them have depth."""
+    height, width = depth.shape[0] // factor, depth.shape[1] // factor
+    if factor < 3:
+        return np.ascontiguousarray(depth[::factor, ::factor][:height, :width])
+    offsets = np.rint((factor - 1) / 2 + np.array([-1, 0, 1]) * factor / 3).astype(int)
+    blocks = depth[: height * factor, : width * factor].reshape(height, factor, width, factor)
+    nine = blocks[:, offsets][:, :, :, offsets].transpose(0, 2, 1, 3).reshape(height, width, 9)
+    nine = np.sort(nine, axis=2)
+    empty = (nine == 0).sum(axis=2)
+    middle = np.take_along_axis(nine, np.minimum((9 + empty) // 2, 8)[:, :, None], axis=2)[:, :, 0]
+    return np.where(empty <= 4, middle, np.uint16(0))
+
+
+class Places:
+    """Places by number, found again by what they look like.
+
+    Descriptors vote for places that have one alike: locality-sensitive hashing (Gionis, Indyk and Motwani
+    1999), eight tables over 14 bits each. Memory: 16 KB a place of the capacity, beside the views.
+    """
+
+    def __init__(self, capacity: int = CAPACITY) -> None:
+        rng = np.random.default_rng(7)
+        self._bits = np.stack([rng.choice(256, _BITS, replace=False) for _ in range(_TABLES)])
+        self._capacity = capacity
+        self._seen = np.zeros((_TABLES << _BITS, -(-capacity // 8)), np.uint8)  # a bit for each place
+        self._votes = np.ones(capacity)  # by how many descriptors a place can get votes
+        self._numbers = np.full(capacity, -1, np.int64)
+        self.views: dict[int, View] = {}
+
+    @property
+    def full(self) -> bool:
+        """Whether one must be forgotten before another is added."""
+        return len(self.views) >= self._capacity
+
+    def add(self, number: int, view: View) -> None:
+        """Remember a place under its number; there must be room."""
+        slot = int(np.flatnonzero(self._numbers < 0)[0])
+        self._numbers[slot] = number
+        self._seen[self._keys(view), slot >> 3] |= np.uint8(128 >> (slot & 7))
+        self._votes[slot] = np.sqrt(max(len(view.descriptors), 1))
+        self.views[number] = view
+
+    def forget(self, number: int) -> None:
+        """Its memory goes to the next one added."""
+        slot = int(np.flatnonzero(self._numbers == number)[0])
+        self._numbers[slot] = -1
+        self._seen[:, slot >> 3] &= np.uint8(255 ^ 128 >> (slot & 7))
+        del self.views[number]
+
+    def alike(self, view: View, *, before: int | None = None, count: int = 4) -> list[int]:
+        """The places (with numbers below `before`) that look most like the view, best first."""
+        allowed = self._numbers >= 0
+        slots = np.flatnonzero(allowed if before is None else allowed & (self._numbers < before))
+        scores = self._count(view)[slots] / self._votes[slots]
+        best = np.argsort(-scores, kind="stable")[:count]
+        return [int(self._numbers[slots[i]]) for i in best if scores[i] > 0]
+
+    def _keys(self, view: View) -> NDArray[np.int64]:
+        """Rows of `_seen` that the descriptors fall into."""
+        bits = np.unpackbits(view.descriptors, axis=1)
+        powers = 1 << np.arange(_BITS)
+        keys = [(bits[:, chosen] @ powers) + (table << _BITS) for table, chosen in enumerate(self._bits)]
+        return np.unique(np.concatenate(keys)).astype(np.int64)
+
+    def _count(self, view: View) -> NDArray[np.float64]:
+        rows = np.unpackbits(self._seen[self._keys(view)], axis=1)[:, : self._capacity]
+        common = rows.sum(axis=1, dtype=np.int32) > max(_COMMON * len(self.views), 2)
+        rows[common] = 0
+        votes: NDArray[np.float64] = rows.sum(axis=0, dtype=np.float64)
+        return votes

@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: MIT
+"""Pose-graph optimisation: where poses are, given what is known between pairs of them.
+
+Sparse Levenberg-Marquardt over SE(3) with analytic Jacobians. Edges marked `robust` (loops) may be wrong:
+graduated non-convexity with truncated least squares (Yang, Antonante, Tzoumas and Carlone, "Graduated
+Non-Convexity for Robust Spatial Perception", 2020) finds out which ones, from any start.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import MissingDependency
+from tsfusion.geometry import twists
+
+Matrix = NDArray[np.float64]
+
+TRUSTED = 22.5  # χ² of six degrees of freedom that one in a thousand exceeds
+_GROWTH = 1.4  # of the control parameter, as in the paper
+_FIRST = 10  # iterations with all edges, before wrong ones are looked for
+_SETTLED = 1e-9  # metres and radians: a step this small ends the iterations
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """What is known of node `end` seen from node `start`.
+
+    Attributes:
+        T_start_end: (4, 4), pose of `end` in the axes of `start`.
+        information: (6, 6) inverse covariance of the twist `log(T_start_end⁻¹ · T_start⁻¹ T_end)`,
+            translation first; `information(…)` makes one.
+        robust: it may be altogether wrong.
+    """
+
+    start: int
+    end: int
+    T_start_end: Matrix
+    information: Matrix
+    robust: bool = False
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Solution:
+    """Corrected poses.
+
+    Attributes:
+        nodes: node → (4, 4), in the order given.
+        weights: (edges,) 0 to 1; 0 = found wrong and left out; always 1 where not robust.
+        chi2: (edges,) squared error of each edge in its own units, before any weight.
+        before, after: sum of `chi2` times `weights` at the poses given and at those found.
+        iterations: linear systems solved.
+    """
+
+    nodes: dict[int, Matrix]
+    weights: NDArray[np.float64]
+    chi2: NDArray[np.float64]
+    before: float
+    after: float
+    iterations: int
+
+
+def information(translation: float, rotation: float) -> Matrix:
+    """(6, 6) of independent errors: standard deviations in metres and radians."""
+    return np.diag([translation**-2.0] * 3 + [rotation**-2.0] * 3)
+
+
+def optimise(
+    nodes: Mapping[int, Matrix], edges: Sequence[Edge], *, trusted: float = TRUSTED, iterations: int = 300
+) -> Solution:
+    """The poses that fit the edges best; the first node stays where it is.
+
+    Args:
+        nodes: node → (4, 4) to begin with, each connected to the first one by edges.
+        trusted: χ² up to which a robust edge counts as right.
+        iterations: linear systems solved at most.
+
+    Raises:
+        MissingDependency: without scipy.
+    """
+    problem = _Problem(nodes, edges)
+    T = np.array([nodes[key] for key in nodes], dtype=np.float64)
+    weights = np.ones(len(edges))
+    if not edges:
+        return Solution(nodes=dict(nodes), weights=weights, chi2=weights, before=0, after=0, iterations=0)
+    start = problem.chi2(T)
+    robust = np.array([edge.robust for edge in edges])
+    T, used = problem.descend(T, weights, min(_FIRST, iterations))
+    chi2 = problem.chi2(T)
+    worst = float(chi2[robust].max(initial=0.0))
+    if worst > trusted:
+        control = trusted / (2 * worst - trusted)
+        while used < iterations:
+            weights = np.where(robust, _truncated(chi2, trusted, control), 1.0)
+            T, more = problem.descend(T, weights, min(2, iterations - used))
+            used, control, chi2 = used + more, control * _GROWTH, problem.chi2(T)
+            if np.isin(weights, (0.0, 1.0)).all():
+                break
+        weights = np.where(robust & (chi2 > trusted), 0.0, 1.0)
+    if used >= _FIRST:  # not settled yet
+        T, more = problem.descend(T, weights, max(iterations - used, 1))
+        used, chi2 = used + more, problem.chi2(T)
+    return Solution(
+        nodes=dict(zip(nodes, T, strict=True)),
+        weights=weights,
+        chi2=chi2,
+        before=float(weights @ start),
+        after=float(weights @ chi2),
+        iterations=used,
+    )
+
+
+def _truncated(chi2: NDArray[np.float64], trusted: float, control: float) -> NDArray[np.float64]:
+    """Weights of truncated least squares, smoothed by the control parameter (the paper's eq. 14)."""
+    inner, outer = control / (control + 1) * trusted, (control + 1) / control * trusted
+    between = np.sqrt(trusted * control * (control + 1) / np.maximum(chi2, 1e-300)) - control
+    return np.where(chi2 <= inner, 1.0, np.where(chi2 >= outer, 0.0, np.clip(between, 0, 1)))
+
+
+class _Problem:
+    """The edges as arrays, and the sparsity of their normal equations."""
+
+    def __init__(self, nodes: Mapping[int, Matrix], edges: Sequence[Edge]) -> None:
+        self._linalg, self._sparse = require()
+        place = {key: index for index, key in enumerate(nodes)}
+        self._start = np.array([place[edge.start] for edge in edges], dtype=np.int64)
+        self._end = np.array([place[edge.end] for edge in edges], dtype=np.int64)
+        self._inverse = twists.inverse(np.array([e.T_start_end for e in edges]).reshape(-1, 4, 4))
+        self._information = np.array([edge.information for edge in edges]).reshape(-1, 6, 6)
+        self._size = 6 * (len(nodes) - 1)  # the first node is no variable
+        self._lay_out()
+
+    def _lay_out(self) -> None:
+        """Where in a CSC matrix each number of the edges' four 6×6 blocks is added."""
+        six = np.arange(6)
+        first, second = (6 * (ends[:, None] - 1) + six for ends in (self._start, self._end))  # (m, 6)
+        rows, columns = [], []
+        for a, b in ((first, first), (first, second), (second, first), (second, second)):
+            rows.append(np.repeat(a, 6, axis=1))
+            columns.append(np.tile(b, (1, 6)))
+        row, column = np.concatenate(rows).ravel(), np.concatenate(columns).ravel()
+        self._variable = (row >= 0) & (column >= 0)
+        keys = column[self._variable] * self._size + row[self._variable]
+        unique, self._slot = np.unique(keys, return_inverse=True)
+        column, self._rows = np.divmod(unique, max(self._size, 1))
+        self._pointers = np.searchsorted(column, np.arange(self._size + 1))
+        self._diagonal = np.flatnonzero(column == self._rows)
+        ends = np.concatenate([first, second]).ravel()
+        self._known, self._ends = ends >= 0, ends[ends >= 0]
+
+    def errors(self, T: Matrix) -> NDArray[np.float64]:
+        """(m, 6) twists by which the edges are not met."""
+        return twists.log(self._inverse @ twists.inverse(T[self._start]) @ T[self._end])
+
+    def chi2(self, T: Matrix) -> NDArray[np.float64]:
+        """(m,) squared errors in the edges' own units."""
+        return _squares(self.errors(T), self._information)
+
+    def descend(self, T: Matrix, weights: NDArray[np.float64], steps: int) -> tuple[Matrix, int]:
+        """The poses after at most `steps` of Levenberg-Marquardt, and how many there were."""
+        damping, error = 1e-7, self.errors(T)
+        cost = float(weights @ _squares(error, self._information))
+        for step in range(steps):
+            H, g = self._normal(T, error, weights)
+            while damping < 1e9:
+                x = self._solve(H, g, damping)
+                moved = T.copy()
+                moved[1:] = T[1:] @ twists.exp(x.reshape(-1, 6))
+                new_error = self.errors(moved)
+                new = float(weights @ _squares(new_error, self._information))
+                if new <= cost or np.abs(x).max(initial=0.0) < _SETTLED:
+                    break
+                damping = max(damping, 1e-7) * 10
+            if new >= cost:
+                return T, step + 1
+            gained, T, error, cost, damping = cost - new, moved, new_error, new, damping / 10
+            if np.abs(x).max() < _SETTLED or gained < 1e-10 * cost:
+                return T, step + 1
+        return T, steps
+
+    def _normal(
+        self, T: Matrix, error: NDArray[np.float64], weights: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The values of the CSC matrix JᵀΩJ, and −JᵀΩe."""
+        second = twists.right_jacobian_inverse(error)
+        first = -second @ twists.adjoint(twists.inverse(T[self._end]) @ T[self._start])
+        information = weights[:, None, None] * self._information
+        a, b = (J.transpose(0, 2, 1) @ information for J in (first, second))
+        blocks = np.concatenate([a @ first, a @ second, b @ first, b @ second])
+        H = _sums(self._slot, blocks.ravel()[self._variable], len(self._rows))
+        g = np.concatenate([np.einsum("nij,nj->ni", J, error) for J in (a, b)]).ravel()
+        return H, -_sums(self._ends, g[self._known], self._size)
+
+    def _solve(self, H: NDArray[np.float64], g: NDArray[np.float64], damping: float) -> NDArray[np.float64]:
+        if not self._size:
+            return np.zeros(0)
+        H = H.copy()
+        H[self._diagonal] += damping * H[self._diagonal] + 1e-12
+        shape = (self._size, self._size)
+        matrix = self._sparse.csc_matrix((H, self._rows, self._pointers), shape=shape)
+        factors = self._linalg.splu(
+            matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+        x: NDArray[np.float64] = factors.solve(g)
+        return x
+
+
+def _sums(places: NDArray[np.int64], values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    return np.bincount(places, weights=values, minlength=count).astype(np.float64)
+
+
+def _squares(error: NDArray[np.float64], information: NDArray[np.float64]) -> NDArray[np.float64]:
+    result: NDArray[np.float64] = np.einsum("ni,nij,nj->n", error, information, error, optimize=True)
+    return result
+
+
+def require() -> tuple[Any, Any]:
+    """scipy's sparse linear algebra and matrices.
+
+    Raises:
+        MissingDependency: without scipy.
+    """
+    try:
+        import scipy.sparse
+        import scipy.sparse.linalg
+    except ImportError as error:
+        raise MissingDependency(
+            "pose graphs need scipy; install it with: pip install 'tsfusion[slam]'"
+        ) from error
+    return scipy.sparse.linalg, scipy.sparse

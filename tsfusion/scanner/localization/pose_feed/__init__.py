@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Poses that another process publishes over ZeroMQ."""

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: MIT
+"""Poses that another process publishes while the scan goes on: any SLAM, over a ZeroMQ socket.
+
+`feed_messages` says what is sent; contrib/pose_sender.py is a sender.
+"""
+
+import logging
+import re
+import time
+import weakref
+from collections import Counter
+from typing import Any
+
+import zmq
+
+from tsfusion.core.errors import DecodeError, InvalidConfig, TransportError
+from tsfusion.geometry.frame import Frame
+from tsfusion.scanner.localization.localizer import Corrections, Lost, Pose
+from tsfusion.scanner.localization.pose_feed.map_deformation import Deformation
+from tsfusion.scanner.localization.pose_feed.messages import MAX_BYTES, decode
+from tsfusion.scanner.localization.pose_feed.pose_history import PoseHistory
+from tsfusion.scanner.localization.tracking_keyframes import Anchors
+from tsfusion.wire import sockets
+
+log = logging.getLogger(__name__)
+
+WAIT = 0.1  # seconds for a pose that is under way; docs/localization.md says so
+_BUSY = 0.1  # seconds that messages are taken for one frame, so that a flood cannot hold it up
+_SILENCE = 5.0  # seconds; libzmq gives some connections up for good, so that it is made again
+_ANOTHER_CLOCK = 3600.0  # seconds
+_KINDS = 20  # of reasons that are told apart
+_NS = 1_000_000_000
+
+
+class Feed:
+    """`Localizer` that hears poses on a ZeroMQ SUB socket and interpolates them at the frame's stamp.
+
+    What is malformed is counted and dropped. Corrections are moved from the stamps they name to the tracking
+    keyframes around them.
+
+    Args:
+        address: `tcp://host:port` to connect to, where a PUB socket is bound; or `@tcp://127.0.0.1:port` to
+            bind here, for senders that connect. There are no keys: only this machine's own can be bound.
+        max_gap_s: seconds between two poses; between those farther apart there is none.
+        time_offset_s: seconds to add to a frame's stamp before its pose is looked up.
+        wait_s: seconds a frame waits for the pose after it.
+
+    Attributes:
+        received: messages taken.
+        dropped: messages that were not, by reason.
+
+    Raises:
+        InvalidConfig: for an address that is none, or open to others.
+        TransportError: when it cannot be bound.
+    """
+
+    absolute = True
+
+    def __init__(
+        self, address: str, *, max_gap_s: float, time_offset_s: float = 0.0, wait_s: float = WAIT
+    ) -> None:
+        self.received = 0
+        self.dropped: Counter[str] = Counter()
+        self._max_gap_ns, self._offset_ns = round(max_gap_s * _NS), round(time_offset_s * _NS)
+        self._wait = wait_s
+        self._link = _Link(address)
+        self._closing = weakref.finalize(self, self._link.close)
+        self._history = PoseHistory()
+        self._deformation = Deformation()
+        self._anchors = Anchors()
+
+    @property
+    def address(self) -> str:
+        """Where it listens, with the real port; or where it is connected to."""
+        return self._link.endpoint
+
+    def close(self) -> None:
+        """Let go of the socket; may be called twice."""
+        self._closing()
+
+    def __enter__(self) -> "Feed":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def track(self, frame: Frame) -> Pose | Lost:
+        """The feed's pose at the frame's stamp, waited for a moment if need be."""
+        if not frame.timestamp_ns:
+            return Lost(reason="the frame has no time, so that no pose can be looked up", timestamp_ns=0)
+        stamp = frame.timestamp_ns + self._offset_ns
+        deadline = time.monotonic() + self._wait
+        self._hear(0)
+        while not self._history.decided(stamp, max_gap_ns=self._max_gap_ns):
+            left = deadline - time.monotonic()
+            if left <= 0:
+                break
+            self._hear(left)
+        T = self._history.at(stamp, max_gap_ns=self._max_gap_ns)
+        if T is None:
+            return Lost(reason=self._missing(stamp), timestamp_ns=frame.timestamp_ns)
+        pose = self._anchors.pose(T, frame.timestamp_ns)
+        if pose.starts_anchor:
+            self._deformation.add(pose.anchor, stamp, T)
+        return pose
+
+    def corrections(self) -> Corrections | None:
+        """What the sender's loop closure found out since the last call."""
+        return self._deformation.news()
+
+    def reset(self) -> None:
+        """The world stays the sender's."""
+        self._anchors.reset()
+        self._deformation.reset()
+
+    def _hear(self, seconds: float) -> None:
+        """Take the messages that are there; wait for the first one at most so long."""
+        parts = self._link.receive(seconds)
+        enough = time.monotonic() + _BUSY
+        while parts is not None:
+            self._take(parts)
+            if time.monotonic() > enough:
+                return
+            parts = self._link.receive(0)
+
+    def _take(self, parts: list[bytes]) -> None:
+        try:
+            if len(parts) != 1:
+                raise DecodeError(f"a message has 1 frame, got {len(parts)}")
+            said = decode(parts[0])
+        except DecodeError as error:
+            self._drop(str(error))
+            return
+        self.received += 1
+        if said.stamp_ns is not None:
+            self._history.add(said.stamp_ns, said.pose)
+        if said.graph is not None:
+            unknown = self._deformation.learn(said.graph, self._history, self._max_gap_ns)
+            if unknown:
+                log.warning("%d corrected poses are of moments that no pose was sent of", unknown)
+
+    def _drop(self, reason: str) -> None:
+        kind = re.split(r",| \(| - ", reason)[0]
+        self.dropped[kind if kind in self.dropped or len(self.dropped) < _KINDS else "others"] += 1
+        if self.dropped.total() == 1:
+            log.warning("a message from %s is no pose and was dropped: %s", self.address, reason)
+
+    def _missing(self, stamp: int) -> str:
+        where = f"from {self.address}"
+        if not len(self._history):
+            if self._link.binds:
+                return f"no pose has come yet to @{self.address}, where it listens: senders connect to it"
+            return f"no pose has come {where} yet"
+        away = (stamp - self._history.last_ns) / _NS
+        if abs(away) > _ANOTHER_CLOCK:
+            return (
+                f"the last pose {where} is {abs(away):.0f} s away from the frame: are these the same clock?"
+            )
+        if away > 0:
+            return (
+                f"the pose comes too late or not at all: the newest {where} is {away:.3f} s older than the "
+                f"frame, after {self._wait:g} s of waiting"
+            )
+        return f"{where}, there is no pose within {self._max_gap_ns / _NS:g} s on both sides of the frame"
+
+
+class _Link:
+    """The SUB socket, made anew when nothing has come for a while."""
+
+    def __init__(self, address: str) -> None:
+        self.binds = address.startswith("@")
+        plain = address.removeprefix("@")
+        if self.binds:
+            sockets.check_own_machine(plain)
+        self._target = plain if self.binds else sockets.target(plain)
+        self._context: zmq.Context[Any] = zmq.Context()
+        self._socket = sockets.pose_feed(self._context, MAX_BYTES)
+        self.endpoint = self._target
+        try:
+            self._open()
+        except (InvalidConfig, TransportError):
+            self.close()
+            raise
+
+    def receive(self, seconds: float) -> list[bytes] | None:
+        """The frames of the next message; None when none comes in time."""
+        if self._socket.poll(round(seconds * 1000)):
+            self._heard = time.monotonic()
+            return self._socket.recv_multipart()
+        if not self.binds and time.monotonic() - self._heard > _SILENCE:
+            self._socket.close()
+            self._socket = sockets.pose_feed(self._context, MAX_BYTES)
+            self._open()
+        return None
+
+    def close(self) -> None:
+        self._context.destroy(linger=0)
+
+    def _open(self) -> None:
+        self._heard = time.monotonic()
+        if self.binds:
+            self.endpoint = sockets.bind_one(self._socket, self._target)
+        else:
+            self._socket.connect(self._target)

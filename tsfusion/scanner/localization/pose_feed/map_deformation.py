@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: MIT
+"""Corrections of another SLAM's poses, moved to the tracking keyframes they lie between."""
+
+from bisect import bisect_right
+
+import numpy as np
+
+from tsfusion.geometry import se3
+from tsfusion.scanner.localization.localizer import Corrections, Matrix
+from tsfusion.scanner.localization.pose_feed.messages import Graph
+from tsfusion.scanner.localization.pose_feed.pose_history import PoseHistory
+
+
+class Deformation:
+    """How a corrected graph moves odometry's world, by time.
+
+    At each of the graph's stamps it is the corrected pose times the inverse of the one sent before. Between
+    two of them it goes evenly from one to the other; before the first and after the last it stays.
+    """
+
+    def __init__(self) -> None:
+        self._stamps: list[int] = []
+        self._moves: list[Matrix] = []
+        self._T_corrected_world = np.eye(4)
+        self._loops = 0
+        self._news = False
+        self._anchors: dict[int, tuple[int, Matrix]] = {}
+        self._revision = 0
+
+    def add(self, anchor: int, stamp_ns: int, T_world_camera: Matrix) -> None:
+        """A tracking keyframe."""
+        self._anchors[anchor] = stamp_ns, T_world_camera
+
+    def learn(self, graph: Graph, history: PoseHistory, max_gap_ns: int) -> int:
+        """Take a graph for the truth; how many of its stamps no pose is known of."""
+        before = [history.at(stamp, max_gap_ns=max_gap_ns) for stamp in graph.stamps_ns]
+        known = [
+            (stamp, after @ se3.inverse(T))
+            for stamp, after, T in zip(graph.stamps_ns, graph.poses, before, strict=True)
+            if T is not None
+        ]
+        unknown = len(graph.stamps_ns) - len(known)
+        if known or graph.T_corrected_world is not None:
+            self._stamps, self._moves = [stamp for stamp, _ in known], [move for _, move in known]
+            last = self._moves[-1] if known else np.eye(4)
+            self._T_corrected_world = last if graph.T_corrected_world is None else graph.T_corrected_world
+            self._loops, self._news = graph.loops, True
+        return unknown
+
+    def news(self) -> Corrections | None:
+        """What the graph means for every tracking keyframe since `reset`, once."""
+        if not self._news:
+            return None
+        self._news, self._revision = False, self._revision + 1
+        return Corrections(
+            revision=self._revision,
+            anchors={
+                number: se3.nearest(self._move(stamp) @ T) for number, (stamp, T) in self._anchors.items()
+            },
+            T_corrected_world=self._T_corrected_world,
+            loops=self._loops,
+        )
+
+    def reset(self) -> None:
+        """Forget the tracking keyframes; what the graph says stays true."""
+        self._anchors.clear()
+        self._revision = 0
+
+    def _move(self, stamp_ns: int) -> Matrix:
+        if not self._moves:
+            return self._T_corrected_world
+        right = bisect_right(self._stamps, stamp_ns)
+        if right == len(self._stamps):
+            return self._T_corrected_world if stamp_ns > self._stamps[-1] else self._moves[-1]
+        if right == 0:
+            return self._moves[0]
+        begin, end = self._stamps[right - 1], self._stamps[right]
+        share = (stamp_ns - begin) / (end - begin)
+        step = se3.log(self._moves[right] @ se3.inverse(self._moves[right - 1]))
+        return se3.exp(share * step) @ self._moves[right - 1]

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: MIT
+"""What another process may say on a pose feed.
+
+A message is one frame, JSON or MessagePack, a map of:
+
+- `stamp_ns`: integer, of the clock that stamps the frames.
+- `pose`: `[tx, ty, tz, qx, qy, qz, qw]`, or the 16 numbers of T_world_camera row by row; of the sensor whose
+  frames are followed, OpenCV axes (a LiDAR: its own). It is odometry: it must not jump when a loop is closed.
+- `lost`: true instead of a pose: the sender does not know where the sensor was.
+- `corrections`: what loop closure found, alone or beside a pose. A map of `stamps_ns`, of poses sent before;
+  `poses`, their corrected ones, each as above; `loops`, closed so far (optional); and `T_corrected_world`, as
+  a pose, which moves odometry poses from now on (optional; RTAB-Map's map_to_odom). The newest replaces all
+  others.
+
+Keys that are not known are passed over.
+"""
+
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta, Struct
+
+from tsfusion.core.errors import DecodeError, InvalidKeyframe
+from tsfusion.geometry.keyframe import check_pose
+from tsfusion.geometry.trajectory import rigid
+from tsfusion.scanner.localization.localizer import Matrix
+
+MAX_BYTES = 1 << 20  # of a message: corrections of 5,000 poses in JSON, 15,000 in MessagePack
+_FARTHEST = 1e7  # metres from the origin
+
+Stamp = Annotated[int, Meta(ge=1, le=2**63 - 1)]
+Numbers = Annotated[list[float], Meta(min_length=7, max_length=16)]
+
+
+class _Graph(Struct):
+    stamps_ns: list[Stamp]
+    poses: list[Numbers]
+    T_corrected_world: Numbers | None = None
+    loops: Annotated[int, Meta(ge=0, le=2**31)] = 0
+
+
+class _Message(Struct):
+    stamp_ns: Stamp | None = None
+    pose: Numbers | None = None
+    lost: bool = False
+    corrections: _Graph | None = None
+
+
+class Graph(Struct, frozen=True, kw_only=True):
+    """Corrected poses of moments, in order of their stamps."""
+
+    stamps_ns: list[int]
+    poses: list[Matrix]
+    T_corrected_world: Matrix | None
+    loops: int
+
+
+class Said(Struct, frozen=True, kw_only=True):
+    """One message. `pose` None with a stamp: the sender is lost."""
+
+    stamp_ns: int | None
+    pose: Matrix | None
+    graph: Graph | None
+
+
+_json = msgspec.json.Decoder(_Message)
+_msgpack = msgspec.msgpack.Decoder(_Message)
+
+
+def decode(message: bytes) -> Said:
+    """Raises DecodeError for anything that is not as described above."""
+    try:
+        # A map never begins with `{` in MessagePack.
+        raw = (_json if message.lstrip()[:1] == b"{" else _msgpack).decode(message)
+        if raw.stamp_ns is None and (raw.pose is not None or raw.lost):
+            raise DecodeError("stamp_ns is missing")
+        if raw.stamp_ns is None and raw.corrections is None:
+            raise DecodeError("neither a pose nor corrections")
+        if raw.stamp_ns is not None and (raw.pose is None) != raw.lost:
+            raise DecodeError("either a pose or lost must be given with a stamp")
+        pose = None if raw.pose is None else _matrix(raw.pose)
+        graph = None if raw.corrections is None else _graph(raw.corrections)
+    except (msgspec.DecodeError, UnicodeDecodeError, InvalidKeyframe, RecursionError) as error:
+        raise DecodeError(str(error)) from error
+    return Said(stamp_ns=raw.stamp_ns, pose=pose, graph=graph)
+
+
+def _graph(raw: _Graph) -> Graph:
+    if len(raw.stamps_ns) != len(raw.poses):
+        raise DecodeError(f"{len(raw.stamps_ns)} stamps with {len(raw.poses)} corrected poses")
+    by_stamp = dict(
+        sorted(zip(raw.stamps_ns, map(_matrix, raw.poses), strict=True), key=lambda item: item[0])
+    )
+    T = None if raw.T_corrected_world is None else _matrix(raw.T_corrected_world)
+    return Graph(stamps_ns=[*by_stamp], poses=[*by_stamp.values()], T_corrected_world=T, loops=raw.loops)
+
+
+def _matrix(numbers: list[float]) -> Matrix:
+    """(4, 4) from 7 or 16 numbers. Raises DecodeError or InvalidKeyframe."""
+    values = np.array(numbers, dtype=np.float64)
+    if len(values) == 16:
+        T = values.reshape(4, 4)
+    elif len(values) == 7:
+        norm = float(np.linalg.norm(values[3:]))
+        if not abs(norm - 1) <= 0.01:
+            raise DecodeError(f"the quaternion must have length 1, got {norm:.4g}")
+        T = rigid(values[3:] / norm, values[:3])
+    else:
+        raise DecodeError(f"a pose has 7 or 16 numbers, got {len(values)}")
+    if not np.abs(T).max() <= _FARTHEST:
+        raise DecodeError(f"a pose must lie within {_FARTHEST:g} m")
+    return check_pose(T)

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: MIT
+"""Depth images as small planes, and how far a view's points are from those of another (point to plane).
+
+Projective association after Blais and Levine, "Registering multiview range data" (1995); point to plane after
+Chen and Medioni (1992). A plane is linear in inverse depth over the pixels: blocks of pixels are averaged
+there, and planes fitted there by least squares.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.geometry import se3
+from tsfusion.geometry.keyframe import Intrinsics
+
+Floats = NDArray[np.float32]
+
+COLUMNS = 160  # blocks a row, about
+_FIT_RADIUS = 1  # blocks
+_FIT_SHARE = 0.6  # of the blocks around one that must be valid
+_NEAREST = 0.1  # metres
+_CURVED = 0.006  # deviation within a block or from its plane, as a share of the depth
+_GRAZING = 0.17  # cosine between ray and normal
+_CELL = 8  # blocks
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What one depth image says of the surface, in its camera's axes.
+
+    Attributes:
+        intrinsics: of the image of blocks.
+        shape: rows and columns of blocks.
+        points: (3, n) float32 metres, the blocks' centres.
+        sigma: (n,) float32 metres, a depth camera's deviation at each.
+        index: (n,) block of each, row by row.
+        planes: (4, rows·columns) float32: unit normal and offset, normal · p = offset > 0; 0 = no plane.
+        roughness: deviation of the blocks from the planes fitted around them, as a share of `sigma`.
+    """
+
+    intrinsics: Intrinsics
+    shape: tuple[int, int]
+    points: Floats
+    sigma: Floats
+    index: NDArray[np.intp]
+    planes: Floats
+    roughness: float
+
+    @property
+    def covered(self) -> float:
+        """Share of the blocks that have a plane."""
+        return float(np.count_nonzero(self.planes[3]) / self.planes.shape[1])
+
+    def every(self, step: int) -> NDArray[np.intp]:
+        """Which points are on every `step`-th row and column of blocks."""
+        row, column = np.divmod(self.index, self.shape[1])
+        return np.flatnonzero((row % step == step // 2) & (column % step == step // 2))
+
+
+def deviation(depth: Any) -> Any:
+    """Metres of depth noise at metres of depth, structured light (Nguyen, Izadi and Lovell 2012)."""
+    return 0.0012 + 0.0019 * (depth - 0.4) ** 2
+
+
+def surface(depth: Floats, intrinsics: Intrinsics) -> Surface:
+    """The planes of (H, W) float32 metres; 0 = no depth."""
+    block = max(1, round(depth.shape[1] / COLUMNS))
+    inverse, valid = _blocks(depth, block)
+    K, shape = intrinsics.scaled(1 / block), (inverse.shape[0], inverse.shape[1])
+    index = np.flatnonzero(valid)
+    v, u = np.divmod(index, shape[1])
+    z = 1 / inverse.ravel()[index]
+    points = np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z]).astype(np.float32)
+    planes = np.zeros((4, valid.size), np.float32)
+    planes[:3], roughness = _normals(inverse, valid, K)
+    # Through the block's own point, not its neighbours' mean: that lies inside of what is round.
+    planes[3, index] = np.einsum("in,in->n", planes[:3, index], points)
+    return Surface(K, shape, points, deviation(points[2]).astype(np.float32), index, planes, roughness)
+
+
+def _blocks(depth: Floats, block: int) -> tuple[Floats, NDArray[np.bool_]]:
+    """Mean inverse depth of blocks, and where at least half of a block lies on one smooth surface."""
+    rows, columns = depth.shape[0] // block, depth.shape[1] // block
+    depth = np.ascontiguousarray(depth[: rows * block, : columns * block])
+    there = (depth > _NEAREST).astype(np.float32)
+    inverse = np.divide(1, depth, out=np.zeros_like(depth), where=there > 0)
+    size = (columns, rows)
+    share, mean, square = (
+        cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (there, inverse, inverse * inverse)
+    )
+    valid = share >= 0.5
+    mean = np.divide(mean, share, out=np.ones_like(mean), where=valid)
+    spread = np.divide(square, share, out=np.ones_like(mean), where=valid) - mean * mean
+    z = 1 / mean
+    limit = _CURVED * z + 2 * deviation(z)
+    return mean, valid & (spread * z**4 < limit**2)
+
+
+def _normals(inverse: Floats, valid: NDArray[np.bool_], K: Intrinsics) -> tuple[Floats, float]:
+    """Normals of planes fitted to inverse depth around each block, (3, n), 0 where none fits; roughness."""
+    r = _FIT_RADIUS
+    ones, step = np.ones(2 * r + 1), np.arange(-r, r + 1, dtype=np.float64)
+    w = valid.astype(np.float32)
+    q = inverse * w
+
+    def moment(image: Floats, x: NDArray[np.float64], y: NDArray[np.float64]) -> Any:
+        return cv2.sepFilter2D(image, cv2.CV_32F, x, y, borderType=cv2.BORDER_CONSTANT)
+
+    s, su, sv = moment(w, ones, ones), moment(w, step, ones), moment(w, ones, step)
+    suu, suv, svv = moment(w, step**2, ones), moment(w, step, step), moment(w, ones, step**2)
+    sq, squ, sqv = moment(q, ones, ones), moment(q, step, ones), moment(q, ones, step)
+    ok = valid & (s >= _FIT_SHARE * (2 * r + 1) ** 2)
+    s = np.where(ok, s, 1)
+    mu, mv, mq = su / s, sv / s, sq / s
+    cuu, cuv, cvv = suu / s - mu * mu, suv / s - mu * mv, svv / s - mv * mv
+    cuq, cvq = squ / s - mu * mq, sqv / s - mv * mq
+    det = cuu * cvv - cuv * cuv
+    ok &= det > 0.1
+    det = np.where(ok, det, 1)
+    a, b = (cvv * cuq - cuv * cvq) / det, (cuu * cvq - cuv * cuq) / det
+    rest = moment(q * inverse, ones, ones) / s - mq * mq - a * cuq - b * cvq
+    z = 1 / np.where(ok, mq, 1)
+    off = np.sqrt(np.maximum(rest, 0)) * z * z
+    sigma = deviation(z)
+    ok &= off < _CURVED * z + sigma
+    x = ((np.arange(ok.shape[1]) - K.cx) / K.fx).astype(np.float32)[None, :]
+    y = ((np.arange(ok.shape[0]) - K.cy) / K.fy).astype(np.float32)[:, None]
+    # 1/z = a (u - u0) + b (v - v0) + c around block (u0, v0) is normal · (x, y, 1) = 1/z.
+    nx, ny, c = a * np.float32(K.fx), b * np.float32(K.fy), mq - a * mu - b * mv
+    normals = np.stack([nx, ny, c - nx * x - ny * y])
+    length = np.maximum(np.sqrt((normals * normals).sum(axis=0)), np.float32(1e-12))
+    ok &= c > _GRAZING * length * np.sqrt(x * x + y * y + 1)
+    free = 1 - 3 / (2 * r + 1) ** 2  # of the residuals, with three parameters fitted
+    roughness = float(np.median(off[ok] / sigma[ok]) / np.sqrt(free)) if ok.any() else 0.0
+    return np.where(ok, normals / length, 0).reshape(3, -1), roughness
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """A view's points beside the planes of another, where they fall into its image.
+
+    Attributes:
+        moved: (3, m) float32, the points in the other's axes.
+        normals: (3, m) float32.
+        distance: (m,) float32 metres, signed.
+        sigma: (m,) float32 metres.
+        chosen: (m,) which of the view's points.
+        block: (m,) where in the other's image of blocks.
+    """
+
+    moved: Floats
+    normals: Floats
+    distance: Floats
+    sigma: Floats
+    chosen: NDArray[np.intp]
+    block: NDArray[np.intp]
+
+
+def match(there: Surface, here: Surface, T_there_here: se3.Transform, some: NDArray[np.intp] | None) -> Match:
+    """The points of `here` (or `some` of them) beside the planes of `there` that they project onto."""
+    points, sigma = (here.points, here.sigma) if some is None else (here.points[:, some], here.sigma[some])
+    K, (rows, columns) = there.intrinsics, there.shape
+    moved = T_there_here[:3, :3].astype(np.float32) @ points + T_there_here[:3, 3:].astype(np.float32)
+    scale = 1 / np.maximum(moved[2], np.float32(_NEAREST))
+    u = moved[0] * scale * np.float32(K.fx) + np.float32(K.cx + 0.5)
+    v = moved[1] * scale * np.float32(K.fy) + np.float32(K.cy + 0.5)
+    inside = np.flatnonzero((moved[2] > _NEAREST) & (u >= 0) & (v >= 0) & (u < columns) & (v < rows))
+    block = v[inside].astype(np.intp) * columns + u[inside].astype(np.intp)
+    there_is = there.planes[3].take(block) > 0
+    chosen, block = inside[there_is], block[there_is]
+    moved, planes = moved.take(chosen, axis=1), there.planes.take(block, axis=1)
+    distance = planes[0] * moved[0] + planes[1] * moved[1] + planes[2] * moved[2] - planes[3]
+    which = chosen if some is None else some[chosen]
+    return Match(moved, planes[:3], distance, sigma[chosen], which, block)
+
+
+def alike(found: Match, columns: int) -> float:
+    """How many blocks err as one: 1 for white noise, dozens where a sensor's errors are smooth.
+
+    The variance of the distances' means over cells of `_CELL` × `_CELL` blocks, against a single block's.
+    """
+    near = np.abs(found.distance) < 4 * found.sigma
+    whitened = (found.distance[near] / found.sigma[near]).astype(np.float64)
+    row, column = np.divmod(found.block[near], columns)
+    cell = row // _CELL * columns + column // _CELL
+    count, total = np.bincount(cell), np.bincount(cell, weights=whitened)
+    full = count > _CELL * _CELL // 2
+    if not full.any():
+        return 1.0
+    variance = max(float(np.mean(whitened**2)), 1e-12)
+    return max(1.0, float((total[full] ** 2).sum() / count[full].sum()) / variance)
+
+
+def equations(found: Match, weight: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(6, 6) and (6,) of the step that brings the points to their planes: `exp(step) @ T_there_here`."""
+    x, y, z = found.moved
+    nx, ny, nz = found.normals
+    J = np.stack([nx, ny, nz, y * nz - z * ny, z * nx - x * nz, x * ny - y * nx])
+    weighted = J * weight
+    H, g = weighted @ J.T, weighted @ found.distance
+    return H.astype(np.float64), -g.astype(np.float64)

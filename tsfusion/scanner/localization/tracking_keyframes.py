@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: MIT
+"""Which frames are tracking keyframes, where frame is compared with frame or poses are given."""
+
+import math
+
+import numpy as np
+
+from tsfusion.geometry import se3
+from tsfusion.scanner.localization.localizer import Matrix, Pose
+
+
+class Anchors:
+    """Hangs each pose on the last tracking keyframe, and begins a new one when the sensor has moved away.
+
+    Attributes:
+        distance: metres to the next one; may be changed at any time.
+
+    Args:
+        angle: degrees to the next one.
+    """
+
+    def __init__(self, *, distance: float = 0.5, angle: float = 10.0) -> None:
+        self.distance = distance
+        self._angle = math.radians(angle)
+        self._number = -1
+        self._T_world_anchor: Matrix | None = None
+
+    def pose(self, T_world_camera: Matrix, timestamp_ns: int, *, quality: float = 1.0) -> Pose:
+        """The pose as a localizer gives it."""
+        T = np.eye(4) if self._T_world_anchor is None else se3.inverse(self._T_world_anchor) @ T_world_camera
+        moved = se3.distance(T) > self.distance or se3.angle(T) > self._angle
+        starts = self._T_world_anchor is None or moved
+        if starts:
+            self._number += 1
+            self._T_world_anchor, T = T_world_camera, np.eye(4)
+        return Pose(
+            T_world_camera=T_world_camera,
+            timestamp_ns=timestamp_ns,
+            anchor=self._number,
+            T_anchor_camera=T,
+            starts_anchor=starts,
+            quality=quality,
+        )
+
+    def reset(self) -> None:
+        """The next pose is a tracking keyframe. Numbers go on."""
+        self._T_world_anchor = None

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: MIT
+"""The scanner: a source of frames, a localizer, the choice of keyframes, and the client that sends them.
+
+No Taichi here: it runs on the robot.
+"""
+
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Any, Literal
+
+import msgspec
+
+from tsfusion.client import Client
+from tsfusion.core.config import MAP_NAME_LENGTH, ScanConfig
+from tsfusion.delivery.outbox import ClientStats
+from tsfusion.geometry.frame import Frame
+from tsfusion.scanner.keyframe_selection import Selector
+from tsfusion.scanner.localization.localizer import Corrections, Localizer, Lost, Pose
+from tsfusion.scanner.tracked_trajectory import Track
+
+State = Literal["starting", "tracking", "lost"]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(eq=False)
+class Submap:
+    """A world of its own: everything between two losses.
+
+    Attributes:
+        name: of the map it goes into.
+        client: sends its keyframes.
+        located: its frames, in order.
+        corrections: the newest of loop closure, None = there were none.
+        said: number of the last keyframe whose correction the client was told.
+    """
+
+    name: str
+    client: Client
+    located: Track = field(default_factory=Track)
+    corrections: Corrections | None = None
+    said: int = 0
+
+    def correct(self) -> None:
+        """Have the client say where its keyframes were, by the newest corrections."""
+        assert self.corrections is not None
+        seqs, poses = self.located.keyframes(self.corrections)
+        if len(seqs):
+            self.said = int(seqs[-1])
+            said = dict(zip(seqs.tolist(), poses, strict=True))
+            self.client.correct(said, T_map_odometry=self.corrections.T_corrected_world)
+
+
+class ScanState(msgspec.Struct, frozen=True, kw_only=True):
+    """How a scan is doing.
+
+    Attributes:
+        why: what a lost sensor lacks.
+        selected: keyframes by the rule that chose them.
+        loops: closed so far, over all submaps.
+        stats: of all clients together.
+        link: why the server takes nothing at the moment; empty when it does.
+        keyframe_delay_ms: captured to fused, of the newest keyframe that is known; None = none yet.
+    """
+
+    state: State
+    why: str
+    frames: int
+    tracked: int
+    lost: int
+    submap: str
+    submaps: int
+    selected: dict[str, int]
+    loops: int
+    stats: ClientStats
+    link: str
+    keyframe_delay_ms: float | None
+
+
+class Scanner:
+    """Takes frames one by one; `run` takes all of a source.
+
+    A lost sensor sends nothing. When it is not found again within `patience` seconds of the frames' clock,
+    the localizer begins a new world, whose keyframes go into a map of their own: NAME-2, NAME-3, …; it is
+    opened when there is a pose again.
+
+    Args:
+        localizer: says where each frame was taken.
+        config: when a keyframe is taken, and how long to be patient.
+        connect: opens a client that sends to the map of that name.
+        map_name: of the first submap.
+        taken: names that no submap may have.
+        outdoors: see `Selector`.
+        most: submaps; a sensor that is lost once more has to find back into the last. None = any number.
+    """
+
+    def __init__(
+        self,
+        localizer: Localizer,
+        config: ScanConfig,
+        connect: Callable[[str], Client],
+        *,
+        map_name: str,
+        taken: Collection[str] = (),
+        outdoors: bool = False,
+        most: int | None = None,
+    ) -> None:
+        self._localizer, self._config, self._most = localizer, config, most
+        self._connect, self._map_name, self._taken = connect, map_name, {map_name, *taken}
+        self._selector = Selector(config, outdoors=outdoors)
+        self._next: str | None = None  # the map of the submap that begins with the next pose
+        self._lost_since: int | None = None
+        self._why = ""
+        self._state: State = "starting"
+        self._frames = self._lost = 0
+        self._tracking_cpu = 0.0
+        self._selected: Counter[str] = Counter()
+        self.submaps: list[Submap] = [Submap(map_name, connect(map_name))]
+
+    def run(self, frames: Iterable[Frame], watch: Callable[["Scanner"], None]) -> None:
+        """Take every frame, and let `watch` look after each."""
+        for frame in frames:
+            self.take(frame)
+            watch(self)
+
+    def take(self, frame: Frame) -> None:
+        """Find the frame's pose, and send it if it is a keyframe."""
+        before = time.process_time()
+        found = self._localizer.track(frame)
+        self._tracking_cpu += time.process_time() - before
+        self._frames += 1
+        if isinstance(found, Lost):
+            self._missed(found, frame)
+        else:
+            self._located(found, frame)
+        corrections = self._localizer.corrections()
+        if corrections is not None:
+            self._correct(corrections)
+
+    def finish(self) -> None:
+        """No frame comes any more: keyframes since the last loops are moved by what those said, too."""
+        for submap in self.submaps:
+            if submap.corrections is not None and submap.located.last_seq > submap.said:
+                submap.correct()
+
+    @property
+    def tracking_cpu_ms(self) -> float:
+        """CPU milliseconds of the process while the localizer was at work, a frame."""
+        return 1000 * self._tracking_cpu / max(self._frames, 1)
+
+    def state(self) -> ScanState:
+        """What to show."""
+        clients = [submap.client for submap in self.submaps]
+        return ScanState(
+            state=self._state,
+            why=self._why,
+            frames=self._frames,
+            tracked=self._frames - self._lost,
+            lost=self._lost,
+            submap=self._next or self.submaps[-1].name,
+            submaps=len(self.submaps) + (self._next is not None),
+            selected=dict(self._selected),
+            loops=sum(submap.corrections.loops for submap in self.submaps if submap.corrections),
+            stats=_total([client.stats for client in clients]),
+            link=clients[-1].problem,
+            keyframe_delay_ms=_newest_delay(clients[-1]),
+        )
+
+    def _located(self, pose: Pose, frame: Frame) -> None:
+        if self._state == "lost":
+            log.info("the sensor is found again")
+        self._state, self._why, self._lost_since = "tracking", "", None
+        if self._next is not None:
+            self.submaps.append(Submap(self._next, self._connect(self._next)))
+            self._next = None
+        submap, T = self.submaps[-1], pose.T_world_camera
+        reason = self._selector.reason(frame, T)
+        seq = None
+        if reason is not None:
+            self._selected[reason] += 1
+            self._selector.took(frame, T)
+            seq = submap.client.send(frame.keyframe(T))
+        submap.located.add(pose, frame.T_world_camera, seq)
+
+    def _missed(self, lost: Lost, frame: Frame) -> None:
+        self._lost += 1
+        if self._state == "tracking":
+            log.warning("the sensor is lost: %s", lost.reason)
+        self._why = lost.reason
+        self._state = "lost" if self.submaps[-1].located and self._next is None else "starting"
+        if self._lost_since is None:
+            self._lost_since = frame.timestamp_ns
+        seconds = (frame.timestamp_ns - self._lost_since) / 1e9
+        if self._state == "lost" and seconds >= self._config.patience and self._may_begin_submap:
+            self._begin_submap(seconds)
+
+    @property
+    def _may_begin_submap(self) -> bool:
+        return not self._localizer.absolute and len(self.submaps) != self._most
+
+    def _begin_submap(self, seconds: float) -> None:
+        name = next(name for name in map(self._name, count(2)) if name not in self._taken)
+        self._taken.add(name)
+        log.warning("lost for %.1f s (%s): what follows goes into a new map, %s", seconds, self._why, name)
+        self._localizer.reset()
+        self._selector.reset()
+        self._state, self._lost_since, self._next = "starting", None, name
+
+    def _name(self, number: int) -> str:
+        suffix = f"-{number}"
+        return self._map_name[: MAP_NAME_LENGTH - len(suffix)] + suffix
+
+    def _correct(self, corrections: Corrections) -> None:
+        submap = self.submaps[-1]
+        before = submap.corrections.loops if submap.corrections else 0
+        submap.corrections = corrections
+        if corrections.loops > before:
+            log.info("a place was seen again: %d loops closed", corrections.loops)
+        submap.correct()
+
+
+def _total(stats: list[ClientStats]) -> ClientStats:
+    """Sums of the counts; of the state, the first that is not well."""
+
+    def together(values: list[Any]) -> Any:
+        if isinstance(values[0], dict):
+            return dict(sum(map(Counter, values), Counter()))
+        if isinstance(values[0], int):
+            return sum(values)
+        return next((value for value in values if value != "ok"), "ok")
+
+    names = ClientStats.__struct_fields__
+    return ClientStats(*(together([getattr(each, name) for each in stats]) for name in names))
+
+
+def _newest_delay(client: Client) -> float | None:
+    record = client.newest_fused
+    if record is None or not record.captured_ns:
+        return None
+    return (record.fused_ns - record.captured_ns) / 1e6

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: MIT
+"""Which files of a folder make up a frame, when a file is wholly written, and the camera of the folder."""
+
+import re
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.formats.image_folders import read_open3d_camera
+from tsfusion.datasets.readers import decoded, read_intrinsics, read_numbers
+from tsfusion.geometry.keyframe import Intrinsics
+
+Kind = Literal["depth", "pair", "points"]
+Key = tuple[tuple[int, Decimal, str], ...]
+
+EXPECTED = (
+    "depth/NAME.png with color/, rgb/, image/ or images/NAME.png|jpg; frame-*.depth.png with "
+    "frame-*.color.png|jpg; left/ and right/NAME.png|jpg; NAME.bin, there or in velodyne/"
+)
+CAMERAS = ("camera-intrinsics.txt", "K.txt", "camera_intrinsic.json", "camera_intrinsics.json")
+COLOR = ("color", "rgb", "image", "images")
+
+_NOT_MEASURED = 65535  # how 7-Scenes marks it
+_IMAGES = r"\.(?:png|jpe?g)"
+_ANY_IMAGE, _PNG, _SCAN = (re.compile(rf"([^.].*){ending}") for ending in (_IMAGES, r"\.png", r"\.bin"))
+_FLAT_DEPTH, _FLAT_COLOR = re.compile(r"(frame-.+)\.depth\.png"), re.compile(rf"(frame-.+)\.color{_IMAGES}")
+_PNG_END, _JPEG_END = b"\0\0\0\0IEND\xaeB`\x82", b"\xff\xd9"
+_POINT = 16  # bytes: x, y, z and intensity in float32
+_NANOSECONDS = 19  # digits of a time of this century
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the files of a frame are: (folder, pattern of file names whose group is the frame's name)."""
+
+    kind: Kind
+    first: tuple[Path, re.Pattern[str]]
+    second: tuple[Path, re.Pattern[str]] | None = None
+
+    def partner(self, name: str) -> Path | None:
+        """The second file of a frame, if it is there."""
+        if self.second is None:
+            return None
+        where, pattern = self.second
+        middle = ".color" if pattern is _FLAT_COLOR else ""
+        candidates = (where / f"{name}{middle}.{ending}" for ending in ("png", "jpg", "jpeg"))
+        return next((path for path in candidates if path.exists()), None)
+
+
+def layout_of(root: Path) -> Layout | None:
+    """The layout of what is in the folder so far; None = nothing that is known."""
+    if (root / "depth").is_dir():
+        color = next((root / name for name in COLOR if (root / name).is_dir()), root / COLOR[0])
+        return Layout("depth", (root / "depth", _PNG), (color, _ANY_IMAGE))
+    if (root / "left").is_dir() and (root / "right").is_dir():
+        return Layout("pair", (root / "left", _ANY_IMAGE), (root / "right", _ANY_IMAGE))
+    if (root / "velodyne").is_dir():
+        return Layout("points", (root / "velodyne", _SCAN))
+    names = [path.name for path in root.iterdir()]
+    if any(_FLAT_DEPTH.fullmatch(name) for name in names):
+        return Layout("depth", (root, _FLAT_DEPTH), (root, _FLAT_COLOR))
+    if any(_SCAN.fullmatch(name) for name in names):
+        return Layout("points", (root, _SCAN))
+    return None
+
+
+def order(name: str) -> Key:
+    """Names in the order of their numbers: 9 before 10, 1.25 before 1.5."""
+    parts = re.findall(r"([0-9]+(?:\.[0-9]+)?)|([^0-9]+)", name)
+    return tuple((0, Decimal(number), "") if number else (1, Decimal(0), text) for number, text in parts)
+
+
+def time_of(name: str) -> int | None:
+    """Nanoseconds, of a name that is decimal seconds (TUM) or nanoseconds (EuRoC)."""
+    if re.fullmatch(r"\d+\.\d+", name, re.ASCII):
+        return int(Decimal(name) * 1_000_000_000)
+    return int(name) if re.fullmatch(rf"\d{{{_NANOSECONDS}}}", name, re.ASCII) else None
+
+
+def whole_image(path: Path, flags: int) -> NDArray[Any] | None:
+    """The image, decoded as OpenCV's `flags` say; None while not wholly written, or if damaged."""
+    raw = path.read_bytes()
+    if not raw.endswith(_PNG_END if path.suffix == ".png" else _JPEG_END):
+        return None
+    return decoded(np.frombuffer(raw, np.uint8), flags)
+
+
+def whole_scan(path: Path) -> NDArray[np.float32] | None:
+    """(n, 3) float32 points of x, y, z, intensity; None where the file does not hold whole ones."""
+    raw = path.read_bytes()
+    if not raw or len(raw) % _POINT:
+        return None
+    return np.frombuffer(raw, np.float32).reshape(-1, 4)[:, :3]
+
+
+def depth_of(image: NDArray[Any]) -> NDArray[Any]:
+    """A depth image with 0 for what was not measured."""
+    if image.dtype == np.uint16:
+        image[image == _NOT_MEASURED] = 0
+    return image
+
+
+def camera_of(root: Path) -> Intrinsics | None:
+    """The intrinsics written in the folder (`CAMERAS`), in it or one above; None = not there (yet).
+
+    Raises:
+        DatasetError: the file is malformed, or only half written.
+    """
+    for place in (root, root.parent):
+        for name in CAMERAS:
+            path = place / name
+            if path.is_file():
+                return read_open3d_camera(path) if path.suffix == ".json" else read_intrinsics(path)
+    return None
+
+
+def baseline_of(root: Path) -> float | None:
+    """Metres, from `baseline.txt`; None = not there (yet).
+
+    Raises:
+        DatasetError: it is not one number above 0.
+    """
+    path = root / "baseline.txt"
+    if not path.is_file():
+        return None
+    baseline = float(read_numbers(path, "the baseline in metres", columns=1)[0, 0])
+    if baseline <= 0:
+        raise DatasetError(f"{path} must hold the baseline in metres, > 0, got {baseline}")
+    return baseline

@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: MIT
+"""Intel RealSense through librealsense: a camera, a recording of one, or a device made by a program."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tsfusion.core.errors import InvalidConfig, MissingDependency, SourceError
+from tsfusion.geometry.calibration import Camera, Undistorter
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.scanner.sources import realsense_frames as feeds
+from tsfusion.scanner.sources.source import Live, monotonic_of
+
+RECORDINGS = (".db3", ".bag")
+
+_LENSES = {
+    "brown_conrady": "radtan",
+    "modified_brown_conrady": "radtan",
+    "inverse_brown_conrady": "radtan",
+    "kannala_brandt4": "equidistant",
+}
+_ADVICE = "Close other programs that use it, or try another cable and USB 3 port"
+_SLICE_MS = 100  # between two looks at whether the source was closed
+_APART = 0.75  # of a period: images further apart are not of one exposure
+_REORDERED = 16  # sets that librealsense could have under way
+_OLDEST_S = 1.0  # the stamp of a camera's frame that seems older is of another clock
+
+
+class RealSense(Live):
+    """Depth brought onto colour, or the rectified infrared pair, of one RealSense.
+
+    The projector and all other options stay as they are on the camera. A live camera hands out its newest
+    frames; those that a slow consumer misses count as `dropped`. A recording hands out all of them.
+
+    Args:
+        camera: serial number; default the first one found.
+        recording: a file instead of a camera, as librealsense records it.
+        device: a `pyrealsense2.device` of this process instead (a software device).
+        images: `depth`, or `infrared`: the pair of the stereo cameras. Switch the dot projector off for it:
+            its dots move with the camera.
+        color: with the colour camera, where there is one; without it depth stays on its own pixels.
+        size: (height, width) of all images of a camera.
+        fps: frames a second of a camera.
+        real_time: play a recording at the speed it was taken, with what that drops.
+        deadline: seconds without a frame after which a camera counts as stopped.
+        sensor: sensor model; default `realsense`, `tof` for a camera without a baseline, `stereo` for the
+            infrared pair.
+
+    Raises:
+        SourceError: no such camera, it is in use or lacks such images; the recording cannot be played.
+        MissingDependency: without pyrealsense2.
+    """
+
+    def __init__(
+        self,
+        camera: str | None = None,
+        *,
+        recording: str | Path | None = None,
+        device: Any = None,
+        images: feeds.Images = "depth",
+        color: bool = True,
+        size: feeds.Size = (480, 640),
+        fps: int = 30,
+        real_time: bool = False,
+        deadline: float = 5.0,
+        sensor: str | None = None,
+    ) -> None:
+        if images not in ("depth", "infrared"):
+            raise InvalidConfig(f"images of a RealSense must be depth or infrared, got {images!r}")
+        if sum(given is not None for given in (camera, recording, device)) > 1:
+            raise InvalidConfig("give one of camera, recording and device of a RealSense")
+        self._rs = _pyrealsense2()
+        recording = None if recording is None else Path(recording).expanduser()
+        super().__init__(f"RealSense {camera or (recording.name if recording else '')}".strip(), "realsense")
+        self.live = recording is None or real_time
+        self._played, self._deadline, self._number = recording is not None, deadline, -_REORDERED
+        try:
+            self._feed, self._color = feeds.open_feed(
+                self._rs, camera=camera, recording=recording, device=device, images=images, color=color,
+                size=size, fps=fps, real_time=real_time,
+            )  # fmt: skip
+        except RuntimeError as error:  # all that librealsense raises
+            advice = f"expected a recording of librealsense at {recording}" if recording else _ADVICE
+            raise SourceError(f"{self.name} cannot be opened: {error}. {advice}") from error
+        try:
+            self._infrared = images == "infrared"
+            self._prepare()
+        except BaseException:
+            self._feed.stop()
+            raise
+        self.sensor = sensor or self.sensor
+
+    def __iter__(self) -> Iterator[Frame]:
+        last = time.monotonic()
+        while not self._closed.is_set():
+            over = self._feed.over()
+            frames = self._next()
+            frame = None
+            if frames is not None:
+                frame = self._pair(frames) if self._infrared else self._depth(frames)
+            if frame is not None:
+                yield frame
+                last = time.monotonic()
+            elif over and frames is None:
+                return
+            elif not self._played and time.monotonic() - last > self._deadline:
+                raise self._stopped()
+
+    def close(self) -> None:
+        """Stop the camera; a blocked iteration ends within a tenth of a second."""
+        super().close()
+        self._feed.stop()
+
+    def _next(self) -> Any:
+        try:
+            return self._feed.wait(_SLICE_MS)
+        except RuntimeError as error:
+            if self._closed.is_set():
+                return None
+            raise SourceError(f"{self.name} stopped: {error}. {_ADVICE}") from error
+
+    def _stopped(self) -> SourceError:
+        if not feeds.plugged_in(self._rs, self._feed.device):
+            return SourceError(f"{self.name} was unplugged; plug it in and start again")
+        return SourceError(f"{self.name} delivered no complete frames for {self._deadline:g} s. {_ADVICE}")
+
+    def _prepare(self) -> None:
+        """Read the calibration of the streams in use."""
+        stream = self._rs.stream
+        if self._infrared:
+            left, right = (self._feed.profile(stream.infrared, index) for index in (1, 2))
+            self.sensor, shown = "stereo", left
+            baseline: float | None = abs(float(left.get_extrinsics_to(right).translation[0]))
+        else:
+            left = self._feed.profile(stream.depth)
+            shown = self._feed.profile(stream.color) if self._color else left
+            baseline = feeds.baseline(self._rs, self._feed.device)
+            self.sensor = "tof" if baseline is None else "realsense"
+            self._align = self._rs.align(stream.color)
+        self._undistorter = _undistorter(shown, self.name)
+        if self._undistorter is None:
+            camera = shown.get_intrinsics()
+            self.intrinsics = Intrinsics(camera.fx, camera.fy, camera.ppx, camera.ppy)
+        else:
+            self.intrinsics = self._undistorter.intrinsics
+        self.baseline_fx = None if baseline is None else baseline * left.get_intrinsics().fx
+
+    def _depth(self, frames: Any) -> Frame | None:
+        depth = frames.get_depth_frame()
+        color = frames.get_color_frame() if self._color else None
+        if not self._whole(depth, color, needed=self._color):
+            return None
+        timestamp_ns, captured_ns = self._stamps(depth)
+        if self._color:
+            aligned = self._align.process(frames)
+            depth, color = aligned.get_depth_frame(), feeds.bgr(self._rs, aligned.get_color_frame())
+        image = np.array(depth.get_data())
+        if self._undistorter is not None:
+            image = self._undistorter.depth(image)
+            color = None if color is None else self._undistorter.image(color)
+        return Frame(
+            sensor=self.sensor,
+            depth=image,
+            depth_scale=round(depth.get_units(), 9),  # it comes in single precision
+            color=color,
+            intrinsics=self.intrinsics,
+            baseline_fx=self.baseline_fx,
+            timestamp_ns=timestamp_ns,
+            captured_ns=captured_ns,
+        )
+
+    def _pair(self, frames: Any) -> Frame | None:
+        left, right = frames.get_infrared_frame(1), frames.get_infrared_frame(2)
+        if not self._whole(left, right, needed=True):
+            return None
+        timestamp_ns, captured_ns = self._stamps(left)
+        grey = np.array(left.get_data())
+        return Frame(
+            sensor=self.sensor,
+            left=grey,
+            right=np.array(right.get_data()),
+            color=np.repeat(grey[:, :, None], 3, axis=2),
+            intrinsics=self.intrinsics,
+            baseline_fx=self.baseline_fx,
+            timestamp_ns=timestamp_ns,
+            captured_ns=captured_ns,
+        )
+
+    def _whole(self, first: Any, second: Any, *, needed: bool) -> bool:
+        """Whether the set has a new first image and its second of the same exposure; counts what has not.
+
+        Numbers left out were dropped; a set may repeat an image beside the next one of the other stream;
+        a number that is much smaller comes from a camera that began anew.
+        """
+        if not first or 0 <= self._number - first.frame_number < _REORDERED:
+            return False
+        if 0 <= self._number < first.frame_number - 1:
+            self._skip("dropped", first.frame_number - 1 - self._number)
+        self._number = first.frame_number
+        if not needed:
+            return True
+        period_ms = 1000 / first.profile.fps()
+        one_clock = second and first.frame_timestamp_domain == second.frame_timestamp_domain
+        if not second or (one_clock and abs(first.timestamp - second.timestamp) > _APART * period_ms):
+            self._skip("incomplete")
+            return False
+        return True
+
+    def _stamps(self, frame: Any) -> tuple[int, int]:
+        """`timestamp_ns` and `captured_ns`."""
+        stamp = round(frame.timestamp * 1e6)  # from milliseconds
+        foreign = self._played or frame.frame_timestamp_domain == self._rs.timestamp_domain.hardware_clock
+        captured = time.monotonic_ns() if foreign else monotonic_of(stamp, oldest_s=_OLDEST_S)
+        return stamp, captured
+
+
+def _undistorter(profile: Any, name: str) -> Undistorter | None:
+    """For colour cameras that are not corrected in the camera (D455, D405); None for all others.
+
+    Librealsense projects with the forward polynomial in all three Brown-Conrady models (`rs2_project`).
+    """
+    camera = profile.get_intrinsics()
+    if not any(camera.coeffs):
+        return None
+    model = _LENSES.get(camera.model.name)
+    if model is None or profile.stream_type().name == "infrared":
+        raise SourceError(
+            f"{name}: the {profile.stream_type().name} images are distorted ({camera.model.name} "
+            f"{list(camera.coeffs)}), which is not expected of a RealSense's depth or infrared images"
+        )
+    K = (camera.fx, camera.fy, camera.ppx, camera.ppy)
+    coefficients = camera.coeffs[:4] if model == "equidistant" else camera.coeffs
+    return Undistorter(Camera.named(K, (camera.height, camera.width), model, coefficients))
+
+
+def _pyrealsense2() -> Any:
+    try:
+        import pyrealsense2
+    except ImportError as error:
+        raise MissingDependency(
+            "RealSense needs pyrealsense2; install it with: pip install 'tsfusion[realsense]'"
+        ) from error
+    return pyrealsense2

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: MIT
+"""What makes raw stereo images a rectified pair."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError, InvalidConfig, SourceError
+from tsfusion.geometry.calibration import Rectifier, Size
+from tsfusion.geometry.calibration_files import read_rig
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import Intrinsics
+
+# A folder as a calibration: the files of the left and the right camera, or of intrinsics and extrinsics.
+TOGETHER = (
+    ("cam0/sensor.yaml", "cam1/sensor.yaml"),
+    ("mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml"),
+    ("left.yaml", "right.yaml"),
+    ("intrinsics.yml", "extrinsics.yml"),
+)
+
+
+class Pairs(Protocol):
+    """A stereo camera's calibration at work; a `calibration.Rectifier` is one."""
+
+    @property
+    def intrinsics(self) -> Intrinsics: ...
+
+    @property
+    def baseline_fx(self) -> float: ...
+
+    @property
+    def size(self) -> Size: ...
+
+    def pair(self, left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Both images rectified."""
+
+
+@dataclass(frozen=True)
+class Rectified:
+    """For images that are rectified already."""
+
+    intrinsics: Intrinsics
+    baseline_m: float
+    size: Size
+
+    @property
+    def baseline_fx(self) -> float:
+        """Metre · pixels."""
+        return self.baseline_m * self.intrinsics.fx
+
+    def pair(self, left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Both images as they are."""
+        return left, right
+
+
+def rectifier(calibration: str | Path, *, size: Size | None) -> Rectifier:
+    """From a file, or from a folder that holds two which belong together (`TOGETHER`).
+
+    Args:
+        size: (height, width) of one image, for files that do not say.
+
+    Raises:
+        SourceError: it cannot be read, and what was expected.
+    """
+    path = Path(calibration).expanduser()
+    files = [path]
+    if path.is_dir():
+        found = [names for names in TOGETHER if all((path / name).is_file() for name in names)]
+        if not found:
+            expected = "; ".join(" and ".join(names) for names in TOGETHER)
+            raise SourceError(f"{path} holds no calibration of a stereo camera; expected one of {expected}")
+        files = [path / name for name in found[0]]
+    try:
+        try:
+            rig = read_rig(*files)
+        except DatasetError:
+            if size is None:
+                raise
+            rig = read_rig(*files, size=size)
+        return Rectifier(rig)
+    except (DatasetError, InvalidConfig) as error:
+        raise SourceError(f"calibration: {error}") from error
+
+
+def frame_of(
+    left: NDArray[Any],
+    right: NDArray[Any],
+    pairs: Pairs,
+    *,
+    sensor: str,
+    timestamp_ns: int,
+    captured_ns: int,
+) -> Frame:
+    """Raw images, grey or BGR, (H, W) or (H, W, 3) uint8, as a rectified frame with the left one's colour."""
+    left, right = pairs.pair(left, right)
+    return Frame(
+        sensor=sensor,
+        left=_grey(left),
+        right=_grey(right),
+        color=left if left.ndim == 3 else np.repeat(left[:, :, None], 3, axis=2),
+        intrinsics=pairs.intrinsics,
+        baseline_fx=pairs.baseline_fx,
+        timestamp_ns=timestamp_ns,
+        captured_ns=captured_ns,
+    )
+
+
+def _grey(image: NDArray[Any]) -> NDArray[np.uint8]:
+    if image.ndim == 2:
+        return image
+    grey: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return grey

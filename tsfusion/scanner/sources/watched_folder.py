@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: MIT
+"""A folder that another program writes frames to."""
+
+import logging
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError
+from tsfusion.geometry.calibration import Undistorter
+from tsfusion.geometry.calibration_files import read_camera
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.scanner.sources import folder_layouts, stereo_pairs
+from tsfusion.scanner.sources.source import Live, monotonic_of
+
+log = logging.getLogger(__name__)
+
+ENDS = ("DONE", ".end")  # a file of this name: nothing more will be written
+SENSORS = {"depth": "kinect", "pair": "stereo", "points": "lidar"}
+
+_REST = 10  # times as long as listing the folder took, at least, until it is listed again
+_SETTLED_S = 0.5  # a format without an end counts as wholly written when it did not change for so long
+_OLDEST_S = 600.0  # the time of a file written longer ago is of another clock
+_WAIT = object()  # a frame whose files are not all there
+
+
+class Folder(Live):
+    """Frames in the order of their names, each as soon as its files are wholly written.
+
+    Layouts: `layouts.EXPECTED`. What is there already comes first. A frame waits for the one before it if
+    that is begun; after `deadline` without a change it is left out. Colour must lie on depth, pixel by
+    pixel. Times are those in the names (decimal seconds, or nanoseconds), else when the file was written.
+
+    It ends when a file `DONE` or `.end` appears, or after `idle` seconds without anything new. The name of
+    every frame is remembered (100 bytes each).
+
+    Args:
+        path: an existing folder; its layout and its camera may still come.
+        intrinsics: default from the folder or the one above (`layouts.CAMERAS`).
+        calibration: instead, a camera's file; for left/ and right/ a stereo camera's (`pairs.rectifier`),
+            default in the folder, or else intrinsics and `baseline.txt` of images that are rectified.
+        baseline: metres, of left/ and right/ that are rectified.
+        depth_scale: metres per unit.
+        idle: seconds; None = wait for ever.
+        deadline: seconds that a begun frame or a missing camera is waited for.
+        poll: seconds between two looks.
+
+    Raises:
+        SourceError: no such folder or calibration.
+    """
+
+    live = False  # what was written stays there
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        intrinsics: Intrinsics | None = None,
+        calibration: str | Path | None = None,
+        baseline: float | None = None,
+        depth_scale: float = 0.001,
+        idle: float | None = None,
+        deadline: float = 5.0,
+        poll: float = 0.05,
+        sensor: str | None = None,
+    ) -> None:
+        root = Path(path).expanduser()
+        if not root.is_dir():
+            raise SourceError(f"{root} is not a folder; expected one that frames are written to")
+        if calibration is not None and not Path(calibration).expanduser().exists():
+            raise SourceError(f"calibration: {calibration} does not exist")
+        self._root, self._layout = root, folder_layouts.layout_of(root)
+        super().__init__(f"folder {root.name}", "kinect")
+        self._sensor = sensor
+        self._name_sensor()
+        self._intrinsics, self._calibration, self._baseline = intrinsics, calibration, baseline
+        self._depth_scale, self._idle, self._deadline, self._poll = depth_scale, idle, deadline, poll
+        self._opened_ns, self._stamp = time.time_ns(), 0
+        self._handled: set[str] = set()  # names of first files
+        self._last: folder_layouts.Key = ()
+        self._colored: bool | None = None  # whether frames come with colour; None = not known yet
+        self._camera: Any = None  # Intrinsics, an Undistorter, or Pairs
+        self._begun: Any = None  # what the frame that is waited for consists of so far
+        self._since = time.monotonic()  # when something last changed
+
+    def __iter__(self) -> Iterator[Frame]:
+        self._since = time.monotonic()
+        while not self._closed.is_set():
+            ended = any((self._root / name).exists() for name in ENDS)
+            looked = time.monotonic()
+            waiting = self._list()
+            pause = max(self._poll, _REST * (time.monotonic() - looked))
+            for name, first in waiting:
+                if self._closed.is_set():
+                    return
+                frame = self._take(name, first, final=ended)
+                if frame is _WAIT:
+                    break
+                self._handled.add(first.name)
+                if isinstance(frame, Frame):
+                    self._last = folder_layouts.order(name)
+                    yield frame
+                self._since = time.monotonic()
+            else:
+                if ended or (self._idle is not None and time.monotonic() - self._since > self._idle):
+                    return
+            self._closed.wait(pause)
+
+    def _list(self) -> list[tuple[str, Path]]:
+        """(name, first file) of the frames that are new, in order."""
+        try:
+            if self._layout is None or not self._handled:  # the folder of colour may still come
+                self._layout = folder_layouts.layout_of(self._root)
+                self._name_sensor()
+            if self._layout is None:
+                return []
+            where, pattern = self._layout.first
+            with os.scandir(where) as entries:
+                files = [entry.name for entry in entries if entry.name not in self._handled]
+        except OSError as error:
+            raise SourceError(f"{self._root} cannot be read any more: {error.strerror}") from error
+        found = []
+        for file in files:
+            match = pattern.fullmatch(file)
+            if match and folder_layouts.order(match[1]) < self._last:
+                self._handled.add(file)
+                self._skip("late")
+            elif match:
+                found.append((match[1], where / file))
+        return sorted(found, key=lambda item: folder_layouts.order(item[0]))
+
+    def _take(self, name: str, first: Path, *, final: bool) -> Any:
+        """The frame, None if it is left out, or `_WAIT`."""
+        assert self._layout is not None
+        kind, second = self._layout.kind, self._layout.partner(name)
+        state = (name, *(_state(path) for path in (first, second)))
+        if state != self._begun:
+            self._begun, self._since = state, time.monotonic()
+        waited = time.monotonic() - self._since
+        final = final or waited > self._deadline
+        if second is None and self._layout.second is not None and self._colored is not False:
+            if not final:
+                return _WAIT
+            if kind == "pair" or self._colored:
+                return self._skip("without its other image")
+            self._colored = False  # there is none, of any frame
+        images: list[Any]
+        try:
+            if kind == "points":
+                written = time.time() - first.stat().st_mtime
+                images = [
+                    folder_layouts.whole_scan(first) if max(waited, written) > _SETTLED_S or final else None
+                ]
+            else:
+                images = [_image(first, kind)] + ([] if second is None else [_image(second, "pair")])
+        except OSError:  # taken away again
+            images = [None]
+        if any(image is None for image in images):
+            return self._skip("damaged") if final else _WAIT
+        if kind != "points" and self._camera is None and not self._find_camera(kind, images[0], final=final):
+            return _WAIT
+        self._colored = self._colored or (kind == "depth" and len(images) == 2)
+        try:
+            return self._frame(kind, images, *self._stamps(name, first))
+        except OSError:  # taken away again
+            return self._skip("damaged")
+        except (InvalidKeyframe, InvalidConfig, cv2.error) as error:
+            if "malformed" not in self.skipped:
+                log.warning("%s: %s is left out: %s", self.name, first.name, error)
+            return self._skip("malformed")
+
+    def _frame(self, kind: str, images: list[Any], timestamp_ns: int, captured_ns: int) -> Frame:
+        if kind == "pair":
+            left, right = images
+            return stereo_pairs.frame_of(
+                left,
+                right,
+                self._camera,
+                sensor=self.sensor,
+                timestamp_ns=timestamp_ns,
+                captured_ns=captured_ns,
+            )
+        depth = color = K = None
+        if kind == "depth":
+            depth, color, K = self._flat(
+                folder_layouts.depth_of(images[0]), images[1] if images[1:] else None
+            )
+        return Frame(
+            sensor=self.sensor,
+            depth=depth,
+            depth_scale=self._depth_scale,
+            points=images[0] if kind == "points" else None,
+            color=color,
+            intrinsics=K,
+            timestamp_ns=timestamp_ns,
+            captured_ns=captured_ns,
+        )
+
+    def _flat(self, depth: NDArray[Any], color: Any) -> tuple[NDArray[Any], Any, Intrinsics]:
+        """Without the distortion of the calibration's lens."""
+        if color is not None and color.ndim == 2:
+            color = cv2.cvtColor(color, cv2.COLOR_GRAY2BGR)
+        if not isinstance(self._camera, Undistorter):
+            return depth, color, self._camera
+        color = None if color is None else self._camera.image(color)
+        return self._camera.depth(depth), color, self._camera.intrinsics
+
+    def _find_camera(self, kind: str, image: NDArray[Any], *, final: bool) -> bool:
+        """Read the camera once there is an image to know its size by."""
+        try:
+            self._camera = self._pairs(image) if kind == "pair" else self._one_camera(image)
+        except DatasetError as error:  # it may be half written
+            if final or self._calibration is not None:
+                raise SourceError(str(error)) from error
+        if self._camera is None and final:
+            need = " and baseline.txt, or a stereo camera's calibration" if kind == "pair" else ""
+            raise SourceError(
+                f"{self._root} has no camera: expected one of {', '.join(folder_layouts.CAMERAS)} in it"
+                f"{need} (or --calibration FILE)"
+            )
+        return self._camera is not None
+
+    def _one_camera(self, image: NDArray[Any]) -> Intrinsics | Undistorter | None:
+        if self._calibration is None:
+            return self._intrinsics or folder_layouts.camera_of(self._root)
+        camera = read_camera(Path(self._calibration).expanduser(), size=(image.shape[0], image.shape[1]))
+        return camera.intrinsics if camera.model == "pinhole" else Undistorter(camera)
+
+    def _pairs(self, image: NDArray[Any]) -> stereo_pairs.Pairs | None:
+        size = image.shape[0], image.shape[1]
+        there = any(all((self._root / name).is_file() for name in names) for names in stereo_pairs.TOGETHER)
+        if self._calibration is not None or there:
+            return stereo_pairs.rectifier(self._calibration or self._root, size=size)
+        intrinsics = self._intrinsics or folder_layouts.camera_of(self._root)
+        baseline = self._baseline or folder_layouts.baseline_of(self._root)
+        if intrinsics is None or baseline is None:
+            return None
+        return stereo_pairs.Rectified(intrinsics, baseline, size)
+
+    def _stamps(self, name: str, first: Path) -> tuple[int, int]:
+        """`timestamp_ns` and `captured_ns`; the first grows, also where files were written out of order."""
+        written_ns = first.stat().st_mtime_ns
+        self._stamp = max(folder_layouts.time_of(name) or written_ns, self._stamp + 1)
+        own = written_ns >= self._opened_ns
+        captured = monotonic_of(written_ns, oldest_s=_OLDEST_S) if own else time.monotonic_ns()
+        return self._stamp, captured
+
+    def _name_sensor(self) -> None:
+        self.sensor = self._sensor or SENSORS[self._layout.kind if self._layout else "depth"]
+
+
+def _image(path: Path, kind: str) -> NDArray[Any] | None:
+    return folder_layouts.whole_image(path, cv2.IMREAD_UNCHANGED if kind == "depth" else cv2.IMREAD_ANYCOLOR)
+
+
+def _state(path: Path | None) -> tuple[int, int] | None:
+    try:
+        found = None if path is None else path.stat()
+    except OSError:
+        return None
+    return None if found is None else (found.st_size, found.st_mtime_ns)

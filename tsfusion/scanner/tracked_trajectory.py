@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: MIT
+"""A trajectory that grows for hours: its frames' poses in plain numbers, some 300 bytes each."""
+
+from array import array
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.scanner.localization.localizer import Corrections, Matrix, Pose
+
+_NONE = -1
+_BOTTOM = (0.0, 0.0, 0.0, 1.0)
+_ROWS = 12  # numbers of a pose: the upper three rows
+_COLUMNS = 4  # other numbers of a frame
+
+Poses = NDArray[np.float64]  # (n, 4, 4)
+
+
+class Track:
+    """Frames that have a pose, in order.
+
+    The number of a frame as a keyframe is -1 where it is none, or was left out.
+    """
+
+    def __init__(self) -> None:
+        self._numbers = array("q")  # stamp, anchor, seq, place of the reference
+        self._poses = array("d")  # T_world_camera, T_anchor_camera
+        self._references = array("d")
+
+    def add(self, pose: Pose, reference: Matrix | None, seq: int | None) -> None:
+        """The next frame.
+
+        Args:
+            reference: (4, 4), what the source itself said of the pose; None = nothing.
+            seq: its number as a keyframe, if it is one.
+        """
+        at = _NONE
+        if reference is not None:
+            at = len(self._references) // _ROWS
+            self._references.frombytes(_bytes(reference))
+        self._poses.frombytes(_bytes(pose.T_world_camera) + _bytes(pose.T_anchor_camera))
+        self._numbers.extend((pose.timestamp_ns, pose.anchor, _NONE if seq is None else seq, at))
+
+    def __len__(self) -> int:
+        return len(self._numbers) // _COLUMNS
+
+    @property
+    def stamps_ns(self) -> list[int]:
+        """Of the frames."""
+        return self._numbers[::_COLUMNS].tolist()
+
+    @property
+    def seqs(self) -> NDArray[np.int64]:
+        """(n,): numbers of keyframes; -1 where a frame is none."""
+        return np.array(self._numbers[2::_COLUMNS], dtype=np.int64)
+
+    @property
+    def last_seq(self) -> int:
+        """Number of the last keyframe; -1 = there is none."""
+        return int(self.seqs.max(initial=_NONE))
+
+    def poses(self, corrections: Corrections | None = None) -> Poses:
+        """(n, 4, 4) T_world_camera, as tracked, or after loop closure."""
+        return self._corrected(corrections, np.arange(len(self)))
+
+    def keyframes(self, corrections: Corrections | None = None) -> tuple[NDArray[np.int64], Poses]:
+        """The numbers of the keyframes, (m,), and (m, 4, 4) T_world_camera."""
+        chosen = np.flatnonzero(self.seqs != _NONE)
+        return self.seqs[chosen], self._corrected(corrections, chosen)
+
+    def with_reference(self) -> tuple[NDArray[np.int64], Poses]:
+        """Which frames the source itself said a pose of, (m,), and (m, 4, 4) those."""
+        references = np.array(self._references).reshape(-1, 3, 4)
+        return np.flatnonzero(self._columns[:, 3] != _NONE), _matrices(references)
+
+    def _corrected(self, corrections: Corrections | None, chosen: NDArray[np.int64]) -> Poses:
+        pairs = self._pairs[chosen]
+        poses = _matrices(pairs[:, 0])
+        if corrections is None:
+            return poses
+        poses = corrections.T_corrected_world @ poses
+        numbers, which = np.unique(self._columns[chosen, 1], return_inverse=True)
+        known = np.array([number in corrections.anchors for number in numbers.tolist()], dtype=bool)
+        anchors = np.array([corrections.anchors.get(number, np.eye(4)) for number in numbers.tolist()])
+        hang = known[which]
+        poses[hang] = anchors.reshape(-1, 4, 4)[which[hang]] @ _matrices(pairs[hang, 1])
+        return poses
+
+    @property
+    def _columns(self) -> NDArray[np.int64]:
+        return np.array(self._numbers, dtype=np.int64).reshape(-1, _COLUMNS)
+
+    @property
+    def _pairs(self) -> NDArray[np.float64]:
+        return np.array(self._poses).reshape(-1, 2, 3, 4)
+
+
+def _bytes(T: Matrix) -> bytes:
+    return np.asarray(T, dtype=np.float64)[:3].tobytes()
+
+
+def _matrices(rows: NDArray[np.float64]) -> Poses:
+    """(…, 4, 4) from (…, 3, 4)."""
+    bottom = np.broadcast_to(np.array(_BOTTOM), (*rows.shape[:-2], 1, 4))
+    return np.concatenate([rows, bottom], axis=-2)

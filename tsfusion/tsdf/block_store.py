@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: MIT
+"""The map's memory: blocks of 8³ voxels in slots, found by their packed coordinates."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.kernels import block_hash
+from tsfusion.kernels.integrate import CUBE, WEIGHT_MASK
+from tsfusion.tsdf.growing_array import GrowingArray
+
+_FIRST_CAPACITY = 1024
+_CHUNK = 1024  # blocks read at a time where a whole layer would be copied
+_BEHIND = np.array([x << 42 | y << 21 | z for x in (0, 1) for y in (0, 1) for z in (0, 1)])  # in packed keys
+
+
+class BlockStore:
+    """Slots 0 … count-1, each with a key and one row of 512 voxels in every layer.
+
+    Layers, (slot, 512): `sums` int64; with colour `color_rgn` int64 and `color_b` int32; when smoothing
+    `correction` float32 (kernels/integrate.py and smooth.py say what they hold). Beside them, one number a
+    block: `dirty` uint8, and int32 `stamps` (the last keyframe that touched it), `places` (where in that
+    keyframe's list), `bounds` (no voxel has more weight than this).
+    A layer the map does not have is one row of zeros, so that kernels can be handed it.
+    """
+
+    def __init__(self, *, color: bool, corrected: bool) -> None:
+        self.count = 0
+        self.hash_keys = np.zeros(4 * _FIRST_CAPACITY, np.int64)
+        self.hash_slots = np.zeros(4 * _FIRST_CAPACITY, np.int32)
+        self._keys = GrowingArray((), np.int64, _FIRST_CAPACITY)
+        self._dirty = GrowingArray((), np.uint8, _FIRST_CAPACITY)
+        self._stamps, self._places, self._bounds = (
+            GrowingArray((), np.int32, _FIRST_CAPACITY) for _ in range(3)
+        )
+        present = {"sums": True, "color_rgn": color, "color_b": color, "correction": corrected}
+        dtypes = {"sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "correction": np.float32}
+        self._layers = {
+            name: GrowingArray((CUBE,), dtypes[name], _FIRST_CAPACITY if there else 1)
+            for name, there in present.items()
+        }
+        self._present = [name for name, there in present.items() if there]
+
+    @property
+    def keys(self) -> NDArray[np.int64]:
+        return self._keys.array[: self.count]
+
+    @property
+    def sums(self) -> NDArray[np.int64]:
+        return self._layers["sums"].array
+
+    @property
+    def color_rgn(self) -> NDArray[np.int64]:
+        return self._layers["color_rgn"].array
+
+    @property
+    def color_b(self) -> NDArray[np.int32]:
+        return self._layers["color_b"].array
+
+    @property
+    def correction(self) -> NDArray[np.float32]:
+        return self._layers["correction"].array
+
+    @property
+    def dirty(self) -> NDArray[np.uint8]:
+        return self._dirty.array
+
+    @property
+    def stamps(self) -> NDArray[np.int32]:
+        return self._stamps.array
+
+    @property
+    def places(self) -> NDArray[np.int32]:
+        return self._places.array
+
+    @property
+    def bounds(self) -> NDArray[np.int32]:
+        return self._bounds.array
+
+    def layers(self) -> dict[str, NDArray[Any]]:
+        """The layers the map has, by name."""
+        return {name: self._layers[name].array for name in self._present}
+
+    def insert(self, keys: NDArray[np.int64]) -> None:
+        """Append blocks with distinct new keys; their voxels are zero.
+
+        Raises:
+            MemoryError: when there is none for them; the map is as it was.
+        """
+        first, count = self.count, self.count + len(keys)
+        for array in self._arrays():
+            array.reserve(count)
+        grown = 2 * count > len(self.hash_keys)
+        if grown:
+            size = 1 << (4 * count - 1).bit_length()
+            self.hash_keys, self.hash_slots = np.zeros(size, np.int64), np.zeros(size, np.int32)
+        self._keys.array[first:count] = keys
+        self.count = count
+        self._hash(0 if grown else first)
+
+    def drop(self, count: int) -> None:
+        """Take back the newest blocks, so that `count` remain; their voxels must be zero."""
+        for array in (self._keys, self._dirty, self._stamps, self._places, self._bounds):
+            array.array[count : self.count] = 0
+        self.count = count
+        self.hash_keys[:] = self.hash_slots[:] = 0
+        self._hash(0)
+
+    def slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
+        """(n,) slots of keys, -1 where there is no such block."""
+        slots = np.empty(len(keys), np.int32)
+        block_hash.find_blocks(keys, self.hash_keys, self.hash_slots, slots)
+        return slots
+
+    def measure_bounds(self) -> None:
+        """Set `bounds` from the sums."""
+        for i in range(0, self.count, _CHUNK):
+            chunk = slice(i, min(i + _CHUNK, self.count))
+            self.bounds[chunk] = (self.sums[chunk] & WEIGHT_MASK).max(axis=1)
+
+    def take_dirty(self) -> NDArray[np.int64]:
+        """Slots changed since the last call."""
+        slots = np.flatnonzero(self.dirty[: self.count])
+        self.dirty[slots] = 0
+        return slots
+
+    def used(self) -> NDArray[np.int64]:
+        """Slots with any vote left, in the order of their keys."""
+        order = np.argsort(self.keys)
+        chunks = [order[i : i + _CHUNK] for i in range(0, len(order), _CHUNK)]
+        return np.concatenate([order[:0], *(chunk[self.sums[chunk].any(axis=1)] for chunk in chunks)])
+
+    def in_order(self, layer: str) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
+        """Keys and rows of the used blocks in key order, some at a time."""
+        used = self.used()
+        for i in range(0, len(used), _CHUNK):
+            chunk = used[i : i + _CHUNK]
+            yield self.keys[chunk], self._layers[layer].array[chunk]
+
+    def _hash(self, first: int) -> None:
+        """Put the blocks from `first` on into the hash."""
+        block_hash.insert_blocks(
+            self._keys.array, first, self.count - first, first, self.hash_keys, self.hash_slots
+        )
+
+    @property
+    def bytes_per_block(self) -> int:
+        return sum(array.item_bytes for array in self._arrays())
+
+    def _arrays(self) -> tuple[GrowingArray, ...]:
+        layers = (self._layers[name] for name in self._present)
+        return (self._keys, self._dirty, self._stamps, self._places, self._bounds, *layers)
+
+    @property
+    def nbytes(self) -> int:
+        """What the blocks and their hash take."""
+        return self.count * self.bytes_per_block + self.hash_keys.nbytes + self.hash_slots.nbytes
+
+
+def pack_keys(coordinates: NDArray[np.int32]) -> NDArray[np.int64]:
+    """(n, 3) block coordinates → (n,) int64 keys, as `kernels.traversal.pack`."""
+    x, y, z = (np.asarray(coordinates, np.int64) + (1 << 20)).reshape(-1, 3).T
+    return np.ascontiguousarray(x << 42 | y << 21 | z)
+
+
+def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int32]:
+    """(n,) keys → (n, 3) int32 block coordinates."""
+    mask = (1 << 21) - 1
+    return (np.stack([keys >> 42, keys >> 21, keys], axis=1) & mask).astype(np.int32) - (1 << 20)
+
+
+def cells_of(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The blocks whose cells read these blocks: themselves and their neighbours towards −x, −y, −z."""
+    return unpack_keys(np.unique((pack_keys(coordinates)[:, None] - _BEHIND).ravel()))

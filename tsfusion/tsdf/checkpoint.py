@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: MIT
+"""A saved map: one file, written whole or not at all, verified when read.
+
+    TSFMAP1\\n | header | chunk … | digest      each but the first: uint32 length, then its bytes
+
+The header is msgpack; a chunk is one zstd frame with the keys and then each layer of up to 1024 blocks,
+blocks in key order; the digest is blake2b-128 of everything before it.
+"""
+
+import contextlib
+import hashlib
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import msgspec
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from tsfusion.core import durable_files
+from tsfusion.core.config import VolumeConfig
+from tsfusion.core.errors import CheckpointError, DamagedCheckpoint
+
+MAGIC = b"TSFMAP1\n"
+CHUNK = 1024  # blocks
+CUBE = 512  # voxels a block
+DTYPES = {"sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "correction": np.float32}
+
+
+class Header(msgspec.Struct, kw_only=True):
+    """What a checkpoint says of itself."""
+
+    config: VolumeConfig
+    keyframes: int
+    map_hash: str
+    layers: list[str]
+    meta: dict[str, Any]
+    blocks: int = 0
+
+
+def write(
+    path: Path,
+    header: Header,
+    keys: NDArray[np.int64],
+    slots: NDArray[np.int64],
+    layers: dict[str, NDArray[Any]],
+) -> Path:
+    """Write blocks `slots` of each layer (…, 512) under their keys.
+
+    What was at `path` stays as it was until the new file is whole and on the disk. A part that a killed
+    writer left is overwritten.
+
+    Raises:
+        CheckpointError: when the disk refuses.
+    """
+    header.blocks = len(keys)
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        with partial.open("wb") as file:
+            _write_body(file, header, keys, slots, layers)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+        durable_files.sync_folder(path.parent)
+    except BaseException as error:  # an interrupted one leaves no part either
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise CheckpointError(f"cannot write the map {path}: {error.strerror}") from error
+        raise
+    return path
+
+
+def read(path: Path) -> tuple[Header, NDArray[np.int64], dict[str, NDArray[Any]]]:
+    """Header, keys and layers of a checkpoint.
+
+    Raises:
+        DamagedCheckpoint: when it is not to the byte what was written.
+        CheckpointError: when it is not there, cannot be read now, or is of another version.
+    """
+    try:
+        with path.open("rb") as file:
+            _check_magic(file, path)
+            _check_digest(file, path)
+            header = _read_header(file, path)
+            keys = np.empty(header.blocks, np.int64)
+            layers = {name: np.empty((header.blocks, CUBE), DTYPES[name]) for name in header.layers}
+            for first, chunk in _read_chunks(file, path, header):
+                count, at = min(CHUNK, header.blocks - first), 0
+                for target in (keys, *layers.values()):
+                    part = target[first : first + count]
+                    part[...] = np.frombuffer(chunk, part.dtype, part.size, at).reshape(part.shape)
+                    at += part.nbytes
+    except OSError as error:
+        raise CheckpointError(f"cannot read the map {path}: {error.strerror}") from error
+    except MemoryError as error:
+        raise CheckpointError(f"the map {path} does not fit into this machine's memory") from error
+    return header, keys, layers
+
+
+def verify(path: Path, header: Header, map_hash: str) -> None:
+    """Raise DamagedCheckpoint unless the loaded map has the hash that was saved."""
+    if map_hash != header.map_hash:
+        raise DamagedCheckpoint(f"{path} says its map hash is {header.map_hash}, but it loads as {map_hash}")
+
+
+def _write_body(
+    file: BinaryIO,
+    header: Header,
+    keys: NDArray[np.int64],
+    slots: NDArray[np.int64],
+    layers: dict[str, NDArray[Any]],
+) -> None:
+    digest = hashlib.blake2b(MAGIC, digest_size=16)
+    file.write(MAGIC)
+    compressor = zstandard.ZstdCompressor(level=1)
+    for payload in _payloads(header, keys, slots, layers, compressor):
+        for part in (struct.pack("<I", len(payload)), payload):
+            digest.update(part)
+            file.write(part)
+    file.write(digest.digest())
+
+
+def _payloads(
+    header: Header,
+    keys: NDArray[np.int64],
+    slots: NDArray[np.int64],
+    layers: dict[str, NDArray[Any]],
+    compressor: zstandard.ZstdCompressor,
+) -> Iterator[bytes]:
+    yield msgspec.msgpack.encode(header)
+    for i in range(0, len(keys), CHUNK):
+        chunk = slots[i : i + CHUNK]
+        raw = keys[i : i + CHUNK].tobytes() + b"".join(layer[chunk].tobytes() for layer in layers.values())
+        yield compressor.compress(raw)
+
+
+def _check_magic(file: BinaryIO, path: Path) -> None:
+    magic = file.read(len(MAGIC))
+    if magic == MAGIC:
+        return
+    is_of_another_version = len(magic) == len(MAGIC) and magic.startswith(MAGIC[:-2])
+    kind = CheckpointError if is_of_another_version else DamagedCheckpoint
+    raise kind(f"{path} is not a tsfusion map of version 1 (it starts with {magic!r})")
+
+
+def _read_header(file: BinaryIO, path: Path) -> Header:
+    (length,) = struct.unpack("<I", _exactly(file, 4, path))
+    try:
+        header = msgspec.msgpack.decode(_exactly(file, length, path), type=Header)
+    except msgspec.ValidationError as error:  # the digest agrees: it is as its writer meant it
+        raise CheckpointError(f"{path} is of another version: {error}") from error
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise DamagedCheckpoint(f"{path} is malformed: {error}") from error
+    if not set(header.layers) <= set(DTYPES):
+        raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
+    if not 0 <= header.blocks <= header.config.max_blocks:
+        raise DamagedCheckpoint(f"{path} is malformed: it claims {header.blocks} blocks")
+    return header
+
+
+def _read_chunks(file: BinaryIO, path: Path, header: Header) -> Iterator[tuple[int, bytes]]:
+    per_block = 8 + sum(CUBE * np.dtype(DTYPES[name]).itemsize for name in header.layers)
+    for first in range(0, header.blocks, CHUNK):
+        size = min(CHUNK, header.blocks - first) * per_block
+        (length,) = struct.unpack("<I", _exactly(file, 4, path))
+        frame = _exactly(file, length, path)
+        try:
+            if zstandard.get_frame_parameters(frame).content_size != size:
+                raise DamagedCheckpoint(f"{path} is damaged: a chunk is not of the {size} bytes expected")
+            yield first, zstandard.ZstdDecompressor().decompress(frame)
+        except zstandard.ZstdError as error:
+            raise DamagedCheckpoint(f"{path} is damaged: {error}") from error
+
+
+def _check_digest(file: BinaryIO, path: Path) -> None:
+    """Compare the digest of the whole file before any of it is believed; leaves `file` where it was.
+
+    Before anything is allocated, too: a header with one flipped bit may ask for all memory there is.
+    """
+    here = file.tell()
+    remaining = file.seek(0, os.SEEK_END) - 16
+    file.seek(0)
+    digest = hashlib.blake2b(digest_size=16)
+    while remaining > 0:
+        part = file.read(min(1 << 20, remaining))
+        digest.update(part)
+        remaining -= len(part)
+    if file.read() != digest.digest():
+        raise DamagedCheckpoint(f"{path} is cut short or altered: its digest does not match")
+    file.seek(here)
+
+
+def _exactly(file: BinaryIO, size: int, path: Path) -> bytes:
+    if size > os.fstat(file.fileno()).st_size or len(content := file.read(size)) != size:
+        raise DamagedCheckpoint(f"{path} is cut short")
+    return content

@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: MIT
+"""The field regulariser's planning: which blocks, how many iterations; the work is in `kernels/field.py`.
+
+A view of the map's sums: no order of keyframes or threads can show. Blocks are solved with a halo of their
+neighbours, so that some blocks' values are nearly those of the whole map (docs/method.md says how nearly).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.kernels import field_smoothing as kernels
+from tsfusion.kernels import normal_smoothing
+from tsfusion.kernels.block_hash import find_blocks
+from tsfusion.kernels.integrate import CUBE, QUANTA_PER_VOXEL
+from tsfusion.tsdf.surface_values import Layers, values_of
+
+BATCH = 8192  # blocks solved at once, beside their halo; some 10 kB each
+ITERATIONS = 12  # Chebyshev steps a re-weighting: the mesh is 1 % (Kinect) to 6 % (stereo) from the limit
+LOWEST = 0.02  # eigenvalue of M⁻¹A from which on the iteration damps evenly
+LEAST_REACH = 2.0  # voxels
+COARSE_FROM = 64.0  # λ that smooths over more voxels than so few iterations reach
+NORMAL_SAMPLES = 3  # voxels to each side of the surface: less would be no ray
+
+_KEY_STEP = np.array([1 << 42, 1 << 21, 1], np.int64)  # one block along x, y, z in a packed key
+_AROUND = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]) @ _KEY_STEP
+_SIDES = np.array([sign * step for step in _KEY_STEP for sign in (-1, 1)], np.int64)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """`smoothness` λ against data weights in full-confidence samples, `edge` ε in voxels: D2 beyond it
+    counts as an edge, `reweightings` of ω after the first solve with ω = 1."""
+
+    smoothness: float
+    edge: float
+    reweightings: int
+
+    @property
+    def reach(self) -> float:
+        """Voxels: the length over which the penalty smooths; what lies deeper does not move the surface."""
+        return max(LEAST_REACH, float(self.smoothness**0.25))
+
+    @property
+    def coarser(self) -> int:
+        """Levels of cells of twice the size to start from, where λ against the data is 16 times smaller."""
+        return int(self.smoothness >= COARSE_FROM)
+
+
+def solve(
+    keys: NDArray[np.int64],
+    layers: Layers,
+    min_weight: float,
+    out: NDArray[np.float32] | None = None,
+    *,
+    settings: Settings,
+) -> NDArray[np.float32]:
+    """The `View` of the regularised signed distances."""
+    if out is None:
+        out = np.empty((len(keys), CUBE), np.float32)
+    for first in range(0, len(keys), BATCH):
+        part = keys[first : first + BATCH]
+        _Batch(part, layers, min_weight, settings).solve(out[first : first + len(part)])
+    return out[: len(keys)]
+
+
+def along_normals(
+    keys: NDArray[np.int64],
+    layers: Layers,
+    min_weight: float,
+    out: NDArray[np.float32] | None = None,
+    *,
+    smoothness: float,
+) -> NDArray[np.float32]:
+    """The `View` of values smoothed along the normals only: paper eq. 3 on samples along the gradient."""
+    centre = np.zeros((NORMAL_SAMPLES + 1, NORMAL_SAMPLES + 1), np.float32)
+    for n in range(NORMAL_SAMPLES + 1):
+        D2 = np.diff(np.eye(2 * n + 1), 2, axis=0)
+        centre[n, : n + 1] = np.linalg.inv(np.eye(2 * n + 1) + smoothness * D2.T @ D2)[n, n:]
+    if out is None:
+        out = np.empty((len(keys), CUBE), np.float32)
+    for first in range(0, len(keys), BATCH):
+        part = keys[first : first + BATCH]
+        read = around(part, layers, 1)
+        normal_smoothing.smooth_along_normals(
+            _index(read, part), _index(read, part[:, None] + _AROUND), values_of(read, layers, min_weight),
+            LEAST_REACH * QUANTA_PER_VOXEL, centre, out[first : first + len(part)],
+        )  # fmt: skip
+    return out[: len(keys)]
+
+
+def spread(keys: NDArray[np.int64], layers: Layers, settings: Settings) -> NDArray[np.int64]:
+    """The blocks whose field may move by more than a hundredth of a voxel with the sums of these."""
+    return around(keys, layers, 1 + settings.coarser)
+
+
+@dataclass
+class _Level:
+    """Listed cells of one resolution: `bits` = log2 of the cells a side of a block."""
+
+    bits: int
+    number: NDArray[np.int32]
+    starts: NDArray[np.int32]
+    links: NDArray[np.int32]
+    y: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    x: NDArray[np.float32]
+
+    @classmethod
+    def make(cls, bits: int, number: NDArray[np.int32], counts: NDArray[np.int32]) -> "_Level":
+        total = int(counts.sum())
+        y, weight, x = (np.zeros(total + 1, np.float32) for _ in range(3))  # the last stands for "none"
+        starts = (np.cumsum(counts) - counts).astype(np.int32)
+        return cls(bits, number, starts, np.empty((total, 6), np.int32), y, weight, x)
+
+    def relax(self, smoothness: float, edge: float, reweightings: int, *, first: bool) -> None:
+        """Solve with ω = 1 if `first`, then with ω from the last solution, again and again."""
+        total = len(self.x)
+        omega, bent = np.zeros((total, 3), np.float32), np.zeros((total, 3), np.float32)
+        inverse, step = np.empty(total, np.float32), np.zeros(total, np.float32)
+        for flat in ([1] if first else []) + [0] * reweightings:
+            kernels.reweigh(self.links, self.x, flat, edge, omega)
+            kernels.precondition(self.links, self.weight, omega, smoothness, inverse)
+            for keep, gain in _chebyshev():
+                kernels.bend(self.links, self.x, omega, bent)
+                kernels.relax(
+                    self.links, self.y, self.weight, inverse, bent, smoothness, keep, gain, step, self.x
+                )
+
+
+class _Batch:
+    """Some blocks and their halo, as lists of cells."""
+
+    def __init__(
+        self, wanted: NDArray[np.int64], layers: Layers, min_weight: float, settings: Settings
+    ) -> None:
+        self.wanted, self.settings = wanted, settings
+        self.keys = keys = around(wanted, layers, 2 + settings.coarser)
+        self.values = values_of(keys, layers, min_weight)
+        self.levels = self._list(layers)
+
+    def solve(self, solved: NDArray[np.float32]) -> None:
+        """Write the values of the wanted blocks."""
+        s, coarsest = self.settings, len(self.levels) - 1
+        for depth in range(coarsest, -1, -1):
+            level = self.levels[depth]
+            if depth < coarsest:
+                coarse = self.levels[depth + 1]
+                kernels.refine(
+                    level.bits, coarse.links, coarse.number, coarse.starts, coarse.x,
+                    level.number, level.starts, level.x,
+                )  # fmt: skip
+            # between cells of twice the size a bend is 4 times as large, and there are 8 times fewer
+            level.relax(
+                s.smoothness / 2**depth, s.edge * QUANTA_PER_VOXEL * 4**depth, s.reweightings,
+                first=depth == coarsest,
+            )  # fmt: skip
+        finest = self.levels[0]
+        rows = _index(self.keys, self.wanted)
+        kernels.write_values(rows, self.values, finest.number, finest.starts, finest.x, solved)
+
+    def _list(self, layers: Layers) -> list[_Level]:
+        """The voxels near the surface, and their coarser cells."""
+        blocks = len(self.keys)
+        sides = _index(self.keys, self.keys[:, None] + _SIDES)
+        number, counts = np.empty((blocks, CUBE), np.int32), np.empty(blocks, np.int32)
+        kernels.number_voxels(self.values, self.settings.reach * QUANTA_PER_VOXEL, number, counts)
+        fine = _Level.make(3, number, counts)
+        kernels.list_voxels(
+            self.values, _slots(self.keys, layers), layers.sums, sides,
+            fine.number, fine.starts, fine.links, fine.y, fine.weight, fine.x,
+        )  # fmt: skip
+        levels = [fine]
+        for _ in range(self.settings.coarser):
+            number = np.empty((blocks, fine.number.shape[1] // 8), np.int32)
+            kernels.number_parents(fine.bits, fine.number, number, counts)
+            coarse = _Level.make(fine.bits - 1, number, counts)
+            kernels.list_parents(
+                fine.bits, sides, fine.number, fine.starts, fine.links, fine.y, fine.weight,
+                coarse.number, coarse.starts, coarse.links, coarse.y, coarse.weight, coarse.x,
+            )  # fmt: skip
+            levels.append(coarse)
+            fine = coarse
+        return levels
+
+
+def _chebyshev() -> Iterator[tuple[float, float]]:
+    """(share of the last step, gain of the residual) of each step, for eigenvalues in [LOWEST, 1]."""
+    middle, half = (1 + LOWEST) / 2, (1 - LOWEST) / 2
+    rho = half / middle
+    yield 0.0, 1 / middle
+    for _ in range(ITERATIONS - 1):
+        last, rho = rho, 1 / (2 * middle / half - rho)
+        yield rho * last, 2 * rho / half
+
+
+def around(keys: NDArray[np.int64], layers: Layers, rings: int = 1) -> NDArray[np.int64]:
+    """The blocks of the map up to so many blocks away, these among them; sorted."""
+    for _ in range(rings):
+        keys = np.unique((keys[:, None] + _AROUND).ravel())
+        keys = keys[_slots(keys, layers) >= 0]
+    return keys
+
+
+def _index(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Position of each query in the sorted `keys`, −1 where absent."""
+    if not len(keys):
+        return np.full(queries.shape, -1, np.int32)
+    at = np.minimum(np.searchsorted(keys, queries), len(keys) - 1)
+    return np.where(keys[at] == queries, at, -1).astype(np.int32)
+
+
+def _slots(keys: NDArray[np.int64], layers: Layers) -> NDArray[np.int32]:
+    slots = np.empty(len(keys), np.int32)
+    find_blocks(keys, layers.hash_keys, layers.hash_slots, slots)
+    return slots

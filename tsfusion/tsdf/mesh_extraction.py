@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: MIT
+"""Mesh extraction: which blocks are read, and working memory; the work is in `kernels/cells.py` and
+`kernels/marching.py`."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.kernels import marching_cubes, marching_tables, surface_cells
+from tsfusion.kernels.block_hash import find_blocks, insert_blocks
+from tsfusion.kernels.integrate import CUBE
+from tsfusion.kernels.voxel_values import BANDS
+from tsfusion.tsdf.growing_array import GrowingArray
+from tsfusion.tsdf.surface_values import Layers, View, values_of
+
+_KEEP = 1 << 14  # blocks whose working memory is kept for the next mesh: 45 MB
+_NO_COLOR = np.zeros((1, CUBE), np.int64)
+_NO_SLOTS = np.zeros(1, np.int32)
+
+
+class MeshScratch:
+    """Working memory of one extraction: a row a block, and one row for the blocks that are not there.
+
+    What the arrays hold is said in `kernels/cells.py`.
+    """
+
+    def __init__(self) -> None:
+        self.padded = np.empty((BANDS, marching_cubes.PADDED), np.float32)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._table = np.zeros(0, np.int64)
+        self._table_rows = np.zeros(0, np.int32)
+        self._found = GrowingArray((), np.int64, 0)
+        self.values = GrowingArray((CUBE,), np.float32, 0)
+        self.around = GrowingArray((surface_cells.AROUND,), np.int32, 0)
+        self.seen = GrowingArray((8,), np.uint64, 0)
+        self.inside = GrowingArray((8,), np.uint64, 0)
+        self.active = GrowingArray((8,), np.uint64, 0)
+        self.edges = GrowingArray((surface_cells.PLANES,), np.uint64, 0)
+        self.starts = GrowingArray((surface_cells.PLANES,), np.int32, 0)
+        self.state = GrowingArray((4,), np.int32, 0)
+        self.first = GrowingArray((2,), np.int32, 0)
+
+    def _arrays(self) -> list[GrowingArray]:
+        return [value for value in vars(self).values() if isinstance(value, GrowingArray)]
+
+    def reserve(self, rows: int) -> None:
+        for array in self._arrays():
+            array.reserve(rows + 1)
+
+    def release(self) -> None:
+        """Give the memory of a large mesh back."""
+        if self.values.capacity > _KEEP:
+            self._forget()
+
+    def table(self, keys: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """An empty hash with room for some keys."""
+        size = 1 << max(4, (2 * keys).bit_length())
+        if len(self._table) < size:
+            self._table, self._table_rows = np.zeros(size, np.int64), np.zeros(size, np.int32)
+        self._table[:size] = 0
+        return self._table[:size], self._table_rows[:size]
+
+    def keys_around(self, wanted: NDArray[np.int64], layers: Layers) -> NDArray[np.int64]:
+        """Sorted keys of the map's blocks that are, or touch, a wanted one."""
+        if len(wanted) == layers.count:
+            return wanted
+        most = min(surface_cells.AROUND * len(wanted), layers.count)
+        self._found.reserve(most)
+        table, _ = self.table(most)
+        found = surface_cells.collect_around(
+            len(wanted), wanted, layers.hash_keys, layers.hash_slots, table, self._found.array
+        )
+        return np.sort(self._found.array[:found])
+
+    @property
+    def nbytes(self) -> int:
+        return self.padded.nbytes + self._table.nbytes + self._table_rows.nbytes + sum(
+            array.array.nbytes for array in self._arrays()
+        )  # fmt: skip
+
+
+def extract(
+    wanted: NDArray[np.int64],
+    layers: Layers,
+    min_weight: float,
+    scratch: MeshScratch | None = None,
+    view: View = values_of,
+) -> Mesh:
+    """Mesh of the cells of the map's blocks `wanted` (sorted distinct keys)."""
+    scratch = scratch or MeshScratch()
+    keys = scratch.keys_around(wanted, layers)
+    count = len(keys)
+    scratch.reserve(count)
+    values = view(keys, layers, min_weight, scratch.values.array)
+    table, table_rows = scratch.table(count)
+    insert_blocks(keys, 0, count, 0, table, table_rows)
+    around, inside, active = scratch.around.array, scratch.inside.array, scratch.active.array
+    edges, starts, first = scratch.edges.array, scratch.starts.array, scratch.first.array
+    surface_cells.find_cells(
+        count, keys, len(wanted), wanted, table, table_rows, values, marching_tables.TRIANGLE_COUNT,
+        around, scratch.seen.array, inside, active, edges, starts, scratch.state.array, first,
+    )  # fmt: skip
+    vertices, triangles = first[count]
+    positions, normals = np.empty((vertices, 3), np.float32), np.empty((vertices, 3), np.float32)
+    has_color = layers.color_rgn is not None
+    colors = np.empty((vertices if has_color else 0, 3), np.uint8)
+    slots = _slots(keys, layers) if has_color else _NO_SLOTS
+    marching_cubes.emit_vertices(
+        count, keys, around, values, edges, first, scratch.padded, layers.voxel_size, slots,
+        _NO_COLOR if layers.color_rgn is None else layers.color_rgn, layers.color_b, int(has_color),
+        positions, normals, colors,
+    )  # fmt: skip
+    faces = np.empty((triangles, 3), np.int32)
+    marching_cubes.emit_faces(
+        count, around, inside, active, edges, starts, first,
+        marching_tables.TRIANGLE_COUNT, marching_tables.TRIANGLE_STARTS, faces,
+    )  # fmt: skip
+    scratch.release()
+    return Mesh(positions, faces, normals, colors if has_color else None)
+
+
+def _slots(keys: NDArray[np.int64], layers: Layers) -> NDArray[np.int32]:
+    """The slot of every key, and −1 for the row of the blocks that are not there."""
+    slots = np.full(len(keys) + 1, -1, np.int32)
+    find_blocks(keys, layers.hash_keys, layers.hash_slots, slots)
+    return slots

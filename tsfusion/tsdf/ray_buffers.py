@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: MIT
+"""Memory for one keyframe at a time: its rays and what they touch. Reused, never per call."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.config import SensorModel, VolumeConfig
+from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.kernels import ray_smoothing, rays_from_images, rays_from_points
+from tsfusion.kernels.integrate import CUBE, TOUCHED_COUNT, TOUCHED_HEADER, TOUCHED_OVERFLOW
+from tsfusion.kernels.voxel_traversal import BAND_FIELDS, MAX_CROSSED, RAY_FIELDS, SAMPLES
+from tsfusion.tsdf.growing_array import GrowingArray
+
+BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thread count
+FULL_WEIGHT_SIGMA = 0.25  # voxels: noise below this no longer shows in the map
+_NOTHING = {len(shape): np.zeros(shape, np.uint8) for shape in ((1,), (1, 3), (1, 1, 3))}
+
+
+class Scratch:
+    """Rays of the current keyframe (`rays`, by `bands`), the slots of the blocks they touch (`touched`), and
+    the keys of those that the map does not have (`missing`, a hash set)."""
+
+    def __init__(self, *, color: bool, regularised: bool) -> None:
+        self.color = color
+        self.colored = False  # the current keyframe brings colour, and the map keeps it
+        self.rays = np.zeros((0, RAY_FIELDS), np.int32)
+        self.deferred = np.zeros(0, np.int32)
+        self.bands = np.zeros((BANDS, BAND_FIELDS), np.int32)
+        self.missing = np.zeros(1 << 15, np.int64)
+        self._depths = np.zeros((BANDS, rays_from_images.TILE_SAMPLES), np.int32)
+        self._touched = GrowingArray((), np.int32, 1024)
+        units = BANDS if regularised else 1
+        self.signal = np.zeros((units, MAX_CROSSED, ray_smoothing.SIGNAL_FIELDS), np.float32)
+        self.crossed = np.zeros((units, MAX_CROSSED, 2), np.int32)
+        self._votes = GrowingArray((CUBE,), np.int64, 1024 if regularised else 1)
+
+    @property
+    def touched(self) -> NDArray[np.int32]:
+        """Count, overflow of `missing`, and the slots (kernels/integrate.py)."""
+        return self._touched.array
+
+    @property
+    def votes(self) -> NDArray[np.int64]:
+        """Votes of the smoother for each touched block; zero between keyframes."""
+        return self._votes.array
+
+    @property
+    def touched_slots(self) -> NDArray[np.int32]:
+        return self.touched[TOUCHED_HEADER : TOUCHED_HEADER + self.touched[TOUCHED_COUNT]]
+
+    def reserve_touched(self, blocks: int) -> None:
+        """Make room for touching all `blocks` of the map."""
+        self._touched.reserve(TOUCHED_HEADER + blocks)
+
+    def make_rays(self, keyframe: Keyframe, config: VolumeConfig) -> int:
+        """Fill `rays`; returns the number of samples that went into them."""
+        voxel_size, bundle = config.voxel_size, int(config.bundle)
+        parameters = model_parameters(
+            config.model(keyframe.sensor), voxel_size, keyframe.baseline_fx,
+            outlier_filter=config.outlier_filter, space_carving=config.space_carving,
+        )  # fmt: skip
+        self.colored = self.color and keyframe.color is not None
+        T = keyframe.T_world_camera
+        if keyframe.kind == "points":
+            self._reserve_rays(len(keyframe.measurement))
+            pose = np.ascontiguousarray(T[:3]) / voxel_size
+            origins = keyframe.origins
+            if origins is None or not len(origins):
+                origins = np.zeros(3, np.float32)
+            rays_from_points.rays_from_points(
+                keyframe.points, origins.reshape(-1, 3),
+                *_optional(keyframe.color if self.colored else None, 2), *_optional(keyframe.confidence, 1),
+                pose, parameters, bundle, self.rays, self.bands,
+            )  # fmt: skip
+        else:
+            height, width = keyframe.shape
+            self._reserve_rays(
+                -(-height // rays_from_images.TILE)
+                * -(-width // rays_from_images.TILE)
+                * rays_from_images.TILE_SAMPLES
+            )
+            rays_from_images.rays_from_image(
+                keyframe.measurement, int(keyframe.kind == "disparity"), _depth_scale(keyframe),
+                *_optional(keyframe.color if self.colored else None, 3), *_optional(keyframe.confidence, 2),
+                _camera(keyframe, voxel_size), parameters, bundle, self._depths, self.rays, self.bands,
+            )  # fmt: skip
+        return int(self.bands[:, SAMPLES].sum())
+
+    def take_missing(self) -> NDArray[np.int64]:
+        """Keys of the missing blocks, in an order that only the set decides; it is empty after."""
+        keys: NDArray[np.int64] = self.missing[self.missing != 0]
+        self.missing[:] = 0
+        return keys
+
+    def grow_missing(self) -> None:
+        """Double the set after an overflow; it is empty after."""
+        self.missing = np.zeros(2 * len(self.missing), np.int64)
+        self.touched[TOUCHED_OVERFLOW] = 0
+
+    def reserve_votes(self) -> None:
+        self._votes.reserve(int(self.touched[TOUCHED_COUNT]))
+
+    @property
+    def nbytes(self) -> int:
+        arrays = [value for value in vars(self).values() if isinstance(value, np.ndarray)]
+        return sum(a.nbytes for a in arrays) + sum(g.array.nbytes for g in (self._touched, self._votes))
+
+    def _reserve_rays(self, count: int) -> None:
+        if len(self.rays) < count:
+            self.rays = np.zeros((count, RAY_FIELDS), np.int32)
+            self.deferred = np.zeros(count, np.int32)
+
+
+def model_parameters(
+    model: SensorModel,
+    voxel_size: float,
+    baseline_fx: float | None,
+    *,
+    outlier_filter: bool = True,
+    space_carving: bool = False,
+) -> NDArray[np.float64]:
+    """The kernel's `model` argument (12 float64, see kernels/rays.py)."""
+    slope, z0 = model.sigma_slope, model.sigma_z0
+    if baseline_fx is not None and model.disparity_sigma > 0:
+        slope, z0 = model.disparity_sigma / baseline_fx, 0.0
+    return np.array(
+        [
+            model.sigma_floor, slope, z0, model.min_support, model.max_support, voxel_size,
+            FULL_WEIGHT_SIGMA * voxel_size, model.min_range, model.max_range, outlier_filter,
+            3 * 256 / voxel_size, space_carving,
+        ]
+    )  # fmt: skip
+
+
+def _depth_scale(keyframe: Keyframe) -> float:
+    """Metres a unit, or metres times units (disparity)."""
+    if keyframe.kind == "disparity":
+        assert keyframe.baseline_fx is not None  # checked by Keyframe
+        return keyframe.baseline_fx / keyframe.disparity_scale
+    return keyframe.depth_scale if keyframe.measurement.dtype == np.uint16 else 1.0
+
+
+def _camera(keyframe: Keyframe, voxel_size: float) -> NDArray[np.float64]:
+    """(4, 3) float64: what a pixel's step right, its step down, pixel (0, 0) and the centre are in voxels."""
+    K, T = keyframe.intrinsics, keyframe.T_world_camera
+    assert K is not None  # checked by Keyframe
+    R = T[:3, :3] / voxel_size
+    du, dv = R[:, 0] / K.fx, R[:, 1] / K.fy
+    return np.stack([du, dv, R[:, 2] - K.cx * du - K.cy * dv, T[:3, 3] / voxel_size])
+
+
+def _optional(array: NDArray[np.uint8] | None, dims: int) -> tuple[NDArray[Any], int]:
+    return (_NOTHING[dims], 0) if array is None else (array, 1)

@@ -1,0 +1,326 @@
+# SPDX-License-Identifier: MIT
+"""The map: exact integer sums in sparse blocks of 8³ voxels, and the views derived from them."""
+
+import hashlib
+import os
+import struct
+from functools import partial
+from pathlib import Path
+from typing import Any, get_args
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core import process
+from tsfusion.core.config import VIEW_SETTINGS, SensorModel, Surface, VolumeConfig, make, override
+from tsfusion.core.errors import InvalidConfig, MapError
+from tsfusion.geometry.keyframe import Intrinsics, Keyframe
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.kernels import integrate, ray_smoothing, runtime
+from tsfusion.kernels.integrate import CUBE
+from tsfusion.kernels.sensor_noise import WEIGHT_ONE
+from tsfusion.kernels.voxel_traversal import COUNT
+from tsfusion.tsdf import checkpoint, field_regularizer
+from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.integrator import Integrator
+from tsfusion.tsdf.mesh_extraction import MeshScratch, extract
+from tsfusion.tsdf.ray_buffers import Scratch
+from tsfusion.tsdf.surface_values import Layers, View, values_of
+
+
+class IntegrateStats(msgspec.Struct, frozen=True):
+    """What one keyframe did to the map."""
+
+    samples: int  # pixels or points with a usable return
+    invalid: int  # without a return, out of range, or untrusted
+    rays: int
+    blocks: int  # touched
+    new_blocks: int
+    updates: int  # of voxels by rays
+
+
+class VolumeStats(msgspec.Struct, frozen=True):
+    """What the map holds. `bytes` counts what the blocks and their hash take; scratch is beside it."""
+
+    keyframes: int
+    blocks: int
+    voxels: int
+    bytes: int
+    bytes_per_block: int
+    scratch_bytes: int
+
+
+class Volume:
+    """A sparse volume that keyframes are added to, and exactly removed from.
+
+    Give a `VolumeConfig` or its fields: `Volume(voxel_size=0.02, sensor="kinect", regularizer="ray")`.
+    Use it from one thread (Taichi's). `threads` counts for the first volume of a process: Taichi starts once.
+
+    Raises:
+        InvalidConfig: for an unknown setting or a value out of range.
+    """
+
+    def __init__(self, config: VolumeConfig | None = None, **settings: Any) -> None:
+        if config is None:
+            config = make(VolumeConfig, settings)
+        elif settings:
+            config = override(config, **settings)
+        model = config.model()
+        if model.min_range >= model.max_range or model.min_support > model.max_support:
+            raise InvalidConfig(
+                f"ranges must be ordered: min_range {model.min_range} < max_range {model.max_range} m, "
+                f"min_support {model.min_support} ≤ max_support {model.max_support} voxels"
+            )
+        if config.space_carving and model.regularizer != "off":
+            raise InvalidConfig(
+                f"space_carving and the regularizer {model.regularizer!r} exclude each other: smoothing is "
+                "for the band around a ray's end; use regularizer = off"
+            )
+        self.config = config
+        self.model = model
+        self.meta: dict[str, Any] = {}
+        self.keyframes = 0
+        runtime.start(config.threads)
+        self._smooths = model.regularizer != "off"
+        self._scratch = Scratch(color=config.color, regularised=self._smooths)
+        self._store = BlockStore(color=config.color, corrected=self._smooths)
+        self._integrator = Integrator(self._store, self._scratch, config)
+        self._mesh_scratch = MeshScratch()
+
+    def integrate(self, keyframe: Keyframe) -> IntegrateStats:
+        """Add a keyframe. On an error the map is as it was.
+
+        Raises:
+            MapFull: the keyframe or the map would exceed its limit of blocks.
+            WeightOverflow: a voxel has taken as many votes as its integers hold.
+        """
+        return self._apply(keyframe, +1)
+
+    def retract(self, keyframe: Keyframe) -> IntegrateStats:
+        """Remove a keyframe that was integrated: the sums get back the bytes they had without it.
+
+        Smoothed values cannot be un-smoothed: in the blocks it touched they fall back to the raw ones.
+
+        Raises:
+            MapError: the map cannot hold this keyframe: a voxel of it has fewer votes than would be taken
+                away. A keyframe never integrated goes unnoticed where others left votes enough.
+        """
+        return self._apply(keyframe, -1)
+
+    def take_dirty(self) -> NDArray[np.int32]:
+        """Coordinates of the blocks changed since the last call: (n, 3) int32, in units of 8 voxels."""
+        return unpack_keys(self._store.keys[self._store.take_dirty()])
+
+    def cells_to_mesh(self, dirty: NDArray[np.int32]) -> NDArray[np.int32]:
+        """The blocks whose mesh the changes to these blocks reach: (m, 3) int32.
+
+        They and their neighbours towards −x, −y, −z; the field carries a change into the blocks around first.
+        Of what is meshed raw, normals at the rim may be a keyframe behind.
+        """
+        if self.model.surface == "normal":
+            dirty = unpack_keys(field_regularizer.around(pack_keys(dirty), self._layers(), 1))
+        if self.model.surface == "field":
+            dirty = unpack_keys(field_regularizer.spread(pack_keys(dirty), self._layers(), self._field))
+        return cells_of(dirty)
+
+    def extract_mesh(
+        self,
+        min_weight: float | None = None,
+        blocks: NDArray[np.int32] | None = None,
+        surface: Surface | None = None,
+    ) -> Mesh:
+        """The surface, by marching cubes over the whole map or over the cells of some blocks.
+
+        Args:
+            min_weight: full-confidence samples a voxel needs to count as seen; default the sensor's.
+            blocks: (n, 3) int32 block coordinates. A mesh of `cells_to_mesh(take_dirty())` replaces what
+                changed.
+            surface: what to mesh instead of what the settings say; for `raw`, `cells_of(take_dirty())` do.
+        """
+        if min_weight is None:
+            min_weight = self.model.min_weight
+        most = integrate.WEIGHT_LIMIT / WEIGHT_ONE
+        if not 0 <= min_weight <= most:
+            raise InvalidConfig(f"min_weight must be from 0 to {most:.0f}, got {min_weight}")
+        store = self._store
+        chosen = store.keys
+        if blocks is not None:
+            if np.shape(blocks)[1:] != (3,) or np.asarray(blocks).dtype.kind != "i":
+                raise InvalidConfig(f"blocks must be (n, 3) integers, got {np.asarray(blocks)!r}")
+            reachable = (np.abs(np.asarray(blocks, np.int64)) < 1 << 18).all(
+                axis=1
+            )  # beyond it coordinates have no key
+            chosen = np.unique(pack_keys(blocks[reachable]))
+            chosen = chosen[store.slots_of(chosen) >= 0]
+        return extract(np.sort(chosen), self._layers(), min_weight, self._mesh_scratch, self._view(surface))
+
+    def map_hash(self) -> str:
+        """Hex digest of the exact sums: equal for the same keyframes in any order, on any number of threads.
+
+        Colour and smoothed values are not part of it (colour may travel lossily; smoothing has an order).
+        """
+        digest = hashlib.blake2b(digest_size=16)
+        digest.update(struct.pack("<di", self.config.voxel_size, integrate.QUANTA_PER_VOXEL))
+        for keys, sums in self._store.in_order("sums"):
+            digest.update(keys.data)
+            digest.update(sums.data)
+        return digest.hexdigest()
+
+    def color_hash(self) -> str:
+        """Hex digest of the exact colour sums."""
+        digest = hashlib.blake2b(digest_size=16)
+        if self.config.color:
+            for layer in ("color_rgn", "color_b"):
+                for keys, sums in self._store.in_order(layer):
+                    digest.update(keys.data)
+                    digest.update(sums.data)
+        return digest.hexdigest()
+
+    def stats(self) -> VolumeStats:
+        """Counts and exact bytes."""
+        store = self._store
+        return VolumeStats(
+            keyframes=self.keyframes,
+            blocks=store.count,
+            voxels=store.count * CUBE,
+            bytes=store.nbytes,
+            bytes_per_block=store.bytes_per_block,
+            scratch_bytes=self._scratch.nbytes + self._mesh_scratch.nbytes,
+        )
+
+    def warm_up(self) -> None:
+        """Compile every kernel, so that the first keyframe is not slower than the rest."""
+        throwaway = Volume(override(self.config, max_blocks=1 << 14, max_blocks_per_keyframe=1 << 14))
+        for keyframe in warm_up_keyframes(self.model, self.config.voxel_size):
+            throwaway.integrate(keyframe)
+            throwaway.retract(keyframe)
+            throwaway.integrate(keyframe)
+        throwaway.extract_mesh(min_weight=0)
+        throwaway.extract_mesh(min_weight=0, blocks=throwaway.take_dirty()[:1])
+
+    def save(self, path: str | os.PathLike[str], meta: dict[str, Any] | None = None) -> Path:
+        """Write a checkpoint: complete and on disk, or not at all.
+
+        Args:
+            path: the file, by custom `*.tsf`.
+            meta: anything JSON-like to keep with it; comes back as `.meta`.
+
+        Raises:
+            CheckpointError: when the file cannot be written.
+        """
+        layers = self._store.layers()
+        header = checkpoint.Header(
+            config=self.config, keyframes=self.keyframes, map_hash=self.map_hash(),
+            meta=self.meta if meta is None else meta, layers=list(layers),
+        )  # fmt: skip
+        used = self._store.used()
+        return checkpoint.write(Path(path), header, self._store.keys[used], used, layers)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], threads: int | None = None, **view: Any) -> "Volume":
+        """Read a checkpoint back, verified against its own hash.
+
+        Args:
+            view: settings of how the surface is read (`config.VIEW_SETTINGS`) instead of the saved ones;
+                None = as saved.
+
+        Raises:
+            InvalidConfig: for a setting that the stored sums depend on.
+            CheckpointError: when the file is missing, torn, altered or of another version.
+        """
+        header, keys, stored = checkpoint.read(Path(path))
+        saved = header.config
+        fixed = {name for name in view if name not in VIEW_SETTINGS}
+        if saved.model().regularizer != "off" and view.get("smoothness") not in (None, saved.smoothness):
+            fixed.add("smoothness")  # it has smoothed along rays already
+        if fixed:
+            raise InvalidConfig(f"a saved map cannot change {', '.join(sorted(fixed))}; fuse it anew")
+        volume = cls(override(msgspec.structs.replace(saved, threads=threads), **view))
+        volume._store.insert(keys)
+        for name, array in volume._store.layers().items():
+            array[: len(keys)] = stored[name]
+        volume._store.measure_bounds()
+        volume.keyframes = header.keyframes
+        volume.meta = header.meta
+        checkpoint.verify(Path(path), header, volume.map_hash())
+        return volume
+
+    def _apply(self, keyframe: Keyframe, sign: int) -> IntegrateStats:
+        if sign < 0 and self.keyframes == 0:
+            raise MapError("cannot retract a keyframe from a map that holds none")
+        scratch, store, before = self._scratch, self._store, self._store.count
+        samples = scratch.make_rays(keyframe, self.config)
+        with process.uninterrupted():
+            updates = self._integrator.apply(sign, lambda: self._smooth(sign))
+            self.keyframes += sign
+        total = int(np.prod(keyframe.shape))
+        return IntegrateStats(
+            samples=samples, invalid=total - samples, rays=int(scratch.bands[:, COUNT].sum()),
+            blocks=len(scratch.touched_slots), new_blocks=store.count - before, updates=updates,
+        )  # fmt: skip
+
+    @property
+    def _field(self) -> field_regularizer.Settings:
+        model = self.model
+        return field_regularizer.Settings(model.field_smoothness, model.field_edge, model.field_reweightings)
+
+    def _view(self, surface: Surface | None) -> View:
+        """What the surface is read from."""
+        surface = surface or self.model.surface
+        if surface not in get_args(Surface):
+            raise InvalidConfig(f"surface must be one of {', '.join(get_args(Surface))}, got {surface!r}")
+        if surface == "field":
+            return partial(field_regularizer.solve, settings=self._field)
+        if surface == "normal":
+            return partial(field_regularizer.along_normals, smoothness=self.model.smoothness)
+        return values_of
+
+    def _layers(self) -> Layers:
+        store = self._store
+        return Layers(
+            sums=store.sums,
+            color_rgn=store.color_rgn if self.config.color else None,
+            color_b=store.color_b,
+            correction=store.correction if self._smooths else None,
+            hash_keys=store.hash_keys,
+            hash_slots=store.hash_slots,
+            count=store.count,
+            voxel_size=self.config.voxel_size,
+        )
+
+    def _smooth(self, sign: int) -> None:
+        """Bring the regularised layer up to date in the blocks just touched."""
+        s, store, model = self._scratch, self._store, self.model
+        if not self._smooths:
+            return
+        if sign < 0:
+            store.correction[s.touched_slots] = 0
+            return
+        s.reserve_votes()
+        weighted = model.regularizer == "ray"
+        ray_smoothing.smooth_rays(
+            s.rays, s.bands, store.hash_keys, store.hash_slots, store.places, model.smoothness, int(weighted),
+            int(model.feedback or not weighted), store.sums, store.correction, s.signal, s.crossed, s.votes,
+        )  # fmt: skip
+        ray_smoothing.commit_votes(s.touched, store.sums, s.votes, store.correction)
+
+
+def warm_up_keyframes(model: SensorModel, voxel_size: float) -> list[Keyframe]:
+    """One of each kind and depth type, 16×16, all within the sensor's range."""
+    near = max(model.min_range * 1.5, 4 * voxel_size)
+    pose, camera = np.eye(4), Intrinsics(20.0, 20.0, 8.0, 8.0)
+    color = np.zeros((16, 16, 3), np.uint8)
+    metres = np.full((16, 16), near, np.float32)
+    units = np.full((16, 16), 1000, np.uint16)
+    rays = np.dstack(
+        [*np.meshgrid(np.linspace(-0.4, 0.4, 16), np.linspace(-0.4, 0.4, 16)), np.ones((16, 16))]
+    )
+    points = (rays * near).reshape(-1, 3).astype(np.float32)
+    return [
+        Keyframe(depth=metres, intrinsics=camera, T_world_camera=pose, color=color),
+        Keyframe(depth=units, depth_scale=near / 1000, intrinsics=camera, T_world_camera=pose),
+        Keyframe(disparity=units, disparity_scale=1 / 16, baseline_fx=near * 1000 / 16,
+                 intrinsics=camera, T_world_camera=pose),
+        Keyframe(points=points, T_world_camera=pose, color=color.reshape(-1, 3)),
+    ]  # fmt: skip

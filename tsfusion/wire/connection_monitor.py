@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: MIT
+"""What happens on a client's connection, in words for a person.
+
+libzmq's `send` succeeds while the other side turns the connection away, so its events are watched instead.
+Measured with libzmq 4.3.5:
+
+| case | events |
+|---|---|
+| the server does not know the key, or it was revoked | HANDSHAKE_FAILED_AUTH, and no further try, ever |
+| only one side has keys | HANDSHAKE_FAILED_NO_DETAIL a few times, then .._PROTOCOL, and no further try |
+| another server key than the server's | HANDSHAKE_FAILED_NO_DETAIL, again and again |
+| nobody listens behind a tunnel | HANDSHAKE_FAILED_NO_DETAIL, again and again |
+| a frozen server | HANDSHAKE_FAILED_NO_DETAIL after HANDSHAKE_IVL, again and again |
+| what answers is no ZeroMQ | DISCONNECTED and no further try, or HANDSHAKE_FAILED_NO_DETAIL again and again |
+| bytes that are no message, after the handshake | DISCONNECTED, and no further try |
+| nobody listens | CONNECT_RETRIED alone |
+"""
+
+import itertools
+import shlex
+import struct
+import time
+from typing import Any
+
+import zmq
+
+from tsfusion.wire.curve import ClientKeys
+
+_EVENTS = (
+    zmq.EVENT_CONNECTED
+    | zmq.EVENT_CONNECT_RETRIED
+    | zmq.EVENT_DISCONNECTED
+    | zmq.EVENT_HANDSHAKE_SUCCEEDED
+    | zmq.EVENT_HANDSHAKE_FAILED_AUTH
+    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+    | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+)
+_MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
+_TURNED_AWAY = 1.0  # seconds: who closes the connection later than this has not judged it, but is stuck
+_IN_A_ROW = 2  # one may be a server that ends
+_RETRIED_WITHIN = 0.5  # seconds: libzmq says at once when it is going to try again
+_numbers = itertools.count()
+
+
+class Monitor:
+    """Watches one connecting socket; make it before `connect`, close it before the socket.
+
+    Attributes:
+        socket: becomes readable when something has happened. Call `problem` then, and every now and then.
+        connected: whether the handshake is done and the connection stands.
+        made: connections that stood, this one included. What was sent on an earlier one may be lost: send it
+            again when this rises, not before, or it goes where the last one went.
+        lost: connections that stood and have ended.
+        gave_up: libzmq will not try again, whatever the server does: close the socket and make another.
+        refused: the server has certainly turned us away.
+    """
+
+    def __init__(self, socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = None) -> None:
+        self.connected = False
+        self.made = 0
+        self.lost = 0
+        self.gave_up = False
+        self.refused = False
+        self.address = address
+        self._watched = socket
+        self._key = keys.public if keys else ""
+        self._connected_at = 0.0
+        self._ended_at = 0.0  # 0 = it stands, or is being tried
+        self._failures = 0
+        # A name of its own: pyzmq names the endpoint by a file descriptor, which may be in use again.
+        endpoint = f"inproc://tsfusion-monitor-{next(_numbers)}"
+        socket.monitor(endpoint, _EVENTS)
+        self.socket: zmq.Socket[Any] = socket.context.socket(zmq.PAIR)
+        self.socket.setsockopt(zmq.LINGER, 0)
+        self.socket.setsockopt(zmq.RCVHWM, 0)  # a full one would hold up all connections of the context
+        self.socket.connect(endpoint)
+
+    def close(self) -> None:
+        """Stop watching."""
+        if not self._watched.closed:
+            self._watched.disable_monitor()
+        self.socket.close()
+
+    def problem(self) -> str | None:
+        """What keeps the connection from being made; empty = it is made; None = nothing new."""
+        news: str | None = None
+        while True:
+            try:
+                head, _endpoint = self.socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                break
+            event, value = struct.unpack("=HI", head)
+            said = self._on(event, value)
+            news = news if said is None else said
+        if self._ended_at and not self.gave_up and time.monotonic() - self._ended_at > _RETRIED_WITHIN:
+            self.gave_up = True
+            news = f"what answers at {self.address} is no tsfusion server, or was garbled on the way"
+        return news
+
+    def _on(self, event: int, value: int) -> str | None:
+        if event == zmq.EVENT_CONNECTED:
+            self._connected_at, self._ended_at = time.monotonic(), 0.0
+        elif event == zmq.EVENT_CONNECT_RETRIED:
+            self._ended_at = 0.0
+        elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+            self.connected, self.refused, self._failures = True, False, 0
+            self.made += 1
+            return ""
+        elif event == zmq.EVENT_DISCONNECTED:
+            self.lost += self.connected
+            self.connected = False
+            self._ended_at = time.monotonic()
+        elif event == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+            self.refused = self.gave_up = True
+            return self._unknown()
+        elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
+            self.gave_up = True
+            self.refused = value == _MISMATCH
+            return (
+                self._mismatch() if self.refused else f"what answers at {self.address} is no tsfusion server"
+            )
+        else:
+            return self._turned_away()
+        return None
+
+    def _turned_away(self) -> str | None:
+        if time.monotonic() - self._connected_at > _TURNED_AWAY:
+            return f"the server at {self.address} takes the connection, but says nothing"
+        self._failures += 1
+        if self._failures < _IN_A_ROW:
+            return None
+        if self._key:
+            return (
+                f"{self.address} ends the connection before the keys are agreed on: the server's key is not "
+                "the one given (`tsfusion keys list` shows it there), or nobody listens behind a tunnel"
+            )
+        return (
+            f"{self.address} ends the connection at once: nobody listens behind a tunnel, or the server asks "
+            "for keys and this client has none"
+        )
+
+    def _unknown(self) -> str:
+        key = shlex.quote(self._key)
+        key = f"-- {key}" if self._key.startswith("-") else key  # no option
+        return (
+            f"the server at {self.address} does not know this client's key {self._key} (or it was revoked): "
+            f"on the server, run `tsfusion keys allow NAME {key}`"
+        )
+
+    def _mismatch(self) -> str:
+        if self._key:
+            return (
+                f"this client has keys, but the server at {self.address} was started without: leave them out"
+            )
+        return (
+            f"the server at {self.address} takes only connections with keys: make a pair by `tsfusion keys "
+            "new NAME` and give both it and the server's public key (--key, --server-key)"
+        )

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: MIT
+"""CURVE keys: their files, and how a socket gets them.
+
+A key is 40 characters (Z85 of 32 bytes). Files are ZeroMQ certificates, as `zmq.auth.load_certificate` reads
+them: `NAME.key` holds the public key, `NAME.key_secret` both.
+"""
+
+import os
+import re
+import shlex
+import stat
+import struct
+from pathlib import Path
+from typing import Any
+
+import zmq
+from msgspec import Struct
+from zmq.utils import z85
+
+from tsfusion.core.errors import InvalidConfig
+
+DOMAIN = b"tsfusion"  # of the questions to `zap.Zap`
+PUBLIC, SECRET = ".key", ".key_secret"
+SERVER = "server"  # the name of a server's own pair in its folder
+
+_MAX_FILE_BYTES = 1 << 14
+_KEY_BYTES = 32
+_OTHERS = stat.S_IRWXG | stat.S_IRWXO
+_LINE = re.compile(r'^\s*(public|secret)-key\s*=\s*"([^"\s]+)"\s*$', re.MULTILINE)
+
+
+class ServerKeys(Struct, frozen=True):
+    """A server's own pair."""
+
+    public: str
+    secret: str
+
+    def secure(self, socket: "zmq.Socket[Any]") -> None:
+        """Let this socket take connections from allowed keys only; call it before `bind`.
+
+        Without a ZAP handler in the socket's context nobody can connect (with libzmq's defaults
+        everybody could).
+        """
+        socket.setsockopt(zmq.CURVE_SERVER, 1)
+        socket.setsockopt_string(zmq.CURVE_SECRETKEY, self.secret)
+        socket.setsockopt(zmq.ZAP_DOMAIN, DOMAIN)
+        socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
+
+    def __repr__(self) -> str:
+        return f"ServerKeys(public={self.public!r})"
+
+
+class ClientKeys(Struct, frozen=True):
+    """A client's own pair, and the public key that its server must have."""
+
+    public: str
+    secret: str
+    server: str
+
+    def secure(self, socket: "zmq.Socket[Any]") -> None:
+        """Let this socket talk to that server only; call it before `connect`."""
+        socket.setsockopt_string(zmq.CURVE_PUBLICKEY, self.public)
+        socket.setsockopt_string(zmq.CURVE_SECRETKEY, self.secret)
+        socket.setsockopt_string(zmq.CURVE_SERVERKEY, self.server)
+
+    def __repr__(self) -> str:
+        return f"ClientKeys(public={self.public!r}, server={self.server!r})"
+
+
+def server_keys(folder: str | os.PathLike[str]) -> ServerKeys:
+    """The pair of the server whose keys are in this folder.
+
+    Raises:
+        InvalidConfig: when there is none, others can read it, or it is malformed.
+    """
+    path = Path(folder).expanduser() / f"{SERVER}{SECRET}"
+    if not path.exists():
+        place = shlex.quote(str(folder))
+        raise InvalidConfig(
+            f"{path} does not exist; make the server's keys by `tsfusion keys new {SERVER} --dir {place}`"
+        )
+    return ServerKeys(*read_pair(path))
+
+
+def client_keys(key: str | None, server_key: str | None) -> ClientKeys | None:
+    """What `ClientConfig.key` and `ClientConfig.server_key` say; None when neither is given.
+
+    Args:
+        key: the client's own secret key, a file.
+        server_key: the server's public key, a file or the 40 characters.
+
+    Raises:
+        InvalidConfig: when one is given without the other, a file is missing or malformed, or others can read
+            the secret one.
+    """
+    if key is None and server_key is None:
+        return None
+    if key is None or server_key is None:
+        given, missing = ("server_key", "key") if key is None else ("key", "server_key")
+        raise InvalidConfig(
+            f"{given} needs {missing}, too: a connection with keys takes the client's own secret key (a file "
+            "of `tsfusion keys new`) and the server's public key"
+        )
+    return ClientKeys(*read_pair(Path(key).expanduser()), server=public_key(server_key))
+
+
+def public_key(given: str) -> str:
+    """A public key, from a file or from its 40 characters.
+
+    Raises:
+        InvalidConfig: when it is neither.
+    """
+    if is_key(given):
+        return given
+    path = Path(given).expanduser()
+    if not os.path.exists(path):
+        raise InvalidConfig(f"a public key is a file or 40 characters, got {given!r}")
+    keys = _read(path, secret=False)
+    if "secret" in keys:
+        raise InvalidConfig(
+            f"{path} holds a secret key, which stays on its machine: give the file NAME{PUBLIC} beside it"
+        )
+    return keys.get("public") or _none_in(path, "public", f"a file NAME{PUBLIC}")
+
+
+def read_pair(path: Path) -> tuple[str, str]:
+    """Public and secret key of a file that only its owner can read.
+
+    Raises:
+        InvalidConfig: for a file that is missing or malformed, or that others can read.
+    """
+    keys = _read(path, secret=True)
+    secret = keys.get("secret") or _none_in(path, "secret", f"a file NAME{SECRET}")
+    public = zmq.curve_public(secret.encode()).decode()
+    if keys.get("public", public) != public:
+        raise InvalidConfig(f"{path} is damaged: its public key does not belong to its secret key")
+    return public, secret
+
+
+def is_key(text: str) -> bool:
+    """Whether these are 40 characters that stand for 32 bytes."""
+    try:
+        return len(z85.decode(text)) == _KEY_BYTES
+    except (ValueError, KeyError, struct.error):  # wrong length, other characters, more than 32 bits in five
+        return False
+
+
+def _read(path: Path, *, secret: bool) -> dict[str, str]:
+    """The keys that a file holds, by kind."""
+    try:
+        with path.open("rb") as file:
+            mode = os.fstat(file.fileno()).st_mode
+            if secret and mode & _OTHERS:
+                raise InvalidConfig(
+                    f"others can read the secret key {path} (mode {stat.S_IMODE(mode):04o}); if nobody has, "
+                    f"run `chmod 600 {shlex.quote(str(path))}`, else make a new one"
+                )
+            content = file.read(_MAX_FILE_BYTES)
+    except OSError as error:
+        raise InvalidConfig(f"cannot read the key {path}: {error.strerror}") from error
+    keys = dict(_LINE.findall(content.decode("utf-8", "replace")))
+    for kind, key in keys.items():
+        if not is_key(key):
+            raise InvalidConfig(f"{path} is damaged: its {kind} key is not 40 characters that make a key")
+    return keys
+
+
+def _none_in(path: Path, kind: str, expected: str) -> str:
+    raise InvalidConfig(f"{path} holds no {kind} key; expected {expected} of `tsfusion keys new`")

@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: MIT
+"""A folder of keys: this machine's own pairs and, on a server, the list of those that may connect.
+
+| file | holds |
+|---|---|
+| `NAME.key_secret`, `NAME.key` | a pair, and its public half to give away; `server` is the server's own |
+| `allowed.toml` | the server's allow-list: names and public keys, and the keys that were revoked |
+
+The folder is its owner's alone (0700), every file 0600 from its first byte, and replaced whole.
+"""
+
+import logging
+import os
+import re
+import stat
+import time
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import zmq
+from msgspec import Meta, Struct
+
+from tsfusion.core import durable_files
+from tsfusion.core.config import ClientName
+from tsfusion.core.errors import InvalidConfig
+from tsfusion.wire import curve
+
+log = logging.getLogger(__name__)
+
+ALLOWED = "allowed.toml"
+DEFAULT_FOLDER = "tsfusion-keys"
+
+_MAX_LIST_BYTES = 1 << 20
+_RETRY = 1.0  # seconds
+_LIST_HEAD = "# Who may connect: written by `tsfusion keys allow` and `revoke`, read by the server at once.\n"
+_PAIR_HEAD = "#   ZeroMQ CURVE {}: written by `tsfusion keys new`.\n"
+
+Folder = str | os.PathLike[str]
+
+
+class Allowed(Struct, frozen=True, forbid_unknown_fields=True):
+    """An allow-list. No key is in it twice."""
+
+    allowed: dict[ClientName, Annotated[str, Meta(max_length=64)]] = {}  # name → public key
+    revoked: dict[str, ClientName] = {}  # public key → the name it had
+
+
+class Pair(Struct, frozen=True):
+    """One of a folder's own pairs."""
+
+    name: str
+    public: str
+
+
+def create(folder: Folder, name: str, *, force: bool = False) -> Pair:
+    """Make a pair of keys under this name.
+
+    Args:
+        force: replace the pair that is there.
+
+    Raises:
+        InvalidConfig: for a bad name, or one that has keys already.
+        OutputError: when the files cannot be written.
+    """
+    check_name(name)
+    place = durable_files.made(Path(folder).expanduser())
+    with durable_files.locked(place):
+        paths = [place / f"{name}{ending}" for ending in (curve.SECRET, curve.PUBLIC)]
+        for path in paths:
+            if path.exists() and not force:
+                raise InvalidConfig(f"{path} exists; choose another name, or replace it by --force")
+        public, secret = _draw()
+        lines = f'curve\n    public-key = "{public}"\n'
+        secret_line = f'    secret-key = "{secret}"\n'
+        durable_files.write(paths[0], _PAIR_HEAD.format("**Secret** Certificate") + lines + secret_line)
+        durable_files.write(paths[1], _PAIR_HEAD.format("Public Certificate") + lines)
+        if name == curve.SERVER and not (place / ALLOWED).exists():
+            durable_files.write(place / ALLOWED, _dumps(Allowed()))
+    return Pair(name, public)
+
+
+def allow(folder: Folder, name: str, key: str) -> str | None:
+    """Let a client with this public key in, under this name. The name's earlier key no longer is.
+
+    Args:
+        key: 40 characters, or a file.
+
+    Returns:
+        The name's earlier key.
+
+    Raises:
+        InvalidConfig: for a bad name or key, or one that is taken, or a folder without a server's keys.
+        OutputError: when the list cannot be written.
+    """
+    check_name(name)
+    public = curve.public_key(key)
+    place = _existing(folder)
+    with durable_files.locked(place):
+        own = curve.server_keys(place).public
+        listed = read_list(place) if has_list(place) else Allowed()
+        earlier = listed.allowed.get(name)
+        _check_free(name, public, own, listed)
+        if earlier == public:
+            return None
+        revoked = {key: was for key, was in listed.revoked.items() if key != public}
+        if earlier is not None:
+            revoked[earlier] = name
+        durable_files.write(place / ALLOWED, _dumps(Allowed({**listed.allowed, name: public}, revoked)))
+    return earlier
+
+
+def revoke(folder: Folder, name: str) -> str:
+    """Keep the client of this name out; returns its key.
+
+    Raises:
+        InvalidConfig: when no key is allowed under the name.
+        OutputError: when the list cannot be written.
+    """
+    place = _existing(folder)
+    with durable_files.locked(place):
+        listed = read_list(place)
+        if name not in listed.allowed:
+            names = ", ".join(sorted(listed.allowed)) or "nobody is allowed"
+            raise InvalidConfig(f"no key is allowed under the name {name!r}, but: {names}")
+        left = dict(listed.allowed)
+        key = left.pop(name)
+        durable_files.write(place / ALLOWED, _dumps(Allowed(left, {**listed.revoked, key: name})))
+    return key
+
+
+def pairs(folder: Folder) -> list[Pair]:
+    """The folder's own pairs, by name.
+
+    Raises:
+        InvalidConfig: when the folder or a pair cannot be read.
+    """
+    place = _existing(folder)
+    found = sorted(place.glob(f"*{curve.SECRET}"))
+    return [Pair(path.name.removesuffix(curve.SECRET), curve.read_pair(path)[0]) for path in found]
+
+
+def has_list(folder: Folder) -> bool:
+    """Whether it is a server's folder."""
+    return os.path.lexists(Path(folder).expanduser() / ALLOWED)
+
+
+def read_list(folder: Folder) -> Allowed:
+    """The allow-list of a server's folder.
+
+    Raises:
+        InvalidConfig: when it is missing or malformed, or others could change it.
+    """
+    path = Path(folder).expanduser() / ALLOWED
+    try:
+        with path.open("rb") as file:
+            mode = os.fstat(file.fileno()).st_mode
+            content = file.read(_MAX_LIST_BYTES + 1)
+    except OSError as error:
+        raise InvalidConfig(f"cannot read the allow-list {path}: {error.strerror}") from error
+    if durable_files.others_can_change(mode):
+        raise InvalidConfig(f"others can change the allow-list {path} (mode {stat.S_IMODE(mode):04o})")
+    return _loads(content, path)
+
+
+def check_name(name: str) -> None:
+    """Raise InvalidConfig unless a client can be called so."""
+    try:
+        msgspec.convert(name, ClientName)
+    except msgspec.ValidationError as error:
+        raise InvalidConfig(
+            f"a name is 1 to 32 letters, digits and . _ -, the first a letter or digit; got {name!r}"
+        ) from error
+
+
+class AllowList:
+    """Who may connect, as the file says now. Nobody, while it cannot be read.
+
+    Attributes:
+        problem: why it cannot be read; empty = it can.
+    """
+
+    def __init__(self, folder: Folder) -> None:
+        self.problem = ""
+        self._folder = Path(folder).expanduser()
+        self._path = self._folder / ALLOWED
+        self._seen: tuple[int, ...] | None = ()  # the file's stamp when it was read; None = there was none
+        self._again = 0.0  # when a list that cannot be read is tried once more, though nothing has changed
+        self._names: dict[str, str] = {}  # public key → name
+        self._revoked: dict[str, str] = {}
+        self.refresh()
+
+    def refresh(self) -> bool:
+        """Read the file again if it has changed; microseconds if not. Whether anyone is no longer who it was.
+
+        Never raises.
+        """
+        seen = self._stamp()
+        if seen == self._seen and not (self.problem and time.monotonic() > self._again):
+            return False
+        before, self._seen = self._names, seen
+        try:
+            durable_files.checked(self._folder)
+            listed = read_list(self._folder)
+        except InvalidConfig as error:
+            self._fail(str(error))
+        else:
+            self.problem = ""
+            self._names = {key: name for name, key in listed.allowed.items()}
+            self._revoked = dict(listed.revoked)
+            log.log(
+                logging.INFO if self._names else logging.WARNING,
+                "clients that may connect: %d, keys revoked: %d", len(self._names), len(self._revoked),
+            )  # fmt: skip
+        return any(self._names.get(key) != name for key, name in before.items())
+
+    def name_of(self, key: str | None) -> str | None:
+        """The name that a public key is allowed under; None = it is not."""
+        return self._names.get(key) if key is not None else None
+
+    def why_not(self, key: str) -> str:
+        """A word for why a key is not allowed."""
+        if self.problem:
+            return "allow-list"
+        return "revoked" if key in self._revoked else "unknown"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Everybody who is allowed."""
+        return tuple(sorted(self._names.values()))
+
+    def _stamp(self) -> tuple[int, ...] | None:
+        try:
+            stat = os.stat(self._path)
+        except OSError:
+            return None
+        return stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino, stat.st_size
+
+    def _fail(self, problem: str) -> None:
+        if problem != self.problem:
+            log.error("nobody is allowed to connect: %s", problem)
+        self.problem = problem
+        self._again = time.monotonic() + _RETRY
+        self._names, self._revoked = {}, {}
+
+
+def _existing(folder: Folder) -> Path:
+    try:
+        return durable_files.checked(Path(folder).expanduser())
+    except InvalidConfig as error:
+        raise InvalidConfig(
+            f"{error}; `tsfusion keys new {curve.SERVER}` makes a server's folder of keys, "
+            "`tsfusion keys new NAME` a scanner's"
+        ) from error
+
+
+def _loads(content: bytes, path: Path) -> Allowed:
+    try:
+        listed = msgspec.toml.decode(content, type=Allowed)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InvalidConfig(f"the allow-list {path} is damaged: {error}") from error
+    keys = [*listed.allowed.values(), *listed.revoked]
+    if len(content) > _MAX_LIST_BYTES or not all(map(curve.is_key, keys)):
+        raise InvalidConfig(f"the allow-list {path} is damaged: it holds what is no key, or too much")
+    if len(set(keys)) < len(keys):
+        raise InvalidConfig(f"the allow-list {path} is damaged: a key is in it twice")
+    return listed
+
+
+def _dumps(listed: Allowed) -> str:
+    lines = [_LIST_HEAD, "[allowed]"]  # a Z85 key has no quote and no backslash
+    lines += [f'"{name}" = "{key}"' for name, key in sorted(listed.allowed.items())]
+    lines += ["", "[revoked]"]
+    lines += [f'"{key}" = "{name}"' for key, name in listed.revoked.items()]
+    return "\n".join(lines) + "\n"
+
+
+def _check_free(name: str, public: str, own: str, listed: Allowed) -> None:
+    if name == curve.SERVER or public == own:
+        raise InvalidConfig("that is the server's own: a client has a name and a pair of keys of its own")
+    for other, key in listed.allowed.items():
+        if key == public and other != name:
+            raise InvalidConfig(
+                f"this key is allowed under the name {other} already; `tsfusion keys revoke {other}` frees it"
+            )
+
+
+def _draw() -> tuple[str, str]:
+    """A new pair whose public key cannot be taken for an option."""
+    while True:
+        public, secret = (key.decode("ascii") for key in zmq.curve_keypair())
+        if re.match("[0-9a-zA-Z]", public):
+            return public, secret

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: MIT
+"""What scanner and server say to each other on the control socket (msgpack of tagged structs).
+
+All `*_ns` stamps of the server are its own monotonic clock; the client shifts them to its own.
+"""
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta, Struct
+
+from tsfusion.core.config import MapName
+from tsfusion.core.errors import DecodeError
+from tsfusion.wire import corrections
+from tsfusion.wire.corrections import Corrections
+from tsfusion.wire.health import Health, MeshLayout, Status
+from tsfusion.wire.keyframe_times import Seq, Stamps
+
+SessionId = Annotated[bytes, Meta(min_length=16, max_length=16)]
+Counts = dict[Annotated[str, Meta(max_length=32)], Annotated[int, Meta(ge=0)]]  # by reason
+
+
+class Hello(Struct, frozen=True, tag="hello", omit_defaults=True):
+    """A client opens (or re-opens) its session."""
+
+    session: SessionId
+    version: int  # wire format it speaks
+    map: MapName = "default"
+
+
+class Welcome(Struct, frozen=True, tag="welcome"):
+    """The server's answer. A new `epoch` is a new server process: resend everything after `durable`.
+
+    `corrections`: the revision of this session's that is on the server's disk; None = it takes none.
+    """
+
+    epoch: str
+    version: int
+    durable: Seq  # the highest seq of this session that is on the server's disk; 0 = none
+    fused: Seq  # the highest that the map has taken or refused; 0 = none
+    window_keyframes: int  # credit: sent, not yet durable
+    window_bytes: int
+    max_frame_bytes: int
+    corrections: Annotated[int, Meta(ge=0)] | None = None
+
+
+class Ack(Struct, frozen=True, tag="ack"):
+    """Progress. Everything up to `durable` may leave the spool.
+
+    `resend` asks to go back to durable + 1 at once: something in between never came.
+    """
+
+    session: SessionId
+    durable: Seq
+    fused: Seq
+    stamps: tuple[Stamps, ...] = ()
+    resend: bool = False
+
+
+class Nack(Struct, frozen=True, tag="nack"):
+    """This keyframe will never be in the map.
+
+    Attributes:
+        stage: `door` = it was not journaled and must not be sent again; `map` = it is journaled, but the
+            map could not take it.
+    """
+
+    session: SessionId
+    seq: Seq
+    stage: Literal["door", "map"]
+    reason: str
+    message: str
+
+
+class Hold(Struct, frozen=True, tag="hold"):
+    """Nothing is taken from this session for so long: keep everything, then go on from durable + 1.
+
+    `reason`: `disk` (full or failing) or `quota`; `message` says it to a person.
+    """
+
+    session: SessionId
+    seconds: float
+    reason: str
+    message: str
+
+
+class Corrected(Struct, frozen=True, tag="corrected"):
+    """The answer to Corrections: this revision of the session is on the server's disk, or a later one."""
+
+    session: SessionId
+    revision: Annotated[int, Meta(ge=0)]
+
+
+class Uncorrected(Struct, frozen=True, tag="uncorrected"):
+    """The answer to Corrections that are not taken.
+
+    `again_s`: seconds after which they may be sent again; 0 = they never will be.
+    """
+
+    session: SessionId
+    revision: Annotated[int, Meta(ge=0)]
+    reason: str
+    message: str
+    again_s: float = 0.0
+
+
+class Denied(Struct, frozen=True, tag="denied"):
+    """The answer to a Hello that opens no session (yet): ask again, but tell the user why.
+
+    `reason`: `opening` (the map is being opened), `map` (there is no such map, and no room for one, or it
+    cannot be opened), `session` (it is another client's) or `version`.
+    """
+
+    session: SessionId
+    reason: str
+    message: str
+
+
+class Ping(Struct, frozen=True, tag="ping", omit_defaults=True):
+    """A client is alive, and how it is doing.
+
+    Attributes:
+        offset_ns: what the client takes the server's clock minus its own to be (None = not yet known).
+        bound_ns: the most that this can be wrong.
+        waiting: keyframes in its spool.
+        skipped: keyframes that were never spooled or left it unsent, by reason, since the client began.
+    """
+
+    session: Annotated[bytes, Meta(max_length=16)]
+    sent_ns: int
+    offset_ns: int | None = None
+    bound_ns: int = 0
+    waiting: Annotated[int, Meta(ge=0)] = 0
+    skipped: Annotated[Counts, Meta(max_length=16)] = {}
+
+
+class Pong(Struct, frozen=True, tag="pong"):
+    epoch: str
+    ping_sent_ns: int
+    received_ns: int
+    sent_ns: int
+    durable: Seq = 0
+    fused: Seq = 0
+
+
+ASK_AGAIN = "ask again"  # so ends the error of a Reply when the same question may be answered soon
+
+
+class Command(Struct, frozen=True, tag="command", kw_only=True):
+    """A request of a person or program; answered by one Reply."""
+
+    name: Literal["ping", "health", "status", "mesh"]
+    map: MapName = "default"
+    min_weight: float | None = None
+
+
+class Reply(Struct, frozen=True, tag="reply", kw_only=True):
+    """The answer to a Command; arrays of a mesh follow as raw frames."""
+
+    name: str
+    error: str | None = None
+    health: "Health | None" = None
+    status: "Status | None" = None
+    mesh: "MeshLayout | None" = None
+
+
+ToServer = Hello | Ping | Command | Corrections
+ToClient = Welcome | Denied | Hold | Ack | Nack | Corrected | Uncorrected | Pong | Reply
+_TO_SERVER = msgspec.msgpack.Decoder(ToServer)
+_TO_CLIENT = msgspec.msgpack.Decoder(ToClient)
+encode = msgspec.msgpack.encode
+
+
+def decode_to_server(frame: Any) -> ToServer:
+    """Raises DecodeError for anything but a message to the server."""
+    return _decode(_TO_SERVER, frame)  # type: ignore[no-any-return]
+
+
+def decode_to_client(frame: Any) -> ToClient:
+    """Raises DecodeError for anything but a message to the client."""
+    return _decode(_TO_CLIENT, frame)  # type: ignore[no-any-return]
+
+
+def _decode(decoder: Any, frame: Any) -> Any:
+    try:
+        return decoder.decode(frame)
+    except Exception as error:  # msgspec also raises UnicodeDecodeError and RecursionError
+        raise DecodeError(f"not a control message: {error}") from error
+
+
+def said(frames: Sequence[Any]) -> ToServer:
+    """What a control message says. Only corrections have frames behind their head.
+
+    Raises:
+        DecodeError: for anything but a message to the server.
+    """
+    if len(frames) > 1 + corrections.MAX_FRAMES:
+        raise DecodeError(f"a control message of {len(frames)} frames")
+    message = decode_to_server(frames[0] if frames else b"")
+    if len(frames) > 1 and not isinstance(message, Corrections):
+        raise DecodeError(f"a {type(message).__name__} of {len(frames)} frames")
+    return message

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: MIT
+"""What a running server can be asked: its health, a map's status, a map's mesh."""
+
+import time
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+import zmq
+from numpy.typing import NDArray
+
+from tsfusion.core.config import DEFAULT_MAP
+from tsfusion.core.errors import DecodeError, NotAllowed, ServerUnreachable, TransportError
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.wire import messages, sockets
+from tsfusion.wire.connection_monitor import Monitor
+from tsfusion.wire.curve import ClientKeys
+from tsfusion.wire.health import Health, MeshLayout, Status
+from tsfusion.wire.messages import ASK_AGAIN, Command, Reply
+from tsfusion.wire.sockets import control_address
+
+_AGAIN_INTERVAL = 0.25  # seconds
+_ANSWER_TIMEOUT = 5.0  # seconds; the gateway is never busy, so who says nothing for so long is not there
+
+
+def fetch_health(
+    address: str, *, control: str | None = None, timeout: float = 10.0, keys: ClientKeys | None = None
+) -> Health:
+    """How the server at a data address is doing; answered at once, whatever its fusers do.
+
+    Args:
+        keys: of `curve.client_keys`, for a server with keys.
+
+    Raises:
+        NotAllowed: when the server turns the connection away.
+        ServerUnreachable: when nobody answers in `timeout` seconds.
+    """
+    reply, _ = _ask(address, control, Command(name="health"), timeout, keys)
+    if reply.health is None:
+        raise TransportError(f"the server at {address} answered without its health")
+    return reply.health
+
+
+def fetch_status(
+    address: str,
+    *,
+    control: str | None = None,
+    map_name: str = DEFAULT_MAP,
+    timeout: float = 10.0,
+    keys: ClientKeys | None = None,
+) -> Status:
+    """How a map of the server at a data address is doing. See `fetch_health`.
+
+    Raises:
+        TransportError: when the server cannot say.
+    """
+    reply, _ = _ask(address, control, Command(name="status", map=map_name), timeout, keys)
+    if reply.status is None:
+        raise TransportError(f"the server at {address} answered without a status")
+    return reply.status
+
+
+def fetch_mesh(
+    address: str,
+    *,
+    control: str | None = None,
+    map_name: str = DEFAULT_MAP,
+    min_weight: float | None = None,
+    timeout: float = 60.0,
+    keys: ClientKeys | None = None,
+) -> Mesh:
+    """The whole mesh of a map of the server at a data address, as of now. See `fetch_health`.
+
+    A server makes one at a time, and none while keyframes have to come first: it is asked again.
+
+    Raises:
+        ServerUnreachable: when nobody is there (known after a few seconds), or the mesh takes longer than
+            `timeout` seconds.
+        TransportError: when the server cannot make it, or not within `timeout` seconds.
+    """
+    command = Command(name="mesh", map=map_name, min_weight=min_weight)
+    deadline = time.monotonic() + timeout
+    while True:
+        try:
+            left = max(deadline - time.monotonic(), 0.0)
+            reply, frames = _ask(address, control, command, left, keys)
+            break
+        except TransportError as error:
+            if not str(error).endswith(ASK_AGAIN) or time.monotonic() + 2 * _AGAIN_INTERVAL > deadline:
+                raise
+        time.sleep(_AGAIN_INTERVAL)
+    if reply.mesh is None:
+        raise TransportError(f"the server at {address} answered without a mesh")
+    return mesh_of(reply.mesh, frames)
+
+
+def _ask(
+    address: str, control: str | None, command: Command, timeout: float, keys: ClientKeys | None
+) -> tuple[Reply, list[memoryview]]:
+    """The fuser's answer. That takes its time, so it is asked first whether anybody is there."""
+    address = control_address(sockets.target(address), control)
+    if timeout > _ANSWER_TIMEOUT:
+        request(address, Command(name="ping"), timeout=_ANSWER_TIMEOUT, keys=keys)
+    return request(address, command, timeout=timeout, keys=keys)
+
+
+def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:
+    """A mesh from its frames (see `MeshLayout`).
+
+    Raises:
+        TransportError: when the frames are not what the layout says.
+    """
+    wanted: list[tuple[int, type]] = [
+        (layout.vertices, np.float32), (layout.faces, np.int32), (layout.vertices, np.float32),
+    ]  # fmt: skip
+    if layout.colors:
+        wanted.append((layout.vertices, np.uint8))
+    sizes = [rows * 3 * np.dtype(dtype).itemsize for rows, dtype in wanted]
+    if sizes != [frame.nbytes for frame in frames]:
+        raise TransportError(f"a mesh of {sizes} bytes was announced, got {[f.nbytes for f in frames]}")
+    arrays: list[NDArray[Any]] = [
+        np.frombuffer(frame, dtype).reshape(-1, 3) for frame, (_, dtype) in zip(frames, wanted, strict=True)
+    ]
+    return Mesh(*arrays)
+
+
+_LOOK_EVERY = 0.2  # seconds
+_LONGEST = 1e6  # seconds; a poll takes no more than 2³¹ ms
+
+
+def request(
+    address: str, command: messages.Command, *, timeout: float, keys: ClientKeys | None = None
+) -> tuple[messages.Reply, list[memoryview]]:
+    """Send a command to a server's control address; its reply and the raw frames that came with it.
+
+    Args:
+        timeout: seconds.
+        keys: of `curve.client_keys`; None = a connection without.
+
+    Raises:
+        InvalidConfig: for a malformed address.
+        NotAllowed: as soon as the server turns the connection away.
+        ServerUnreachable: when nobody answered within `timeout` seconds.
+        TransportError: when the server answered that it cannot.
+    """
+    address, timeout = sockets.target(address), min(timeout, _LONGEST)
+    context: zmq.Context[Any] = zmq.Context()
+    link = sockets.dealer(context, keys)
+    monitor = Monitor(link, address, keys)
+    try:
+        link.connect(address)
+        head, *frames = _exchange(link, monitor, command, timeout)
+        reply = messages.decode_to_client(head.buffer)
+    except DecodeError as error:
+        raise TransportError(f"what answers at {address} is no tsfusion server: {error}") from error
+    finally:
+        monitor.close()
+        link.close()
+        context.term()
+    if not isinstance(reply, messages.Reply):
+        raise TransportError(f"the server at {address} answered a command with a {type(reply).__name__}")
+    if reply.error is not None:
+        raise TransportError(f"the server at {address}: {reply.error}")
+    return reply, [frame.buffer for frame in frames]
+
+
+def _exchange(
+    link: sockets.AnySocket, monitor: Monitor, command: messages.Command, timeout: float
+) -> list[zmq.Frame]:
+    """Send the question on each connection that is made, until there is an answer; its frames."""
+    deadline = time.monotonic() + timeout
+    why, asked = "", 0  # on which connection
+    while (left := deadline - time.monotonic()) > 0:
+        wanted = zmq.POLLIN | (zmq.POLLOUT if monitor.made > asked else 0)
+        polled = [(link, wanted), (monitor.socket, zmq.POLLIN)]
+        events = dict(zmq.zmq_poll(polled, int(min(left, _LOOK_EVERY) * 1000) + 1)).get(link, 0)
+        if events & zmq.POLLIN:
+            return link.recv_multipart(copy=False)
+        if events & zmq.POLLOUT:
+            asked = monitor.made
+            with suppress(zmq.Again):  # gone again already: it is asked again on the next connection
+                link.send(messages.encode(command), zmq.NOBLOCK)
+        news = monitor.problem()
+        why = why if news is None else news
+        if monitor.gave_up:
+            raise (NotAllowed if monitor.refused else TransportError)(why)
+    reason = f": {why}" if why else ""
+    raise ServerUnreachable(f"no server answered at {monitor.address} within {timeout:g} s{reason}")
