@@ -16,7 +16,14 @@ from tsfusion.datasets import Synthetic, open_dataset
 from tsfusion.datasets.formats import stanford_bunny
 from tsfusion.datasets.synthetic import benchmark_worlds
 from tsfusion.evaluation import surface_error
-from tsfusion.evaluation.known_surfaces import COMPLETE_WITHIN, Reference, Solid, Truth, measure, rounded
+from tsfusion.evaluation.known_surfaces import (
+    COMPLETE_WITHIN,
+    ReferenceSurface,
+    Solid,
+    Truth,
+    measure,
+    rounded,
+)
 from tsfusion.evaluation.view_prediction import compare_views, points_world
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.kernels import runtime
@@ -243,7 +250,9 @@ def _bunny(setup: Setup) -> Material:
     folder = DATA / FOLDERS[setup.scene]
     scans = list(stanford_bunny.scans(folder))
     measured = _seen(scans, setup)
-    truth = Reference(*stanford_bunny.reference(folder), measured, reach=COMPLETE_WITHIN * setup.voxel_size)
+    truth = ReferenceSurface(
+        *stanford_bunny.reference(folder), measured, reach=COMPLETE_WITHIN * setup.voxel_size
+    )
     return Material(scans, "scanner", truth)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Corrections, Lost, Pose
+from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
 
 MAX_DEPTH = 5.0  # metres
 
@@ -46,7 +46,7 @@ class FrameToFrame(ABC):
     def motion(self, last: Any, now: Any, frame: Frame) -> NDArray[np.float64] | None:
         """T_last_now, None = failed."""
 
-    def corrections(self) -> Corrections | None:
+    def corrections(self) -> PoseCorrections | None:
         return None
 
     def reset(self) -> None:

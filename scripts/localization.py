@@ -46,8 +46,8 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization import registry
 from tsfusion.scanner.localization.localizer import Localizer, Lost
 from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing
-from tsfusion.scanner.sources.recorded import Recorded
-from tsfusion.scanner.tracked_trajectory import Track
+from tsfusion.scanner.sources.recorded import RecordedSource
+from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 
 DOCS = Path(__file__).parents[1] / "docs" / "localization.md"
 BEGIN, END = "<!-- table: python scripts/localization.py --write-docs -->", "<!-- end of table -->"
@@ -164,9 +164,9 @@ def _track(scene: Scene) -> dict[str, Any]:
     dataset = scene.open()
     if dataset is None:
         return {"name": scene.name, "error": f"no {scene.path} in {DATA}"}
-    localizer, track, spent, lost = None, Track(), 0.0, 0
+    localizer, track, spent, lost = None, TrackedTrajectory(), 0.0, 0
     corrections = None
-    for frame in Recorded(dataset):
+    for frame in RecordedSource(dataset):
         if localizer is None:
             localizer = _localizer(scene, frame)
         before = time.process_time()

@@ -16,7 +16,7 @@ from tsfusion.core import process
 from tsfusion.core.config import DEFAULT_MAP, ServerConfig, VolumeConfig
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.core.service_manager import Watchdog
-from tsfusion.gateway.access_control import Door
+from tsfusion.gateway.access_control import AccessControl
 from tsfusion.gateway.gateway import Gateway
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Ports
@@ -81,7 +81,7 @@ def _open(
             volumes.setdefault(name, volumes[DEFAULT_MAP])
     context: zmq.Context[Any] = zmq.Context()
     stack.callback(context.term)
-    door = Door(context, server.keys)
+    door = AccessControl(context, server.keys)
     stack.callback(door.close)
     ports = Ports(context, server, door.keys)
     stack.callback(ports.close)

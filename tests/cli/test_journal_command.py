@@ -20,7 +20,7 @@ from tsfusion.cli import main
 from tsfusion.core.errors import JournalError
 from tsfusion.geometry import se3
 from tsfusion.journal import Journal, segment_path
-from tsfusion.journal.recording import Recording
+from tsfusion.journal.recording import JournalRecording
 from tsfusion.journal.state_folder import find
 from tsfusion.wire import codec, corrections
 from tsfusion.wire.corrections import SessionCorrections
@@ -297,7 +297,7 @@ def test_what_is_whole_is_saved_in_order_into_closed_segments(state: Path, tmp_p
         with path.open("rb") as file:
             assert list(make_reader(file, validate_crcs=True).iter_messages())
     assert run("verify", tmp_path / "saved")[0] == 0
-    keyframe = next(iter(Recording(tmp_path / "saved")))
+    keyframe = next(iter(JournalRecording(tmp_path / "saved")))
     assert np.array_equal(keyframe.depth, wall(1).depth)
     assert contents(state) == before
 

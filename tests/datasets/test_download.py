@@ -26,7 +26,7 @@ from tsfusion.core.errors import DatasetError, MissingDependency, OutputError
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.download import archives
 from tsfusion.datasets.download import http as download_http
-from tsfusion.datasets.download.catalogue import CATALOGUE, File, Recording, entry
+from tsfusion.datasets.download.catalogue import CATALOGUE, File, PublicRecording, entry
 from tsfusion.datasets.download.download import Fetched, check, fetch
 
 pytest.importorskip("pooch")
@@ -137,8 +137,10 @@ def silent(_done: int, _all: int) -> None:
     pass
 
 
-def one(url: str, name: str = "file.bin", checksum: str | None = None) -> Recording:
-    return Recording("one", "One", "https://example.org", "none", (File(f"{url}/{name}", name, checksum),))
+def one(url: str, name: str = "file.bin", checksum: str | None = None) -> PublicRecording:
+    return PublicRecording(
+        "one", "One", "https://example.org", "none", (File(f"{url}/{name}", name, checksum),)
+    )
 
 
 def sha256(content: bytes = CONTENT) -> str:
@@ -434,7 +436,7 @@ def test_archives_within_archives_and_several_files_make_one_folder(server: Serv
         "traj.txt": b"4",
     }
     files = (File("", "scene.zip"), File("", "depth.tgz", into="depth"), File("", "traj.txt"))
-    recording = Recording("all", "All", "", "", files, opens="scene")
+    recording = PublicRecording("all", "All", "", "", files, opens="scene")
     done = fetch(recording, tmp_path, silent, base=f"{server.url}/")
     assert done.path == tmp_path / "all" / "scene"
     found = {str(path.relative_to(tmp_path / "all")): path.read_text()

@@ -28,9 +28,9 @@ from tsfusion.geometry.calibration import Camera, Rectifier, StereoRig, Undistor
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.journal import Journal, segment_path
-from tsfusion.journal.recording import Recording
+from tsfusion.journal.recording import JournalRecording
 from tsfusion.journal.ros2_export import export
-from tsfusion.journal.state_folder import Place
+from tsfusion.journal.state_folder import JournalPlace
 from tsfusion.wire import codec
 
 pytest.importorskip("rosbags")
@@ -172,7 +172,7 @@ def test_an_exported_journal_comes_back_equal(data: Data, tmp_path: Path) -> Non
         place = journal_of(tmp_path / name, keyframes)
         out = tmp_path / f"{name}.mcap"
         export(place, out, lambda _done, _all: None)
-        journaled, found = Recording(place.path), open_dataset(out)
+        journaled, found = JournalRecording(place.path), open_dataset(out)
         assert len(found) == len(journaled)
         for read, written in zip(found, journaled, strict=True):
             assert np.array_equal(read.measurement, written.measurement, equal_nan=True)
@@ -183,13 +183,13 @@ def test_an_exported_journal_comes_back_equal(data: Data, tmp_path: Path) -> Non
             assert np.allclose(read.T_world_camera, written.T_world_camera, atol=1e-9, rtol=0)
 
 
-def journal_of(folder: Path, keyframes: list[Keyframe]) -> Place:
+def journal_of(folder: Path, keyframes: list[Keyframe]) -> JournalPlace:
     log, session = Journal(folder / "journal", 1 << 30, sync=False), bytes(range(16))
     for seq, keyframe in enumerate(keyframes, 1):
         frames = codec.encode(keyframe, session=session, seq=seq, jpeg_quality=90)
         log.append(frames, session=session, seq=seq, client="scanner", logged_ns=T0 + seq * 10**8)
     log.close()
-    return Place(folder / "journal")
+    return JournalPlace(folder / "journal")
 
 
 def test_a_journal_and_a_ros_recording_are_told_apart(tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ def test_a_journal_and_a_ros_recording_are_told_apart(tmp_path: Path) -> None:
     export(place, tmp_path / "out.mcap", lambda _done, _all: None)
     bag = walls(tmp_path)
     for journaled in (tmp_path, place.path, segment):
-        assert isinstance(replay.open_recording(journaled), Recording)
+        assert isinstance(replay.open_recording(journaled), JournalRecording)
         assert not recognises(journaled) or journaled == tmp_path
     for recorded in (tmp_path / "out.mcap", bag, bag / "recorded.mcap"):
         assert isinstance(replay.open_recording(recorded), Bag)

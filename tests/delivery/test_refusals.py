@@ -13,7 +13,7 @@ from tsfusion import Client
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, InvalidConfig, JournalError, KeyframeRefused, ServerUnreachable
 from tsfusion.delivery.spool import Spool
-from tsfusion.journal.recording import Recording
+from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec
 from tsfusion.wire.keyframe_header import unpack
 from tsfusion.wire.queries import fetch_status
@@ -114,7 +114,7 @@ def test_refused_keyframes_are_kept_aside_and_the_rest_arrives(tmp_path: Path) -
             assert client.stats.refused == {"values": 3}
             assert client.stats.durable == 7
         assert server.numbers == [0, 2, 3, 5, 6, 8, 9]
-    kept = [keyframe.timestamp_ns - 10**9 for keyframe in Recording(tmp_path / "refused")]
+    kept = [keyframe.timestamp_ns - 10**9 for keyframe in JournalRecording(tmp_path / "refused")]
     assert kept == [1, 4, 7]
 
 
@@ -135,7 +135,7 @@ def test_a_real_server_refuses_some_and_fuses_the_rest(tmp_path: Path) -> None:
             assert client.stats.durable == 1
         assert fetch_status(server.address).keyframes_fused == 10
         assert server.terminate() == 0
-    kept = [keyframe.timestamp_ns - 10**9 for keyframe in Recording(spool / "refused")]
+    kept = [keyframe.timestamp_ns - 10**9 for keyframe in JournalRecording(spool / "refused")]
     assert kept == [3, 4, 11]
 
 
@@ -150,7 +150,7 @@ def test_what_is_kept_aside_is_bounded(tmp_path: Path, monkeypatch: pytest.Monke
             client.flush(DEADLINE)
     files = sorted((tmp_path / "refused").glob("*.mcap"))
     assert sum(file.stat().st_size for file in files) <= 21_000
-    assert Recording(files[-1])[0].timestamp_ns == 10**9 + 29
+    assert JournalRecording(files[-1])[0].timestamp_ns == 10**9 + 29
     with scripted() as server, joined(server, spool=tmp_path) as client:  # nobody sends these
         client.send(wall(99))
         client.flush(DEADLINE)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
 """The client's stamps: one row a keyframe, memory of one size, whatever a server says."""
 
-from tsfusion.delivery.timing import CAPACITY, Times
+from tsfusion.delivery.timing import CAPACITY, KeyframeTimesTable
 from tsfusion.wire.keyframe_times import KeyframeTimes, Stamps
 
 
 def test_a_row_fills_up_as_news_come() -> None:
-    times = Times()
+    times = KeyframeTimesTable()
     times.add(5, timestamp_ns=1, captured_ns=2)
     times.sent(5, 3)
     times.stamp(Stamps(5, 110, 120), 100, 7)
@@ -20,7 +20,7 @@ def test_a_row_fills_up_as_news_come() -> None:
 
 
 def test_strangers_and_removed_keyframes_have_no_row() -> None:
-    times = Times()
+    times = KeyframeTimesTable()
     times.add(5, timestamp_ns=1, captured_ns=2)
     times.add(6, timestamp_ns=1, captured_ns=2)
     times.remove(5)
@@ -32,7 +32,7 @@ def test_strangers_and_removed_keyframes_have_no_row() -> None:
 
 
 def test_the_oldest_rows_go_first() -> None:
-    times = Times()
+    times = KeyframeTimesTable()
     for seq in range(1, CAPACITY + 101):
         times.add(seq, timestamp_ns=seq, captured_ns=0)
     kept = [row.seq for row in times.copy()]
@@ -40,7 +40,7 @@ def test_the_oldest_rows_go_first() -> None:
 
 
 def test_impossible_stamps_do_no_harm() -> None:
-    times = Times()
+    times = KeyframeTimesTable()
     times.add(1, timestamp_ns=0, captured_ns=0)
     times.stamp(Stamps(1, 1 << 64, -(1 << 63), 5, 1 << 63), 1 << 62, 1 << 70)
     (row,) = times.copy()

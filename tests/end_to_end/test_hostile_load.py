@@ -8,14 +8,14 @@ from attacks import ATTACKS
 from hostile_run import run, table
 
 from tsfusion.core import process
-from tsfusion.gateway.memory_guard import MemoryBound
+from tsfusion.gateway.memory_guard import MemoryGuard
 
 
 def test_memory_that_does_not_come_back_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Else every connection would be dropped for ever."""
     held = 0
     monkeypatch.setattr(process, "rss_bytes", lambda: held)
-    bound = MemoryBound(800)
+    bound = MemoryGuard(800)
     told = []
     for held in (700, 800, 850, 900, 950, 960, 980, 1080, 1090, 400, 790, 810):  # noqa: B007
         told.append(bound.excess(elsewhere=0))
@@ -27,7 +27,7 @@ def test_memory_that_was_freed_counts_no_more(monkeypatch: pytest.MonkeyPatch) -
     held = [900]
     monkeypatch.setattr(process, "rss_bytes", lambda: held[0])
     monkeypatch.setattr(process, "give_back_memory", lambda: held.__setitem__(0, 500))
-    assert MemoryBound(800).excess(elsewhere=0) == 0
+    assert MemoryGuard(800).excess(elsewhere=0) == 0
 
 
 WITHOUT_KEYS = (

@@ -21,7 +21,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal.recording import read_keyframes
 from tsfusion.scanner.localization.localizer import Lost, Pose
-from tsfusion.scanner.localization.pose_feed.feed import Feed
+from tsfusion.scanner.localization.pose_feed.feed import PoseFeed
 
 BRIDGE = ROOT / "contrib" / "ros1_bridge.py"
 TALKER = SUPPORT / "ros1_talker.py"
@@ -99,7 +99,7 @@ def place(tenths: float) -> np.ndarray:
 )
 def test_poses_reach_the_feed(ros: dict[str, str], source: list[str]) -> None:
     with ExitStack() as stack:
-        feed = stack.enter_context(Feed("@tcp://127.0.0.1:0", max_gap_s=0.15, wait_s=15.0))
+        feed = stack.enter_context(PoseFeed("@tcp://127.0.0.1:0", max_gap_s=0.15, wait_s=15.0))
         stack.enter_context(
             process(PYTHON, BRIDGE, "--feed", feed.address, "--connect", *source, environment=ros)
         )
@@ -115,7 +115,7 @@ def test_poses_reach_the_feed(ros: dict[str, str], source: list[str]) -> None:
 def test_a_lost_camera_is_said_to_be_lost(ros: dict[str, str]) -> None:
     """Calibration comes, and with it the times; tf says nothing."""
     with ExitStack() as stack:
-        feed = stack.enter_context(Feed("@tcp://127.0.0.1:0", max_gap_s=0.15, wait_s=0.05))
+        feed = stack.enter_context(PoseFeed("@tcp://127.0.0.1:0", max_gap_s=0.15, wait_s=0.05))
         words = ("--world", "odom", "--camera", "camera", "--camera-info", "/info")
         stack.enter_context(
             process(PYTHON, BRIDGE, "--feed", feed.address, "--connect", *words, environment=ros)

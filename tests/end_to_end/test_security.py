@@ -16,7 +16,7 @@ import tsfusion
 from tsfusion import Client
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, NotAllowed, TransportError
-from tsfusion.journal.recording import Recording
+from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec, key_folder, messages, sockets
 from tsfusion.wire.curve import ClientKeys, client_keys, server_keys
 from tsfusion.wire.keyframe_header import VERSION
@@ -222,7 +222,7 @@ def test_a_revocation_cuts_at_once_and_others_go_on(tmp_path: Path) -> None:
         robot.flush(timeout=DEADLINE)
         cart.wait_fused(timeout=DEADLINE)
         assert server.terminate() == 0
-    assert len(Recording(site.state)) == 13
+    assert len(JournalRecording(site.state)) == 13
 
 
 def test_a_new_key_under_the_old_name_goes_on_with_the_spool(tmp_path: Path) -> None:

@@ -19,10 +19,10 @@ from tsfusion.core import config as core_config
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import JournalError, ServerUnreachable, TransportError
 from tsfusion.gateway import map_registry
-from tsfusion.gateway.map_registry import Atlas
+from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.journal import state_folder
-from tsfusion.journal.recording import Recording
+from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec, messages, sockets
 from tsfusion.wire.keyframe_header import VERSION, Refused, unpack
 from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_status
@@ -72,8 +72,8 @@ def test_two_scanners_two_maps(tmp_path: Path) -> None:
         assert server.terminate() == 0
     assert state_folder.names(tmp_path) == ["default", "yard-2"]
     with pytest.raises(JournalError, match=r"has several maps \(default, yard-2\): choose one with --map"):
-        Recording(tmp_path)
-    assert len(Recording(tmp_path, "yard-2")) == len(Recording(tmp_path / "maps/yard-2")) == 8
+        JournalRecording(tmp_path)
+    assert len(JournalRecording(tmp_path, "yard-2")) == len(JournalRecording(tmp_path / "maps/yard-2")) == 8
     with serving(tmp_path) as server:  # both are taken up again, without anybody asking
         until(lambda: set(fetch_health(server.address).maps) == set(numbers))
         assert fetch_status(server.address, map_name="yard-2").map_hash == fused_hash(numbers["yard-2"])
@@ -94,7 +94,7 @@ def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
         raise JournalError("no room")
 
     monkeypatch.setattr(map_registry, "HostedMap", fail)
-    found: Any = Atlas(zmq.Context.instance(), ServerConfig(state=str(tmp_path)), None)  # type: ignore[arg-type]
+    found: Any = MapRegistry(zmq.Context.instance(), ServerConfig(state=str(tmp_path)), None)  # type: ignore[arg-type]
     found._volumes = {"default": VolumeConfig()}
     for i in range(200):
         assert found.open_for_client(f"map{i}") is None
@@ -248,7 +248,7 @@ def test_a_journal_keeps_to_its_limit(tmp_path: Path) -> None:
         scan(server.address, "default", range(1200))
         until(lambda: fetch_health(server.address).maps["default"].journal_bytes < 2 * limit)
         server.kill()
-    assert len(Recording(tmp_path)) < 1200
+    assert len(JournalRecording(tmp_path)) < 1200
     with serving(tmp_path, **settings) as server:
         until(lambda: fetch_health(server.address).maps["default"].keyframes_fused == 1200)
         scan(server.address, "default", range(1200, 1210))

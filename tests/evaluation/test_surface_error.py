@@ -9,7 +9,7 @@ from tsfusion import Intrinsics, Keyframe, Mesh
 from tsfusion.datasets import Synthetic
 from tsfusion.datasets.synthetic import benchmark_worlds, worlds
 from tsfusion.evaluation import surface_error
-from tsfusion.evaluation.known_surfaces import Reference, Solid, edges_of, measure
+from tsfusion.evaluation.known_surfaces import ReferenceSurface, Solid, edges_of, measure
 from tsfusion.evaluation.view_prediction import compare_views, depth_metres, points_world, predicted_depth
 
 VOXEL = 0.02
@@ -152,7 +152,7 @@ def test_an_empty_mesh_is_measured_too() -> None:
 
 def test_a_reference_mesh_measures_to_its_triangles() -> None:
     cube = trimesh.creation.box((2, 2, 2))
-    truth = Reference(cube.vertices, cube.faces, np.array([(0, 0, 1.0)]), reach=0.2, samples=20_000)
+    truth = ReferenceSurface(cube.vertices, cube.faces, np.array([(0, 0, 1.0)]), reach=0.2, samples=20_000)
     points = np.array([(0.3, 0.1, 1.25), (0, -0.8, 0.1), (1.3, 1.4, 0.0)])
     assert truth.distance(points) == pytest.approx([0.25, 0.2, 0.5], abs=1e-6)
     assert truth.normals(points)[:2] == pytest.approx(np.array([(0, 0, 1), (0, -1, 0)]), abs=1e-6)

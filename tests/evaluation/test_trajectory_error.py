@@ -20,7 +20,7 @@ from tsfusion.datasets.trajectory_files import read_tum, write_tum
 from tsfusion.evaluation.trajectory_error import absolute_error, associate, paired, read, umeyama
 from tsfusion.geometry import se3
 from tsfusion.geometry.trajectory import quaternion, rigid
-from tsfusion.scanner.sources.recorded import Recorded
+from tsfusion.scanner.sources.recorded import RecordedSource
 
 RNG = np.random.default_rng(7)
 
@@ -164,7 +164,7 @@ def test_a_recording_is_a_reference(data, tmp_path, folder, option):
     """By its times, or those that a scan counts where it has none."""
     root, given = data(folder), dict(each.split("=") for each in option[1:])
     dataset, estimate = open_dataset(root, **given), tmp_path / "estimate.txt"
-    stamps = [frame.timestamp_ns for frame in Recorded(select(dataset, limit=30))]
+    stamps = [frame.timestamp_ns for frame in RecordedSource(select(dataset, limit=30))]
     T = se3.exp(np.array([3.0, -2, 1, 0.5, -1, 2]))
     write_tum(estimate, stamps, [T @ pose_of(dataset, index) for index in range(30)])
     done = tsfusion("ate", estimate, root, *option, "--json")

@@ -20,7 +20,7 @@ from tsfusion.core.errors import CheckpointError, InvalidConfig, MapError
 from tsfusion.core.folder_lock import hold
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.fuser import Fuser
-from tsfusion.fuser.saved_map import SavedMap
+from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.journal import Journal, Position
 from tsfusion.journal.state_folder import MAP_FILE, PREVIOUS_FILE
 from tsfusion.wire import codec
@@ -77,7 +77,7 @@ def opened(state: Path, volume: VolumeConfig = VOLUME, **settings: Any) -> tuple
 
 
 def status(fuser: Fuser, link: Link) -> fuser_messages.FuserStatus:
-    fuser.take(fuser_messages.Ask(1, Command(name="status")))
+    fuser.take(fuser_messages.FuserQuery(1, Command(name="status")))
     answer = link.last()
     assert answer.status is not None
     return msgspec.structs.replace(answer.status, peak_rss_bytes=0)  # of this whole process
@@ -98,7 +98,7 @@ def test_keyframes_are_fused_meshed_and_checkpointed(tmp_path: Path) -> None:
     fuser.take(fuser_messages.Finish())
     assert fuser.exit_status == 0
     again, link_again = opened(tmp_path)
-    assert again.ready().done == {SESSION: fuser_messages.Progress(3, "robot")}
+    assert again.ready().done == {SESSION: fuser_messages.SessionProgress(3, "robot")}
     assert status(again, link_again) == status(fuser, link)
 
 
@@ -196,7 +196,7 @@ def test_a_checkpoint_that_cannot_be_read_now_stays(
         patched.setattr(Path, "open", refused)
         with pytest.raises(CheckpointError, match=os.strerror(code)):
             opened(tmp_path)
-    assert opened(tmp_path)[0].ready().done == {SESSION: fuser_messages.Progress(1, "")}
+    assert opened(tmp_path)[0].ready().done == {SESSION: fuser_messages.SessionProgress(1, "")}
 
 
 def test_a_checkpoint_without_memory_for_it_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -233,7 +233,7 @@ def test_a_checkpoint_on_request_keeps_the_one_before(tmp_path: Path) -> None:
     assert (tmp_path / PREVIOUS_FILE).exists()
     (tmp_path / MAP_FILE).write_bytes(b"")
     again, _ = opened(tmp_path, keep_previous=True)
-    assert again.ready().done == {SESSION: fuser_messages.Progress(1, "robot")}
+    assert again.ready().done == {SESSION: fuser_messages.SessionProgress(1, "robot")}
 
 
 @pytest.mark.parametrize("keep_previous", [False, True])
@@ -243,9 +243,9 @@ def test_a_checkpoint_that_fails_leaves_the_old_ones(
 ) -> None:
     folder = tmp_path / "map"
     folder.mkdir()
-    written = SavedMap(folder, VOLUME, keep_previous=keep_previous)
+    written = MapCheckpoints(folder, VOLUME, keep_previous=keep_previous)
     for seq in (1, 2):
-        written.done = {SESSION: fuser_messages.Progress(seq, "robot")}
+        written.done = {SESSION: fuser_messages.SessionProgress(seq, "robot")}
         assert written.save()
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert sorted(before) == ([PREVIOUS_FILE] if keep_previous else []) + [MAP_FILE]
@@ -258,14 +258,14 @@ def test_a_checkpoint_that_fails_leaves_the_old_ones(
         assert not written.save()
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     (folder / "map.new.tsf").write_bytes(b"by one that was killed")
-    assert SavedMap(folder, VOLUME, keep_previous=keep_previous).done == written.done
+    assert MapCheckpoints(folder, VOLUME, keep_previous=keep_previous).done == written.done
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
 def test_a_map_of_many_sessions_comes_back(tmp_path: Path) -> None:
-    written = SavedMap(tmp_path, VOLUME, keep_previous=False)
+    written = MapCheckpoints(tmp_path, VOLUME, keep_previous=False)
     written.done = {
-        number.to_bytes(16): fuser_messages.Progress(number, "robot") for number in range(1, 40_001)
+        number.to_bytes(16): fuser_messages.SessionProgress(number, "robot") for number in range(1, 40_001)
     }
     assert written.save()
     assert opened(tmp_path)[0].ready().done == written.done
@@ -325,7 +325,7 @@ def test_no_question_ends_the_fuser(tmp_path: Path, min_weight: float) -> None:
     (position,) = fill(tmp_path, 1)
     fuser, link = opened(tmp_path)
     fuser.take(order(0, position))
-    fuser.take(fuser_messages.Ask(1, Command(name="mesh", min_weight=min_weight)))
+    fuser.take(fuser_messages.FuserQuery(1, Command(name="mesh", min_weight=min_weight)))
     assert "min_weight must be" in link.last().error
 
 

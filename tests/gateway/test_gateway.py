@@ -23,7 +23,7 @@ from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.datasets import open_dataset
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import fuser_process, fuser_supervisor
-from tsfusion.gateway.access_control import Door
+from tsfusion.gateway.access_control import AccessControl
 from tsfusion.gateway.gateway import Gateway
 from tsfusion.gateway.ports import Ports
 from tsfusion.journal import Journal, state_folder
@@ -103,7 +103,7 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
             server = ServerConfig(state=str(tmp_path), **settings)
             context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
             stack.callback(context.term)
-            door = Door(context, None)
+            door = AccessControl(context, None)
             ports = Ports(context, server)
             stack.callback(ports.close)
             gateway = Gateway(context, server, ports, door)

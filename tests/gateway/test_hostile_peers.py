@@ -23,9 +23,9 @@ from tsfusion.core.errors import InvalidConfig, JournalError, ServerUnreachable,
 from tsfusion.delivery.spool import Spool
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import fuser_process
-from tsfusion.gateway.client_routes import Routes
-from tsfusion.gateway.fuser_queries import Questions
-from tsfusion.gateway.fuser_supervisor import FuserLink
+from tsfusion.gateway.client_routes import ClientRoutes
+from tsfusion.gateway.fuser_queries import FuserQueries
+from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.journal import Position
 from tsfusion.wire import codec, health, messages, queries, sockets
 from tsfusion.wire.keyframe_header import Refused, pack, unpack
@@ -64,7 +64,7 @@ def test_a_stranger_cannot_unsubscribe_a_viewer(shared: Server) -> None:
 
 
 def test_strangers_do_not_push_out_a_client_that_is_heard() -> None:
-    routes = Routes()
+    routes = ClientRoutes()
     client = routes.connect(b"client", "default", b"1")
     assert client is not None
     for number in range(3000):
@@ -123,16 +123,16 @@ def test_who_does_not_fetch_a_mesh_gets_no_second_one(shared: Server) -> None:
 
 
 class Map:
-    """As `Questions` sees one: what its fuser was asked, and whether keyframes come."""
+    """As `FuserQueries` sees one: what its fuser was asked, and whether keyframes come."""
 
     ready, failed = True, ""
 
     def __init__(self) -> None:
         self.fuser: Any = self
-        self.asked: list[fuser_messages.Ask] = []
+        self.asked: list[fuser_messages.FuserQuery] = []
         self.is_calm = True
 
-    def send(self, ask: fuser_messages.Ask) -> bool:
+    def send(self, ask: fuser_messages.FuserQuery) -> bool:
         self.asked.append(ask)
         return True
 
@@ -141,13 +141,13 @@ class Map:
 
 
 class Asking:
-    """Questions about a map, and the errors that they were answered with."""
+    """FuserQueries about a map, and the errors that they were answered with."""
 
     def __init__(self, most_bytes: int = 1 << 30) -> None:
         self.map = Map()
         self.errors: list[str | None] = []
         self.frames: list[Any] = []
-        self.questions = Questions(self._on_answer, most_bytes)
+        self.questions = FuserQueries(self._on_answer, most_bytes)
 
     def _on_answer(self, identity: bytes, message: messages.ToClient, frames: Any = ()) -> None:
         assert isinstance(message, messages.Reply)
@@ -164,7 +164,9 @@ class Asking:
         """The one that was asked for last."""
         layout = health.MeshLayout(vertices=0, faces=0, colors=False)
         frames = [zmq.Frame(bytes(nbytes // 2)), zmq.Frame(bytes(nbytes // 2))]
-        self.questions.answered(fuser_messages.Answer(self.map.asked[-1].number, layout=layout), None, frames)
+        self.questions.answered(
+            fuser_messages.FuserReply(self.map.asked[-1].number, layout=layout), None, frames
+        )
 
 
 def test_a_fuser_makes_one_mesh_at_a_time() -> None:
@@ -249,7 +251,7 @@ while True:
 def test_orders_that_find_no_room_are_given_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fuser_process, "COMMAND", (sys.executable, "-c", _SLOW))
     context: zmq.Context[Any] = zmq.Context()
-    link = FuserLink(context, tmp_path, ServerConfig(state=str(tmp_path)), VolumeConfig())
+    link = FuserSupervisor(context, tmp_path, ServerConfig(state=str(tmp_path)), VolumeConfig())
     try:
 
         def heard() -> bool:

@@ -4,8 +4,8 @@
 from typing import Any, cast
 
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.gateway.fuser_supervisor import FuserLink
-from tsfusion.gateway.journal_retention import Retention
+from tsfusion.gateway.fuser_supervisor import FuserSupervisor
+from tsfusion.gateway.journal_retention import JournalRetention
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.sessions import Session, Sessions
 from tsfusion.journal import Journal, Position
@@ -39,17 +39,17 @@ class Fuser:
         return True
 
 
-def ten_segments() -> tuple[Retention, Folder, Session]:
+def ten_segments() -> tuple[JournalRetention, Folder, Session]:
     """One session of ten keyframes, a segment each."""
     sessions, index, folder = Sessions(), KeyframeIndex(), Folder()
     session = sessions.open(bytes(16))
     for seq in range(1, 11):
         index.add(Position(seq, 8), session, seq)
-    return Retention(cast(Journal, folder), index, sessions, 1), folder, session
+    return JournalRetention(cast(Journal, folder), index, sessions, 1), folder, session
 
 
-def let_go(retention: Retention, folder: Folder, fuser: Fuser) -> int:
-    retention.step(cast(FuserLink, fuser), ())
+def let_go(retention: JournalRetention, folder: Folder, fuser: Fuser) -> int:
+    retention.step(cast(FuserSupervisor, fuser), ())
     return folder.below
 
 

@@ -16,7 +16,7 @@ from tsfusion import journal
 from tsfusion.core.errors import JournalError
 from tsfusion.delivery.spool import Spool
 from tsfusion.journal import Journal, Position, segment_path
-from tsfusion.journal.recording import Recording, read_keyframes
+from tsfusion.journal.recording import JournalRecording, read_keyframes
 from tsfusion.wire import codec
 
 SESSION = bytes(16)
@@ -191,19 +191,19 @@ def record(folder: Path, count: int) -> None:
 
 def test_a_journal_is_a_dataset_of_its_keyframes(tmp_path: Path) -> None:
     record(tmp_path / "journal", 6)
-    recording = Recording(tmp_path)
+    recording = JournalRecording(tmp_path)
     assert len(recording) == 6
     for i, keyframe in enumerate(recording):
         assert np.array_equal(keyframe.depth, wall(i).depth)
     assert len(list(read_keyframes(tmp_path / "journal"))) == 6
-    assert 0 < len(Recording(segment_path(tmp_path / "journal", 1))) < 6
+    assert 0 < len(JournalRecording(segment_path(tmp_path / "journal", 1))) < 6
 
 
 def test_an_empty_recording_is_one_clear_error(tmp_path: Path) -> None:
     with pytest.raises(JournalError, match="no keyframes in"):
-        Recording(tmp_path)
+        JournalRecording(tmp_path)
     with pytest.raises(JournalError, match="does not exist"):
-        Recording(tmp_path / "nothing.mcap")
+        JournalRecording(tmp_path / "nothing.mcap")
 
 
 # --- spools ---

@@ -18,7 +18,7 @@ from tsfusion.evaluation.view_prediction import points_world
 from tsfusion.journal import Journal, read, records, segment_path
 from tsfusion.journal.ros2_export import Export, export
 from tsfusion.journal.ros2_messages import depth_image, quaternion
-from tsfusion.journal.state_folder import Place
+from tsfusion.journal.state_folder import JournalPlace
 from tsfusion.wire import codec
 from tsfusion.wire.keyframe_header import unpack
 
@@ -28,7 +28,7 @@ Data = Callable[[str], Path]
 Read = dict[str, list[tuple[int, Any]]]
 
 
-def journal_of(folder: Path, scans: dict[str, list[Keyframe]]) -> Place:
+def journal_of(folder: Path, scans: dict[str, list[Keyframe]]) -> JournalPlace:
     """A journal with a session for each client."""
     log = Journal(folder / "journal", 1 << 30, sync=False)
     for number, (client, keyframes) in enumerate(scans.items(), 1):
@@ -37,7 +37,7 @@ def journal_of(folder: Path, scans: dict[str, list[Keyframe]]) -> Place:
             frames = codec.encode(keyframe, session=session, seq=seq, jpeg_quality=90)
             log.append(frames, session=session, seq=seq, client=client, logged_ns=NOW + seq)
     log.close()
-    return Place(folder / "journal")
+    return JournalPlace(folder / "journal")
 
 
 def silent(_done: int, _total: int) -> None:
@@ -259,7 +259,7 @@ def test_sessions_have_names_of_their_own(tmp_path: Path) -> None:
         log.append(frames, session=session, seq=1, client=client)
         log.append(frames, session=session, seq=1, client=client)  # a second time
     log.close()
-    done = export(Place(tmp_path / "journal"), tmp_path / "out.mcap", silent)
+    done = export(JournalPlace(tmp_path / "journal"), tmp_path / "out.mcap", silent)
     assert done.keyframes == 5
     named = {topic.split("/")[1] for topic in done.messages} - {"tf"}
     assert named == {"arm_7", "arm_7_2", "scanner", "scanner_2", "scanner_7up"}
@@ -281,11 +281,11 @@ def test_damaged_keyframes_are_left_out_and_named(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def small(tmp_path: Path) -> Place:
+def small(tmp_path: Path) -> JournalPlace:
     return journal_of(tmp_path, {"a": [wall(0)]})
 
 
-def test_nothing_half_written_is_left(small: Place, tmp_path: Path) -> None:
+def test_nothing_half_written_is_left(small: JournalPlace, tmp_path: Path) -> None:
     before = sorted(tmp_path.iterdir())
 
     def interrupted(_done: int, _total: int) -> None:
@@ -296,7 +296,7 @@ def test_nothing_half_written_is_left(small: Place, tmp_path: Path) -> None:
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_places_that_cannot_be_written_are_named(small: Place, tmp_path: Path) -> None:
+def test_places_that_cannot_be_written_are_named(small: JournalPlace, tmp_path: Path) -> None:
     segment = segment_path(small.path, 1)
     content = segment.read_bytes()
     for out, message in (
@@ -308,7 +308,7 @@ def test_places_that_cannot_be_written_are_named(small: Place, tmp_path: Path) -
         with pytest.raises(OutputError, match=message):
             export(small, out, silent)
     with pytest.raises(OutputError, match="in the journal that is read"):
-        export(Place(segment), segment, silent)
+        export(JournalPlace(segment), segment, silent)
     assert segment.read_bytes() == content
     assert read(small.path, next(records(segment)).position).seq == 1
 
@@ -316,12 +316,12 @@ def test_places_that_cannot_be_written_are_named(small: Place, tmp_path: Path) -
 def test_an_empty_journal_is_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / "journal").mkdir()
     with pytest.raises(JournalError, match="no keyframes in"):
-        export(Place(tmp_path / "journal"), tmp_path / "out.mcap", silent)
+        export(JournalPlace(tmp_path / "journal"), tmp_path / "out.mcap", silent)
     assert not (tmp_path / "out.mcap").exists()
 
 
 def test_without_rosbags_the_error_names_the_command(
-    small: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small: JournalPlace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = builtins.__import__
 

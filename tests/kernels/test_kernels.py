@@ -13,7 +13,7 @@ from tsfusion.kernels import block_hash, integrate, marching_tables, rasterizer,
 from tsfusion.kernels.voxel_traversal import COUNT, RAY_FIELDS, START, WEIGHT
 from tsfusion.tsdf.block_store import BlockStore, unpack_keys
 from tsfusion.tsdf.integrator import Integrator
-from tsfusion.tsdf.ray_buffers import BANDS, Scratch, model_parameters
+from tsfusion.tsdf.ray_buffers import BANDS, RayBuffers, model_parameters
 
 QUANTA = integrate.QUANTA_PER_VOXEL
 Segment = tuple[NDArray[np.int64], NDArray[np.float64], int]  # end 2⁻¹⁰ voxel, direction, half 2⁻⁸ voxel
@@ -69,7 +69,7 @@ class Map:
 
     def __init__(self) -> None:
         self.store = BlockStore(color=True, corrected=True)
-        self.scratch = Scratch(color=True, regularised=True)
+        self.scratch = RayBuffers(color=True, regularised=True)
         self._integrator = Integrator(self.store, self.scratch, VolumeConfig())
 
     def apply(self, rays: NDArray[np.int32], sign: int = 1) -> int:
@@ -330,7 +330,7 @@ def ray_ends(rays: NDArray[np.float64]) -> NDArray[np.float64]:
     return (((rays[:, :3] + 0.5) * gradient).sum(axis=1) + rays[:, 12]) / 65536
 
 
-def rays_of(scratch: Scratch) -> NDArray[np.int32]:
+def rays_of(scratch: RayBuffers) -> NDArray[np.int32]:
     return np.vstack([scratch.rays[s : s + n] for s, n in scratch.bands[:, [START, COUNT]]])
 
 
@@ -339,7 +339,7 @@ def rays_of(scratch: Scratch) -> NDArray[np.int32]:
 def test_rays_from_images_equal_the_twin(kind: str, bundled: bool) -> None:
     keyframe, voxel_size = image_keyframe(11, kind), 0.05
     parameters = model_parameters(SENSORS["stereo"], voxel_size, keyframe.baseline_fx)
-    scratch = Scratch(color=False, regularised=False)
+    scratch = RayBuffers(color=False, regularised=False)
     samples = scratch.make_rays(
         keyframe, VolumeConfig(sensor="stereo", voxel_size=voxel_size, bundle=bundled)
     )
@@ -383,7 +383,7 @@ def test_rays_from_points_equal_the_twin(own_origins: bool, bundled: bool) -> No
     pose[:3, 3] = (1.0, -2.0, 3.0)
     keyframe = Keyframe(points=points, origins=origins, T_world_camera=pose)
     voxel_size, model = 0.2, SENSORS["scanner"]
-    scratch = Scratch(color=False, regularised=False)
+    scratch = RayBuffers(color=False, regularised=False)
     config = VolumeConfig(sensor="scanner", voxel_size=voxel_size, bundle=bundled)
     samples = scratch.make_rays(keyframe, config)
     parameters = model_parameters(model, voxel_size, None)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tsfusion.kernels import block_hash, marching_tables, runtime, surface_cells
 from tsfusion.tsdf.block_store import cells_of, pack_keys, unpack_keys
-from tsfusion.tsdf.mesh_extraction import MeshScratch
+from tsfusion.tsdf.mesh_extraction import MeshBuffers
 from tsfusion.tsdf.surface_values import Layers, values_of
 
 PATCH = np.array([(x, y, z) for x in (-2, -1, 0) for y in (-1, 0) for z in (-1, 0, 1) if x + y + z], np.int32)
@@ -55,7 +55,7 @@ def test_the_blocks_around_equal_the_twin(wanted: int) -> None:
     chosen = np.random.default_rng(wanted).permutation(PATCH)[:wanted]
     around = (chosen[:, None] + np.array([*np.ndindex(3, 3, 3)]) - 1).reshape(-1, 3)
     expected = {tuple(b) for b in around.tolist()} & {tuple(b) for b in PATCH.tolist()}
-    found = MeshScratch().keys_around(np.sort(pack_keys(chosen)), layers)
+    found = MeshBuffers().keys_around(np.sort(pack_keys(chosen)), layers)
     assert (np.diff(found) > 0).all()
     assert {tuple(b) for b in unpack_keys(found).tolist()} == expected
 
@@ -72,7 +72,7 @@ def test_cells_and_edges_equal_the_twin(known: float, wanted: int) -> None:
     rows[3] = np.abs(rows[3])  # a block without a sign change of its own
     chosen = np.sort(random.permutation(count)[:wanted])
     runtime.start(2)
-    scratch = MeshScratch()
+    scratch = MeshBuffers()
     scratch.reserve(count)
     s = {name: getattr(scratch, name).array for name in
          ("around", "seen", "inside", "active", "edges", "starts", "state", "first")}  # fmt: skip
@@ -111,13 +111,13 @@ def voxels_in(planes: NDArray[np.uint64], corner: list[int]) -> set[kernel_twins
 
 def test_no_blocks_have_no_cells() -> None:
     layers = layers_of(PATCH, np.zeros((len(PATCH), 512), np.int64), None)
-    assert len(MeshScratch().keys_around(np.zeros(0, np.int64), layers)) == 0
+    assert len(MeshBuffers().keys_around(np.zeros(0, np.int64), layers)) == 0
     assert cells_of(np.zeros((0, 3), np.int32)).shape == (0, 3)
 
 
 def test_the_scratch_gives_the_memory_of_a_large_mesh_back(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tsfusion.tsdf.mesh_extraction._KEEP", 100)
-    scratch = MeshScratch()
+    scratch = MeshBuffers()
     scratch.reserve(50)
     small = scratch.nbytes
     scratch.release()

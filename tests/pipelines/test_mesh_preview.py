@@ -14,7 +14,7 @@ from tsfusion.datasets import Synthetic
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.pipelines.mesh_preview import (
     BACKGROUND,
-    Camera,
+    PreviewCamera,
     choose_camera,
     draw,
     height_colors,
@@ -51,7 +51,7 @@ def test_depth_of_a_sphere() -> None:
     sphere = from_trimesh(trimesh.creation.icosphere(5, 1.0))
     T = np.eye(4)
     T[2, 3] = -4.0
-    image = draw(sphere, Camera(T, fov=math.radians(60)), 201, 151)
+    image = draw(sphere, PreviewCamera(T, fov=math.radians(60)), 201, 151)
     assert image[75, 100, 3] == pytest.approx(3.0, abs=2e-3)
     assert (image[0, 0] == (*np.float32(BACKGROUND), 0)).all()
     # The silhouette of a unit sphere at 4 m: tan of its angular radius is 1/sqrt(15).
@@ -62,9 +62,9 @@ def test_depth_of_a_sphere() -> None:
 
 def test_walls_are_open_from_outside_and_closed_from_inside() -> None:
     room = box_room()
-    outside = draw(room, Camera(look((0, -6, 1.4), (0, 1, 0))), 120, 90)
+    outside = draw(room, PreviewCamera(look((0, -6, 1.4), (0, 1, 0))), 120, 90)
     assert outside[45, 60, 3] == pytest.approx(8.0, rel=1e-4)  # through the near wall to the far one
-    inside = draw(room, Camera(look((0, -1, 1.4), (0, 1, 0)), fov=math.radians(90)), 120, 90)
+    inside = draw(room, PreviewCamera(look((0, -1, 1.4), (0, 1, 0)), fov=math.radians(90)), 120, 90)
     assert (inside[..., 3] > 0).all()
     assert inside[45, 60, 3] == pytest.approx(3.0, rel=1e-4)
 
@@ -73,9 +73,9 @@ def test_walls_are_open_from_outside_and_closed_from_inside() -> None:
 def test_triangles_through_the_near_plane_are_cut(near: float) -> None:
     """Floor and walls reach behind the eye; every pixel whose surface is beyond `near` is still drawn."""
     room = box_room()
-    camera = Camera(look((0.3, -1, 1.4), (0, 1, 0)), fov=math.radians(100), near=near)
+    camera = PreviewCamera(look((0.3, -1, 1.4), (0, 1, 0)), fov=math.radians(100), near=near)
     depth = draw(room, camera, 160, 120)[..., 3]
-    full = draw(room, Camera(camera.T_world_camera, camera.fov, near=0.01), 160, 120)[..., 3]
+    full = draw(room, PreviewCamera(camera.T_world_camera, camera.fov, near=0.01), 160, 120)[..., 3]
     assert (full > 0).all()
     beyond = full > near * 1.01
     assert np.allclose(depth[beyond], full[beyond], rtol=1e-4)
@@ -89,7 +89,7 @@ def test_the_nearer_surface_wins() -> None:
     faces = np.array([(0, 1, 2), (0, 2, 3), (4, 5, 6), (4, 6, 7)], np.int32)
     normals = np.tile(np.array((0, 0, -1), np.float32), (8, 1))
     colors = np.repeat(np.array([(255, 0, 0), (0, 255, 0)], np.uint8), 4, axis=0)
-    image = draw(Mesh(vertices, faces, normals, colors), Camera(np.eye(4)), 61, 41)
+    image = draw(Mesh(vertices, faces, normals, colors), PreviewCamera(np.eye(4)), 61, 41)
     assert image[20, 30, 3] == 2.0
     assert image[20, 30, 0] == 0
     assert image[20, 30, 1] > 0.5
@@ -101,7 +101,7 @@ def test_same_bytes_every_time() -> None:
     noisy = Mesh(
         room.vertices + rng.normal(0, 0.3, room.vertices.shape).astype(np.float32), room.faces, room.normals
     )
-    camera = Camera(look((0, -1, 1.4), (0, 1, 0)))
+    camera = PreviewCamera(look((0, -1, 1.4), (0, 1, 0)))
     first = draw(noisy, camera, 160, 120)
     assert all((draw(noisy, camera, 160, 120) == first).all() for _ in range(5))
 
@@ -169,7 +169,7 @@ def test_pixels_equal_the_twin_on_a_heap_of_triangles() -> None:
     random = np.random.default_rng(1)
     corners = random.uniform((-3, -2, -0.5), (3, 2, 6), (60, 1, 3)) + random.normal(0, 0.7, (60, 3, 3))
     mesh = from_trimesh(trimesh.Trimesh(corners.reshape(-1, 3), np.arange(180).reshape(-1, 3), process=False))
-    camera = Camera(np.eye(4), fov=math.radians(70))
+    camera = PreviewCamera(np.eye(4), fov=math.radians(70))
     image = draw(mesh, camera, 80, 60)
     focal = 0.5 * 80 / math.tan(camera.fov / 2)
     seen, depth = kernel_twins.see(mesh.vertices, mesh.faces, focal, (60, 80), camera.near)

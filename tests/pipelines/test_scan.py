@@ -24,11 +24,11 @@ from tsfusion.core.errors import InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.trajectory_files import read_tum, write_tum
 from tsfusion.evaluation.held_out_views import compare_scans
 from tsfusion.geometry.frame import Frame
-from tsfusion.journal.recording import Recording
+from tsfusion.journal.recording import JournalRecording
 from tsfusion.pipelines import scan as pipelines_scan
 from tsfusion.pipelines import target_server
 from tsfusion.scanner.scanner import ScanState
-from tsfusion.scanner.sources.source import Live
+from tsfusion.scanner.sources.source import LiveSource
 from tsfusion.wire.queries import fetch_status
 
 VOXEL = 0.05
@@ -118,7 +118,7 @@ def test_without_taichi_to_a_server_elsewhere(walk: Path, tmp_path: Path) -> Non
         )  # fmt: skip
         assert "give it a map of its own (--map NAME)" in again.stderr
         assert end(process) == 0
-    stamps = [keyframe.timestamp_ns for keyframe in Recording(tmp_path / "state", "hall")]
+    stamps = [keyframe.timestamp_ns for keyframe in JournalRecording(tmp_path / "state", "hall")]
     assert stamps == [*sent.timestamps_ns, stamps[0]]
 
 
@@ -135,7 +135,7 @@ def test_ctrl_c_without_a_server_keeps_all_for_the_next_scan(walk: Path, tmp_pat
     assert 0 < run["frames"] < 40
     assert run["left"] == run["keyframes_sent"] >= 1
     assert "no server answers" in run["link"]
-    assert len(Recording(spool / "default")) == run["left"]
+    assert len(JournalRecording(spool / "default")) == run["left"]
     with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, _):
         more = figures(
             tsfusion(
@@ -256,7 +256,7 @@ class Told:
         self.state = state
 
 
-class Frames(Live):
+class Frames(LiveSource):
     """Frames from a list."""
 
     def __init__(self, frames: list[Frame], *, live: bool = False) -> None:

@@ -9,7 +9,7 @@ from tsfusion.core.config import ScanConfig
 from tsfusion.datasets.dataset import frame_of
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.keyframe_selection import Selector
+from tsfusion.scanner.keyframe_selection import KeyframeSelector
 
 K = Intrinsics(100.0, 100.0, 79.5, 59.5)
 
@@ -27,9 +27,9 @@ def at(*translation: float, degrees: float = 0.0) -> np.ndarray:
     return T
 
 
-def selector(outdoors: bool = False, **rules) -> Selector:
+def selector(outdoors: bool = False, **rules) -> KeyframeSelector:
     """One that has taken a wall at the origin."""
-    made = Selector(ScanConfig(**rules), outdoors=outdoors)
+    made = KeyframeSelector(ScanConfig(**rules), outdoors=outdoors)
     assert made.reason(wall(), at(0, 0, 0)) == "first"
     made.took(wall(), at(0, 0, 0))
     return made
@@ -74,7 +74,7 @@ def test_pairs_points_and_blind_frames_have_no_overlap():
         wall(z=0.0),
     ]
     for frame in frames:
-        made = Selector(ScanConfig(distance=9.0), outdoors=False)
+        made = KeyframeSelector(ScanConfig(distance=9.0), outdoors=False)
         made.took(frame, at(0, 0, 0))
         assert made.reason(frame, at(3, 0, 0)) is None
         assert made.reason(frame, at(9, 0, 0)) == "distance"
@@ -92,7 +92,7 @@ def test_rates_on_real_scenes(data):
     scenes = {"7scenes/redkitchen": {}, "kitti_odometry": {"sequence": "06"}}
     for name, options in scenes.items():
         dataset = open_dataset(data(name), **options)
-        made = Selector(ScanConfig(), outdoors=dataset.sensor == "stereo")
+        made = KeyframeSelector(ScanConfig(), outdoors=dataset.sensor == "stereo")
         taken = []
         for index in range(len(dataset)):
             frame = frame_of(dataset, index)

@@ -16,10 +16,10 @@ from tsfusion.cli import scan_output
 from tsfusion.core.config import ScanConfig
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
-from tsfusion.journal.recording import Recording
-from tsfusion.scanner.localization.localizer import Corrections, Localizer, Lost, Pose
+from tsfusion.journal.recording import JournalRecording
+from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections
 from tsfusion.scanner.scanner import Scanner
-from tsfusion.scanner.tracked_trajectory import Track
+from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 from tsfusion.wire import corrections
 
 FRAME_NS = 100_000_000
@@ -33,7 +33,7 @@ class Scripted:
         self.absolute = absolute
         self.resets = 0
         self._script, self._at, self._anchor = script, -1, 0
-        self._news: Corrections | None = None
+        self._news: PoseCorrections | None = None
         self._anchors: dict[int, np.ndarray] = {}
 
     def track(self, frame: Frame) -> Pose | Lost:
@@ -45,13 +45,13 @@ class Scripted:
         self._anchors[self._anchor] = T
         if self._script[self._at] == "C":
             moved = {number: pose(0, 0.05) @ anchor for number, anchor in self._anchors.items()}
-            self._news = Corrections(revision=1, anchors=moved, T_corrected_world=pose(0, 0.05), loops=1)
+            self._news = PoseCorrections(revision=1, anchors=moved, T_corrected_world=pose(0, 0.05), loops=1)
         return Pose(
             T_world_camera=T, timestamp_ns=frame.timestamp_ns, anchor=self._anchor,
             T_anchor_camera=np.eye(4), starts_anchor=True,
         )  # fmt: skip
 
-    def corrections(self) -> Corrections | None:
+    def corrections(self) -> PoseCorrections | None:
         news, self._news = self._news, None
         return news
 
@@ -87,7 +87,7 @@ def scanned(
 
 def spooled(spools: Path, name: str) -> list[int]:
     """Which frames were to be sent to a map."""
-    return [keyframe.timestamp_ns // FRAME_NS - 1 for keyframe in Recording(spools / name)]
+    return [keyframe.timestamp_ns // FRAME_NS - 1 for keyframe in JournalRecording(spools / name)]
 
 
 def test_a_lost_sensor_sends_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -188,7 +188,7 @@ def test_warnings_stand_above_the_table(capsys: pytest.CaptureFixture[str]) -> N
 
 def test_a_track_gives_back_what_it_took() -> None:
     rng = np.random.default_rng(5)
-    track, poses, references = Track(), [], []
+    track, poses, references = TrackedTrajectory(), [], []
     assert (len(track), len(track.poses()), len(track.keyframes()[0]), track.last_seq) == (0, 0, 0, -1)
     for number in range(20):
         T, T_anchor, reference = (se3.exp(rng.normal(0, 1, 6)) for _ in range(3))
@@ -201,7 +201,9 @@ def test_a_track_gives_back_what_it_took() -> None:
     np.testing.assert_array_equal(track.poses(), [given.T_world_camera for given in poses])
     assert track.stamps_ns == [given.timestamp_ns for given in poses]
     anchors = {number: se3.exp(rng.normal(0, 1, 6)) for number in range(4)}
-    moved = Corrections(revision=1, anchors=anchors, T_corrected_world=se3.exp(rng.normal(0, 1, 6)), loops=1)
+    moved = PoseCorrections(
+        revision=1, anchors=anchors, T_corrected_world=se3.exp(rng.normal(0, 1, 6)), loops=1
+    )
     one_by_one = [
         anchors[given.anchor] @ given.T_anchor_camera
         if given.anchor in anchors
@@ -218,7 +220,7 @@ def test_a_track_gives_back_what_it_took() -> None:
 
 
 def test_a_track_of_an_hour_is_small() -> None:
-    track = Track()
+    track = TrackedTrajectory()
     T = np.eye(4)
     tracemalloc.start()
     for number in range(20_000):

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Corrections, Lost, Pose
+from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
 
 
 class Drifting:
@@ -44,7 +44,7 @@ class Drifting:
             starts_anchor=True,
         )
 
-    def corrections(self) -> Corrections | None:
+    def corrections(self) -> PoseCorrections | None:
         return None
 
     def reset(self) -> None:

@@ -237,7 +237,7 @@ def _checkpoint_seeds() -> list[bytes]:
     found = []
     for blocks in (0, 1, 3):
         layers = {"sums": np.arange(blocks * 512, dtype=np.int64).reshape(blocks, 512)}
-        header = checkpoint.Header(
+        header = checkpoint.CheckpointHeader(
             config=VolumeConfig(), keyframes=1, map_hash="00", layers=["sums"], meta={"done": {}}
         )
         keys = np.arange(blocks, dtype=np.int64)

@@ -11,13 +11,13 @@ from typing import Any
 
 import zmq
 
-from tsfusion.gateway.access_control import Zap
+from tsfusion.gateway.access_control import ZapHandler
 from tsfusion.wire import codec, messages, sockets
 from tsfusion.wire.curve import ServerKeys
-from tsfusion.wire.keyframe_header import VERSION, Header
+from tsfusion.wire.keyframe_header import VERSION, KeyframeHeader
 
 
-def number(header: Header) -> int:
+def number(header: KeyframeHeader) -> int:
     """Which of `wire.wall(i)` this is."""
     return header.timestamp_ns - 10**9
 
@@ -55,7 +55,7 @@ class ScriptedServer:
         self.fuse_to: int | None = None
         self.hold: tuple[float, str, str] | None = None
         self.denial: tuple[str, str] | None = None
-        self.refuses: Callable[[Header], bool] = lambda header: False
+        self.refuses: Callable[[KeyframeHeader], bool] = lambda header: False
         self.keys: ServerKeys | None = None
         self.allowed: dict[str, str] = {}
         self.same_epoch = False
@@ -82,7 +82,7 @@ class ScriptedServer:
         self._stopping.clear()
         self.epoch = self.epoch if self.same_epoch and self.epoch else secrets.token_hex(4)
         self._context: zmq.Context[Any] = zmq.Context()
-        self._zap = Zap(self._context, self.allowed.get)
+        self._zap = ZapHandler(self._context, self.allowed.get)
         self._data = sockets.pull(self._context, 1 << 20, self.keys)
         self._router = sockets.router(self._context, self.keys)
         for made, address in ((self._data, self.address), (self._router, self.control)):

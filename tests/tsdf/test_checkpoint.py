@@ -98,7 +98,7 @@ def forge(path: Path, content: bytes) -> None:
 def test_a_forged_file_is_refused_before_it_asks_for_memory(saved: Path, tmp_path: Path) -> None:
     whole, path = saved.read_bytes()[:-16], tmp_path / "map.tsf"
     size = int.from_bytes(whole[8:12], "little")
-    header = msgspec.msgpack.decode(whole[12 : 12 + size], type=checkpoint.Header)
+    header = msgspec.msgpack.decode(whole[12 : 12 + size], type=checkpoint.CheckpointHeader)
     for change in ({"blocks": 3_000_000}, {"blocks": -1}, {"layers": ["sums", "sums2"]}, {"layers": []}):
         altered = msgspec.msgpack.encode(msgspec.structs.replace(header, **change))
         forge(path, whole[:8] + struct.pack("<I", len(altered)) + altered + whole[12 + size :])

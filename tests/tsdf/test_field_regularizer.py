@@ -19,13 +19,13 @@ from tsfusion import Volume
 from tsfusion.kernels import block_hash, runtime
 from tsfusion.tsdf import field_regularizer
 from tsfusion.tsdf.block_store import pack_keys
-from tsfusion.tsdf.field_regularizer import Settings, along_normals, solve
+from tsfusion.tsdf.field_regularizer import FieldSettings, along_normals, solve
 from tsfusion.tsdf.mesh_extraction import extract
 from tsfusion.tsdf.surface_values import Layers, values_of
 
 QUANTA = 60
-SETTINGS = Settings(smoothness=10.0, edge=0.03, reweightings=2)
-STRONG = Settings(smoothness=500.0, edge=0.03, reweightings=2)
+SETTINGS = FieldSettings(smoothness=10.0, edge=0.03, reweightings=2)
+STRONG = FieldSettings(smoothness=500.0, edge=0.03, reweightings=2)
 
 
 def layers_of(keys: NDArray[np.int64], sums: NDArray[np.int64]) -> Layers:
@@ -89,7 +89,7 @@ def test_a_coarser_start_leads_to_the_same_field(monkeypatch: pytest.MonkeyPatch
     """Where nothing bends more than ε there is one minimum: from wherever it starts, steps lead to it."""
     distance, weight = noisy_roof(2)
     keys, sums = map_of(distance, weight, (-2, -1, -1))
-    often = Settings(smoothness=500.0, edge=4.0, reweightings=30)
+    often = FieldSettings(smoothness=500.0, edge=4.0, reweightings=30)
     assert often.coarser == 1
     raw = np.where(weight > 0, np.rint(distance * QUANTA), np.nan)
     expected = kernel_twins.field(raw, weight / 16, often, QUANTA)
@@ -105,14 +105,14 @@ def test_without_smoothness_the_field_is_raw() -> None:
     distance, weight = noisy_roof(3)
     keys, sums = map_of(distance, weight, (0, 0, 0))
     layers = layers_of(keys, sums)
-    rows = solve(keys, layers, 1.0, settings=Settings(smoothness=0.0, edge=0.03, reweightings=2))
+    rows = solve(keys, layers, 1.0, settings=FieldSettings(smoothness=0.0, edge=0.03, reweightings=2))
     assert np.array_equal(rows, values_of(keys, layers, 1.0), equal_nan=True)
     expected = np.where(weight > 0, np.rint(distance * QUANTA), np.nan)
     assert np.allclose(dense(rows, distance.shape), expected, atol=1e-3, equal_nan=True)
 
 
 @pytest.mark.parametrize("settings", [SETTINGS, STRONG])
-def test_a_ramp_passes_unchanged(settings: Settings) -> None:
+def test_a_ramp_passes_unchanged(settings: FieldSettings) -> None:
     random = np.random.default_rng(4)
     p = centres((24, 16, 16))
     distance = np.clip((p - 8) @ (0.5, 0.25, -0.25), -10, 10)  # sixtieths of a voxel, exactly
@@ -128,7 +128,7 @@ def test_a_ramp_passes_unchanged(settings: Settings) -> None:
 
 
 @pytest.mark.parametrize("settings", [SETTINGS, STRONG])
-def test_a_shift_by_whole_blocks_and_the_order_of_slots_change_no_bit(settings: Settings) -> None:
+def test_a_shift_by_whole_blocks_and_the_order_of_slots_change_no_bit(settings: FieldSettings) -> None:
     distance, weight = noisy_roof(5)
     keys, sums = map_of(distance, weight, (0, 0, 0))
     rows = solve(keys, layers_of(keys, sums), 1.0, settings=settings)
@@ -196,7 +196,7 @@ def test_a_part_equals_the_whole_to_a_hundredth_voxel(monkeypatch: pytest.Monkey
         volume.integrate(formula_scenes.with_noise(view, 0.004, random))
     volume.take_dirty()
     model = volume.model
-    settings = Settings(model.field_smoothness, model.field_edge, model.field_reweightings)
+    settings = FieldSettings(model.field_smoothness, model.field_edge, model.field_reweightings)
     before = np.sort(volume._store.keys)
     old = solve(before, layers(volume), 0.5, settings=settings)
     volume.integrate(formula_scenes.with_noise(views[-1], 0.004, random))
@@ -230,7 +230,7 @@ def test_a_cube_keeps_its_edges_and_its_faces_lose_their_noise() -> None:
     keys, sums = map_of(distance, weight, (0, 0, 0))
     raw = layers_of(keys, sums)
     errors = {}
-    for name, settings in (("raw", Settings(0.0, 0.03, 0)), ("field", Settings(30.0, 0.01, 4))):
+    for name, settings in (("raw", FieldSettings(0.0, 0.03, 0)), ("field", FieldSettings(30.0, 0.01, 4))):
         mesh = extract(keys, raw, 1.0, view=partial(solve, settings=settings))
         q = abs(mesh.vertices - 24.0) - 11.7
         error = abs(np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0))

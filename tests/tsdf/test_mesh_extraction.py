@@ -21,7 +21,7 @@ from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.datasets.formats import stanford_bunny
 from tsfusion.kernels import block_hash, runtime
 from tsfusion.tsdf.block_store import cells_of, pack_keys, unpack_keys
-from tsfusion.tsdf.mesh_extraction import MeshScratch, extract
+from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
 from tsfusion.tsdf.surface_values import Layers
 
 
@@ -187,7 +187,7 @@ def test_a_part_equals_the_same_cells_of_the_whole(known: float) -> None:
     assert whole.colors is not None
     looks = {tuple(v): (*n, *c) for v, n, c in zip(
         whole.vertices.tolist(), whole.normals.tolist(), whole.colors.tolist(), strict=True)}  # fmt: skip
-    scratch = MeshScratch()  # what an earlier mesh left in it must not show
+    scratch = MeshBuffers()  # what an earlier mesh left in it must not show
     total: Counter = Counter()
     for part in (keys[:0], keys[:1], keys[1:8], keys[8:9], keys[9:]):
         mesh = extract(part, layers, 1.0, scratch)

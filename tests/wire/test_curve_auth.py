@@ -17,9 +17,9 @@ from keyframes_and_servers import until
 from zmq.utils import z85
 
 from tsfusion.core.errors import NotAllowed, ServerUnreachable, TransportError
-from tsfusion.gateway.access_control import Zap, sender_of
+from tsfusion.gateway.access_control import ZapHandler, sender_of
 from tsfusion.wire import messages, sockets
-from tsfusion.wire.connection_monitor import Monitor
+from tsfusion.wire.connection_monitor import ConnectionMonitor
 from tsfusion.wire.curve import ClientKeys, ServerKeys
 from tsfusion.wire.messages import Command
 from tsfusion.wire.queries import request
@@ -50,7 +50,7 @@ class Door:
         self.silent = threading.Event()
         self._keys = keys
         self._context: zmq.Context[Any] = zmq.Context()
-        self.zap = Zap(self._context, allowed.get, lambda _: "revoked") if guarded else None
+        self.zap = ZapHandler(self._context, allowed.get, lambda _: "revoked") if guarded else None
         self._open()
         self.addresses = sockets.bind(self._pull, self._router, self._publish, "tcp://127.0.0.1:0", None)
         self._stopping = threading.Event()
@@ -130,7 +130,7 @@ class Caller:
     def __init__(self, kind: Callable[..., sockets.AnySocket], address: str, keys: ClientKeys | None) -> None:
         self._context: zmq.Context[Any] = zmq.Context()
         self.socket = kind(self._context, keys)
-        self.monitor = Monitor(self.socket, address, keys)
+        self.monitor = ConnectionMonitor(self.socket, address, keys)
         self.said: str | None = None
         self.socket.connect(address)
 
@@ -248,7 +248,7 @@ def test_other_ways_in_are_closed(mechanism: str) -> None:
             made.setsockopt_string(zmq.PLAIN_USERNAME, "robot1")
             made.setsockopt_string(zmq.PLAIN_PASSWORD, ROBOT.public)
         address = at.addresses.control if mechanism == "plain" else at.addresses.publish
-        monitor = Monitor(made, address)
+        monitor = ConnectionMonitor(made, address)
         made.connect(address)
         until(lambda: monitor.problem() is not None and monitor.gave_up)
         monitor.close()
@@ -378,10 +378,10 @@ def test_without_keys_a_sender_can_claim_to_be_anybody() -> None:
 
 
 @contextmanager
-def handler(allow: Callable[[str], str | None]) -> Iterator[tuple[Zap, sockets.AnySocket]]:
-    """A Zap, and a socket that asks it as libzmq does."""
+def handler(allow: Callable[[str], str | None]) -> Iterator[tuple[ZapHandler, sockets.AnySocket]]:
+    """A ZapHandler, and a socket that asks it as libzmq does."""
     context: zmq.Context[Any] = zmq.Context()
-    made = Zap(context, allow)
+    made = ZapHandler(context, allow)
     asker: sockets.AnySocket = context.socket(zmq.DEALER)
     asker.setsockopt(zmq.LINGER, 0)
     asker.connect("inproc://zeromq.zap.01")
@@ -514,7 +514,7 @@ def test_monitors_leave_no_file_open() -> None:
         counts = []
         for _ in range(20):
             made = sockets.push(context, ROBOT)
-            watched = Monitor(made, at.addresses.data, ROBOT)
+            watched = ConnectionMonitor(made, at.addresses.data, ROBOT)
             made.connect(at.addresses.data)
             until(lambda watched=watched: watched.problem() == "")
             watched.close()

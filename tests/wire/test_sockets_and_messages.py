@@ -13,11 +13,11 @@ import zmq
 
 from tsfusion.core.errors import DecodeError, InvalidConfig, ServerUnreachable, TransportError
 from tsfusion.delivery.timing import ClockOffset
-from tsfusion.gateway.client_routes import Routes
+from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.keyframe_index import KeyframeIndex
-from tsfusion.gateway.keyframe_outcomes import Delays
+from tsfusion.gateway.keyframe_outcomes import DelayStatistics
 from tsfusion.gateway.ports import Subscriptions
-from tsfusion.gateway.sessions import Session, Sessions, Turns
+from tsfusion.gateway.sessions import FairQueue, Session, Sessions
 from tsfusion.journal import Position, Scan, quarantine
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import messages, sockets
@@ -170,7 +170,7 @@ def test_sessions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_strangers_do_not_grow_the_sessions() -> None:
-    sessions, routes = Sessions(), Routes()
+    sessions, routes = Sessions(), ClientRoutes()
     for i in range(3000):
         routes.connect(i.to_bytes(16, "big"), "default", b"id")
         assert sessions.admit(i.to_bytes(16, "big"), 1, 0) == "next"
@@ -180,7 +180,7 @@ def test_strangers_do_not_grow_the_sessions() -> None:
 
 
 def test_a_live_session_is_not_taken_over() -> None:
-    routes = Routes()
+    routes = ClientRoutes()
     route = routes.connect(SESSION, "default", b"1", "robot")
     assert not route.open_to("thief")
     assert routes.connect(SESSION, "default", b"3", "robot") is route
@@ -196,7 +196,7 @@ def key_of(number: int) -> bytes:
 
 
 def test_a_flood_of_greetings_pushes_out_those_of_its_own_name_only() -> None:
-    routes = Routes()
+    routes = ClientRoutes()
     routes.connect(SESSION, "default", b"1", "cart")
     for number in range(3000):
         routes.connect(key_of(number), "default", b"2", "robot")
@@ -205,7 +205,7 @@ def test_a_flood_of_greetings_pushes_out_those_of_its_own_name_only() -> None:
 
 
 def test_many_names_share_the_routes_fairly() -> None:
-    routes = Routes()
+    routes = ClientRoutes()
     routes.connect(SESSION, "default", b"1", "cart")
     for number in range(6000):
         routes.connect(key_of(number), "default", b"2", f"robot{number % 40}")
@@ -214,7 +214,7 @@ def test_many_names_share_the_routes_fairly() -> None:
 
 
 def test_who_scans_is_not_pushed_out_by_who_only_greets() -> None:
-    routes = Routes()
+    routes = ClientRoutes()
     routes.heard(routes.connect(SESSION, "default", b"1"), scans=True)
     routes.connect(b"known".ljust(16), "default", b"1", scans=True)
     for number in range(3000):
@@ -224,7 +224,7 @@ def test_who_scans_is_not_pushed_out_by_who_only_greets() -> None:
 
 
 def test_who_scanned_once_shuts_nobody_out() -> None:
-    routes = Routes()
+    routes = ClientRoutes()
     for number in range(2000):
         routes.connect(key_of(number), "default", b"2", scans=True)
     route = routes.connect(SESSION, "default", b"1")
@@ -234,7 +234,7 @@ def test_who_scanned_once_shuts_nobody_out() -> None:
 
 def test_the_fuser_takes_from_each_client_in_turn() -> None:
     """One that floods holds nobody up; each session keeps its order."""
-    turns, sessions, index = Turns(), Sessions(), KeyframeIndex()
+    turns, sessions, index = FairQueue(), Sessions(), KeyframeIndex()
     flood, more, small = (sessions.open(bytes([i]) * 16, client) for i, client in enumerate("aab"))
     for seq in range(1, 7):
         for session in (flood, more):
@@ -306,7 +306,7 @@ def test_the_index_keeps_stamps() -> None:
 
 
 def test_delays_are_published_with_their_bound() -> None:
-    delays = Delays()
+    delays = DelayStatistics()
     assert (delays.summary().count, delays.bound_ms) == (0, 0.0)
     for delay_ns, bound_ns in ((5_000_000, 100_000), (7_000_000, 300_000)):
         delays.add(delay_ns, bound_ns)
@@ -314,7 +314,7 @@ def test_delays_are_published_with_their_bound() -> None:
 
 
 def test_a_delay_that_cannot_be_does_not_count() -> None:
-    delays = Delays()
+    delays = DelayStatistics()
     day = 86_400 * 10**9
     assert [delays.add(delay, 1000) for delay in (-1000, day, -1001, day + 1, -(1 << 62))] == [
         *(True, True, False, False, False)
@@ -324,7 +324,7 @@ def test_a_delay_that_cannot_be_does_not_count() -> None:
 
 @pytest.mark.parametrize("clock", [(1 << 62, 0), (-(1 << 62), 0), (5, -1), (5, 1 << 62), (5, 3601 * 10**9)])
 def test_a_clock_that_cannot_be_is_not_believed(clock: tuple[int, int]) -> None:
-    route = Routes().connect(SESSION, "default", b"1")
+    route = ClientRoutes().connect(SESSION, "default", b"1")
     route.said(Ping(SESSION, 1, 7, 3, waiting=2))
     assert (route.offset_ns, route.bound_ns, route.waiting) == (7, 3, 2)
     route.said(Ping(SESSION, 1, *clock, waiting=4))

@@ -62,9 +62,9 @@ def _root(
     version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
 ) -> None:
     if version:
-        from tsfusion import __version__
+        from importlib.metadata import version as installed
 
-        typer.echo(f"tsfusion {__version__}")
+        typer.echo(f"tsfusion {installed('tsfusion')}")
     elif context.invoked_subcommand is None:
         typer.echo(context.get_help())
 

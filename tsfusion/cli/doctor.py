@@ -150,12 +150,14 @@ def _kernels() -> Finding:
     import numpy as np
 
     from tsfusion.geometry.mesh import Mesh
-    from tsfusion.pipelines.mesh_preview import Camera, draw
+    from tsfusion.pipelines.mesh_preview import PreviewCamera, draw
 
     started = time.perf_counter()
     corners = np.array([(-9, -9, 2), (-9, 9, 2), (9, 9, 2)], np.float32)
     normals = np.tile(np.array((0, 0, -1), np.float32), (3, 1))
-    depth = draw(Mesh(corners, np.array([(0, 1, 2)], np.int32), normals), Camera(np.eye(4)), 8, 8)[..., 3]
+    depth = draw(Mesh(corners, np.array([(0, 1, 2)], np.int32), normals), PreviewCamera(np.eye(4)), 8, 8)[
+        ..., 3
+    ]
     seconds = time.perf_counter() - started
     if depth[6, 1] != 2:
         return Finding(

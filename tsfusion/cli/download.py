@@ -9,7 +9,7 @@ import typer
 from tsfusion.cli import options
 
 if TYPE_CHECKING:
-    from tsfusion.datasets.download.catalogue import Recording
+    from tsfusion.datasets.download.catalogue import PublicRecording
     from tsfusion.datasets.download.download import Checked
 
 
@@ -47,7 +47,7 @@ def download(
         _fetch(catalogue.entry(name), to, base, json=json)
 
 
-def _list(recordings: "list[Recording]", *, json: bool) -> None:
+def _list(recordings: "list[PublicRecording]", *, json: bool) -> None:
     from tsfusion.cli import output
 
     if json:
@@ -60,7 +60,7 @@ def _list(recordings: "list[Recording]", *, json: bool) -> None:
         typer.echo(f"{one.name:<24}  {size:>12}  {one.title}\n{'':<24}  {'':>12}  {one.licence}; {one.page}")
 
 
-def _fetch(recording: "Recording", to: Path, base: str | None, *, json: bool) -> None:
+def _fetch(recording: "PublicRecording", to: Path, base: str | None, *, json: bool) -> None:
     from tsfusion.cli import output
     from tsfusion.datasets.download import download
 
@@ -76,7 +76,7 @@ def _fetch(recording: "Recording", to: Path, base: str | None, *, json: bool) ->
     typer.echo(f"{done.path}\nnext: tsfusion replay {done.path}")
 
 
-def _check(recordings: "list[Recording]", to: Path, *, json: bool) -> None:
+def _check(recordings: "list[PublicRecording]", to: Path, *, json: bool) -> None:
     from tsfusion.cli import output
     from tsfusion.datasets.download import download
 

@@ -10,8 +10,8 @@ import typer
 from tsfusion.cli import options
 
 if TYPE_CHECKING:
-    from tsfusion.journal.inspection import Info, Problem, SessionInfo, Verdict
-    from tsfusion.journal.state_folder import Place
+    from tsfusion.journal.inspection import JournalInfo, Problem, SessionInfo, Verdict
+    from tsfusion.journal.state_folder import JournalPlace
 
 _MOST_LINES = 20  # of one kind, for a person; --json has all
 
@@ -162,7 +162,7 @@ def export(
         raise typer.Exit(1)
 
 
-def _find(path: Path, map_name: str | None) -> "Place":
+def _find(path: Path, map_name: str | None) -> "JournalPlace":
     from tsfusion.journal.state_folder import find
 
     return find(path, map_name)
@@ -176,7 +176,7 @@ def _loss(lost: int) -> str:
     return f"{_count(lost, 'keyframe')} lost, at least" if lost else "no keyframe is lost"
 
 
-def _describe_info(found: "Info") -> str:
+def _describe_info(found: "JournalInfo") -> str:
     from tsfusion.cli.output import size
 
     lines = [

@@ -12,7 +12,7 @@ from tsfusion.cli import options
 if TYPE_CHECKING:
     from tsfusion.core.config import VolumeConfig
     from tsfusion.geometry.mesh import Mesh
-    from tsfusion.journal.recording import Recording
+    from tsfusion.journal.recording import JournalRecording
     from tsfusion.tsdf.volume import Volume
 
 
@@ -91,10 +91,10 @@ def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bo
     if source.suffix == ".tsf":
         return Volume.load(source, config.threads, **view)
     from tsfusion.journal import state_folder
-    from tsfusion.journal.recording import Recording
+    from tsfusion.journal.recording import JournalRecording
 
     source = state_folder.resolve(source, name)
-    recording = Recording(source)
+    recording = JournalRecording(source)
     saved = source / state_folder.MAP_FILE
     if saved.is_file() and not given:
         volume = Volume.load(saved, config.threads, **view)
@@ -104,7 +104,7 @@ def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bo
     return _fuse(recording, Volume(config), quiet)
 
 
-def _fuse(recording: "Recording", volume: "Volume", quiet: bool) -> "Volume":
+def _fuse(recording: "JournalRecording", volume: "Volume", quiet: bool) -> "Volume":
     """Add every keyframe; as in the server, one that the map cannot take is counted and left out."""
     from tsfusion.cli import output
     from tsfusion.core.errors import MapError

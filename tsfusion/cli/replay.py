@@ -107,12 +107,12 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
     """A dataset, or a journal; `given` are settings of a dataset, None = left out."""
     if _is_journal(path):
         from tsfusion.core.errors import DatasetError
-        from tsfusion.journal.recording import Recording
+        from tsfusion.journal.recording import JournalRecording
 
         for name, value in given.items():
             if value is not None and name != "posed":
                 raise DatasetError(f"--{name} has no effect on a journal")
-        return Recording(path)
+        return JournalRecording(path)
     from tsfusion.datasets import describe, open_dataset
 
     dataset = open_dataset(path, unpack=unpack, **given)

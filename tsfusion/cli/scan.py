@@ -157,7 +157,7 @@ def _open(
     part: dict[str, Any],
 ) -> "Source":
     """The source by its name, as much of it as is asked for."""
-    from tsfusion.scanner.sources.recorded import Limited
+    from tsfusion.scanner.sources.recorded import LimitedSource
 
     if is_live(spec):
         options.refuse(
@@ -166,12 +166,12 @@ def _open(
             "is for recordings, and this source is live",
         )
         live = open_source(spec, calibration=calibration)
-        return live if part["limit"] is None else Limited(live, part["limit"])
+        return live if part["limit"] is None else LimitedSource(live, part["limit"])
     options.refuse(context, ("calibration",), "is for a live camera")
     from tsfusion.cli.replay import open_recording
     from tsfusion.core.errors import DatasetError
     from tsfusion.datasets import select
-    from tsfusion.scanner.sources.recorded import Recorded
+    from tsfusion.scanner.sources.recorded import RecordedSource
 
     path = Path(spec)
     if not spec.startswith("synthetic:") and not path.expanduser().exists():
@@ -180,7 +180,7 @@ def _open(
             "realsense, camera:0, folder:PATH (docs/sources.md)"
         )
     dataset = open_recording(path, **recording, posed=False)
-    return Recorded(select(dataset, **part), rate=rate)
+    return RecordedSource(select(dataset, **part), rate=rate)
 
 
 @contextmanager

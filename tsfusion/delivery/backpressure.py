@@ -30,7 +30,7 @@ class Backpressure:
     def __init__(self, outbox: Outbox, config: ClientConfig) -> None:
         self._outbox = outbox
         self._config = config
-        self._room = Room(outbox, config.spool_bytes, config.min_free_bytes)
+        self._room = SpoolLimits(outbox, config.spool_bytes, config.min_free_bytes)
         self._passed_over = 0
 
     @property
@@ -107,7 +107,7 @@ _RETRY_INTERVAL = 0.5  # seconds until a disk that refused is tried again: each 
 _MAX_WAITING = 1_000_000  # keyframes: some 200 bytes of memory each
 
 
-class Room:
+class SpoolLimits:
     """The limits of a spool. Call under `outbox.changed`; what it says stands in `outbox.state`.
 
     Args:

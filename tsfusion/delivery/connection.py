@@ -7,7 +7,7 @@ from typing import Any
 import zmq
 
 from tsfusion.wire import sockets
-from tsfusion.wire.connection_monitor import Monitor
+from tsfusion.wire.connection_monitor import ConnectionMonitor
 from tsfusion.wire.curve import ClientKeys
 
 _RETRY_INTERVAL = 2.0  # seconds; an allowed key is let in soon, a forbidden one is no burden
@@ -41,7 +41,7 @@ class Connection:
 
     def _open(self) -> None:
         self.socket = self._make(self._context, self._keys)
-        self._monitor = Monitor(self.socket, self._address, self._keys)
+        self._monitor = ConnectionMonitor(self.socket, self._address, self._keys)
         self._lost = 0
         self.socket.connect(self._address)
 

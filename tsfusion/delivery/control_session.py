@@ -27,7 +27,7 @@ _News: TypeAlias = (
 )
 
 
-class Conversation:
+class ControlSession:
     """One client's side. For the sending thread only; `heard` may be read by any.
 
     Args:

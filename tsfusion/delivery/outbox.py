@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.delivery.correction_queue import Correcting
 from tsfusion.delivery.spool import Spool, Waiting
-from tsfusion.delivery.timing import Times
+from tsfusion.delivery.timing import KeyframeTimesTable
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.wire.keyframe_times import Stamps
 
@@ -85,7 +85,7 @@ class Outbox:
         self.opening = False
         self.skipped: Counter[str] = Counter()
         self.state = "ok"
-        self.times = Times()
+        self.times = KeyframeTimesTable()
         self.durable = 0
         self.correcting = Correcting(spool)
         self._sent = self._durable = self._fused = 0

@@ -18,7 +18,7 @@ import zmq
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.delivery.connection import Connection
-from tsfusion.delivery.control_session import Conversation
+from tsfusion.delivery.control_session import ControlSession
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.refused_keyframes import RefusedFolder
 from tsfusion.delivery.spool import Waiting
@@ -50,7 +50,7 @@ class Sender:
         self._outbox = outbox
         self._config = config
         self._refused = RefusedFolder(outbox)
-        self._talk = Conversation(outbox, self._refused, self._say, address=control, map_name=config.map)
+        self._talk = ControlSession(outbox, self._refused, self._say, address=control, map_name=config.map)
         self._stopping = threading.Event()
         self._waker, self._woken = socket.socketpair()
         self._waker.setblocking(False)

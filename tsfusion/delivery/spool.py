@@ -20,7 +20,7 @@ from tsfusion import journal
 from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.core.folder_lock import lock_folder
-from tsfusion.delivery.tombstones import Gone
+from tsfusion.delivery.tombstones import Tombstones
 from tsfusion.wire.keyframe_header import unpack
 
 log = logging.getLogger(__name__)
@@ -97,7 +97,7 @@ class Spool:
         if len(sessions) > 1:
             raise JournalError(f"{self.folder} holds keyframes of {len(sessions)} sessions: not one spool")
         self.session = sessions.pop()
-        self._gone = Gone(self.folder, self.session)
+        self._gone = Tombstones(self.folder, self.session)
         self._many_gone = 2 * self._gone.written + _MANY_GONE
         self._segments = {number: Segment(self._size(number)) for number in journal.segments(self.folder)}
         self.waiting: deque[Waiting] = deque()

@@ -14,7 +14,7 @@ _COLUMN = {name: place for place, name in enumerate(_FIELDS)}
 _OF_THE_SERVER = ("received_ns", "durable_ns", "fuse_start_ns", "fused_ns", "meshed_ns")
 
 
-class Times:
+class KeyframeTimesTable:
     """A row a keyframe; a new one takes the place of the one that came `CAPACITY` numbers before."""
 
     def __init__(self) -> None:

@@ -19,7 +19,7 @@ _SESSION_BYTES = 16
 log = logging.getLogger(__name__)
 
 
-class Gone:
+class Tombstones:
     """A file of numbers, behind the session they belong to. A disk that refuses is passed over.
 
     Attributes:

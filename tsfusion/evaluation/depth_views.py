@@ -27,7 +27,7 @@ _TREE = 20_000  # points of a scan that others are compared with
 _EXACT_TREE = 4  # FLANN_INDEX_KDTREE_SINGLE
 
 
-class View(Protocol):
+class DepthView(Protocol):
     """A frame's measurement.
 
     Attributes:
@@ -46,9 +46,9 @@ class View(Protocol):
         ...
 
 
-def view_of(frame: Frame) -> View | None:
+def view_of(frame: Frame) -> DepthView | None:
     """The frame's measurement, None when too little was measured."""
-    made: View
+    made: DepthView
     if frame.points is not None:
         made = _Scan(frame.points)
     elif frame.kind == "pair":

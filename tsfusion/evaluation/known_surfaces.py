@@ -73,7 +73,7 @@ class Solid:
         return np.stack(slope, axis=1) / (2 * _STEP)
 
 
-class Reference:
+class ReferenceSurface:
     """A reference mesh, sampled: the distance is that from the triangle of the nearest sample.
 
     Args:

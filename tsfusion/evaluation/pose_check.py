@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.datasets.dataset import Dataset, frame_of, pose_of
-from tsfusion.evaluation.depth_views import View, view_of
+from tsfusion.evaluation.depth_views import DepthView, view_of
 from tsfusion.evaluation.pose_mistakes import MISTAKES, SCALES, or_text, scale_text, untold_text
 from tsfusion.geometry import se3
 from tsfusion.geometry.trajectory import Pose
@@ -49,7 +49,7 @@ _UNEXPLAINED = (
 
 
 @dataclass(frozen=True)
-class Report:
+class PoseCheckReport:
     """What a check found.
 
     Attributes:
@@ -77,7 +77,7 @@ class Report:
     tried: dict[str, float] = field(default_factory=dict)
 
 
-def check(dataset: Dataset) -> Report:
+def check(dataset: Dataset) -> PoseCheckReport:
     """Compare some neighbouring frames of a dataset under its poses and under those of usual mistakes.
 
     Takes about a second, of a LiDAR two; reads about 20 frames.
@@ -87,13 +87,13 @@ def check(dataset: Dataset) -> Report:
     """
     pairs = _pairs(dataset)
     if not pairs:
-        return Report("cannot tell", "no two frames with a pose and a measurement")
+        return PoseCheckReport("cannot tell", "no two frames with a pose and a measurement")
     motions = [pair.motion() for pair in pairs]
     given = _fits(pairs, motions)
     best = _refined(pairs, motions)
     tried = {mistake.name: _fits(pairs, [p.motion(mistake.meant) for p in pairs]) for mistake in MISTAKES}
     report = partial(
-        Report,
+        PoseCheckReport,
         pairs=len(pairs),
         fit=_mean(given, best >= _FITS),
         best_fit=_mean(best, best >= _FITS),
@@ -134,8 +134,8 @@ class _Pair:
     first: int
     second: int
     poses: tuple[Pose, Pose]
-    seen: View
-    by: View
+    seen: DepthView
+    by: DepthView
 
     def motion(self, meant: Callable[[Pose], Motion] = np.asarray) -> Motion:
         """From the first sensor's axes to the second's."""
@@ -165,7 +165,7 @@ def _pairs(dataset: Dataset) -> list[_Pair]:
     return pairs
 
 
-def _seen(dataset: Dataset, index: int) -> tuple[Pose, View] | None:
+def _seen(dataset: Dataset, index: int) -> tuple[Pose, DepthView] | None:
     frame = frame_of(dataset, index)
     view = None if frame.T_world_camera is None else view_of(frame)
     return None if view is None or frame.T_world_camera is None else (frame.T_world_camera, view)

@@ -10,7 +10,7 @@ from tsfusion.core.errors import MissingDependency
 _CHUNK = 1 << 21  # point-segment pairs measured at once
 
 
-class Spread(msgspec.Struct, frozen=True):
+class DistanceSpread(msgspec.Struct, frozen=True):
     """A set of errors in three figures, millimetres; NaN of none."""
 
     mean: float
@@ -18,12 +18,14 @@ class Spread(msgspec.Struct, frozen=True):
     p95: float
 
 
-def spread_mm(error: NDArray[np.floating]) -> Spread:
+def spread_mm(error: NDArray[np.floating]) -> DistanceSpread:
     """Mean, root mean square and 95th percentile of |error|: (n,) metres → millimetres."""
     if not len(error):
-        return Spread(np.nan, np.nan, np.nan)
+        return DistanceSpread(np.nan, np.nan, np.nan)
     size = np.abs(error).astype(np.float64) * 1e3
-    return Spread(float(size.mean()), float(np.sqrt((size**2).mean())), float(np.percentile(size, 95)))
+    return DistanceSpread(
+        float(size.mean()), float(np.sqrt((size**2).mean())), float(np.percentile(size, 95))
+    )
 
 
 def percent_within(error: NDArray[np.floating], tolerance: float) -> float:

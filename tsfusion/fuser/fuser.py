@@ -24,7 +24,7 @@ from tsfusion import journal
 from tsfusion.core import process
 from tsfusion.core.errors import TsfusionError
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.fuser.saved_map import SavedMap
+from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.journal import state_folder
 from tsfusion.wire import codec, sockets
@@ -52,11 +52,11 @@ class Fuser:
         self._next_mesh = 0.0
         self._rough = np.zeros((0, 3), np.int32)  # cells that viewers have as fused only
         self._hashes: tuple[int, str, str] | None = None
-        self._working = Working(begin.working)
+        self._working = CurrentKeyframe(begin.working)
         self._most = process.data_bytes() + _SET_ASIDE + begin.memory_bytes
         process.limit_memory(self._most)
         self.exit_status: int | None = None
-        self._map = SavedMap(self._folder, begin.volume, keep_previous=begin.keep_previous)
+        self._map = MapCheckpoints(self._folder, begin.volume, keep_previous=begin.keep_previous)
         self._volume = self._map.volume
         self._volume.warm_up()
 
@@ -71,7 +71,7 @@ class Fuser:
         """Do what the gateway says."""
         if isinstance(message, fuser_messages.Fuse):
             self._fuse(message)
-        elif isinstance(message, fuser_messages.Ask):
+        elif isinstance(message, fuser_messages.FuserQuery):
             self._answer(message)
         elif isinstance(message, fuser_messages.Publish):
             self._watched = message.wanted
@@ -167,7 +167,7 @@ class Fuser:
             self._working.at(fuser_messages.NOT_WORKING)  # not if it ended the process, however it did
         if reason is not None:
             self._map.rejected[reason] = self._map.rejected.get(reason, 0) + 1
-        self._map.done[order.session] = fuser_messages.Progress(order.seq, order.client)
+        self._map.done[order.session] = fuser_messages.SessionProgress(order.seq, order.client)
         self._send(fuser_messages.Done(order.index, start, time.monotonic_ns(), reason, message))
         self._since_checkpoint += 1
         if self._begin.checkpoint_every and self._since_checkpoint >= self._begin.checkpoint_every:
@@ -181,16 +181,16 @@ class Fuser:
         self._send(fuser_messages.Saved(written))
         return not self._since_checkpoint
 
-    def _answer(self, ask: fuser_messages.Ask) -> None:
+    def _answer(self, ask: fuser_messages.FuserQuery) -> None:
         try:
             if ask.command.name == "mesh":
                 layout, frames = _mesh_frames(self._volume.extract_mesh(ask.command.min_weight))
-                self._send(fuser_messages.Answer(ask.number, layout=layout), frames)
+                self._send(fuser_messages.FuserReply(ask.number, layout=layout), frames)
             else:
-                self._send(fuser_messages.Answer(ask.number, status=self._status()))
+                self._send(fuser_messages.FuserReply(ask.number, status=self._status()))
         except (TsfusionError, ArithmeticError, ValueError, MemoryError) as error:
             # whatever was asked, the map goes on: a crash would be blamed on the next keyframe
-            self._send(fuser_messages.Answer(ask.number, error=str(error) or type(error).__name__))
+            self._send(fuser_messages.FuserReply(ask.number, error=str(error) or type(error).__name__))
 
     def _status(self) -> fuser_messages.FuserStatus:
         stats = self._volume.stats()
@@ -216,7 +216,7 @@ class Fuser:
         self._link.send_multipart([fuser_messages.encode(message), *(frames or [])], copy=False)
 
 
-class Working:
+class CurrentKeyframe:
     """A word of memory that outlives the process: which keyframe it is at."""
 
     def __init__(self, path: str) -> None:

@@ -38,7 +38,7 @@ class Begin(Struct, frozen=True, tag="begin"):
     memory_bytes: int
 
 
-class Progress(Struct, frozen=True, array_like=True):
+class SessionProgress(Struct, frozen=True, array_like=True):
     """How far the map is with a session: fused or rejected up to `seq`; `client` owns the session."""
 
     seq: int
@@ -59,7 +59,7 @@ class Fuse(Struct, frozen=True, tag="fuse"):
     skip: str | None = None
 
 
-class Ask(Struct, frozen=True, tag="ask"):
+class FuserQuery(Struct, frozen=True, tag="ask"):
     """Answer a person's command between two keyframes."""
 
     number: int
@@ -87,7 +87,7 @@ class Started(Struct, frozen=True, tag="started"):
 class Ready(Struct, frozen=True, tag="ready"):
     """Kernels are warm. `done`: how far the map is, by session. `rejected`: reason → count."""
 
-    done: dict[bytes, Progress]
+    done: dict[bytes, SessionProgress]
     keyframes: int = 0
     rejected: dict[str, int] = {}
     blocks: int = 0
@@ -149,7 +149,7 @@ class FuserStatus(Struct, frozen=True):
     config: dict[str, Any]
 
 
-class Answer(Struct, frozen=True, tag="answer"):
+class FuserReply(Struct, frozen=True, tag="answer"):
     """To an Ask; arrays of a mesh follow as frames."""
 
     number: int
@@ -158,8 +158,8 @@ class Answer(Struct, frozen=True, tag="answer"):
     layout: MeshLayout | None = None
 
 
-ToFuser = Begin | Fuse | Ask | Publish | Save | Finish
-ToGateway = Started | Ready | Failed | Done | Saved | Meshed | Answer
+ToFuser = Begin | Fuse | FuserQuery | Publish | Save | Finish
+ToGateway = Started | Ready | Failed | Done | Saved | Meshed | FuserReply
 to_fuser: "msgspec.msgpack.Decoder[ToFuser]" = msgspec.msgpack.Decoder(ToFuser)
 to_gateway: "msgspec.msgpack.Decoder[ToGateway]" = msgspec.msgpack.Decoder(ToGateway)
 encode = msgspec.msgpack.encode

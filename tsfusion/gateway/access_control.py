@@ -18,7 +18,7 @@ from tsfusion.wire.key_folder import AllowList
 log = logging.getLogger(__name__)
 
 
-class Door:
+class AccessControl:
     """The allow-list of one server; without a folder of keys everybody who can reach it may come in.
 
     Args:
@@ -35,14 +35,14 @@ class Door:
     def __init__(self, context: "zmq.Context[Any]", folder: str | None) -> None:
         self.keys: ServerKeys | None = None
         self._allowed: AllowList | None = None
-        self._zap: Zap | None = None
+        self._zap: ZapHandler | None = None
         self._revoked = False
         if folder is not None:
             self.keys = server_keys(folder)
             self._allowed = AllowList(Path(folder))
             if self._allowed.problem:  # who starts a server is there to mend it; later, nobody is let in
                 raise InvalidConfig(self._allowed.problem)
-            self._zap = Zap(context, self._allowed.name_of, self._allowed.why_not)
+            self._zap = ZapHandler(context, self._allowed.name_of, self._allowed.why_not)
         self.poll = [] if self._zap is None else [self._zap.socket]
 
     @property
@@ -86,7 +86,7 @@ _KEY_BYTES = 32
 Allow = Callable[[str], str | None]
 
 
-class Zap:
+class ZapHandler:
     """Answers for one context. Make it before the sockets with keys bind; close it after them.
 
     Args:

@@ -18,7 +18,7 @@ _LARGEST_OFFSET_NS = 10 * 366 * 86_400 * 10**9  # ten years; monotonic clocks be
 _LARGEST_BOUND_NS = 3600 * 10**9
 
 
-class Route(Struct, eq=False):
+class ClientRoute(Struct, eq=False):
     """A live client.
 
     Attributes:
@@ -87,20 +87,20 @@ class Route(Struct, eq=False):
         )
 
 
-class Routes:
+class ClientRoutes:
     """The live clients, by session. When they are too many, the longest unheard of the largest name goes:
     nobody's greetings push out others. Within a name, those that never sent a keyframe go first."""
 
     def __init__(self) -> None:
-        self._by_session: dict[bytes, Route] = {}
-        self._names: dict[str, Crowd] = {}
+        self._by_session: dict[bytes, ClientRoute] = {}
+        self._names: dict[str, _NameRoutes] = {}
 
-    def __iter__(self) -> Iterator[Route]:
+    def __iter__(self) -> Iterator[ClientRoute]:
         return iter(self._by_session.values())
 
     def connect(
         self, session: bytes, map_name: str, identity: bytes, client: str = "", *, scans: bool = False
-    ) -> Route:
+    ) -> ClientRoute:
         """Answers for this session go to this connection from now on.
 
         Args:
@@ -109,7 +109,7 @@ class Routes:
         route = self._by_session.get(session)
         if route is None or route.client != client or route.map != map_name:
             self._drop(route)
-            route = self._by_session[session] = Route(session, map_name, identity, client)
+            route = self._by_session[session] = ClientRoute(session, map_name, identity, client)
         route.identity = identity
         route.scans |= scans
         self.heard(route)
@@ -120,19 +120,19 @@ class Routes:
             self._drop(max(self._names.values(), key=len).least())
         return route
 
-    def heard(self, route: Route, *, scans: bool = False) -> None:
+    def heard(self, route: ClientRoute, *, scans: bool = False) -> None:
         """It is alive: now the last of those that could be pushed out.
 
         Args:
             scans: it sent a keyframe.
         """
         route.heard = time.monotonic()
-        crowd = self._names.setdefault(route.client, Crowd())
+        crowd = self._names.setdefault(route.client, _NameRoutes())
         crowd.remove(route)
         route.scans |= scans
         crowd.add(route)
 
-    def _drop(self, route: Route | None) -> None:
+    def _drop(self, route: ClientRoute | None) -> None:
         if route is not None:
             del self._by_session[route.session]
             crowd = self._names[route.client]
@@ -140,7 +140,7 @@ class Routes:
             if not len(crowd):
                 del self._names[route.client]
 
-    def get(self, session: bytes) -> Route | None:
+    def get(self, session: bytes) -> ClientRoute | None:
         """The connection of a session's client, if it said hello here."""
         return self._by_session.get(session)
 
@@ -150,26 +150,26 @@ class Routes:
         self._names.clear()
 
 
-class Crowd:
+class _NameRoutes:
     """The routes of one client name, longest unheard first."""
 
     def __init__(self) -> None:
-        self._new: OrderedDict[bytes, Route] = OrderedDict()
-        self._scan: OrderedDict[bytes, Route] = OrderedDict()
+        self._new: OrderedDict[bytes, ClientRoute] = OrderedDict()
+        self._scan: OrderedDict[bytes, ClientRoute] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._new) + len(self._scan)
 
-    def add(self, route: Route) -> None:
+    def add(self, route: ClientRoute) -> None:
         """The last heard."""
         (self._scan if route.scans else self._new)[route.session] = route
 
-    def remove(self, route: Route) -> None:
+    def remove(self, route: ClientRoute) -> None:
         """If it is here."""
         self._new.pop(route.session, None)
         self._scan.pop(route.session, None)
 
-    def least(self) -> Route:
+    def least(self) -> ClientRoute:
         """Which to do without. Some are always new ones: nobody is shut out by all who ever scanned."""
         crowd = self._new if len(self._new) > _NEW_ROUTES or not self._scan else self._scan
         return next(iter(crowd.values()))

@@ -16,8 +16,8 @@ from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.gateway.hosted_map import HostedMap
-from tsfusion.gateway.keyframe_intake import Intake
-from tsfusion.gateway.map_registry import Atlas
+from tsfusion.gateway.keyframe_intake import KeyframeIntake
+from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.wire import corrections
 from tsfusion.wire.corrections import Corrections, SessionCorrections
@@ -35,7 +35,7 @@ _RATE = 20.0  # messages a second of a client
 class Corrector:
     """The way from the control socket into the maps' corrections."""
 
-    def __init__(self, server: ServerConfig, maps: Atlas, intake: Intake) -> None:
+    def __init__(self, server: ServerConfig, maps: MapRegistry, intake: KeyframeIntake) -> None:
         self._server = server
         self._maps = maps
         self._intake = intake

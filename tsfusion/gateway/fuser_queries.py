@@ -16,9 +16,9 @@ from msgspec import Struct
 from tsfusion.core import process
 from tsfusion.core.config import ServerConfig
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.gateway.fuser_supervisor import FuserLink
+from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.hosted_map import HostedMap
-from tsfusion.gateway.memory_guard import Departures
+from tsfusion.gateway.memory_guard import PendingReplies
 from tsfusion.wire import health, messages
 from tsfusion.wire.health import Health, Status
 
@@ -27,7 +27,7 @@ _KEYFRAMES_SHARE = 3  # a mesh, then three times as long none: a quarter of a bu
 _RESTARTS = f"the fuser restarts; {messages.ASK_AGAIN}"
 
 
-class Answer(Protocol):
+class SendReply(Protocol):
     """How an answer leaves."""
 
     def __call__(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
@@ -38,7 +38,7 @@ class Asked(Protocol):
     """A map that is open."""
 
     @property
-    def fuser(self) -> FuserLink:
+    def fuser(self) -> FuserSupervisor:
         """What answers."""
 
     def calm(self, since: float) -> bool:
@@ -62,19 +62,19 @@ class Made(Struct, frozen=True):
     rest_until: float
 
 
-class Questions:
+class FuserQueries:
     """Those that are not answered yet, a few.
 
     Args:
         most_bytes: of meshes that wait to be read; a single one may be larger.
     """
 
-    def __init__(self, answer: Answer, most_bytes: int) -> None:
+    def __init__(self, answer: SendReply, most_bytes: int) -> None:
         self._answer = answer
         self._most_bytes = most_bytes
         self._open: dict[int, Question] = {}
         self._count = 0
-        self._meshes = Departures()
+        self._meshes = PendingReplies()
         self._made: dict[str, Made] = {}
 
     @property
@@ -102,7 +102,7 @@ class Questions:
             return problem
         self._count += 1
         if len(self._open) >= _MAX_QUESTIONS or not asked.fuser.send(
-            fuser_messages.Ask(self._count, question.command)
+            fuser_messages.FuserQuery(self._count, question.command)
         ):
             return f"too many questions at once; {messages.ASK_AGAIN}"
         self._open[self._count] = question
@@ -132,7 +132,7 @@ class Questions:
         return waiting + coming <= self._most_bytes
 
     def answered(
-        self, answer: fuser_messages.Answer, status: health.Status | None, frames: Sequence[zmq.Frame]
+        self, answer: fuser_messages.FuserReply, status: health.Status | None, frames: Sequence[zmq.Frame]
     ) -> None:
         """What the fuser says."""
         question = self._open.pop(answer.number, None)

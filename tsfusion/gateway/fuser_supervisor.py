@@ -33,7 +33,7 @@ _WELL = 60.0  # seconds after which a process that goes on fusing is no reason t
 _PATIENCE = 10  # times as long, when it is no keyframe that takes so long: a mesh, a checkpoint
 
 
-class FuserLink:
+class FuserSupervisor:
     """One fuser process after another, all at work on the same map.
 
     Attributes:

@@ -17,14 +17,14 @@ from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import DecodeError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import fuser_queries
-from tsfusion.gateway.access_control import Door
-from tsfusion.gateway.client_routes import Route, Routes
+from tsfusion.gateway.access_control import AccessControl
+from tsfusion.gateway.client_routes import ClientRoute, ClientRoutes
 from tsfusion.gateway.correction_intake import Corrector
-from tsfusion.gateway.fuser_queries import Questions
+from tsfusion.gateway.fuser_queries import FuserQueries
 from tsfusion.gateway.hosted_map import HostedMap
-from tsfusion.gateway.keyframe_intake import Intake
-from tsfusion.gateway.map_registry import Atlas
-from tsfusion.gateway.memory_guard import MemoryBound
+from tsfusion.gateway.keyframe_intake import KeyframeIntake
+from tsfusion.gateway.map_registry import MapRegistry
+from tsfusion.gateway.memory_guard import MemoryGuard
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Ports, Subscriptions, each, send_now
 from tsfusion.wire import messages, sockets
@@ -56,22 +56,22 @@ class Gateway:
         context: "zmq.Context[Any]",
         server: ServerConfig,
         ports: Ports,
-        door: Door,
+        door: AccessControl,
         metrics: Metrics | None = None,
     ) -> None:
         self.ports = ports
-        self.maps = Atlas(context, server, self)
+        self.maps = MapRegistry(context, server, self)
         self._server = server
         self._door = door
         self._metrics = metrics
-        self._routes = Routes()
-        self._intake = Intake(server, self.maps, door, self)
+        self._routes = ClientRoutes()
+        self._intake = KeyframeIntake(server, self.maps, door, self)
         self._refused = self._intake.refused
         self._corrector = Corrector(server, self.maps, self._intake)
-        self._questions = Questions(self._answer, server.memory_bytes // _MESHES_SHARE)
+        self._questions = FuserQueries(self._answer, server.memory_bytes // _MESHES_SHARE)
         self._topics = Subscriptions()
         self._watched: dict[str, bool] = {}  # what each fuser knows of it
-        self._memory = MemoryBound(server.memory_bytes)
+        self._memory = MemoryGuard(server.memory_bytes)
         self._accepting = self._stopped = False
         self._started = time.monotonic()
         self._next_snapshot = 0.0
@@ -172,10 +172,10 @@ class Gateway:
     def _on_other(
         self,
         hosted: HostedMap,
-        message: fuser_messages.Meshed | fuser_messages.Answer,
+        message: fuser_messages.Meshed | fuser_messages.FuserReply,
         frames: Sequence[zmq.Frame],
     ) -> None:
-        if isinstance(message, fuser_messages.Answer):
+        if isinstance(message, fuser_messages.FuserReply):
             status = (
                 None
                 if message.status is None
@@ -317,7 +317,7 @@ class Gateway:
         if route is not None and route.client == client:
             self._routes.heard(route, scans=scans)
 
-    def route(self, session: bytes) -> Route | None:
+    def route(self, session: bytes) -> ClientRoute | None:
         """The connection of a session's client."""
         return self._routes.get(session)
 

@@ -13,23 +13,23 @@ from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.correction_store import Revisions
-from tsfusion.gateway.fuser_supervisor import FuserLink
-from tsfusion.gateway.journal_retention import Retention
+from tsfusion.gateway.fuser_supervisor import FuserSupervisor
+from tsfusion.gateway.journal_retention import JournalRetention
 from tsfusion.gateway.keyframe_index import KeyframeIndex
-from tsfusion.gateway.keyframe_outcomes import Clients, Outcomes
-from tsfusion.gateway.sessions import Sessions, Turns
+from tsfusion.gateway.keyframe_outcomes import Clients, KeyframeOutcomes
+from tsfusion.gateway.sessions import FairQueue, Sessions
 from tsfusion.journal import Journal, state_folder
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import keyframe_times
 from tsfusion.wire.health import MapHealth, MapState
-from tsfusion.wire.keyframe_header import Header
+from tsfusion.wire.keyframe_header import KeyframeHeader
 
 log = logging.getLogger(__name__)
 
 _SEGMENTS_KEPT = 4  # a journal with a limit goes in pieces of a quarter of it
 
 
-Other = Callable[[fuser_messages.Meshed | fuser_messages.Answer, Sequence[zmq.Frame]], None]
+Other = Callable[[fuser_messages.Meshed | fuser_messages.FuserReply, Sequence[zmq.Frame]], None]
 
 
 class HostedMap:
@@ -66,9 +66,9 @@ class HostedMap:
         self._index = KeyframeIndex()
         self._index.recover(self._journal.found, self.sessions)
         self._journal.found = []
-        self._turns = Turns()
+        self._turns = FairQueue()
         self._waiting = len(self._index)
-        self._outcomes = Outcomes(
+        self._outcomes = KeyframeOutcomes(
             name,
             self._index,
             self.sessions,
@@ -79,8 +79,8 @@ class HostedMap:
         self._last: float | None = None
         self._held_until = 0.0
         self._lost = ""
-        self._retention = Retention(self._journal, self._index, self.sessions, most)
-        self.fuser = FuserLink(context, self.folder, server, volume)
+        self._retention = JournalRetention(self._journal, self._index, self.sessions, most)
+        self.fuser = FuserSupervisor(context, self.folder, server, volume)
 
     @property
     def drained(self) -> bool:
@@ -110,7 +110,7 @@ class HostedMap:
         """Seconds for which nothing is taken because the disk refused."""
         return max(self._held_until - now, 0.0)
 
-    def accept(self, header: Header, frames: Sequence[Any], client: str, received_ns: int) -> None:
+    def accept(self, header: KeyframeHeader, frames: Sequence[Any], client: str, received_ns: int) -> None:
         """Write the session's next keyframe to the journal, and say so.
 
         Raises:
@@ -173,7 +173,7 @@ class HostedMap:
             elif isinstance(message, fuser_messages.Meshed):
                 self._outcomes.on_meshed(message)
                 other(message, frames)
-            elif isinstance(message, fuser_messages.Answer):
+            elif isinstance(message, fuser_messages.FuserReply):
                 other(message, frames)
         if ended and not self.fuser.finishing:
             self.fuser.restart()

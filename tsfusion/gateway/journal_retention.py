@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.gateway.fuser_supervisor import FuserLink
+from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.sessions import Sessions
 from tsfusion.journal import Journal
@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 _SAVE_INTERVAL = 10.0  # seconds between checkpoints that are made only for the journal's sake
 
 
-class Retention:
+class JournalRetention:
     """Call `step` for ever. The limit is passed only by what came since the checkpoint before the last."""
 
     def __init__(
@@ -52,7 +52,7 @@ class Retention:
         )
         return min(unfused, default=self._journal.segment)
 
-    def step(self, fuser: FuserLink, needed: Iterable[int]) -> None:
+    def step(self, fuser: FuserSupervisor, needed: Iterable[int]) -> None:
         """Make room where there is need and it can be made.
 
         Args:

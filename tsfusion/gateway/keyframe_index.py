@@ -12,7 +12,7 @@ from tsfusion.journal import Position, Scan
 from tsfusion.wire.keyframe_times import Stamps
 
 
-class Entry(Struct, frozen=True):
+class IndexEntry(Struct, frozen=True):
     """One journaled keyframe."""
 
     index: int
@@ -95,11 +95,11 @@ class KeyframeIndex:
         self._columns["fuse_start_ns"][index - self._first] = fuse_start_ns
         self._columns["fused_ns"][index - self._first] = fused_ns
 
-    def __getitem__(self, index: int) -> Entry:
+    def __getitem__(self, index: int) -> IndexEntry:
         segment, offset, session, seq, captured, *stamps = (
             column[index - self._first] for column in self._columns.values()
         )
-        return Entry(index, Position(segment, offset), session, Stamps(seq, *stamps), captured)
+        return IndexEntry(index, Position(segment, offset), session, Stamps(seq, *stamps), captured)
 
     def after(self, session: Session, seq: int) -> int:
         """How many keyframes of a session, of those not forgotten, have a number up to `seq`."""

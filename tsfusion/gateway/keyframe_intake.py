@@ -15,20 +15,20 @@ import zmq
 from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import JournalError
-from tsfusion.gateway.access_control import Door
+from tsfusion.gateway.access_control import AccessControl
 from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.keyframe_outcomes import Clients
-from tsfusion.gateway.map_registry import Atlas
+from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.wire import codec, messages
-from tsfusion.wire.keyframe_header import Header, Refused, unpack
+from tsfusion.wire.keyframe_header import KeyframeHeader, Refused, unpack
 
 log = logging.getLogger(__name__)
 
 _HOLDS = (0.25, 10.0)  # seconds, shortest and longest: each costs what was under way
 
 
-class Intake:
+class KeyframeIntake:
     """The way from the data socket into the journals.
 
     Attributes:
@@ -37,7 +37,9 @@ class Intake:
         quotas: of every client, whatever it sends.
     """
 
-    def __init__(self, server: ServerConfig, maps: Atlas, door: Door, clients: Clients) -> None:
+    def __init__(
+        self, server: ServerConfig, maps: MapRegistry, door: AccessControl, clients: Clients
+    ) -> None:
         self.refused: Counter[str] = Counter()
         self.duplicates = 0
         self._server = server
@@ -108,7 +110,7 @@ class Intake:
         self._clients.send(key, messages.Hold(key, seconds, reason, message))
 
     def _on_checked(
-        self, hosted: HostedMap, header: Header, buffers: list[Any], client: str, received_ns: int
+        self, hosted: HostedMap, header: KeyframeHeader, buffers: list[Any], client: str, received_ns: int
     ) -> None:
         # before all else: what is journaled must not be refused when it comes again
         verdict = hosted.sessions.admit(header.session, header.seq, header.previous)
@@ -128,7 +130,7 @@ class Intake:
         except JournalError:
             self._hold(header.session, hosted.held(time.monotonic()), "disk", hosted.problem)
 
-    def _refuse(self, error: Refused, client: str, header: Header | None = None) -> None:
+    def _refuse(self, error: Refused, client: str, header: KeyframeHeader | None = None) -> None:
         """Count a bad message; answer it when it says whose it is, so that it is not sent for ever."""
         self.refused[error.reason] += 1
         if header is None:

@@ -14,8 +14,8 @@ import numpy as np
 from tsfusion.core import logs
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.gateway.client_routes import Route
-from tsfusion.gateway.keyframe_index import Entry, KeyframeIndex
+from tsfusion.gateway.client_routes import ClientRoute
+from tsfusion.gateway.keyframe_index import IndexEntry, KeyframeIndex
 from tsfusion.gateway.sessions import Session, Sessions
 from tsfusion.journal import read
 from tsfusion.journal.quarantine import Quarantine
@@ -31,7 +31,7 @@ class Clients(Protocol):
     def send(self, session: bytes, message: messages.ToClient) -> None:
         """Pass it to the session's client, if that is connected."""
 
-    def route(self, session: bytes) -> Route | None:
+    def route(self, session: bytes) -> ClientRoute | None:
         """Its connection."""
 
     def heard(self, session: bytes, client: str, *, scans: bool) -> None:
@@ -41,7 +41,7 @@ class Clients(Protocol):
         """A keyframe took so long for a stage."""
 
 
-class Outcomes:
+class KeyframeOutcomes:
     """One map's, over all its fusers.
 
     Attributes:
@@ -64,7 +64,7 @@ class Outcomes:
         self.rejected: Counter[str] = Counter()
         self.unmeshed: deque[int] = deque()
         self.blocks = self.map_bytes = 0
-        self.delays = Delays()
+        self.delays = DelayStatistics()
         self._name = name
         self._index = index
         self._sessions = sessions
@@ -118,7 +118,7 @@ class Outcomes:
             self._on_rejected(session, entry, done)
         self.acknowledge(session.key, [entry.stamps])
 
-    def _on_fused(self, session: Session, entry: Entry) -> None:
+    def _on_fused(self, session: Session, entry: IndexEntry) -> None:
         route, stamps = self._clients.route(session.key), entry.stamps
         if stamps.durable_ns:  # 0: journaled by an earlier server
             waited, fused = stamps.fuse_start_ns - stamps.durable_ns, stamps.fused_ns - stamps.fuse_start_ns
@@ -129,7 +129,7 @@ class Outcomes:
             if self.delays.add(delay_ns, route.bound_ns):
                 self._clients.observe(self._name, "total", delay_ns / 1e9)
 
-    def _on_rejected(self, session: Session, entry: Entry, done: fuser_messages.Done) -> None:
+    def _on_rejected(self, session: Session, entry: IndexEntry, done: fuser_messages.Done) -> None:
         assert done.reason is not None
         self._told_rejected.add(done.index)
         seq = entry.stamps.seq
@@ -163,7 +163,7 @@ _DELAYS = 1024
 _LONGEST_DELAY_NS = 86_400 * 10**9  # a day
 
 
-class Delays:
+class DelayStatistics:
     """Capture to fused of the last keyframes."""
 
     def __init__(self) -> None:

@@ -21,10 +21,10 @@ log = logging.getLogger(__name__)
 
 _MAX_UNOPENED = 64
 _RETRY_INTERVAL = 10.0  # seconds before a map that could not be opened is tried again
-Other = Callable[[HostedMap, fuser_messages.Meshed | fuser_messages.Answer, Sequence[zmq.Frame]], None]
+Other = Callable[[HostedMap, fuser_messages.Meshed | fuser_messages.FuserReply, Sequence[zmq.Frame]], None]
 
 
-class Atlas:
+class MapRegistry:
     """Opens maps, keeps all of them going, ends them."""
 
     def __init__(self, context: "zmq.Context[Any]", server: ServerConfig, clients: Clients) -> None:

@@ -8,7 +8,7 @@ import zmq
 from tsfusion.core import process
 
 
-class MemoryBound:
+class MemoryGuard:
     """When what connections hold in memory is too much, so that they have to be dropped.
 
     That frees it, but not at once (threads of ZeroMQ's do it) and perhaps not all (this process may need
@@ -34,7 +34,7 @@ class MemoryBound:
         return told
 
 
-class Departures:
+class PendingReplies:
     """Large answers that have not left yet, one a reader: who does not read must not fill our memory."""
 
     def __init__(self) -> None:

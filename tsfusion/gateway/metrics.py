@@ -8,17 +8,17 @@ other.
 import platform
 import time
 from collections.abc import Callable, Iterator
+from importlib.metadata import version
 from pathlib import Path
 
 from prometheus_client import CollectorRegistry, Histogram, generate_latest
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from tsfusion import __version__
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.logs import printable
 from tsfusion.gateway import metrics_families
-from tsfusion.gateway.metrics_http import Answer, Page
+from tsfusion.gateway.metrics_http import HttpResponse, MetricsPage
 from tsfusion.wire.health import Health
 from tsfusion.wire.keyframe_times import STAGES as LEDGER_STAGES
 
@@ -48,7 +48,7 @@ class Metrics(Collector):
         self._clock = clock
         self._seen: tuple[Health, float] | None = None
         self._maps: set[str] = set()
-        self._page: Page | None = None
+        self._page: MetricsPage | None = None
         self.registry = CollectorRegistry()
         self._delay = Histogram(
             "tsfusion_keyframe_delay_seconds",
@@ -84,30 +84,32 @@ class Metrics(Collector):
             InvalidConfig: when others than this machine could reach it.
             TransportError: when the port is taken.
         """
-        self._page = Page(address, {"/metrics": self._figures, "/livez": self._alive, "/readyz": self._ready})
+        self._page = MetricsPage(
+            address, {"/metrics": self._figures, "/livez": self._alive, "/readyz": self._ready}
+        )
         return self._page.address
 
     def close(self) -> None:
-        """Answer no more."""
+        """HttpResponse no more."""
         if self._page is not None:
             self._page.close()
             self._page = None
 
     # --- pages ---
 
-    def _figures(self) -> Answer:
-        return Answer(200, generate_latest(self.registry), _TEXT_FORMAT)
+    def _figures(self) -> HttpResponse:
+        return HttpResponse(200, generate_latest(self.registry), _TEXT_FORMAT)
 
-    def _alive(self) -> Answer:
+    def _alive(self) -> HttpResponse:
         _, silence = self._fresh()
-        return Answer(503, silence) if silence else Answer(200, "alive")
+        return HttpResponse(503, silence) if silence else HttpResponse(200, "alive")
 
-    def _ready(self) -> Answer:
+    def _ready(self) -> HttpResponse:
         health, silence = self._fresh()
         if health is None:
-            return Answer(503, silence)
+            return HttpResponse(503, silence)
         problems = "\n".join(map(printable, health.problems))
-        return Answer(200, "ready") if health.ready else Answer(503, problems or "not ready")
+        return HttpResponse(200, "ready") if health.ready else HttpResponse(503, problems or "not ready")
 
     def _fresh(self) -> tuple[Health | None, str]:
         """The snapshot, or why there is none."""
@@ -128,7 +130,7 @@ class Metrics(Collector):
     def collect(self) -> Iterator[Metric]:
         """Everything but the delays, of the last snapshot."""
         build = GaugeMetricFamily("tsfusion_build_info", "Versions.", labels=("version", "python"))
-        build.add_metric((__version__, platform.python_version()), 1)
+        build.add_metric((version("tsfusion"), platform.python_version()), 1)
         yield build
         seen = self._seen
         age = self._clock() - seen[1] if seen else None

@@ -29,7 +29,7 @@ _LAST_PORT = 65535
 log = logging.getLogger(__name__)
 
 
-class Answer(Struct, frozen=True):
+class HttpResponse(Struct, frozen=True):
     """What a page shows. Text ends with a line break."""
 
     status: int
@@ -37,7 +37,7 @@ class Answer(Struct, frozen=True):
     kind: str = "text/plain; charset=utf-8"
 
 
-class Page:
+class MetricsPage:
     """Answers GET and HEAD for the paths it is given, and 404 for all others, until `close`.
 
     Args:
@@ -52,7 +52,7 @@ class Page:
         TransportError: when the port is taken.
     """
 
-    def __init__(self, address: str, pages: Mapping[str, Callable[[], Answer]]) -> None:
+    def __init__(self, address: str, pages: Mapping[str, Callable[[], HttpResponse]]) -> None:
         self._pages = pages
         self._listener = _listen(address)
         self.address = _text(*self._listener.getsockname()[:2])
@@ -115,24 +115,26 @@ class Page:
         writer.write("\r\n".join((*lines, "", "")).encode() + (b"" if head.startswith("HEAD ") else body))
         await writer.drain()
 
-    def _answer(self, head: str) -> Answer:
+    def _answer(self, head: str) -> HttpResponse:
         first, *rest = head.split("\r\n")
         request = _REQUEST.fullmatch(first)
         hosts = [line.partition(":")[2].strip() for line in rest if line[:5].lower() == "host:"]
         if request is None or len(hosts) > 1 or (not hosts and request["minor"] == "1"):
-            return Answer(400, "this is not HTTP as it is spoken here")
+            return HttpResponse(400, "this is not HTTP as it is spoken here")
         if hosts and not _OWN_HOST.fullmatch(hosts[0]):
-            return Answer(403, "ask for this page at localhost or 127.0.0.1; a proxy has to set Host so, too")
+            return HttpResponse(
+                403, "ask for this page at localhost or 127.0.0.1; a proxy has to set Host so, too"
+            )
         if request["method"] not in ("GET", "HEAD"):
-            return Answer(405, "only GET and HEAD")
+            return HttpResponse(405, "only GET and HEAD")
         page = self._pages.get(request["path"])
         if page is None:
-            return Answer(404, f"there is {', '.join(self._pages)}")
+            return HttpResponse(404, f"there is {', '.join(self._pages)}")
         try:
             return page()
         except Exception:  # the next request may fare better; the thread has to live
             log.exception("%s cannot be shown", request["path"])
-            return Answer(500, "this page failed; the server's log says why")
+            return HttpResponse(500, "this page failed; the server's log says why")
 
 
 def _listen(address: str) -> socket.socket:

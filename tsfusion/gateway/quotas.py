@@ -9,7 +9,7 @@ import numpy as np
 
 from tsfusion.core.config import ServerConfig
 from tsfusion.wire.codec import measurement
-from tsfusion.wire.keyframe_header import Header, Refused
+from tsfusion.wire.keyframe_header import KeyframeHeader, Refused
 
 _BURST = 2.0  # seconds' worth that may come at once
 _MAX_CLIENTS = 4096
@@ -63,7 +63,7 @@ class Quotas:
             data.take(nbytes)
         return seconds
 
-    def check(self, header: Header) -> None:
+    def check(self, header: KeyframeHeader) -> None:
         """Raise Refused (`quota`) for a keyframe of too many points, or taken too far away."""
         server = self._server
         shape = next(buffer.shape for buffer in header.buffers if buffer.name == measurement(header))

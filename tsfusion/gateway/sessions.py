@@ -97,7 +97,7 @@ class Sessions:
         return self._all[number]
 
 
-class Turns:
+class FairQueue:
     """Whose keyframe the fuser gets next: one of each client in turn, and of its sessions in turn."""
 
     def __init__(self) -> None:

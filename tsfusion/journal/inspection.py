@@ -16,7 +16,7 @@ from tsfusion.geometry.keyframe import check_pose
 from tsfusion.journal import state_folder
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.record_scan import Damage
-from tsfusion.journal.state_folder import Place, Watcher
+from tsfusion.journal.state_folder import JournalPlace, Watcher
 from tsfusion.wire import codec, corrections
 from tsfusion.wire.corrections import SessionCorrections
 from tsfusion.wire.keyframe_header import unpack
@@ -69,7 +69,7 @@ class SessionInfo(Struct, kw_only=True):
     turned_deg: float = 0.0
 
 
-class Info(Struct, kw_only=True):
+class JournalInfo(Struct, kw_only=True):
     """A journal at a glance."""
 
     path: str
@@ -94,7 +94,7 @@ class Verdict(Struct, kw_only=True):
     problems: list[Problem]
 
 
-def summarize(place: Place, watch: Watcher) -> Info:
+def summarize(place: JournalPlace, watch: Watcher) -> JournalInfo:
     """Read every record's CRC and head; nothing is decoded.
 
     Raises:
@@ -113,7 +113,7 @@ def summarize(place: Place, watch: Watcher) -> Info:
         else:
             segment.keyframes += 1
             moves.note(_count(sessions, step), step)
-    return Info(
+    return JournalInfo(
         path=str(place.path),
         keyframes=sum(segment.keyframes for segment in segments.values()),
         nbytes=sum(segment.nbytes for segment in segments.values()),
@@ -133,7 +133,7 @@ def _segment(path: Path) -> SegmentInfo:
     return SegmentInfo(name=path.name, nbytes=nbytes, state="closed" if journal.is_closed(path) else "open")
 
 
-def _corrections(place: Place, problems: list[Problem]) -> dict[bytes, SessionCorrections]:
+def _corrections(place: JournalPlace, problems: list[Problem]) -> dict[bytes, SessionCorrections]:
     try:
         return {} if place.corrections is None else corrections.read(place.corrections)
     except JournalError as error:
@@ -192,7 +192,7 @@ def problem(path: Path, damage: Damage) -> Problem:
     return Problem(kind, path.name, damage.position.offset, damage.nbytes, damage.lost, damage.what)
 
 
-def verify(place: Place, watch: Watcher) -> Verdict:
+def verify(place: JournalPlace, watch: Watcher) -> Verdict:
     """Read and decode every keyframe.
 
     Raises:

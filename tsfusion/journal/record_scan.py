@@ -16,7 +16,7 @@ from msgspec import Struct
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import mcap_layout, segment_file
 from tsfusion.journal.mcap_layout import Position, Record
-from tsfusion.journal.segment_file import Source
+from tsfusion.journal.segment_file import SegmentFile
 
 _WINDOW_BYTES = 1 << 20
 _MAX_INTRO_BYTES = 1 << 16
@@ -51,7 +51,7 @@ def walk(path: Path) -> Iterator[Record | Damage]:
         JournalError: when the file cannot be opened or read.
     """
     try:
-        with Source(path) as source:
+        with SegmentFile(path) as source:
             yield from _Walk(source, segment_number(path)).steps()
     except OSError as error:
         raise failed("read", path, error) from error
@@ -73,7 +73,7 @@ def _was_index(raw: bytes) -> bool:
 
 
 class _Walk:
-    def __init__(self, source: Source, number: int) -> None:
+    def __init__(self, source: SegmentFile, number: int) -> None:
         self._source = source
         self._number = number
         self._seal = segment_file.read(source)

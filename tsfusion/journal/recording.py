@@ -19,7 +19,7 @@ from tsfusion.wire import codec
 log = logging.getLogger(__name__)
 
 
-class Recording:
+class JournalRecording:
     """The keyframes of a state folder (of one map, or of the one named), a map's folder or its `journal`, a
     spool folder or one `.mcap` segment.
 
@@ -59,11 +59,11 @@ class Recording:
 
 
 def read_keyframes(path: str | os.PathLike[str]) -> Iterator[Keyframe]:
-    """The keyframes of a `Recording`, one after the other."""
-    return iter(Recording(path))
+    """The keyframes of a `JournalRecording`, one after the other."""
+    return iter(JournalRecording(path))
 
 
-def _places(place: state_folder.Place) -> list[tuple[Path, int]]:
+def _places(place: state_folder.JournalPlace) -> list[tuple[Path, int]]:
     """Segment file and offset of each keyframe."""
     found, last = [], dict[bytes, int]()
     for file, step in place.steps():

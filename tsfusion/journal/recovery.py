@@ -12,7 +12,7 @@ from tsfusion.core.errors import JournalError, OutputError
 from tsfusion.core.output_folder import building
 from tsfusion.journal.inspection import Problem, problem
 from tsfusion.journal.record_scan import Damage
-from tsfusion.journal.state_folder import Place, Watcher
+from tsfusion.journal.state_folder import JournalPlace, Watcher
 from tsfusion.journal.writer import Journal
 
 
@@ -28,7 +28,7 @@ class Recovery(Struct, kw_only=True):
     problems: list[Problem]
 
 
-def recover(place: Place, out: Path, segment_bytes: int, watch: Watcher) -> Recovery:
+def recover(place: JournalPlace, out: Path, segment_bytes: int, watch: Watcher) -> Recovery:
     """Write every whole keyframe of a journal into the new folder `out`, in order, in closed segments.
 
     The journal itself is only read. `out` appears when all of it is on the disk, and not at all otherwise.
@@ -72,7 +72,7 @@ def recover(place: Place, out: Path, segment_bytes: int, watch: Watcher) -> Reco
     )
 
 
-def _check(place: Place, out: Path) -> None:
+def _check(place: JournalPlace, out: Path) -> None:
     try:
         is_used = out.is_dir() and any(out.iterdir())
     except OSError as error:

@@ -18,7 +18,7 @@ from tsfusion.journal.inspection import Problem, problem
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.record_scan import Damage
 from tsfusion.journal.ros2_messages import Converter, Outgoing
-from tsfusion.journal.state_folder import Place, Watcher
+from tsfusion.journal.state_folder import JournalPlace, Watcher
 from tsfusion.wire import codec
 from tsfusion.wire.keyframe_header import unpack
 
@@ -37,7 +37,7 @@ class Export(Struct, kw_only=True):
     problems: list[Problem]
 
 
-def export(place: Place, out: Path, watch: Watcher) -> Export:
+def export(place: JournalPlace, out: Path, watch: Watcher) -> Export:
     """Write every keyframe of a journal as ROS 2 messages; `out` appears when it is whole.
 
     Raises:
@@ -123,7 +123,7 @@ class _Exporter:
         self._problems: list[Problem] = []
         self._keyframes = 0
 
-    def run(self, place: Place, watch: Watcher) -> None:
+    def run(self, place: JournalPlace, watch: Watcher) -> None:
         """Everything that is whole, each keyframe once."""
         for path, step in place.steps(watch):
             if isinstance(step, Damage):

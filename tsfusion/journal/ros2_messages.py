@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.journal.mcap_layout import Record
-from tsfusion.wire.keyframe_header import Header
+from tsfusion.wire.keyframe_header import KeyframeHeader
 
 WORLD = "world"
 _MILLIMETRE = 0.001
@@ -39,7 +39,7 @@ class Converter:
         self._types = types
 
     def convert(
-        self, keyframe: Keyframe, header: Header, record: Record, name: str, stamp_ns: int
+        self, keyframe: Keyframe, header: KeyframeHeader, record: Record, name: str, stamp_ns: int
     ) -> Iterator[Outgoing]:
         """The messages of one keyframe, its place first.
 
@@ -102,7 +102,7 @@ class Converter:
         return Outgoing(topic, "sensor_msgs/msg/Image", content)
 
     def _color(
-        self, color: NDArray[np.uint8], header: Header, record: Record, topic: str, heading: Any
+        self, color: NDArray[np.uint8], header: KeyframeHeader, record: Record, topic: str, heading: Any
     ) -> Outgoing:
         index = [buffer.name for buffer in header.buffers].index("color")
         form = header.buffers[index].codec

@@ -20,7 +20,7 @@ _SECTOR_BYTES = 1 << 16
 log = logging.getLogger(__name__)
 
 
-class Source:
+class SegmentFile:
     """A file as it is now: what a writer adds later is not seen.
 
     Attributes:
@@ -37,7 +37,7 @@ class Source:
         self.size = os.fstat(self._file.fileno()).st_size
         self.failed = self.answered = False
 
-    def __enter__(self) -> "Source":
+    def __enter__(self) -> "SegmentFile":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: TracebackType | None) -> None:
@@ -93,7 +93,7 @@ class Seal(Struct, frozen=True):
     keyframes: int | None = None  # that the segment held when it was closed
 
 
-def read(source: Source) -> Seal:
+def read(source: SegmentFile) -> Seal:
     """Look at the end of a segment."""
     closing = (
         source.read(source.size - len(MAGIC), len(MAGIC)) == MAGIC if source.size > len(MAGIC) else False
@@ -107,7 +107,7 @@ def read(source: Source) -> Seal:
     return Seal("whole" if closing else "broken", start - len(END_OF_DATA), keyframes)
 
 
-def _summary(source: Source, footer_at: int) -> tuple[int, bytes] | None:
+def _summary(source: SegmentFile, footer_at: int) -> tuple[int, bytes] | None:
     """Where the summary starts, and its bytes; None unless its CRC agrees."""
     footer = source.read(footer_at, _FOOTER.size)
     opcode, length, start, _, crc32 = _FOOTER.unpack(footer)

@@ -14,7 +14,7 @@ from tsfusion.core.errors import JournalError
 from tsfusion.journal import mcap_layout, segment_file
 from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.record_scan import Damage, failed, segment_number, walk
-from tsfusion.journal.segment_file import Source
+from tsfusion.journal.segment_file import SegmentFile
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ def read_at(path: Path, offset: int) -> Record:
         JournalError: when it is not there or its CRC differs; from an OSError when the system refuses.
     """
     try:
-        with Source(path) as source:
+        with SegmentFile(path) as source:
             head = mcap_layout.head(source.read(offset, mcap_layout.HEAD_BYTES))
             raw = b"" if head is None else source.read(offset, head.nbytes)
             record = mcap_layout.unpack(raw, Position(segment_number(path), offset))
@@ -111,7 +111,7 @@ def describe(path: Path, damage: Damage) -> str:
 def is_closed(path: Path) -> bool:
     """Whether a segment ends with an index, as normal MCAP readers need it; False when it cannot be read."""
     try:
-        with Source(path) as source:
+        with SegmentFile(path) as source:
             return segment_file.read(source).state == "whole"
     except OSError:
         return False

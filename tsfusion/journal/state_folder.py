@@ -71,7 +71,7 @@ def resolve(path: Path, name: str | None = None) -> Path:
 Watcher = Callable[[int, int], None]  # bytes read, bytes of all
 
 
-class Place(Struct, frozen=True):
+class JournalPlace(Struct, frozen=True):
     """A journal on the disk.
 
     Attributes:
@@ -122,7 +122,7 @@ class Place(Struct, frozen=True):
             watch(before, total)
 
 
-def find(path: Path, map_name: str | None = None) -> Place:
+def find(path: Path, map_name: str | None = None) -> JournalPlace:
     """The journal at a path: a state folder, a map's folder in it, a folder of segments, or one segment.
 
     Args:
@@ -141,15 +141,15 @@ def find(path: Path, map_name: str | None = None) -> Place:
     if path.name == JOURNAL_FOLDER and _is_map(path.parent):
         return _of_map(path.parent)
     if path.is_dir():
-        return Place(path)
+        return JournalPlace(path)
     if path.suffix != ".mcap":
         raise JournalError(f"{path} is no journal; expected a folder or an .mcap file")
-    return Place(path)
+    return JournalPlace(path)
 
 
-def _of_map(folder: Path) -> Place:
+def _of_map(folder: Path) -> JournalPlace:
     beside = (folder / name for name in (QUARANTINE_FOLDER, CORRECTIONS_FOLDER))
-    return Place(folder / JOURNAL_FOLDER, *beside)
+    return JournalPlace(folder / JOURNAL_FOLDER, *beside)
 
 
 def _is_map(folder: Path) -> bool:

@@ -49,7 +49,7 @@ class Journal:
         self.folder = Path(folder)
         self._segment_bytes = segment_bytes
         self._sync = sync
-        self._room = Room(self.folder, min_free_bytes)
+        self._room = FreeSpace(self.folder, min_free_bytes)
         self._file: BinaryIO | None = None
         self._writer: Any = None
         self._identity = b""
@@ -272,7 +272,7 @@ _LOOK_BYTES = 16 << 20  # written between two looks at the disk, at most
 _LOOK_SECONDS = 1.0
 
 
-class Room:
+class FreeSpace:
     """The room for writing on a folder's disk, of which `min_free_bytes` are not for us."""
 
     def __init__(self, folder: Path, min_free_bytes: int) -> None:

@@ -19,7 +19,7 @@ _STAMPS = (
 )  # fmt: skip
 
 
-class Summary(msgspec.Struct, frozen=True):
+class LatencySummary(msgspec.Struct, frozen=True):
     """The ledger in a few figures. Delay = captured → fused.
 
     `clock_bound_ms` bounds the error of every figure that compares the scanner's clock with the server's.
@@ -38,10 +38,10 @@ def durations_ms(records: Sequence[KeyframeTimes], start: str, end: str) -> NDAr
     return np.where(known, (stamps[:, 1] - stamps[:, 0]) / 1e6, np.nan)
 
 
-def summarise(records: Sequence[KeyframeTimes]) -> Summary:
+def summarise(records: Sequence[KeyframeTimes]) -> LatencySummary:
     """Mean, percentiles and maximum of the delay and of each stage, and the delay's slope."""
     delay = durations_ms(records, *DELAY)
-    return Summary(
+    return LatencySummary(
         delay_ms=spread(delay),
         slope_ms_per_keyframe=slope(delay),
         stages_ms={name: spread(durations_ms(records, *ends)) for name, ends in STAGES.items()},
@@ -96,7 +96,7 @@ def plot(records: Sequence[KeyframeTimes], path: Path, *, target_ms: float = TAR
     figure.savefig(path, format="png")
 
 
-def _title(summary: Summary) -> str:
+def _title(summary: LatencySummary) -> str:
     delay = summary.delay_ms
     return (
         f"delay per keyframe: mean {delay.mean:.0f}, p95 {delay.p95:.0f}, max {delay.max:.0f} ms; "

@@ -23,7 +23,7 @@ _NEAR = 0.05  # metres
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class PreviewCamera:
     """Where a picture is taken from.
 
     Attributes:
@@ -43,7 +43,7 @@ def render(
     *,
     width: int = 1280,
     height: int = 800,
-    camera: Camera | None = None,
+    camera: PreviewCamera | None = None,
     ups: Sequence[NDArray[np.float64]] = (),
 ) -> Path:
     """Draw `mesh` to a PNG file; complete or not at all.
@@ -70,7 +70,7 @@ def render(
 
 
 def draw(
-    mesh: Mesh, camera: Camera, width: int, height: int, *, up: NDArray[np.float64] | None = None
+    mesh: Mesh, camera: PreviewCamera, width: int, height: int, *, up: NDArray[np.float64] | None = None
 ) -> NDArray[np.float32]:
     """(height, width, 4) float32: linear RGB in 0…1 and depth z in metres (0 where nothing is seen).
 
@@ -142,10 +142,10 @@ def up_direction(mesh: Mesh, ups: Sequence[NDArray[np.float64]] = ()) -> NDArray
     return up
 
 
-def choose_camera(mesh: Mesh, up: NDArray[np.float64], *, aspect: float) -> Camera:
+def choose_camera(mesh: Mesh, up: NDArray[np.float64], *, aspect: float) -> PreviewCamera:
     """The view from above, among a ring of them, in which most of the picture shows a front side."""
     sample = _core(mesh.vertices)
-    best, best_score = Camera(np.eye(4)), -1.0
+    best, best_score = PreviewCamera(np.eye(4)), -1.0
     for elevation in _ELEVATIONS:
         for azimuth in np.arange(_AZIMUTHS) * (2 * math.pi / _AZIMUTHS):
             camera = _orbit(sample, up, azimuth, math.radians(elevation), aspect)
@@ -155,7 +155,7 @@ def choose_camera(mesh: Mesh, up: NDArray[np.float64], *, aspect: float) -> Came
     return best
 
 
-def _score(mesh: Mesh, camera: Camera, aspect: float) -> float:
+def _score(mesh: Mesh, camera: PreviewCamera, aspect: float) -> float:
     """The share of the pixels that see a front side."""
     depth = draw(mesh, camera, int(96 * aspect), 96)[..., 3]
     return float(np.count_nonzero(depth)) / depth.size
@@ -172,7 +172,7 @@ def _core(vertices: NDArray[np.float32]) -> NDArray[np.float64]:
 
 def _orbit(
     points: NDArray[np.float64], up: NDArray[np.float64], azimuth: float, elevation: float, aspect: float
-) -> Camera:
+) -> PreviewCamera:
     """A camera that looks down on `points` at the given angles, as near as shows all of them."""
     east = np.cross(up, (0.0, 1.0, 0.0) if abs(up[1]) < 0.9 else (1.0, 0.0, 0.0))
     east /= np.linalg.norm(east)
@@ -183,7 +183,7 @@ def _orbit(
     right /= np.linalg.norm(right)
     T = np.eye(4)
     T[:3, :3] = np.stack((right, np.cross(forward, right), forward), axis=1)
-    tan_x = math.tan(0.5 * Camera.fov) * 0.95
+    tan_x = math.tan(0.5 * PreviewCamera.fov) * 0.95
     tan_y = tan_x / aspect
     x, y, z = (points @ T[:3, :3]).T
     # The smallest wedge around all points, per axis: where its two planes meet is the eye.
@@ -192,7 +192,7 @@ def _orbit(
     eye_x, eye_y = 0.5 * (left + rightmost), 0.5 * (top + bottom)
     eye_z = min((left - rightmost) / (2 * tan_x), (top - bottom) / (2 * tan_y))
     T[:3, 3] = T[:3, :3] @ (eye_x, eye_y, eye_z)
-    return Camera(T)
+    return PreviewCamera(T)
 
 
 def _develop(image: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:

@@ -12,9 +12,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion import __version__
+from tsfusion.client import ClientStats
 from tsfusion.core.output_folder import RECORD
-from tsfusion.delivery.outbox import ClientStats
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.pipelines import latency_ledger, mesh_preview
 from tsfusion.wire.health import Status
@@ -149,6 +148,7 @@ def measure(surface: KnownSurface, mesh: Mesh) -> Accuracy:
 def versions() -> dict[str, str]:
     """Of Python, the platform, tsfusion and what it stands on."""
     packages = (
+        "tsfusion",
         "taichi",
         "numpy",
         "opencv-python-headless",
@@ -158,7 +158,7 @@ def versions() -> dict[str, str]:
         "msgspec",
         "zstandard",
     )
-    found = {"tsfusion": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    found = {"python": platform.python_version(), "platform": platform.platform()}
     for name in packages:
         try:
             found[name] = metadata.version(name)

@@ -12,7 +12,7 @@ from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.pipelines import latency_ledger, replay_results
-from tsfusion.scanner.localization.localizer import Corrections
+from tsfusion.scanner.localization.localizer import PoseCorrections
 from tsfusion.scanner.scanner import Scanner, Submap
 from tsfusion.scanner.sources.source import Source
 from tsfusion.wire.health import Status
@@ -152,7 +152,7 @@ def records(submaps: list[Submap]) -> list[KeyframeTimes]:
     return [record for submap in submaps for record in submap.client.records]
 
 
-def _error(submap: Submap, corrections: Corrections | None) -> TrajectoryError | None:
+def _error(submap: Submap, corrections: PoseCorrections | None) -> TrajectoryError | None:
     """Against the source's own poses, over the frames that have one."""
     which, references = submap.located.with_reference()
     if len(which) < 2:

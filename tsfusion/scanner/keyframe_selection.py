@@ -14,7 +14,7 @@ INDOORS, OUTDOORS = 0.1, 2.0  # metres between keyframes
 _STEP = 16  # pixels between those whose overlap is looked at
 
 
-class Selector:
+class KeyframeSelector:
     """A frame becomes a keyframe when it sees enough that is new.
 
     It does when less than `min_overlap` of the last keyframe's pixels (those with a depth) lie in its view,

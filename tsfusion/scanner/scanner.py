@@ -18,9 +18,9 @@ from tsfusion.client import Client
 from tsfusion.core.config import MAP_NAME_LENGTH, ScanConfig
 from tsfusion.delivery.outbox import ClientStats
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.keyframe_selection import Selector
-from tsfusion.scanner.localization.localizer import Corrections, Localizer, Lost, Pose
-from tsfusion.scanner.tracked_trajectory import Track
+from tsfusion.scanner.keyframe_selection import KeyframeSelector
+from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections
+from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 
 State = Literal["starting", "tracking", "lost"]
 
@@ -41,8 +41,8 @@ class Submap:
 
     name: str
     client: Client
-    located: Track = field(default_factory=Track)
-    corrections: Corrections | None = None
+    located: TrackedTrajectory = field(default_factory=TrackedTrajectory)
+    corrections: PoseCorrections | None = None
     said: int = 0
 
     def correct(self) -> None:
@@ -94,7 +94,7 @@ class Scanner:
         connect: opens a client that sends to the map of that name.
         map_name: of the first submap.
         taken: names that no submap may have.
-        outdoors: see `Selector`.
+        outdoors: see `KeyframeSelector`.
         most: submaps; a sensor that is lost once more has to find back into the last. None = any number.
     """
 
@@ -111,7 +111,7 @@ class Scanner:
     ) -> None:
         self._localizer, self._config, self._most = localizer, config, most
         self._connect, self._map_name, self._taken = connect, map_name, {map_name, *taken}
-        self._selector = Selector(config, outdoors=outdoors)
+        self._selector = KeyframeSelector(config, outdoors=outdoors)
         self._next: str | None = None  # the map of the submap that begins with the next pose
         self._lost_since: int | None = None
         self._why = ""
@@ -214,7 +214,7 @@ class Scanner:
         suffix = f"-{number}"
         return self._map_name[: MAP_NAME_LENGTH - len(suffix)] + suffix
 
-    def _correct(self, corrections: Corrections) -> None:
+    def _correct(self, corrections: PoseCorrections) -> None:
         submap = self.submaps[-1]
         before = submap.corrections.loops if submap.corrections else 0
         submap.corrections = corrections

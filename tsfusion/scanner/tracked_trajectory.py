@@ -6,7 +6,7 @@ from array import array
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.scanner.localization.localizer import Corrections, Matrix, Pose
+from tsfusion.scanner.localization.localizer import Matrix, Pose, PoseCorrections
 
 _NONE = -1
 _BOTTOM = (0.0, 0.0, 0.0, 1.0)
@@ -16,7 +16,7 @@ _COLUMNS = 4  # other numbers of a frame
 Poses = NDArray[np.float64]  # (n, 4, 4)
 
 
-class Track:
+class TrackedTrajectory:
     """Frames that have a pose, in order.
 
     The number of a frame as a keyframe is -1 where it is none, or was left out.
@@ -59,11 +59,11 @@ class Track:
         """Number of the last keyframe; -1 = there is none."""
         return int(self.seqs.max(initial=_NONE))
 
-    def poses(self, corrections: Corrections | None = None) -> Poses:
+    def poses(self, corrections: PoseCorrections | None = None) -> Poses:
         """(n, 4, 4) T_world_camera, as tracked, or after loop closure."""
         return self._corrected(corrections, np.arange(len(self)))
 
-    def keyframes(self, corrections: Corrections | None = None) -> tuple[NDArray[np.int64], Poses]:
+    def keyframes(self, corrections: PoseCorrections | None = None) -> tuple[NDArray[np.int64], Poses]:
         """The numbers of the keyframes, (m,), and (m, 4, 4) T_world_camera."""
         chosen = np.flatnonzero(self.seqs != _NONE)
         return self.seqs[chosen], self._corrected(corrections, chosen)
@@ -73,7 +73,7 @@ class Track:
         references = np.array(self._references).reshape(-1, 3, 4)
         return np.flatnonzero(self._columns[:, 3] != _NONE), _matrices(references)
 
-    def _corrected(self, corrections: Corrections | None, chosen: NDArray[np.int64]) -> Poses:
+    def _corrected(self, corrections: PoseCorrections | None, chosen: NDArray[np.int64]) -> Poses:
         pairs = self._pairs[chosen]
         poses = _matrices(pairs[:, 0])
         if corrections is None:

@@ -30,7 +30,7 @@ CUBE = 512  # voxels a block
 DTYPES = {"sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "correction": np.float32}
 
 
-class Header(msgspec.Struct, kw_only=True):
+class CheckpointHeader(msgspec.Struct, kw_only=True):
     """What a checkpoint says of itself."""
 
     config: VolumeConfig
@@ -43,7 +43,7 @@ class Header(msgspec.Struct, kw_only=True):
 
 def write(
     path: Path,
-    header: Header,
+    header: CheckpointHeader,
     keys: NDArray[np.int64],
     slots: NDArray[np.int64],
     layers: dict[str, NDArray[Any]],
@@ -74,7 +74,7 @@ def write(
     return path
 
 
-def read(path: Path) -> tuple[Header, NDArray[np.int64], dict[str, NDArray[Any]]]:
+def read(path: Path) -> tuple[CheckpointHeader, NDArray[np.int64], dict[str, NDArray[Any]]]:
     """Header, keys and layers of a checkpoint.
 
     Raises:
@@ -101,7 +101,7 @@ def read(path: Path) -> tuple[Header, NDArray[np.int64], dict[str, NDArray[Any]]
     return header, keys, layers
 
 
-def verify(path: Path, header: Header, map_hash: str) -> None:
+def verify(path: Path, header: CheckpointHeader, map_hash: str) -> None:
     """Raise DamagedCheckpoint unless the loaded map has the hash that was saved."""
     if map_hash != header.map_hash:
         raise DamagedCheckpoint(f"{path} says its map hash is {header.map_hash}, but it loads as {map_hash}")
@@ -109,7 +109,7 @@ def verify(path: Path, header: Header, map_hash: str) -> None:
 
 def _write_body(
     file: BinaryIO,
-    header: Header,
+    header: CheckpointHeader,
     keys: NDArray[np.int64],
     slots: NDArray[np.int64],
     layers: dict[str, NDArray[Any]],
@@ -125,7 +125,7 @@ def _write_body(
 
 
 def _payloads(
-    header: Header,
+    header: CheckpointHeader,
     keys: NDArray[np.int64],
     slots: NDArray[np.int64],
     layers: dict[str, NDArray[Any]],
@@ -147,10 +147,10 @@ def _check_magic(file: BinaryIO, path: Path) -> None:
     raise kind(f"{path} is not a tsfusion map of version 1 (it starts with {magic!r})")
 
 
-def _read_header(file: BinaryIO, path: Path) -> Header:
+def _read_header(file: BinaryIO, path: Path) -> CheckpointHeader:
     (length,) = struct.unpack("<I", _exactly(file, 4, path))
     try:
-        header = msgspec.msgpack.decode(_exactly(file, length, path), type=Header)
+        header = msgspec.msgpack.decode(_exactly(file, length, path), type=CheckpointHeader)
     except msgspec.ValidationError as error:  # the digest agrees: it is as its writer meant it
         raise CheckpointError(f"{path} is of another version: {error}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -162,7 +162,7 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
     return header
 
 
-def _read_chunks(file: BinaryIO, path: Path, header: Header) -> Iterator[tuple[int, bytes]]:
+def _read_chunks(file: BinaryIO, path: Path, header: CheckpointHeader) -> Iterator[tuple[int, bytes]]:
     per_block = 8 + sum(CUBE * np.dtype(DTYPES[name]).itemsize for name in header.layers)
     for first in range(0, header.blocks, CHUNK):
         size = min(CHUNK, header.blocks - first) * per_block

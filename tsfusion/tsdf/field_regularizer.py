@@ -30,7 +30,7 @@ _SIDES = np.array([sign * step for step in _KEY_STEP for sign in (-1, 1)], np.in
 
 
 @dataclass(frozen=True)
-class Settings:
+class FieldSettings:
     """`smoothness` λ against data weights in full-confidence samples, `edge` ε in voxels: D2 beyond it
     counts as an edge, `reweightings` of ω after the first solve with ω = 1."""
 
@@ -55,7 +55,7 @@ def solve(
     min_weight: float,
     out: NDArray[np.float32] | None = None,
     *,
-    settings: Settings,
+    settings: FieldSettings,
 ) -> NDArray[np.float32]:
     """The `View` of the regularised signed distances."""
     if out is None:
@@ -91,7 +91,7 @@ def along_normals(
     return out[: len(keys)]
 
 
-def spread(keys: NDArray[np.int64], layers: Layers, settings: Settings) -> NDArray[np.int64]:
+def spread(keys: NDArray[np.int64], layers: Layers, settings: FieldSettings) -> NDArray[np.int64]:
     """The blocks whose field may move by more than a hundredth of a voxel with the sums of these."""
     return around(keys, layers, 1 + settings.coarser)
 
@@ -134,7 +134,7 @@ class _Batch:
     """Some blocks and their halo, as lists of cells."""
 
     def __init__(
-        self, wanted: NDArray[np.int64], layers: Layers, min_weight: float, settings: Settings
+        self, wanted: NDArray[np.int64], layers: Layers, min_weight: float, settings: FieldSettings
     ) -> None:
         self.wanted, self.settings = wanted, settings
         self.keys = keys = around(wanted, layers, 2 + settings.coarser)

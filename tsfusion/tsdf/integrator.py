@@ -23,7 +23,7 @@ from tsfusion.kernels.integrate import (
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.voxel_traversal import DEFERRED, UPDATES, WEIGHT
 from tsfusion.tsdf.block_store import BlockStore
-from tsfusion.tsdf.ray_buffers import BANDS, Scratch
+from tsfusion.tsdf.ray_buffers import BANDS, RayBuffers
 
 PART_WEIGHT = WEIGHT_LIMIT  # a lane's reserve: within a part none can carry unnoticed
 
@@ -33,7 +33,7 @@ Part = tuple[int, int]  # bands first … last - 1
 class Integrator:
     """The one writer of a map's sums."""
 
-    def __init__(self, store: BlockStore, scratch: Scratch, config: VolumeConfig) -> None:
+    def __init__(self, store: BlockStore, scratch: RayBuffers, config: VolumeConfig) -> None:
         self._store = store
         self._scratch = scratch
         self._config = config

@@ -11,14 +11,14 @@ from tsfusion.kernels.block_hash import find_blocks, insert_blocks
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.voxel_values import BANDS
 from tsfusion.tsdf.growing_array import GrowingArray
-from tsfusion.tsdf.surface_values import Layers, View, values_of
+from tsfusion.tsdf.surface_values import Layers, SurfaceView, values_of
 
 _KEEP = 1 << 14  # blocks whose working memory is kept for the next mesh: 45 MB
 _NO_COLOR = np.zeros((1, CUBE), np.int64)
 _NO_SLOTS = np.zeros(1, np.int32)
 
 
-class MeshScratch:
+class MeshBuffers:
     """Working memory of one extraction: a row a block, and one row for the blocks that are not there.
 
     What the arrays hold is said in `kernels/cells.py`.
@@ -85,11 +85,11 @@ def extract(
     wanted: NDArray[np.int64],
     layers: Layers,
     min_weight: float,
-    scratch: MeshScratch | None = None,
-    view: View = values_of,
+    scratch: MeshBuffers | None = None,
+    view: SurfaceView = values_of,
 ) -> Mesh:
     """Mesh of the cells of the map's blocks `wanted` (sorted distinct keys)."""
-    scratch = scratch or MeshScratch()
+    scratch = scratch or MeshBuffers()
     keys = scratch.keys_around(wanted, layers)
     count = len(keys)
     scratch.reserve(count)

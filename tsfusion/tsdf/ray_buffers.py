@@ -18,7 +18,7 @@ FULL_WEIGHT_SIGMA = 0.25  # voxels: noise below this no longer shows in the map
 _NOTHING = {len(shape): np.zeros(shape, np.uint8) for shape in ((1,), (1, 3), (1, 1, 3))}
 
 
-class Scratch:
+class RayBuffers:
     """Rays of the current keyframe (`rays`, by `bands`), the slots of the blocks they touch (`touched`), and
     the keys of those that the map does not have (`missing`, a hash set)."""
 

@@ -28,7 +28,7 @@ class Layers:
     voxel_size: float
 
 
-class View(Protocol):
+class SurfaceView(Protocol):
     """Reads values from the map: `values_of`, or one of `field` with its settings."""
 
     def __call__(
@@ -49,7 +49,7 @@ class View(Protocol):
 def values_of(
     keys: NDArray[np.int64], layers: Layers, min_weight: float, out: NDArray[np.float32] | None = None
 ) -> NDArray[np.float32]:
-    """The `View` of what was fused, as it is."""
+    """The `SurfaceView` of what was fused, as it is."""
     if out is None:
         out = np.empty((len(keys), CUBE), np.float32)
     correction = layers.correction

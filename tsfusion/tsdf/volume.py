@@ -24,9 +24,9 @@ from tsfusion.kernels.voxel_traversal import COUNT
 from tsfusion.tsdf import checkpoint, field_regularizer
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.integrator import Integrator
-from tsfusion.tsdf.mesh_extraction import MeshScratch, extract
-from tsfusion.tsdf.ray_buffers import Scratch
-from tsfusion.tsdf.surface_values import Layers, View, values_of
+from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
+from tsfusion.tsdf.ray_buffers import RayBuffers
+from tsfusion.tsdf.surface_values import Layers, SurfaceView, values_of
 
 
 class IntegrateStats(msgspec.Struct, frozen=True):
@@ -83,10 +83,10 @@ class Volume:
         self.keyframes = 0
         runtime.start(config.threads)
         self._smooths = model.regularizer != "off"
-        self._scratch = Scratch(color=config.color, regularised=self._smooths)
+        self._scratch = RayBuffers(color=config.color, regularised=self._smooths)
         self._store = BlockStore(color=config.color, corrected=self._smooths)
         self._integrator = Integrator(self._store, self._scratch, config)
-        self._mesh_scratch = MeshScratch()
+        self._mesh_scratch = MeshBuffers()
 
     def integrate(self, keyframe: Keyframe) -> IntegrateStats:
         """Add a keyframe. On an error the map is as it was.
@@ -210,7 +210,7 @@ class Volume:
             CheckpointError: when the file cannot be written.
         """
         layers = self._store.layers()
-        header = checkpoint.Header(
+        header = checkpoint.CheckpointHeader(
             config=self.config, keyframes=self.keyframes, map_hash=self.map_hash(),
             meta=self.meta if meta is None else meta, layers=list(layers),
         )  # fmt: skip
@@ -261,11 +261,13 @@ class Volume:
         )  # fmt: skip
 
     @property
-    def _field(self) -> field_regularizer.Settings:
+    def _field(self) -> field_regularizer.FieldSettings:
         model = self.model
-        return field_regularizer.Settings(model.field_smoothness, model.field_edge, model.field_reweightings)
+        return field_regularizer.FieldSettings(
+            model.field_smoothness, model.field_edge, model.field_reweightings
+        )
 
-    def _view(self, surface: Surface | None) -> View:
+    def _view(self, surface: Surface | None) -> SurfaceView:
         """What the surface is read from."""
         surface = surface or self.model.surface
         if surface not in get_args(Surface):

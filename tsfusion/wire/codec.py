@@ -22,7 +22,7 @@ from tsfusion.wire.keyframe_header import (
     ArrayCodec,
     ArrayName,
     Buffer,
-    Header,
+    KeyframeHeader,
     Refused,
     pack,
     stamp,
@@ -79,7 +79,7 @@ def encode(
             )
         )
     scales = {"depth": keyframe.depth_scale, "disparity": keyframe.disparity_scale}
-    header = Header(
+    header = KeyframeHeader(
         session=session,
         seq=seq,
         previous=seq - 1 if previous is None else previous,
@@ -120,7 +120,7 @@ def decode(frames: Sequence[Any]) -> Keyframe:
     )
 
 
-def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> Header:
+def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> KeyframeHeader:
     """Everything that can be known of a message without decompressing it.
 
     Raises:
@@ -139,12 +139,12 @@ def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> Hea
     return header
 
 
-def measurement(header: Header) -> str:
+def measurement(header: KeyframeHeader) -> str:
     """`depth`, `disparity` or `points`."""
     return next(buffer.name for buffer in header.buffers if buffer.name in _MEASUREMENTS)
 
 
-def _check_limits(header: Header, frames: int) -> None:
+def _check_limits(header: KeyframeHeader, frames: int) -> None:
     names = [buffer.name for buffer in header.buffers]
     if len(names) != frames - 1 or len(set(names)) != len(names):
         raise Refused("limits", f"{frames - 1} arrays came, the header announces {', '.join(names)}")
@@ -176,7 +176,7 @@ def _expected_shapes(kind: str, shapes: dict[ArrayName, tuple[int, ...]]) -> dic
     return {kind: [shape], "origins": origins, "color": [three], "confidence": [one]}
 
 
-def _check_sizes(header: Header, frames: Sequence[Any], max_frame_bytes: int) -> None:
+def _check_sizes(header: KeyframeHeader, frames: Sequence[Any], max_frame_bytes: int) -> None:
     total = memoryview(frames[0]).nbytes
     for buffer, frame in zip(header.buffers, frames[1:], strict=True):
         size = memoryview(frame).nbytes
@@ -192,7 +192,7 @@ def _check_sizes(header: Header, frames: Sequence[Any], max_frame_bytes: int) ->
             raise Refused("limits", f"the image of {buffer.name} is not {buffer.shape} as announced")
 
 
-def _check_values(header: Header) -> None:
+def _check_values(header: KeyframeHeader) -> None:
     kind = measurement(header)
     numbers = [value for value in (header.scale, header.baseline_fx) if value is not None]
     if not all(np.isfinite(value) and value > 0 for value in numbers):
@@ -209,7 +209,7 @@ def _check_values(header: Header) -> None:
         raise Refused("values", "disparity needs baseline_fx")
 
 
-def _pose(header: Header) -> NDArray[np.float64]:
+def _pose(header: KeyframeHeader) -> NDArray[np.float64]:
     return np.array([*header.pose, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4)
 
 
@@ -244,4 +244,4 @@ def _unpack(buffer: Buffer, frame: Any) -> NDArray[Any]:
     return array_encoding.unpack_image(frame, dtype, buffer.shape)
 
 
-__all__ = ["VERSION", "Buffer", "Header", "Refused", "check", "decode", "encode", "stamp", "unpack"]
+__all__ = ["VERSION", "Buffer", "KeyframeHeader", "Refused", "check", "decode", "encode", "stamp", "unpack"]

@@ -42,7 +42,7 @@ _RETRIED_WITHIN = 0.5  # seconds: libzmq says at once when it is going to try ag
 _numbers = itertools.count()
 
 
-class Monitor:
+class ConnectionMonitor:
     """Watches one connecting socket; make it before `connect`, close it before the socket.
 
     Attributes:

@@ -43,7 +43,7 @@ class Buffer(Struct, frozen=True, kw_only=True):
     crc32: Annotated[int, Meta(ge=0, le=(1 << 32) - 1)]  # of the frame
 
 
-class Header(Struct, frozen=True, kw_only=True, omit_defaults=True):
+class KeyframeHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Everything of a keyframe but its arrays.
 
     Attributes:
@@ -73,15 +73,15 @@ class Header(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 _PREFIX = MAGIC + bytes([VERSION])
-_DECODER = msgspec.msgpack.Decoder(Header)
+_DECODER = msgspec.msgpack.Decoder(KeyframeHeader)
 
 
-def pack(header: Header) -> bytes:
+def pack(header: KeyframeHeader) -> bytes:
     """The bytes of frame 0."""
     return _PREFIX + msgspec.msgpack.encode(header)
 
 
-def unpack(frame: Any) -> Header:
+def unpack(frame: Any) -> KeyframeHeader:
     """Read frame 0 (any bytes-like object).
 
     Raises:

@@ -13,7 +13,7 @@ from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.errors import DecodeError, NotAllowed, ServerUnreachable, TransportError
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.wire import messages, sockets
-from tsfusion.wire.connection_monitor import Monitor
+from tsfusion.wire.connection_monitor import ConnectionMonitor
 from tsfusion.wire.curve import ClientKeys
 from tsfusion.wire.health import Health, MeshLayout, Status
 from tsfusion.wire.messages import ASK_AGAIN, Command, Reply
@@ -146,7 +146,7 @@ def request(
     address, timeout = sockets.target(address), min(timeout, _LONGEST)
     context: zmq.Context[Any] = zmq.Context()
     link = sockets.dealer(context, keys)
-    monitor = Monitor(link, address, keys)
+    monitor = ConnectionMonitor(link, address, keys)
     try:
         link.connect(address)
         head, *frames = _exchange(link, monitor, command, timeout)
@@ -165,7 +165,7 @@ def request(
 
 
 def _exchange(
-    link: sockets.AnySocket, monitor: Monitor, command: messages.Command, timeout: float
+    link: sockets.AnySocket, monitor: ConnectionMonitor, command: messages.Command, timeout: float
 ) -> list[zmq.Frame]:
     """Send the question on each connection that is made, until there is an answer; its frames."""
     deadline = time.monotonic() + timeout

@@ -28,9 +28,9 @@ from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.trajectory import quaternion, rigid, slerp
-from tsfusion.scanner.localization.given_poses import FromFile, Given
+from tsfusion.scanner.localization.given_poses import GivenPoses, TrajectoryFilePoses
 from tsfusion.scanner.localization.localizer import Lost, Pose
-from tsfusion.scanner.localization.pose_feed.feed import Feed
+from tsfusion.scanner.localization.pose_feed.feed import PoseFeed
 from tsfusion.scanner.localization.pose_feed.messages import MAX_BYTES, decode
 from tsfusion.scanner.localization.pose_feed.pose_history import PoseHistory
 
@@ -62,7 +62,7 @@ def same(pose: Pose | Lost, T: np.ndarray, within: float = 1e-9) -> None:
 
 
 def test_given_poses_are_believed() -> None:
-    room, localizer = Synthetic("room", "lidar", count=12, color=False), Given()
+    room, localizer = Synthetic("room", "lidar", count=12, color=False), GivenPoses()
     found = [localizer.track(room.frame(index)) for index in range(12)]
     for index, pose in enumerate(found):
         same(pose, room.pose(index))
@@ -74,7 +74,7 @@ def test_given_poses_are_believed() -> None:
 
 
 def test_no_pose_given_is_lost() -> None:
-    localizer = Given()
+    localizer = GivenPoses()
     assert isinstance(localizer.track(frame(1, way(0))), Pose)
     assert localizer.track(frame(2)) == Lost(reason="the source gives no pose for this frame", timestamp_ns=2)
     localizer.reset()
@@ -97,12 +97,12 @@ def tum(tmp_path: Path) -> Path:
 
 
 def test_trajectory_is_interpolated(tum: Path) -> None:
-    localizer = FromFile(tum, max_gap_s=0.15)
+    localizer = TrajectoryFilePoses(tum, max_gap_s=0.15)
     same(localizer.track(frame(START)), way(0), 1e-8)
     same(localizer.track(frame(START + SECOND // 4)), way(0.25), 1e-3)
     exact = slerp(quaternion(way(0.2)[:3, :3]), quaternion(way(0.3)[:3, :3]), 0.5)
     same(localizer.track(frame(START + SECOND // 4)), rigid(exact, (way(0.2) + way(0.3))[:3, 3] / 2), 1e-8)
-    shifted = FromFile(tum, max_gap_s=0.15, time_offset_s=-0.5)
+    shifted = TrajectoryFilePoses(tum, max_gap_s=0.15, time_offset_s=-0.5)
     same(shifted.track(frame(START + SECOND)), way(0.5), 1e-8)
     assert localizer.absolute
 
@@ -118,19 +118,21 @@ def test_trajectory_is_interpolated(tum: Path) -> None:
 )
 def test_no_pose_at_that_time_is_lost(tum: Path, seconds: float, reason: str) -> None:
     stamp = START + round(seconds * SECOND)
-    assert FromFile(tum, max_gap_s=0.15).track(frame(stamp)) == Lost(reason=reason, timestamp_ns=stamp)
+    assert TrajectoryFilePoses(tum, max_gap_s=0.15).track(frame(stamp)) == Lost(
+        reason=reason, timestamp_ns=stamp
+    )
 
 
 def test_kitti_file_with_its_times(data: Callable[[str], Path]) -> None:
     root = data("kitti_odometry")
     dataset = open_dataset(root, sequence="06", modality="stereo")
-    localizer = FromFile(root / "poses" / "06.txt", max_gap_s=0.2)
+    localizer = TrajectoryFilePoses(root / "poses" / "06.txt", max_gap_s=0.2)
     for index in (0, 3, 29):
         same(localizer.track(frame_of(dataset, index)), dataset[index].T_world_camera)
 
 
 def test_a_source_without_times_gets_one_pose_at_most(data: Callable[[str], Path]) -> None:
-    localizer = FromFile(data("kitti_odometry") / "poses" / "06.txt", max_gap_s=0.2)
+    localizer = TrajectoryFilePoses(data("kitti_odometry") / "poses" / "06.txt", max_gap_s=0.2)
     assert isinstance(localizer.track(frame(0)), Pose)  # KITTI's clock begins at 0
     lost = localizer.track(frame(0))
     assert isinstance(lost, Lost)
@@ -156,7 +158,7 @@ def test_useless_files_are_explained(tmp_path: Path, poses: str, times: str | No
     if times is not None:
         (tmp_path / "times.txt").write_text(times, encoding="utf-8")
     with pytest.raises(DatasetError, match=said):
-        FromFile(path, max_gap_s=0.1)
+        TrajectoryFilePoses(path, max_gap_s=0.1)
 
 
 # ── a feed ─────────────────────────────────────────────────────────────────────────────────────────
@@ -186,12 +188,12 @@ class Sender:
 
 
 @pytest.fixture
-def feed() -> Iterator[Feed]:
-    with Feed("@tcp://127.0.0.1:0", max_gap_s=0.15, wait_s=0.05) as made:
+def feed() -> Iterator[PoseFeed]:
+    with PoseFeed("@tcp://127.0.0.1:0", max_gap_s=0.15, wait_s=0.05) as made:
         yield made
 
 
-def heard(feed: Feed, say: Callable[[int], None]) -> None:
+def heard(feed: PoseFeed, say: Callable[[int], None]) -> None:
     """Speak until somebody listens: what is published before is nobody's."""
     until, count = time.monotonic() + DEADLINE, 0
     while not feed.received:
@@ -201,7 +203,7 @@ def heard(feed: Feed, say: Callable[[int], None]) -> None:
         feed.track(frame(START - 1000 * SECOND))
 
 
-def test_the_documented_sender_drives_it(feed: Feed) -> None:
+def test_the_documented_sender_drives_it(feed: PoseFeed) -> None:
     sender = Sender(feed.address)
     try:
         heard(feed, lambda count: sender.pose(-100 + count))
@@ -228,7 +230,7 @@ def test_the_documented_sender_drives_it(feed: Feed) -> None:
         sender.close()
 
 
-def test_the_documented_sender_passes_over_what_is_no_pose(feed: Feed) -> None:
+def test_the_documented_sender_passes_over_what_is_no_pose(feed: PoseFeed) -> None:
     seconds = START // SECOND
     lines = "# timestamp tx ty tz qx qy qz qw", "", "now 0 0 0 0 0 0 1", f"{seconds} 0 0 0", f"{seconds} here"
     pose = f"{seconds} " + " ".join(f"{number!r}" for number in seven(way(0.0)))
@@ -270,7 +272,7 @@ def said(seconds: float, T: np.ndarray | None = None) -> dict[str, Any]:
     return {"stamp_ns": START + round(seconds * SECOND), "pose": seven(T)}
 
 
-def follow(feed: Feed, seconds: float) -> Pose:
+def follow(feed: PoseFeed, seconds: float) -> Pose:
     """The feed's pose at a time, as soon as it is there."""
     until = time.monotonic() + DEADLINE
     while isinstance(found := feed.track(frame(START + round(seconds * SECOND))), Lost):
@@ -279,7 +281,10 @@ def follow(feed: Feed, seconds: float) -> Pose:
 
 
 def test_a_frame_waits_for_the_pose_after_it() -> None:
-    with Feed("@tcp://127.0.0.1:0", max_gap_s=0.15, wait_s=DEADLINE) as feed, publisher(feed.address) as send:
+    with (
+        PoseFeed("@tcp://127.0.0.1:0", max_gap_s=0.15, wait_s=DEADLINE) as feed,
+        publisher(feed.address) as send,
+    ):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(feed, "_wait", 0.05)
             heard(feed, lambda count: send(said(-100 + count)))
@@ -299,7 +304,7 @@ def test_a_frame_waits_for_the_pose_after_it() -> None:
             later.wait()
 
 
-def test_matrices_and_messagepack_are_understood(feed: Feed) -> None:
+def test_matrices_and_messagepack_are_understood(feed: PoseFeed) -> None:
     with publisher(feed.address) as send:
         heard(feed, lambda count: send(said(-100 + count)))
         send({"stamp_ns": START, "pose": way(0).ravel().tolist(), "frame": "odom"})
@@ -350,7 +355,7 @@ def test_any_bytes_are_a_pose_or_refused(message: bytes) -> None:
         decode(message)
 
 
-def test_hostile_messages_are_counted_and_dropped(feed: Feed, caplog: pytest.LogCaptureFixture) -> None:
+def test_hostile_messages_are_counted_and_dropped(feed: PoseFeed, caplog: pytest.LogCaptureFixture) -> None:
     with publisher(feed.address) as send, zmq.Context() as context, context.socket(zmq.PUB) as parts:
         heard(feed, lambda count: send(said(-100 + count)))
         before = feed.received
@@ -371,7 +376,7 @@ def test_hostile_messages_are_counted_and_dropped(feed: Feed, caplog: pytest.Log
             feed.track(frame(START))
 
 
-def test_a_message_that_is_too_long_costs_its_connection_only(feed: Feed) -> None:
+def test_a_message_that_is_too_long_costs_its_connection_only(feed: PoseFeed) -> None:
     with publisher(feed.address) as send:
         heard(feed, lambda count: send(said(-100 + count)))
         send(b"{" + b" " * MAX_BYTES)
@@ -388,7 +393,7 @@ def test_a_connection_that_libzmq_gave_up_is_made_again(monkeypatch: pytest.Monk
     with zmq.Context() as context, context.socket(zmq.PUB) as made:
         made.setsockopt(zmq.LINGER, 0)
         address = f"tcp://127.0.0.1:{made.bind_to_random_port('tcp://127.0.0.1')}"
-        with Feed(address, max_gap_s=0.15, wait_s=0.05) as feed:
+        with PoseFeed(address, max_gap_s=0.15, wait_s=0.05) as feed:
             heard(feed, lambda count: made.send(json.dumps(said(-100 + count)).encode()))
             made.send(b"{" + b" " * MAX_BYTES)
             until = time.monotonic() + DEADLINE
@@ -397,7 +402,7 @@ def test_a_connection_that_libzmq_gave_up_is_made_again(monkeypatch: pytest.Monk
                 made.send(json.dumps(said(0.0)).encode())
 
 
-def test_a_flood_does_not_hold_up_a_frame(feed: Feed) -> None:
+def test_a_flood_does_not_hold_up_a_frame(feed: PoseFeed) -> None:
     code = (
         "import sys, zmq\n"
         "with zmq.Context() as c, c.socket(zmq.PUB) as s:\n"
@@ -418,7 +423,7 @@ def test_a_flood_does_not_hold_up_a_frame(feed: Feed) -> None:
         flood.wait()
 
 
-def test_large_graphs_one_after_the_other_do_not_hold_up_a_frame(feed: Feed) -> None:
+def test_large_graphs_one_after_the_other_do_not_hold_up_a_frame(feed: PoseFeed) -> None:
     stamps = [START + index for index in range(2000)]
     graph = {"stamps_ns": stamps, "poses": [[0.0, 0, 0, 0, 0, 0, 1]] * len(stamps)}
     with publisher(feed.address) as send:
@@ -434,7 +439,7 @@ def test_large_graphs_one_after_the_other_do_not_hold_up_a_frame(feed: Feed) -> 
             assert time.thread_time() - before < 3
 
 
-def test_corrections_move_the_tracking_keyframes(feed: Feed) -> None:
+def test_corrections_move_the_tracking_keyframes(feed: PoseFeed) -> None:
     """Odometry drifts sideways by 1 cm in 0.1 s; the sender's loop closure finds out at 1.0 s."""
     with publisher(feed.address) as send:
         heard(feed, lambda count: send(said(-100 + count)))
@@ -485,7 +490,7 @@ def test_a_sender_that_binds_may_come_later_and_again() -> None:
     with zmq.Context() as context, context.socket(zmq.PUB) as probe:
         port = probe.bind_to_random_port("tcp://127.0.0.1")
     address = f"tcp://127.0.0.1:{port}"
-    with Feed(address, max_gap_s=0.15, wait_s=0.05) as feed:
+    with PoseFeed(address, max_gap_s=0.15, wait_s=0.05) as feed:
         assert feed.address == address
         nothing = feed.track(frame(START))
         assert isinstance(nothing, Lost)
@@ -500,7 +505,7 @@ def test_a_sender_that_binds_may_come_later_and_again() -> None:
                     made.send(json.dumps(said(turn)).encode())
 
 
-def test_what_cannot_be_listened_to_is_explained(feed: Feed) -> None:
+def test_what_cannot_be_listened_to_is_explained(feed: PoseFeed) -> None:
     nothing = feed.track(frame(START))
     assert isinstance(nothing, Lost)
     assert f"@{feed.address}, where it listens" in nothing.reason
@@ -510,15 +515,15 @@ def test_what_cannot_be_listened_to_is_explained(feed: Feed) -> None:
         ("@tcp://0.0.0.0:5570", r"only tcp://127.0.0.1 can be bound"),
     ):
         with pytest.raises(InvalidConfig, match=said_of_it):
-            Feed(address, max_gap_s=0.1)
+            PoseFeed(address, max_gap_s=0.1)
     with pytest.raises(TransportError, match="cannot listen"):
-        Feed(f"@{feed.address}", max_gap_s=0.1)
+        PoseFeed(f"@{feed.address}", max_gap_s=0.1)
     without = feed.track(frame(0))
     assert isinstance(without, Lost)
     assert "no time" in without.reason
 
 
-def test_another_clock_is_named(feed: Feed) -> None:
+def test_another_clock_is_named(feed: PoseFeed) -> None:
     with publisher(feed.address) as send:
         heard(feed, lambda count: send(said(count)))
         lost = feed.track(frame(5 * SECOND))

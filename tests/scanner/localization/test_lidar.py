@@ -21,7 +21,7 @@ from tsfusion.scanner.localization.localizer import Lost, Pose
 
 pytest.importorskip("kiss_icp", reason="no kiss-icp: pip install 'tsfusion[lidar]'")
 
-from tsfusion.scanner.localization.lidar import Lidar
+from tsfusion.scanner.localization.lidar import LidarLocalizer
 
 Data = Callable[[str], Path]
 
@@ -58,7 +58,7 @@ def away(found: list[Pose | Lost], frames: list[Frame]) -> list[float]:
 
 
 def test_kitti_agrees_with_orb(kitti: list[Frame]) -> None:
-    lidar, found, spent = Lidar(), [], []
+    lidar, found, spent = LidarLocalizer(), [], []
     for frame in kitti:
         before = time.process_time()
         found.append(lidar.track(frame))
@@ -70,7 +70,7 @@ def test_kitti_agrees_with_orb(kitti: list[Frame]) -> None:
 
 def test_street_from_a_rolling_start(street: list[Frame]) -> None:
     """KISS-ICP alone takes the first two metres for none: rings on the ground look the same everywhere."""
-    lidar = Lidar()
+    lidar = LidarLocalizer()
     found = [lidar.track(frame) for frame in street]
     errors = away(found, street)
     assert max(errors[:4]) < 0.15
@@ -83,14 +83,14 @@ def test_street_from_a_rolling_start(street: list[Frame]) -> None:
 def test_room() -> None:
     dataset = Synthetic("room", "lidar", count=40, color=False)
     frames = [dataset.frame(index) for index in range(20)]
-    lidar = Lidar()
+    lidar = LidarLocalizer()
     assert max(away([lidar.track(frame) for frame in frames], frames)) < 0.08
 
 
 def test_equal_scans_give_equal_poses(street: list[Frame]) -> None:
     runs = []
     for _ in range(2):
-        lidar = Lidar()
+        lidar = LidarLocalizer()
         found = [lidar.track(frame) for frame in street[:5]]
         runs.append([pose.T_world_camera for pose in found if isinstance(pose, Pose)])
     np.testing.assert_array_equal(runs[0], runs[1])
@@ -117,7 +117,7 @@ def nearly_nothing(frame: Frame) -> Frame:
 def test_a_bad_scan_is_lost_and_leaves_no_trace(
     street: list[Frame], spoil: Callable[[Frame], Frame], reason: str
 ) -> None:
-    lidar = Lidar()
+    lidar = LidarLocalizer()
     found = [
         lidar.track(spoil(frame) if index in (6, 7) else frame) for index, frame in enumerate(street[:12])
     ]
@@ -129,7 +129,7 @@ def test_a_bad_scan_is_lost_and_leaves_no_trace(
 
 
 def test_another_street_is_no_motion(kitti: list[Frame], data: Data) -> None:
-    lidar = Lidar()
+    lidar = LidarLocalizer()
     for frame in kitti[:4]:
         assert isinstance(lidar.track(frame), Pose)
     for index in range(3):
@@ -138,7 +138,7 @@ def test_another_street_is_no_motion(kitti: list[Frame], data: Data) -> None:
 
 
 def test_reset_begins_a_new_world(street: list[Frame]) -> None:
-    lidar = Lidar()
+    lidar = LidarLocalizer()
     before = [pose for pose in (lidar.track(frame) for frame in street[:3]) if isinstance(pose, Pose)]
     lidar.reset()
     after = lidar.track(street[3])
@@ -186,7 +186,7 @@ def test_deskewed_scans_are_placed_where_they_began(street: list[Frame]) -> None
     frames = drive(street, 9)
     worst = {}
     for deskew in (True, False):
-        lidar = Lidar(deskew=deskew)
+        lidar = LidarLocalizer(deskew=deskew)
         worst[deskew] = max(away([lidar.track(frame) for frame in frames], frames))
     assert worst[True] < 0.3
     assert 2 * worst[True] < worst[False]
@@ -194,11 +194,11 @@ def test_deskewed_scans_are_placed_where_they_began(street: list[Frame]) -> None
 
 def test_images_are_refused() -> None:
     with pytest.raises(InvalidKeyframe, match="follows points, got depth"):
-        Lidar().track(Synthetic("room", "kinect", count=1, color=False).frame(0))
+        LidarLocalizer().track(Synthetic("room", "kinect", count=1, color=False).frame(0))
 
 
 def test_too_little_to_begin_with() -> None:
-    lost = Lidar().track(scan(np.ones((5, 3))))
+    lost = LidarLocalizer().track(scan(np.ones((5, 3))))
     assert isinstance(lost, Lost)
     assert lost.reason == "only 5 points to begin with"
 

@@ -17,14 +17,14 @@ from tsfusion.datasets.synthetic import loop_worlds
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Corrections, Lost, Pose
+from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
 from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing
-from tsfusion.scanner.localization.loop_closure.loop_consensus import Consensus, Loop
-from tsfusion.scanner.localization.loop_closure.odometry_drift import Chain, Drift
-from tsfusion.scanner.localization.loop_closure.place_index import Places, View, view
+from tsfusion.scanner.localization.loop_closure.loop_consensus import Loop, LoopConsensus
+from tsfusion.scanner.localization.loop_closure.odometry_drift import Chain, OdometryDrift
+from tsfusion.scanner.localization.loop_closure.place_index import PlaceIndex, PlaceView, view
 from tsfusion.scanner.localization.loop_closure.verification import check, matches
-from tsfusion.scanner.localization.rgbd.tracker import RGBD
-from tsfusion.scanner.tracked_trajectory import Track
+from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
+from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
 
 FAR, TURNED = 0.05, 2.0  # metres and degrees: a loop that is farther off is wrong
 
@@ -35,8 +35,8 @@ class Run:
     def __init__(self, frames: Sequence[Frame], seed: int = 0) -> None:
         self.closing = LoopClosing(Drifting(seed))
         self.truth = np.array([frame.T_world_camera for frame in frames])
-        self.track = Track()
-        self.corrections: list[Corrections] = []
+        self.track = TrackedTrajectory()
+        self.corrections: list[PoseCorrections] = []
         for frame in frames:
             pose = self.closing.track(frame)
             assert isinstance(pose, Pose)
@@ -46,7 +46,7 @@ class Run:
                 assert self.closing.corrections() is None
         self.loops = self.closing.consensus.believed
 
-    def error(self, corrections: Corrections | None) -> TrajectoryError:
+    def error(self, corrections: PoseCorrections | None) -> TrajectoryError:
         return absolute_error(self.track.poses(corrections), self.truth)
 
     def wrong(self) -> list[tuple[int, int, float, float]]:
@@ -68,11 +68,11 @@ def two_laps() -> list[Frame]:
 
 
 @cache
-def views() -> list[View]:
+def views() -> list[PlaceView]:
     return [seen(frame) for frame in two_laps()[:4]]
 
 
-def seen(frame: Frame) -> View:
+def seen(frame: Frame) -> PlaceView:
     assert frame.depth_m is not None
     found = view(frame, frame.depth_m)
     assert found is not None
@@ -179,7 +179,7 @@ def test_matches_are_mutual_and_clear():
 
 
 def test_places_are_found_by_their_looks_and_forgotten():
-    places = Places(capacity=3)
+    places = PlaceIndex(capacity=3)
     for number, seen_there in zip((3, 5, 8), views(), strict=False):
         assert not places.full
         places.add(number, seen_there)
@@ -241,11 +241,11 @@ def test_a_lost_camera_finds_itself():
 def test_a_lost_tracker_goes_on_where_it_has_been_before():
     """It walks on for 4 m, is covered, and wakes up where it was long ago: the world is the same."""
     dataset = Synthetic("corridor", count=520, width=320)
-    alone = RGBD()
+    alone = RGBDLocalizer()
     for index in range(34, 46):
         alone.track(dataset.frame(index))
     assert isinstance(alone.track(dataset.frame(8)), Lost)
-    closing = LoopClosing(RGBD())
+    closing = LoopClosing(RGBDLocalizer())
     for index in range(46):
         assert isinstance(closing.track(dataset.frame(index)), Pose)
     frame = dataset.frame(46)
@@ -277,8 +277,8 @@ def test_without_scipy_it_says_what_to_install(monkeypatch):
         LoopClosing(Drifting())
 
 
-def straight(count: int, drift: Drift | None = None) -> Chain:
-    chain = Chain(drift or Drift())
+def straight(count: int, drift: OdometryDrift | None = None) -> Chain:
+    chain = Chain(drift or OdometryDrift())
     for number in range(count):
         chain.add(number, se3.exp(np.array([0.5 * number, 0, 0, 0, 0, 0])))
     return chain
@@ -292,7 +292,7 @@ def claim(old: int, new: int, *, off: float = 0.0, sigma: float = 0.02) -> Loop:
 def test_odometry_knows_how_far_it_may_be_off():
     """The covariance of a stretch against that of a thousand walks with the stated noise."""
     rng = np.random.default_rng(9)
-    drift = Drift(translation_bias=0.0, rotation_bias=0.0)
+    drift = OdometryDrift(translation_bias=0.0, rotation_bias=0.0)
     steps = [se3.exp(np.array([0.4, 0.1, 0, 0, 0.1 * (k % 3), 0.2])) for k in range(12)]
     chain = Chain(drift)
     T = se3.exp(rng.normal(0, 1, 6))
@@ -319,7 +319,7 @@ def test_odometry_knows_how_far_it_may_be_off():
 
 
 def test_one_loop_is_not_believed_and_three_that_agree_are():
-    consensus = Consensus(straight(60))
+    consensus = LoopConsensus(straight(60))
     off = 1.0  # between 3 and 6 deviations: more than expected, less than impossible
     far = claim(0, 50, off=off)
     assert 3 < consensus.deviation(far.old, far.new, far.T_old_new, far.covariance) < 6
@@ -334,26 +334,28 @@ def test_one_loop_is_not_believed_and_three_that_agree_are():
 
 
 def test_where_odometry_expects_a_loop_two_suffice():
-    consensus = Consensus(straight(60))
+    consensus = LoopConsensus(straight(60))
     assert consensus.hear([claim(0, 50)]) == []
     assert len(consensus.hear([claim(1, 51)])) == 2
 
 
 def test_a_look_alike_nearby_makes_a_loop_doubtful():
     """Twelve deviations are needed to rule another explanation out."""
-    consensus = Consensus(straight(60))
+    consensus = LoopConsensus(straight(60))
     for new in range(50, 54):
         found = consensus.hear([claim(new - 50, new), claim(new - 48, new, off=2.0)])
         assert found == []
     assert consensus.refused["fits another place too"] == 4
-    sure = Consensus(straight(60, Drift(translation=0.005, rotation=0.001, translation_bias=0.002)))
+    sure = LoopConsensus(
+        straight(60, OdometryDrift(translation=0.005, rotation=0.001, translation_bias=0.002))
+    )
     for new in range(50, 54):
         found += sure.hear([claim(new - 50, new), claim(new - 48, new, off=2.0)])
     assert len(found) == 4
 
 
 def test_loops_of_one_keyframe_that_contradict_each_other_are_both_refused():
-    consensus = Consensus(straight(60))
+    consensus = LoopConsensus(straight(60))
     for new in range(50, 54):
         assert consensus.hear([claim(new - 50, new), claim(new - 49, new, off=0.9)]) == []
     assert consensus.refused == {"fits another place too": 4}
@@ -367,7 +369,7 @@ def test_an_image_too_small_is_no_place():
 
 def test_a_place_seen_to_have_a_twin_is_doubtful_ever_after():
     chain = straight(400)
-    consensus = Consensus(chain)
+    consensus = LoopConsensus(chain)
     twin = Loop(0, 8, np.eye(4), 0.02)  # 8 stands 4 m from 0 and looks as if it stood there
     assert consensus.hear([twin]) == []
     assert consensus.refused == {"contradicts the odometry": 1}
@@ -378,7 +380,7 @@ def test_a_place_seen_to_have_a_twin_is_doubtful_ever_after():
 
 
 def test_a_loop_the_graph_disowns_counts_no_more():
-    consensus = Consensus(straight(60))
+    consensus = LoopConsensus(straight(60))
     for new in (50, 51):
         consensus.hear([claim(new - 50, new)])
     wrong = consensus.believed[0]

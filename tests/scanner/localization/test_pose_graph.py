@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from tsfusion.core.errors import MissingDependency
 from tsfusion.evaluation.trajectory_error import absolute_error
 from tsfusion.geometry import se3, twists
-from tsfusion.scanner.localization.loop_closure.pose_graph import Edge, information, optimise
+from tsfusion.scanner.localization.loop_closure.pose_graph import PoseGraphEdge, information, optimise
 
 TIGHT = information(0.01, 0.002)
 
@@ -32,19 +32,19 @@ def ring(count: int, *, laps: float = 1.0, radius: float = 5.0) -> NDArray[np.fl
 
 def drifting(
     truth: NDArray[np.float64], rng: np.random.Generator
-) -> tuple[dict[int, NDArray[np.float64]], list[Edge]]:
+) -> tuple[dict[int, NDArray[np.float64]], list[PoseGraphEdge]]:
     """Odometry of noise as its edges state: the poses it leads to, and the edges."""
     nodes, edges = {0: truth[0]}, []
     for i in range(len(truth) - 1):
         noise = se3.exp(rng.normal(0, 1, 6) * ([0.01] * 3 + [0.002] * 3))
         step = se3.inverse(truth[i]) @ truth[i + 1] @ noise
         nodes[i + 1] = nodes[i] @ step
-        edges.append(Edge(i, i + 1, step, TIGHT))
+        edges.append(PoseGraphEdge(i, i + 1, step, TIGHT))
     return nodes, edges
 
 
-def loop(truth: NDArray[np.float64], start: int, end: int) -> Edge:
-    return Edge(start, end, se3.inverse(truth[start]) @ truth[end], TIGHT, robust=True)
+def loop(truth: NDArray[np.float64], start: int, end: int) -> PoseGraphEdge:
+    return PoseGraphEdge(start, end, se3.inverse(truth[start]) @ truth[end], TIGHT, robust=True)
 
 
 def stacked(nodes: dict[int, NDArray[np.float64]]) -> NDArray[np.float64]:
@@ -77,7 +77,7 @@ def test_the_jacobian_is_the_derivative(size):
 
 def test_a_graph_that_fits_stays_as_it_is():
     truth = random_poses(np.random.default_rng(3), 30)
-    edges = [Edge(i, i + 1, se3.inverse(truth[i]) @ truth[i + 1], TIGHT) for i in range(29)]
+    edges = [PoseGraphEdge(i, i + 1, se3.inverse(truth[i]) @ truth[i + 1], TIGHT) for i in range(29)]
     found = optimise(dict(enumerate(truth)), [*edges, loop(truth, 0, 29), loop(truth, 25, 4)])
     np.testing.assert_allclose(stacked(found.nodes), truth, atol=1e-12)
     assert found.after < 1e-18
@@ -102,7 +102,9 @@ def test_names_of_nodes_and_the_order_of_edges_mean_nothing():
     nodes, edges = drifting(truth, np.random.default_rng(5))
     edges.append(loop(truth, 1, 24))
     renamed = {1000 - 7 * key: T for key, T in nodes.items()}
-    again = [Edge(1000 - 7 * e.start, 1000 - 7 * e.end, e.T_start_end, e.information) for e in edges[::-1]]
+    again = [
+        PoseGraphEdge(1000 - 7 * e.start, 1000 - 7 * e.end, e.T_start_end, e.information) for e in edges[::-1]
+    ]
     one, two = optimise(nodes, edges), optimise(renamed, again)
     np.testing.assert_allclose(stacked(one.nodes), stacked(two.nodes), atol=1e-6)
 
@@ -111,9 +113,9 @@ def test_a_loop_spreads_the_error_evenly():
     """A straight chain whose ends are known a metre shorter: each step gives up its equal share."""
     step = se3.exp(np.array([1.0, 0, 0, 0, 0, 0]))
     nodes = {i: se3.exp(np.array([float(i), 0, 0, 0, 0, 0])) for i in range(11)}
-    edges = [Edge(i, i + 1, step, information(0.1, 0.01)) for i in range(10)]
+    edges = [PoseGraphEdge(i, i + 1, step, information(0.1, 0.01)) for i in range(10)]
     ends = se3.exp(np.array([9.0, 0, 0, 0, 0, 0]))
-    found = optimise(nodes, [*edges, Edge(0, 10, ends, information(1e-4, 1e-4))])
+    found = optimise(nodes, [*edges, PoseGraphEdge(0, 10, ends, information(1e-4, 1e-4))])
     np.testing.assert_allclose(stacked(found.nodes)[:, 0, 3], np.arange(11) * 0.9, atol=1e-5)
     np.testing.assert_allclose(stacked(found.nodes)[:, 1:3, 3], 0, atol=1e-9)
 
@@ -125,7 +127,7 @@ def test_the_optimum_is_that_of_a_general_solver():
     nodes, edges = drifting(truth, rng)
     weight = rng.normal(0, 1, (6, 6))
     weight = weight @ weight.T + np.eye(6)  # a covariance that mixes translation and rotation
-    edges += [Edge(8, 0, se3.inverse(truth[8]) @ truth[0], 100 * weight), loop(truth, 2, 7)]
+    edges += [PoseGraphEdge(8, 0, se3.inverse(truth[8]) @ truth[0], 100 * weight), loop(truth, 2, 7)]
     square_roots = [np.linalg.cholesky(edge.information).T for edge in edges]
 
     def residuals(x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -152,7 +154,7 @@ def test_loops_that_are_wrong_are_left_out(wrong):
     edges += [loop(truth, i, i + 80) for i in range(0, 80, 8)]
     expected = optimise(nodes, edges)
     false = [
-        Edge(int(i), int(i + 40), se3.exp(rng.normal(0, 0.2, 6)), TIGHT, robust=True)
+        PoseGraphEdge(int(i), int(i + 40), se3.exp(rng.normal(0, 0.2, 6)), TIGHT, robust=True)
         for i in rng.choice(110, wrong, replace=False)
     ]
     found = optimise(nodes, [*edges, *false])
@@ -167,7 +169,7 @@ def test_loops_that_are_wrong_are_left_out(wrong):
 def test_a_trusted_edge_is_never_left_out():
     truth = ring(20)
     nodes, edges = drifting(truth, np.random.default_rng(8))
-    wrong = Edge(0, 19, se3.exp(np.array([3.0, 0, 0, 0, 0, 0])), TIGHT)
+    wrong = PoseGraphEdge(0, 19, se3.exp(np.array([3.0, 0, 0, 0, 0, 0])), TIGHT)
     found = optimise(nodes, [*edges, wrong])
     assert (found.weights == 1).all()
     assert np.linalg.norm((se3.inverse(found.nodes[0]) @ found.nodes[19])[:3, 3] - (3, 0, 0)) < 1.0
@@ -179,7 +181,7 @@ def test_small_graphs():
     np.testing.assert_array_equal(alone.nodes[5], start)
     assert alone.iterations == 0
     step = se3.exp(np.array([0.5, 0, 0, 0, 1.0, 0]))
-    pair = optimise({5: start, 2: np.eye(4)}, [Edge(5, 2, step, TIGHT, robust=True)])
+    pair = optimise({5: start, 2: np.eye(4)}, [PoseGraphEdge(5, 2, step, TIGHT, robust=True)])
     np.testing.assert_allclose(pair.nodes[2], start @ step, atol=1e-9)
 
 

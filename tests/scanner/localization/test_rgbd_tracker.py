@@ -17,7 +17,7 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.localizer import Lost, Pose
-from tsfusion.scanner.localization.rgbd.tracker import RGBD
+from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def frames(dataset, *, start=0, stop=None, stride=1):
 
 
 def test_the_kitchen_at_two_and_a_half_frames_a_second(kitchen):
-    result = track(RGBD(), frames(kitchen, stop=75, stride=3))
+    result = track(RGBDLocalizer(), frames(kitchen, stop=75, stride=3))
     assert not result.lost
     assert result.ate() < 30
 
@@ -47,7 +47,7 @@ def test_the_kitchen_at_two_and_a_half_frames_a_second(kitchen):
 @pytest.mark.parametrize("stride", [1, 2, 3])
 def test_the_kitchen(kitchen, stride):
     """The recorded poses are good to 30 mm. On a quiet core a frame takes half of what is allowed here."""
-    localizer, recorded, spent = RGBD(), list(frames(kitchen, stride=stride)), 0.0
+    localizer, recorded, spent = RGBDLocalizer(), list(frames(kitchen, stride=stride)), 0.0
     for frame in recorded:
         assert frame.gray is not None
     begun = time.process_time()
@@ -65,14 +65,16 @@ def test_the_kitchen(kitchen, stride):
 @pytest.mark.parametrize("path", ["handheld", pytest.param("circle", marks=pytest.mark.slow)])
 def test_rooms_with_exact_poses(world, bound, path):
     count = 40 if path == "handheld" else 150
-    result = track(RGBD(), frames(Synthetic(world, count=count, path=path)))
+    result = track(RGBDLocalizer(), frames(Synthetic(world, count=count, path=path)))
     assert not result.lost
     assert result.ate() < bound
 
 
 @pytest.mark.slow
 def test_a_room_at_full_resolution():
-    result = track(RGBD(), frames(Synthetic("room", count=150, path="handheld", width=640), stride=3))
+    result = track(
+        RGBDLocalizer(), frames(Synthetic("room", count=150, path="handheld", width=640), stride=3)
+    )
     assert not result.lost
     assert result.ate() < 3
 
@@ -81,17 +83,17 @@ def test_a_room_at_full_resolution():
     ("folder", "stop", "bound"), [("hololens", 20, 10), ("redwood_livingroom1", 10, 10), ("3dmatch", 3, 15)]
 )
 def test_other_sensors(data, folder, stop, bound):
-    result = track(RGBD(), frames(open_dataset(data(folder)), stop=stop))
+    result = track(RGBDLocalizer(), frames(open_dataset(data(folder)), stop=stop))
     assert not result.lost
     assert result.ate() < bound
 
 
 def test_depth_alone(kitchen):
     bare = (replace(frame, color=None) for frame in frames(kitchen, stop=30))
-    result = track(RGBD(), bare)
+    result = track(RGBDLocalizer(), bare)
     assert not result.lost
     assert result.ate() < 30
-    room = track(RGBD(), frames(Synthetic("room", count=20, path="handheld", color=False)))
+    room = track(RGBDLocalizer(), frames(Synthetic("room", count=20, path="handheld", color=False)))
     assert not room.lost
     assert room.ate() < 1
 
@@ -99,7 +101,7 @@ def test_depth_alone(kitchen):
 def test_garbage_is_lost_and_the_way_is_found_again(kitchen):
     seen = list(frames(kitchen, stop=36, stride=1))
     between = list(garbage(seen[20]).values())
-    localizer = RGBD()
+    localizer = RGBDLocalizer()
     before = track(localizer, seen[:21])
     assert not before.lost
     assert len(track(localizer, between).lost) == len(between)
@@ -114,7 +116,7 @@ def test_garbage_is_lost_and_the_way_is_found_again(kitchen):
 
 def test_uncovered_elsewhere_it_finds_a_place_it_has_been_to(kitchen):
     """Lost at one end of the way, shown its beginning: nothing but the look of the place can help."""
-    localizer, seen = RGBD(), list(frames(kitchen, stop=45))
+    localizer, seen = RGBDLocalizer(), list(frames(kitchen, stop=45))
     assert not track(localizer, seen).lost
     assert isinstance(localizer.track(garbage(seen[-1])["covered"]), Lost)
     again = track(localizer, seen[:8])
@@ -135,7 +137,7 @@ def test_no_pose_after_a_jump_is_wrong(kitchen, color):
         there = {index: replace(frame, color=None) for index, frame in there.items()}
     lost = 0
     for first, last in [(0, 36), (0, 60), (24, 84), (36, 108), (60, 0), (84, 36), (108, 12), (120, 60)]:
-        result = track(RGBD(), [there[first], there[last]])
+        result = track(RGBDLocalizer(), [there[first], there[last]])
         lost += len(result.lost)
         if not result.lost:
             moved = se3.inverse(result.truth[0]) @ result.truth[1]
@@ -147,22 +149,26 @@ def test_no_pose_after_a_jump_is_wrong(kitchen, color):
 
 def test_another_place_is_lost(kitchen, data):
     other = open_dataset(data("redwood_livingroom1")).frame(0)
-    assert track(RGBD(), [kitchen.frame(0), replace(other, intrinsics=kitchen.intrinsics)]).lost == [1]
+    assert track(RGBDLocalizer(), [kitchen.frame(0), replace(other, intrinsics=kitchen.intrinsics)]).lost == [
+        1
+    ]
 
 
 @pytest.mark.parametrize("waves", [False, True])
 def test_along_a_plain_wall_it_is_lost(waves):
     """Depth says nothing of a motion along a plane, and noise in both images must not pass for it."""
     plain = [wall(2 * index, textured=False, waves=waves, seed=index) for index in range(6)]
-    result = track(RGBD(), plain)
+    result = track(RGBDLocalizer(), plain)
     assert result.lost == [1, 2, 3, 4, 5]
     assert "plain wall" in result.answers[1].reason
-    assert track(RGBD(), [replace(frame, color=None) for frame in plain]).lost == [1, 2, 3, 4, 5]
+    assert track(RGBDLocalizer(), [replace(frame, color=None) for frame in plain]).lost == [1, 2, 3, 4, 5]
 
 
 @pytest.mark.parametrize("waves", [False, True])
 def test_along_a_wall_with_a_pattern_it_goes_by_the_image(waves):
-    result = track(RGBD(), [wall(2 * index, textured=True, waves=waves, seed=index) for index in range(12)])
+    result = track(
+        RGBDLocalizer(), [wall(2 * index, textured=True, waves=waves, seed=index) for index in range(12)]
+    )
     assert not result.lost
     expected = np.arange(12) * 2 * 2.0 / CAMERA.fx
     np.testing.assert_allclose(result.poses[:, 0, 3], expected, atol=0.003)
@@ -181,7 +187,7 @@ def test_a_picture_carried_through_the_view_is_not_followed():
             depth[100:300, left : left + 200] = 6000
             color[100:300, left : left + 200] = picture
         shown.append(replace(frame, depth=depth, color=color))
-    result = track(RGBD(), shown)
+    result = track(RGBDLocalizer(), shown)
     assert not result.lost
     assert result.ate() < 5
 
@@ -189,13 +195,13 @@ def test_a_picture_carried_through_the_view_is_not_followed():
 def test_frames_left_out_are_made_up_for_by_the_clock():
     dataset = Synthetic("room", count=40, path="handheld")
     some = [0, 1, 2, 3, 6, 7, 8, 12, 13, 14, 15, 19, 20, 21, 26, 27]
-    result = track(RGBD(), (dataset.frame(index) for index in some))
+    result = track(RGBDLocalizer(), (dataset.frame(index) for index in some))
     assert not result.lost
     assert result.ate() < 2
 
 
 def test_equal_frames_give_equal_poses_to_the_bit(room):
-    first, second = (track(RGBD(), room).poses for _ in range(2))
+    first, second = (track(RGBDLocalizer(), room).poses for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
@@ -211,14 +217,14 @@ def test_units_do_not_matter(room):
         )
         for frame in room[:8]
     ]  # fmt: skip
-    expected = track(RGBD(), room[:8]).poses
+    expected = track(RGBDLocalizer(), room[:8]).poses
     for other in (metres, unset):
-        np.testing.assert_allclose(track(RGBD(), other).poses, expected, atol=1e-6)
-    np.testing.assert_allclose(track(RGBD(), disparity).poses, expected, atol=1e-3)
+        np.testing.assert_allclose(track(RGBDLocalizer(), other).poses, expected, atol=1e-6)
+    np.testing.assert_allclose(track(RGBDLocalizer(), disparity).poses, expected, atol=1e-3)
 
 
 def test_anchors_and_quality(room):
-    localizer = RGBD()
+    localizer = RGBDLocalizer()
     poses, anchors = [localizer.track(frame) for frame in room], {}
     assert all(isinstance(pose, Pose) for pose in poses)
     assert poses[0].starts_anchor
@@ -238,7 +244,7 @@ def test_anchors_and_quality(room):
 
 
 def test_reset_begins_another_world(room):
-    localizer = RGBD()
+    localizer = RGBDLocalizer()
     before = [localizer.track(frame) for frame in room[:6]]
     localizer.reset()
     after = localizer.track(room[12])
@@ -248,7 +254,7 @@ def test_reset_begins_another_world(room):
 
 
 def test_a_first_frame_without_depth_is_no_beginning(room):
-    localizer = RGBD()
+    localizer = RGBDLocalizer()
     lost = localizer.track(garbage(room[0])["blank depth"])
     assert isinstance(lost, Lost)
     assert lost.reason == "0.0% of the depth image shows a surface"
@@ -258,7 +264,7 @@ def test_a_first_frame_without_depth_is_no_beginning(room):
 
 
 def test_an_image_of_another_size_goes_by_depth(room):
-    localizer = RGBD()
+    localizer = RGBDLocalizer()
     localizer.track(room[0])
     half = replace(
         room[1],
@@ -280,7 +286,7 @@ def test_an_image_of_another_size_goes_by_depth(room):
 )  # fmt: skip
 def test_frames_without_a_depth_image_are_refused(fields, kind):
     with pytest.raises(InvalidKeyframe, match=f"needs a depth or disparity image in every frame, got {kind}"):
-        RGBD().track(Frame(sensor="scanner", **fields))
+        RGBDLocalizer().track(Frame(sensor="scanner", **fields))
 
 
 @pytest.mark.slow

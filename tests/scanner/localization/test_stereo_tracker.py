@@ -23,8 +23,8 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.stereo_matching import Matcher, quick_disparity
 from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
 from tsfusion.scanner.localization.stereo.rectification_check import RectificationCheck
-from tsfusion.scanner.localization.stereo.reprojection import Rig, refine
-from tsfusion.scanner.localization.stereo.tracker import Stereo
+from tsfusion.scanner.localization.stereo.reprojection import StereoCamera, refine
+from tsfusion.scanner.localization.stereo.tracker import StereoLocalizer
 
 Data = Callable[[str], Path]
 
@@ -67,7 +67,7 @@ def garbage(frame: Frame) -> Frame:
 
 def test_kitti_drift_and_time(data: Data) -> None:
     clip = frames(data, "06", 30)
-    stereo = Stereo()
+    stereo = StereoLocalizer()
     found, spent = [], []
     for frame in clip:
         before = time.process_time()
@@ -86,21 +86,21 @@ def test_kitti_drift_and_time(data: Data) -> None:
 
 def test_equal_frames_give_equal_poses(data: Data) -> None:
     clip = frames(data, "06", 5)
-    once, again = (positions(poses(Stereo(), clip)) for _ in range(2))
+    once, again = (positions(poses(StereoLocalizer(), clip)) for _ in range(2))
     np.testing.assert_array_equal(once, again)
 
 
 def test_half_the_frame_rate_is_enough(data: Data) -> None:
     clip = frames(data, "06", 30)[::2]
     error = absolute_error(
-        positions(poses(Stereo(), clip)), np.array([frame.T_world_camera for frame in clip])
+        positions(poses(StereoLocalizer(), clip)), np.array([frame.T_world_camera for frame in clip])
     )
     assert error.drift_percent <= 1.0
 
 
 def test_anchors_carry_the_poses(data: Data) -> None:
     clip = frames(data, "06", 8)
-    found = poses(Stereo(), clip)
+    found = poses(StereoLocalizer(), clip)
     anchors = {pose.anchor: pose.T_world_camera for pose in found if pose.starts_anchor}
     assert list(anchors) == list(range(len(anchors)))
     assert 2 <= len(anchors) < len(found)
@@ -118,7 +118,7 @@ def test_a_camera_that_stands_still_stays_where_it_is(data: Data) -> None:
         noise = rng.normal(0, 3, image.shape)
         return np.clip(image + noise, 0, 255).astype(np.uint8)
 
-    found = poses(Stereo(), [both(frame, noisy) for _ in range(8)])
+    found = poses(StereoLocalizer(), [both(frame, noisy) for _ in range(8)])
     assert max(se3.distance(pose.T_world_camera) for pose in found) < 0.02
     assert max(se3.angle(pose.T_world_camera) for pose in found) < np.radians(0.05)
 
@@ -126,7 +126,7 @@ def test_a_camera_that_stands_still_stays_where_it_is(data: Data) -> None:
 @pytest.mark.parametrize("spoil", [blank, garbage])
 def test_a_bad_frame_is_lost_and_the_next_one_is_not(data: Data, spoil: Callable[[Frame], Frame]) -> None:
     clip = frames(data, "06", 5)
-    stereo, whole = Stereo(), poses(Stereo(), clip)
+    stereo, whole = StereoLocalizer(), poses(StereoLocalizer(), clip)
     found = [stereo.track(spoil(frame) if index == 3 else frame) for index, frame in enumerate(clip)]
     assert isinstance(found[3], Lost)
     assert found[3].timestamp_ns == clip[3].timestamp_ns
@@ -138,7 +138,7 @@ def test_a_bad_frame_is_lost_and_the_next_one_is_not(data: Data, spoil: Callable
 
 def test_another_place_is_no_motion(data: Data) -> None:
     clip, other = frames(data, "06", 30), frames(data, "01", 3)
-    stereo = Stereo()
+    stereo = StereoLocalizer()
     poses(stereo, clip[:4])
     elsewhere = [both(frame, lambda image: np.ascontiguousarray(image[:370, :1226])) for frame in other]
     assert all(isinstance(stereo.track(frame), Lost) for frame in [*elsewhere, *clip[14:18]])
@@ -149,7 +149,7 @@ def test_another_place_is_no_motion(data: Data) -> None:
 
 def test_reset_begins_a_new_world(data: Data) -> None:
     clip = frames(data, "06", 6)
-    stereo = Stereo()
+    stereo = StereoLocalizer()
     before = poses(stereo, clip[:3])
     stereo.reset()
     after = poses(stereo, clip[3:])
@@ -161,7 +161,7 @@ def test_reset_begins_a_new_world(data: Data) -> None:
 
 def test_nothing_to_begin_with(data: Data) -> None:
     (frame,) = frames(data, "06", 1)
-    stereo = Stereo()
+    stereo = StereoLocalizer()
     first = stereo.track(blank(frame))
     assert isinstance(first, Lost)
     assert "corners with depth" in first.reason
@@ -170,7 +170,7 @@ def test_nothing_to_begin_with(data: Data) -> None:
 
 def test_disparity_with_an_image() -> None:
     street = Synthetic("street", "stereo", count=12)
-    found = poses(Stereo(), [street.frame(index) for index in range(12)])
+    found = poses(StereoLocalizer(), [street.frame(index) for index in range(12)])
     error = absolute_error(positions(found), np.array([street.pose(index) for index in range(12)]))
     assert error.drift_percent < 1.5
 
@@ -179,7 +179,7 @@ def test_what_it_cannot_follow() -> None:
     for sensor, said in (("lidar", "got points"), ("kinect", "got depth without colour")):
         frame = Synthetic("room", sensor, count=1, color=False).frame(0)
         with pytest.raises(InvalidKeyframe, match=said):
-            Stereo().track(frame)
+            StereoLocalizer().track(frame)
 
 
 def test_quick_disparity_agrees_with_ground_truth(data: Data) -> None:
@@ -201,7 +201,7 @@ def test_quick_disparity_agrees_with_ground_truth(data: Data) -> None:
 def test_refinement_finds_motion_and_offset() -> None:
     rng = np.random.default_rng(2)
     K, baseline_fx, count = Intrinsics(700.0, 700.0, 600.0, 180.0), 380.0, 400
-    rig, guess = Rig(K, baseline_fx), se3.exp(np.array([0, 0, 1.0, 0, 0.018, 0]))
+    rig, guess = StereoCamera(K, baseline_fx), se3.exp(np.array([0, 0, 1.0, 0, 0.018, 0]))
     T = se3.exp(np.array([0.05, 0.01, 1.1, 0.002, 0.02, -0.003]))
     disparity = rng.uniform(3, 60, count)
     old = np.column_stack([rng.uniform(0, 1200, count), rng.uniform(0, 370, count)]).astype(np.float32)
@@ -277,7 +277,7 @@ def euroc(folder: Path, *, rectify: bool) -> list[Frame]:
 
 
 def check(followed: list[Frame]) -> RectificationCheck:
-    stereo = Stereo()
+    stereo = StereoLocalizer()
     for frame in followed:
         stereo.track(frame)
     assert stereo.rectification is not None
@@ -355,7 +355,7 @@ def test_swapped_sides_are_named(data: Data) -> None:
 def test_the_faulty_clip_shows_from_its_images_alone(data: Data) -> None:
     """KITTI 01 as handed down: lengths come out 8 % long, and its disparities are too low."""
     clip = frames(data, "01", 15)
-    stereo = Stereo()
+    stereo = StereoLocalizer()
     found = positions(poses(stereo, clip))
     said = stereo.rectification
     assert said is not None

@@ -27,7 +27,7 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources import folder_layouts
 from tsfusion.scanner.sources.registry import is_live, open_source
 from tsfusion.scanner.sources.source import Source
-from tsfusion.scanner.sources.watched_folder import Folder
+from tsfusion.scanner.sources.watched_folder import WatchedFolder
 
 H, W = 24, 32
 K = Intrinsics(40.0, 40.0, 15.5, 11.5)
@@ -149,7 +149,7 @@ def test_what_was_there_before_comes_first(tmp_path: Path) -> None:
     camera(tmp_path)
     for number in (10, 9, 2):
         rgbd(tmp_path, number, name=str(number))
-    with Folder(tmp_path) as source:
+    with WatchedFolder(tmp_path) as source:
         frames = iter(source)
         assert numbers([next(frames) for _ in range(3)]) == [2, 9, 10]
         rgbd(tmp_path, 11, name="11")
@@ -164,7 +164,7 @@ def test_names_that_are_times(tmp_path: Path) -> None:
     rgbd(tmp_path, 1, name="1305031102.5")
     rgbd(tmp_path, 0, name="1305031102.175304")
     (tmp_path / "DONE").touch()
-    with Folder(tmp_path) as source:
+    with WatchedFolder(tmp_path) as source:
         frames = list(source)
     assert numbers(frames) == [0, 1]
     assert [frame.timestamp_ns for frame in frames] == [1305031102175304000, 1305031102500000000]
@@ -176,7 +176,7 @@ def test_names_that_are_no_times_take_the_files(tmp_path: Path) -> None:
     os.utime(tmp_path / "depth" / "000000.png", ns=(1, 1_600_000_000_000_000_000))
     (tmp_path / "DONE").touch()
     begun = time.monotonic_ns()
-    with Folder(tmp_path) as source:
+    with WatchedFolder(tmp_path) as source:
         (frame,) = source
     assert frame.timestamp_ns == 1_600_000_000_000_000_000
     assert frame.captured_ns >= begun  # it was captured long before; the delay is counted from the reading
@@ -186,7 +186,7 @@ def test_it_ends_when_nothing_comes(tmp_path: Path) -> None:
     camera(tmp_path)
     rgbd(tmp_path, 0)
     begun = time.monotonic()
-    with Folder(tmp_path, idle=0.4) as source:
+    with WatchedFolder(tmp_path, idle=0.4) as source:
         assert numbers(list(source)) == [0]
     assert 0.4 < time.monotonic() - begun < 10
 
@@ -195,7 +195,7 @@ def test_depth_alone(tmp_path: Path) -> None:
     camera(tmp_path)
     for number in range(3):
         write(tmp_path, f"depth/{number}.png", png(depth(number)))
-    with Folder(tmp_path, deadline=0.3, idle=0.3) as source:
+    with WatchedFolder(tmp_path, deadline=0.3, idle=0.3) as source:
         frames = list(source)
     assert numbers(frames) == [0, 1, 2]
     assert all(frame.color is None for frame in frames)
@@ -210,7 +210,7 @@ def test_the_layout_of_7_scenes(data: Callable[[str], Path], tmp_path: Path) -> 
         for path in recorded.glob(f"{stem}.*"):
             (tmp_path / path.name).write_bytes(path.read_bytes())
     (tmp_path / "DONE").touch()
-    with Folder(tmp_path) as source:
+    with WatchedFolder(tmp_path) as source:
         frames = list(source)
     assert len(frames) == len(stems) == 3
     for stem, frame in zip(stems, frames, strict=True):
@@ -227,7 +227,7 @@ def test_an_open3d_camera_and_a_scale(tmp_path: Path) -> None:
     (tmp_path / "camera_intrinsic.json").write_text(json.dumps({"intrinsic_matrix": matrix}))
     rgbd(tmp_path, 0)
     (tmp_path / "DONE").touch()
-    with Folder(tmp_path, depth_scale=0.0002, sensor="tof") as source:
+    with WatchedFolder(tmp_path, depth_scale=0.0002, sensor="tof") as source:
         (frame,) = source
     assert (frame.intrinsics, frame.depth_scale, frame.sensor) == (K, 0.0002, "tof")
 
@@ -238,7 +238,7 @@ def test_rectified_pairs(tmp_path: Path) -> None:
     for side, number in (("left", 1), ("right", 2)):
         write(tmp_path, f"{side}/1403715273262142976.png", png(color(number)[:, :, 0]))
     (tmp_path / "DONE").touch()
-    with Folder(tmp_path) as source:
+    with WatchedFolder(tmp_path) as source:
         assert source.sensor == "stereo"
         (frame,) = source
     assert frame.left is not None
@@ -255,7 +255,7 @@ def test_raw_pairs_with_their_calibration(data: Callable[[str], Path], tmp_path:
         for path in (place / side / "data").glob("*.png"):
             write(tmp_path, f"{name}/{path.name}", path.read_bytes())
     (tmp_path / "DONE").touch()
-    with Folder(tmp_path, calibration=place) as source:
+    with WatchedFolder(tmp_path, calibration=place) as source:
         frames = list(source)
     assert len(frames) >= 2
     assert frames[0].baseline_fx is not None
@@ -273,7 +273,7 @@ def assert_same(frame: Frame, points: NDArray[np.float32]) -> None:
 def test_scans(tmp_path: Path) -> None:
     points = np.random.default_rng(0).normal(size=(100, 4)).astype(np.float32)
     write(tmp_path, "velodyne/000000.bin", points.tobytes())
-    with Folder(tmp_path, poll=0.01) as source:
+    with WatchedFolder(tmp_path, poll=0.01) as source:
         frames = iter(source)
         assert_same(next(frames), points)
         path = tmp_path / "velodyne" / "000001.bin"
@@ -297,7 +297,7 @@ def test_a_lens_that_distorts(tmp_path: Path) -> None:
     )
     rgbd(tmp_path, 0)
     (tmp_path / "DONE").touch()
-    with Folder(tmp_path, calibration=tmp_path / "calibration.yaml") as source:
+    with WatchedFolder(tmp_path, calibration=tmp_path / "calibration.yaml") as source:
         (frame,) = source
     assert frame.intrinsics is not None
     assert frame.intrinsics.fx > 41
@@ -309,12 +309,12 @@ def test_a_lens_that_distorts(tmp_path: Path) -> None:
 def test_without_a_camera_it_says_what_is_missing(tmp_path: Path) -> None:
     rgbd(tmp_path, 0)
     with (
-        Folder(tmp_path, deadline=0.2) as source,
+        WatchedFolder(tmp_path, deadline=0.2) as source,
         pytest.raises(SourceError, match=r"has no camera: .* K\.txt"),
     ):
         list(source)
     (tmp_path / "K.txt").write_text("1 2 3\n")
-    with Folder(tmp_path, deadline=0.2) as source, pytest.raises(SourceError, match=r"K\.txt"):
+    with WatchedFolder(tmp_path, deadline=0.2) as source, pytest.raises(SourceError, match=r"K\.txt"):
         list(source)
 
 
@@ -323,7 +323,7 @@ def test_a_folder_that_goes_away(tmp_path: Path) -> None:
     place.mkdir()
     camera(place)
     rgbd(place, 0)
-    with Folder(place) as source:
+    with WatchedFolder(place) as source:
         frames = iter(source)
         next(frames)
         place.rename(tmp_path / "elsewhere")
@@ -346,7 +346,7 @@ def test_files_that_go_away_while_they_are_read(tmp_path: Path, monkeypatch: pyt
 
     monkeypatch.setattr(folder_layouts, "whole_image", then_gone)
     (tmp_path / "DONE").touch()
-    with Folder(tmp_path) as source:
+    with WatchedFolder(tmp_path) as source:
         assert numbers(list(source)) == [1]
         assert source.skipped == {"damaged": 1}
 
@@ -361,13 +361,13 @@ def test_an_image_that_claims_to_be_huge_is_left_out(tmp_path: Path) -> None:
     struct.pack_into(">I", content, 29, zlib.crc32(content[12:29]))
     first.write_bytes(content)
     (tmp_path / "DONE").touch()
-    with Folder(tmp_path) as source:
+    with WatchedFolder(tmp_path) as source:
         assert numbers(list(source)) == [1]
         assert source.skipped == {"damaged": 1}
 
 
 def test_close_from_another_thread_ends_the_iteration(tmp_path: Path) -> None:
-    source = Folder(tmp_path, poll=60)
+    source = WatchedFolder(tmp_path, poll=60)
     closing = threading.Timer(0.2, source.close)
     closing.start()
     assert list(source) == []

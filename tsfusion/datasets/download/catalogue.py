@@ -36,7 +36,7 @@ class File(NamedTuple):
     into: str = ""
 
 
-class Recording(NamedTuple):
+class PublicRecording(NamedTuple):
     """One entry.
 
     Attributes:
@@ -55,38 +55,38 @@ class Recording(NamedTuple):
     note: str = ""
 
 
-def _tum(name: str, sequence: str, nbytes: int | None, checksum: str | None = None) -> Recording:
+def _tum(name: str, sequence: str, nbytes: int | None, checksum: str | None = None) -> PublicRecording:
     archive = f"rgbd_dataset_{sequence}.tgz"
     url = f"{_TUM}/{sequence.split('_', maxsplit=1)[0]}/{archive}"
     title = f"TUM RGB-D {sequence}: Kinect, motion capture"
     files = (File(url, archive, checksum),)
-    return Recording(name, title, _TUM_PAGE, "CC BY 4.0", files, nbytes, f"rgbd_dataset_{sequence}")
+    return PublicRecording(name, title, _TUM_PAGE, "CC BY 4.0", files, nbytes, f"rgbd_dataset_{sequence}")
 
 
-def _icl(number: int, nbytes: int | None = None) -> Recording:
+def _icl(number: int, nbytes: int | None = None) -> PublicRecording:
     archive = f"living_room_traj{number}_frei_png.tar.gz"
-    return Recording(
+    return PublicRecording(
         f"icl-nuim-living-room-{number}",
         f"ICL-NUIM living room, trajectory {number}: rendered without noise, exact poses",
         _ICL_PAGE, "CC BY 3.0", (File(f"https://www.doc.ic.ac.uk/~ahanda/{archive}", archive),), nbytes,
     )  # fmt: skip
 
 
-def _seven(scene: str) -> Recording:
-    return Recording(
+def _seven(scene: str) -> PublicRecording:
+    return PublicRecording(
         f"7scenes-{scene}", f"7-Scenes {scene}: Kinect, several sequences", _SEVEN_PAGE,
         "Microsoft Research, non-commercial", (File(f"{_SEVEN}/{scene}.zip", f"{scene}.zip"),), opens=scene,
     )  # fmt: skip
 
 
-def _euroc(bundle: str, bitstream: str, md5: str, nbytes: int, first: str) -> Recording:
+def _euroc(bundle: str, bitstream: str, md5: str, nbytes: int, first: str) -> PublicRecording:
     file = File(f"{_ETH}/{bitstream}/content", f"{bundle}.zip", f"md5:{md5}")
     title = f"EuRoC {bundle}: stereo of a drone, all its sequences (folders and bags)"
     name = f"euroc-{bundle.replace('_', '-').replace('vicon-', '')}"
-    return Recording(name, title, _ETH_PAGE, "non-commercial", (file,), nbytes, f"{bundle}/{first}")
+    return PublicRecording(name, title, _ETH_PAGE, "non-commercial", (file,), nbytes, f"{bundle}/{first}")
 
 
-CATALOGUE: tuple[Recording, ...] = (
+CATALOGUE: tuple[PublicRecording, ...] = (
     _tum("tum-fr1-xyz", "freiburg1_xyz", 448_204_271,
          "sha256:a0236d97b8c30cd93b653656d2b6c293ff7c982a4130ef2a1a8beecdb124ef98"),
     _tum("tum-fr1-desk", "freiburg1_desk", 344_011_403,
@@ -97,19 +97,19 @@ CATALOGUE: tuple[Recording, ...] = (
     _tum("tum-fr3-office", "freiburg3_long_office_household", 1_483_556_251),
     _icl(0), _icl(1), _icl(2, 429_825_445), _icl(3),
     *map(_seven, ("chess", "fire", "heads", "office", "pumpkin", "redkitchen", "stairs")),
-    Recording(
+    PublicRecording(
         "redwood-sample", "Redwood living room: five RGB-D frames, as Open3D ships them", _OPEN3D_PAGE,
         "see the page",
         (File(f"{_OPEN3D}/20220301-data/SampleRedwoodRGBDImages.zip", "SampleRedwoodRGBDImages.zip",
               "md5:43971c5f690c9cfc52dda8c96a0140ee"),),
     ),
-    Recording(
+    PublicRecording(
         "redwood-lounge", "Stanford lounge: 3000 RGB-D frames with a trajectory", _OPEN3D_PAGE,
         "see the page",
         (File(f"{_OPEN3D}/20220301-data/LoungeRGBDImages.zip", "LoungeRGBDImages.zip",
               "md5:cdd307caef898519a8829ce1b6ab9f75"),),
     ),
-    Recording(
+    PublicRecording(
         "redwood-livingroom1", "Augmented ICL-NUIM living room 1: 2870 RGB-D frames, simulated noise",
         _OPEN3D_PAGE, "see the page",
         (File(f"{_OPEN3D}/augmented-icl-nuim/livingroom1-color.zip", "livingroom1-color.zip",
@@ -125,27 +125,27 @@ CATALOGUE: tuple[Recording, ...] = (
            "c6347f4e0476aaa9a43a919c163c49c5", 6_013_384_949, "V2_01_easy"),
     _euroc("machine_hall", "7b2419c1-62b5-4714-b7f8-485e5fe3e5fe",
            "363f5c2502b469cdd97ef85997714806", 12_683_729_426, "MH_01_easy"),
-    Recording(
+    PublicRecording(
         "replica", "Replica rendered for NICE-SLAM: eight rooms, exact poses",
         "https://github.com/cvg/nice-slam", "Replica Research Terms, non-commercial",
         (File("https://cvg-data.inf.ethz.ch/nice-slam/data/Replica.zip", "Replica.zip"),),
         opens="Replica/room0",
     ),
-    Recording(
+    PublicRecording(
         "corbs-e1", "CoRBS electrical cabinet E1: Kinect v2, pre-registered",
         "http://corbs.dfki.uni-kl.de", "see the page",
         (File(f"{_CORBS}/E1_pre_registereddata.zip", "E1_pre_registereddata.zip"),
          File(f"{_CORBS}/E1_Trajectory.zip", "E1_Trajectory.zip")),
         opens="E1_pre_registereddata",
     ),
-    Recording(
+    PublicRecording(
         "bunny", "Stanford bunny: ten range scans and the mesh (for accuracy, not for replay)",
         "https://graphics.stanford.edu/data/3Dscanrep/", "research, with acknowledgement",
         (File("https://graphics.stanford.edu/pub/3Dscanrep/bunny.tar.gz", "bunny.tar.gz",
               "sha256:a5720bd96d158df403d153381b8411a727a1d73cff2f33dc9b212d6f75455b84"),),
         opens="bunny",
     ),
-    Recording(
+    PublicRecording(
         "kitti-odometry", "KITTI odometry: stereo and Velodyne of a car",
         "https://www.cvlibs.net/datasets/kitti/eval_odometry.php", "CC BY-NC-SA 3.0",
         note="its makers ask for a registration; unpack what you get there into one folder",
@@ -153,7 +153,7 @@ CATALOGUE: tuple[Recording, ...] = (
 )  # fmt: skip
 
 
-def entry(name: str) -> Recording:
+def entry(name: str) -> PublicRecording:
     """The entry of that name.
 
     Raises:

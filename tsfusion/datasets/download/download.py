@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from tsfusion.core.errors import DatasetError, MissingDependency, OutputError
 from tsfusion.datasets.download import archives, http
-from tsfusion.datasets.download.catalogue import File, Recording
+from tsfusion.datasets.download.catalogue import File, PublicRecording
 from tsfusion.datasets.download.http import Watcher
 
 _INSTALL = "downloads need pooch; install it with: pip install 'tsfusion[download]'"
@@ -41,7 +41,7 @@ class Fetched(NamedTuple):
     files: list[Checked]
 
 
-def fetch(recording: Recording, to: Path, watch: Watcher, *, base: str | None = None) -> Fetched:
+def fetch(recording: PublicRecording, to: Path, watch: Watcher, *, base: str | None = None) -> Fetched:
     """Have a recording in `to`: its archives, and the folder `to/NAME` they are unpacked to.
 
     Args:
@@ -65,7 +65,7 @@ def fetch(recording: Recording, to: Path, watch: Watcher, *, base: str | None = 
     return Fetched(folder / recording.opens if recording.opens else folder, files)
 
 
-def check(recording: Recording, to: Path) -> list[Checked]:
+def check(recording: PublicRecording, to: Path) -> list[Checked]:
     """The files of a recording that are in `to`, each compared with the checksum known of it.
 
     Raises:
@@ -162,7 +162,7 @@ def _extract(archive: Path, into: Path) -> None:
         raise DatasetError(f"{error}; remove {archive} to fetch it again") from error
 
 
-def _unpack(recording: Recording, to: Path, folder: Path) -> None:
+def _unpack(recording: PublicRecording, to: Path, folder: Path) -> None:
     try:
         with tempfile.TemporaryDirectory(prefix=".unpacking-", dir=to) as place:
             partial = Path(place) / folder.name

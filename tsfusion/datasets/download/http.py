@@ -13,10 +13,10 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import IO, Any
 
-from tsfusion import __version__
 from tsfusion.core import durable_files
 from tsfusion.core.errors import DatasetError, OutputError
 
@@ -66,7 +66,7 @@ def download(url: str, part: Path, watch: Watcher) -> None:
 def _attempt(url: str, part: Path, watch: Watcher) -> bool:
     """One request; whether the file is whole then."""
     start, validator = _nbytes(part), _validator(part)
-    headers = {"User-Agent": f"tsfusion/{__version__}", "Accept-Encoding": "identity"}
+    headers = {"User-Agent": f"tsfusion/{version('tsfusion')}", "Accept-Encoding": "identity"}
     if start and validator:
         headers |= {"Range": f"bytes={start}-", "If-Range": validator}
     try:

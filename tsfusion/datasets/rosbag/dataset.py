@@ -18,8 +18,15 @@ from tsfusion.datasets.dataset import Frames, require_frames
 from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.messages import MILLIMETRES
 from tsfusion.datasets.rosbag.poses import PoseFinder, pose_streams
-from tsfusion.datasets.rosbag.reader import ENDINGS, Message, Place, Recording, is_journal, recording
-from tsfusion.datasets.rosbag.topics import Chooser, Modality, recorded_scale
+from tsfusion.datasets.rosbag.reader import (
+    ENDINGS,
+    BagRecording,
+    Message,
+    MessagePlace,
+    is_journal,
+    recording,
+)
+from tsfusion.datasets.rosbag.topics import Modality, TopicChooser, recorded_scale
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
@@ -100,12 +107,14 @@ class Bag(Frames):
             raise DatasetError(
                 f"modality of a ROS recording must be {', '.join(_MODALITIES)}; got {modality!r}"
             )
-        self._recording = Recording(place)
+        self._recording = BagRecording(place)
         topics = {
             "depth_topic": depth_topic, "color_topic": color_topic, "info_topic": info_topic,
             "points_topic": points_topic, "left_topic": left_topic, "right_topic": right_topic,
         }  # fmt: skip
-        chosen = Chooser(self._recording, topics, intrinsics=intrinsics, rectified=rectified).choose(modality)
+        chosen = TopicChooser(self._recording, topics, intrinsics=intrinsics, rectified=rectified).choose(
+            modality
+        )
         self._chosen = chosen
         self.name, self.sensor, self.skipped = f"ROS {place.name}", sensor or chosen.sensor, {}
         self._with_color = color
@@ -125,12 +134,12 @@ class Bag(Frames):
     def __len__(self) -> int:
         return len(self._mains)
 
-    def _index(self, poses: PoseFinder) -> tuple[dict[int, Place], dict[int, Place]]:
+    def _index(self, poses: PoseFinder) -> tuple[dict[int, MessagePlace], dict[int, MessagePlace]]:
         """Places by time of the main and the other messages, from one pass over the recording."""
         chosen = self._chosen
         used = [chosen.main] + ([chosen.other] if chosen.other and self._with_other else [])
         check = _CHECKS.get(chosen.main.kind)
-        places: dict[str, list[Place]] = {one.topic: [] for one in used}
+        places: dict[str, list[MessagePlace]] = {one.topic: [] for one in used}
         broken: Counter[str] = Counter()
         for message in self._recording.messages([*used, *poses.streams]):
             if not isinstance(message, Message):
@@ -158,7 +167,9 @@ class Bag(Frames):
     def _with_other(self) -> bool:
         return self._with_color or self._chosen.modality == "stereo"
 
-    def _pair(self, mains: dict[int, Place], others: dict[int, Place], max_difference_ns: int) -> None:
+    def _pair(
+        self, mains: dict[int, MessagePlace], others: dict[int, MessagePlace], max_difference_ns: int
+    ) -> None:
         """Give each main message the nearest other one."""
         stamps = np.array(sorted(mains), dtype=np.int64)
         there = np.array(sorted(others), dtype=np.int64)
@@ -285,7 +296,7 @@ def _place(path: Path) -> Path:
     raise DatasetError(f"{path} {holds}; expected {EXPECTED}")
 
 
-def _by_time(places: list[Place]) -> dict[int, Place]:
+def _by_time(places: list[MessagePlace]) -> dict[int, MessagePlace]:
     """Messages by their header's stamp, or by the recorder's clock where a header says nothing."""
     return {place.stamp_ns or place.log_ns: place for place in places}
 

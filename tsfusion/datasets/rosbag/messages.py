@@ -68,7 +68,7 @@ class Cloud(NamedTuple):
     times_s: NDArray[np.float32] | None
 
 
-class Camera(NamedTuple):
+class CameraInfo(NamedTuple):
     """A CameraInfo. `P` is of the rectified image, `K`, `D` and `R` of the image as it comes."""
 
     width: int
@@ -255,7 +255,7 @@ def point_times(moments: NDArray[Any], stamp_ns: int) -> NDArray[np.float32] | N
     return np.where(known, start_s + (values - first) * unit, 0).astype(np.float32)
 
 
-def camera(message: Any) -> Camera:
+def camera(message: Any) -> CameraInfo:
     """A CameraInfo with the binning and region of its images worked in."""
     K, D, R, P = (
         np.array(getattr(message, name, getattr(message, name.upper(), None)), np.float64) for name in "kdrp"
@@ -270,7 +270,7 @@ def camera(message: Any) -> Camera:
     for axis, bins in enumerate((message.binning_x, message.binning_y)):
         K[axis] /= max(1, bins)
         P[axis] /= max(1, bins)
-    return Camera(
+    return CameraInfo(
         width // max(1, message.binning_x),
         height // max(1, message.binning_y),
         str(message.distortion_model),

@@ -8,12 +8,12 @@ import numpy as np
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN
-from tsfusion.datasets.rosbag.reader import Message, Recording, Stream
-from tsfusion.datasets.rosbag.transforms import OLD_TF, PATH, POSE_KINDS, TF, Told, Track, Transforms
+from tsfusion.datasets.rosbag.reader import BagRecording, Message, Stream
+from tsfusion.datasets.rosbag.transforms import OLD_TF, PATH, POSE_KINDS, TF, Told, Transforms, TransformTrack
 from tsfusion.geometry.trajectory import Pose
 
 
-def pose_streams(recording: Recording, pose_topic: str | None) -> list[Stream]:
+def pose_streams(recording: BagRecording, pose_topic: str | None) -> list[Stream]:
     """The transforms, and the topic of poses that was named or all of them.
 
     Raises:
@@ -101,7 +101,7 @@ class PoseFinder:
             )
         return lambda stamp: self._transforms.at(world, self._frame, stamp)
 
-    def _track(self) -> Track | None:
+    def _track(self) -> TransformTrack | None:
         """The poses of the most telling kind of topic."""
         for kind in POSE_KINDS:
             tracks = {
@@ -124,11 +124,11 @@ class PoseFinder:
                 )
         return None
 
-    def _leads(self, found: Track) -> bool:
+    def _leads(self, found: TransformTrack) -> bool:
         body = self._body or found.body
         return body in ("", self._frame) or self._transforms.connected(body, self._frame)
 
-    def _by_track(self, found: Track) -> Callable[[int], Pose | None]:
+    def _by_track(self, found: TransformTrack) -> Callable[[int], Pose | None]:
         body = self._body or found.body or self._frame
         world = self._world or found.world
 

@@ -35,7 +35,7 @@ class Stream(NamedTuple):
     messages: int
 
 
-class Place(NamedTuple):
+class MessagePlace(NamedTuple):
     """Where a message is: enough to read it again."""
 
     connection: int
@@ -51,7 +51,7 @@ class Message(NamedTuple):
     """
 
     stream: Stream
-    place: Place
+    place: MessagePlace
     content: Any
 
 
@@ -93,7 +93,7 @@ def _opening(path: Path) -> bytes:
         return b""
 
 
-class Recording:
+class BagRecording:
     """The messages of a recording. Its files stay open until it is no longer used.
 
     Raises:
@@ -153,7 +153,7 @@ class Recording:
                 if content is None:
                     yield stream
                 else:
-                    yield Message(stream, Place(number, log_ns, stamp_ns(content)), content)
+                    yield Message(stream, MessagePlace(number, log_ns, stamp_ns(content)), content)
 
     def first(self, stream: Stream) -> Any:
         """The first message of a stream that can be read; None = there is none."""
@@ -162,7 +162,7 @@ class Recording:
                 return message.content
         return None
 
-    def read(self, place: Place) -> Any:
+    def read(self, place: MessagePlace) -> Any:
         """The message at a place.
 
         Raises:

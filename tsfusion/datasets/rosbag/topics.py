@@ -8,9 +8,9 @@ from typing import Any, Literal, NamedTuple
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.rosbag import messages
-from tsfusion.datasets.rosbag.cameras import RECTIFIED, Cameras, Picture, Rig, View, picture
+from tsfusion.datasets.rosbag.cameras import RECTIFIED, CameraRig, Cameras, CameraView, ImagePair, picture
 from tsfusion.datasets.rosbag.messages import CAMERA, CLOUD, COMPRESSED, IMAGE
-from tsfusion.datasets.rosbag.reader import Recording, Stream, frame_id
+from tsfusion.datasets.rosbag.reader import BagRecording, Stream, frame_id
 from tsfusion.geometry.keyframe import Intrinsics
 
 log = logging.getLogger(__name__)
@@ -35,11 +35,11 @@ class Apart(NamedTuple):
     """A colour camera that is not the depth camera."""
 
     frame: str
-    view: View
+    view: CameraView
     size: tuple[int, int]
 
 
-class Chosen(NamedTuple):
+class ChosenTopics(NamedTuple):
     """What to read.
 
     Attributes:
@@ -57,8 +57,8 @@ class Chosen(NamedTuple):
     sensor: str
     frame: str
     size: tuple[int, int]
-    view: View | None = None
-    rig: Rig | None = None
+    view: CameraView | None = None
+    rig: CameraRig | None = None
     apart: Apart | None = None
 
     def check_size(self, stream: Stream, size: tuple[int, ...]) -> None:
@@ -68,7 +68,7 @@ class Chosen(NamedTuple):
             raise DatasetError(f"is {size[1]}×{size[0]}, the first {expected[1]}×{expected[0]}")
 
 
-class Chooser:
+class TopicChooser:
     """Chooses among the topics of one recording.
 
     Args:
@@ -79,7 +79,7 @@ class Chooser:
 
     def __init__(
         self,
-        recording: Recording,
+        recording: BagRecording,
         given: dict[str, str | None],
         *,
         intrinsics: Intrinsics | None,
@@ -88,9 +88,9 @@ class Chooser:
         self._recording, self._given = recording, given
         info = self._named("info_topic", (CAMERA,))
         self._cameras = Cameras(recording, info and info.topic, intrinsics, rectified)
-        self._found: list[Picture] | None = None
+        self._found: list[ImagePair] | None = None
 
-    def choose(self, modality: Modality | None) -> Chosen:
+    def choose(self, modality: Modality | None) -> ChosenTopics:
         """The sensor to read; of several kinds depth goes before stereo before LiDAR.
 
         Raises:
@@ -123,7 +123,7 @@ class Chooser:
         wanted = " or ".join(kind.rpartition("/")[2] for kind in kinds)
         raise self._error(f"{option}={topic!r} is no topic of {wanted}")
 
-    def _pictures(self) -> list[Picture]:
+    def _pictures(self) -> list[ImagePair]:
         """Every topic of images that can be read."""
         if self._found is None:
             streams = [one for one in self._recording.streams if one.kind in (IMAGE, COMPRESSED)]
@@ -131,7 +131,7 @@ class Chooser:
             self._found = [one for one in found if one is not None]
         return self._found
 
-    def _picture(self, option: str) -> Picture | None:
+    def _picture(self, option: str) -> ImagePair | None:
         stream = self._named(option, (IMAGE, COMPRESSED))
         if stream is None:
             return None
@@ -140,7 +140,7 @@ class Chooser:
             raise self._error(f"the images of {stream.topic} cannot be decoded")
         return found
 
-    def _depth(self) -> Chosen | None:
+    def _depth(self) -> ChosenTopics | None:
         main = self._picture("depth_topic") or self._only(
             [one for one in self._pictures() if one.is_depth],
             lambda one: (bool(_REGISTERED.search(one.base)), bool(RECTIFIED.search(one.base))),
@@ -151,9 +151,9 @@ class Chooser:
         other, apart = self._color_of(main)
         sensor = next((name for pattern, name in _SENSORS if re.search(pattern, main.base)), "kinect")
         view = self._cameras.view(main)
-        return Chosen("depth", main.stream, other, sensor, main.frame, main.size, view, apart=apart)
+        return ChosenTopics("depth", main.stream, other, sensor, main.frame, main.size, view, apart=apart)
 
-    def _color_of(self, depth: Picture) -> tuple[Stream | None, Apart | None]:
+    def _color_of(self, depth: ImagePair) -> tuple[Stream | None, Apart | None]:
         """The colour images of a depth camera, and their own camera where they are not registered to it.
 
         Registered are images told by a depth that says so in its name, or in the depth's frame, of its size.
@@ -177,7 +177,7 @@ class Chooser:
         log.warning("%s: %s has no CameraInfo and is left out (%s)", self._path, best.stream.topic, sizes)
         return None, None
 
-    def _stereo(self) -> Chosen | None:
+    def _stereo(self) -> ChosenTopics | None:
         left, right = self._picture("left_topic"), self._picture("right_topic")
         if left is None and right is None:
             pairs = [pair for one in self._pictures() if (pair := self._pair(one)) is not None]
@@ -191,7 +191,7 @@ class Chooser:
             return None
         if left is None or right is None:
             raise self._error("left_topic and right_topic go together")
-        return Chosen(
+        return ChosenTopics(
             "stereo",
             left.stream,
             right.stream,
@@ -201,7 +201,7 @@ class Chooser:
             rig=self._cameras.rig(left, right),
         )
 
-    def _pair(self, right: Picture) -> tuple[Picture, Picture] | None:
+    def _pair(self, right: ImagePair) -> tuple[ImagePair, ImagePair] | None:
         """The left and the right images, if these are some of a right camera."""
         if messages.is_depth(right.first):
             return None
@@ -216,7 +216,7 @@ class Chooser:
                         return left, right
         return None
 
-    def _lidar(self) -> Chosen | None:
+    def _lidar(self) -> ChosenTopics | None:
         stream = self._named("points_topic", (CLOUD,))
         if stream is None:
             found = [one for one in self._recording.streams if one.kind == CLOUD]
@@ -228,9 +228,9 @@ class Chooser:
         first = self._recording.first(stream)
         if first is None:
             raise self._error(f"no point cloud of {stream.topic} can be read")
-        return Chosen("lidar", stream, None, "lidar", frame_id(first), (0, 0))
+        return ChosenTopics("lidar", stream, None, "lidar", frame_id(first), (0, 0))
 
-    def _only(self, found: list[Picture], rank: Any, option: str) -> Picture | None:
+    def _only(self, found: list[ImagePair], rank: Any, option: str) -> ImagePair | None:
         """The one that ranks highest; of the transports of one topic the fullest, then the raw one."""
         if not found:
             return None
@@ -242,7 +242,7 @@ class Chooser:
         return max(best, key=lambda one: (one.stream.messages, one.stream.kind == IMAGE))
 
 
-def recorded_scale(recording: Recording, depth: Stream) -> float | None:
+def recorded_scale(recording: BagRecording, depth: Stream) -> float | None:
     """Metres per unit of a depth that librealsense itself recorded; None = it is somebody else's."""
     device = re.match(r"/device_\d+/sensor_\d+", depth.topic)
     for stream in recording.streams if device else ():
@@ -254,7 +254,7 @@ def recorded_scale(recording: Recording, depth: Stream) -> float | None:
     return None
 
 
-def _closeness(color: Picture, depth: Picture) -> tuple[object, ...]:
+def _closeness(color: ImagePair, depth: ImagePair) -> tuple[object, ...]:
     """How likely colour images belong to the depth images: by frame, name and rectification."""
     return (
         color.frame == depth.frame,

@@ -140,7 +140,7 @@ class Transforms:
         return T
 
 
-class Track(NamedTuple):
+class TransformTrack(NamedTuple):
     """Poses of one frame in another, of a topic.
 
     Attributes:
@@ -176,6 +176,6 @@ class Told:
                 where = pose.position, pose.orientation
             self._samples.add(stamp_ns(one), *where)
 
-    def track(self) -> Track | None:
+    def track(self) -> TransformTrack | None:
         """The poses; None = there is none."""
-        return Track(self.world, self.body, self._samples.trajectory()) if self._samples else None
+        return TransformTrack(self.world, self.body, self._samples.trajectory()) if self._samples else None

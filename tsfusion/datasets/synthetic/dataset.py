@@ -25,7 +25,7 @@ _T_CAMERA_LIDAR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0,
 
 
 @dataclass(frozen=True)
-class Camera:
+class SyntheticCamera:
     """A pinhole camera of a synthetic recording; `baseline` in metres, for stereo."""
 
     size: tuple[int, int]  # height, width
@@ -34,7 +34,7 @@ class Camera:
 
 
 @dataclass(frozen=True)
-class Lidar:
+class SyntheticLidar:
     """A spinning LiDAR: elevations in degrees, range and noise in metres."""
 
     rows: int = 64
@@ -48,10 +48,10 @@ class Lidar:
 
 
 CAMERAS = {
-    "room": Camera((240, 320), Intrinsics(292.5, 292.5, 159.5, 119.5), 0.12),
-    "street": Camera((188, 620), Intrinsics(353.5, 353.5, 309.5, 91.5), 0.54),
+    "room": SyntheticCamera((240, 320), Intrinsics(292.5, 292.5, 159.5, 119.5), 0.12),
+    "street": SyntheticCamera((188, 620), Intrinsics(353.5, 353.5, 309.5, 91.5), 0.54),
 }
-LIDARS = {"room": Lidar(lowest=-45.0, highest=45.0, max_range=30.0), "street": Lidar()}
+LIDARS = {"room": SyntheticLidar(lowest=-45.0, highest=45.0, max_range=30.0), "street": SyntheticLidar()}
 WORLDS: dict[str, Callable[[int], worlds.World]] = {  # by the number of keyframes
     "room": lambda _: worlds.room(),
     "street": lambda count: worlds.street(max(80.0, count + 40.0)),
@@ -208,14 +208,16 @@ def stereo(z: NDArray[np.float64], baseline_fx: float, rng: np.random.Generator 
     return np.where(valid, units, 0).astype(np.uint16)
 
 
-def _resized(camera: Camera, width: int | None) -> Camera:
+def _resized(camera: SyntheticCamera, width: int | None) -> SyntheticCamera:
     if width is None:
         return camera
     factor = width / camera.size[1]
-    return Camera((round(camera.size[0] * factor), width), camera.intrinsics.scaled(factor), camera.baseline)
+    return SyntheticCamera(
+        (round(camera.size[0] * factor), width), camera.intrinsics.scaled(factor), camera.baseline
+    )
 
 
-def _camera_rays(camera: Camera) -> NDArray[np.float64]:
+def _camera_rays(camera: SyntheticCamera) -> NDArray[np.float64]:
     """(H·W, 3) float64 directions with z = 1."""
     K, (height, width) = camera.intrinsics, camera.size
     v, u = np.mgrid[:height, :width]
@@ -223,7 +225,7 @@ def _camera_rays(camera: Camera) -> NDArray[np.float64]:
     return rays.reshape(-1, 3)
 
 
-def _lidar_rays(lidar: Lidar) -> NDArray[np.float64]:
+def _lidar_rays(lidar: SyntheticLidar) -> NDArray[np.float64]:
     """(rows·columns, 3) float64 unit directions, x forward, z up."""
     elevation = np.radians(np.linspace(lidar.highest, lidar.lowest, lidar.rows))[:, None]
     azimuth = np.linspace(np.pi, -np.pi, lidar.columns, endpoint=False)[None, :]

@@ -11,13 +11,13 @@ from tsfusion.datasets.readers import read_lines
 from tsfusion.datasets.trajectory_files import nanoseconds, read_kitti, read_tum
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.trajectory import Trajectory, quaternion
-from tsfusion.scanner.localization.localizer import Corrections, Lost, Pose
-from tsfusion.scanner.localization.tracking_keyframes import Anchors
+from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
+from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
 
 _TUM_COLUMNS, _KITTI_COLUMNS = 8, 12
 
 
-class FromFile:
+class TrajectoryFilePoses:
     """`Localizer` that looks poses up by the frame's stamp and interpolates between neighbours.
 
     A file in KITTI's format has no times. They are read from `times.txt` (seconds, a line a pose), which is
@@ -40,7 +40,7 @@ class FromFile:
         self._trajectory = read_trajectory(Path(path).expanduser())
         self._max_gap_ns = round(max_gap_s * 1e9)
         self._offset_ns = round(time_offset_s * 1e9)
-        self._anchors = Anchors()
+        self._anchors = TrackingKeyframes()
         self._begun = False
 
     def track(self, frame: Frame) -> Pose | Lost:
@@ -54,7 +54,7 @@ class FromFile:
             return Lost(reason=self._missing(frame.timestamp_ns, stamp), timestamp_ns=frame.timestamp_ns)
         return self._anchors.pose(T, frame.timestamp_ns)
 
-    def corrections(self) -> Corrections | None:
+    def corrections(self) -> PoseCorrections | None:
         """None: the file says what it says."""
         return None
 
@@ -122,13 +122,13 @@ def _in_time(stamps: Sequence[int], poses: Sequence[np.ndarray], path: Path) -> 
     return Trajectory(times, translations, np.array([quaternion(T[:3, :3]) for T in poses]))
 
 
-class Given:
+class GivenPoses:
     """`Localizer` that believes `frame.T_world_camera`."""
 
     absolute = True
 
     def __init__(self) -> None:
-        self._anchors = Anchors()
+        self._anchors = TrackingKeyframes()
 
     def track(self, frame: Frame) -> Pose | Lost:
         """The frame's own pose; Lost where it has none."""
@@ -136,7 +136,7 @@ class Given:
             return Lost(reason="the source gives no pose for this frame", timestamp_ns=frame.timestamp_ns)
         return self._anchors.pose(frame.T_world_camera, frame.timestamp_ns)
 
-    def corrections(self) -> Corrections | None:
+    def corrections(self) -> PoseCorrections | None:
         """None: what is given is not corrected."""
         return None
 

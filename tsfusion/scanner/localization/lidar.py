@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import InvalidKeyframe, MissingDependency
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Corrections, Lost, Matrix, Pose
-from tsfusion.scanner.localization.tracking_keyframes import Anchors
+from tsfusion.scanner.localization.localizer import Lost, Matrix, Pose, PoseCorrections
+from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
 
 Points = NDArray[np.float64]  # (n, 3) metres
 
@@ -33,7 +33,7 @@ _PATIENCE = 5  # scans without a pose through which the sensor is thought to go 
 _ANCHOR = 2.0  # voxels to the next tracking keyframe
 
 
-class Lidar:
+class LidarLocalizer:
     """`Localizer` of point clouds, z up. Needs the extra `lidar`.
 
     A beginning in full motion is what KISS-ICP alone gets wrong: rings on the ground look the same wherever
@@ -64,7 +64,7 @@ class Lidar:
         self._make: Any = kiss_icp.kiss_icp.KissICP
         self._max_range, self._voxel_size = max_range, voxel_size
         self._deskew, self._threads = deskew, threads
-        self._anchors = Anchors()
+        self._anchors = TrackingKeyframes()
         self.reset()
 
     def track(self, frame: Frame) -> Pose | Lost:
@@ -91,7 +91,7 @@ class Lidar:
         T = se3.nearest(self._accept(T, map_points, frame))
         return self._anchors.pose(T, frame.timestamp_ns, quality=quality)
 
-    def corrections(self) -> Corrections | None:
+    def corrections(self) -> PoseCorrections | None:
         """None: odometry closes no loops."""
         return None
 

@@ -48,7 +48,7 @@ class Lost:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Corrections:
+class PoseCorrections:
     """What loop closure found out about poses given before. The newest revision replaces all others.
 
     Attributes:
@@ -83,7 +83,7 @@ class Localizer(Protocol):
             InvalidKeyframe: when the frame lacks what this localizer needs (colour, depth, a stereo pair).
         """
 
-    def corrections(self) -> Corrections | None:
+    def corrections(self) -> PoseCorrections | None:
         """What is new since the last call; None = nothing."""
 
     def reset(self) -> None:

@@ -6,9 +6,9 @@ import logging
 from tsfusion.core.config import LocalizerName, ScanConfig
 from tsfusion.core.errors import InvalidConfig, MissingDependency
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Corrections, Localizer, Lost, Pose
+from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections
 
-__all__ = ["Corrections", "Localizer", "Lost", "Pose", "choose", "make"]
+__all__ = ["Localizer", "Lost", "Pose", "PoseCorrections", "choose", "make"]
 
 _BY_KIND: dict[str, LocalizerName] = {
     "depth": "rgbd",
@@ -54,27 +54,27 @@ def make(config: ScanConfig, first: Frame) -> Localizer:
             f"the localizer {name} follows {_WORDS[name]}, and this source gives {_KINDS[first.kind]}"
         )
     if name == "given":
-        from tsfusion.scanner.localization.given_poses import Given
+        from tsfusion.scanner.localization.given_poses import GivenPoses
 
-        return Given()
+        return GivenPoses()
     if name == "trajectory":
-        from tsfusion.scanner.localization.given_poses import FromFile
+        from tsfusion.scanner.localization.given_poses import TrajectoryFilePoses
 
-        return FromFile(
+        return TrajectoryFilePoses(
             _needed(config.trajectory, "--trajectory FILE"),
             max_gap_s=config.max_gap,
             time_offset_s=config.time_offset,
         )
     if name == "feed":
-        from tsfusion.scanner.localization.pose_feed.feed import Feed
+        from tsfusion.scanner.localization.pose_feed.feed import PoseFeed
 
-        return Feed(
+        return PoseFeed(
             _needed(config.feed, "--feed ADDRESS"), max_gap_s=config.max_gap, time_offset_s=config.time_offset
         )
     if name == "lidar":
-        from tsfusion.scanner.localization.lidar import Lidar
+        from tsfusion.scanner.localization.lidar import LidarLocalizer
 
-        return Lidar()
+        return LidarLocalizer()
     return _with_loops(_tracker(name), wanted=config.loop_closure)
 
 
@@ -86,12 +86,12 @@ def _needed(value: str | None, flag: str) -> str:
 
 def _tracker(name: LocalizerName) -> Localizer:
     if name == "stereo":
-        from tsfusion.scanner.localization.stereo.tracker import Stereo
+        from tsfusion.scanner.localization.stereo.tracker import StereoLocalizer
 
-        return Stereo()
-    from tsfusion.scanner.localization.rgbd.tracker import RGBD
+        return StereoLocalizer()
+    from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
 
-    return RGBD()
+    return RGBDLocalizer()
 
 
 def _with_loops(tracker: Localizer, *, wanted: bool) -> Localizer:

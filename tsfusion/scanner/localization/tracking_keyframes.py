@@ -9,7 +9,7 @@ from tsfusion.geometry import se3
 from tsfusion.scanner.localization.localizer import Matrix, Pose
 
 
-class Anchors:
+class TrackingKeyframes:
     """Hangs each pose on the last tracking keyframe, and begins a new one when the sensor has moved away.
 
     Attributes:

@@ -35,7 +35,7 @@ _NANOSECONDS = 19  # digits of a time of this century
 
 
 @dataclass(frozen=True)
-class Layout:
+class FolderLayout:
     """Where the files of a frame are: (folder, pattern of file names whose group is the frame's name)."""
 
     kind: Kind
@@ -52,20 +52,20 @@ class Layout:
         return next((path for path in candidates if path.exists()), None)
 
 
-def layout_of(root: Path) -> Layout | None:
+def layout_of(root: Path) -> FolderLayout | None:
     """The layout of what is in the folder so far; None = nothing that is known."""
     if (root / "depth").is_dir():
         color = next((root / name for name in COLOR if (root / name).is_dir()), root / COLOR[0])
-        return Layout("depth", (root / "depth", _PNG), (color, _ANY_IMAGE))
+        return FolderLayout("depth", (root / "depth", _PNG), (color, _ANY_IMAGE))
     if (root / "left").is_dir() and (root / "right").is_dir():
-        return Layout("pair", (root / "left", _ANY_IMAGE), (root / "right", _ANY_IMAGE))
+        return FolderLayout("pair", (root / "left", _ANY_IMAGE), (root / "right", _ANY_IMAGE))
     if (root / "velodyne").is_dir():
-        return Layout("points", (root / "velodyne", _SCAN))
+        return FolderLayout("points", (root / "velodyne", _SCAN))
     names = [path.name for path in root.iterdir()]
     if any(_FLAT_DEPTH.fullmatch(name) for name in names):
-        return Layout("depth", (root, _FLAT_DEPTH), (root, _FLAT_COLOR))
+        return FolderLayout("depth", (root, _FLAT_DEPTH), (root, _FLAT_COLOR))
     if any(_SCAN.fullmatch(name) for name in names):
-        return Layout("points", (root, _SCAN))
+        return FolderLayout("points", (root, _SCAN))
     return None
 
 

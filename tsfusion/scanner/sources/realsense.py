@@ -13,7 +13,7 @@ from tsfusion.geometry.calibration import Camera, Undistorter
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources import realsense_frames as feeds
-from tsfusion.scanner.sources.source import Live, monotonic_of
+from tsfusion.scanner.sources.source import LiveSource, monotonic_of
 
 RECORDINGS = (".db3", ".bag")
 
@@ -30,7 +30,7 @@ _REORDERED = 16  # sets that librealsense could have under way
 _OLDEST_S = 1.0  # the stamp of a camera's frame that seems older is of another clock
 
 
-class RealSense(Live):
+class RealSense(LiveSource):
     """Depth brought onto colour, or the rectified infrared pair, of one RealSense.
 
     The projector and all other options stay as they are on the camera. A live camera hands out its newest

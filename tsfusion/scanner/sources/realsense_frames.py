@@ -18,7 +18,7 @@ Size = tuple[int, int]  # height, width
 _QUEUE = 4  # framesets a syncer keeps; the oldest goes first
 
 
-class Feed(Protocol):
+class RealSenseStream(Protocol):
     """Where framesets come from.
 
     Attributes:
@@ -124,7 +124,7 @@ def open_feed(
     size: Size,
     fps: int,
     real_time: bool,
-) -> tuple[Feed, bool]:
+) -> tuple[RealSenseStream, bool]:
     """The feed, and whether it has colour.
 
     Raises:

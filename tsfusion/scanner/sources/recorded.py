@@ -9,10 +9,10 @@ from types import TracebackType
 
 from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, frame_of
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.sources.source import Live, Source
+from tsfusion.scanner.sources.source import LiveSource, Source
 
 
-class Recorded(Live):
+class RecordedSource(LiveSource):
     """The frames of a dataset, in order; as if they came from a sensor.
 
     Args:
@@ -44,7 +44,7 @@ class Recorded(Live):
             yield dataclasses.replace(frame, timestamp_ns=stamp, captured_ns=time.monotonic_ns())
 
 
-class Limited:
+class LimitedSource:
     """At most `limit` frames of a source, which is closed with it."""
 
     def __init__(self, source: Source, limit: int) -> None:
@@ -61,7 +61,7 @@ class Limited:
         """Close the source."""
         self._source.close()
 
-    def __enter__(self) -> "Limited":
+    def __enter__(self) -> "LimitedSource":
         return self
 
     def __exit__(

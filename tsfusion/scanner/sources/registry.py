@@ -72,14 +72,14 @@ def _camera() -> Callable[..., Source]:
 
 
 def _folder() -> Callable[..., Source]:
-    from tsfusion.scanner.sources.watched_folder import Folder
+    from tsfusion.scanner.sources.watched_folder import WatchedFolder
 
     def opener(rest: str | None, **options: Any) -> Source:
         if rest is None:
             raise SourceError("folder needs the path of one: folder:PATH")
-        return Folder(rest, **options)
+        return WatchedFolder(rest, **options)
 
-    return _like(opener, Folder)
+    return _like(opener, WatchedFolder)
 
 
 _OWN: dict[str, Callable[[], Callable[..., Source]]] = {

@@ -47,7 +47,7 @@ class Source(Protocol):
 
 
 SECOND = 1_000_000_000  # nanoseconds
-_Self = TypeVar("_Self", bound="Live")
+_Self = TypeVar("_Self", bound="LiveSource")
 
 
 class Closed:
@@ -74,7 +74,7 @@ class Closed:
         return self._set
 
 
-class Live(ABC):
+class LiveSource(ABC):
     """A `Source`; `close` ends the iteration, which looks at `_closed` whenever it waits."""
 
     live = True

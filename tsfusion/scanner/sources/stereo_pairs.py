@@ -24,7 +24,7 @@ TOGETHER = (
 )
 
 
-class Pairs(Protocol):
+class StereoPairs(Protocol):
     """A stereo camera's calibration at work; a `calibration.Rectifier` is one."""
 
     @property
@@ -90,7 +90,7 @@ def rectifier(calibration: str | Path, *, size: Size | None) -> Rectifier:
 def frame_of(
     left: NDArray[Any],
     right: NDArray[Any],
-    pairs: Pairs,
+    pairs: StereoPairs,
     *,
     sensor: str,
     timestamp_ns: int,

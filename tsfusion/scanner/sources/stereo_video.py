@@ -18,8 +18,8 @@ from tsfusion.core.errors import InvalidConfig, SourceError
 from tsfusion.geometry.calibration import Size
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.sources.source import Live
-from tsfusion.scanner.sources.stereo_pairs import Pairs, Rectified, frame_of, rectifier
+from tsfusion.scanner.sources.source import LiveSource
+from tsfusion.scanner.sources.stereo_pairs import Rectified, StereoPairs, frame_of, rectifier
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +27,7 @@ _SLICE_S = 0.1  # between two looks at whether the source was closed
 _JOIN_S = 2.0  # a driver that hangs is left to its own thread
 
 
-class StereoVideo(Live):
+class StereoVideo(LiveSource):
     """Left and right halves of one picture, as rectified pairs.
 
     Of a camera or a network stream the newest picture is handed out, and those in between count as
@@ -76,7 +76,7 @@ class StereoVideo(Live):
             if calibration is None:
                 assert intrinsics is not None
                 assert baseline is not None
-                self._pairs: Pairs = Rectified(intrinsics, baseline, size or shown)
+                self._pairs: StereoPairs = Rectified(intrinsics, baseline, size or shown)
             else:
                 self._pairs = pairs or rectifier(calibration, size=size or shown)
         except BaseException:
@@ -100,7 +100,7 @@ class StereoVideo(Live):
             with self._reading:
                 self._capture.release()
 
-    def _all(self) -> Iterator["Picture"]:
+    def _all(self) -> Iterator["VideoPicture"]:
         count, fps = 0, self._capture.get(cv2.CAP_PROP_FPS)
         period = round(1e9 / fps) if fps > 0 else 1  # a time of 0 would mean that it is unknown
         while not self._closed.is_set():
@@ -110,11 +110,11 @@ class StereoVideo(Live):
             if not there:
                 break
             count += 1
-            yield Picture(image, since_start + period, time.monotonic_ns())
+            yield VideoPicture(image, since_start + period, time.monotonic_ns())
         if not count and not self._closed.is_set():
             raise SourceError(f"{self._place} holds no pictures that can be decoded; expected a video")
 
-    def _newest(self, grabber: "Grabber") -> Iterator["Picture"]:
+    def _newest(self, grabber: "Grabber") -> Iterator["VideoPicture"]:
         last = time.monotonic()
         while not self._closed.is_set():
             picture = grabber.take(_SLICE_S)
@@ -132,7 +132,7 @@ class StereoVideo(Live):
                     "and is the USB port fast enough for its pictures?"
                 )
 
-    def _frame(self, picture: "Picture") -> Frame:
+    def _frame(self, picture: "VideoPicture") -> Frame:
         height, width = self._pairs.size
         if picture.image.shape[:2] != (height, 2 * width):
             raise SourceError(
@@ -151,7 +151,7 @@ class StereoVideo(Live):
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class VideoPicture:
     """One image as captured."""
 
     image: NDArray[np.uint8]
@@ -170,12 +170,12 @@ class Grabber:
     def __init__(self, capture: Any) -> None:
         self.dropped, self.ended = 0, False
         self._capture = capture
-        self._newest: Picture | None = None
+        self._newest: VideoPicture | None = None
         self._changed, self._closed = threading.Condition(), False
         self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
         self._thread.start()
 
-    def take(self, timeout: float) -> Picture | None:
+    def take(self, timeout: float) -> VideoPicture | None:
         """The newest picture nobody took yet; None if there is none in time."""
         with self._changed:
             self._changed.wait_for(lambda: self._newest or self.ended or self._closed, timeout)
@@ -195,7 +195,7 @@ class Grabber:
                 captured_ns, timestamp_ns = time.monotonic_ns(), time.time_ns()
                 there, image = self._capture.retrieve()
                 if there:
-                    self._put(Picture(image, timestamp_ns, captured_ns))
+                    self._put(VideoPicture(image, timestamp_ns, captured_ns))
         except cv2.error as error:
             log.warning("a camera's picture cannot be read: %s", error)
         finally:
@@ -204,14 +204,14 @@ class Grabber:
                 self._changed.notify_all()
             self._capture.release()
 
-    def _put(self, picture: Picture) -> None:
+    def _put(self, picture: VideoPicture) -> None:
         with self._changed:
             self.dropped += self._newest is not None
             self._newest = picture
             self._changed.notify_all()
 
 
-def _when_it_says(calibration: str | Path, size: Size | None) -> Pairs | None:
+def _when_it_says(calibration: str | Path, size: Size | None) -> StereoPairs | None:
     """The rectifier, unless the file leaves the size of its images to the camera."""
     try:
         return rectifier(calibration, size=size)

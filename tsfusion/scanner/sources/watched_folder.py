@@ -17,7 +17,7 @@ from tsfusion.geometry.calibration_files import read_camera
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources import folder_layouts, stereo_pairs
-from tsfusion.scanner.sources.source import Live, monotonic_of
+from tsfusion.scanner.sources.source import LiveSource, monotonic_of
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +30,7 @@ _OLDEST_S = 600.0  # the time of a file written longer ago is of another clock
 _WAIT = object()  # a frame whose files are not all there
 
 
-class Folder(Live):
+class WatchedFolder(LiveSource):
     """Frames in the order of their names, each as soon as its files are wholly written.
 
     Layouts: `layouts.EXPECTED`. What is there already comes first. A frame waits for the one before it if
@@ -232,7 +232,7 @@ class Folder(Live):
         camera = read_camera(Path(self._calibration).expanduser(), size=(image.shape[0], image.shape[1]))
         return camera.intrinsics if camera.model == "pinhole" else Undistorter(camera)
 
-    def _pairs(self, image: NDArray[Any]) -> stereo_pairs.Pairs | None:
+    def _pairs(self, image: NDArray[Any]) -> stereo_pairs.StereoPairs | None:
         size = image.shape[0], image.shape[1]
         there = any(all((self._root / name).is_file() for name in names) for names in stereo_pairs.TOGETHER)
         if self._calibration is not None or there:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry import se3, twists
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.localization.loop_closure.place_index import View
+from tsfusion.scanner.localization.loop_closure.place_index import PlaceView
 
 _STEPS = 8
 _EVERY = 3  # depth pixels, to find the pose; all of them to judge it
@@ -33,7 +33,7 @@ class Agreement:
     through: float
 
 
-def agreement(old: View, new: View, T_old_new: se3.Transform) -> Agreement:
+def agreement(old: PlaceView, new: PlaceView, T_old_new: se3.Transform) -> Agreement:
     """How the depths agree if the new camera stood at `T_old_new` (4, 4) in the old one's axes."""
     one, two = _into(new, old, T_old_new), _into(old, new, se3.inverse(T_old_new))
     return Agreement(
@@ -44,8 +44,8 @@ def agreement(old: View, new: View, T_old_new: se3.Transform) -> Agreement:
 
 
 def refined(
-    old: View,
-    new: View,
+    old: PlaceView,
+    new: PlaceView,
     T_old_new: se3.Transform,
     first: NDArray[np.int64],
     second: NDArray[np.int64],
@@ -83,7 +83,7 @@ def _reprojection(
     T: se3.Transform,
     points: NDArray[np.float32],
     pixels: NDArray[np.float32],
-    camera: View,
+    camera: PlaceView,
     *,
     towards_old: bool,
 ) -> Term:
@@ -115,7 +115,7 @@ def _reprojection(
 class _Surface:
     """A view's depth as points with normals."""
 
-    def __init__(self, view: View) -> None:
+    def __init__(self, view: PlaceView) -> None:
         self._view = view
         z = view.depth_mm.astype(np.float64) / 1000
         self._points = _lift(z, view.small)
@@ -141,7 +141,7 @@ class _Surface:
         return J, r, w * (_DENSE_WORTH * _EVERY / self._view.depth_mm.size)
 
 
-def _into(source: View, target: View, T: se3.Transform) -> Agreement:
+def _into(source: PlaceView, target: PlaceView, T: se3.Transform) -> Agreement:
     """One direction of `agreement`: `T` leads from the source's axes to the target's."""
     points = _points(source)
     low, high = _window(target.depth_mm.astype(np.float32) / 1000)
@@ -158,7 +158,7 @@ def _into(source: View, target: View, T: se3.Transform) -> Agreement:
     return Agreement(overlap=len(z) / max(len(points), 1), agree=1 - through - hidden, through=through)
 
 
-def _points(view: View) -> NDArray[np.float64]:
+def _points(view: PlaceView) -> NDArray[np.float64]:
     """(n, 3) of all depth pixels."""
     z = view.depth_mm.astype(np.float64) / 1000
     return _lift(z, view.small)[z > 0]
@@ -171,7 +171,7 @@ def _lift(z: NDArray[np.float64], K: Intrinsics) -> NDArray[np.float64]:
 
 
 def _pixels(
-    points: NDArray[np.float64], view: View
+    points: NDArray[np.float64], view: PlaceView
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
     """Row and column of the small depth pixel of those points that have one, and which do."""
     K, (height, width) = view.small, view.depth_mm.shape

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Corrections, Localizer, Lost, Pose
+from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections
 from tsfusion.scanner.localization.loop_closure import pose_graph, verification
-from tsfusion.scanner.localization.loop_closure.loop_consensus import Consensus, Loop
-from tsfusion.scanner.localization.loop_closure.odometry_drift import Chain, Drift
-from tsfusion.scanner.localization.loop_closure.place_index import CAPACITY, Places, View, view
+from tsfusion.scanner.localization.loop_closure.loop_consensus import Loop, LoopConsensus
+from tsfusion.scanner.localization.loop_closure.odometry_drift import Chain, OdometryDrift
+from tsfusion.scanner.localization.loop_closure.place_index import CAPACITY, PlaceIndex, PlaceView, view
 from tsfusion.scanner.localization.loop_closure.pose_graph import Matrix
 
 _GAP = (10, 3.0)  # keyframes, and metres and radians of way: what is younger is no loop
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(kw_only=True)
-class Counts:
+class LoopCounts:
     """What happened since the last `reset`: keyframes, views compared, loops that looked right, believed."""
 
     keyframes: int = 0
@@ -60,18 +60,20 @@ class LoopClosing:
         MissingDependency: without scipy.
     """
 
-    def __init__(self, localizer: Localizer, *, drift: Drift | None = None, capacity: int = CAPACITY) -> None:
+    def __init__(
+        self, localizer: Localizer, *, drift: OdometryDrift | None = None, capacity: int = CAPACITY
+    ) -> None:
         pose_graph.require()
-        self._localizer, self._drift, self._capacity = localizer, drift or Drift(), capacity
+        self._localizer, self._drift, self._capacity = localizer, drift or OdometryDrift(), capacity
         self.absolute = localizer.absolute
         self._forget()
 
     def _forget(self) -> None:
         self._chain = Chain(self._drift)
-        self.consensus = Consensus(self._chain)
-        self._places = Places(self._capacity)
+        self.consensus = LoopConsensus(self._chain)
+        self._places = PlaceIndex(self._capacity)
         self._corrected: dict[int, Matrix] = {}
-        self.counts = Counts()
+        self.counts = LoopCounts()
         self._news = False
         self._due = False
         self._optimised_at = 0  # keyframes then
@@ -103,12 +105,12 @@ class LoopClosing:
             self._T_world_tracker = place.T_world_camera @ se3.inverse(begun.T_world_camera)
         return begun
 
-    def corrections(self) -> Corrections | None:
+    def corrections(self) -> PoseCorrections | None:
         """The poses of all tracking keyframes after the last optimisation; None if that is known already."""
         if not self._news:
             return None
         self._news = False
-        return Corrections(
+        return PoseCorrections(
             revision=self.counts.optimisations,
             anchors=dict(self._corrected),
             T_corrected_world=self._correction(),
@@ -164,7 +166,7 @@ class LoopClosing:
                 self._optimise()
             self._remember(pose.anchor, seen)
 
-    def _loops(self, number: int, seen: View) -> list[Loop]:
+    def _loops(self, number: int, seen: PlaceView) -> list[Loop]:
         """Loops from a new keyframe to places that check out."""
         before = self._old_enough(number)
         if before is None:
@@ -188,7 +190,7 @@ class LoopClosing:
         return next((other + 1 for other in earlier if ways[number] - ways[other] >= _GAP[1]), None)
 
     def _nearby(self, number: int, before: int) -> list[int]:
-        """Places that by the corrected poses show the same, the nearest first."""
+        """PlaceIndex that by the corrected poses show the same, the nearest first."""
         places = [place for place in self._places.views if place < before]
         if not places:
             return []
@@ -216,7 +218,7 @@ class LoopClosing:
         self._optimised_at, self._due, self._news = self.counts.keyframes, False, True
         log.debug("closed %d loops: χ² %.1f → %.1f", self.counts.closed, solution.before, solution.after)
 
-    def _remember(self, number: int, seen: View) -> None:
+    def _remember(self, number: int, seen: PlaceView) -> None:
         if self._places.full:
             self._places.forget(self._dispensable())
         self._places.add(number, seen)
@@ -228,7 +230,7 @@ class LoopClosing:
         return places[1 + int(np.argmin(ways[2:] - ways[:-2]))] if len(places) > 2 else places[0]
 
 
-def _view(frame: Frame) -> View | None:
+def _view(frame: Frame) -> PlaceView | None:
     depth = _depth(frame)
     return None if depth is None else view(frame, depth)
 

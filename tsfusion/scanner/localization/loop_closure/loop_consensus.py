@@ -9,7 +9,7 @@ import numpy as np
 
 from tsfusion.geometry import se3
 from tsfusion.scanner.localization.loop_closure.odometry_drift import Chain
-from tsfusion.scanner.localization.loop_closure.pose_graph import Edge, Matrix, information
+from tsfusion.scanner.localization.loop_closure.pose_graph import Matrix, PoseGraphEdge, information
 
 GATE = 6.0  # standard deviations by which a loop may contradict what was known
 _AMBIGUOUS = 12.0  # deviations up to which another explanation is not ruled out
@@ -30,9 +30,11 @@ class Loop:
     sigma: float
 
     @property
-    def edge(self) -> Edge:
+    def edge(self) -> PoseGraphEdge:
         """For the pose graph."""
-        return Edge(self.old, self.new, self.T_old_new, information(self.sigma, _ROTATION), robust=True)
+        return PoseGraphEdge(
+            self.old, self.new, self.T_old_new, information(self.sigma, _ROTATION), robust=True
+        )
 
     @property
     def covariance(self) -> Matrix:
@@ -40,7 +42,7 @@ class Loop:
         return np.diag([self.sigma**2] * 3 + [_ROTATION**2] * 3)
 
 
-class Consensus:
+class LoopConsensus:
     """Takes loops that look right one by one, and says which are to be believed.
 
     1. The loop must not contradict the odometry, taken over the shortest way: from the start of the loop to

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from tsfusion.geometry import se3
-from tsfusion.scanner.localization.loop_closure.pose_graph import Edge, Matrix
+from tsfusion.scanner.localization.loop_closure.pose_graph import Matrix, PoseGraphEdge
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drift:
+class OdometryDrift:
     """Standard deviations of odometry over a way; a radian of turning counts as a metre of way.
 
     Attributes:
@@ -38,10 +38,10 @@ class Chain:
         edges: from each to the next, for the pose graph.
     """
 
-    def __init__(self, drift: Drift) -> None:
+    def __init__(self, drift: OdometryDrift) -> None:
         self._drift = drift
         self.poses: dict[int, Matrix] = {}
-        self.edges: list[Edge] = []
+        self.edges: list[PoseGraphEdge] = []
         self.ways: dict[int, float] = {}
         self._sums: dict[int, Matrix] = {}  # (6, 6), world axes
 
@@ -56,7 +56,7 @@ class Chain:
             d = self._drift
             variances = [d.translation**2 * way + d.floor**2] * 3 + [d.rotation**2 * way + d.floor**2 / 9] * 3
             A = se3.adjoint(T_world_camera)
-            self.edges.append(Edge(last, number, step, np.diag(1 / np.array(variances))))
+            self.edges.append(PoseGraphEdge(last, number, step, np.diag(1 / np.array(variances))))
             self.ways[number] = self.ways[last] + way
             self._sums[number] = self._sums[last] + (A * variances) @ A.T
         self.poses[number] = T_world_camera

@@ -23,7 +23,7 @@ _COMMON = 0.3  # share of the places from which on a key tells nothing
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class View:
+class PlaceView:
     """A keyframe's looks: 36 KB with 500 features.
 
     Attributes:
@@ -49,7 +49,7 @@ class View:
     measured: bool
 
 
-def view(frame: Frame, depth_m: NDArray[np.float32]) -> View | None:
+def view(frame: Frame, depth_m: NDArray[np.float32]) -> PlaceView | None:
     """Of a frame with its (H, W) depth in metres; None where there is no camera, or no image to speak of."""
     gray, K = frame.gray, frame.intrinsics
     if gray is None or K is None or min(gray.shape) < _SMALLEST:
@@ -61,7 +61,7 @@ def view(frame: Frame, depth_m: NDArray[np.float32]) -> View | None:
     pixels = np.array([point.pt for point in keypoints], np.float32).reshape(-1, 2)
     z = bilinear(depth_m, pixels)
     factor = max(1, round(float(np.sqrt(depth_m.size / _SMALL))))
-    return View(
+    return PlaceView(
         descriptors=descriptors,
         pixels=pixels,
         points=lifted(pixels, np.where(z > 0, z, np.nan), K).astype(np.float32),
@@ -88,7 +88,7 @@ def _medians(depth: NDArray[np.uint16], factor: int) -> NDArray[np.uint16]:
     return np.where(empty <= 4, middle, np.uint16(0))
 
 
-class Places:
+class PlaceIndex:
     """Places by number, found again by what they look like.
 
     Descriptors vote for places that have one alike: locality-sensitive hashing (Gionis, Indyk and Motwani
@@ -102,14 +102,14 @@ class Places:
         self._seen = np.zeros((_TABLES << _BITS, -(-capacity // 8)), np.uint8)  # a bit for each place
         self._votes = np.ones(capacity)  # by how many descriptors a place can get votes
         self._numbers = np.full(capacity, -1, np.int64)
-        self.views: dict[int, View] = {}
+        self.views: dict[int, PlaceView] = {}
 
     @property
     def full(self) -> bool:
         """Whether one must be forgotten before another is added."""
         return len(self.views) >= self._capacity
 
-    def add(self, number: int, view: View) -> None:
+    def add(self, number: int, view: PlaceView) -> None:
         """Remember a place under its number; there must be room."""
         slot = int(np.flatnonzero(self._numbers < 0)[0])
         self._numbers[slot] = number
@@ -124,7 +124,7 @@ class Places:
         self._seen[:, slot >> 3] &= np.uint8(255 ^ 128 >> (slot & 7))
         del self.views[number]
 
-    def alike(self, view: View, *, before: int | None = None, count: int = 4) -> list[int]:
+    def alike(self, view: PlaceView, *, before: int | None = None, count: int = 4) -> list[int]:
         """The places (with numbers below `before`) that look most like the view, best first."""
         allowed = self._numbers >= 0
         slots = np.flatnonzero(allowed if before is None else allowed & (self._numbers < before))
@@ -132,14 +132,14 @@ class Places:
         best = np.argsort(-scores, kind="stable")[:count]
         return [int(self._numbers[slots[i]]) for i in best if scores[i] > 0]
 
-    def _keys(self, view: View) -> NDArray[np.int64]:
+    def _keys(self, view: PlaceView) -> NDArray[np.int64]:
         """Rows of `_seen` that the descriptors fall into."""
         bits = np.unpackbits(view.descriptors, axis=1)
         powers = 1 << np.arange(_BITS)
         keys = [(bits[:, chosen] @ powers) + (table << _BITS) for table, chosen in enumerate(self._bits)]
         return np.unique(np.concatenate(keys)).astype(np.int64)
 
-    def _count(self, view: View) -> NDArray[np.float64]:
+    def _count(self, view: PlaceView) -> NDArray[np.float64]:
         rows = np.unpackbits(self._seen[self._keys(view)], axis=1)[:, : self._capacity]
         common = rows.sum(axis=1, dtype=np.int32) > max(_COMMON * len(self.views), 2)
         rows[common] = 0

@@ -25,7 +25,7 @@ _SETTLED = 1e-9  # metres and radians: a step this small ends the iterations
 
 
 @dataclass(frozen=True, eq=False)
-class Edge:
+class PoseGraphEdge:
     """What is known of node `end` seen from node `start`.
 
     Attributes:
@@ -43,7 +43,7 @@ class Edge:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Solution:
+class PoseGraphSolution:
     """Corrected poses.
 
     Attributes:
@@ -68,8 +68,12 @@ def information(translation: float, rotation: float) -> Matrix:
 
 
 def optimise(
-    nodes: Mapping[int, Matrix], edges: Sequence[Edge], *, trusted: float = TRUSTED, iterations: int = 300
-) -> Solution:
+    nodes: Mapping[int, Matrix],
+    edges: Sequence[PoseGraphEdge],
+    *,
+    trusted: float = TRUSTED,
+    iterations: int = 300,
+) -> PoseGraphSolution:
     """The poses that fit the edges best; the first node stays where it is.
 
     Args:
@@ -84,7 +88,9 @@ def optimise(
     T = np.array([nodes[key] for key in nodes], dtype=np.float64)
     weights = np.ones(len(edges))
     if not edges:
-        return Solution(nodes=dict(nodes), weights=weights, chi2=weights, before=0, after=0, iterations=0)
+        return PoseGraphSolution(
+            nodes=dict(nodes), weights=weights, chi2=weights, before=0, after=0, iterations=0
+        )
     start = problem.chi2(T)
     robust = np.array([edge.robust for edge in edges])
     T, used = problem.descend(T, weights, min(_FIRST, iterations))
@@ -102,7 +108,7 @@ def optimise(
     if used >= _FIRST:  # not settled yet
         T, more = problem.descend(T, weights, max(iterations - used, 1))
         used, chi2 = used + more, problem.chi2(T)
-    return Solution(
+    return PoseGraphSolution(
         nodes=dict(zip(nodes, T, strict=True)),
         weights=weights,
         chi2=chi2,
@@ -122,7 +128,7 @@ def _truncated(chi2: NDArray[np.float64], trusted: float, control: float) -> NDA
 class _Problem:
     """The edges as arrays, and the sparsity of their normal equations."""
 
-    def __init__(self, nodes: Mapping[int, Matrix], edges: Sequence[Edge]) -> None:
+    def __init__(self, nodes: Mapping[int, Matrix], edges: Sequence[PoseGraphEdge]) -> None:
         self._linalg, self._sparse = require()
         place = {key: index for index, key in enumerate(nodes)}
         self._start = np.array([place[edge.start] for edge in edges], dtype=np.int64)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
 from tsfusion.scanner.localization.loop_closure.dense_alignment import Agreement, agreement, refined
-from tsfusion.scanner.localization.loop_closure.place_index import View
+from tsfusion.scanner.localization.loop_closure.place_index import PlaceView
 
 _RATIO = 0.9  # of the best descriptor distance to the second
 _FARTHEST = 64  # bits of 256 in which a match may differ
@@ -26,7 +26,7 @@ _OVERLAP = 0.2  # of the pixels with depth
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Check:
+class LoopCheck:
     """What came of comparing two views.
 
     Attributes:
@@ -45,7 +45,7 @@ class Check:
     depths: Agreement | None = None
 
 
-def check(old: View, new: View) -> Check:
+def check(old: PlaceView, new: PlaceView) -> LoopCheck:
     """Compare two views of a camera, or of two cameras.
 
     Repeated structure is refused where anything differs: depth that contradicts is looked for in both
@@ -53,11 +53,11 @@ def check(old: View, new: View) -> Check:
     """
     first, second = matches(old.descriptors, new.descriptors)
     if len(first) < _INLIERS:
-        return Check(refused=f"{len(first)} matches")
+        return LoopCheck(refused=f"{len(first)} matches")
     forward = _pose(old.points[first], new.pixels[second], new)
     backward = None if forward is None else _pose(new.points[second], old.pixels[first], old)
     if forward is None or backward is None:
-        return Check(refused=f"no pose from {len(first)} matches")
+        return LoopCheck(refused=f"no pose from {len(first)} matches")
     inliers = forward[1] | backward[1]
     count = int(inliers.sum())
     first, second = first[inliers], second[inliers]
@@ -65,19 +65,19 @@ def check(old: View, new: View) -> Check:
     depth = float(np.nanmedian(old.points[first][:, 2]))
     apart = T @ backward[0]
     if se3.distance(apart) > _DISAGREE[0] * depth or np.degrees(se3.angle(apart)) > _DISAGREE[1]:
-        return Check(T_old_new=T, refused="the poses found both ways differ", inliers=count)
+        return LoopCheck(T_old_new=T, refused="the poses found both ways differ", inliers=count)
     T = T @ se3.exp(-0.5 * se3.log(apart))
     if count < _INLIERS:
-        return Check(T_old_new=T, refused=f"{count} matches agree", inliers=count)
+        return LoopCheck(T_old_new=T, refused=f"{count} matches agree", inliers=count)
     spread = min(_hull(old.pixels[first], old.size), _hull(new.pixels[second], new.size))
     if spread < _SPREAD:
-        return Check(T_old_new=T, refused=f"matches cover {spread:.0%} of the image", inliers=count)
+        return LoopCheck(T_old_new=T, refused=f"matches cover {spread:.0%} of the image", inliers=count)
     T = refined(old, new, T, first, second)
     depths = agreement(old, new, T)
     refused = _contradiction(depths, measured=old.measured and new.measured)
     near = float(np.nanpercentile(old.points[first][:, 2], 25))
     sigma = max(0.01, 0.01 * near, 0.3 * max(old.noise, new.noise) * near**2)
-    return Check(T_old_new=T, refused=refused, inliers=count, sigma=sigma, depths=depths)
+    return LoopCheck(T_old_new=T, refused=refused, inliers=count, sigma=sigma, depths=depths)
 
 
 def matches(old: NDArray[np.uint8], new: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -99,7 +99,7 @@ def _signs(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def _pose(
-    points: NDArray[np.float32], pixels: NDArray[np.float32], camera: View
+    points: NDArray[np.float32], pixels: NDArray[np.float32], camera: PlaceView
 ) -> tuple[se3.Transform, NDArray[np.bool_]] | None:
     """T_points_camera and which agree, from three points at a time (P3P) and refinement."""
     known = np.flatnonzero(np.isfinite(points[:, 2]))

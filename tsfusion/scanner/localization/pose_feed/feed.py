@@ -15,11 +15,11 @@ import zmq
 
 from tsfusion.core.errors import DecodeError, InvalidConfig, TransportError
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Corrections, Lost, Pose
-from tsfusion.scanner.localization.pose_feed.map_deformation import Deformation
+from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
+from tsfusion.scanner.localization.pose_feed.map_deformation import MapDeformation
 from tsfusion.scanner.localization.pose_feed.messages import MAX_BYTES, decode
 from tsfusion.scanner.localization.pose_feed.pose_history import PoseHistory
-from tsfusion.scanner.localization.tracking_keyframes import Anchors
+from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
 from tsfusion.wire import sockets
 
 log = logging.getLogger(__name__)
@@ -32,7 +32,7 @@ _KINDS = 20  # of reasons that are told apart
 _NS = 1_000_000_000
 
 
-class Feed:
+class PoseFeed:
     """`Localizer` that hears poses on a ZeroMQ SUB socket and interpolates them at the frame's stamp.
 
     What is malformed is counted and dropped. Corrections are moved from the stamps they name to the tracking
@@ -66,8 +66,8 @@ class Feed:
         self._link = _Link(address)
         self._closing = weakref.finalize(self, self._link.close)
         self._history = PoseHistory()
-        self._deformation = Deformation()
-        self._anchors = Anchors()
+        self._deformation = MapDeformation()
+        self._anchors = TrackingKeyframes()
 
     @property
     def address(self) -> str:
@@ -78,7 +78,7 @@ class Feed:
         """Let go of the socket; may be called twice."""
         self._closing()
 
-    def __enter__(self) -> "Feed":
+    def __enter__(self) -> "PoseFeed":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -104,7 +104,7 @@ class Feed:
             self._deformation.add(pose.anchor, stamp, T)
         return pose
 
-    def corrections(self) -> Corrections | None:
+    def corrections(self) -> PoseCorrections | None:
         """What the sender's loop closure found out since the last call."""
         return self._deformation.news()
 

@@ -6,12 +6,12 @@ from bisect import bisect_right
 import numpy as np
 
 from tsfusion.geometry import se3
-from tsfusion.scanner.localization.localizer import Corrections, Matrix
+from tsfusion.scanner.localization.localizer import Matrix, PoseCorrections
 from tsfusion.scanner.localization.pose_feed.messages import Graph
 from tsfusion.scanner.localization.pose_feed.pose_history import PoseHistory
 
 
-class Deformation:
+class MapDeformation:
     """How a corrected graph moves odometry's world, by time.
 
     At each of the graph's stamps it is the corrected pose times the inverse of the one sent before. Between
@@ -47,12 +47,12 @@ class Deformation:
             self._loops, self._news = graph.loops, True
         return unknown
 
-    def news(self) -> Corrections | None:
+    def news(self) -> PoseCorrections | None:
         """What the graph means for every tracking keyframe since `reset`, once."""
         if not self._news:
             return None
         self._news, self._revision = False, self._revision + 1
-        return Corrections(
+        return PoseCorrections(
             revision=self._revision,
             anchors={
                 number: se3.nearest(self._move(stamp) @ T) for number, (stamp, T) in self._anchors.items()

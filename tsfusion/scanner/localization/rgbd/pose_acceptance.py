@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tsfusion.geometry import se3
 from tsfusion.scanner.localization.rgbd import point_to_plane
 from tsfusion.scanner.localization.rgbd.pose_solver import Estimate
-from tsfusion.scanner.localization.rgbd.view import Seen, View
+from tsfusion.scanner.localization.rgbd.view import FrameView, Seen
 
 Matrix = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ class Evidence:
         return None
 
 
-def weigh(seen: Seen, view: View, estimate: Estimate, corners: int) -> Evidence:
+def weigh(seen: Seen, view: FrameView, estimate: Estimate, corners: int) -> Evidence:
     """The evidence for an estimate of `seen`'s pose in `view`'s axes."""
     found = point_to_plane.match(view.seen.surface, seen.surface, estimate.T_anchor_camera, None)
     agree = np.abs(found.distance) < _NEAR + 3 * found.sigma
@@ -83,7 +83,7 @@ def weigh(seen: Seen, view: View, estimate: Estimate, corners: int) -> Evidence:
     )
 
 
-def _likeness(seen: Seen, view: View, found: point_to_plane.Match) -> float | None:
+def _likeness(seen: Seen, view: FrameView, found: point_to_plane.Match) -> float | None:
     if seen.pattern is None or view.seen.pattern is None or not len(found.block):
         return None
     here, there = seen.pattern[seen.surface.index[found.chosen]], view.seen.pattern[found.block]

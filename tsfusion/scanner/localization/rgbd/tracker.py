@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization import features
-from tsfusion.scanner.localization.localizer import Corrections, Lost, Pose
+from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
 from tsfusion.scanner.localization.rgbd import point_to_plane, pose_acceptance, pose_solver
-from tsfusion.scanner.localization.rgbd.view import Seen, View
+from tsfusion.scanner.localization.rgbd.view import FrameView, Seen
 
 Matrix = NDArray[np.float64]
 
@@ -39,12 +39,12 @@ _NO_CORNERS = (np.empty((0, 3)), np.empty((0, 2), np.float32))
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    view: View
+    view: FrameView
     T_view_camera: Matrix
     evidence: pose_acceptance.Evidence
 
 
-class RGBD:
+class RGBDLocalizer:
     """Follows a depth camera, with colour where there is some. A `Localizer`.
 
     Corners are followed from the tracking keyframe (Lucas and Kanade); the pose they give begins a
@@ -58,7 +58,7 @@ class RGBD:
 
     def __init__(self) -> None:
         self._next = self._turn = 0
-        self._kept: deque[View] = deque(maxlen=_KEPT)
+        self._kept: deque[FrameView] = deque(maxlen=_KEPT)
         self.reset()
 
     def reset(self) -> None:
@@ -69,7 +69,7 @@ class RGBD:
         self._motion: Matrix | None = None  # between the last two frames; None = not known
         self._is_lost = False
 
-    def corrections(self) -> Corrections | None:
+    def corrections(self) -> PoseCorrections | None:
         """None: this localizer never looks back."""
         return None
 
@@ -93,7 +93,7 @@ class RGBD:
             reason = reason or doubt
         return self._lost(frame, reason or "nothing known is in view")
 
-    def _guesses(self, frame: Frame, seen: Seen) -> Iterator[tuple[View, Matrix]]:
+    def _guesses(self, frame: Frame, seen: Seen) -> Iterator[tuple[FrameView, Matrix]]:
         """(view, T_view_camera to begin with), the likeliest first; what follows the last pose is wild."""
         last = self._kept[-1]
         T_view_last = se3.inverse(last.T_world_camera) @ self._last
@@ -109,7 +109,7 @@ class RGBD:
             if resected is not None and resected[1].sum() >= _INLIERS:
                 yield view, resected[0]
 
-    def _recalled(self, seen: Seen) -> list[tuple[View, NDArray[np.float64], features.Pixels]]:
+    def _recalled(self, seen: Seen) -> list[tuple[FrameView, NDArray[np.float64], features.Pixels]]:
         """Of the newest keyframes and some others, in turn, those most like the frame; the corners shared."""
         newest, others = list(self._kept)[-_NEWEST:][::-1], list(self._kept)[:-_NEWEST]
         self._turn += _RECALLED - _NEWEST
@@ -127,7 +127,7 @@ class RGBD:
         longer = now_ns / self._interval_ns
         return se3.exp(se3.log(self._motion) * longer) if longer <= _LONGEST else np.eye(4)
 
-    def _attempt(self, seen: Seen, view: View, guess: Matrix) -> _Found:
+    def _attempt(self, seen: Seen, view: FrameView, guess: Matrix) -> _Found:
         """The best pose near `guess`, T_view_camera, and what speaks for it."""
         points, pixels = view.follow(seen, guess)
         tolerance = _TOLERANCE * seen.columns / 640
@@ -147,9 +147,9 @@ class RGBD:
             view, estimate.T_anchor_camera, pose_acceptance.weigh(seen, view, estimate, len(points))
         )
 
-    def _older(self, seen: Seen, T_world_camera: Matrix, view: View) -> list[View]:
+    def _older(self, seen: Seen, T_world_camera: Matrix, view: FrameView) -> list[FrameView]:
         """The oldest keyframes that see the same as the frame, and agree about where it is."""
-        some, chosen = seen.surface.every(8), list[View]()
+        some, chosen = seen.surface.every(8), list[FrameView]()
         for older in self._kept:
             if len(chosen) == _OLDER or older is view:
                 break
@@ -181,7 +181,7 @@ class RGBD:
 
     def _start(self, frame: Frame, seen: Seen, T: Matrix, quality: float) -> Pose:
         """The frame becomes the tracking keyframe."""
-        view = View.of(seen, self._next, T)
+        view = FrameView.of(seen, self._next, T)
         self._next += 1
         self._kept.append(view)
         self._stand(T, frame)
@@ -202,7 +202,7 @@ class RGBD:
         return Lost(reason=reason, timestamp_ns=frame.timestamp_ns)
 
 
-def _misfit(seen: Seen, view: View, T_view_camera: Matrix) -> float:
+def _misfit(seen: Seen, view: FrameView, T_view_camera: Matrix) -> float:
     """Median distance of the frame's points from the view's planes, in deviations of the sensor."""
     found = point_to_plane.match(view.seen.surface, seen.surface, T_view_camera, seen.surface.every(4))
     return float(np.median(np.abs(found.distance) / found.sigma)) if len(found.distance) else np.inf

@@ -97,7 +97,7 @@ class Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class FrameView:
     """A tracking keyframe.
 
     Attributes:
@@ -114,7 +114,7 @@ class View:
     points: NDArray[np.float64]
 
     @classmethod
-    def of(cls, seen: Seen, number: int, T_world_camera: Matrix) -> "View":
+    def of(cls, seen: Seen, number: int, T_world_camera: Matrix) -> "FrameView":
         """Of a frame whose pose is known."""
         if seen.gray is None:
             return cls(number, T_world_camera, seen, np.empty((0, 2), np.float32), np.empty((0, 3)))

@@ -27,7 +27,7 @@ _STEPS = 10
 
 
 @dataclass(frozen=True)
-class Rig:
+class StereoCamera:
     """A rectified pair of cameras: `baseline_fx` is its focal length times its baseline, px·m."""
 
     intrinsics: Intrinsics
@@ -67,7 +67,7 @@ def refine(
     old: Pixels,
     disparity: NDArray[np.floating],
     new: Pixels,
-    rig: Rig,
+    rig: StereoCamera,
     *,
     with_offset: bool = False,
 ) -> Motion | None:
@@ -118,7 +118,7 @@ def _normal_equations(
 
 
 def _linearised(
-    T_new_old: se3.Transform, old: Pixels, disparity: NDArray[np.floating], new: Pixels, rig: Rig
+    T_new_old: se3.Transform, old: Pixels, disparity: NDArray[np.floating], new: Pixels, rig: StereoCamera
 ) -> tuple[Vectors, Vectors]:
     """(n, 2) pixel residuals, and (n, 2, 7) by a twist of the new camera's axes and by disparity."""
     K, X = rig.intrinsics, rig.lift(old, disparity)

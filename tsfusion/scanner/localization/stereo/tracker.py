@@ -12,10 +12,10 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.stereo_matching import quick_disparity
 from tsfusion.scanner.localization import features
-from tsfusion.scanner.localization.localizer import Corrections, Lost, Matrix, Pose
+from tsfusion.scanner.localization.localizer import Lost, Matrix, Pose, PoseCorrections
 from tsfusion.scanner.localization.stereo.rectification_check import Rectification, RectificationCheck
-from tsfusion.scanner.localization.stereo.reprojection import Rig, refine
-from tsfusion.scanner.localization.tracking_keyframes import Anchors
+from tsfusion.scanner.localization.stereo.reprojection import StereoCamera, refine
+from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
 
 _CORNERS = 1000
 _FEWEST = 25  # points that must agree
@@ -39,7 +39,7 @@ class _Seen:
     gray: NDArray[np.uint8]
     pixels: features.Pixels  # (n, 2) corners with depth
     disparity: NDArray[np.float32]  # (n,)
-    rig: Rig
+    rig: StereoCamera
     timestamp_ns: int
     T_world_camera: Matrix
 
@@ -59,7 +59,7 @@ class _View:
 
     gray: NDArray[np.uint8]
     disparity: NDArray[np.float32]
-    rig: Rig
+    rig: StereoCamera
 
     @cached_property
     def corners(self) -> tuple[features.Pixels, NDArray[np.float32]]:
@@ -68,7 +68,7 @@ class _View:
         return pixels, features.bilinear(self.disparity, pixels)
 
 
-class Stereo:
+class StereoLocalizer:
     """`Localizer` of rectified stereo pairs; also of disparity or depth images with an image beside them.
 
     A frame is compared with the last one that had a pose: a few bad ones in between are bridged, and a camera
@@ -78,7 +78,7 @@ class Stereo:
     absolute = False
 
     def __init__(self) -> None:
-        self._anchors = Anchors()
+        self._anchors = TrackingKeyframes()
         self._rectification = Rectification()
         self._reference: _Seen | None = None
         self._velocity: NDArray[np.float64] | None = None  # twist a second; a frame where there are no stamps
@@ -119,7 +119,7 @@ class Stereo:
                 self._anchors.distance = _ANCHOR * seen.median_depth
         return self._anchors.pose(T, frame.timestamp_ns, quality=quality)
 
-    def corrections(self) -> Corrections | None:
+    def corrections(self) -> PoseCorrections | None:
         """None: odometry closes no loops."""
         return None
 
@@ -191,7 +191,7 @@ def _measured(frame: Frame) -> _View:
             + ("" if frame.kind == "points" else " without colour")
         )
     assert frame.intrinsics is not None
-    rig = Rig(frame.intrinsics, frame.baseline_fx or _PROJECTOR)
+    rig = StereoCamera(frame.intrinsics, frame.baseline_fx or _PROJECTOR)
     if frame.right is not None:
         return _View(gray, quick_disparity(gray, frame.right), rig)
     assert depth is not None

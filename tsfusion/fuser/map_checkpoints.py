@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from tsfusion.core import durable_files
 from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
-from tsfusion.fuser.messages import Progress
+from tsfusion.fuser.messages import SessionProgress
 from tsfusion.journal import state_folder
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ _NEW_FILE = "map.new.tsf"
 log = logging.getLogger(__name__)
 
 
-class SavedMap:
+class MapCheckpoints:
     """The checkpoints in a map's folder.
 
     Args:
@@ -49,11 +49,13 @@ class SavedMap:
         with suppress(OSError):  # of a process that was killed
             self._new.unlink()
         self._keep_previous = keep_previous
-        self.done: dict[bytes, Progress] = {}
+        self.done: dict[bytes, SessionProgress] = {}
         self.rejected: dict[str, int] = {}
         self.volume = _resume(self._path, config) or _resume(self._previous, config) or Volume(config)
         if meta := self.volume.meta:
-            self.done = {bytes.fromhex(key): Progress(*progress) for key, progress in meta["done"].items()}
+            self.done = {
+                bytes.fromhex(key): SessionProgress(*progress) for key, progress in meta["done"].items()
+            }
             self.rejected = dict(meta["rejected"])
 
     def save(self) -> bool:
