@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tsfusion.cli import options
-from tsfusion.scanner.sources.registry import is_live, open_source
 
 if TYPE_CHECKING:
     from tsfusion.scanner.sources.source import Source
@@ -158,6 +157,7 @@ def _open(
 ) -> "Source":
     """The source by its name, as much of it as is asked for."""
     from tsfusion.scanner.sources.recorded import LimitedSource
+    from tsfusion.scanner.sources.registry import is_live, open_source
 
     if is_live(spec):
         options.refuse(
