@@ -12,6 +12,7 @@ import pytest
 
 from tsfusion.core import logs
 
+os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # programs that tests start find what tests find
 DATA = Path(os.environ.get("TSFUSION_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 

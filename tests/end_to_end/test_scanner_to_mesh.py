@@ -376,7 +376,7 @@ def test_a_busy_port_a_busy_folder_and_a_bad_folder_are_one_clear_line(
 
 def test_the_scanner_and_the_gateway_never_import_taichi() -> None:
     code = """
-import sys, tsfusion.client, tsfusion.server, tsfusion.recording, tsfusion.codec
+import sys, tsfusion.client, tsfusion.server, tsfusion.journal.recording, tsfusion.wire.codec
 tsfusion.Client, tsfusion.Keyframe
 sys.exit("taichi" in sys.modules)
 """

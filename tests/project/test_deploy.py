@@ -146,7 +146,11 @@ def figures_there_are() -> set[str]:
 
 def test_alerts_and_guide_name_figures_there_are() -> None:
     there_are = figures_there_are()
-    for path in (DEPLOY / "tsfusion-alerts.yml", DEPLOY / "README.md", ROOT / "tests" / "alerts.yml"):
+    for path in (
+        DEPLOY / "tsfusion-alerts.yml",
+        DEPLOY / "README.md",
+        ROOT / "tests" / "project" / "alerts.yml",
+    ):
         named = set(re.findall(r"\btsfusion_[a-z_]+", path.read_text(encoding="utf-8")))
         unknown = {name for name in named if name not in there_are and f"{name}_count" not in there_are}
         assert named, path
@@ -156,7 +160,10 @@ def test_alerts_and_guide_name_figures_there_are() -> None:
 @pytest.mark.skipif(shutil.which("promtool") is None, reason="no promtool")
 @pytest.mark.parametrize(
     ("folder", "arguments"),
-    [(DEPLOY, ["check", "config", "prometheus.yml"]), (ROOT / "tests", ["test", "rules", "alerts.yml"])],
+    [
+        (DEPLOY, ["check", "config", "prometheus.yml"]),
+        (ROOT / "tests" / "project", ["test", "rules", "alerts.yml"]),
+    ],
 )
 def test_prometheus_understands_its_files(folder: Path, arguments: list[str]) -> None:
     done = subprocess.run(

@@ -180,13 +180,14 @@ import sys
 from pathlib import Path
 import numpy as np
 from tsfusion.tsdf import checkpoint
+from tsfusion.tsdf.checkpoint import CheckpointHeader
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import CheckpointError
 folder = Path(sys.argv[1])
 def save(blocks):
     keys = np.arange(blocks, dtype=np.int64)
     sums = np.random.default_rng(0).integers(0, 1 << 40, (blocks, 512))
-    header = checkpoint.Header(config=VolumeConfig(), keyframes=blocks, map_hash="", layers=["sums"], meta={})
+    header = CheckpointHeader(config=VolumeConfig(), keyframes=blocks, map_hash="", layers=["sums"], meta={})
     checkpoint.write(folder / "map.tsf", header, keys, keys, {"sums": sums})
 save(100)
 before = (folder / "map.tsf").read_bytes()

@@ -482,7 +482,7 @@ def test_a_server_that_dies_before_it_answers(tmp_path: Path, writes: bool) -> N
 
 _SCANS = """
 import os, signal, sys
-from wire import pose, wall
+from keyframes_and_servers import pose, wall
 from tsfusion import Client
 client = Client(sys.argv[1], spool=sys.argv[2])
 seqs = [client.send(wall(i)) for i in range(3)]

@@ -206,9 +206,9 @@ def test_too_little_to_begin_with() -> None:
 def test_without_kiss_icp_the_command_is_named() -> None:
     program = (
         "import sys; sys.modules['kiss_icp'] = None\n"
-        "from tsfusion.scanner.localization.lidar import Lidar\n"
+        "from tsfusion.scanner.localization.lidar import LidarLocalizer\n"
         "from tsfusion.core.errors import MissingDependency\n"
-        "try: Lidar()\n"
+        "try: LidarLocalizer()\n"
         'except MissingDependency as error: sys.exit("tsfusion[lidar]" not in str(error))\n'
         "sys.exit(2)"
     )

@@ -303,12 +303,12 @@ import cv2
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.localizer import Pose
-from tsfusion.scanner.localization.rgbd.tracker import RGBD
+from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
 
 def megabytes(name):
     return int(re.search(name + r":\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) / 1024
 
-localizer, sizes, K = RGBD(), [], Intrinsics(585.0, 585.0, 320.0, 240.0)
+localizer, sizes, K = RGBDLocalizer(), [], Intrinsics(585.0, 585.0, 320.0, 240.0)
 names = [f"{sys.argv[1]}/{index:03}" for index in range(125)]
 for name in names + names[::-1]:
     depth, color = cv2.imread(name + ".png", cv2.IMREAD_UNCHANGED), cv2.imread(name + ".jpg")

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from repository import ROOT
 
 from tsfusion.core.errors import InvalidConfig, SourceError
 from tsfusion.scanner.sources.realsense import RealSense
@@ -362,7 +361,7 @@ def test_close_in_the_middle_of_a_recording(recording: Path) -> None:
 
 def test_ctrl_c_comes_through() -> None:
     program = (
-        "import signal, sys, tests.test_realsense as t\n"
+        "import signal, sys, test_realsense as t\n"
         "signal.signal(signal.SIGALRM, signal.default_int_handler)\n"
         "signal.setitimer(signal.ITIMER_REAL, 0.3)\n"
         "try:\n"
@@ -372,7 +371,7 @@ def test_ctrl_c_comes_through() -> None:
         "    sys.exit(7)\n"
     )
     command = [sys.executable, "-c", program]
-    done = subprocess.run(command, cwd=ROOT, timeout=60, check=False)
+    done = subprocess.run(command, cwd=Path(__file__).parent, timeout=60, check=False)
     assert done.returncode == 7
 
 

@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from repository import ROOT
 
 from tsfusion.core.errors import InvalidConfig, SourceError
 from tsfusion.datasets.readers import read_image
@@ -206,7 +205,7 @@ def test_close_from_another_thread_ends_the_iteration(quiet_ffmpeg: None) -> Non
 def test_ctrl_c_comes_through(quiet_ffmpeg: None) -> None:
     program = (
         "import signal, sys\n"
-        "from tests.test_video import rectified\n"
+        "from test_stereo_video import rectified\n"
         "signal.signal(signal.SIGALRM, signal.default_int_handler)\n"
         "try:\n"
         "    with rectified(sys.argv[1], deadline=60) as source:\n"
@@ -219,7 +218,7 @@ def test_ctrl_c_comes_through(quiet_ffmpeg: None) -> None:
     )
     with NetworkCamera() as camera:
         command = [sys.executable, "-c", program, camera.url]
-        done = subprocess.run(command, cwd=ROOT, timeout=60, check=False)
+        done = subprocess.run(command, cwd=Path(__file__).parent, timeout=60, check=False)
     assert done.returncode == 7
 
 

@@ -79,8 +79,7 @@ def numbers(frames: list[Frame]) -> list[int]:
 WRITER = """
     import os, sys, time
     from pathlib import Path
-    sys.path.insert(0, sys.argv[2])
-    from tests.test_sources import K, camera, color, depth, np, png, write
+    from test_watched_folder import K, camera, color, depth, np, png, write
 
     root = Path(sys.argv[1])
 
@@ -127,11 +126,11 @@ WRITER = """
 
 
 def test_a_slow_untidy_writer(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", textwrap.dedent(WRITER), str(tmp_path), str(ROOT)]
+    command = [sys.executable, "-c", textwrap.dedent(WRITER), str(tmp_path)]
     begun = time.monotonic_ns()
     source: Source = open_source(f"folder:{tmp_path}", deadline=1.0)
     frames = []
-    with subprocess.Popen(command) as writer, source:
+    with subprocess.Popen(command, cwd=Path(__file__).parent) as writer, source:
         for frame in source:
             frames.append(frame)
             if numbers([frame]) == [9]:
