@@ -10,14 +10,14 @@ from scipy.optimize import least_squares
 
 from tsfusion.core.errors import MissingDependency
 from tsfusion.evaluation.trajectory_error import absolute_error
-from tsfusion.geometry import se3, twists
+from tsfusion.geometry import se3
 from tsfusion.scanner.localization.loop_closure.pose_graph import PoseGraphEdge, information, optimise
 
 TIGHT = information(0.01, 0.002)
 
 
 def random_poses(rng: np.random.Generator, count: int, size: float = 1.0) -> NDArray[np.float64]:
-    return twists.exp(rng.normal(0, size, (count, 6)))
+    return se3.exp(rng.normal(0, size, (count, 6)))
 
 
 def ring(count: int, *, laps: float = 1.0, radius: float = 5.0) -> NDArray[np.float64]:
@@ -49,30 +49,6 @@ def loop(truth: NDArray[np.float64], start: int, end: int) -> PoseGraphEdge:
 
 def stacked(nodes: dict[int, NDArray[np.float64]]) -> NDArray[np.float64]:
     return np.array(list(nodes.values()))
-
-
-def test_batches_are_the_single_formulas():
-    rng = np.random.default_rng(1)
-    for size in (1e-9, 1e-3, 0.01, 0.02, 0.1, 1.0):
-        x = rng.normal(0, size, (20, 6))
-        T = twists.exp(x)
-        np.testing.assert_allclose(T, [se3.exp(v) for v in x], atol=1e-13)
-        np.testing.assert_allclose(twists.log(T), [se3.log(A) for A in T], atol=1e-9 * size)
-        np.testing.assert_allclose(twists.inverse(T), [se3.inverse(A) for A in T], atol=1e-15)
-        np.testing.assert_allclose(twists.adjoint(T), [se3.adjoint(A) for A in T], atol=1e-15)
-    half_turn = se3.exp(np.array([1.0, 2, 3, 0, np.pi, 0]))[None]
-    np.testing.assert_allclose(twists.exp(twists.log(half_turn)), half_turn, atol=1e-9)
-
-
-@pytest.mark.parametrize("size", [1e-4, 0.019, 0.021, 0.5, 2.0])
-def test_the_jacobian_is_the_derivative(size):
-    rng = np.random.default_rng(2)
-    x = rng.normal(0, 1, (10, 6))
-    x[:, 3:] *= size / np.linalg.norm(x[:, 3:], axis=1, keepdims=True)
-    J = twists.right_jacobian_inverse(x)
-    for k, step in enumerate(np.eye(6) * 1e-6):
-        ahead, behind = (twists.log(twists.exp(x) @ twists.exp(np.tile(s * step, (10, 1)))) for s in (1, -1))
-        np.testing.assert_allclose(J[:, :, k], (ahead - behind) / 2e-6, atol=3e-8)
 
 
 def test_a_graph_that_fits_stays_as_it_is():

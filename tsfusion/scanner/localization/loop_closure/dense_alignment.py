@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.geometry import se3, twists
+from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.loop_closure.place_index import PlaceView
 
@@ -102,7 +102,7 @@ def _reprojection(
     # q = exp(step) T p there, or T' exp(-step) p where T' leads from the old view to the new one.
     motion = np.zeros((len(q), 3, 6))
     motion[:, :, :3] = np.eye(3)
-    motion[:, :, 3:] = -twists.hat(q if towards_old else p)
+    motion[:, :, 3:] = -se3.hat(q if towards_old else p)
     if not towards_old:
         motion = -T[:3, :3] @ motion
     J = (projection @ motion).reshape(-1, 6)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import MissingDependency
-from tsfusion.geometry import twists
+from tsfusion.geometry import se3
 
 Matrix = NDArray[np.float64]
 
@@ -133,7 +133,7 @@ class _Problem:
         place = {key: index for index, key in enumerate(nodes)}
         self._start = np.array([place[edge.start] for edge in edges], dtype=np.int64)
         self._end = np.array([place[edge.end] for edge in edges], dtype=np.int64)
-        self._inverse = twists.inverse(np.array([e.T_start_end for e in edges]).reshape(-1, 4, 4))
+        self._inverse = se3.inverse(np.array([e.T_start_end for e in edges]).reshape(-1, 4, 4))
         self._information = np.array([edge.information for edge in edges]).reshape(-1, 6, 6)
         self._size = 6 * (len(nodes) - 1)  # the first node is no variable
         self._lay_out()
@@ -158,7 +158,7 @@ class _Problem:
 
     def errors(self, T: Matrix) -> NDArray[np.float64]:
         """(m, 6) twists by which the edges are not met."""
-        return twists.log(self._inverse @ twists.inverse(T[self._start]) @ T[self._end])
+        return se3.log(self._inverse @ se3.inverse(T[self._start]) @ T[self._end])
 
     def chi2(self, T: Matrix) -> NDArray[np.float64]:
         """(m,) squared errors in the edges' own units."""
@@ -173,7 +173,7 @@ class _Problem:
             while damping < 1e9:
                 x = self._solve(H, g, damping)
                 moved = T.copy()
-                moved[1:] = T[1:] @ twists.exp(x.reshape(-1, 6))
+                moved[1:] = T[1:] @ se3.exp(x.reshape(-1, 6))
                 new_error = self.errors(moved)
                 new = float(weights @ _squares(new_error, self._information))
                 if new <= cost or np.abs(x).max(initial=0.0) < _SETTLED:
@@ -190,8 +190,8 @@ class _Problem:
         self, T: Matrix, error: NDArray[np.float64], weights: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The values of the CSC matrix JᵀΩJ, and −JᵀΩe."""
-        second = twists.right_jacobian_inverse(error)
-        first = -second @ twists.adjoint(twists.inverse(T[self._end]) @ T[self._start])
+        second = se3.right_jacobian_inverse(error)
+        first = -second @ se3.adjoint(se3.inverse(T[self._end]) @ T[self._start])
         information = weights[:, None, None] * self._information
         a, b = (J.transpose(0, 2, 1) @ information for J in (first, second))
         blocks = np.concatenate([a @ first, a @ second, b @ first, b @ second])
