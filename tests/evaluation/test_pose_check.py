@@ -19,7 +19,8 @@ from tsfusion.evaluation.pose_check import check
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.trajectory import Pose, quaternion, rigid
+from tsfusion.geometry.se3 import Transform
+from tsfusion.geometry.trajectory import quaternion, rigid
 
 Data = Callable[[str], Path]
 MIRROR, OPENGL = np.diag([1.0, -1, 1, 1]), np.diag([1.0, -1, -1, 1])
@@ -33,7 +34,7 @@ class Corrupted(Frames):
     def __init__(
         self,
         dataset: Dataset,
-        pose: Callable[[Pose], NDArray[np.float64]] = np.asarray,
+        pose: Callable[[Transform], NDArray[np.float64]] = np.asarray,
         frame: Callable[[Frame], dict[str, object]] = lambda _: {},
         late: int = 0,
     ) -> None:
@@ -54,21 +55,21 @@ class Corrupted(Frames):
         return Frame(**{**fields, **changed})
 
 
-def stretched(factor: float) -> Callable[[Pose], Pose]:
-    def change(T: Pose) -> Pose:
-        moved: Pose = np.array(T)
+def stretched(factor: float) -> Callable[[Transform], Transform]:
+    def change(T: Transform) -> Transform:
+        moved: Transform = np.array(T)
         moved[:3, 3] *= factor
         return moved
 
     return change
 
 
-def reordered(order: list[int]) -> Callable[[Pose], Pose]:
+def reordered(order: list[int]) -> Callable[[Transform], Transform]:
     return lambda T: rigid(quaternion(T[:3, :3])[order], T[:3, 3])
 
 
-def transposed(T: Pose) -> Pose:
-    turned: Pose = np.array(T)
+def transposed(T: Transform) -> Transform:
+    turned: Transform = np.array(T)
     turned[:3, :3] = T[:3, :3].T
     return turned
 
@@ -83,7 +84,7 @@ def negative_fy(frame: Frame) -> dict[str, object]:
     return {"intrinsics": Intrinsics(K.fx, -K.fy, K.cx, K.cy)}
 
 
-POSES: dict[str, tuple[Callable[[Pose], NDArray[np.float64]], str]] = {
+POSES: dict[str, tuple[Callable[[Transform], NDArray[np.float64]], str]] = {
     "inverse": (se3.inverse, "inverse"),
     "opengl": (lambda T: T @ OPENGL, "opengl"),
     "view matrix": (lambda T: OPENGL @ se3.inverse(T), "inverse opengl"),

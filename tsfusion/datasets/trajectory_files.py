@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError, InvalidKeyframe
 from tsfusion.datasets.readers import numbers, read_lines, read_numbers
 from tsfusion.geometry.keyframe import check_pose
-from tsfusion.geometry.trajectory import Pose, Trajectory, quaternion
+from tsfusion.geometry.se3 import Transform
+from tsfusion.geometry.trajectory import Trajectory, quaternion
 
 
-def write_tum(path: Path, timestamps_ns: Sequence[int], poses: Sequence[Pose]) -> None:
+def write_tum(path: Path, timestamps_ns: Sequence[int], poses: Sequence[Transform]) -> None:
     """`timestamp tx ty tz qx qy qz qw` a line, nine decimals: what `read_tum` and the field's tools read."""
     lines = ["# timestamp tx ty tz qx qy qz qw (T_world_camera)\n"]
     for stamp, T in zip(timestamps_ns, poses, strict=True):
@@ -82,13 +83,13 @@ def _in_order(stamps: list[int], rows: list[list[float]], path: Path, content: s
     return Trajectory(np.array(stamps, dtype=np.int64)[order], table[:, :3], quaternions)
 
 
-def read_kitti(path: Path) -> list[Pose]:
+def read_kitti(path: Path) -> list[Transform]:
     """3×4 row-major matrices, one a line; the line number is the frame number."""
     table = read_numbers(path, "12 numbers a line, a 3×4 row-major camera-to-world matrix", columns=12)
     return [_pose(row.reshape(3, 4), f"{path}, pose {index}") for index, row in enumerate(table)]
 
 
-def read_matrix(path: Path) -> Pose:
+def read_matrix(path: Path) -> Transform:
     """One 4×4 camera-to-world matrix in a file (7-Scenes)."""
     table = read_numbers(path, "a 4×4 camera-to-world matrix", columns=4)
     if table.shape != (4, 4):
@@ -96,13 +97,13 @@ def read_matrix(path: Path) -> Pose:
     return _pose(table, str(path))
 
 
-def read_matrix_rows(path: Path) -> list[Pose]:
+def read_matrix_rows(path: Path) -> list[Transform]:
     """4×4 matrices, one a line of 16 numbers (HoloLens folders)."""
     table = read_numbers(path, "16 numbers a line, a 4×4 row-major camera-to-world matrix", columns=16)
     return [_pose(row.reshape(4, 4), f"{path}, pose {index}") for index, row in enumerate(table)]
 
 
-def read_log(path: Path) -> list[tuple[int, Pose]]:
+def read_log(path: Path) -> list[tuple[int, Transform]]:
     """Redwood / Open3D `.log`: a line of three integers, then a 4×4 camera-to-world matrix; repeated."""
     lines = read_lines(path, "a Redwood trajectory: three integers, then a 4×4 matrix, repeated")
     if not lines or len(lines) % 5:
@@ -120,7 +121,7 @@ def read_log(path: Path) -> list[tuple[int, Pose]]:
     return poses
 
 
-def _pose(matrix: NDArray[np.float64], where: str) -> Pose:
+def _pose(matrix: NDArray[np.float64], where: str) -> Transform:
     T = np.eye(4)
     T[: len(matrix)] = matrix
     try:

@@ -19,7 +19,7 @@ from tsfusion.datasets.dataset import Dataset, frame_of, pose_of
 from tsfusion.evaluation.depth_views import DepthView, view_of
 from tsfusion.evaluation.pose_mistakes import MISTAKES, SCALES, or_text, scale_text, untold_text
 from tsfusion.geometry import se3
-from tsfusion.geometry.trajectory import Pose
+from tsfusion.geometry.se3 import Transform
 
 Verdict = Literal["agree", "disagree", "cannot tell"]
 Motion = NDArray[np.float64]  # (4, 4), from the first frame of a pair to the second
@@ -133,11 +133,11 @@ class _Pair:
 
     first: int
     second: int
-    poses: tuple[Pose, Pose]
+    poses: tuple[Transform, Transform]
     seen: DepthView
     by: DepthView
 
-    def motion(self, meant: Callable[[Pose], Motion] = np.asarray) -> Motion:
+    def motion(self, meant: Callable[[Transform], Motion] = np.asarray) -> Motion:
         """From the first sensor's axes to the second's."""
         first, second = (meant(T) for T in self.poses)
         return np.asarray(np.linalg.inv(second) @ first, np.float64)
@@ -165,7 +165,7 @@ def _pairs(dataset: Dataset) -> list[_Pair]:
     return pairs
 
 
-def _seen(dataset: Dataset, index: int) -> tuple[Pose, DepthView] | None:
+def _seen(dataset: Dataset, index: int) -> tuple[Transform, DepthView] | None:
     frame = frame_of(dataset, index)
     view = None if frame.T_world_camera is None else view_of(frame)
     return None if view is None or frame.T_world_camera is None else (frame.T_world_camera, view)
@@ -252,9 +252,9 @@ def _time_shift(dataset: Dataset, pairs: list[_Pair], best: NDArray[np.float64])
     gap = next((gap for gap in (4, 1) if any(p.second - p.first == gap for p in pairs)), None)
     indices = [index for index, pair in enumerate(pairs) if pair.second - pair.first == gap][::2]
     chosen, reachable = [pairs[index] for index in indices], best[indices]
-    poses: dict[int, Pose | None] = {}
+    poses: dict[int, Transform | None] = {}
 
-    def pose(index: int) -> Pose | None:
+    def pose(index: int) -> Transform | None:
         if index not in poses:
             poses[index] = pose_of(dataset, index) if 0 <= index < len(dataset) else None
         return poses[index]

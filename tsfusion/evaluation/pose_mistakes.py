@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.geometry.trajectory import Pose, quaternion, rigid
+from tsfusion.geometry.se3 import Transform
+from tsfusion.geometry.trajectory import quaternion, rigid
 
 _MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -27,23 +28,23 @@ class Mistake:
 
     name: str
     text: str
-    meant: Callable[[Pose], NDArray[np.float64]]
+    meant: Callable[[Transform], NDArray[np.float64]]
 
 
-def _turned(order: list[int]) -> Callable[[Pose], Pose]:
-    def meant(T: Pose) -> Pose:
+def _turned(order: list[int]) -> Callable[[Transform], Transform]:
+    def meant(T: Transform) -> Transform:
         return rigid(quaternion(T[:3, :3])[order], T[:3, 3])
 
     return meant
 
 
-def _conjugated(T: Pose) -> Pose:
-    meant: Pose = np.array(T)
+def _conjugated(T: Transform) -> Transform:
+    meant: Transform = np.array(T)
     meant[:3, :3] = T[:3, :3].T
     return meant
 
 
-def _inverse(T: Pose) -> NDArray[np.float64]:
+def _inverse(T: Transform) -> NDArray[np.float64]:
     return np.asarray(np.linalg.inv(T), np.float64)
 
 

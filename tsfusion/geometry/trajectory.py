@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Todo."""
+"""Poses over time, interpolated, and rotations as quaternions."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-Pose = NDArray[np.float64]  # (4, 4) T_world_camera
+from tsfusion.geometry.se3 import Transform
 
 _EXACT_NS = 1_000_000  # a pose this near in time needs no neighbour
 
@@ -25,7 +25,7 @@ class Trajectory:
     translations: NDArray[np.float64]
     quaternions: NDArray[np.float64]
 
-    def at(self, timestamp_ns: int, *, max_gap_ns: int) -> Pose | None:
+    def at(self, timestamp_ns: int, *, max_gap_ns: int) -> Transform | None:
         """The pose at a time: SLERP and linear between the neighbours, never beyond the ends.
 
         None when the neighbours are more than `max_gap_ns` apart, unless one is within a millisecond.
@@ -58,7 +58,7 @@ def slerp(q0: NDArray[np.float64], q1: NDArray[np.float64], share: float) -> NDA
     return unit
 
 
-def rigid(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> Pose:
+def rigid(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> Transform:
     """(4, 4) from a unit quaternion (x y z w) and a translation."""
     x, y, z, w = quaternion
     T = np.eye(4)

@@ -6,7 +6,8 @@ from array import array
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.scanner.localization.localizer import Matrix, Pose, PoseCorrections
+from tsfusion.geometry.se3 import Transform
+from tsfusion.scanner.localization.localizer import Pose, PoseCorrections
 
 _NONE = -1
 _BOTTOM = (0.0, 0.0, 0.0, 1.0)
@@ -27,7 +28,7 @@ class TrackedTrajectory:
         self._poses = array("d")  # T_world_camera, T_anchor_camera
         self._references = array("d")
 
-    def add(self, pose: Pose, reference: Matrix | None, seq: int | None) -> None:
+    def add(self, pose: Pose, reference: Transform | None, seq: int | None) -> None:
         """The next frame.
 
         Args:
@@ -95,7 +96,7 @@ class TrackedTrajectory:
         return np.array(self._poses).reshape(-1, 2, 3, 4)
 
 
-def _bytes(T: Matrix) -> bytes:
+def _bytes(T: Transform) -> bytes:
     return np.asarray(T, dtype=np.float64)[:3].tobytes()
 
 

@@ -15,7 +15,8 @@ from tsfusion.geometry.calibration import Rectifier
 from tsfusion.geometry.calibration_files import read_rig, read_tree
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import check_pose
-from tsfusion.geometry.trajectory import Pose, Trajectory
+from tsfusion.geometry.se3 import Transform
+from tsfusion.geometry.trajectory import Trajectory
 
 EXPECTED = "mav0/{cam0,cam1}/{data.csv,sensor.yaml,data/*.png} and mav0/state_groundtruth_estimate0/data.csv"
 _TRUTH = "state_groundtruth_estimate0/data.csv"
@@ -125,7 +126,7 @@ def _listed(camera: Path) -> list[tuple[int, Path]]:
     return sorted(images)
 
 
-def _calibrated(place: Path) -> tuple[Rectifier, Pose]:
+def _calibrated(place: Path) -> tuple[Rectifier, Transform]:
     """The rectification, and T_body_rectified of the left camera."""
     files = [place / camera / "sensor.yaml" for camera in ("cam0", "cam1")]
     try:
@@ -145,7 +146,9 @@ def _trajectory(place: Path, *, required: bool) -> Trajectory | None:
     return None
 
 
-def _pose(trajectory: Trajectory | None, stamp_ns: int, max_gap_ns: int, T_body_camera: Pose) -> Pose | None:
+def _pose(
+    trajectory: Trajectory | None, stamp_ns: int, max_gap_ns: int, T_body_camera: Transform
+) -> Transform | None:
     T_world_body = None if trajectory is None else trajectory.at(stamp_ns, max_gap_ns=max_gap_ns)
     return None if T_world_body is None else T_world_body @ T_body_camera
 

@@ -11,7 +11,8 @@ from tsfusion.datasets.dataset import SCAN, Frames, folder, kept, require_frames
 from tsfusion.datasets.readers import numbers, read_lines
 from tsfusion.datasets.trajectory_files import check_quaternion
 from tsfusion.geometry.frame import Frame
-from tsfusion.geometry.trajectory import Pose, rigid
+from tsfusion.geometry.se3 import Transform
+from tsfusion.geometry.trajectory import rigid
 
 EXPECTED = "NNNNNN/points.bin (float32 x, y, z) and graph.txt (`vK tx ty tz qx qy qz qw` a line)"
 _BYTES = 12  # a point
@@ -54,7 +55,7 @@ class LidarDump(Frames):
         )
 
 
-def _read_graph(path: Path, *, required: bool) -> dict[int, Pose]:
+def _read_graph(path: Path, *, required: bool) -> dict[int, Transform]:
     if not path.exists():
         if required:
             raise DatasetError(f"{path} is missing; expected {EXPECTED}; {SCAN}")

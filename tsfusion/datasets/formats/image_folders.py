@@ -15,7 +15,7 @@ from tsfusion.datasets.dataset import Frames
 from tsfusion.datasets.readers import checked_intrinsics, read_color, read_depth
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.trajectory import Pose
+from tsfusion.geometry.se3 import Transform
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -37,7 +37,7 @@ class DepthImages(Frames):
         sensor: str,
         depth: Sequence[Path],
         color: Sequence[Path | None],
-        poses: Sequence[Pose | None],
+        poses: Sequence[Transform | None],
         intrinsics: Intrinsics,
         skipped: dict[str, int],
         depth_scale: float = 0.001,
@@ -135,7 +135,7 @@ def matched(depth: list[Path], where: Path, expected: str) -> list[Path]:
     return [by_stem[image.stem] for image in depth]
 
 
-def by_number(files: list[Path], poses: list[tuple[int, Pose]], source: Path) -> list[Pose | None]:
+def by_number(files: list[Path], poses: list[tuple[int, Transform]], source: Path) -> list[Transform | None]:
     """Each image's pose: the k-th one's where there are as many, else by the number that is its name."""
     if len(files) == len(poses):
         return [pose for _, pose in poses]

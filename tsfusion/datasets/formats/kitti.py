@@ -19,7 +19,7 @@ from tsfusion.datasets.readers import checked_intrinsics, read_lines
 from tsfusion.datasets.trajectory_files import nanoseconds, read_kitti
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics, check_pose
-from tsfusion.geometry.trajectory import Pose
+from tsfusion.geometry.se3 import Transform
 
 EXPECTED = "sequences/NN/{calib.txt,times.txt,image_0,image_1,velodyne} and poses/NN.txt"
 _COLUMNS = 12  # numbers of a 3×4 matrix
@@ -56,7 +56,7 @@ class Drive(Frames):
     intrinsics: Intrinsics | None
     baseline_fx: float | None
     _frames: list[int]
-    _poses: list[Pose | None]
+    _poses: list[Transform | None]
     _left: dict[int, Path]  # or the scans
     _right: dict[int, Path]
     _with_color: bool
@@ -186,7 +186,7 @@ def _scan_files(place: Path) -> dict[int, Path]:
     return scans
 
 
-def _trajectory(root: Path, sequence: str, poses: str | Path | None, *, posed: bool) -> dict[int, Pose]:
+def _trajectory(root: Path, sequence: str, poses: str | Path | None, *, posed: bool) -> dict[int, Transform]:
     """Frame number → pose; without `posed` the benchmark's own file may be missing, as it is from 11 on."""
     path = root / "poses" / f"{sequence}.txt"
     if poses is not None:
@@ -226,7 +226,7 @@ def _stereo_camera(calibration: Mapping[str, NDArray[np.float64]], path: Path) -
     return checked_intrinsics(camera, path), baseline_fx
 
 
-def _transform(row: NDArray[np.float64], path: Path) -> Pose:
+def _transform(row: NDArray[np.float64], path: Path) -> Transform:
     try:
         return check_pose(np.vstack([row.reshape(3, 4), (0, 0, 0, 1)]))
     except InvalidKeyframe as error:

@@ -17,8 +17,7 @@ from tsfusion.datasets.dataset import folder, kept, require_frames
 from tsfusion.datasets.formats.kitti import Drive, numbered
 from tsfusion.datasets.readers import checked_intrinsics, read_color, read_lines, read_numbers
 from tsfusion.geometry.keyframe import Intrinsics, check_pose
-from tsfusion.geometry.se3 import inverse
-from tsfusion.geometry.trajectory import Pose
+from tsfusion.geometry.se3 import Transform, inverse
 
 EXPECTED = "DATE/DATE_drive_NNNN_sync/{image_00..03,velodyne_points,oxts}/data and DATE/calib_*.txt"
 _CAMERAS = {"grey": ("00", "01"), "color": ("02", "03")}
@@ -85,7 +84,7 @@ class KITTIRaw(Drive):
 
 
 class _Rig(NamedTuple):
-    T_imu_sensor: Pose
+    T_imu_sensor: Transform
     intrinsics: Intrinsics | None = None
     baseline_fx: float | None = None
 
@@ -157,14 +156,14 @@ def _files(
     return {n: file for n, file in left.items() if n in both}, right
 
 
-def _imu_poses(place: Path, *, required: bool) -> dict[int, Pose]:
+def _imu_poses(place: Path, *, required: bool) -> dict[int, Transform]:
     """Frame number → T_world_imu, by pykitti's Mercator projection; the first packet is the origin."""
     from pykitti.utils import OxtsPacket, pose_from_oxts_packet
 
     files = numbered(place, ".txt")
     if required and not files:
         raise DatasetError(f"{place} has no packets (*.txt); expected {EXPECTED}")
-    poses: dict[int, Pose] = {}
+    poses: dict[int, Transform] = {}
     scale, origin = None, None
     for number, file in files.items():
         packet = OxtsPacket(*read_numbers(file, "30 numbers of a GPS/IMU packet", columns=_PACKET)[0])
@@ -177,14 +176,14 @@ def _imu_poses(place: Path, *, required: bool) -> dict[int, Pose]:
     return poses
 
 
-def _rigid(path: Path) -> Pose:
+def _rigid(path: Path) -> Transform:
     found = _read_calibration(path, {"R": 9, "T": 3})
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = found["R"].reshape(3, 3), found["T"]
     return _checked(T, path)
 
 
-def _checked(T: Pose, path: Path) -> Pose:
+def _checked(T: Transform, path: Path) -> Transform:
     try:
         return check_pose(T)
     except InvalidKeyframe as error:

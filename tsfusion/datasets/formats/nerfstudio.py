@@ -17,7 +17,7 @@ from tsfusion.datasets.readers import read_color, read_image
 from tsfusion.geometry.calibration import Camera, Undistorter
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import check_pose
-from tsfusion.geometry.trajectory import Pose
+from tsfusion.geometry.se3 import Transform
 
 EXPECTED = "transforms.json with fl_x, cx, … and frames of file_path, depth_file_path, transform_matrix"
 DEPTH_SCALE = 0.001  # metres per unit, where the file does not say
@@ -165,7 +165,7 @@ def _image(path: Path) -> Path:
     return path if path.suffix or not path.with_suffix(".png").exists() else path.with_suffix(".png")
 
 
-def _pose(frame: dict[str, Any], applied_scale: float, where: str) -> Pose | None:
+def _pose(frame: dict[str, Any], applied_scale: float, where: str) -> Transform | None:
     if frame.get("transform_matrix") is None:
         return None
     try:

@@ -15,7 +15,7 @@ from tsfusion.datasets.formats.image_folders import (
 from tsfusion.datasets.readers import checked_intrinsics, read_intrinsics
 from tsfusion.datasets.trajectory_files import read_log, read_matrix_rows
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.trajectory import Pose
+from tsfusion.geometry.se3 import Transform
 
 HOLOLENS_EXPECTED = "K.txt, poses.txt, depth/*.png and images/*.png"
 REDWOOD_EXPECTED = "depth/*.png, image/, color/ or rgb/, and trajectory.log, odometry.log or *-traj.txt"
@@ -64,7 +64,7 @@ class HoloLens(DepthImages):
         root = folder(path, "HoloLens")
         depth = images(root / "depth", HOLOLENS_EXPECTED)
         require_frames(len(depth), root / "depth", HOLOLENS_EXPECTED, {})
-        poses: list[Pose | None] = [None] * len(depth)
+        poses: list[Transform | None] = [None] * len(depth)
         if posed or (root / "poses.txt").exists():
             poses = [*read_matrix_rows(root / "poses.txt")]
         if len(poses) != len(depth):

@@ -10,7 +10,7 @@ from tsfusion.datasets.formats.image_folders import DepthImages, images
 from tsfusion.datasets.readers import checked_intrinsics, numbers, read_depth
 from tsfusion.datasets.trajectory_files import read_matrix_rows
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.trajectory import Pose
+from tsfusion.geometry.se3 import Transform
 
 EXPECTED = "traj.txt, results/depthN.png and results/frameN.jpg, with cam_params.json there or one folder up"
 SIZE = (680, 1200)  # height, width
@@ -70,7 +70,7 @@ def _frames(root: Path, depth: list[Path]) -> list[Path | None]:
     return [by_number[path.stem[len("depth") :]] for path in depth]
 
 
-def _poses(root: Path, files: list[Path], *, posed: bool) -> list[Pose | None]:
+def _poses(root: Path, files: list[Path], *, posed: bool) -> list[Transform | None]:
     path = root / "traj.txt"
     if not path.exists():
         if posed:

@@ -13,7 +13,7 @@ from tsfusion.datasets.formats.image_folders import DepthImages, images, matched
 from tsfusion.datasets.readers import checked_intrinsics, read_color, read_lines, read_numbers
 from tsfusion.datasets.trajectory_files import read_matrix
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.trajectory import Pose
+from tsfusion.geometry.se3 import Transform
 
 EXPECTED = "color/N.jpg, depth/N.png, pose/N.txt and intrinsic/intrinsic_{depth,color}.txt"
 _PLACES = ("intrinsic/intrinsic_{}.txt", "intrinsics_{}.txt", "intrinsic_{}.txt")
@@ -87,7 +87,7 @@ def _required(root: Path) -> Intrinsics:
     return intrinsics
 
 
-def _pose(path: Path) -> Pose | None:
+def _pose(path: Path) -> Transform | None:
     if not path.exists():
         return None
     lost = any("inf" in line.lower() for _, line in read_lines(path, "a 4×4 camera-to-world matrix"))

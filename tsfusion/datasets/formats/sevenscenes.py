@@ -13,7 +13,7 @@ from tsfusion.datasets.trajectory_files import read_matrix
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.trajectory import Pose
+from tsfusion.geometry.se3 import Transform
 
 EXPECTED = "frame-XXXXXX.{depth.png,pose.txt,color.png|jpg}, in the folder or in its seq-XX folders"
 KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0)  # the release's own figure
@@ -119,7 +119,7 @@ def _file(stem: Path, suffix: str) -> Path:
     return stem.with_name(f"{stem.name}.{suffix}")
 
 
-def _pose(stem: Path) -> Pose | None:
+def _pose(stem: Path) -> Transform | None:
     path = _file(stem, "pose.txt")
     return read_matrix(path) if path.exists() else None
 

@@ -14,7 +14,7 @@ from tsfusion.datasets.formats.tum_lists import ASSOCIATIONS, read_recording
 from tsfusion.datasets.readers import checked_intrinsics, read_depth, read_intrinsics
 from tsfusion.datasets.trajectory_files import read_tum
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.trajectory import Pose
+from tsfusion.geometry.se3 import Transform
 
 EXPECTED = (
     "groundtruth.txt or *.gt.freiburg, and the images that depth.txt and rgb.txt, or associations.txt, list"
@@ -128,7 +128,7 @@ class TUM(DepthImages):
 
 def _poses_at(
     stamps_ns: list[int], trajectory: Path | None, *, max_gap_ns: int, offset_ns: int
-) -> list[Pose | None]:
+) -> list[Transform | None]:
     if trajectory is None:
         return [None] * len(stamps_ns)
     poses = read_tum(trajectory)

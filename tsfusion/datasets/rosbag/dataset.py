@@ -30,7 +30,7 @@ from tsfusion.datasets.rosbag.topics import Modality, TopicChooser, recorded_sca
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.trajectory import Pose
+from tsfusion.geometry.se3 import Transform
 
 log = logging.getLogger(__name__)
 
@@ -185,7 +185,7 @@ class Bag(Frames):
         self._mains = [mains[stamp] for stamp in stamps.tolist()]
         self._others = [others[int(there[i])] if ok else None for i, ok in zip(nearest, near, strict=True)]
 
-    def _pose(self, at: Callable[[int], Pose | None], offset_ns: int, posed: bool) -> None:
+    def _pose(self, at: Callable[[int], Transform | None], offset_ns: int, posed: bool) -> None:
         """Find the frames' poses; leave out those without."""
         assert self.timestamps_ns is not None
         self._poses = [at(stamp + offset_ns) for stamp in self.timestamps_ns.tolist()]

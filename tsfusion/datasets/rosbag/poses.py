@@ -10,7 +10,7 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN
 from tsfusion.datasets.rosbag.reader import BagRecording, Message, Stream
 from tsfusion.datasets.rosbag.transforms import OLD_TF, PATH, POSE_KINDS, TF, Told, Transforms, TransformTrack
-from tsfusion.geometry.trajectory import Pose
+from tsfusion.geometry.se3 import Transform
 
 
 def pose_streams(recording: BagRecording, pose_topic: str | None) -> list[Stream]:
@@ -67,7 +67,7 @@ class PoseFinder:
                 self._told_by[message.stream] = Told()  # each path holds all that were before
             self._told_by[message.stream].add(message.content, message.stream.kind)
 
-    def finish(self, *, required: bool) -> Callable[[int], Pose | None]:
+    def finish(self, *, required: bool) -> Callable[[int], Transform | None]:
         """What gives `T_world_sensor` at a time, None where it is not known.
 
         Raises:
@@ -88,11 +88,11 @@ class PoseFinder:
             )
         return lambda _stamp: None
 
-    def between(self, target: str, source: str, stamp: int) -> Pose | None:
+    def between(self, target: str, source: str, stamp: int) -> Transform | None:
         """`T_target_source` at a time by the transforms, after `finish`; None where they do not tell it."""
         return self._transforms.at(target, source, stamp)
 
-    def _by_transforms(self) -> Callable[[int], Pose | None]:
+    def _by_transforms(self) -> Callable[[int], Transform | None]:
         world = self._transforms.ancestors(self._frame)[-1] if self._world is None else self._world
         if not self._transforms.connected(world, self._frame):
             chain = " ← ".join(self._transforms.ancestors(self._frame))
@@ -128,17 +128,17 @@ class PoseFinder:
         body = self._body or found.body
         return body in ("", self._frame) or self._transforms.connected(body, self._frame)
 
-    def _by_track(self, found: TransformTrack) -> Callable[[int], Pose | None]:
+    def _by_track(self, found: TransformTrack) -> Callable[[int], Transform | None]:
         body = self._body or found.body or self._frame
         world = self._world or found.world
 
-        def at(stamp: int) -> Pose | None:
+        def at(stamp: int) -> Transform | None:
             T = found.trajectory.at(stamp, max_gap_ns=self._max_gap_ns)
             T_body_sensor = self._transforms.at(body, self._frame, stamp)
             T_world = np.eye(4) if world == found.world else self._transforms.at(world, found.world, stamp)
             if T is None or T_body_sensor is None or T_world is None:
                 return None
-            posed: Pose = T_world @ T @ T_body_sensor
+            posed: Transform = T_world @ T @ T_body_sensor
             return posed
 
         return at

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from tsfusion.datasets.rosbag.reader import frame_id, stamp_ns
 from tsfusion.geometry import se3
-from tsfusion.geometry.trajectory import Pose, Trajectory, rigid
+from tsfusion.geometry.se3 import Transform
+from tsfusion.geometry.trajectory import Trajectory, rigid
 
 TF = "tf2_msgs/msg/TFMessage"
 OLD_TF = "tf/msg/tfMessage"
@@ -54,7 +55,7 @@ class _Edge(NamedTuple):
     trajectory: Trajectory
     is_constant: bool
 
-    def at(self, stamp: int, max_gap_ns: int) -> Pose | None:
+    def at(self, stamp: int, max_gap_ns: int) -> Transform | None:
         if self.is_constant:
             return rigid(self.trajectory.quaternions[0], self.trajectory.translations[0])
         return self.trajectory.at(stamp, max_gap_ns=max_gap_ns)
@@ -115,7 +116,7 @@ class Transforms:
         """Whether the two are in one tree."""
         return self.ancestors(one)[-1] == self.ancestors(other)[-1]
 
-    def at(self, target: str, source: str, stamp: int) -> Pose | None:
+    def at(self, target: str, source: str, stamp: int) -> Transform | None:
         """`T_target_source` at a time; None where it is not known then."""
         if target == source:
             return np.eye(4)
@@ -129,9 +130,9 @@ class Transforms:
             return None
         return se3.inverse(T_common_target) @ T_common_source
 
-    def _down(self, frames: list[str], stamp: int) -> Pose | None:
+    def _down(self, frames: list[str], stamp: int) -> Transform | None:
         """The pose of the first frame in the parent of the last."""
-        T: Pose = np.eye(4)
+        T: Transform = np.eye(4)
         for frame in frames:
             step = self._edges[frame].at(stamp, self._max_gap_ns)
             if step is None:

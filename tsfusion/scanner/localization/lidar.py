@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import InvalidKeyframe, MissingDependency
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Lost, Matrix, Pose, PoseCorrections
+from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
 from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
 
 Points = NDArray[np.float64]  # (n, 3) metres
@@ -129,13 +129,13 @@ class LidarLocalizer:
         self._voxel = voxel
         self._anchors.distance = _ANCHOR * voxel
 
-    def _expected(self) -> Matrix:
+    def _expected(self) -> se3.Transform:
         """Where the motion leads, scans without a pose counted; after many of those, the last pose."""
         steps = self._missed + 1 if self._missed < _PATIENCE else 0
-        T: Matrix = self._icp.last_pose @ se3.exp(se3.log(self._icp.last_delta) * steps)
+        T: se3.Transform = self._icp.last_pose @ se3.exp(se3.log(self._icp.last_delta) * steps)
         return T
 
-    def _align(self, thin: Points) -> Matrix:
+    def _align(self, thin: Points) -> se3.Transform:
         icp = self._icp
         guess, threshold = self._expected(), icp.adaptive_threshold.get_threshold()
         if self._settling:
@@ -143,7 +143,9 @@ class LidarLocalizer:
             if len(upright) >= _FEWEST_UPRIGHT and not around.empty():
                 guess = icp.registration.align_points_to_map(upright, around, guess, 3 * threshold, threshold)
                 threshold = _FINE * self._voxel
-        T: Matrix = icp.registration.align_points_to_map(thin, icp.local_map, guess, 3 * threshold, threshold)
+        T: se3.Transform = icp.registration.align_points_to_map(
+            thin, icp.local_map, guess, 3 * threshold, threshold
+        )
         return T
 
     def _upright_map(self) -> Any:
@@ -154,7 +156,7 @@ class LidarLocalizer:
         made.add_points(cloud[_is_upright(cloud, self._voxel)])
         return made
 
-    def _problem(self, T: Matrix, overlap: float) -> str:
+    def _problem(self, T: se3.Transform, overlap: float) -> str:
         """Why the pose is not believed; empty = it is."""
         if overlap < _OVERLAP:
             return f"{overlap:.0%} of the points lie where some were before"
@@ -167,7 +169,7 @@ class LidarLocalizer:
             )
         return ""
 
-    def _straightened(self, frame: Frame, motion: Matrix) -> Points:
+    def _straightened(self, frame: Frame, motion: se3.Transform) -> Points:
         """The points in reach, seen from where the sensor was at the scan's end."""
         assert frame.points is not None
         scan: Points = self._icp.preprocessor.preprocess(
@@ -182,13 +184,13 @@ class LidarLocalizer:
             return np.zeros(0)
         return times.astype(np.float64)
 
-    def _from_stamp(self, frame: Frame) -> Matrix:
+    def _from_stamp(self, frame: Frame) -> se3.Transform:
         """The sensor at the scan's end, seen from where it was at the frame's stamp."""
         times = self._times(frame)
         share = float(np.clip(-times.min() / np.ptp(times), 0, 1)) if len(times) else 1.0
         return se3.exp((1 - share) * se3.log(self._icp.last_delta))
 
-    def _accept(self, T: Matrix, map_points: Points, frame: Frame) -> Matrix:
+    def _accept(self, T: se3.Transform, map_points: Points, frame: Frame) -> se3.Transform:
         """Put the scan into the map; the sensor's pose at the frame's stamp."""
         icp = self._icp
         moved = se3.exp(se3.log(se3.inverse(icp.last_pose) @ T) / (self._missed + 1))

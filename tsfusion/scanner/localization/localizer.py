@@ -2,14 +2,10 @@
 """What a localizer is, and what it says of a frame."""
 
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Protocol
 
 from tsfusion.geometry.frame import Frame
-
-Matrix: TypeAlias = NDArray[np.float64]  # (4, 4)
+from tsfusion.geometry.se3 import Transform
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -26,10 +22,10 @@ class Pose:
         quality: 0 to 1, the share of what was compared that agrees; 1 where poses are given.
     """
 
-    T_world_camera: Matrix
+    T_world_camera: Transform
     timestamp_ns: int
     anchor: int
-    T_anchor_camera: Matrix
+    T_anchor_camera: Transform
     starts_anchor: bool = False
     quality: float = 1.0
 
@@ -59,8 +55,8 @@ class PoseCorrections:
     """
 
     revision: int
-    anchors: dict[int, Matrix]
-    T_corrected_world: Matrix
+    anchors: dict[int, Transform]
+    T_corrected_world: Transform
     loops: int
 
 

@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from tsfusion.geometry import se3
-from tsfusion.scanner.localization.localizer import Matrix, Pose
+from tsfusion.scanner.localization.localizer import Pose
 
 
 class TrackingKeyframes:
@@ -23,9 +23,9 @@ class TrackingKeyframes:
         self.distance = distance
         self._angle = math.radians(angle)
         self._number = -1
-        self._T_world_anchor: Matrix | None = None
+        self._T_world_anchor: se3.Transform | None = None
 
-    def pose(self, T_world_camera: Matrix, timestamp_ns: int, *, quality: float = 1.0) -> Pose:
+    def pose(self, T_world_camera: se3.Transform, timestamp_ns: int, *, quality: float = 1.0) -> Pose:
         """The pose as a localizer gives it."""
         T = np.eye(4) if self._T_world_anchor is None else se3.inverse(self._T_world_anchor) @ T_world_camera
         moved = se3.distance(T) > self.distance or se3.angle(T) > self._angle

@@ -15,7 +15,6 @@ from tsfusion.scanner.localization.loop_closure import pose_graph, verification
 from tsfusion.scanner.localization.loop_closure.loop_consensus import Loop, LoopConsensus
 from tsfusion.scanner.localization.loop_closure.odometry_drift import Chain, OdometryDrift
 from tsfusion.scanner.localization.loop_closure.place_index import CAPACITY, PlaceIndex, PlaceView, view
-from tsfusion.scanner.localization.loop_closure.pose_graph import Matrix
 
 _GAP = (10, 3.0)  # keyframes, and metres and radians of way: what is younger is no loop
 _CHECKS = 4  # views compared with each keyframe's
@@ -72,13 +71,15 @@ class LoopClosing:
         self._chain = Chain(self._drift)
         self.consensus = LoopConsensus(self._chain)
         self._places = PlaceIndex(self._capacity)
-        self._corrected: dict[int, Matrix] = {}
+        self._corrected: dict[int, se3.Transform] = {}
         self.counts = LoopCounts()
         self._news = False
         self._due = False
         self._optimised_at = 0  # keyframes then
         self._lost = 0  # frames, since the last that was not
-        self._T_world_tracker: Matrix = np.eye(4)  # the tracker's world began anew where it was found again
+        self._T_world_tracker: se3.Transform = np.eye(
+            4
+        )  # the tracker's world began anew where it was found again
 
     def track(self, frame: Frame) -> Pose | Lost:
         """As the wrapped localizer says; a lost one goes on where a place is known again."""
@@ -145,7 +146,7 @@ class LoopClosing:
             T_anchor_camera=T,
         )
 
-    def _correction(self) -> Matrix:
+    def _correction(self) -> se3.Transform:
         """`T_corrected_world` after the last keyframe."""
         last = next(reversed(self._corrected))
         return self._corrected[last] @ se3.inverse(self._chain.poses[last])

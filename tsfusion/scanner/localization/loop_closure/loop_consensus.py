@@ -9,7 +9,7 @@ import numpy as np
 
 from tsfusion.geometry import se3
 from tsfusion.scanner.localization.loop_closure.odometry_drift import Chain
-from tsfusion.scanner.localization.loop_closure.pose_graph import Matrix, PoseGraphEdge, information
+from tsfusion.scanner.localization.loop_closure.pose_graph import PoseGraphEdge, information
 
 GATE = 6.0  # standard deviations by which a loop may contradict what was known
 _AMBIGUOUS = 12.0  # deviations up to which another explanation is not ruled out
@@ -26,7 +26,7 @@ class Loop:
 
     old: int
     new: int
-    T_old_new: Matrix
+    T_old_new: se3.Transform
     sigma: float
 
     @property
@@ -37,7 +37,7 @@ class Loop:
         )
 
     @property
-    def covariance(self) -> Matrix:
+    def covariance(self) -> se3.Matrix6:
         """(6, 6), as a twist in the axes of `new`."""
         return np.diag([self.sigma**2] * 3 + [_ROTATION**2] * 3)
 
@@ -59,7 +59,9 @@ class LoopConsensus:
         self.believed: list[Loop] = []
         self._ends = np.empty((0, 2))  # ways of the believed loops' ends
         self._waiting: list[Loop] = []
-        self._twins: dict[int, list[tuple[int, Matrix]]] = {}  # place → (another, T_another_place) by looks
+        self._twins: dict[
+            int, list[tuple[int, se3.Transform]]
+        ] = {}  # place → (another, T_another_place) by looks
         self.refused: dict[str, int] = {}
 
     def hear(self, loops: list[Loop]) -> list[Loop]:
@@ -79,7 +81,7 @@ class LoopConsensus:
             return []
         return [found for loop in allowed for found in self._supported(loop)]
 
-    def deviation(self, old: int, new: int, T_old_new: Matrix, covariance: Matrix) -> float:
+    def deviation(self, old: int, new: int, T_old_new: se3.Transform, covariance: se3.Matrix6) -> float:
         """Standard deviations (the root of χ²) between a claim and what was known."""
         T, known = self._known(old, new)
         error = se3.log(se3.inverse(T_old_new) @ T)
@@ -95,7 +97,7 @@ class LoopConsensus:
         self._count_ends()
         self._count("contradicts other loops")
 
-    def _known(self, old: int, new: int) -> tuple[Matrix, Matrix]:
+    def _known(self, old: int, new: int) -> tuple[se3.Transform, se3.Matrix6]:
         """`T_old_new` and covariance over the shortest way."""
         ways = self._chain.ways
         direct = abs(ways[new] - ways[old])
@@ -106,7 +108,7 @@ class LoopConsensus:
                 return self._through(self.believed[best], old, new)
         return self._chain.between(old, new)
 
-    def _through(self, loop: Loop, old: int, new: int) -> tuple[Matrix, Matrix]:
+    def _through(self, loop: Loop, old: int, new: int) -> tuple[se3.Transform, se3.Matrix6]:
         """`T_old_new` and covariance by odometry to a loop, over it, and on."""
         first, first_covariance = self._chain.between(old, loop.old)
         last, covariance = self._chain.between(loop.new, new)
@@ -158,7 +160,7 @@ class LoopConsensus:
         for loop in right:
             self._add_twin(loop.old, wrong.old, wrong.T_old_new @ se3.inverse(loop.T_old_new))
 
-    def _add_twin(self, place: int, other: int, T_other_place: Matrix) -> None:
+    def _add_twin(self, place: int, other: int, T_other_place: se3.Transform) -> None:
         for a, b, T in ((place, other, T_other_place), (other, place, se3.inverse(T_other_place))):
             twins = self._twins.setdefault(a, [])
             twins.append((b, T))

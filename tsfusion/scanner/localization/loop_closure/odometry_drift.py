@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tsfusion.geometry import se3
-from tsfusion.scanner.localization.loop_closure.pose_graph import Matrix, PoseGraphEdge
+from tsfusion.scanner.localization.loop_closure.pose_graph import PoseGraphEdge
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,12 +40,12 @@ class Chain:
 
     def __init__(self, drift: OdometryDrift) -> None:
         self._drift = drift
-        self.poses: dict[int, Matrix] = {}
+        self.poses: dict[int, se3.Transform] = {}
         self.edges: list[PoseGraphEdge] = []
         self.ways: dict[int, float] = {}
-        self._sums: dict[int, Matrix] = {}  # (6, 6), world axes
+        self._sums: dict[int, se3.Matrix6] = {}  # (6, 6), world axes
 
-    def add(self, number: int, T_world_camera: Matrix) -> None:
+    def add(self, number: int, T_world_camera: se3.Transform) -> None:
         """The next keyframe."""
         last = next(reversed(self.poses), None)
         if last is None:
@@ -61,7 +61,7 @@ class Chain:
             self._sums[number] = self._sums[last] + (A * variances) @ A.T
         self.poses[number] = T_world_camera
 
-    def between(self, start: int, end: int) -> tuple[Matrix, Matrix]:
+    def between(self, start: int, end: int) -> tuple[se3.Transform, se3.Matrix6]:
         """`T_start_end` by odometry, and its (6, 6) covariance as a twist in the axes of `end`."""
         T = se3.inverse(self.poses[start]) @ self.poses[end]
         A = se3.adjoint(se3.inverse(self.poses[end]))

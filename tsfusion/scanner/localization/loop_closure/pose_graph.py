@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import MissingDependency
 from tsfusion.geometry import se3
 
-Matrix = NDArray[np.float64]
-
 TRUSTED = 22.5  # χ² of six degrees of freedom that one in a thousand exceeds
 _GROWTH = 1.4  # of the control parameter, as in the paper
 _FIRST = 10  # iterations with all edges, before wrong ones are looked for
@@ -37,8 +35,8 @@ class PoseGraphEdge:
 
     start: int
     end: int
-    T_start_end: Matrix
-    information: Matrix
+    T_start_end: se3.Transform
+    information: se3.Matrix6
     robust: bool = False
 
 
@@ -54,7 +52,7 @@ class PoseGraphSolution:
         iterations: linear systems solved.
     """
 
-    nodes: dict[int, Matrix]
+    nodes: dict[int, se3.Transform]
     weights: NDArray[np.float64]
     chi2: NDArray[np.float64]
     before: float
@@ -62,13 +60,13 @@ class PoseGraphSolution:
     iterations: int
 
 
-def information(translation: float, rotation: float) -> Matrix:
+def information(translation: float, rotation: float) -> se3.Matrix6:
     """(6, 6) of independent errors: standard deviations in metres and radians."""
     return np.diag([translation**-2.0] * 3 + [rotation**-2.0] * 3)
 
 
 def optimise(
-    nodes: Mapping[int, Matrix],
+    nodes: Mapping[int, se3.Transform],
     edges: Sequence[PoseGraphEdge],
     *,
     trusted: float = TRUSTED,
@@ -128,7 +126,7 @@ def _truncated(chi2: NDArray[np.float64], trusted: float, control: float) -> NDA
 class _Problem:
     """The edges as arrays, and the sparsity of their normal equations."""
 
-    def __init__(self, nodes: Mapping[int, Matrix], edges: Sequence[PoseGraphEdge]) -> None:
+    def __init__(self, nodes: Mapping[int, se3.Transform], edges: Sequence[PoseGraphEdge]) -> None:
         self._linalg, self._sparse = require()
         place = {key: index for index, key in enumerate(nodes)}
         self._start = np.array([place[edge.start] for edge in edges], dtype=np.int64)
@@ -156,15 +154,17 @@ class _Problem:
         ends = np.concatenate([first, second]).ravel()
         self._known, self._ends = ends >= 0, ends[ends >= 0]
 
-    def errors(self, T: Matrix) -> NDArray[np.float64]:
+    def errors(self, T: se3.Transform) -> se3.Twist:
         """(m, 6) twists by which the edges are not met."""
         return se3.log(self._inverse @ se3.inverse(T[self._start]) @ T[self._end])
 
-    def chi2(self, T: Matrix) -> NDArray[np.float64]:
+    def chi2(self, T: se3.Transform) -> NDArray[np.float64]:
         """(m,) squared errors in the edges' own units."""
         return _squares(self.errors(T), self._information)
 
-    def descend(self, T: Matrix, weights: NDArray[np.float64], steps: int) -> tuple[Matrix, int]:
+    def descend(
+        self, T: se3.Transform, weights: NDArray[np.float64], steps: int
+    ) -> tuple[se3.Transform, int]:
         """The poses after at most `steps` of Levenberg-Marquardt, and how many there were."""
         damping, error = 1e-7, self.errors(T)
         cost = float(weights @ _squares(error, self._information))
@@ -187,7 +187,7 @@ class _Problem:
         return T, steps
 
     def _normal(
-        self, T: Matrix, error: NDArray[np.float64], weights: NDArray[np.float64]
+        self, T: se3.Transform, error: NDArray[np.float64], weights: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The values of the CSC matrix JᵀΩJ, and −JᵀΩe."""
         second = se3.right_jacobian_inverse(error)

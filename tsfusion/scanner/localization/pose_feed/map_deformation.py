@@ -6,7 +6,7 @@ from bisect import bisect_right
 import numpy as np
 
 from tsfusion.geometry import se3
-from tsfusion.scanner.localization.localizer import Matrix, PoseCorrections
+from tsfusion.scanner.localization.localizer import PoseCorrections
 from tsfusion.scanner.localization.pose_feed.messages import Graph
 from tsfusion.scanner.localization.pose_feed.pose_history import PoseHistory
 
@@ -20,14 +20,14 @@ class MapDeformation:
 
     def __init__(self) -> None:
         self._stamps: list[int] = []
-        self._moves: list[Matrix] = []
+        self._moves: list[se3.Transform] = []
         self._T_corrected_world = np.eye(4)
         self._loops = 0
         self._news = False
-        self._anchors: dict[int, tuple[int, Matrix]] = {}
+        self._anchors: dict[int, tuple[int, se3.Transform]] = {}
         self._revision = 0
 
-    def add(self, anchor: int, stamp_ns: int, T_world_camera: Matrix) -> None:
+    def add(self, anchor: int, stamp_ns: int, T_world_camera: se3.Transform) -> None:
         """A tracking keyframe."""
         self._anchors[anchor] = stamp_ns, T_world_camera
 
@@ -66,7 +66,7 @@ class MapDeformation:
         self._anchors.clear()
         self._revision = 0
 
-    def _move(self, stamp_ns: int) -> Matrix:
+    def _move(self, stamp_ns: int) -> se3.Transform:
         if not self._moves:
             return self._T_corrected_world
         right = bisect_right(self._stamps, stamp_ns)

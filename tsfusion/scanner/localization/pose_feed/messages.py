@@ -23,8 +23,8 @@ from msgspec import Meta, Struct
 
 from tsfusion.core.errors import DecodeError, InvalidKeyframe
 from tsfusion.geometry.keyframe import check_pose
+from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import rigid
-from tsfusion.scanner.localization.localizer import Matrix
 
 MAX_BYTES = 1 << 20  # of a message: corrections of 5,000 poses in JSON, 15,000 in MessagePack
 _FARTHEST = 1e7  # metres from the origin
@@ -51,8 +51,8 @@ class Graph(Struct, frozen=True, kw_only=True):
     """Corrected poses of moments, in order of their stamps."""
 
     stamps_ns: list[int]
-    poses: list[Matrix]
-    T_corrected_world: Matrix | None
+    poses: list[Transform]
+    T_corrected_world: Transform | None
     loops: int
 
 
@@ -60,7 +60,7 @@ class Said(Struct, frozen=True, kw_only=True):
     """One message. `pose` None with a stamp: the sender is lost."""
 
     stamp_ns: int | None
-    pose: Matrix | None
+    pose: Transform | None
     graph: Graph | None
 
 
@@ -96,7 +96,7 @@ def _graph(raw: _Graph) -> Graph:
     return Graph(stamps_ns=[*by_stamp], poses=[*by_stamp.values()], T_corrected_world=T, loops=raw.loops)
 
 
-def _matrix(numbers: list[float]) -> Matrix:
+def _matrix(numbers: list[float]) -> Transform:
     """(4, 4) from 7 or 16 numbers. Raises DecodeError or InvalidKeyframe."""
     values = np.array(numbers, dtype=np.float64)
     if len(values) == 16:

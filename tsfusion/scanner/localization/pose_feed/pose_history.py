@@ -6,8 +6,8 @@ from bisect import bisect_left
 
 import numpy as np
 
+from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import Trajectory, quaternion
-from tsfusion.scanner.localization.localizer import Matrix
 
 _NUMBERS = 7  # translation and quaternion; all NaN says that the sender was lost
 
@@ -28,7 +28,7 @@ class PoseHistory:
         """The latest stamp. Only where there is one."""
         return self._stamps[-1]
 
-    def add(self, stamp_ns: int, T: Matrix | None) -> None:
+    def add(self, stamp_ns: int, T: Transform | None) -> None:
         """A pose, or None for lost; a stamp that is there already is replaced."""
         row = array("d", [np.nan] * _NUMBERS if T is None else [*T[:3, 3], *quaternion(T[:3, :3])])
         at = bisect_left(self._stamps, stamp_ns)
@@ -41,7 +41,7 @@ class PoseHistory:
             gone = self._limit // 10 or 1
             del self._stamps[:gone], self._numbers[: _NUMBERS * gone]
 
-    def at(self, stamp_ns: int, *, max_gap_ns: int) -> Matrix | None:
+    def at(self, stamp_ns: int, *, max_gap_ns: int) -> Transform | None:
         """The pose at a time, interpolated between its neighbours as `Trajectory.at` does; None = unknown."""
         right = bisect_left(self._stamps, stamp_ns)
         neighbours = [k for k in (right - 1, right) if 0 <= k < len(self)]

@@ -4,14 +4,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
 from tsfusion.scanner.localization.rgbd import point_to_plane
 from tsfusion.scanner.localization.rgbd.pose_solver import Estimate
 from tsfusion.scanner.localization.rgbd.view import FrameView, Seen
-
-Matrix = NDArray[np.float64]
 
 _NEAR = 0.01  # metres, and three deviations: a point on its plane
 _PATTERN = 0.1  # of what all could be: below, there is nothing to compare

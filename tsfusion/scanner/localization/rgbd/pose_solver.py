@@ -15,8 +15,6 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.rgbd import point_to_plane
 
-Matrix = NDArray[np.float64]
-
 PIXEL = 1.0  # deviation of a followed corner, at 640 columns
 _REACH = 3.0  # deviations at which a residual counts a quarter
 _TRUST = 0.1  # of a plane's residual against a corner's, until it is known how far neighbours err alike
@@ -39,7 +37,7 @@ class Link:
         pixels: (n, 2) where the new image has them.
     """
 
-    T_view_anchor: Matrix
+    T_view_anchor: se3.Transform
     surface: point_to_plane.Surface
     points: NDArray[np.float64]
     pixels: NDArray[np.float32]
@@ -56,10 +54,10 @@ class Estimate:
         corners: (6, 6) information that the corners give.
     """
 
-    T_anchor_camera: Matrix
-    planes: Matrix
-    spurious: Matrix
-    corners: Matrix
+    T_anchor_camera: se3.Transform
+    planes: se3.Matrix6
+    spurious: se3.Matrix6
+    corners: se3.Matrix6
 
 
 def solve(
@@ -67,7 +65,7 @@ def solve(
     here: point_to_plane.Surface,
     camera: Intrinsics,
     columns: int,
-    T_anchor_camera: Matrix,
+    T_anchor_camera: se3.Transform,
 ) -> Estimate:
     """The pose at which corners and planes agree best, from a pose nearby.
 
@@ -105,7 +103,7 @@ def solve(
 
 def _planes(
     found: point_to_plane.Match, gate: float, trust: float
-) -> tuple[Matrix, NDArray[np.float64], point_to_plane.Floats]:
+) -> tuple[se3.Matrix6, se3.Twist, point_to_plane.Floats]:
     """Normal equations of the distances to planes, and each one's weight."""
     near = np.abs(found.distance) < np.float32(gate) + 3 * found.sigma
     if np.count_nonzero(near) < 12:
@@ -120,13 +118,13 @@ def _planes(
 
 def _spurious(
     found: point_to_plane.Match, weight: point_to_plane.Floats, there: point_to_plane.Surface
-) -> Matrix:
+) -> se3.Matrix6:
     """(6, 6) information that errors of the planes' normals alone would give."""
     slope = there.roughness * found.sigma * (there.intrinsics.fx / found.moved[2])
     return _isotropic(found.moved, weight * (slope * slope / _PLANE_NOISE + _WAVES**2))
 
 
-def _isotropic(points: point_to_plane.Floats, weight: NDArray[np.floating]) -> Matrix:
+def _isotropic(points: point_to_plane.Floats, weight: NDArray[np.floating]) -> se3.Matrix6:
     """(6, 6) information of points that are held in all three directions."""
     p, w = points.astype(np.float64), weight.astype(np.float64)
     total, first, second = w.sum(), p @ w, (p * w) @ p.T
@@ -138,7 +136,9 @@ def _isotropic(points: point_to_plane.Floats, weight: NDArray[np.floating]) -> M
     return H
 
 
-def _corners(link: Link, camera: Intrinsics, T_view_camera: Matrix, pixel: float) -> tuple[Matrix, Matrix]:
+def _corners(
+    link: Link, camera: Intrinsics, T_view_camera: se3.Transform, pixel: float
+) -> tuple[se3.Matrix6, se3.Twist]:
     """Normal equations of the reprojection errors of a link's corners."""
     if not len(link.points):
         return np.zeros((6, 6)), np.zeros(6)

@@ -15,8 +15,6 @@ from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
 from tsfusion.scanner.localization.rgbd import point_to_plane, pose_acceptance, pose_solver
 from tsfusion.scanner.localization.rgbd.view import FrameView, Seen
 
-Matrix = NDArray[np.float64]
-
 _KEPT = 40  # tracking keyframes, about 1 MB each at 640×480
 _DISTANCE, _ANGLE = 0.1, np.radians(10)  # to the next one
 _OVERLAP = 0.6  # with the last one; below: the next one
@@ -40,7 +38,7 @@ _NO_CORNERS = (np.empty((0, 3)), np.empty((0, 2), np.float32))
 @dataclass(frozen=True, eq=False)
 class _Found:
     view: FrameView
-    T_view_camera: Matrix
+    T_view_camera: se3.Transform
     evidence: pose_acceptance.Evidence
 
 
@@ -64,9 +62,9 @@ class RGBDLocalizer:
     def reset(self) -> None:
         """Forget the world: the next frame's camera is the new one's origin."""
         self._kept.clear()
-        self._last: Matrix = np.eye(4)
+        self._last: se3.Transform = np.eye(4)
         self._last_ns = self._interval_ns = 0
-        self._motion: Matrix | None = None  # between the last two frames; None = not known
+        self._motion: se3.Transform | None = None  # between the last two frames; None = not known
         self._is_lost = False
 
     def corrections(self) -> PoseCorrections | None:
@@ -93,7 +91,7 @@ class RGBDLocalizer:
             reason = reason or doubt
         return self._lost(frame, reason or "nothing known is in view")
 
-    def _guesses(self, frame: Frame, seen: Seen) -> Iterator[tuple[FrameView, Matrix]]:
+    def _guesses(self, frame: Frame, seen: Seen) -> Iterator[tuple[FrameView, se3.Transform]]:
         """(view, T_view_camera to begin with), the likeliest first; what follows the last pose is wild."""
         last = self._kept[-1]
         T_view_last = se3.inverse(last.T_world_camera) @ self._last
@@ -118,7 +116,7 @@ class RGBDLocalizer:
         recalled = [(view, *view.recall(seen)) for view in views]
         return sorted(recalled, key=lambda entry: -len(entry[1]))[:_TRIED]
 
-    def _expected_motion(self, frame: Frame) -> Matrix:
+    def _expected_motion(self, frame: Frame) -> se3.Transform:
         """The last motion, going on for as long as this frame is after the last one."""
         assert self._motion is not None
         now_ns = frame.timestamp_ns - self._last_ns
@@ -127,7 +125,7 @@ class RGBDLocalizer:
         longer = now_ns / self._interval_ns
         return se3.exp(se3.log(self._motion) * longer) if longer <= _LONGEST else np.eye(4)
 
-    def _attempt(self, seen: Seen, view: FrameView, guess: Matrix) -> _Found:
+    def _attempt(self, seen: Seen, view: FrameView, guess: se3.Transform) -> _Found:
         """The best pose near `guess`, T_view_camera, and what speaks for it."""
         points, pixels = view.follow(seen, guess)
         tolerance = _TOLERANCE * seen.columns / 640
@@ -147,7 +145,7 @@ class RGBDLocalizer:
             view, estimate.T_anchor_camera, pose_acceptance.weigh(seen, view, estimate, len(points))
         )
 
-    def _older(self, seen: Seen, T_world_camera: Matrix, view: FrameView) -> list[FrameView]:
+    def _older(self, seen: Seen, T_world_camera: se3.Transform, view: FrameView) -> list[FrameView]:
         """The oldest keyframes that see the same as the frame, and agree about where it is."""
         some, chosen = seen.surface.every(8), list[FrameView]()
         for older in self._kept:
@@ -179,7 +177,7 @@ class RGBDLocalizer:
             quality=evidence.agreeing,
         )
 
-    def _start(self, frame: Frame, seen: Seen, T: Matrix, quality: float) -> Pose:
+    def _start(self, frame: Frame, seen: Seen, T: se3.Transform, quality: float) -> Pose:
         """The frame becomes the tracking keyframe."""
         view = FrameView.of(seen, self._next, T)
         self._next += 1
@@ -194,7 +192,7 @@ class RGBDLocalizer:
             quality=quality,
         )
 
-    def _stand(self, T: Matrix, frame: Frame) -> None:
+    def _stand(self, T: se3.Transform, frame: Frame) -> None:
         self._last, self._last_ns, self._is_lost = T, frame.timestamp_ns, False
 
     def _lost(self, frame: Frame, reason: str) -> Lost:
@@ -202,7 +200,7 @@ class RGBDLocalizer:
         return Lost(reason=reason, timestamp_ns=frame.timestamp_ns)
 
 
-def _misfit(seen: Seen, view: FrameView, T_view_camera: Matrix) -> float:
+def _misfit(seen: Seen, view: FrameView, T_view_camera: se3.Transform) -> float:
     """Median distance of the frame's points from the view's planes, in deviations of the sensor."""
     found = point_to_plane.match(view.seen.surface, seen.surface, T_view_camera, seen.surface.every(4))
     return float(np.median(np.abs(found.distance) / found.sigma)) if len(found.distance) else np.inf

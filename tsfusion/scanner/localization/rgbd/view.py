@@ -16,8 +16,6 @@ from tsfusion.scanner.localization import features
 from tsfusion.scanner.localization.rgbd import point_to_plane
 
 Gray = NDArray[np.uint8]
-Matrix = NDArray[np.float64]
-
 _CORNERS = 400
 _DESCRIBED = 600
 _RATIO = 0.8  # of the best match's distance to the second best's
@@ -108,13 +106,13 @@ class FrameView:
     """
 
     number: int
-    T_world_camera: Matrix
+    T_world_camera: se3.Transform
     seen: Seen
     corners: features.Pixels
     points: NDArray[np.float64]
 
     @classmethod
-    def of(cls, seen: Seen, number: int, T_world_camera: Matrix) -> "FrameView":
+    def of(cls, seen: Seen, number: int, T_world_camera: se3.Transform) -> "FrameView":
         """Of a frame whose pose is known."""
         if seen.gray is None:
             return cls(number, T_world_camera, seen, np.empty((0, 2), np.float32), np.empty((0, 3)))
@@ -123,7 +121,7 @@ class FrameView:
         points, ok = seen.lifted(corners)
         return cls(number, T_world_camera, seen, corners[ok], points[ok])
 
-    def follow(self, seen: Seen, T_view_camera: Matrix) -> tuple[NDArray[np.float64], features.Pixels]:
+    def follow(self, seen: Seen, T_view_camera: se3.Transform) -> tuple[NDArray[np.float64], features.Pixels]:
         """(n, 3) corners of this view found again near where the pose given says, and (n, 2) there."""
         old, new = self.seen.gray, seen.gray
         if old is None or new is None or old.shape != new.shape or not len(self.points):

@@ -12,7 +12,7 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.stereo_matching import quick_disparity
 from tsfusion.scanner.localization import features
-from tsfusion.scanner.localization.localizer import Lost, Matrix, Pose, PoseCorrections
+from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
 from tsfusion.scanner.localization.stereo.rectification_check import Rectification, RectificationCheck
 from tsfusion.scanner.localization.stereo.reprojection import StereoCamera, refine
 from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
@@ -41,7 +41,7 @@ class _Seen:
     disparity: NDArray[np.float32]  # (n,)
     rig: StereoCamera
     timestamp_ns: int
-    T_world_camera: Matrix
+    T_world_camera: se3.Transform
 
     @cached_property
     def points(self) -> NDArray[np.float64]:
