@@ -52,7 +52,7 @@ class RealSense(LiveSource):
 
     Raises:
         SourceError: no such camera, it is in use or lacks such images; the recording cannot be played.
-        MissingDependency: without pyrealsense2.
+        MissingDependency: without pyrealsense2, or without the USB library that it loads.
     """
 
     def __init__(
@@ -240,8 +240,13 @@ def _undistorter(profile: Any, name: str) -> Undistorter | None:
 def _pyrealsense2() -> Any:
     try:
         import pyrealsense2
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise MissingDependency(
             "RealSense needs pyrealsense2; install it with: pip install 'tsfusion[realsense]'"
+        ) from error
+    except ImportError as error:  # a shared library that the wheel does not bring along
+        raise MissingDependency(
+            f"RealSense needs pyrealsense2, which is installed but cannot be loaded ({error}); "
+            "on Debian and Ubuntu install its USB library with: apt-get install libusb-1.0-0"
         ) from error
     return pyrealsense2
