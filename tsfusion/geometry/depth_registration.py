@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Depth and colour of two cameras brought together, either way, and a measure of how well they fit."""
+"""Registration of a depth and a colour camera: the colour of depth pixels, the depth of colour pixels."""
 
 import cv2
 import numpy as np
@@ -12,7 +12,6 @@ Size = tuple[int, int]  # height, width
 _FAR = np.float32(65.535)  # metres: where a pixel without depth is taken to be
 _OVERLAP = 1.2  # how much wider than its share a depth pixel is drawn: no gaps on slanted surfaces
 _OCCLUDED = np.float32(1.03)  # behind what the colour camera sees, times its depth
-_EDGE = 0.05  # a depth edge: jump between neighbours, times depth
 
 
 class Registration:
@@ -103,30 +102,3 @@ class Registration:
         behind = there <= 0
         there[behind] = 1
         return x / there, y / there, np.where(behind, np.float32(0), there)
-
-
-def edge_fit(color: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> float:
-    """How well two images are registered: the colour's gradient under depth edges, in multiples of its mean.
-
-    About 1 when they have nothing to do with each other, 2 to 4 on real pairs that fit; NaN without edges.
-    """
-    gradient, edges = _gradient(color), _depth_edges(depth_m)
-    return float(gradient[edges].mean() / gradient.mean()) if edges.any() and gradient.any() else float("nan")
-
-
-def _gradient(color: NDArray[np.uint8]) -> NDArray[np.float32]:
-    gray = cv2.cvtColor(color, cv2.COLOR_BGR2GRAY) if color.ndim == 3 else color
-    blurred = cv2.GaussianBlur(gray, (0, 0), 1.0)
-    across, down = (cv2.Sobel(blurred, cv2.CV_32F, dx, dy) for dx, dy in ((1, 0), (0, 1)))
-    return np.asarray(cv2.magnitude(across, down), np.float32)
-
-
-def _depth_edges(depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """The near side of every jump in depth."""
-    edges = np.zeros(depth_m.shape, bool)
-    for axis in (0, 1):
-        for way in (1, -1):
-            other = np.roll(depth_m, way, axis=axis)
-            edges |= (depth_m > 0) & (other > depth_m * (1 + _EDGE))
-    edges[[0, -1]] = edges[:, [0, -1]] = False
-    return edges
