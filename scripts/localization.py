@@ -203,7 +203,7 @@ def _localizer(scene: Scene, first: Frame) -> Localizer:
     if scene.peer:
         made: Localizer = getattr(_odometry_peers, scene.peer)()
         return made
-    return registry.make(ScanConfig(localizer=scene.localizer, loop_closure=scene.loops), first)
+    return registry.create_localizer(ScanConfig(localizer=scene.localizer, loop_closure=scene.loops), first)
 
 
 def _verdict(

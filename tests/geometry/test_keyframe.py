@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The door: what a keyframe must be, and what is said when it is not."""
+"""Keyframes: what one must be, and the message when it is not."""
 
 from typing import Any
 

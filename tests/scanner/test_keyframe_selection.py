@@ -31,7 +31,7 @@ def selector(outdoors: bool = False, **rules) -> KeyframeSelector:
     """One that has taken a wall at the origin."""
     made = KeyframeSelector(ScanConfig(**rules), outdoors=outdoors)
     assert made.reason(wall(), at(0, 0, 0)) == "first"
-    made.took(wall(), at(0, 0, 0))
+    made.accept(wall(), at(0, 0, 0))
     return made
 
 
@@ -75,7 +75,7 @@ def test_pairs_points_and_blind_frames_have_no_overlap():
     ]
     for frame in frames:
         made = KeyframeSelector(ScanConfig(distance=9.0), outdoors=False)
-        made.took(frame, at(0, 0, 0))
+        made.accept(frame, at(0, 0, 0))
         assert made.reason(frame, at(3, 0, 0)) is None
         assert made.reason(frame, at(9, 0, 0)) == "distance"
 
@@ -98,7 +98,7 @@ def test_rates_on_real_scenes(data):
             frame = frame_of(dataset, index)
             reason = made.reason(frame, frame.T_world_camera)
             if reason:
-                made.took(frame, frame.T_world_camera)
+                made.accept(frame, frame.T_world_camera)
                 taken.append(reason)
         counts[name] = len(taken), len(dataset)
     kitchen, street = counts.values()

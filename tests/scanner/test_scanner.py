@@ -27,7 +27,7 @@ NOBODY = "tcp://127.0.0.1:1"
 
 
 class Scripted:
-    """Says what it was told to: `T`, `L`ost, or `C`: a pose, and a loop that moves all of them by 5 cm."""
+    """Scripted localizer: `T`racked, `L`ost, or `C`: a pose, and a loop that moves all by 5 cm."""
 
     def __init__(self, script: str, *, absolute: bool = False) -> None:
         self.absolute = absolute

@@ -91,7 +91,7 @@ def scan(
         first = next(frames, None)
         if first is None:
             raise failure[0] if failure else SourceError(f"{source.name} gave no frames")
-        localizer = registry.make(config, first)
+        localizer = registry.create_localizer(config, first)
         stack.callback(getattr(localizer, "close", lambda: None))
         if connect is None:
             progress.stage("starting a server (the first start compiles kernels)")
@@ -137,7 +137,7 @@ def scan(
         replay_results.write_ledger(work, records)
         result = scan_results.summarise(
             source, scanner, maps, records,
-            localizer=registry.choose(config, first), complete=complete, seconds=seconds,
+            localizer=registry.localizer_name(config, first), complete=complete, seconds=seconds,
             peak_rss_bytes=peak, config=config, volume=volume if place.child else None,
         )  # fmt: skip
         stack.close()  # clients and server end before the folder of theirs goes

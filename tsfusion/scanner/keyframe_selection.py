@@ -49,7 +49,7 @@ class KeyframeSelector:
             return "overlap"
         return None
 
-    def took(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> None:
+    def accept(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> None:
         """This frame is a keyframe now: the next are compared to it."""
         self._last = (T_world_camera, frame.timestamp_ns)
         self._seen = _overlap(frame)

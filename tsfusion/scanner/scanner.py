@@ -36,21 +36,21 @@ class Submap:
         client: sends its keyframes.
         located: its frames, in order.
         corrections: the newest of loop closure, None = there were none.
-        said: number of the last keyframe whose correction the client was told.
+        corrected_seq: number of the last keyframe whose correction the client was told.
     """
 
     name: str
     client: Client
     located: TrackedTrajectory = field(default_factory=TrackedTrajectory)
     corrections: PoseCorrections | None = None
-    said: int = 0
+    corrected_seq: int = 0
 
     def correct(self) -> None:
         """Have the client say where its keyframes were, by the newest corrections."""
         assert self.corrections is not None
         seqs, poses = self.located.keyframes(self.corrections)
         if len(seqs):
-            self.said = int(seqs[-1])
+            self.corrected_seq = int(seqs[-1])
             said = dict(zip(seqs.tolist(), poses, strict=True))
             self.client.correct(said, T_map_odometry=self.corrections.T_corrected_world)
 
@@ -124,19 +124,19 @@ class Scanner:
     def run(self, frames: Iterable[Frame], watch: Callable[["Scanner"], None]) -> None:
         """Take every frame, and let `watch` look after each."""
         for frame in frames:
-            self.take(frame)
+            self.process(frame)
             watch(self)
 
-    def take(self, frame: Frame) -> None:
+    def process(self, frame: Frame) -> None:
         """Find the frame's pose, and send it if it is a keyframe."""
         before = time.process_time()
         found = self._localizer.track(frame)
         self._tracking_cpu += time.process_time() - before
         self._frames += 1
         if isinstance(found, Lost):
-            self._missed(found, frame)
+            self._handle_lost(found, frame)
         else:
-            self._located(found, frame)
+            self._handle_pose(found, frame)
         corrections = self._localizer.corrections()
         if corrections is not None:
             self._correct(corrections)
@@ -144,7 +144,7 @@ class Scanner:
     def finish(self) -> None:
         """No frame comes any more: keyframes since the last loops are moved by what those said, too."""
         for submap in self.submaps:
-            if submap.corrections is not None and submap.located.last_seq > submap.said:
+            if submap.corrections is not None and submap.located.last_seq > submap.corrected_seq:
                 submap.correct()
 
     @property
@@ -170,7 +170,7 @@ class Scanner:
             keyframe_delay_ms=_newest_delay(clients[-1]),
         )
 
-    def _located(self, pose: Pose, frame: Frame) -> None:
+    def _handle_pose(self, pose: Pose, frame: Frame) -> None:
         if self._state == "lost":
             log.info("the sensor is found again")
         self._state, self._why, self._lost_since = "tracking", "", None
@@ -182,11 +182,11 @@ class Scanner:
         seq = None
         if reason is not None:
             self._selected[reason] += 1
-            self._selector.took(frame, T)
+            self._selector.accept(frame, T)
             seq = submap.client.send(frame.keyframe(T))
         submap.located.add(pose, frame.T_world_camera, seq)
 
-    def _missed(self, lost: Lost, frame: Frame) -> None:
+    def _handle_lost(self, lost: Lost, frame: Frame) -> None:
         self._lost += 1
         if self._state == "tracking":
             log.warning("the sensor is lost: %s", lost.reason)

@@ -143,7 +143,7 @@ ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
 
 
 @pytest.mark.parametrize(
-    ("poses", "times", "said"),
+    ("poses", "times", "message"),
     [
         (ROW, None, r"has no times \(KITTI's format\); put them beside it as .*times.txt"),
         (ROW * 3, "0\n1\n", "has 2 lines, .* has 3 poses"),
@@ -152,12 +152,12 @@ ROW = "1 0 0 0 0 1 0 0 0 0 1 0\n"
         ("# nothing\n", None, "holds no poses"),
     ],
 )
-def test_useless_files_are_explained(tmp_path: Path, poses: str, times: str | None, said: str) -> None:
+def test_useless_files_are_explained(tmp_path: Path, poses: str, times: str | None, message: str) -> None:
     path = tmp_path / "poses.txt"
     path.write_text(poses, encoding="utf-8")
     if times is not None:
         (tmp_path / "times.txt").write_text(times, encoding="utf-8")
-    with pytest.raises(DatasetError, match=said):
+    with pytest.raises(DatasetError, match=message):
         TrajectoryFilePoses(path, max_gap_s=0.1)
 
 
@@ -193,11 +193,11 @@ def feed() -> Iterator[PoseFeed]:
         yield made
 
 
-def heard(feed: PoseFeed, say: Callable[[int], None]) -> None:
+def wait_until_received(feed: PoseFeed, say: Callable[[int], None]) -> None:
     """Speak until somebody listens: what is published before is nobody's."""
     until, count = time.monotonic() + DEADLINE, 0
     while not feed.received:
-        assert time.monotonic() < until, "nothing was heard"
+        assert time.monotonic() < until, "no message arrived"
         say(count)
         count += 1
         feed.track(frame(START - 1000 * SECOND))
@@ -206,7 +206,7 @@ def heard(feed: PoseFeed, say: Callable[[int], None]) -> None:
 def test_the_documented_sender_drives_it(feed: PoseFeed) -> None:
     sender = Sender(feed.address)
     try:
-        heard(feed, lambda count: sender.pose(-100 + count))
+        wait_until_received(feed, lambda count: sender.pose(-100 + count))
         for tenth in range(6):
             sender.pose(tenth / 10)
         until = time.monotonic() + DEADLINE
@@ -243,15 +243,15 @@ def test_the_documented_sender_passes_over_what_is_no_pose(feed: PoseFeed) -> No
         until = time.monotonic() + DEADLINE
         sender.stdin.write("\n".join((*lines, "NaN 0 0 0 0 0 0 1", "Infinity lost", "")))
         while not feed.received:
-            assert time.monotonic() < until, "nothing was heard"
+            assert time.monotonic() < until, "no message arrived"
             sender.stdin.write(f"{pose}\n")
             sender.stdin.flush()
             feed.track(frame(START))
         same(follow(feed, 0.0), way(0.0))
         sender.stdin.close()
-        told = sender.stderr.read().splitlines()
+        complaints = sender.stderr.read().splitlines()
         assert sender.wait(DEADLINE) == 0
-    assert [line.split(" is no ")[0] for line in told] == [f"line {n}" for n in (3, 4, 5, 6, 7)]
+    assert [line.split(" is no ")[0] for line in complaints] == [f"line {n}" for n in (3, 4, 5, 6, 7)]
     assert not feed.dropped
 
 
@@ -267,7 +267,7 @@ def publisher(address: str) -> Iterator[Callable[[Any], None]]:
         )
 
 
-def said(seconds: float, T: np.ndarray | None = None) -> dict[str, Any]:
+def posed(seconds: float, T: np.ndarray | None = None) -> dict[str, Any]:
     T = way(seconds) if T is None else T
     return {"stamp_ns": START + round(seconds * SECOND), "pose": seven(T)}
 
@@ -287,8 +287,8 @@ def test_a_frame_waits_for_the_pose_after_it() -> None:
     ):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(feed, "_wait", 0.05)
-            heard(feed, lambda count: send(said(-100 + count)))
-        send(said(0.0))
+            wait_until_received(feed, lambda count: send(posed(-100 + count)))
+        send(posed(0.0))
         feed.track(frame(START))
         code = (
             "import json, sys, zmq\n"
@@ -296,7 +296,7 @@ def test_a_frame_waits_for_the_pose_after_it() -> None:
             "    s.connect(sys.argv[1])\n"
             "    while s.poll(20, zmq.POLLIN) == 0: s.send(sys.argv[2].encode())\n"
         )
-        later = subprocess.Popen([sys.executable, "-c", code, feed.address, json.dumps(said(0.1))])
+        later = subprocess.Popen([sys.executable, "-c", code, feed.address, json.dumps(posed(0.1))])
         try:
             same(feed.track(frame(START + SECOND // 20)), way(0.05), 1e-3)
         finally:
@@ -306,9 +306,9 @@ def test_a_frame_waits_for_the_pose_after_it() -> None:
 
 def test_matrices_and_messagepack_are_understood(feed: PoseFeed) -> None:
     with publisher(feed.address) as send:
-        heard(feed, lambda count: send(said(-100 + count)))
+        wait_until_received(feed, lambda count: send(posed(-100 + count)))
         send({"stamp_ns": START, "pose": way(0).ravel().tolist(), "frame": "odom"})
-        send(msgspec.msgpack.encode(said(0.1)))
+        send(msgspec.msgpack.encode(posed(0.1)))
         same(follow(feed, 0.1), way(0.1))
         same(follow(feed, 0.0), way(0.0))
         assert not feed.dropped
@@ -357,12 +357,12 @@ def test_any_bytes_are_a_pose_or_refused(message: bytes) -> None:
 
 def test_hostile_messages_are_counted_and_dropped(feed: PoseFeed, caplog: pytest.LogCaptureFixture) -> None:
     with publisher(feed.address) as send, zmq.Context() as context, context.socket(zmq.PUB) as parts:
-        heard(feed, lambda count: send(said(-100 + count)))
+        wait_until_received(feed, lambda count: send(posed(-100 + count)))
         before = feed.received
         with caplog.at_level(logging.WARNING):
             for message in BAD:
                 send(message)
-            send(said(0.0))
+            send(posed(0.0))
             same(follow(feed, 0.0), way(0.0))
         assert feed.received == before + 1
         assert feed.dropped.total() == len(BAD)
@@ -372,19 +372,19 @@ def test_hostile_messages_are_counted_and_dropped(feed: PoseFeed, caplog: pytest
         until = time.monotonic() + DEADLINE
         while not feed.dropped["a message has 1 frame"]:
             assert time.monotonic() < until
-            parts.send_multipart([b"topic", json.dumps(said(0.1)).encode()])
+            parts.send_multipart([b"topic", json.dumps(posed(0.1)).encode()])
             feed.track(frame(START))
 
 
 def test_a_message_that_is_too_long_costs_its_connection_only(feed: PoseFeed) -> None:
     with publisher(feed.address) as send:
-        heard(feed, lambda count: send(said(-100 + count)))
+        wait_until_received(feed, lambda count: send(posed(-100 + count)))
         send(b"{" + b" " * MAX_BYTES)
     with publisher(feed.address) as send:
         until = time.monotonic() + DEADLINE
         while isinstance(feed.track(frame(START)), Lost):
             assert time.monotonic() < until
-            send(said(0.0))
+            send(posed(0.0))
 
 
 def test_a_connection_that_libzmq_gave_up_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -394,12 +394,12 @@ def test_a_connection_that_libzmq_gave_up_is_made_again(monkeypatch: pytest.Monk
         made.setsockopt(zmq.LINGER, 0)
         address = f"tcp://127.0.0.1:{made.bind_to_random_port('tcp://127.0.0.1')}"
         with PoseFeed(address, max_gap_s=0.15, wait_s=0.05) as feed:
-            heard(feed, lambda count: made.send(json.dumps(said(-100 + count)).encode()))
+            wait_until_received(feed, lambda count: made.send(json.dumps(posed(-100 + count)).encode()))
             made.send(b"{" + b" " * MAX_BYTES)
             until = time.monotonic() + DEADLINE
             while isinstance(feed.track(frame(START)), Lost):
                 assert time.monotonic() < until
-                made.send(json.dumps(said(0.0)).encode())
+                made.send(json.dumps(posed(0.0)).encode())
 
 
 def test_a_flood_does_not_hold_up_a_frame(feed: PoseFeed) -> None:
@@ -427,7 +427,7 @@ def test_large_graphs_one_after_the_other_do_not_hold_up_a_frame(feed: PoseFeed)
     stamps = [START + index for index in range(2000)]
     graph = {"stamps_ns": stamps, "poses": [[0.0, 0, 0, 0, 0, 0, 1]] * len(stamps)}
     with publisher(feed.address) as send:
-        heard(feed, lambda count: send(said(-100 + count)))
+        wait_until_received(feed, lambda count: send(posed(-100 + count)))
         received = feed.received
         for _ in range(100):
             send({"corrections": graph})
@@ -442,7 +442,7 @@ def test_large_graphs_one_after_the_other_do_not_hold_up_a_frame(feed: PoseFeed)
 def test_corrections_move_the_tracking_keyframes(feed: PoseFeed) -> None:
     """Odometry drifts sideways by 1 cm in 0.1 s; the sender's loop closure finds out at 1.0 s."""
     with publisher(feed.address) as send:
-        heard(feed, lambda count: send(said(-100 + count)))
+        wait_until_received(feed, lambda count: send(posed(-100 + count)))
         feed.reset()
 
         def straight(seconds: float, drift: float = 0.0) -> np.ndarray:
@@ -452,7 +452,7 @@ def test_corrections_move_the_tracking_keyframes(feed: PoseFeed) -> None:
 
         found: dict[int, Pose] = {}
         for tenth in range(11):
-            send(said(tenth / 10, straight(tenth / 10, 0.1)))
+            send(posed(tenth / 10, straight(tenth / 10, 0.1)))
             found[tenth] = follow(feed, tenth / 10)
         assert feed.corrections() is None
         nodes = [0, 3, 10]
@@ -478,7 +478,12 @@ def test_corrections_move_the_tracking_keyframes(feed: PoseFeed) -> None:
         assert feed.corrections() is None
         move = np.eye(4)
         move[0, 3] = 7.0
-        send({**said(1.1), "corrections": {"stamps_ns": [], "poses": [], "T_corrected_world": seven(move)}})
+        send(
+            {
+                **posed(1.1),
+                "corrections": {"stamps_ns": [], "poses": [], "T_corrected_world": seven(move)},
+            }
+        )
         follow(feed, 1.1)
         second = feed.corrections()
         assert second is not None
@@ -502,19 +507,19 @@ def test_a_sender_that_binds_may_come_later_and_again() -> None:
                 until = time.monotonic() + DEADLINE
                 while isinstance(feed.track(frame(START + turn * SECOND)), Lost):
                     assert time.monotonic() < until
-                    made.send(json.dumps(said(turn)).encode())
+                    made.send(json.dumps(posed(turn)).encode())
 
 
 def test_what_cannot_be_listened_to_is_explained(feed: PoseFeed) -> None:
     nothing = feed.track(frame(START))
     assert isinstance(nothing, Lost)
     assert f"@{feed.address}, where it listens" in nothing.reason
-    for address, said_of_it in (
+    for address, message in (
         ("5570", "an address looks like"),
         ("tcp://127.0.0.1:0", "connecting needs a port"),
         ("@tcp://0.0.0.0:5570", r"only tcp://127.0.0.1 can be bound"),
     ):
-        with pytest.raises(InvalidConfig, match=said_of_it):
+        with pytest.raises(InvalidConfig, match=message):
             PoseFeed(address, max_gap_s=0.1)
     with pytest.raises(TransportError, match="cannot listen"):
         PoseFeed(f"@{feed.address}", max_gap_s=0.1)
@@ -525,7 +530,7 @@ def test_what_cannot_be_listened_to_is_explained(feed: PoseFeed) -> None:
 
 def test_another_clock_is_named(feed: PoseFeed) -> None:
     with publisher(feed.address) as send:
-        heard(feed, lambda count: send(said(count)))
+        wait_until_received(feed, lambda count: send(posed(count)))
         lost = feed.track(frame(5 * SECOND))
         assert isinstance(lost, Lost)
         assert "same clock?" in lost.reason

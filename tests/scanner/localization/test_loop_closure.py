@@ -20,7 +20,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
 from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing
 from tsfusion.scanner.localization.loop_closure.loop_consensus import Loop, LoopConsensus
-from tsfusion.scanner.localization.loop_closure.odometry_drift import Chain, OdometryDrift
+from tsfusion.scanner.localization.loop_closure.odometry_drift import OdometryChain, OdometryDrift
 from tsfusion.scanner.localization.loop_closure.place_index import PlaceIndex, PlaceView, view
 from tsfusion.scanner.localization.loop_closure.verification import check, matches
 from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
@@ -185,14 +185,14 @@ def test_places_are_found_by_their_looks_and_forgotten():
         places.add(number, seen_there)
     assert places.full
     for number, seen_there in zip((3, 5, 8), views(), strict=False):
-        assert places.alike(seen_there)[0] == number
-    assert places.alike(views()[2], before=8)[0] == 5
-    assert places.alike(views()[0], before=3) == []
+        assert places.most_similar(seen_there)[0] == number
+    assert places.most_similar(views()[2], before=8)[0] == 5
+    assert places.most_similar(views()[0], before=3) == []
     places.forget(3)
-    assert 3 not in places.alike(views()[0])
+    assert 3 not in places.most_similar(views()[0])
     places.add(9, views()[3])
-    assert places.alike(views()[3])[0] == 9
-    assert 9 not in places.alike(views()[0])[:1]
+    assert places.most_similar(views()[3])[0] == 9
+    assert 9 not in places.most_similar(views()[0])[:1]
 
 
 def test_memory_is_bounded_and_the_way_stays_covered():
@@ -277,8 +277,8 @@ def test_without_scipy_it_says_what_to_install(monkeypatch):
         LoopClosing(Drifting())
 
 
-def straight(count: int, drift: OdometryDrift | None = None) -> Chain:
-    chain = Chain(drift or OdometryDrift())
+def straight(count: int, drift: OdometryDrift | None = None) -> OdometryChain:
+    chain = OdometryChain(drift or OdometryDrift())
     for number in range(count):
         chain.add(number, se3.exp(np.array([0.5 * number, 0, 0, 0, 0, 0])))
     return chain
@@ -294,7 +294,7 @@ def test_odometry_knows_how_far_it_may_be_off():
     rng = np.random.default_rng(9)
     drift = OdometryDrift(translation_bias=0.0, rotation_bias=0.0)
     steps = [se3.exp(np.array([0.4, 0.1, 0, 0, 0.1 * (k % 3), 0.2])) for k in range(12)]
-    chain = Chain(drift)
+    chain = OdometryChain(drift)
     T = se3.exp(rng.normal(0, 1, 6))
     for number in range(13):
         chain.add(number, T)
@@ -323,41 +323,41 @@ def test_one_loop_is_not_believed_and_three_that_agree_are():
     off = 1.0  # between 3 and 6 deviations: more than expected, less than impossible
     far = claim(0, 50, off=off)
     assert 3 < consensus.deviation(far.old, far.new, far.T_old_new, far.covariance) < 6
-    assert consensus.hear([far]) == []
-    assert consensus.hear([claim(1, 51, off=off - 0.7)]) == []  # does not agree with it
-    assert consensus.hear([claim(1, 52, off=off)]) == []
-    believed = consensus.hear([claim(2, 53, off=off)])
+    assert consensus.add([far]) == []
+    assert consensus.add([claim(1, 51, off=off - 0.7)]) == []  # does not agree with it
+    assert consensus.add([claim(1, 52, off=off)]) == []
+    believed = consensus.add([claim(2, 53, off=off)])
     assert [(loop.old, loop.new) for loop in believed] == [(0, 50), (1, 52), (2, 53)]
-    assert [loop.new for loop in consensus.hear([claim(3, 54, off=off)])] == [54]
-    assert consensus.hear([claim(4, 55, off=off + 1.0)]) == []  # contradicts those believed
+    assert [loop.new for loop in consensus.add([claim(3, 54, off=off)])] == [54]
+    assert consensus.add([claim(4, 55, off=off + 1.0)]) == []  # contradicts those believed
     assert consensus.refused == {"contradicts the odometry": 1}
 
 
 def test_where_odometry_expects_a_loop_two_suffice():
     consensus = LoopConsensus(straight(60))
-    assert consensus.hear([claim(0, 50)]) == []
-    assert len(consensus.hear([claim(1, 51)])) == 2
+    assert consensus.add([claim(0, 50)]) == []
+    assert len(consensus.add([claim(1, 51)])) == 2
 
 
 def test_a_look_alike_nearby_makes_a_loop_doubtful():
     """Twelve deviations are needed to rule another explanation out."""
     consensus = LoopConsensus(straight(60))
     for new in range(50, 54):
-        found = consensus.hear([claim(new - 50, new), claim(new - 48, new, off=2.0)])
+        found = consensus.add([claim(new - 50, new), claim(new - 48, new, off=2.0)])
         assert found == []
     assert consensus.refused["fits another place too"] == 4
     sure = LoopConsensus(
         straight(60, OdometryDrift(translation=0.005, rotation=0.001, translation_bias=0.002))
     )
     for new in range(50, 54):
-        found += sure.hear([claim(new - 50, new), claim(new - 48, new, off=2.0)])
+        found += sure.add([claim(new - 50, new), claim(new - 48, new, off=2.0)])
     assert len(found) == 4
 
 
 def test_loops_of_one_keyframe_that_contradict_each_other_are_both_refused():
     consensus = LoopConsensus(straight(60))
     for new in range(50, 54):
-        assert consensus.hear([claim(new - 50, new), claim(new - 49, new, off=0.9)]) == []
+        assert consensus.add([claim(new - 50, new), claim(new - 49, new, off=0.9)]) == []
     assert consensus.refused == {"fits another place too": 4}
 
 
@@ -371,18 +371,18 @@ def test_a_place_seen_to_have_a_twin_is_doubtful_ever_after():
     chain = straight(400)
     consensus = LoopConsensus(chain)
     twin = Loop(0, 8, np.eye(4), 0.02)  # 8 stands 4 m from 0 and looks as if it stood there
-    assert consensus.hear([twin]) == []
+    assert consensus.add([twin]) == []
     assert consensus.refused == {"contradicts the odometry": 1}
     for new in range(390, 396):
-        assert consensus.hear([claim(8, new)]) == []  # it may as well be at 0: 4 m are nothing after 190
+        assert consensus.add([claim(8, new)]) == []  # it may as well be at 0: 4 m are nothing after 190
     assert consensus.refused["fits another place too"] == 6
-    assert len([loop for new in range(390, 396) for loop in consensus.hear([claim(20, new)])]) >= 2
+    assert len([loop for new in range(390, 396) for loop in consensus.add([claim(20, new)])]) >= 2
 
 
 def test_a_loop_the_graph_disowns_counts_no_more():
     consensus = LoopConsensus(straight(60))
     for new in (50, 51):
-        consensus.hear([claim(new - 50, new)])
+        consensus.add([claim(new - 50, new)])
     wrong = consensus.believed[0]
     consensus.disown(wrong)
     assert wrong not in consensus.believed

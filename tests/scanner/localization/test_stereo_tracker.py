@@ -176,9 +176,9 @@ def test_disparity_with_an_image() -> None:
 
 
 def test_what_it_cannot_follow() -> None:
-    for sensor, said in (("lidar", "got points"), ("kinect", "got depth without colour")):
+    for sensor, message in (("lidar", "got points"), ("kinect", "got depth without colour")):
         frame = Synthetic("room", sensor, count=1, color=False).frame(0)
-        with pytest.raises(InvalidKeyframe, match=said):
+        with pytest.raises(InvalidKeyframe, match=message):
             StereoLocalizer().track(frame)
 
 
@@ -287,7 +287,7 @@ def check(followed: list[Frame]) -> RectificationCheck:
 def test_good_pairs_are_not_reported(data: Data, caplog: pytest.LogCaptureFixture) -> None:
     clip = check(frames(data, "06", 12))
     assert clip.ok, clip.problems
-    assert clip.disparity_px is not None  # the car moves: that much can be told
+    assert clip.disparity_px is not None  # the car moves: that much is known
     left, right = motorcycle(data("middlebury_motorcycle"))
     K = Intrinsics(994.978, 994.978, 311.193, 254.877)
     still = Frame(sensor="stereo", left=left, right=right, intrinsics=K, baseline_fx=0.193 * 994.978)
@@ -357,9 +357,9 @@ def test_the_faulty_clip_shows_from_its_images_alone(data: Data) -> None:
     clip = frames(data, "01", 15)
     stereo = StereoLocalizer()
     found = positions(poses(stereo, clip))
-    said = stereo.rectification
-    assert said is not None
-    assert said.disparity_px == pytest.approx(-0.7, abs=0.25)
+    check = stereo.rectification
+    assert check is not None
+    assert check.disparity_px == pytest.approx(-0.7, abs=0.25)
     truth = np.array([frame.T_world_camera for frame in clip])
     ratio = np.linalg.norm(found[-1][:3, 3]) / np.linalg.norm((se3.inverse(truth[0]) @ truth[-1])[:3, 3])
     assert 1.05 < ratio < 1.12

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Corners, followed from image to image (Shi and Tomasi 1994; Lucas and Kanade 1981); the pose they give."""
+"""Corners tracked from image to image (Shi and Tomasi 1994; Lucas and Kanade 1981); poses from them."""
 
 import cv2
 import numpy as np
@@ -13,25 +13,25 @@ Pixels = NDArray[np.float32]  # (n, 2), x then y
 _WINDOW = (21, 21)
 _LEVELS = 3
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
-_THERE_AND_BACK = 1.0  # pixels
-_BLOCK = 5  # pixels around a corner
+_MAX_RETURN_ERROR = 1.0  # pixels between a corner and where tracking there and back leads
+_BLOCK = 5  # pixels a side of the window around a corner
 _SECOND_DIFFERENCES = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
-_NOISE_CORNER = (
-    1000.0  # least eigenvalue of Sobel gradients there in noise of one grey level: hardly ever more
-)
+# Least eigenvalue of the Sobel gradients in a window: noise of one grey level hardly ever gives more.
+_NOISE_EIGENVALUE = 1000.0
 
 
 def corners(gray: NDArray[np.uint8], count: int, *, mask: NDArray[np.uint8] | None = None) -> Pixels:
-    """At most `count` corners, at least a 60th of the width apart, where `mask` (if given) is not 0."""
+    """Find (n, 2) at most `count` corners, at least a 60th of the width apart, where `mask` is not 0."""
     apart = max(4, gray.shape[1] // 60)
     found = cv2.goodFeaturesToTrack(gray, count, 0.005, apart, mask=mask, blockSize=_BLOCK)
     return np.empty((0, 2), np.float32) if found is None else found.reshape(-1, 2).astype(np.float32)
 
 
-def above_noise(gray: NDArray[np.uint8], pixels: Pixels) -> NDArray[np.bool_]:
-    """Which corners are more than the image's noise: (n, 2) → (n,).
+def stronger_than_noise(gray: NDArray[np.uint8], pixels: Pixels) -> NDArray[np.bool_]:
+    """Whether corners stand out of the image's noise: (n, 2) → (n,).
 
-    The noise is Immerkær's ("Fast noise variance estimation", 1996), by the median: what a plain wall shows.
+    The noise is estimated after Immerkær ("Fast noise variance estimation", 1996), by the median, so that
+    plain walls count.
     """
     rough = cv2.filter2D(gray, cv2.CV_16S, _SECOND_DIFFERENCES)[::3, ::3]
     sigma = float(np.median(np.abs(rough))) / (0.6745 * 6)
@@ -42,14 +42,14 @@ def above_noise(gray: NDArray[np.uint8], pixels: Pixels) -> NDArray[np.bool_]:
     x, y = across[row, column].astype(np.float64), down[row, column].astype(np.float64)
     xx, xy, yy = (product.sum(axis=(1, 2)) for product in (x * x, x * y, y * y))
     strength = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
-    above: NDArray[np.bool_] = strength > _NOISE_CORNER * max(sigma, 1.0) ** 2
+    above: NDArray[np.bool_] = strength > _NOISE_EIGENVALUE * max(sigma, 1.0) ** 2
     return above
 
 
 def follow(
     old: NDArray[np.uint8], new: NDArray[np.uint8], points: Pixels, *, guess: Pixels | None = None
 ) -> tuple[Pixels, NDArray[np.bool_]]:
-    """Where (n, 2) points of one grey image are in the other, and which lead back to where they began."""
+    """Track (n, 2) points from one grey image to another; also (n,) which lead back to where they began."""
     if not len(points):
         return points.copy(), np.zeros(0, bool)
     flags = cv2.OPTFLOW_USE_INITIAL_FLOW if guess is not None else 0
@@ -61,7 +61,7 @@ def follow(
         new, old, moved, points.copy(), winSize=_WINDOW, maxLevel=_LEVELS, criteria=_STOP,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
-    near = np.abs(returned - points).max(axis=1) < _THERE_AND_BACK
+    near = np.abs(returned - points).max(axis=1) < _MAX_RETURN_ERROR
     ok: NDArray[np.bool_] = (there.ravel() == 1) & (back.ravel() == 1) & near
     return moved, ok
 
@@ -75,12 +75,12 @@ def resection(
     tolerance: float = 2.0,
     seed: int = 0,
 ) -> tuple[se3.Transform, NDArray[np.bool_]] | None:
-    """The camera pose from (n, 3) points and their (n, 2) pixels, by RANSAC and refinement (PnP).
+    """Find the camera pose from (n, 3) points and their (n, 2) pixels, by RANSAC and refinement (PnP).
 
     Args:
         guess: T_points_camera to begin with.
-        tolerance: pixels of an inlier.
-        seed: of the random choice: equal input gives equal poses.
+        tolerance: pixels by which an inlier may be off.
+        seed: seed of the random choice; equal input gives equal poses.
 
     Returns:
         T_points_camera (4, 4) and the (n,) inliers; None without at least 6 that agree.
@@ -108,7 +108,7 @@ def resection(
 
 
 def bilinear(image: NDArray[np.floating], pixels: Pixels) -> NDArray[np.float32]:
-    """The image's values at (n, 2) pixels; 0 outside, and where a neighbour is 0 (no depth)."""
+    """Interpolate the image at (n, 2) pixels; 0 outside, and where a neighbour is 0 (no depth)."""
     u, v = pixels[:, 0], pixels[:, 1]
     x, y = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
     inside = (x >= 0) & (y >= 0) & (x < image.shape[1] - 1) & (y < image.shape[0] - 1)
@@ -120,8 +120,8 @@ def bilinear(image: NDArray[np.floating], pixels: Pixels) -> NDArray[np.float32]
     return np.where(whole, mixed, 0).astype(np.float32)
 
 
-def lifted(pixels: Pixels, depth: NDArray[np.floating], intrinsics: Intrinsics) -> NDArray[np.float64]:
-    """(n, 2) pixels with (n,) metres of depth → (n, 3) points of the camera."""
+def back_project(pixels: Pixels, depth: NDArray[np.floating], intrinsics: Intrinsics) -> NDArray[np.float64]:
+    """Points of pixels with depth: (n, 2) pixels, (n,) metres → (n, 3) metres in the camera's axes."""
     K = intrinsics
     z = depth.astype(np.float64)
     return np.stack([(pixels[:, 0] - K.cx) / K.fx * z, (pixels[:, 1] - K.cy) / K.fy * z, z], axis=1)

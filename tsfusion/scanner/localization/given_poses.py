@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Poses from a trajectory file that another SLAM has written: TUM's or KITTI's format."""
+"""Localizers that take known poses: those of a trajectory file (TUM or KITTI), or those of the source."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,16 +18,16 @@ _TUM_COLUMNS, _KITTI_COLUMNS = 8, 12
 
 
 class TrajectoryFilePoses:
-    """`Localizer` that looks poses up by the frame's stamp and interpolates between neighbours.
+    """`Localizer` that interpolates the poses of a file at each frame's timestamp.
 
-    A file in KITTI's format has no times. They are read from `times.txt` (seconds, a line a pose), which is
-    looked for beside the file and, for `poses/NN.txt`, in `sequences/NN` as the benchmark has it. Frames are
-    not counted instead: one that a sensor drops would move all later ones.
+    A file in KITTI's format has no times. They are read from `times.txt` (seconds, a line a pose), beside the
+    file or, for `poses/NN.txt`, in `sequences/NN` as in the benchmark. Counting frames instead would move
+    all poses after a dropped frame.
 
     Args:
         path: `timestamp tx ty tz qx qy qz qw` or 12 numbers a line, poses of the sensor whose frames are
             followed (not of a robot's body).
-        max_gap_s: seconds between two poses; between those farther apart there is none.
+        max_gap_s: seconds between two poses at most; there is no pose in longer gaps.
         time_offset_s: seconds to add to a frame's stamp before its pose is looked up.
 
     Raises:
@@ -44,7 +44,7 @@ class TrajectoryFilePoses:
         self._begun = False
 
     def track(self, frame: Frame) -> Pose | Lost:
-        """The trajectory's pose at the frame's stamp; Lost in gaps and beyond the ends."""
+        """Look up the pose at the frame's timestamp; Lost in gaps and beyond the ends."""
         stamp = frame.timestamp_ns + self._offset_ns
         # A recording's first frame may be its time 0; 0 again is a source without times.
         known = bool(frame.timestamp_ns) or not self._begun
@@ -55,11 +55,11 @@ class TrajectoryFilePoses:
         return self._anchors.pose(T, frame.timestamp_ns)
 
     def corrections(self) -> PoseCorrections | None:
-        """None: the file says what it says."""
+        """Return None: the poses of a file are not corrected."""
         return None
 
     def reset(self) -> None:
-        """The world stays the trajectory's."""
+        """Begin a new tracking keyframe; the world stays the trajectory's."""
         self._anchors.reset()
 
     def _missing(self, own: int, stamp: int) -> str:
@@ -80,7 +80,7 @@ class TrajectoryFilePoses:
 
 
 def read_trajectory(path: Path) -> Trajectory:
-    """A TUM or KITTI file, told apart by its columns. Raises DatasetError."""
+    """Read a TUM or KITTI file, recognised by its columns. Raises DatasetError."""
     lines = read_lines(path, "a trajectory in TUM's or KITTI's format")
     if not lines:
         raise DatasetError(f"{path} holds no poses")
@@ -123,7 +123,7 @@ def _in_time(stamps: Sequence[int], poses: Sequence[np.ndarray], path: Path) -> 
 
 
 class GivenPoses:
-    """`Localizer` that believes `frame.T_world_camera`."""
+    """`Localizer` that takes `frame.T_world_camera`, the source's own pose."""
 
     absolute = True
 
@@ -131,15 +131,15 @@ class GivenPoses:
         self._anchors = TrackingKeyframes()
 
     def track(self, frame: Frame) -> Pose | Lost:
-        """The frame's own pose; Lost where it has none."""
+        """Return the frame's own pose; Lost where it has none."""
         if frame.T_world_camera is None:
             return Lost(reason="the source gives no pose for this frame", timestamp_ns=frame.timestamp_ns)
         return self._anchors.pose(frame.T_world_camera, frame.timestamp_ns)
 
     def corrections(self) -> PoseCorrections | None:
-        """None: what is given is not corrected."""
+        """Return None: given poses are not corrected."""
         return None
 
     def reset(self) -> None:
-        """The world stays the source's."""
+        """Begin a new tracking keyframe; the world stays the source's."""
         self._anchors.reset()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Following a LiDAR with KISS-ICP (Vizzo et al. 2023): point-to-point ICP against a local map.
+"""LiDAR odometry with KISS-ICP (Vizzo et al. 2023): point-to-point ICP against a local map.
 
-Its steps are called one by one, so that a scan that does not fit is kept out of the map.
+The steps of KISS-ICP are called one by one, so that a scan that does not fit is kept out of the map.
 """
 
 from typing import Any
@@ -18,32 +18,32 @@ from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
 Points = NDArray[np.float64]  # (n, 3) metres
 
 _INSTALL = "the localizer lidar needs kiss-icp; install it with: pip install 'tsfusion[lidar]'"
-_FEWEST = 30  # points left after thinning
-_FEWEST_UPRIGHT = 50
-_OVERLAP = 0.6  # of the points; 0.88 and more in real scans and synthetic ones, 0.5 in another street
-_FARTHEST = 3.0  # adaptive thresholds from the expected place: beyond them ICP has not looked
-_TURN = np.radians(45)  # from the expected direction
-_SETTLING = 4  # scans until the motion is known
-_COLUMN, _UPRIGHT = 1.0, 0.5  # voxels: width of a column, and the height that makes it upright
-_FINE = 0.5  # voxels: threshold once the upright points are aligned
-_LARGEST_RANGE = 100.0  # metres; with a hundredth of it as voxel, KISS-ICP's own defaults
-_OUTDOORS = 20.0  # metres: farthest hundredth of the points
-_POINTS_A_VOXEL = 20
-_PATIENCE = 5  # scans without a pose through which the sensor is thought to go on moving
-_ANCHOR = 2.0  # voxels to the next tracking keyframe
+MIN_POINTS = 30  # after thinning
+MIN_UPRIGHT_POINTS = 50
+MIN_OVERLAP = 0.6  # share of the points; 0.88 and more in real and synthetic scans, 0.5 in another street
+MAX_SURPRISE = 3.0  # adaptive thresholds from the expected place: ICP has not searched beyond
+MAX_TURN = np.radians(45)  # from the expected direction
+SETTLING_SCANS = 4  # until the motion is known
+COLUMN_WIDTH, UPRIGHT_HEIGHT = 1.0, 0.5  # voxels: a column, and the height that makes it upright
+FINE_THRESHOLD = 0.5  # voxels, once the upright points are aligned
+OUTDOOR_RANGE = 100.0  # metres; with a hundredth of it as voxel, KISS-ICP's own defaults
+OUTDOORS_FROM = 20.0  # metres: distance beyond which a hundredth of the points lies
+POINTS_A_VOXEL = 20
+MAX_MISSED_SCANS = 5  # without a pose, through which the motion is thought to go on
+KEYFRAME_DISTANCE = 2.0  # voxels to the next tracking keyframe
 
 
 class LidarLocalizer:
     """`Localizer` of point clouds, z up. Needs the extra `lidar`.
 
-    A beginning in full motion is what KISS-ICP alone gets wrong: rings on the ground look the same wherever
-    the sensor is, and hold it back. As long as the motion is not known, upright points are aligned first.
+    KISS-ICP alone fails when the sensor moves fast from the first scan on: rings on the ground look the same
+    everywhere and hold the pose back. Until the motion is known, upright points are aligned first.
 
     Args:
         max_range: metres; farther points are left out. None = 100 outdoors, by the first scan indoors.
         voxel_size: metres, of the local map. None = by the first scan: 1 outdoors, a tenth of the median
             distance indoors.
-        deskew: take the sensor's own motion out of scans whose points have times of their own.
+        deskew: whether to take the sensor's motion out of scans whose points have times.
         threads: 1 gives equal poses for equal scans.
     """
 
@@ -68,16 +68,16 @@ class LidarLocalizer:
         self.reset()
 
     def track(self, frame: Frame) -> Pose | Lost:
-        """Where the sensor was at the frame's stamp, seen from the first one."""
+        """Find the sensor's pose at the frame's timestamp, in the axes of the first frame."""
         if frame.points is None:
             raise InvalidKeyframe(f"the localizer lidar follows points, got {frame.kind}")
         if self._icp is None:
-            if len(frame.points) < _FEWEST:
+            if len(frame.points) < MIN_POINTS:
                 return _lost(frame, f"only {len(frame.points)} points to begin with")
             self._begin(frame.points)
         icp = self._icp
         thin, map_points = icp.voxelize(self._straightened(frame, icp.last_delta))
-        if len(thin) < _FEWEST:
+        if len(thin) < MIN_POINTS:
             return self._fail(frame, f"only {len(thin)} points after thinning")
         T, quality = np.eye(4), 1.0
         if not icp.local_map.empty():
@@ -92,7 +92,7 @@ class LidarLocalizer:
         return self._anchors.pose(T, frame.timestamp_ns, quality=quality)
 
     def corrections(self) -> PoseCorrections | None:
-        """None: odometry closes no loops."""
+        """Return None: odometry closes no loops."""
         return None
 
     def reset(self) -> None:
@@ -100,7 +100,7 @@ class LidarLocalizer:
         self._icp: Any = None
         self._first: Frame | None = None
         self._T_first_map = np.eye(4)
-        self._settling, self._missed = _SETTLING, 0
+        self._settling, self._missed = SETTLING_SCANS, 0
         self._anchors.reset()
 
     def _begin(self, points: NDArray[np.float32]) -> None:
@@ -113,13 +113,13 @@ class LidarLocalizer:
         )
 
         near, far = np.percentile(np.linalg.norm(points, axis=1), [50, 99])
-        indoors = far < _OUTDOORS
-        voxel = self._voxel_size or (max(float(near) / 10, 0.1) if indoors else _LARGEST_RANGE / 100)
-        max_range = self._max_range or (float(2 * far) if indoors else _LARGEST_RANGE)
+        indoors = far < OUTDOORS_FROM
+        voxel = self._voxel_size or (max(float(near) / 10, 0.1) if indoors else OUTDOOR_RANGE / 100)
+        max_range = self._max_range or (float(2 * far) if indoors else OUTDOOR_RANGE)
         self._icp = self._make(
             KISSConfig(
                 data=DataConfig(max_range=max_range, min_range=0.0, deskew=self._deskew),
-                mapping=MappingConfig(voxel_size=voxel, max_points_per_voxel=_POINTS_A_VOXEL),
+                mapping=MappingConfig(voxel_size=voxel, max_points_per_voxel=POINTS_A_VOXEL),
                 registration=RegistrationConfig(max_num_threads=self._threads),
                 adaptive_threshold=AdaptiveThresholdConfig(
                     initial_threshold=2 * voxel, min_motion_th=voxel / 10
@@ -127,11 +127,11 @@ class LidarLocalizer:
             )
         )
         self._voxel = voxel
-        self._anchors.distance = _ANCHOR * voxel
+        self._anchors.distance = KEYFRAME_DISTANCE * voxel
 
     def _expected(self) -> se3.Transform:
-        """Where the motion leads, scans without a pose counted; after many of those, the last pose."""
-        steps = self._missed + 1 if self._missed < _PATIENCE else 0
+        """Predict the pose from the motion, also over missed scans; after many of them, the last pose."""
+        steps = self._missed + 1 if self._missed < MAX_MISSED_SCANS else 0
         T: se3.Transform = self._icp.last_pose @ se3.exp(se3.log(self._icp.last_delta) * steps)
         return T
 
@@ -140,9 +140,9 @@ class LidarLocalizer:
         guess, threshold = self._expected(), icp.adaptive_threshold.get_threshold()
         if self._settling:
             upright, around = thin[_is_upright(thin, self._voxel)], self._upright_map()
-            if len(upright) >= _FEWEST_UPRIGHT and not around.empty():
+            if len(upright) >= MIN_UPRIGHT_POINTS and not around.empty():
                 guess = icp.registration.align_points_to_map(upright, around, guess, 3 * threshold, threshold)
-                threshold = _FINE * self._voxel
+                threshold = FINE_THRESHOLD * self._voxel
         T: se3.Transform = icp.registration.align_points_to_map(
             thin, icp.local_map, guess, 3 * threshold, threshold
         )
@@ -152,17 +152,17 @@ class LidarLocalizer:
         from kiss_icp.mapping import VoxelHashMap
 
         cloud = self._icp.local_map.point_cloud()
-        made = VoxelHashMap(self._voxel, self._icp.config.data.max_range, _POINTS_A_VOXEL)
+        made = VoxelHashMap(self._voxel, self._icp.config.data.max_range, POINTS_A_VOXEL)
         made.add_points(cloud[_is_upright(cloud, self._voxel)])
         return made
 
     def _problem(self, T: se3.Transform, overlap: float) -> str:
-        """Why the pose is not believed; empty = it is."""
-        if overlap < _OVERLAP:
+        """Reason to reject the pose; empty = it is accepted."""
+        if overlap < MIN_OVERLAP:
             return f"{overlap:.0%} of the points lie where some were before"
         surprise = se3.inverse(self._expected()) @ T
-        reach = _FARTHEST * self._icp.adaptive_threshold.get_threshold()
-        if se3.distance(surprise) > reach or se3.angle(surprise) > _TURN:
+        reach = MAX_SURPRISE * self._icp.adaptive_threshold.get_threshold()
+        if se3.distance(surprise) > reach or se3.angle(surprise) > MAX_TURN:
             return (
                 f"a jump of {se3.distance(surprise):.2f} m and {np.degrees(se3.angle(surprise)):.0f}° from "
                 "where the motion led"
@@ -170,7 +170,7 @@ class LidarLocalizer:
         return ""
 
     def _straightened(self, frame: Frame, motion: se3.Transform) -> Points:
-        """The points in reach, seen from where the sensor was at the scan's end."""
+        """Points in range, in the sensor's axes at the scan's end."""
         assert frame.points is not None
         scan: Points = self._icp.preprocessor.preprocess(
             frame.points.astype(np.float64), self._times(frame), motion
@@ -178,20 +178,20 @@ class LidarLocalizer:
         return scan
 
     def _times(self, frame: Frame) -> NDArray[np.float64]:
-        """(N,) seconds of its points, or (0,) where the sensor's own motion is not to be taken out."""
+        """Times of the points, (N,) seconds; (0,) where the scan is not to be deskewed."""
         times = frame.point_times_s
         if not self._deskew or times is None or np.ptp(times) <= 0:
             return np.zeros(0)
         return times.astype(np.float64)
 
     def _from_stamp(self, frame: Frame) -> se3.Transform:
-        """The sensor at the scan's end, seen from where it was at the frame's stamp."""
+        """Pose of the sensor at the scan's end, in its axes at the frame's timestamp."""
         times = self._times(frame)
         share = float(np.clip(-times.min() / np.ptp(times), 0, 1)) if len(times) else 1.0
         return se3.exp((1 - share) * se3.log(self._icp.last_delta))
 
     def _accept(self, T: se3.Transform, map_points: Points, frame: Frame) -> se3.Transform:
-        """Put the scan into the map; the sensor's pose at the frame's stamp."""
+        """Put the scan into the map; return the sensor's pose at the frame's timestamp."""
         icp = self._icp
         moved = se3.exp(se3.log(se3.inverse(icp.last_pose) @ T) / (self._missed + 1))
         if icp.local_map.empty():
@@ -211,9 +211,9 @@ class LidarLocalizer:
         return self._T_first_map @ T @ se3.inverse(self._from_stamp(frame))
 
     def _fail(self, frame: Frame, reason: str) -> Lost:
-        """The next scan is sought around the last good one."""
+        """Count a scan without a pose; the next one is sought around the last good one."""
         self._missed += 1
-        self._settling = _SETTLING
+        self._settling = SETTLING_SCANS
         return _lost(frame, reason)
 
 
@@ -222,18 +222,18 @@ def _lost(frame: Frame, reason: str) -> Lost:
 
 
 def _is_upright(points: Points, voxel: float) -> NDArray[np.bool_]:
-    """(n,) points in columns that are higher than a ground is."""
-    cells = np.floor(points[:, :2] / (_COLUMN * voxel)).astype(np.int64)
+    """Whether points lie in columns higher than the ground: (n, 3) → (n,)."""
+    cells = np.floor(points[:, :2] / (COLUMN_WIDTH * voxel)).astype(np.int64)
     _, column = np.unique(cells, axis=0, return_inverse=True)
     lowest, highest = np.full(len(points), np.inf), np.full(len(points), -np.inf)
     np.minimum.at(lowest, column.ravel(), points[:, 2])
     np.maximum.at(highest, column.ravel(), points[:, 2])
-    upright: NDArray[np.bool_] = (highest - lowest)[column.ravel()] > _UPRIGHT * voxel
+    upright: NDArray[np.bool_] = (highest - lowest)[column.ravel()] > UPRIGHT_HEIGHT * voxel
     return upright
 
 
 def _overlap(points: Points, around: Points, voxel: float) -> float:
-    """The share of points in a voxel that has some of the map's, or beside one."""
+    """Share of the points whose voxel, or a neighbour of it, holds points of the map."""
     occupied = np.unique(_keys(around, voxel))
     keys = _keys(points, voxel)
     hit = np.zeros(len(keys), bool)
@@ -244,7 +244,7 @@ def _overlap(points: Points, around: Points, voxel: float) -> float:
 
 
 def _keys(points: Points, voxel: float) -> NDArray[np.int64]:
-    """A number a voxel: 21 bits an axis."""
+    """Number of each point's voxel, 21 bits an axis: (n, 3) → (n,)."""
     cells = np.floor(points / voxel).astype(np.int64) + (1 << 20)
     keys: NDArray[np.int64] = (cells[:, 0] << 42) + (cells[:, 1] << 21) + cells[:, 2]
     return keys

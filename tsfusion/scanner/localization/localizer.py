@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a localizer is, and what it says of a frame."""
+"""The `Localizer` protocol, and its answers: a pose or a loss a frame, and corrections of earlier poses."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -10,13 +10,13 @@ from tsfusion.geometry.se3 import Transform
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Pose:
-    """Where the sensor was at one frame.
+    """Pose of the sensor at one frame.
 
     Attributes:
         T_world_camera: (4, 4) float64; the world is the first frame's camera since the start or the last
-            `reset`, or the given trajectory's. Always the odometry's own: corrections never make it jump.
-        timestamp_ns: of the frame.
-        anchor: number of the tracking keyframe it hangs on, growing, never used twice, also after `reset`.
+            `reset`, or the given trajectory's. Odometry: corrections never make it jump.
+        timestamp_ns: the frame's.
+        anchor: number of the tracking keyframe it is relative to; numbers grow, also across a `reset`.
         T_anchor_camera: (4, 4); the corrected pose is the corrected anchor times this.
         starts_anchor: whether this frame is that tracking keyframe.
         quality: 0 to 1, the share of what was compared that agrees; 1 where poses are given.
@@ -32,11 +32,11 @@ class Pose:
 
 @dataclass(frozen=True, kw_only=True)
 class Lost:
-    """The frame has no pose. Nothing of it may be fused.
+    """Answer for a frame without a pose. Such a frame must not be fused.
 
     Attributes:
-        reason: for a person, such as `12 of 300 points agree`.
-        timestamp_ns: of the frame.
+        reason: text for the user, such as `12 of 300 points agree`.
+        timestamp_ns: the frame's.
     """
 
     reason: str
@@ -45,12 +45,12 @@ class Lost:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PoseCorrections:
-    """What loop closure found out about poses given before. The newest revision replaces all others.
+    """Poses given before, corrected by loop closure. The newest revision replaces all others.
 
     Attributes:
         revision: counts up from 1 since the last `reset`.
-        anchors: tracking keyframe → its corrected (4, 4) T_world_camera; every one since the last `reset`.
-        T_corrected_world: (4, 4); odometry poses after the last anchor, times this from the left.
+        anchors: tracking keyframe → its corrected (4, 4) T_world_camera, for all since the last `reset`.
+        T_corrected_world: (4, 4); `T_corrected_world @ T_world_camera` corrects poses after the last anchor.
         loops: loops closed so far.
     """
 
@@ -61,26 +61,25 @@ class PoseCorrections:
 
 
 class Localizer(Protocol):
-    """Follows a sensor. Frames come in time order, from one thread.
+    """Tracker of a sensor. Frames come in time order, from one thread.
 
-    One that holds a socket has `close()`, too.
+    A localizer that holds a socket has a `close()`, too.
 
     Attributes:
-        absolute: whether its world outlasts `reset`: poses from elsewhere are in one world, however often
-            there is none.
+        absolute: whether its world stays the same after `reset`, as that of poses from elsewhere does.
     """
 
     absolute: bool
 
     def track(self, frame: Frame) -> Pose | Lost:
-        """Where the sensor was; Lost when that is not known (then try the next frame, or `reset`).
+        """Find the sensor's pose; Lost when it is not known (then try the next frame, or `reset`).
 
         Raises:
             InvalidKeyframe: when the frame lacks what this localizer needs (colour, depth, a stereo pair).
         """
 
     def corrections(self) -> PoseCorrections | None:
-        """What is new since the last call; None = nothing."""
+        """Return corrections that are new since the last call; None = there are none."""
 
     def reset(self) -> None:
-        """Forget the world: the next pose begins a new one, that has nothing to do with the old."""
+        """Forget the world: the next pose begins a new one, unrelated to the old."""

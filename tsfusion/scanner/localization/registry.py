@@ -1,57 +1,59 @@
 # SPDX-License-Identifier: MIT
-"""Localizers by name. Without Taichi: they run on the scanner."""
+"""Choice and construction of the localizer that a scan's settings and its first frame ask for."""
 
 import logging
 
 from tsfusion.core.config import LocalizerName, ScanConfig
 from tsfusion.core.errors import InvalidConfig, MissingDependency
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections
+from tsfusion.scanner.localization.localizer import Localizer
 
-__all__ = ["Localizer", "Lost", "Pose", "PoseCorrections", "choose", "make"]
-
-_BY_KIND: dict[str, LocalizerName] = {
+_DEFAULT_FOR_KIND: dict[str, LocalizerName] = {
     "depth": "rgbd",
     "disparity": "rgbd",
     "pair": "stereo",
     "points": "lidar",
 }
 
-_FOLLOWS: dict[str, tuple[str, ...]] = {
+_ACCEPTED_KINDS: dict[str, tuple[str, ...]] = {
     "rgbd": ("depth", "disparity"),
     "stereo": ("pair", "depth", "disparity"),
     "lidar": ("points",),
 }
-_WORDS = {"rgbd": "depth images", "stereo": "stereo pairs, or depth with an image", "lidar": "points"}
-_KINDS = {
-    "depth": "depth images", "disparity": "disparity images", "pair": "stereo pairs", "points": "points"
-}  # fmt: skip
+_INPUT_NAMES = {"rgbd": "depth images", "stereo": "stereo pairs, or depth with an image", "lidar": "points"}
+_KIND_NAMES = {
+    "depth": "depth images",
+    "disparity": "disparity images",
+    "pair": "stereo pairs",
+    "points": "points",
+}
 
 log = logging.getLogger(__name__)
 
 
-def choose(config: ScanConfig, first: Frame) -> LocalizerName:
-    """The localizer's name: the config's, or for `auto` the one that follows such frames."""
+def localizer_name(config: ScanConfig, first: Frame) -> LocalizerName:
+    """Name of the localizer: the setting's, or for `auto` the one that fits the first frame's kind."""
     if config.localizer != "auto":
         return config.localizer
     if config.trajectory is not None:
         return "trajectory"
     if config.feed is not None:
         return "feed"
-    return _BY_KIND[first.kind]
+    return _DEFAULT_FOR_KIND[first.kind]
 
 
-def make(config: ScanConfig, first: Frame) -> Localizer:
-    """The localizer of `choose`, with loop closure where it follows images.
+def create_localizer(config: ScanConfig, first: Frame) -> Localizer:
+    """Construct the localizer that `localizer_name` names, with loop closure if it tracks by images.
 
     Raises:
-        InvalidConfig: when it lacks its file or address.
-        MissingDependency: when it needs an optional package.
+        InvalidConfig: its file or address is missing, or it cannot track frames of this kind.
+        MissingDependency: its optional package is not installed.
     """
-    name = choose(config, first)
-    if first.kind not in _FOLLOWS.get(name, (first.kind,)):
+    name = localizer_name(config, first)
+    if first.kind not in _ACCEPTED_KINDS.get(name, (first.kind,)):
         raise InvalidConfig(
-            f"the localizer {name} follows {_WORDS[name]}, and this source gives {_KINDS[first.kind]}"
+            f"the localizer {name} follows {_INPUT_NAMES[name]}, "
+            f"and this source gives {_KIND_NAMES[first.kind]}"
         )
     if name == "given":
         from tsfusion.scanner.localization.given_poses import GivenPoses
@@ -61,7 +63,7 @@ def make(config: ScanConfig, first: Frame) -> Localizer:
         from tsfusion.scanner.localization.given_poses import TrajectoryFilePoses
 
         return TrajectoryFilePoses(
-            _needed(config.trajectory, "--trajectory FILE"),
+            _required(config.trajectory, "--trajectory FILE"),
             max_gap_s=config.max_gap,
             time_offset_s=config.time_offset,
         )
@@ -69,7 +71,9 @@ def make(config: ScanConfig, first: Frame) -> Localizer:
         from tsfusion.scanner.localization.pose_feed.feed import PoseFeed
 
         return PoseFeed(
-            _needed(config.feed, "--feed ADDRESS"), max_gap_s=config.max_gap, time_offset_s=config.time_offset
+            _required(config.feed, "--feed ADDRESS"),
+            max_gap_s=config.max_gap,
+            time_offset_s=config.time_offset,
         )
     if name == "lidar":
         from tsfusion.scanner.localization.lidar import LidarLocalizer
@@ -78,7 +82,7 @@ def make(config: ScanConfig, first: Frame) -> Localizer:
     return _with_loops(_tracker(name), wanted=config.loop_closure)
 
 
-def _needed(value: str | None, flag: str) -> str:
+def _required(value: str | None, flag: str) -> str:
     if value is None:
         raise InvalidConfig(f"this localizer needs {flag}")
     return value

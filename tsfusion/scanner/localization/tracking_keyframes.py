@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which frames are tracking keyframes, where frame is compared with frame or poses are given."""
+"""Choice of tracking keyframes by distance and angle, for localizers that keep no map of their own."""
 
 import math
 
@@ -10,13 +10,13 @@ from tsfusion.scanner.localization.localizer import Pose
 
 
 class TrackingKeyframes:
-    """Hangs each pose on the last tracking keyframe, and begins a new one when the sensor has moved away.
+    """Make every pose relative to the last tracking keyframe; begin a new one when the sensor has moved away.
 
     Attributes:
-        distance: metres to the next one; may be changed at any time.
+        distance: metres to the next keyframe; may be changed at any time.
 
     Args:
-        angle: degrees to the next one.
+        angle: degrees to the next keyframe.
     """
 
     def __init__(self, *, distance: float = 0.5, angle: float = 10.0) -> None:
@@ -26,7 +26,7 @@ class TrackingKeyframes:
         self._T_world_anchor: se3.Transform | None = None
 
     def pose(self, T_world_camera: se3.Transform, timestamp_ns: int, *, quality: float = 1.0) -> Pose:
-        """The pose as a localizer gives it."""
+        """Make a localizer's answer of (4, 4) `T_world_camera`, relative to the tracking keyframe."""
         T = np.eye(4) if self._T_world_anchor is None else se3.inverse(self._T_world_anchor) @ T_world_camera
         moved = se3.distance(T) > self.distance or se3.angle(T) > self._angle
         starts = self._T_world_anchor is None or moved
@@ -43,5 +43,5 @@ class TrackingKeyframes:
         )
 
     def reset(self) -> None:
-        """The next pose is a tracking keyframe. Numbers go on."""
+        """Make the next pose a tracking keyframe. Numbers go on."""
         self._T_world_anchor = None

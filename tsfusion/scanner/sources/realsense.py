@@ -12,7 +12,7 @@ from tsfusion.core.errors import InvalidConfig, MissingDependency, SourceError
 from tsfusion.geometry.calibration import Camera, Undistorter
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.sources import realsense_frames as feeds
+from tsfusion.scanner.sources import realsense_frames
 from tsfusion.scanner.sources.source import LiveSource, monotonic_of
 
 RECORDINGS = (".db3", ".bag")
@@ -61,9 +61,9 @@ class RealSense(LiveSource):
         *,
         recording: str | Path | None = None,
         device: Any = None,
-        images: feeds.Images = "depth",
+        images: realsense_frames.Images = "depth",
         color: bool = True,
-        size: feeds.Size = (480, 640),
+        size: realsense_frames.Size = (480, 640),
         fps: int = 30,
         real_time: bool = False,
         deadline: float = 5.0,
@@ -79,7 +79,7 @@ class RealSense(LiveSource):
         self.live = recording is None or real_time
         self._played, self._deadline, self._number = recording is not None, deadline, -_REORDERED
         try:
-            self._feed, self._color = feeds.open_feed(
+            self._stream, self._color = realsense_frames.open_stream(
                 self._rs, camera=camera, recording=recording, device=device, images=images, color=color,
                 size=size, fps=fps, real_time=real_time,
             )  # fmt: skip
@@ -90,18 +90,18 @@ class RealSense(LiveSource):
             self._infrared = images == "infrared"
             self._prepare()
         except BaseException:
-            self._feed.stop()
+            self._stream.stop()
             raise
         self.sensor = sensor or self.sensor
 
     def __iter__(self) -> Iterator[Frame]:
         last = time.monotonic()
         while not self._closed.is_set():
-            over = self._feed.over()
+            over = self._stream.over()
             frames = self._next()
             frame = None
             if frames is not None:
-                frame = self._pair(frames) if self._infrared else self._depth(frames)
+                frame = self._infrared_pair(frames) if self._infrared else self._depth(frames)
             if frame is not None:
                 yield frame
                 last = time.monotonic()
@@ -113,18 +113,18 @@ class RealSense(LiveSource):
     def close(self) -> None:
         """Stop the camera; a blocked iteration ends within a tenth of a second."""
         super().close()
-        self._feed.stop()
+        self._stream.stop()
 
     def _next(self) -> Any:
         try:
-            return self._feed.wait(_SLICE_MS)
+            return self._stream.wait(_SLICE_MS)
         except RuntimeError as error:
             if self._closed.is_set():
                 return None
             raise SourceError(f"{self.name} stopped: {error}. {_ADVICE}") from error
 
     def _stopped(self) -> SourceError:
-        if not feeds.plugged_in(self._rs, self._feed.device):
+        if not realsense_frames.plugged_in(self._rs, self._stream.device):
             return SourceError(f"{self.name} was unplugged; plug it in and start again")
         return SourceError(f"{self.name} delivered no complete frames for {self._deadline:g} s. {_ADVICE}")
 
@@ -132,13 +132,13 @@ class RealSense(LiveSource):
         """Read the calibration of the streams in use."""
         stream = self._rs.stream
         if self._infrared:
-            left, right = (self._feed.profile(stream.infrared, index) for index in (1, 2))
+            left, right = (self._stream.profile(stream.infrared, index) for index in (1, 2))
             self.sensor, shown = "stereo", left
             baseline: float | None = abs(float(left.get_extrinsics_to(right).translation[0]))
         else:
-            left = self._feed.profile(stream.depth)
-            shown = self._feed.profile(stream.color) if self._color else left
-            baseline = feeds.baseline(self._rs, self._feed.device)
+            left = self._stream.profile(stream.depth)
+            shown = self._stream.profile(stream.color) if self._color else left
+            baseline = realsense_frames.baseline(self._rs, self._stream.device)
             self.sensor = "tof" if baseline is None else "realsense"
             self._align = self._rs.align(stream.color)
         self._undistorter = _undistorter(shown, self.name)
@@ -157,7 +157,10 @@ class RealSense(LiveSource):
         timestamp_ns, captured_ns = self._stamps(depth)
         if self._color:
             aligned = self._align.process(frames)
-            depth, color = aligned.get_depth_frame(), feeds.bgr(self._rs, aligned.get_color_frame())
+            depth, color = (
+                aligned.get_depth_frame(),
+                realsense_frames.bgr(self._rs, aligned.get_color_frame()),
+            )
         image = np.array(depth.get_data())
         if self._undistorter is not None:
             image = self._undistorter.depth(image)
@@ -173,7 +176,7 @@ class RealSense(LiveSource):
             captured_ns=captured_ns,
         )
 
-    def _pair(self, frames: Any) -> Frame | None:
+    def _infrared_pair(self, frames: Any) -> Frame | None:
         left, right = frames.get_infrared_frame(1), frames.get_infrared_frame(2)
         if not self._whole(left, right, needed=True):
             return None

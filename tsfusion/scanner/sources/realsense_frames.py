@@ -40,7 +40,7 @@ class RealSenseStream(Protocol):
         """Stop streaming; may be called twice and from another thread."""
 
 
-class Pipeline:
+class PipelineStream:
     """A camera or a recording, as `config` says; `real_time` is None for a camera."""
 
     def __init__(self, rs: Any, config: Any, *, real_time: bool | None) -> None:
@@ -71,7 +71,7 @@ class Pipeline:
             return
 
 
-class Sensors:
+class DeviceStream:
     """The streams wanted of a device, matched by librealsense's syncer.
 
     Args:
@@ -113,7 +113,7 @@ class Sensors:
             sensor.close()
 
 
-def open_feed(
+def open_stream(
     rs: Any,
     *,
     camera: str | None,
@@ -138,20 +138,20 @@ def open_feed(
     if images == "depth":
         wanted = [(rs.stream.depth, -1), *([(rs.stream.color, -1)] if color else [])]
     if device is not None:
-        return Sensors(rs, device, wanted), color
+        return DeviceStream(rs, device, wanted), color
     config = rs.config()
     if recording is not None:
         del found  # the pipeline opens the file for itself
         config.enable_device_from_file(str(recording), repeat_playback=False)
         for stream, index in wanted:
             config.enable_stream(stream, index)
-        return Pipeline(rs, config, real_time=real_time), color
+        return PipelineStream(rs, config, real_time=real_time), color
     config.enable_device(found.get_info(rs.camera_info.serial_number))
     formats = {rs.stream.depth: rs.format.z16, rs.stream.color: rs.format.bgr8}
     for stream, index in wanted:
         pixels = formats.get(stream, rs.format.y8)
         config.enable_stream(stream, index, size[1], size[0], pixels, fps)
-    return Pipeline(rs, config, real_time=None), color
+    return PipelineStream(rs, config, real_time=None), color
 
 
 def plugged_in(rs: Any, device: Any) -> bool:

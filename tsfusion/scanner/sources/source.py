@@ -50,17 +50,17 @@ SECOND = 1_000_000_000  # nanoseconds
 _Self = TypeVar("_Self", bound="LiveSource")
 
 
-class Closed:
+class CloseFlag:
     """A `threading.Event` that a signal's handler may set while its own thread waits for it."""
 
     def __init__(self) -> None:
         self._set = False
-        self._told: queue.SimpleQueue[None] = queue.SimpleQueue()  # its `put` is reentrant; a lock is not
+        self._wakeups: queue.SimpleQueue[None] = queue.SimpleQueue()  # its `put` is reentrant; a lock is not
 
     def set(self) -> None:
         """From now on `is_set`, and whoever waits is woken."""
         self._set = True
-        self._told.put(None)
+        self._wakeups.put(None)
 
     def is_set(self) -> bool:
         """Whether it was set."""
@@ -70,7 +70,7 @@ class Closed:
         """Whether it is set within `timeout` seconds; for one thread at a time."""
         if not self._set:
             with suppress(queue.Empty):
-                self._told.get(timeout=timeout)
+                self._wakeups.get(timeout=timeout)
         return self._set
 
 
@@ -83,7 +83,7 @@ class LiveSource(ABC):
     def __init__(self, name: str, sensor: str) -> None:
         self.name, self.sensor = name, sensor
         self.skipped: dict[str, int] = {}
-        self._closed = Closed()
+        self._closed = CloseFlag()
 
     @abstractmethod
     def __iter__(self) -> Iterator[Frame]:

@@ -24,7 +24,7 @@ TOGETHER = (
 )
 
 
-class StereoPairs(Protocol):
+class PairRectifier(Protocol):
     """A stereo camera's calibration at work; a `calibration.Rectifier` is one."""
 
     @property
@@ -41,7 +41,7 @@ class StereoPairs(Protocol):
 
 
 @dataclass(frozen=True)
-class Rectified:
+class AlreadyRectified:
     """For images that are rectified already."""
 
     intrinsics: Intrinsics
@@ -58,7 +58,7 @@ class Rectified:
         return left, right
 
 
-def rectifier(calibration: str | Path, *, size: Size | None) -> Rectifier:
+def read_rectifier(calibration: str | Path, *, size: Size | None) -> Rectifier:
     """From a file, or from a folder that holds two which belong together (`TOGETHER`).
 
     Args:
@@ -90,7 +90,7 @@ def rectifier(calibration: str | Path, *, size: Size | None) -> Rectifier:
 def frame_of(
     left: NDArray[Any],
     right: NDArray[Any],
-    pairs: StereoPairs,
+    pairs: PairRectifier,
     *,
     sensor: str,
     timestamp_ns: int,

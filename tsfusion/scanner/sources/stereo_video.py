@@ -19,7 +19,7 @@ from tsfusion.geometry.calibration import Size
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources.source import LiveSource
-from tsfusion.scanner.sources.stereo_pairs import Rectified, StereoPairs, frame_of, rectifier
+from tsfusion.scanner.sources.stereo_pairs import AlreadyRectified, PairRectifier, frame_of, read_rectifier
 
 log = logging.getLogger(__name__)
 
@@ -76,16 +76,16 @@ class StereoVideo(LiveSource):
             if calibration is None:
                 assert intrinsics is not None
                 assert baseline is not None
-                self._pairs: StereoPairs = Rectified(intrinsics, baseline, size or shown)
+                self._pairs: PairRectifier = AlreadyRectified(intrinsics, baseline, size or shown)
             else:
-                self._pairs = pairs or rectifier(calibration, size=size or shown)
+                self._pairs = pairs or read_rectifier(calibration, size=size or shown)
         except BaseException:
             self._capture.release()
             raise
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT) if self._file else 0
         self.length = int(count) if count > 0 else None
         self.live = not self._file
-        self._grabber = None if self._file else Grabber(self._capture)
+        self._grabber = None if self._file else CameraThread(self._capture)
 
     def __iter__(self) -> Iterator[Frame]:
         for picture in self._all() if self._grabber is None else self._newest(self._grabber):
@@ -114,7 +114,7 @@ class StereoVideo(LiveSource):
         if not count and not self._closed.is_set():
             raise SourceError(f"{self._place} holds no pictures that can be decoded; expected a video")
 
-    def _newest(self, grabber: "Grabber") -> Iterator["VideoPicture"]:
+    def _newest(self, grabber: "CameraThread") -> Iterator["VideoPicture"]:
         last = time.monotonic()
         while not self._closed.is_set():
             picture = grabber.take(_SLICE_S)
@@ -159,7 +159,7 @@ class VideoPicture:
     captured_ns: int
 
 
-class Grabber:
+class CameraThread:
     """A thread that keeps a camera's newest picture, so that none waits in the driver's queue.
 
     Attributes:
@@ -211,10 +211,10 @@ class Grabber:
             self._changed.notify_all()
 
 
-def _when_it_says(calibration: str | Path, size: Size | None) -> StereoPairs | None:
+def _when_it_says(calibration: str | Path, size: Size | None) -> PairRectifier | None:
     """The rectifier, unless the file leaves the size of its images to the camera."""
     try:
-        return rectifier(calibration, size=size)
+        return read_rectifier(calibration, size=size)
     except SourceError:
         if size is not None or not Path(calibration).expanduser().exists():
             raise

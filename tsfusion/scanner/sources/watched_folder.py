@@ -232,16 +232,16 @@ class WatchedFolder(LiveSource):
         camera = read_camera(Path(self._calibration).expanduser(), size=(image.shape[0], image.shape[1]))
         return camera.intrinsics if camera.model == "pinhole" else Undistorter(camera)
 
-    def _pairs(self, image: NDArray[Any]) -> stereo_pairs.StereoPairs | None:
+    def _pairs(self, image: NDArray[Any]) -> stereo_pairs.PairRectifier | None:
         size = image.shape[0], image.shape[1]
         there = any(all((self._root / name).is_file() for name in names) for names in stereo_pairs.TOGETHER)
         if self._calibration is not None or there:
-            return stereo_pairs.rectifier(self._calibration or self._root, size=size)
+            return stereo_pairs.read_rectifier(self._calibration or self._root, size=size)
         intrinsics = self._intrinsics or folder_layouts.camera_of(self._root)
         baseline = self._baseline or folder_layouts.baseline_of(self._root)
         if intrinsics is None or baseline is None:
             return None
-        return stereo_pairs.Rectified(intrinsics, baseline, size)
+        return stereo_pairs.AlreadyRectified(intrinsics, baseline, size)
 
     def _stamps(self, name: str, first: Path) -> tuple[int, int]:
         """`timestamp_ns` and `captured_ns`; the first grows, also where files were written out of order."""

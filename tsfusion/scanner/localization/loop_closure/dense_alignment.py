@@ -55,7 +55,7 @@ def refined(
     Gauss-Newton over reprojection both ways, and for depth cameras over distances to the old view's planes.
     """
     T = T_old_new
-    target = _Surface(old) if old.measured and new.measured else None
+    target = _DepthNormals(old) if old.measured and new.measured else None
     points = _points(new)[::_EVERY]
     for _ in range(_STEPS):
         H, g = np.zeros((6, 6)), np.zeros(6)
@@ -112,7 +112,7 @@ def _reprojection(
     return J, r.ravel(), np.repeat(w, 2)
 
 
-class _Surface:
+class _DepthNormals:
     """A view's depth as points with normals."""
 
     def __init__(self, view: PlaceView) -> None:

@@ -13,7 +13,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections
 from tsfusion.scanner.localization.loop_closure import pose_graph, verification
 from tsfusion.scanner.localization.loop_closure.loop_consensus import Loop, LoopConsensus
-from tsfusion.scanner.localization.loop_closure.odometry_drift import Chain, OdometryDrift
+from tsfusion.scanner.localization.loop_closure.odometry_drift import OdometryChain, OdometryDrift
 from tsfusion.scanner.localization.loop_closure.place_index import CAPACITY, PlaceIndex, PlaceView, view
 
 _GAP = (10, 3.0)  # keyframes, and metres and radians of way: what is younger is no loop
@@ -68,7 +68,7 @@ class LoopClosing:
         self._forget()
 
     def _forget(self) -> None:
-        self._chain = Chain(self._drift)
+        self._chain = OdometryChain(self._drift)
         self.consensus = LoopConsensus(self._chain)
         self._places = PlaceIndex(self._capacity)
         self._corrected: dict[int, se3.Transform] = {}
@@ -129,7 +129,7 @@ class LoopClosing:
         if seen is None:
             return None
         found = []
-        for place in self._places.alike(seen, count=_CHECKS):
+        for place in self._places.most_similar(seen, count=_CHECKS):
             result = verification.check(self._places.views[place], seen)
             if result.refused is None and result.T_old_new is not None and result.inliers >= _RELOCALISED:
                 found.append((place, result.T_old_new))
@@ -158,7 +158,7 @@ class LoopClosing:
         self.counts.keyframes += 1
         seen = _view(frame)
         if seen is not None:
-            believed = self.consensus.hear(self._loops(pose.anchor, seen))
+            believed = self.consensus.add(self._loops(pose.anchor, seen))
             self.counts.closed += len(believed)
             self._due |= bool(believed)
             waited = self.counts.keyframes - self._optimised_at
@@ -172,7 +172,10 @@ class LoopClosing:
         before = self._old_enough(number)
         if before is None:
             return []
-        likely = [*self._nearby(number, before)[:1], *self._places.alike(seen, before=before, count=_CHECKS)]
+        likely = [
+            *self._nearby(number, before)[:1],
+            *self._places.most_similar(seen, before=before, count=_CHECKS),
+        ]
         found: list[Loop] = []
         for place in list(dict.fromkeys(likely))[:_CHECKS]:
             result = verification.check(self._places.views[place], seen)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tsfusion.geometry import se3
-from tsfusion.scanner.localization.loop_closure.odometry_drift import Chain
+from tsfusion.scanner.localization.loop_closure.odometry_drift import OdometryChain
 from tsfusion.scanner.localization.loop_closure.pose_graph import PoseGraphEdge, information
 
 GATE = 6.0  # standard deviations by which a loop may contradict what was known
@@ -54,7 +54,7 @@ class LoopConsensus:
        later ones nearby need only agree with one of those.
     """
 
-    def __init__(self, chain: Chain) -> None:
+    def __init__(self, chain: OdometryChain) -> None:
         self._chain = chain
         self.believed: list[Loop] = []
         self._ends = np.empty((0, 2))  # ways of the believed loops' ends
@@ -64,7 +64,7 @@ class LoopConsensus:
         ] = {}  # place → (another, T_another_place) by looks
         self.refused: dict[str, int] = {}
 
-    def hear(self, loops: list[Loop]) -> list[Loop]:
+    def add(self, loops: list[Loop]) -> list[Loop]:
         """Those to be believed now, out of one keyframe's loops and those that wait."""
         if not loops:
             return []

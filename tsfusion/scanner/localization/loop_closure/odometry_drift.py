@@ -26,7 +26,7 @@ class OdometryDrift:
     floor: float = 0.002
 
 
-class Chain:
+class OdometryChain:
     """Tracking keyframes in order: poses as odometry gives them, and what lies between any two.
 
     The covariance of a stretch is a difference of two sums in the world's axes, so asking costs the same

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.localization.features import bilinear, lifted
+from tsfusion.scanner.localization.features import back_project, bilinear
 
 FEATURES = 500
 CAPACITY = 1000  # places remembered
@@ -64,7 +64,7 @@ def view(frame: Frame, depth_m: NDArray[np.float32]) -> PlaceView | None:
     return PlaceView(
         descriptors=descriptors,
         pixels=pixels,
-        points=lifted(pixels, np.where(z > 0, z, np.nan), K).astype(np.float32),
+        points=back_project(pixels, np.where(z > 0, z, np.nan), K).astype(np.float32),
         depth_mm=_medians(np.where(depth_m < 65, depth_m * 1000, 0).astype(np.uint16), factor),
         intrinsics=K,
         small=K.scaled(1 / factor),
@@ -124,7 +124,7 @@ class PlaceIndex:
         self._seen[:, slot >> 3] &= np.uint8(255 ^ 128 >> (slot & 7))
         del self.views[number]
 
-    def alike(self, view: PlaceView, *, before: int | None = None, count: int = 4) -> list[int]:
+    def most_similar(self, view: PlaceView, *, before: int | None = None, count: int = 4) -> list[int]:
         """The places (with numbers below `before`) that look most like the view, best first."""
         allowed = self._numbers >= 0
         slots = np.flatnonzero(allowed if before is None else allowed & (self._numbers < before))

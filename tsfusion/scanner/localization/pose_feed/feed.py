@@ -63,8 +63,8 @@ class PoseFeed:
         self.dropped: Counter[str] = Counter()
         self._max_gap_ns, self._offset_ns = round(max_gap_s * _NS), round(time_offset_s * _NS)
         self._wait = wait_s
-        self._link = _Link(address)
-        self._closing = weakref.finalize(self, self._link.close)
+        self._socket = _FeedSocket(address)
+        self._closing = weakref.finalize(self, self._socket.close)
         self._history = PoseHistory()
         self._deformation = MapDeformation()
         self._anchors = TrackingKeyframes()
@@ -72,7 +72,7 @@ class PoseFeed:
     @property
     def address(self) -> str:
         """Where it listens, with the real port; or where it is connected to."""
-        return self._link.endpoint
+        return self._socket.endpoint
 
     def close(self) -> None:
         """Let go of the socket; may be called twice."""
@@ -90,12 +90,12 @@ class PoseFeed:
             return Lost(reason="the frame has no time, so that no pose can be looked up", timestamp_ns=0)
         stamp = frame.timestamp_ns + self._offset_ns
         deadline = time.monotonic() + self._wait
-        self._hear(0)
+        self._receive(0)
         while not self._history.decided(stamp, max_gap_ns=self._max_gap_ns):
             left = deadline - time.monotonic()
             if left <= 0:
                 break
-            self._hear(left)
+            self._receive(left)
         T = self._history.at(stamp, max_gap_ns=self._max_gap_ns)
         if T is None:
             return Lost(reason=self._missing(stamp), timestamp_ns=frame.timestamp_ns)
@@ -106,36 +106,36 @@ class PoseFeed:
 
     def corrections(self) -> PoseCorrections | None:
         """What the sender's loop closure found out since the last call."""
-        return self._deformation.news()
+        return self._deformation.new_corrections()
 
     def reset(self) -> None:
         """The world stays the sender's."""
         self._anchors.reset()
         self._deformation.reset()
 
-    def _hear(self, seconds: float) -> None:
+    def _receive(self, seconds: float) -> None:
         """Take the messages that are there; wait for the first one at most so long."""
-        parts = self._link.receive(seconds)
+        parts = self._socket.receive(seconds)
         enough = time.monotonic() + _BUSY
         while parts is not None:
-            self._take(parts)
+            self._process(parts)
             if time.monotonic() > enough:
                 return
-            parts = self._link.receive(0)
+            parts = self._socket.receive(0)
 
-    def _take(self, parts: list[bytes]) -> None:
+    def _process(self, parts: list[bytes]) -> None:
         try:
             if len(parts) != 1:
                 raise DecodeError(f"a message has 1 frame, got {len(parts)}")
-            said = decode(parts[0])
+            message = decode(parts[0])
         except DecodeError as error:
             self._drop(str(error))
             return
         self.received += 1
-        if said.stamp_ns is not None:
-            self._history.add(said.stamp_ns, said.pose)
-        if said.graph is not None:
-            unknown = self._deformation.learn(said.graph, self._history, self._max_gap_ns)
+        if message.stamp_ns is not None:
+            self._history.add(message.stamp_ns, message.pose)
+        if message.corrections is not None:
+            unknown = self._deformation.apply(message.corrections, self._history, self._max_gap_ns)
             if unknown:
                 log.warning("%d corrected poses are of moments that no pose was sent of", unknown)
 
@@ -148,7 +148,7 @@ class PoseFeed:
     def _missing(self, stamp: int) -> str:
         where = f"from {self.address}"
         if not len(self._history):
-            if self._link.binds:
+            if self._socket.binds:
                 return f"no pose has come yet to @{self.address}, where it listens: senders connect to it"
             return f"no pose has come {where} yet"
         away = (stamp - self._history.last_ns) / _NS
@@ -164,7 +164,7 @@ class PoseFeed:
         return f"{where}, there is no pose within {self._max_gap_ns / _NS:g} s on both sides of the frame"
 
 
-class _Link:
+class _FeedSocket:
     """The SUB socket, made anew when nothing has come for a while."""
 
     def __init__(self, address: str) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from tsfusion.geometry import se3
 from tsfusion.scanner.localization.localizer import PoseCorrections
-from tsfusion.scanner.localization.pose_feed.messages import Graph
+from tsfusion.scanner.localization.pose_feed.messages import FeedCorrections
 from tsfusion.scanner.localization.pose_feed.pose_history import PoseHistory
 
 
@@ -31,23 +31,25 @@ class MapDeformation:
         """A tracking keyframe."""
         self._anchors[anchor] = stamp_ns, T_world_camera
 
-    def learn(self, graph: Graph, history: PoseHistory, max_gap_ns: int) -> int:
+    def apply(self, corrected: FeedCorrections, history: PoseHistory, max_gap_ns: int) -> int:
         """Take a graph for the truth; how many of its stamps no pose is known of."""
-        before = [history.at(stamp, max_gap_ns=max_gap_ns) for stamp in graph.stamps_ns]
+        before = [history.at(stamp, max_gap_ns=max_gap_ns) for stamp in corrected.stamps_ns]
         known = [
             (stamp, after @ se3.inverse(T))
-            for stamp, after, T in zip(graph.stamps_ns, graph.poses, before, strict=True)
+            for stamp, after, T in zip(corrected.stamps_ns, corrected.poses, before, strict=True)
             if T is not None
         ]
-        unknown = len(graph.stamps_ns) - len(known)
-        if known or graph.T_corrected_world is not None:
+        unknown = len(corrected.stamps_ns) - len(known)
+        if known or corrected.T_corrected_world is not None:
             self._stamps, self._moves = [stamp for stamp, _ in known], [move for _, move in known]
             last = self._moves[-1] if known else np.eye(4)
-            self._T_corrected_world = last if graph.T_corrected_world is None else graph.T_corrected_world
-            self._loops, self._news = graph.loops, True
+            self._T_corrected_world = (
+                last if corrected.T_corrected_world is None else corrected.T_corrected_world
+            )
+            self._loops, self._news = corrected.loops, True
         return unknown
 
-    def news(self) -> PoseCorrections | None:
+    def new_corrections(self) -> PoseCorrections | None:
         """What the graph means for every tracking keyframe since `reset`, once."""
         if not self._news:
             return None

@@ -33,21 +33,21 @@ Stamp = Annotated[int, Meta(ge=1, le=2**63 - 1)]
 Numbers = Annotated[list[float], Meta(min_length=7, max_length=16)]
 
 
-class _Graph(Struct):
+class _RawCorrections(Struct):
     stamps_ns: list[Stamp]
     poses: list[Numbers]
     T_corrected_world: Numbers | None = None
     loops: Annotated[int, Meta(ge=0, le=2**31)] = 0
 
 
-class _Message(Struct):
+class _RawMessage(Struct):
     stamp_ns: Stamp | None = None
     pose: Numbers | None = None
     lost: bool = False
-    corrections: _Graph | None = None
+    corrections: _RawCorrections | None = None
 
 
-class Graph(Struct, frozen=True, kw_only=True):
+class FeedCorrections(Struct, frozen=True, kw_only=True):
     """Corrected poses of moments, in order of their stamps."""
 
     stamps_ns: list[int]
@@ -56,19 +56,19 @@ class Graph(Struct, frozen=True, kw_only=True):
     loops: int
 
 
-class Said(Struct, frozen=True, kw_only=True):
+class FeedMessage(Struct, frozen=True, kw_only=True):
     """One message. `pose` None with a stamp: the sender is lost."""
 
     stamp_ns: int | None
     pose: Transform | None
-    graph: Graph | None
+    corrections: FeedCorrections | None
 
 
-_json = msgspec.json.Decoder(_Message)
-_msgpack = msgspec.msgpack.Decoder(_Message)
+_json = msgspec.json.Decoder(_RawMessage)
+_msgpack = msgspec.msgpack.Decoder(_RawMessage)
 
 
-def decode(message: bytes) -> Said:
+def decode(message: bytes) -> FeedMessage:
     """Raises DecodeError for anything that is not as described above."""
     try:
         # A map never begins with `{` in MessagePack.
@@ -80,20 +80,22 @@ def decode(message: bytes) -> Said:
         if raw.stamp_ns is not None and (raw.pose is None) != raw.lost:
             raise DecodeError("either a pose or lost must be given with a stamp")
         pose = None if raw.pose is None else _matrix(raw.pose)
-        graph = None if raw.corrections is None else _graph(raw.corrections)
+        corrections = None if raw.corrections is None else _corrections(raw.corrections)
     except (msgspec.DecodeError, UnicodeDecodeError, InvalidKeyframe, RecursionError) as error:
         raise DecodeError(str(error)) from error
-    return Said(stamp_ns=raw.stamp_ns, pose=pose, graph=graph)
+    return FeedMessage(stamp_ns=raw.stamp_ns, pose=pose, corrections=corrections)
 
 
-def _graph(raw: _Graph) -> Graph:
+def _corrections(raw: _RawCorrections) -> FeedCorrections:
     if len(raw.stamps_ns) != len(raw.poses):
         raise DecodeError(f"{len(raw.stamps_ns)} stamps with {len(raw.poses)} corrected poses")
     by_stamp = dict(
         sorted(zip(raw.stamps_ns, map(_matrix, raw.poses), strict=True), key=lambda item: item[0])
     )
     T = None if raw.T_corrected_world is None else _matrix(raw.T_corrected_world)
-    return Graph(stamps_ns=[*by_stamp], poses=[*by_stamp.values()], T_corrected_world=T, loops=raw.loops)
+    return FeedCorrections(
+        stamps_ns=[*by_stamp], poses=[*by_stamp.values()], T_corrected_world=T, loops=raw.loops
+    )
 
 
 def _matrix(numbers: list[float]) -> Transform:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Depth images as small planes, and how far a view's points are from those of another (point to plane).
+"""Depth images as small planes, and the distances of one image's points from the planes of another.
 
 Projective association after Blais and Levine, "Registering multiview range data" (1995); point to plane after
 Chen and Medioni (1992). A plane is linear in inverse depth over the pixels: blocks of pixels are averaged
@@ -20,23 +20,23 @@ Floats = NDArray[np.float32]
 
 COLUMNS = 160  # blocks a row, about
 _FIT_RADIUS = 1  # blocks
-_FIT_SHARE = 0.6  # of the blocks around one that must be valid
+_FIT_SHARE = 0.6  # share of the blocks around one that must be valid
 _NEAREST = 0.1  # metres
-_CURVED = 0.006  # deviation within a block or from its plane, as a share of the depth
-_GRAZING = 0.17  # cosine between ray and normal
-_CELL = 8  # blocks
+_MAX_CURVATURE = 0.006  # deviation within a block or from its plane, as a share of the depth
+_MIN_COSINE = 0.17  # between ray and normal
+_CELL = 8  # blocks a side, over which errors are averaged
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
-    """What one depth image says of the surface, in its camera's axes.
+class PlaneImage:
+    """Planes fitted to the blocks of one depth image, in its camera's axes.
 
     Attributes:
-        intrinsics: of the image of blocks.
+        intrinsics: those of the image of blocks.
         shape: rows and columns of blocks.
         points: (3, n) float32 metres, the blocks' centres.
-        sigma: (n,) float32 metres, a depth camera's deviation at each.
-        index: (n,) block of each, row by row.
+        sigma: (n,) float32 metres, standard deviation of a depth camera at these depths.
+        index: (n,) number of the point's block, row by row.
         planes: (4, rows·columns) float32: unit normal and offset, normal · p = offset > 0; 0 = no plane.
         roughness: deviation of the blocks from the planes fitted around them, as a share of `sigma`.
     """
@@ -55,18 +55,18 @@ class Surface:
         return float(np.count_nonzero(self.planes[3]) / self.planes.shape[1])
 
     def every(self, step: int) -> NDArray[np.intp]:
-        """Which points are on every `step`-th row and column of blocks."""
+        """Indices of the points on every `step`-th row and column of blocks."""
         row, column = np.divmod(self.index, self.shape[1])
         return np.flatnonzero((row % step == step // 2) & (column % step == step // 2))
 
 
 def deviation(depth: Any) -> Any:
-    """Metres of depth noise at metres of depth, structured light (Nguyen, Izadi and Lovell 2012)."""
+    """Standard deviation of structured light's depth, metres at metres (Nguyen, Izadi and Lovell 2012)."""
     return 0.0012 + 0.0019 * (depth - 0.4) ** 2
 
 
-def surface(depth: Floats, intrinsics: Intrinsics) -> Surface:
-    """The planes of (H, W) float32 metres; 0 = no depth."""
+def fit_planes(depth: Floats, intrinsics: Intrinsics) -> PlaneImage:
+    """Fit planes to a depth image, (H, W) float32 metres; 0 = no depth."""
     block = max(1, round(depth.shape[1] / COLUMNS))
     inverse, valid = _blocks(depth, block)
     K, shape = intrinsics.scaled(1 / block), (inverse.shape[0], inverse.shape[1])
@@ -78,7 +78,7 @@ def surface(depth: Floats, intrinsics: Intrinsics) -> Surface:
     planes[:3], roughness = _normals(inverse, valid, K)
     # Through the block's own point, not its neighbours' mean: that lies inside of what is round.
     planes[3, index] = np.einsum("in,in->n", planes[:3, index], points)
-    return Surface(K, shape, points, deviation(points[2]).astype(np.float32), index, planes, roughness)
+    return PlaneImage(K, shape, points, deviation(points[2]).astype(np.float32), index, planes, roughness)
 
 
 def _blocks(depth: Floats, block: int) -> tuple[Floats, NDArray[np.bool_]]:
@@ -95,12 +95,12 @@ def _blocks(depth: Floats, block: int) -> tuple[Floats, NDArray[np.bool_]]:
     mean = np.divide(mean, share, out=np.ones_like(mean), where=valid)
     spread = np.divide(square, share, out=np.ones_like(mean), where=valid) - mean * mean
     z = 1 / mean
-    limit = _CURVED * z + 2 * deviation(z)
+    limit = _MAX_CURVATURE * z + 2 * deviation(z)
     return mean, valid & (spread * z**4 < limit**2)
 
 
 def _normals(inverse: Floats, valid: NDArray[np.bool_], K: Intrinsics) -> tuple[Floats, float]:
-    """Normals of planes fitted to inverse depth around each block, (3, n), 0 where none fits; roughness."""
+    """Normals, (3, n), of planes fitted to inverse depth around each block, 0 where none fits; roughness."""
     r = _FIT_RADIUS
     ones, step = np.ones(2 * r + 1), np.arange(-r, r + 1, dtype=np.float64)
     w = valid.astype(np.float32)
@@ -125,14 +125,14 @@ def _normals(inverse: Floats, valid: NDArray[np.bool_], K: Intrinsics) -> tuple[
     z = 1 / np.where(ok, mq, 1)
     off = np.sqrt(np.maximum(rest, 0)) * z * z
     sigma = deviation(z)
-    ok &= off < _CURVED * z + sigma
+    ok &= off < _MAX_CURVATURE * z + sigma
     x = ((np.arange(ok.shape[1]) - K.cx) / K.fx).astype(np.float32)[None, :]
     y = ((np.arange(ok.shape[0]) - K.cy) / K.fy).astype(np.float32)[:, None]
     # 1/z = a (u - u0) + b (v - v0) + c around block (u0, v0) is normal · (x, y, 1) = 1/z.
     nx, ny, c = a * np.float32(K.fx), b * np.float32(K.fy), mq - a * mu - b * mv
     normals = np.stack([nx, ny, c - nx * x - ny * y])
     length = np.maximum(np.sqrt((normals * normals).sum(axis=0)), np.float32(1e-12))
-    ok &= c > _GRAZING * length * np.sqrt(x * x + y * y + 1)
+    ok &= c > _MIN_COSINE * length * np.sqrt(x * x + y * y + 1)
     free = 1 - 3 / (2 * r + 1) ** 2  # of the residuals, with three parameters fitted
     roughness = float(np.median(off[ok] / sigma[ok]) / np.sqrt(free)) if ok.any() else 0.0
     return np.where(ok, normals / length, 0).reshape(3, -1), roughness
@@ -140,15 +140,15 @@ def _normals(inverse: Floats, valid: NDArray[np.bool_], K: Intrinsics) -> tuple[
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """A view's points beside the planes of another, where they fall into its image.
+    """Points of one image paired with the planes of another whose blocks they project onto.
 
     Attributes:
-        moved: (3, m) float32, the points in the other's axes.
-        normals: (3, m) float32.
-        distance: (m,) float32 metres, signed.
-        sigma: (m,) float32 metres.
-        chosen: (m,) which of the view's points.
-        block: (m,) where in the other's image of blocks.
+        moved: (3, m) float32 metres, the points in the other camera's axes.
+        normals: (3, m) float32, of the planes.
+        distance: (m,) float32 metres from the planes, signed.
+        sigma: (m,) float32 metres, standard deviation of the points' depth.
+        chosen: (m,) indices of the points.
+        block: (m,) numbers of the other image's blocks.
     """
 
     moved: Floats
@@ -159,8 +159,10 @@ class Match:
     block: NDArray[np.intp]
 
 
-def match(there: Surface, here: Surface, T_there_here: se3.Transform, some: NDArray[np.intp] | None) -> Match:
-    """The points of `here` (or `some` of them) beside the planes of `there` that they project onto."""
+def match(
+    there: PlaneImage, here: PlaneImage, T_there_here: se3.Transform, some: NDArray[np.intp] | None
+) -> Match:
+    """Pair the points of `here` (or those with indices `some`) with the planes of `there`."""
     points, sigma = (here.points, here.sigma) if some is None else (here.points[:, some], here.sigma[some])
     K, (rows, columns) = there.intrinsics, there.shape
     moved = T_there_here[:3, :3].astype(np.float32) @ points + T_there_here[:3, 3:].astype(np.float32)
@@ -177,10 +179,10 @@ def match(there: Surface, here: Surface, T_there_here: se3.Transform, some: NDAr
     return Match(moved, planes[:3], distance, sigma[chosen], which, block)
 
 
-def alike(found: Match, columns: int) -> float:
-    """How many blocks err as one: 1 for white noise, dozens where a sensor's errors are smooth.
+def correlated_blocks(found: Match, columns: int) -> float:
+    """Number of blocks that share one error: 1 for white noise, dozens where a sensor's errors are smooth.
 
-    The variance of the distances' means over cells of `_CELL` × `_CELL` blocks, against a single block's.
+    It is the variance of the distances' means over cells of blocks, in units of what white noise would give.
     """
     near = np.abs(found.distance) < 4 * found.sigma
     whitened = (found.distance[near] / found.sigma[near]).astype(np.float64)
@@ -195,7 +197,10 @@ def alike(found: Match, columns: int) -> float:
 
 
 def equations(found: Match, weight: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(6, 6) and (6,) of the step that brings the points to their planes: `exp(step) @ T_there_here`."""
+    """Normal equations, (6, 6) and (6,), of the step that brings the points to their planes.
+
+    The step is applied as `exp(step) @ T_there_here`.
+    """
     x, y, z = found.moved
     nx, ny, nz = found.normals
     J = np.stack([nx, ny, nz, y * nz - z * ny, z * nx - x * nz, x * ny - y * nx])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Whether a pose that was found can be believed."""
+"""Acceptance test of an RGB-D pose: overlap, agreement of depth and image, and certainty."""
 
 from dataclasses import dataclass
 
@@ -7,28 +7,28 @@ import numpy as np
 
 from tsfusion.geometry import se3
 from tsfusion.scanner.localization.rgbd import point_to_plane
-from tsfusion.scanner.localization.rgbd.pose_solver import Estimate
-from tsfusion.scanner.localization.rgbd.view import FrameView, Seen
+from tsfusion.scanner.localization.rgbd.pose_solver import PoseEstimate
+from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
 
-_NEAR = 0.01  # metres, and three deviations: a point on its plane
-_PATTERN = 0.1  # of what all could be: below, there is nothing to compare
-_SAFETY = 3.0  # times the information that noise alone would give
+ON_PLANE = 0.01  # metres, beside three deviations, from which a point counts as on its plane
+MIN_PATTERN_ENERGY = 0.1  # of 1: with less, there is no pattern to compare
+NOISE_FACTOR = 3.0  # safety factor on the information that noise alone would give
 
-_OVERLAP, _OVERLAP_STRICT = 0.25, 0.4
-_AGREEING, _AGREEING_STRICT, _AGREEING_DEPTH_ALONE = 0.7, 0.8, 0.92
-_LIKENESS, _LIKENESS_STRICT = 0.2, 0.3
-_UNCERTAINTY = 0.01
+MIN_OVERLAP, MIN_OVERLAP_STRICT = 0.25, 0.4  # shares
+MIN_AGREEING, MIN_AGREEING_STRICT, MIN_AGREEING_DEPTH_ALONE = 0.7, 0.8, 0.92  # shares
+MIN_LIKENESS, MIN_LIKENESS_STRICT = 0.2, 0.3  # correlations
+MAX_UNCERTAINTY = 0.01  # metres
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """How a view agrees with another from the pose found.
+class PoseEvidence:
+    """How well a frame agrees with a keyframe at the pose found.
 
     Attributes:
-        overlap: share of the view's points that fall onto planes of the other.
-        agreeing: share of these that lie on them.
-        likeness: -1 to 1, of the grey patterns there; None = no image, or nothing on it.
-        corners: number that agree.
+        overlap: share of the frame's points that fall onto planes of the keyframe.
+        agreeing: share of these points that lie on their planes.
+        likeness: -1 to 1, correlation of the grey patterns there; None = no image, or no pattern.
+        corners: number of corners that agree.
         uncertainty: metres; deviation of the pose in its worst direction, rotations taken at the surface.
     """
 
@@ -39,56 +39,58 @@ class Evidence:
     uncertainty: float
 
     def doubt(self, *, strict: bool) -> str | None:
-        """Why the pose cannot be believed; None = it can.
+        """Reason to reject the pose; None = it is accepted.
 
         In a recorded kitchen poses from frame to frame agreed by 0.92 or more in depth and by 0.35 or more in
         the image, wrong ones by 0.26 and 0.05 or less, but depth alone by 0.9 when centimetres off.
 
         Args:
-            strict: the pose came out of the blue.
+            strict: whether to ask for more, because the pose was not expected.
         """
-        agreeing = _AGREEING_STRICT if strict else _AGREEING
-        likeness = _LIKENESS_STRICT if strict else _LIKENESS
+        agreeing = MIN_AGREEING_STRICT if strict else MIN_AGREEING
+        likeness = MIN_LIKENESS_STRICT if strict else MIN_LIKENESS
         if self.likeness is None:
-            agreeing = _AGREEING_DEPTH_ALONE
-        overlap = _OVERLAP_STRICT if strict else _OVERLAP
+            agreeing = MIN_AGREEING_DEPTH_ALONE
+        overlap = MIN_OVERLAP_STRICT if strict else MIN_OVERLAP
         if self.overlap < overlap:
             return f"{self.overlap:.0%} of the view is of what is known, at least {overlap:.0%} must be"
         if self.agreeing < agreeing:
             return f"{self.agreeing:.0%} of the depth agrees, at least {agreeing:.0%} must"
         if self.likeness is not None and self.likeness < likeness:
             return f"the image agrees by {self.likeness:.2f}, it must by {likeness:.2f} of 1"
-        if self.uncertainty > _UNCERTAINTY:
+        if self.uncertainty > MAX_UNCERTAINTY:
             return (
                 f"the view leaves the pose open by {min(self.uncertainty, 9.99):.3f} m (a plain wall?), "
-                f"at most {_UNCERTAINTY:.3f} m is allowed"
+                f"at most {MAX_UNCERTAINTY:.3f} m is allowed"
             )
         return None
 
 
-def weigh(seen: Seen, view: FrameView, estimate: Estimate, corners: int) -> Evidence:
-    """The evidence for an estimate of `seen`'s pose in `view`'s axes."""
-    found = point_to_plane.match(view.seen.surface, seen.surface, estimate.T_anchor_camera, None)
-    agree = np.abs(found.distance) < _NEAR + 3 * found.sigma
-    total = max(1, seen.surface.points.shape[1])
-    return Evidence(
+def pose_evidence(
+    current: RGBDFrame, keyframe: TrackingKeyframe, estimate: PoseEstimate, corners: int
+) -> PoseEvidence:
+    """Evidence for an estimate of the current frame's pose in a keyframe's axes."""
+    found = point_to_plane.match(keyframe.frame.surface, current.surface, estimate.T_anchor_camera, None)
+    agree = np.abs(found.distance) < ON_PLANE + 3 * found.sigma
+    total = max(1, current.surface.points.shape[1])
+    return PoseEvidence(
         overlap=len(agree) / total,
         agreeing=float(agree.mean()) if len(agree) else 0.0,
-        likeness=_likeness(seen, view, found),
+        likeness=_likeness(current, keyframe, found),
         corners=corners,
         uncertainty=_uncertainty(estimate, found),
     )
 
 
-def _likeness(seen: Seen, view: FrameView, found: point_to_plane.Match) -> float | None:
-    if seen.pattern is None or view.seen.pattern is None or not len(found.block):
+def _likeness(current: RGBDFrame, keyframe: TrackingKeyframe, found: point_to_plane.Match) -> float | None:
+    if current.pattern is None or keyframe.frame.pattern is None or not len(found.block):
         return None
-    here, there = seen.pattern[seen.surface.index[found.chosen]], view.seen.pattern[found.block]
+    here, there = current.pattern[current.surface.index[found.chosen]], keyframe.frame.pattern[found.block]
     energy = float(here @ here + there @ there) / 2
-    return float(here @ there) / energy if energy > _PATTERN * len(here) else None
+    return float(here @ there) / energy if energy > MIN_PATTERN_ENERGY * len(here) else None
 
 
-def _uncertainty(estimate: Estimate, found: point_to_plane.Match) -> float:
+def _uncertainty(estimate: PoseEstimate, found: point_to_plane.Match) -> float:
     if not len(found.block):
         return float("inf")
     center = found.moved.mean(axis=1).astype(np.float64)
@@ -98,7 +100,8 @@ def _uncertainty(estimate: Estimate, found: point_to_plane.Match) -> float:
     lever = max(0.1, float(np.sqrt(found.moved.astype(np.float64).var(axis=1).sum())))
     to_metres = A @ np.diag([1, 1, 1, *[1 / lever] * 3])
     planes, noise, corners = (
-        to_metres.T @ H @ to_metres for H in (estimate.planes, _SAFETY * estimate.spurious, estimate.corners)
+        to_metres.T @ H @ to_metres
+        for H in (estimate.planes, NOISE_FACTOR * estimate.spurious, estimate.corners)
     )
     values, axes = np.linalg.eigh(planes - noise)
     least = float(np.linalg.eigvalsh(axes @ np.diag(np.maximum(values, 0)) @ axes.T + corners)[0])

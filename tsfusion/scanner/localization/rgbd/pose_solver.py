@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""One pose from corners and planes together: Gauss-Newton over reprojection and point-to-plane distances.
+"""Pose from corners and planes together: Gauss-Newton over reprojection and point-to-plane distances.
 
-Both errors are weighted by their deviations and made robust with the Geman-McClure kernel, whose reach
+Both errors are weighted by their deviations and made robust with the Geman-McClure kernel, whose width
 shrinks as the estimate settles.
 """
 
@@ -16,42 +16,42 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.rgbd import point_to_plane
 
 PIXEL = 1.0  # deviation of a followed corner, at 640 columns
-_REACH = 3.0  # deviations at which a residual counts a quarter
-_TRUST = 0.1  # of a plane's residual against a corner's, until it is known how far neighbours err alike
-_FLOOR, _CEILING = 0.25, 3.0  # deviation of the distances to planes, as a share of the sensor's
-_PLANE_NOISE = 6.0  # sum of squares of a fit's offsets along one axis, in blocks: 3 × 3 of them
-_WAVES = 0.03  # radians; what smooth errors of a sensor tilt its planes by
-_DAMPING = 1e-6  # of the information's trace
-_NEARLY_STILL, _STILL = 3e-4, 2e-5  # metres or radians; below, a round is over, the last one
-_STEPS = ((4, 15, 0.3), (2, 6, 0.05), (1, 3, 0.03))  # blocks apart, iterations, gate in metres
+ROBUST_WIDTH = 3.0  # deviations at which a residual counts a quarter
+FIRST_PLANE_WEIGHT = 0.1  # against a corner's 1, until the correlation of neighbouring blocks is known
+MIN_SCALE, MAX_SCALE = 0.25, 3.0  # deviation of the distances to planes, as a share of the sensor's
+FIT_OFFSETS_SQUARED = 6.0  # blocks²: sum over a plane's 3 × 3 blocks of their offsets along one axis
+SMOOTH_TILT = 0.03  # radians by which smooth errors of a sensor tilt its planes
+DAMPING = 1e-6  # share of the information's trace
+COARSE_STEP, FINE_STEP = 3e-4, 2e-5  # metres or radians: a smaller step ends a coarse, the last round
+ROUNDS = ((4, 15, 0.3), (2, 6, 0.05), (1, 3, 0.03))  # blocks between points, iterations, gate in metres
 
 
 @dataclass(frozen=True, eq=False)
-class Link:
-    """A view that the new one is compared with.
+class AlignmentTarget:
+    """A tracking keyframe that the new frame is aligned to.
 
     Attributes:
-        T_view_anchor: (4, 4), fixed.
-        surface: of that view.
-        points: (n, 3) of its corners, in its camera's axes.
-        pixels: (n, 2) where the new image has them.
+        T_target_anchor: (4, 4), known.
+        surface: its planes.
+        points: (n, 3) metres, its corners in its camera's axes.
+        pixels: (n, 2), these corners in the new image.
     """
 
-    T_view_anchor: se3.Transform
-    surface: point_to_plane.Surface
+    T_target_anchor: se3.Transform
+    surface: point_to_plane.PlaneImage
     points: NDArray[np.float64]
     pixels: NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
-    """What came out.
+class PoseEstimate:
+    """The pose found and the information about it, as (6, 6) matrices for a twist from the left.
 
     Attributes:
         T_anchor_camera: (4, 4).
-        planes: (6, 6) information of a step from the left that the distances to planes give.
-        spurious: (6, 6), what noise in the planes' normals alone would give.
-        corners: (6, 6) information that the corners give.
+        planes: information from the distances to planes.
+        spurious: the part of it that noise in the planes' normals alone would give.
+        corners: information from the reprojection of corners.
     """
 
     T_anchor_camera: se3.Transform
@@ -61,71 +61,73 @@ class Estimate:
 
 
 def solve(
-    links: Sequence[Link],
-    here: point_to_plane.Surface,
+    targets: Sequence[AlignmentTarget],
+    here: point_to_plane.PlaneImage,
     camera: Intrinsics,
     columns: int,
     T_anchor_camera: se3.Transform,
-) -> Estimate:
-    """The pose at which corners and planes agree best, from a pose nearby.
+) -> PoseEstimate:
+    """Find the pose at which corners and planes agree best, starting from a pose nearby.
 
     Args:
-        here: surface of the new view.
+        targets: the anchor first; the others take part in the last round.
+        here: planes of the new frame.
         camera, columns: intrinsics and width of its image.
+        T_anchor_camera: (4, 4) start.
     """
-    T, trust = T_anchor_camera, _TRUST
+    T, trust = T_anchor_camera, FIRST_PLANE_WEIGHT
     pixel = PIXEL * columns / 640
     planes = spurious = corners = np.zeros((6, 6))
-    for apart, iterations, gate in _STEPS:
+    for apart, iterations, gate in ROUNDS:
         some = here.every(apart) if apart > 1 else None
-        reach = pixel * (4 if apart == _STEPS[0][0] else 1)
+        reach = pixel * (4 if apart == ROUNDS[0][0] else 1)
         for iteration in range(iterations):
             planes, spurious, corners, g = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
-            for link in links if apart == 1 else links[:1]:
-                T_view_camera = link.T_view_anchor @ T
-                found = point_to_plane.match(link.surface, here, T_view_camera, some)
-                if apart == 1 and iteration == 0 and link is links[0]:
-                    trust = 1 / point_to_plane.alike(found, link.surface.shape[1])
+            for target in targets if apart == 1 else targets[:1]:
+                T_target_camera = target.T_target_anchor @ T
+                found = point_to_plane.match(target.surface, here, T_target_camera, some)
+                if apart == 1 and iteration == 0 and target is targets[0]:
+                    trust = 1 / point_to_plane.correlated_blocks(found, target.surface.shape[1])
                 H_planes, g_planes, weight = _planes(found, gate, apart**2 * trust)
-                H_corners, g_corners = _corners(link, camera, T_view_camera, reach)
-                A = se3.adjoint(link.T_view_anchor)
+                H_corners, g_corners = _corners(target, camera, T_target_camera, reach)
+                A = se3.adjoint(target.T_target_anchor)
                 planes, corners = planes + A.T @ H_planes @ A, corners + A.T @ H_corners @ A
                 g = g + A.T @ (g_planes + g_corners)
                 if apart == 1:
-                    spurious = spurious + A.T @ _spurious(found, weight, link.surface) @ A
+                    spurious = spurious + A.T @ _spurious(found, weight, target.surface) @ A
             H = planes + corners
-            step = np.linalg.solve(H + (_DAMPING * np.trace(H) + 1e-9) * np.eye(6), g)
+            step = np.linalg.solve(H + (DAMPING * np.trace(H) + 1e-9) * np.eye(6), g)
             T = se3.exp(step) @ T
-            if np.abs(step).max() < (_STILL if apart == 1 else _NEARLY_STILL):
+            if np.abs(step).max() < (FINE_STEP if apart == 1 else COARSE_STEP):
                 break
-    return Estimate(se3.nearest(T), planes, spurious, corners)
+    return PoseEstimate(se3.nearest(T), planes, spurious, corners)
 
 
 def _planes(
     found: point_to_plane.Match, gate: float, trust: float
 ) -> tuple[se3.Matrix6, se3.Twist, point_to_plane.Floats]:
-    """Normal equations of the distances to planes, and each one's weight."""
+    """Normal equations of the distances to planes, and the (m,) weights of the distances."""
     near = np.abs(found.distance) < np.float32(gate) + 3 * found.sigma
     if np.count_nonzero(near) < 12:
         return np.zeros((6, 6)), np.zeros(6), np.zeros(len(near), np.float32)
     whitened = found.distance / found.sigma
-    scale = np.float32(np.clip(1.48 * np.median(np.abs(whitened[near])), _FLOOR, _CEILING))
-    ratio = whitened / (scale * np.float32(_REACH))
+    scale = np.float32(np.clip(1.48 * np.median(np.abs(whitened[near])), MIN_SCALE, MAX_SCALE))
+    ratio = whitened / (scale * np.float32(ROBUST_WIDTH))
     weight = np.float32(trust) * near / ((1 + ratio * ratio) * scale * found.sigma) ** 2
     H, g = point_to_plane.equations(found, weight)
     return H, g, weight
 
 
 def _spurious(
-    found: point_to_plane.Match, weight: point_to_plane.Floats, there: point_to_plane.Surface
+    found: point_to_plane.Match, weight: point_to_plane.Floats, there: point_to_plane.PlaneImage
 ) -> se3.Matrix6:
-    """(6, 6) information that errors of the planes' normals alone would give."""
+    """Information that errors of the planes' normals alone would give, (6, 6)."""
     slope = there.roughness * found.sigma * (there.intrinsics.fx / found.moved[2])
-    return _isotropic(found.moved, weight * (slope * slope / _PLANE_NOISE + _WAVES**2))
+    return _isotropic(found.moved, weight * (slope * slope / FIT_OFFSETS_SQUARED + SMOOTH_TILT**2))
 
 
 def _isotropic(points: point_to_plane.Floats, weight: NDArray[np.floating]) -> se3.Matrix6:
-    """(6, 6) information of points that are held in all three directions."""
+    """Information of points that are known in all three directions, (6, 6)."""
     p, w = points.astype(np.float64), weight.astype(np.float64)
     total, first, second = w.sum(), p @ w, (p * w) @ p.T
     H = np.zeros((6, 6))
@@ -137,23 +139,23 @@ def _isotropic(points: point_to_plane.Floats, weight: NDArray[np.floating]) -> s
 
 
 def _corners(
-    link: Link, camera: Intrinsics, T_view_camera: se3.Transform, pixel: float
+    target: AlignmentTarget, camera: Intrinsics, T_target_camera: se3.Transform, pixel: float
 ) -> tuple[se3.Matrix6, se3.Twist]:
-    """Normal equations of the reprojection errors of a link's corners."""
-    if not len(link.points):
+    """Normal equations of the reprojection errors of a target's corners."""
+    if not len(target.points):
         return np.zeros((6, 6)), np.zeros(6)
-    R = T_view_camera[:3, :3].T
-    q = se3.apply(se3.inverse(T_view_camera), link.points)
+    R = T_target_camera[:3, :3].T
+    q = se3.apply(se3.inverse(T_target_camera), target.points)
     ok = q[:, 2] > 0.05
     z = np.where(ok, q[:, 2], 1.0)
-    du = camera.fx * q[:, 0] / z + camera.cx - link.pixels[:, 0]
-    dv = camera.fy * q[:, 1] / z + camera.cy - link.pixels[:, 1]
-    weight = ok / (1 + (du * du + dv * dv) / (pixel * _REACH) ** 2) ** 2 / pixel**2
+    du = camera.fx * q[:, 0] / z + camera.cx - target.pixels[:, 0]
+    dv = camera.fy * q[:, 1] / z + camera.cy - target.pixels[:, 1]
+    weight = ok / (1 + (du * du + dv * dv) / (pixel * ROBUST_WIDTH) ** 2) ** 2 / pixel**2
     zero = np.zeros_like(z)
     Ju = np.stack([camera.fx / z, zero, -camera.fx * q[:, 0] / z**2], axis=1) @ R
     Jv = np.stack([zero, camera.fy / z, -camera.fy * q[:, 1] / z**2], axis=1) @ R
     J = np.concatenate([Ju, Jv])
-    X = np.concatenate([link.points, link.points])
+    X = np.concatenate([target.points, target.points])
     J = -np.concatenate([J, np.cross(X, J)], axis=1)
     w = np.concatenate([weight, weight])
     return (J * w[:, None]).T @ J, -(J * w[:, None]).T @ np.concatenate([du, dv])

@@ -57,7 +57,7 @@ class RectificationCheck:
         return not self.problems
 
 
-class Rectification:
+class RectificationMonitor:
     """Collects what pairs and motions show, and warns once of each thing that is wrong.
 
     Attributes:
@@ -88,19 +88,19 @@ class Rectification:
         self._left.append(left)
         self._right.append(right)
         if not self.wants_pair:
-            self.check = _judge_rows(self._left, self._right, shape)
+            self.check = _check_rows(self._left, self._right, shape)
             for problem in self.check.problems:
                 _log.warning(problem)
-            self._judge_disparity()
+            self._check_disparity()
 
     def add_motion(self, offset: float, sigma: float) -> None:
         """What one motion says all disparities lack, pixels."""
         if np.isfinite([offset, sigma]).all() and sigma < _TRUSTED:
             self._offsets.append(offset)
             self._sigmas.append(sigma)
-            self._judge_disparity()
+            self._check_disparity()
 
-    def _judge_disparity(self) -> None:
+    def _check_disparity(self) -> None:
         if self.check is None or self.wants_motion or self.check.disparity_px is not None:
             return
         too_high = -_sure_offset(np.array(self._offsets), np.array(self._sigmas))
@@ -111,7 +111,7 @@ class Rectification:
         self.check = replace(self.check, disparity_px=too_high, problems=problems)
 
 
-def _judge_rows(left: list[Pixels], right: list[Pixels], shape: tuple[int, ...]) -> RectificationCheck:
+def _check_rows(left: list[Pixels], right: list[Pixels], shape: tuple[int, ...]) -> RectificationCheck:
     height, width = shape[:2]
     first, second = np.concatenate(left), np.concatenate(right)
     centred = first - np.array([(width - 1) / 2, (height - 1) / 2])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.localization.features import Pixels, lifted
+from tsfusion.scanner.localization.features import Pixels, back_project
 
 Vectors = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ class StereoCamera:
 
     def lift(self, pixels: Pixels, disparity: NDArray[np.floating]) -> Vectors:
         """(n, 2) pixels with (n,) pixels of disparity > 0 → (n, 3) points of the left camera."""
-        return lifted(pixels, self.baseline_fx / disparity, self.intrinsics)
+        return back_project(pixels, self.baseline_fx / disparity, self.intrinsics)
 
     def project(self, points: Vectors) -> Pixels:
         """(n, 3) points of the left camera → (n, 2) pixels; those behind it land far outside."""

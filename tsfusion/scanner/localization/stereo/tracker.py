@@ -13,7 +13,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.stereo_matching import quick_disparity
 from tsfusion.scanner.localization import features
 from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
-from tsfusion.scanner.localization.stereo.rectification_check import Rectification, RectificationCheck
+from tsfusion.scanner.localization.stereo.rectification_check import RectificationCheck, RectificationMonitor
 from tsfusion.scanner.localization.stereo.reprojection import StereoCamera, refine
 from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
 
@@ -33,7 +33,7 @@ _PROJECTOR = 43.0  # px·m, a depth camera's baseline times focal length (Kinect
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Seen:
+class _Reference:
     """A frame, reduced to what the next one is compared with."""
 
     gray: NDArray[np.uint8]
@@ -54,7 +54,7 @@ class _Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class _DisparityImage:
     """A frame's left image, (H, W) pixels of disparity (0 = none), and the cameras."""
 
     gray: NDArray[np.uint8]
@@ -79,8 +79,8 @@ class StereoLocalizer:
 
     def __init__(self) -> None:
         self._anchors = TrackingKeyframes()
-        self._rectification = Rectification()
-        self._reference: _Seen | None = None
+        self._rectification = RectificationMonitor()
+        self._reference: _Reference | None = None
         self._velocity: NDArray[np.float64] | None = None  # twist a second; a frame where there are no stamps
 
     @property
@@ -90,24 +90,24 @@ class StereoLocalizer:
 
     def track(self, frame: Frame) -> Pose | Lost:
         """Where the left camera was, seen from the first one."""
-        view = _measured(frame)
+        image = _disparity_image(frame)
         if frame.right is not None and self._rectification.wants_pair:
-            self._check_rows(view, frame.right)
+            self._check_rows(image, frame.right)
         reference, T, quality, moved = self._reference, np.eye(4), 1.0, np.inf
         if reference is not None:
-            found = self._compare(reference, view.gray, frame.timestamp_ns)
+            found = self._compare(reference, image.gray, frame.timestamp_ns)
             if isinstance(found, str):
                 self._velocity = None
                 return Lost(reason=found, timestamp_ns=frame.timestamp_ns)
             T, quality, moved = se3.nearest(reference.T_world_camera @ found[0]), found[1], found[2]
         if moved > _STILL:
-            pixels, disparity = view.corners
+            pixels, disparity = image.corners
             deep = disparity > _LEAST_DISPARITY
-            seen = _Seen(
-                gray=view.gray,
+            seen = _Reference(
+                gray=image.gray,
                 pixels=pixels[deep],
                 disparity=disparity[deep],
-                rig=view.rig,
+                rig=image.rig,
                 timestamp_ns=frame.timestamp_ns,
                 T_world_camera=T,
             )
@@ -129,7 +129,7 @@ class StereoLocalizer:
         self._anchors.reset()
 
     def _compare(
-        self, reference: _Seen, gray: NDArray[np.uint8], timestamp_ns: int
+        self, reference: _Reference, gray: NDArray[np.uint8], timestamp_ns: int
     ) -> tuple[se3.Transform, float, float] | str:
         """T_reference_camera, the share of points that agree, their median motion in pixels; or a reason."""
         if gray.shape != reference.gray.shape:
@@ -156,19 +156,19 @@ class StereoLocalizer:
         self._velocity = se3.log(motion.T_old_new) / elapsed
         return motion.T_old_new, share, float(np.median(np.abs(new - old)[agree].max(axis=1)))
 
-    def _check_rows(self, view: _View, right: NDArray[np.uint8]) -> None:
+    def _check_rows(self, image: _DisparityImage, right: NDArray[np.uint8]) -> None:
         """Also where the matcher found nothing: that may be just what is wrong with the pair."""
-        pixels, disparity = view.corners
+        pixels, disparity = image.corners
         matched = disparity > 0
         guess = pixels.copy()
         guess[:, 0] -= np.where(matched, disparity, np.median(disparity[matched]) if matched.any() else 0)
-        other, found = features.follow(view.gray, right, pixels, guess=guess)
+        other, found = features.follow(image.gray, right, pixels, guess=guess)
         self._rectification.add_pair(pixels[found], other[found], right.shape)
 
     def _check_disparity(
         self,
         T: se3.Transform,
-        reference: _Seen,
+        reference: _Reference,
         followed: NDArray[np.bool_],
         new: features.Pixels,
     ) -> None:
@@ -182,7 +182,7 @@ class StereoLocalizer:
             self._rectification.add_motion(motion.offset, motion.offset_sigma)
 
 
-def _measured(frame: Frame) -> _View:
+def _disparity_image(frame: Frame) -> _DisparityImage:
     """Raises InvalidKeyframe for a frame without an image, or without depth."""
     gray, depth = frame.gray, frame.depth_m
     if gray is None or (depth is None and frame.right is None):
@@ -193,9 +193,11 @@ def _measured(frame: Frame) -> _View:
     assert frame.intrinsics is not None
     rig = StereoCamera(frame.intrinsics, frame.baseline_fx or _PROJECTOR)
     if frame.right is not None:
-        return _View(gray, quick_disparity(gray, frame.right), rig)
+        return _DisparityImage(gray, quick_disparity(gray, frame.right), rig)
     assert depth is not None
-    return _View(gray, np.divide(rig.baseline_fx, depth, out=np.zeros_like(depth), where=depth > 0), rig)
+    return _DisparityImage(
+        gray, np.divide(rig.baseline_fx, depth, out=np.zeros_like(depth), where=depth > 0), rig
+    )
 
 
 def _elapsed(before_ns: int, now_ns: int) -> float:
@@ -204,7 +206,7 @@ def _elapsed(before_ns: int, now_ns: int) -> float:
 
 
 def _follow(
-    reference: _Seen, gray: NDArray[np.uint8], expected: se3.Transform | None
+    reference: _Reference, gray: NDArray[np.uint8], expected: se3.Transform | None
 ) -> tuple[features.Pixels, NDArray[np.bool_]]:
     """The reference's corners in the new image, sought first where they are expected."""
     if expected is not None:
