@@ -389,7 +389,7 @@ def test_a_message_that_is_too_long_costs_its_connection_only(feed: PoseFeed) ->
 
 def test_a_connection_that_libzmq_gave_up_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """After a message that is too long it never tries again to connect."""
-    monkeypatch.setattr("tsfusion.scanner.localization.pose_feed.feed._SILENCE", 0.5)
+    monkeypatch.setattr("tsfusion.scanner.localization.pose_feed.feed.RECONNECT_AFTER", 0.5)
     with zmq.Context() as context, context.socket(zmq.PUB) as made:
         made.setsockopt(zmq.LINGER, 0)
         address = f"tcp://127.0.0.1:{made.bind_to_random_port('tcp://127.0.0.1')}"

@@ -21,7 +21,7 @@ from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
 from tsfusion.scanner.localization.loop_closure.loop_closing import LoopClosing
 from tsfusion.scanner.localization.loop_closure.loop_consensus import Loop, LoopConsensus
 from tsfusion.scanner.localization.loop_closure.odometry_drift import OdometryChain, OdometryDrift
-from tsfusion.scanner.localization.loop_closure.place_index import PlaceIndex, PlaceView, view
+from tsfusion.scanner.localization.loop_closure.place_index import PlaceIndex, PlaceView, place_view
 from tsfusion.scanner.localization.loop_closure.verification import check, matches
 from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
@@ -44,7 +44,7 @@ class Run:
             if (news := self.closing.corrections()) is not None:
                 self.corrections.append(news)
                 assert self.closing.corrections() is None
-        self.loops = self.closing.consensus.believed
+        self.loops = self.closing.consensus.accepted
 
     def error(self, corrections: PoseCorrections | None) -> TrajectoryError:
         return absolute_error(self.track.poses(corrections), self.truth)
@@ -74,7 +74,7 @@ def views() -> list[PlaceView]:
 
 def seen(frame: Frame) -> PlaceView:
     assert frame.depth_m is not None
-    found = view(frame, frame.depth_m)
+    found = place_view(frame, frame.depth_m)
     assert found is not None
     return found
 
@@ -99,7 +99,7 @@ def test_two_laps_with_drift_become_one_place():
 
 
 def test_rooms_all_alike_are_not_one_room():
-    """Each view has its like 4, 8, … metres before, equal to the last pixel: found, and not believed."""
+    """Each view has its like 4, 8, … metres before, equal to the last pixel: found, and not accepted."""
     dataset = Synthetic("rooms", count=45)
     run = Run([dataset.frame(index) for index in range(45)])
     assert run.closing.counts.verified > 30
@@ -318,7 +318,7 @@ def test_odometry_knows_how_far_it_may_be_off():
     np.testing.assert_allclose(covariance_back, A @ covariance @ A.T, rtol=1e-6, atol=1e-12)
 
 
-def test_one_loop_is_not_believed_and_three_that_agree_are():
+def test_one_loop_is_not_accepted_and_three_that_agree_are():
     consensus = LoopConsensus(straight(60))
     off = 1.0  # between 3 and 6 deviations: more than expected, less than impossible
     far = claim(0, 50, off=off)
@@ -326,10 +326,10 @@ def test_one_loop_is_not_believed_and_three_that_agree_are():
     assert consensus.add([far]) == []
     assert consensus.add([claim(1, 51, off=off - 0.7)]) == []  # does not agree with it
     assert consensus.add([claim(1, 52, off=off)]) == []
-    believed = consensus.add([claim(2, 53, off=off)])
-    assert [(loop.old, loop.new) for loop in believed] == [(0, 50), (1, 52), (2, 53)]
+    accepted = consensus.add([claim(2, 53, off=off)])
+    assert [(loop.old, loop.new) for loop in accepted] == [(0, 50), (1, 52), (2, 53)]
     assert [loop.new for loop in consensus.add([claim(3, 54, off=off)])] == [54]
-    assert consensus.add([claim(4, 55, off=off + 1.0)]) == []  # contradicts those believed
+    assert consensus.add([claim(4, 55, off=off + 1.0)]) == []  # contradicts those accepted
     assert consensus.refused == {"contradicts the odometry": 1}
 
 
@@ -364,7 +364,7 @@ def test_loops_of_one_keyframe_that_contradict_each_other_are_both_refused():
 def test_an_image_too_small_is_no_place():
     frame = two_laps()[0]
     tiny = replace(frame, depth=frame.depth[:8, :40].copy(), color=frame.color[:8, :40].copy())
-    assert view(tiny, tiny.depth_m) is None
+    assert place_view(tiny, tiny.depth_m) is None
 
 
 def test_a_place_seen_to_have_a_twin_is_doubtful_ever_after():
@@ -379,13 +379,13 @@ def test_a_place_seen_to_have_a_twin_is_doubtful_ever_after():
     assert len([loop for new in range(390, 396) for loop in consensus.add([claim(20, new)])]) >= 2
 
 
-def test_a_loop_the_graph_disowns_counts_no_more():
+def test_a_loop_the_graph_withdraws_counts_no_more():
     consensus = LoopConsensus(straight(60))
     for new in (50, 51):
         consensus.add([claim(new - 50, new)])
-    wrong = consensus.believed[0]
-    consensus.disown(wrong)
-    assert wrong not in consensus.believed
+    wrong = consensus.accepted[0]
+    consensus.withdraw(wrong)
+    assert wrong not in consensus.accepted
     assert consensus.refused == {"contradicts other loops": 1}
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Two views' depth images against each other: how far they agree, and the pose at which they agree best."""
+"""Alignment of two places' depth images: how far they agree, and the pose at which they agree best."""
 
 from dataclasses import dataclass
 
@@ -11,21 +11,21 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization.loop_closure.place_index import PlaceView
 
-_STEPS = 8
-_EVERY = 3  # depth pixels, to find the pose; all of them to judge it
-_SLACK = 0.01  # metres of error that do not grow with distance
-_DENSE_WORTH = 3000  # measurements in a whole depth image
-_PIXEL = 5.0  # error of a match, pixels at 640 of width: colour and depth may not be registered
+MAX_ITERATIONS = 8
+STRIDE = 3  # every third depth pixel finds the pose; all of them judge it
+DEPTH_FLOOR = 0.01  # metres of depth error that do not grow with distance
+DENSE_WEIGHT = 3000  # independent measurements that a whole depth image counts as
+MATCH_SIGMA = 5.0  # pixels of error of a match at 640 of width: colour and depth may not be registered
 
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """Shares of one view's depth pixels projected into the other, the worse of both directions.
+    """Shares of one place's depth pixels projected into the other, the worse of both directions.
 
     Attributes:
-        overlap: of all with depth, those that fall on a pixel with depth.
-        agree: of these, those where the depth is the expected one.
-        through: of these, those where the other camera saw farther: it looked through the surface.
+        overlap: share of the pixels with depth that fall on a pixel with depth.
+        agree: share of these where the depth is the expected one.
+        through: share of these where the other camera saw farther, through the surface.
     """
 
     overlap: float
@@ -34,7 +34,7 @@ class Agreement:
 
 
 def agreement(old: PlaceView, new: PlaceView, T_old_new: se3.Transform) -> Agreement:
-    """How the depths agree if the new camera stood at `T_old_new` (4, 4) in the old one's axes."""
+    """Agreement of the depths if the new camera is at `T_old_new` (4, 4) in the old one's axes."""
     one, two = _into(new, old, T_old_new), _into(old, new, se3.inverse(T_old_new))
     return Agreement(
         overlap=min(one.overlap, two.overlap),
@@ -43,21 +43,21 @@ def agreement(old: PlaceView, new: PlaceView, T_old_new: se3.Transform) -> Agree
     )
 
 
-def refined(
+def refine(
     old: PlaceView,
     new: PlaceView,
     T_old_new: se3.Transform,
     first: NDArray[np.int64],
     second: NDArray[np.int64],
 ) -> se3.Transform:
-    """The pose that suits matched features (`first` of the old view, `second` of the new) and depths best.
+    """Refine T_old_new by matched features (`first` of the old place, `second` of the new) and depths.
 
-    Gauss-Newton over reprojection both ways, and for depth cameras over distances to the old view's planes.
+    Gauss-Newton over reprojection both ways, and for depth cameras over distances to the old depth's planes.
     """
     T = T_old_new
     target = _DepthNormals(old) if old.measured and new.measured else None
-    points = _points(new)[::_EVERY]
-    for _ in range(_STEPS):
+    points = _points(new)[::STRIDE]
+    for _ in range(MAX_ITERATIONS):
         H, g = np.zeros((6, 6)), np.zeros(6)
         backward = se3.inverse(T)
         terms = [
@@ -87,7 +87,7 @@ def _reprojection(
     *,
     towards_old: bool,
 ) -> Term:
-    """Pixels of error of points seen by the other camera; the step is a twist in the old view's axes."""
+    """Reprojection errors, pixels, of points in the other camera; the step is a twist in the old axes."""
     known = np.isfinite(points[:, 2])
     p, pixels = points[known].astype(np.float64), pixels[known]
     q = se3.apply(T, p)
@@ -106,14 +106,14 @@ def _reprojection(
     if not towards_old:
         motion = -T[:3, :3] @ motion
     J = (projection @ motion).reshape(-1, 6)
-    sigma = _PIXEL * camera.size[0] / 640
+    sigma = MATCH_SIGMA * camera.size[0] / 640
     size = np.linalg.norm(r, axis=1) / sigma
     w = np.minimum(1.0, 2.0 / np.maximum(size, 1e-9)) / sigma**2
     return J, r.ravel(), np.repeat(w, 2)
 
 
 class _DepthNormals:
-    """A view's depth as points with normals."""
+    """Points and normals of a place's depth image."""
 
     def __init__(self, view: PlaceView) -> None:
         self._view = view
@@ -127,22 +127,22 @@ class _DepthNormals:
         self._normals = np.where(whole[:, :, None], normals / np.maximum(length, 1e-12)[:, :, None], 0)
 
     def planes(self, T: se3.Transform, points: NDArray[np.float64], noise: float) -> Term:
-        """Metres from the tangent plane at the pixel each point falls on."""
+        """Distances, metres, of points from the tangent plane at the pixel each falls on."""
         q = se3.apply(T, points)
         rows, columns, inside = _pixels(q, self._view)
         q = q[inside]
         p, n = self._points[rows, columns], self._normals[rows, columns]
         r = ((q - p) * n).sum(axis=1)
-        sigma = _SLACK + 2 * noise * p[:, 2] ** 2
+        sigma = DEPTH_FLOOR + 2 * noise * p[:, 2] ** 2
         near = (np.abs(r) < 5 * sigma) & ((n != 0).any(axis=1))
         q, n, r, sigma = q[near], n[near], r[near], sigma[near]
         J = np.concatenate([n, np.cross(q, n)], axis=1)
         w = np.minimum(1.0, 1.5 * sigma / np.maximum(np.abs(r), 1e-12)) / sigma**2
-        return J, r, w * (_DENSE_WORTH * _EVERY / self._view.depth_mm.size)
+        return J, r, w * (DENSE_WEIGHT * STRIDE / self._view.depth_mm.size)
 
 
 def _into(source: PlaceView, target: PlaceView, T: se3.Transform) -> Agreement:
-    """One direction of `agreement`: `T` leads from the source's axes to the target's."""
+    """Agreement in one direction; `T` is T_target_source."""
     points = _points(source)
     low, high = _window(target.depth_mm.astype(np.float32) / 1000)
     q = se3.apply(T, points)
@@ -151,7 +151,7 @@ def _into(source: PlaceView, target: PlaceView, T: se3.Transform) -> Agreement:
     low, high = low[rows, columns], high[rows, columns]
     seen = high > 0
     low, high, z = low[seen], high[seen], z[seen]
-    tolerance = 2 * _SLACK + 3 * (source.noise + target.noise) * z**2
+    tolerance = 2 * DEPTH_FLOOR + 3 * (source.noise + target.noise) * z**2
     count = max(len(z), 1)
     through = float((z < low - tolerance).sum()) / count
     hidden = float((z > high + tolerance).sum()) / count
@@ -159,13 +159,13 @@ def _into(source: PlaceView, target: PlaceView, T: se3.Transform) -> Agreement:
 
 
 def _points(view: PlaceView) -> NDArray[np.float64]:
-    """(n, 3) of all depth pixels."""
+    """Points of all depth pixels, (n, 3) metres in the camera's axes."""
     z = view.depth_mm.astype(np.float64) / 1000
     return _lift(z, view.small)[z > 0]
 
 
 def _lift(z: NDArray[np.float64], K: Intrinsics) -> NDArray[np.float64]:
-    """(h, w) metres → (h, w, 3)."""
+    """Points of a depth image: (h, w) metres → (h, w, 3)."""
     v, u = np.mgrid[: z.shape[0], : z.shape[1]]
     return np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z], axis=2)
 
@@ -173,7 +173,7 @@ def _lift(z: NDArray[np.float64], K: Intrinsics) -> NDArray[np.float64]:
 def _pixels(
     points: NDArray[np.float64], view: PlaceView
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Row and column of the small depth pixel of those points that have one, and which do."""
+    """Rows and columns of the depth pixels that points fall on, and (n,) which points do."""
     K, (height, width) = view.small, view.depth_mm.shape
     z = np.maximum(points[:, 2], 1e-6)
     u, v = np.rint(points[:, 0] / z * K.fx + K.cx), np.rint(points[:, 1] / z * K.fy + K.cy)
@@ -182,7 +182,7 @@ def _pixels(
 
 
 def _window(z: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Smallest and largest of 3×3 pixels; 0 where the middle one has none."""
+    """Smallest and largest depth of 3×3 pixels; 0 where the middle one has none."""
     far = np.where(z > 0, z, np.inf).astype(np.float32)
     kernel = np.ones((3, 3), np.uint8)
     low, high = cv2.erode(far, kernel), cv2.dilate(z.astype(np.float32), kernel)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Loop closure around any localizer that follows images with depth."""
+"""Loop closure around any localizer of images with depth."""
 
 import itertools
 import logging
@@ -14,25 +14,33 @@ from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseC
 from tsfusion.scanner.localization.loop_closure import pose_graph, verification
 from tsfusion.scanner.localization.loop_closure.loop_consensus import Loop, LoopConsensus
 from tsfusion.scanner.localization.loop_closure.odometry_drift import OdometryChain, OdometryDrift
-from tsfusion.scanner.localization.loop_closure.place_index import CAPACITY, PlaceIndex, PlaceView, view
+from tsfusion.scanner.localization.loop_closure.place_index import CAPACITY, PlaceIndex, PlaceView, place_view
 
-_GAP = (10, 3.0)  # keyframes, and metres and radians of way: what is younger is no loop
-_CHECKS = 4  # views compared with each keyframe's
-_ENOUGH = 2  # loops of one keyframe; one if it says what was known
-_NEAR = (1.0, np.radians(30))  # metres and radians: places worth a look whatever they look like
-_PATIENCE = 10  # keyframes that loops which change little wait for the next optimisation
-_CHANGE = (0.04, np.radians(1.0))  # of metres and radians: a loop that changes more does not wait
-_THRIFT = 50  # with so many keyframes an optimisation costs as much as finding one's loops
-_TRY_AGAIN = 2  # lost frames: looking for a place costs more than tracking
-_RELOCALISED = 30  # matches that must agree where no odometry speaks for a place
-_ONE_PLACE = 0.3  # metres between what several of them say
+MIN_KEYFRAMES, MIN_WAY = 10, 3.0  # keyframes, and metres plus radians of way: younger places are no loops
+MAX_CHECKS = 4  # places compared with each keyframe
+MAX_LOOPS = 2  # of one keyframe; one is enough if it changes little
+NEAR_DISTANCE, NEAR_ANGLE = 1.0, np.radians(30)  # metres, radians: places compared whatever they look like
+WAIT_KEYFRAMES = 10  # until the next optimisation, for loops that change little
+LARGE_CHANGE, LARGE_TURN = 0.04, np.radians(1.0)  # metres, radians: a loop that changes more does not wait
+KEYFRAMES_AN_OPTIMISATION = 50  # of this many keyframes costs as much as finding the loops of one
+LOST_FRAMES_A_SEARCH = 2  # looking for a place costs more than tracking
+MIN_RELOCALISATION_MATCHES = 30  # that must agree where no odometry supports a place
+MAX_PLACE_SPREAD = 0.3  # metres between the poses that several places give
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(kw_only=True)
 class LoopCounts:
-    """What happened since the last `reset`: keyframes, views compared, loops that looked right, believed."""
+    """Counts since the last `reset`.
+
+    Attributes:
+        keyframes: tracking keyframes.
+        checks: places compared.
+        verified: comparisons that found the same place.
+        closed: loops accepted.
+        optimisations: of the pose graph.
+    """
 
     keyframes: int = 0
     checks: int = 0
@@ -42,18 +50,18 @@ class LoopCounts:
 
 
 class LoopClosing:
-    """Passes a localizer's poses through, and finds out where the sensor has been before.
+    """`Localizer` that passes on another one's poses, and corrects them where a place is seen again.
 
-    Poses never jump; `corrections()` says what they should have been. Each tracking keyframe with an image
+    Poses never jump; `corrections()` has the corrected ones. Each tracking keyframe with an image
     and depth costs about 30 CPU ms, plus 0.15 ms a keyframe of the graph when it is optimised, which with
     1,000 keyframes is every twentieth time at most. Memory: 52 KB a place, of which at most `capacity`
-    are remembered (then the one that is nearest to its neighbours goes), and 2 KB a tracking keyframe.
-    LiDAR frames have no image: they are passed through, and no loop is found.
+    are remembered (the one nearest to its neighbours is forgotten), and 2 KB a tracking keyframe.
+    No loops are found among LiDAR frames, which have no image.
 
     Args:
-        localizer: what to wrap; its world must stay one between resets.
-        drift: how far its poses may be off.
-        capacity: places remembered.
+        localizer: the tracker; its world must stay the same between resets.
+        drift: uncertainty of its poses.
+        capacity: number of places remembered.
 
     Raises:
         MissingDependency: without scipy.
@@ -73,8 +81,8 @@ class LoopClosing:
         self._places = PlaceIndex(self._capacity)
         self._corrected: dict[int, se3.Transform] = {}
         self.counts = LoopCounts()
-        self._news = False
-        self._due = False
+        self._is_new = False
+        self._optimisation_due = False
         self._optimised_at = 0  # keyframes then
         self._lost = 0  # frames, since the last that was not
         self._T_world_tracker: se3.Transform = np.eye(
@@ -82,11 +90,11 @@ class LoopClosing:
         )  # the tracker's world began anew where it was found again
 
     def track(self, frame: Frame) -> Pose | Lost:
-        """As the wrapped localizer says; a lost one goes on where a place is known again."""
+        """Track with the wrapped localizer; when it is lost, search for a known place to go on from."""
         found = self._localizer.track(frame)
         if isinstance(found, Lost):
             self._lost += 1
-            found = self._found_again(frame, found) if self._lost % _TRY_AGAIN == 0 else found
+            found = self._relocalised(frame, found) if self._lost % LOST_FRAMES_A_SEARCH == 0 else found
         if isinstance(found, Lost):
             return found
         self._lost = 0
@@ -95,8 +103,8 @@ class LoopClosing:
             self._keyframe(pose, frame)
         return pose
 
-    def _found_again(self, frame: Frame, lost: Lost) -> Pose | Lost:
-        """The tracker's pose after a new beginning at a place that was seen before."""
+    def _relocalised(self, frame: Frame, lost: Lost) -> Pose | Lost:
+        """Restart the tracker at a place that was seen before."""
         place = self.relocalise(frame)
         if place is None:
             return lost
@@ -107,10 +115,10 @@ class LoopClosing:
         return begun
 
     def corrections(self) -> PoseCorrections | None:
-        """The poses of all tracking keyframes after the last optimisation; None if that is known already."""
-        if not self._news:
+        """Poses of all tracking keyframes after the last optimisation; None if they were returned before."""
+        if not self._is_new:
             return None
-        self._news = False
+        self._is_new = False
         return PoseCorrections(
             revision=self.counts.optimisations,
             anchors=dict(self._corrected),
@@ -124,19 +132,23 @@ class LoopClosing:
         self._forget()
 
     def relocalise(self, frame: Frame) -> Pose | None:
-        """Where a frame was taken, by the remembered places alone; None where no place is surely its own."""
-        seen = _view(frame)
+        """Find a frame's pose by the remembered places alone; None unless the place is certain."""
+        seen = _described(frame)
         if seen is None:
             return None
         found = []
-        for place in self._places.most_similar(seen, count=_CHECKS):
+        for place in self._places.most_similar(seen, count=MAX_CHECKS):
             result = verification.check(self._places.views[place], seen)
-            if result.refused is None and result.T_old_new is not None and result.inliers >= _RELOCALISED:
+            if (
+                result.refused is None
+                and result.T_old_new is not None
+                and result.inliers >= MIN_RELOCALISATION_MATCHES
+            ):
                 found.append((place, result.T_old_new))
         if not found or not all(self.consensus.unique(place) for place, _ in found):
             return None
         poses = [self._corrected[place] @ T for place, T in found]
-        if any(se3.distance(se3.inverse(poses[0]) @ other) > _ONE_PLACE for other in poses[1:]):
+        if any(se3.distance(se3.inverse(poses[0]) @ other) > MAX_PLACE_SPREAD for other in poses[1:]):
             return None
         place, T = found[0]
         return Pose(
@@ -156,70 +168,72 @@ class LoopClosing:
         self._chain.add(pose.anchor, pose.T_world_camera)
         self._corrected[pose.anchor] = T @ pose.T_world_camera
         self.counts.keyframes += 1
-        seen = _view(frame)
+        seen = _described(frame)
         if seen is not None:
-            believed = self.consensus.add(self._loops(pose.anchor, seen))
-            self.counts.closed += len(believed)
-            self._due |= bool(believed)
+            accepted = self.consensus.add(self._loops(pose.anchor, seen))
+            self.counts.closed += len(accepted)
+            self._optimisation_due |= bool(accepted)
             waited = self.counts.keyframes - self._optimised_at
-            patience = 0 if any(map(self._changes_much, believed)) else _PATIENCE
-            if self._due and waited >= max(patience, self.counts.keyframes // _THRIFT):
+            patience = 0 if any(map(self._changes_much, accepted)) else WAIT_KEYFRAMES
+            if self._optimisation_due and waited >= max(
+                patience, self.counts.keyframes // KEYFRAMES_AN_OPTIMISATION
+            ):
                 self._optimise()
             self._remember(pose.anchor, seen)
 
     def _loops(self, number: int, seen: PlaceView) -> list[Loop]:
-        """Loops from a new keyframe to places that check out."""
+        """Verified loops from a new keyframe to earlier places."""
         before = self._old_enough(number)
         if before is None:
             return []
         likely = [
             *self._nearby(number, before)[:1],
-            *self._places.most_similar(seen, before=before, count=_CHECKS),
+            *self._places.most_similar(seen, before=before, count=MAX_CHECKS),
         ]
         found: list[Loop] = []
-        for place in list(dict.fromkeys(likely))[:_CHECKS]:
+        for place in list(dict.fromkeys(likely))[:MAX_CHECKS]:
             result = verification.check(self._places.views[place], seen)
             self.counts.checks += 1
             if result.refused is None and result.T_old_new is not None:
                 self.counts.verified += 1
                 found.append(Loop(place, number, result.T_old_new, result.sigma))
-                if len(found) == _ENOUGH or not self._changes_much(found[-1]):
+                if len(found) == MAX_LOOPS or not self._changes_much(found[-1]):
                     break
         return found
 
     def _old_enough(self, number: int) -> int | None:
-        """Keyframes below this number may be loops; None = no one is old enough."""
+        """Number below which keyframes may form loops; None = none is old enough."""
         ways = self._chain.ways
-        earlier = itertools.islice(reversed(ways), _GAP[0], None)
-        return next((other + 1 for other in earlier if ways[number] - ways[other] >= _GAP[1]), None)
+        earlier = itertools.islice(reversed(ways), MIN_KEYFRAMES, None)
+        return next((other + 1 for other in earlier if ways[number] - ways[other] >= MIN_WAY), None)
 
     def _nearby(self, number: int, before: int) -> list[int]:
-        """PlaceIndex that by the corrected poses show the same, the nearest first."""
+        """Places whose corrected poses are near the keyframe's, the nearest first."""
         places = [place for place in self._places.views if place < before]
         if not places:
             return []
         here = self._corrected[number]
         poses = np.array([self._corrected[place] for place in places])
-        away = np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1) / _NEAR[0]
+        away = np.linalg.norm(poses[:, :3, 3] - here[:3, 3], axis=1) / NEAR_DISTANCE
         cosine = (np.einsum("nij,ij->n", poses[:, :3, :3], here[:3, :3]) - 1) / 2
-        turned = np.arccos(np.clip(cosine, -1, 1)) / _NEAR[1]
+        turned = np.arccos(np.clip(cosine, -1, 1)) / NEAR_ANGLE
         return [places[i] for i in np.argsort(away + turned) if max(away[i], turned[i]) < 1]
 
     def _changes_much(self, loop: Loop) -> bool:
         T = se3.inverse(self._corrected[loop.old]) @ self._corrected[loop.new]
         error = se3.inverse(loop.T_old_new) @ T
-        return se3.distance(error) > _CHANGE[0] or se3.angle(error) > _CHANGE[1]
+        return se3.distance(error) > LARGE_CHANGE or se3.angle(error) > LARGE_TURN
 
     def _optimise(self) -> None:
-        loops = self.consensus.believed
+        loops = self.consensus.accepted
         solution = pose_graph.optimise(self._corrected, [*self._chain.edges, *(loop.edge for loop in loops)])
         for loop, weight in zip(list(loops), solution.weights[len(self._chain.edges) :], strict=True):
             if weight == 0:
-                self.consensus.disown(loop)
+                self.consensus.withdraw(loop)
                 self.counts.closed -= 1
         self._corrected = solution.nodes
         self.counts.optimisations += 1
-        self._optimised_at, self._due, self._news = self.counts.keyframes, False, True
+        self._optimised_at, self._optimisation_due, self._is_new = self.counts.keyframes, False, True
         log.debug("closed %d loops: χ² %.1f → %.1f", self.counts.closed, solution.before, solution.after)
 
     def _remember(self, number: int, seen: PlaceView) -> None:
@@ -228,19 +242,19 @@ class LoopClosing:
         self._places.add(number, seen)
 
     def _dispensable(self) -> int:
-        """The place that leaves the smallest gap along the way."""
+        """Place whose removal leaves the smallest gap along the way."""
         places = sorted(self._places.views)
         ways = np.array([self._chain.ways[place] for place in places])
         return places[1 + int(np.argmin(ways[2:] - ways[:-2]))] if len(places) > 2 else places[0]
 
 
-def _view(frame: Frame) -> PlaceView | None:
+def _described(frame: Frame) -> PlaceView | None:
     depth = _depth(frame)
-    return None if depth is None else view(frame, depth)
+    return None if depth is None else place_view(frame, depth)
 
 
 def _depth(frame: Frame) -> NDArray[np.float32] | None:
-    """(H, W) metres; of a stereo pair matched here, quickly."""
+    """Depth of a frame, (H, W) metres; of a stereo pair by quick matching."""
     if frame.left is None or frame.right is None or frame.baseline_fx is None:
         return frame.depth_m
     from tsfusion.geometry.stereo_matching import quick_disparity

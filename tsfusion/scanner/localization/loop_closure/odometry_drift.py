@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How far odometry may be off: the chain of tracking keyframes with its growing uncertainty."""
+"""Uncertainty of odometry, and how it grows along the chain of tracking keyframes."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ class OdometryDrift:
 
     Attributes:
         translation, rotation: metres and radians after one metre; they grow with the root of the way.
-        translation_bias, rotation_bias: metres and radians a metre, always to one side.
+        translation_bias, rotation_bias: systematic error, metres and radians a metre.
         floor: metres (and a third of it in radians) of each single step.
     """
 
@@ -27,10 +27,10 @@ class OdometryDrift:
 
 
 class OdometryChain:
-    """Tracking keyframes in order: poses as odometry gives them, and what lies between any two.
+    """Tracking keyframes in order: odometry's poses, and the motion between any two with its covariance.
 
-    The covariance of a stretch is a difference of two sums in the world's axes, so asking costs the same
-    over ten keyframes and over ten thousand.
+    The covariance of a stretch is a difference of two sums in the world's axes: it costs the same over ten
+    keyframes and over ten thousand.
 
     Attributes:
         poses: keyframe → (4, 4) T_world_camera by odometry.
@@ -46,7 +46,7 @@ class OdometryChain:
         self._sums: dict[int, se3.Matrix6] = {}  # (6, 6), world axes
 
     def add(self, number: int, T_world_camera: se3.Transform) -> None:
-        """The next keyframe."""
+        """Append a keyframe with its (4, 4) pose by odometry."""
         last = next(reversed(self.poses), None)
         if last is None:
             self.ways[number], self._sums[number] = 0.0, np.zeros((6, 6))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is kept of a keyframe to know the place again, and which kept places look most like a new one."""
+"""Place recognition: descriptions of keyframes, and the index that finds the most similar ones."""
 
 from dataclasses import dataclass
 
@@ -14,28 +14,28 @@ from tsfusion.scanner.localization.features import back_project, bilinear
 FEATURES = 500
 CAPACITY = 1000  # places remembered
 
-_SMALLEST = 32  # pixels of an image's shorter side
-_SMALL = 4800  # pixels of the kept depth image, about
-_TABLES, _BITS = 8, 14
+_MIN_SIDE = 32  # pixels of an image's shorter side
+_DEPTH_PIXELS = 4800  # of the kept depth image, about
+_TABLES, _BITS = 8, 14  # hash tables, and bits of their keys
 _DEPTH_NOISE = 0.002  # metres at one metre (Khoshelham and Elberink 2012: 0.0014)
 _DISPARITY_NOISE = 0.5  # pixels
-_COMMON = 0.3  # share of the places from which on a key tells nothing
+_MAX_COMMON = 0.3  # share of the places beyond which a key tells nothing
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlaceView:
-    """A keyframe's looks: 36 KB with 500 features.
+    """Features and small depth image of a keyframe: 36 KB with 500 features.
 
     Attributes:
         descriptors: (n, 32) uint8, ORB (Rublee et al. 2011).
         pixels: (n, 2) float32.
         points: (n, 3) float32 in the camera's axes, metres; NaN where there is no depth.
         depth_mm: (h, w) uint16 millimetres, 0 = none: medians over blocks of the image.
-        intrinsics: of `pixels`.
-        small: intrinsics of `depth_mm`.
+        intrinsics: camera of `pixels`.
+        small: camera of `depth_mm`.
         size: width and height of the image, pixels.
         noise: metres of depth error at one metre; it grows with the square.
-        measured: whether a depth camera saw the depth, rather than a stereo matcher.
+        measured: whether a depth camera measured the depth, rather than a stereo matcher.
     """
 
     descriptors: NDArray[np.uint8]
@@ -49,10 +49,10 @@ class PlaceView:
     measured: bool
 
 
-def view(frame: Frame, depth_m: NDArray[np.float32]) -> PlaceView | None:
-    """Of a frame with its (H, W) depth in metres; None where there is no camera, or no image to speak of."""
+def place_view(frame: Frame, depth_m: NDArray[np.float32]) -> PlaceView | None:
+    """Describe a frame with its (H, W) metres of depth; None without intrinsics or an image large enough."""
     gray, K = frame.gray, frame.intrinsics
-    if gray is None or K is None or min(gray.shape) < _SMALLEST:
+    if gray is None or K is None or min(gray.shape) < _MIN_SIDE:
         return None
     orb = cv2.ORB_create(nfeatures=FEATURES, fastThreshold=10)  # type: ignore[attr-defined]
     keypoints, descriptors = orb.detectAndCompute(gray, None)
@@ -60,7 +60,7 @@ def view(frame: Frame, depth_m: NDArray[np.float32]) -> PlaceView | None:
         keypoints, descriptors = (), np.empty((0, 32), np.uint8)
     pixels = np.array([point.pt for point in keypoints], np.float32).reshape(-1, 2)
     z = bilinear(depth_m, pixels)
-    factor = max(1, round(float(np.sqrt(depth_m.size / _SMALL))))
+    factor = max(1, round(float(np.sqrt(depth_m.size / _DEPTH_PIXELS))))
     return PlaceView(
         descriptors=descriptors,
         pixels=pixels,
@@ -75,7 +75,7 @@ def view(frame: Frame, depth_m: NDArray[np.float32]) -> PlaceView | None:
 
 
 def _medians(depth: NDArray[np.uint16], factor: int) -> NDArray[np.uint16]:
-    """Every `factor`-th pixel: the median of nine of its block, where five or more of them have depth."""
+    """Shrink a depth image: the median of nine pixels a block, where five or more of them have depth."""
     height, width = depth.shape[0] // factor, depth.shape[1] // factor
     if factor < 3:
         return np.ascontiguousarray(depth[::factor, ::factor][:height, :width])
@@ -89,9 +89,9 @@ def _medians(depth: NDArray[np.uint16], factor: int) -> NDArray[np.uint16]:
 
 
 class PlaceIndex:
-    """Places by number, found again by what they look like.
+    """Places by number, found by similar descriptors.
 
-    Descriptors vote for places that have one alike: locality-sensitive hashing (Gionis, Indyk and Motwani
+    Descriptors vote for places that have a similar one: locality-sensitive hashing (Gionis, Indyk and Motwani
     1999), eight tables over 14 bits each. Memory: 16 KB a place of the capacity, beside the views.
     """
 
@@ -99,49 +99,49 @@ class PlaceIndex:
         rng = np.random.default_rng(7)
         self._bits = np.stack([rng.choice(256, _BITS, replace=False) for _ in range(_TABLES)])
         self._capacity = capacity
-        self._seen = np.zeros((_TABLES << _BITS, -(-capacity // 8)), np.uint8)  # a bit for each place
+        self._table = np.zeros((_TABLES << _BITS, -(-capacity // 8)), np.uint8)  # a bit for each place
         self._votes = np.ones(capacity)  # by how many descriptors a place can get votes
         self._numbers = np.full(capacity, -1, np.int64)
         self.views: dict[int, PlaceView] = {}
 
     @property
     def full(self) -> bool:
-        """Whether one must be forgotten before another is added."""
+        """Whether a place must be forgotten before another is added."""
         return len(self.views) >= self._capacity
 
     def add(self, number: int, view: PlaceView) -> None:
         """Remember a place under its number; there must be room."""
         slot = int(np.flatnonzero(self._numbers < 0)[0])
         self._numbers[slot] = number
-        self._seen[self._keys(view), slot >> 3] |= np.uint8(128 >> (slot & 7))
+        self._table[self._keys(view), slot >> 3] |= np.uint8(128 >> (slot & 7))
         self._votes[slot] = np.sqrt(max(len(view.descriptors), 1))
         self.views[number] = view
 
     def forget(self, number: int) -> None:
-        """Its memory goes to the next one added."""
+        """Forget a place, which makes room for another."""
         slot = int(np.flatnonzero(self._numbers == number)[0])
         self._numbers[slot] = -1
-        self._seen[:, slot >> 3] &= np.uint8(255 ^ 128 >> (slot & 7))
+        self._table[:, slot >> 3] &= np.uint8(255 ^ 128 >> (slot & 7))
         del self.views[number]
 
     def most_similar(self, view: PlaceView, *, before: int | None = None, count: int = 4) -> list[int]:
         """The places (with numbers below `before`) that look most like the view, best first."""
         allowed = self._numbers >= 0
         slots = np.flatnonzero(allowed if before is None else allowed & (self._numbers < before))
-        scores = self._count(view)[slots] / self._votes[slots]
+        scores = self._votes_for(view)[slots] / self._votes[slots]
         best = np.argsort(-scores, kind="stable")[:count]
         return [int(self._numbers[slots[i]]) for i in best if scores[i] > 0]
 
     def _keys(self, view: PlaceView) -> NDArray[np.int64]:
-        """Rows of `_seen` that the descriptors fall into."""
+        """Rows of `_table` that the descriptors fall into."""
         bits = np.unpackbits(view.descriptors, axis=1)
         powers = 1 << np.arange(_BITS)
         keys = [(bits[:, chosen] @ powers) + (table << _BITS) for table, chosen in enumerate(self._bits)]
         return np.unique(np.concatenate(keys)).astype(np.int64)
 
-    def _count(self, view: PlaceView) -> NDArray[np.float64]:
-        rows = np.unpackbits(self._seen[self._keys(view)], axis=1)[:, : self._capacity]
-        common = rows.sum(axis=1, dtype=np.int32) > max(_COMMON * len(self.views), 2)
+    def _votes_for(self, view: PlaceView) -> NDArray[np.float64]:
+        rows = np.unpackbits(self._table[self._keys(view)], axis=1)[:, : self._capacity]
+        common = rows.sum(axis=1, dtype=np.int32) > max(_MAX_COMMON * len(self.views), 2)
         rows[common] = 0
         votes: NDArray[np.float64] = rows.sum(axis=0, dtype=np.float64)
         return votes

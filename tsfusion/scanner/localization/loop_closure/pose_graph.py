@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Pose-graph optimisation: where poses are, given what is known between pairs of them.
+"""Pose-graph optimisation: poses from measurements between pairs of them.
 
 Sparse Levenberg-Marquardt over SE(3) with analytic Jacobians. Edges marked `robust` (loops) may be wrong:
 graduated non-convexity with truncated least squares (Yang, Antonante, Tzoumas and Carlone, "Graduated
-Non-Convexity for Robust Spatial Perception", 2020) finds out which ones, from any start.
+Non-Convexity for Robust Spatial Perception", 2020) finds the wrong ones from any start.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,20 +17,20 @@ from tsfusion.core.errors import MissingDependency
 from tsfusion.geometry import se3
 
 TRUSTED = 22.5  # χ² of six degrees of freedom that one in a thousand exceeds
-_GROWTH = 1.4  # of the control parameter, as in the paper
-_FIRST = 10  # iterations with all edges, before wrong ones are looked for
-_SETTLED = 1e-9  # metres and radians: a step this small ends the iterations
+_GROWTH = 1.4  # factor of the control parameter, as in the paper
+_FIRST_ITERATIONS = 10  # with all edges, before wrong ones are sought
+_MIN_STEP = 1e-9  # metres and radians: a smaller step ends the iterations
 
 
 @dataclass(frozen=True, eq=False)
 class PoseGraphEdge:
-    """What is known of node `end` seen from node `start`.
+    """Measured pose of node `end` in the axes of node `start`.
 
     Attributes:
         T_start_end: (4, 4), pose of `end` in the axes of `start`.
         information: (6, 6) inverse covariance of the twist `log(T_start_end⁻¹ · T_start⁻¹ T_end)`,
             translation first; `information(…)` makes one.
-        robust: it may be altogether wrong.
+        robust: whether the measurement may be altogether wrong.
     """
 
     start: int
@@ -61,7 +61,7 @@ class PoseGraphSolution:
 
 
 def information(translation: float, rotation: float) -> se3.Matrix6:
-    """(6, 6) of independent errors: standard deviations in metres and radians."""
+    """Information (6, 6) of independent errors with standard deviations in metres and radians."""
     return np.diag([translation**-2.0] * 3 + [rotation**-2.0] * 3)
 
 
@@ -72,12 +72,12 @@ def optimise(
     trusted: float = TRUSTED,
     iterations: int = 300,
 ) -> PoseGraphSolution:
-    """The poses that fit the edges best; the first node stays where it is.
+    """Find the poses that fit the edges best; the first node stays where it is.
 
     Args:
         nodes: node → (4, 4) to begin with, each connected to the first one by edges.
         trusted: χ² up to which a robust edge counts as right.
-        iterations: linear systems solved at most.
+        iterations: maximum number of linear systems solved.
 
     Raises:
         MissingDependency: without scipy.
@@ -91,7 +91,7 @@ def optimise(
         )
     start = problem.chi2(T)
     robust = np.array([edge.robust for edge in edges])
-    T, used = problem.descend(T, weights, min(_FIRST, iterations))
+    T, used = problem.descend(T, weights, min(_FIRST_ITERATIONS, iterations))
     chi2 = problem.chi2(T)
     worst = float(chi2[robust].max(initial=0.0))
     if worst > trusted:
@@ -103,7 +103,7 @@ def optimise(
             if np.isin(weights, (0.0, 1.0)).all():
                 break
         weights = np.where(robust & (chi2 > trusted), 0.0, 1.0)
-    if used >= _FIRST:  # not settled yet
+    if used >= _FIRST_ITERATIONS:  # not settled yet
         T, more = problem.descend(T, weights, max(iterations - used, 1))
         used, chi2 = used + more, problem.chi2(T)
     return PoseGraphSolution(
@@ -137,7 +137,7 @@ class _Problem:
         self._lay_out()
 
     def _lay_out(self) -> None:
-        """Where in a CSC matrix each number of the edges' four 6×6 blocks is added."""
+        """Find the place in a CSC matrix of each number of the edges' four 6×6 blocks."""
         six = np.arange(6)
         first, second = (6 * (ends[:, None] - 1) + six for ends in (self._start, self._end))  # (m, 6)
         rows, columns = [], []
@@ -155,17 +155,17 @@ class _Problem:
         self._known, self._ends = ends >= 0, ends[ends >= 0]
 
     def errors(self, T: se3.Transform) -> se3.Twist:
-        """(m, 6) twists by which the edges are not met."""
+        """Errors of the edges, (m, 6) twists."""
         return se3.log(self._inverse @ se3.inverse(T[self._start]) @ T[self._end])
 
     def chi2(self, T: se3.Transform) -> NDArray[np.float64]:
-        """(m,) squared errors in the edges' own units."""
+        """Squared errors, (m,), weighted by the edges' information."""
         return _squares(self.errors(T), self._information)
 
     def descend(
         self, T: se3.Transform, weights: NDArray[np.float64], steps: int
     ) -> tuple[se3.Transform, int]:
-        """The poses after at most `steps` of Levenberg-Marquardt, and how many there were."""
+        """Run at most `steps` of Levenberg-Marquardt; return the poses and the number of steps."""
         damping, error = 1e-7, self.errors(T)
         cost = float(weights @ _squares(error, self._information))
         for step in range(steps):
@@ -176,13 +176,13 @@ class _Problem:
                 moved[1:] = T[1:] @ se3.exp(x.reshape(-1, 6))
                 new_error = self.errors(moved)
                 new = float(weights @ _squares(new_error, self._information))
-                if new <= cost or np.abs(x).max(initial=0.0) < _SETTLED:
+                if new <= cost or np.abs(x).max(initial=0.0) < _MIN_STEP:
                     break
                 damping = max(damping, 1e-7) * 10
             if new >= cost:
                 return T, step + 1
             gained, T, error, cost, damping = cost - new, moved, new_error, new, damping / 10
-            if np.abs(x).max() < _SETTLED or gained < 1e-10 * cost:
+            if np.abs(x).max() < _MIN_STEP or gained < 1e-10 * cost:
                 return T, step + 1
         return T, steps
 
@@ -223,7 +223,7 @@ def _squares(error: NDArray[np.float64], information: NDArray[np.float64]) -> ND
 
 
 def require() -> tuple[Any, Any]:
-    """scipy's sparse linear algebra and matrices.
+    """Import scipy's sparse linear algebra and matrices.
 
     Raises:
         MissingDependency: without scipy.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Whether two views show one place, and from where: matches, poses both ways, the depth of every pixel."""
+"""Verification that two views show one place: matches, poses both ways, the depth of every pixel."""
 
 from dataclasses import dataclass
 
@@ -8,34 +8,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
-from tsfusion.scanner.localization.loop_closure.dense_alignment import Agreement, agreement, refined
+from tsfusion.scanner.localization.loop_closure.dense_alignment import Agreement, agreement, refine
 from tsfusion.scanner.localization.loop_closure.place_index import PlaceView
 
-_RATIO = 0.9  # of the best descriptor distance to the second
-_FARTHEST = 64  # bits of 256 in which a match may differ
-_TOLERANCE = 3.0  # pixels at 640 of width
-_INLIERS = 20
-_SPREAD = 0.05  # of the image, covered by the hull of what agrees
-_DISAGREE = (0.06, 4.0)  # of the scene's depth; degrees: between the poses found both ways
-# Shares of the pixels that say something, for measured depth and for matched: those that must agree, and
-# those, at most, where one camera saw through what the other saw. Seen: true loops >= 0.92 and <= 0.007 in
-# a kitchen (Kinect), false ones of a corridor with a tiled floor <= 0.90 and >= 0.065.
-_AGREE = (0.85, 0.6)
-_THROUGH = (0.04, 0.12)
-_OVERLAP = 0.2  # of the pixels with depth
+MAX_RATIO = 0.9  # of the best descriptor distance to the second
+MAX_DIFFERENT_BITS = 64  # of 256, in a match
+PIXEL_TOLERANCE = 3.0  # pixels at 640 of width
+MIN_INLIERS = 20
+MIN_SPREAD = 0.05  # share of the image covered by the hull of the matches that agree
+MAX_DISTANCE, MAX_DEGREES = 0.06, 4.0  # between the poses found both ways; the first of the scene's depth
+# Shares of the pixels with depth in both views, for measured depth and for depth from stereo: those that
+# must agree, and those, at most, where one camera sees through the other's surface. True loops in a kitchen
+# (Kinect) have >= 0.92 and <= 0.007, false ones of a corridor with a tiled floor <= 0.90 and >= 0.065.
+MIN_AGREEMENT = (0.85, 0.6)
+MAX_THROUGH = (0.04, 0.12)
+MIN_OVERLAP = 0.2  # share of the pixels with depth
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LoopCheck:
-    """What came of comparing two views.
+    """Result of comparing two views.
 
     Attributes:
-        T_old_new: (4, 4) pose of the new camera in the old one's axes; None where refused before one was
-            found.
-        refused: why they are not taken for the same place; None = they are.
-        inliers: matches that agree with the pose.
-        sigma: metres by which the pose may be off.
-        depths: how the dense depths agree; None where not compared.
+        T_old_new: (4, 4) pose of the new camera in the old one's axes; None = none was found.
+        refused: reason not to take them for the same place; None = they are the same.
+        inliers: number of matches that agree with the pose.
+        sigma: standard deviation of the pose, metres.
+        depths: agreement of the dense depths; None = not compared.
     """
 
     T_old_new: se3.Transform | None = None
@@ -48,11 +47,11 @@ class LoopCheck:
 def check(old: PlaceView, new: PlaceView) -> LoopCheck:
     """Compare two views of a camera, or of two cameras.
 
-    Repeated structure is refused where anything differs: depth that contradicts is looked for in both
-    directions. Places that are alike in every pixel pass; only a trajectory tells them apart.
+    Repeated structure is refused where the depth of either view contradicts the other. Places that are alike
+    in every pixel pass; only the trajectory tells them apart.
     """
     first, second = matches(old.descriptors, new.descriptors)
-    if len(first) < _INLIERS:
+    if len(first) < MIN_INLIERS:
         return LoopCheck(refused=f"{len(first)} matches")
     forward = _pose(old.points[first], new.pixels[second], new)
     backward = None if forward is None else _pose(new.points[second], old.pixels[first], old)
@@ -64,15 +63,15 @@ def check(old: PlaceView, new: PlaceView) -> LoopCheck:
     T = forward[0]
     depth = float(np.nanmedian(old.points[first][:, 2]))
     apart = T @ backward[0]
-    if se3.distance(apart) > _DISAGREE[0] * depth or np.degrees(se3.angle(apart)) > _DISAGREE[1]:
+    if se3.distance(apart) > MAX_DISTANCE * depth or np.degrees(se3.angle(apart)) > MAX_DEGREES:
         return LoopCheck(T_old_new=T, refused="the poses found both ways differ", inliers=count)
     T = T @ se3.exp(-0.5 * se3.log(apart))
-    if count < _INLIERS:
+    if count < MIN_INLIERS:
         return LoopCheck(T_old_new=T, refused=f"{count} matches agree", inliers=count)
     spread = min(_hull(old.pixels[first], old.size), _hull(new.pixels[second], new.size))
-    if spread < _SPREAD:
+    if spread < MIN_SPREAD:
         return LoopCheck(T_old_new=T, refused=f"matches cover {spread:.0%} of the image", inliers=count)
-    T = refined(old, new, T, first, second)
+    T = refine(old, new, T, first, second)
     depths = agreement(old, new, T)
     refused = _contradiction(depths, measured=old.measured and new.measured)
     near = float(np.nanpercentile(old.points[first][:, 2], 25))
@@ -81,7 +80,7 @@ def check(old: PlaceView, new: PlaceView) -> LoopCheck:
 
 
 def matches(old: NDArray[np.uint8], new: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of (n, 32) and (m, 32) descriptors that are each other's best, clearly."""
+    """Match (n, 32) and (m, 32) descriptors: rows that are clearly each other's nearest."""
     if min(len(old), len(new)) < 2:
         return np.empty(0, np.int64), np.empty(0, np.int64)
     # Of ±1 vectors the product is 256 minus twice the Hamming distance: one for both directions.
@@ -90,7 +89,9 @@ def matches(old: NDArray[np.uint8], new: NDArray[np.uint8]) -> tuple[NDArray[np.
     mutual = distance.argmin(axis=0)[best] == rows
     nearest = distance[rows, best]
     distance[rows, best] = np.inf
-    kept = np.flatnonzero(mutual & (nearest < _FARTHEST) & (nearest < _RATIO * distance.min(axis=1)))
+    kept = np.flatnonzero(
+        mutual & (nearest < MAX_DIFFERENT_BITS) & (nearest < MAX_RATIO * distance.min(axis=1))
+    )
     return kept, best[kept]
 
 
@@ -101,12 +102,12 @@ def _signs(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
 def _pose(
     points: NDArray[np.float32], pixels: NDArray[np.float32], camera: PlaceView
 ) -> tuple[se3.Transform, NDArray[np.bool_]] | None:
-    """T_points_camera and which agree, from three points at a time (P3P) and refinement."""
+    """T_points_camera by RANSAC over three points (P3P) and refinement, and (n,) which points agree."""
     known = np.flatnonzero(np.isfinite(points[:, 2]))
     if len(known) < 8:
         return None
     cv2.setRNGSeed(0)
-    tolerance = _TOLERANCE * max(camera.size[0] / 640, 0.5)
+    tolerance = PIXEL_TOLERANCE * max(camera.size[0] / 640, 0.5)
     points3, pixels2 = points[known].astype(np.float64), pixels[known].astype(np.float64)
     K = camera.intrinsics.matrix
     found, rvec, tvec, chosen = cv2.solvePnPRansac(
@@ -129,10 +130,10 @@ def _hull(pixels: NDArray[np.float32], size: tuple[int, int]) -> float:
 
 
 def _contradiction(depths: Agreement, *, measured: bool) -> str | None:
-    if depths.overlap < _OVERLAP:
+    if depths.overlap < MIN_OVERLAP:
         return f"the views share {depths.overlap:.0%}"
-    if depths.through > _THROUGH[not measured]:
+    if depths.through > MAX_THROUGH[not measured]:
         return f"{depths.through:.0%} of the pixels see through the other view's surfaces"
-    if depths.agree < _AGREE[not measured]:
+    if depths.agree < MIN_AGREEMENT[not measured]:
         return f"the depths agree in {depths.agree:.0%} of the pixels"
     return None

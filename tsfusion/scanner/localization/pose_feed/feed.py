@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Poses that another process publishes while the scan goes on: any SLAM, over a ZeroMQ socket.
+"""Localizer that receives poses from another process, such as a SLAM, over a ZeroMQ socket.
 
-`feed_messages` says what is sent; contrib/pose_sender.py is a sender.
+`messages` defines the format; contrib/pose_sender.py is a sender.
 """
 
 import logging
@@ -25,32 +25,32 @@ from tsfusion.wire import sockets
 log = logging.getLogger(__name__)
 
 WAIT = 0.1  # seconds for a pose that is under way; docs/localization.md says so
-_BUSY = 0.1  # seconds that messages are taken for one frame, so that a flood cannot hold it up
-_SILENCE = 5.0  # seconds; libzmq gives some connections up for good, so that it is made again
-_ANOTHER_CLOCK = 3600.0  # seconds
-_KINDS = 20  # of reasons that are told apart
-_NS = 1_000_000_000
+MAX_RECEIVE = 0.1  # seconds of receiving messages for one frame, so that a flood cannot hold it up
+RECONNECT_AFTER = 5.0  # seconds of silence; libzmq gives some connections up for good
+ANOTHER_CLOCK = 3600.0  # seconds between pose and frame
+MAX_REASONS = 20  # counted apart
+_NS = 1_000_000_000  # nanoseconds a second
 
 
 class PoseFeed:
-    """`Localizer` that hears poses on a ZeroMQ SUB socket and interpolates them at the frame's stamp.
+    """`Localizer` that receives poses on a ZeroMQ SUB socket and interpolates them at the frame's timestamp.
 
-    What is malformed is counted and dropped. Corrections are moved from the stamps they name to the tracking
-    keyframes around them.
+    Malformed messages are counted and dropped. Corrections are interpolated from their timestamps to the
+    tracking keyframes.
 
     Args:
         address: `tcp://host:port` to connect to, where a PUB socket is bound; or `@tcp://127.0.0.1:port` to
-            bind here, for senders that connect. There are no keys: only this machine's own can be bound.
-        max_gap_s: seconds between two poses; between those farther apart there is none.
+            bind here, for senders that connect. There are no keys, so only local addresses can be bound.
+        max_gap_s: seconds between two poses at most; there is no pose in longer gaps.
         time_offset_s: seconds to add to a frame's stamp before its pose is looked up.
         wait_s: seconds a frame waits for the pose after it.
 
     Attributes:
-        received: messages taken.
-        dropped: messages that were not, by reason.
+        received: number of valid messages.
+        dropped: number of malformed messages, by reason.
 
     Raises:
-        InvalidConfig: for an address that is none, or open to others.
+        InvalidConfig: for a malformed address, or one open to other machines.
         TransportError: when it cannot be bound.
     """
 
@@ -71,11 +71,11 @@ class PoseFeed:
 
     @property
     def address(self) -> str:
-        """Where it listens, with the real port; or where it is connected to."""
+        """Address it is bound to, with the real port, or connected to."""
         return self._socket.endpoint
 
     def close(self) -> None:
-        """Let go of the socket; may be called twice."""
+        """Close the socket; may be called twice."""
         self._closing()
 
     def __enter__(self) -> "PoseFeed":
@@ -85,7 +85,7 @@ class PoseFeed:
         self.close()
 
     def track(self, frame: Frame) -> Pose | Lost:
-        """The feed's pose at the frame's stamp, waited for a moment if need be."""
+        """Interpolate the feed's poses at the frame's timestamp; wait up to `wait_s` for the next one."""
         if not frame.timestamp_ns:
             return Lost(reason="the frame has no time, so that no pose can be looked up", timestamp_ns=0)
         stamp = frame.timestamp_ns + self._offset_ns
@@ -105,18 +105,18 @@ class PoseFeed:
         return pose
 
     def corrections(self) -> PoseCorrections | None:
-        """What the sender's loop closure found out since the last call."""
+        """Return the sender's corrections if there are new ones since the last call."""
         return self._deformation.new_corrections()
 
     def reset(self) -> None:
-        """The world stays the sender's."""
+        """Forget the tracking keyframes; the world stays the sender's."""
         self._anchors.reset()
         self._deformation.reset()
 
     def _receive(self, seconds: float) -> None:
-        """Take the messages that are there; wait for the first one at most so long."""
+        """Process the messages that are there; wait at most `seconds` for the first one."""
         parts = self._socket.receive(seconds)
-        enough = time.monotonic() + _BUSY
+        enough = time.monotonic() + MAX_RECEIVE
         while parts is not None:
             self._process(parts)
             if time.monotonic() > enough:
@@ -141,7 +141,7 @@ class PoseFeed:
 
     def _drop(self, reason: str) -> None:
         kind = re.split(r",| \(| - ", reason)[0]
-        self.dropped[kind if kind in self.dropped or len(self.dropped) < _KINDS else "others"] += 1
+        self.dropped[kind if kind in self.dropped or len(self.dropped) < MAX_REASONS else "others"] += 1
         if self.dropped.total() == 1:
             log.warning("a message from %s is no pose and was dropped: %s", self.address, reason)
 
@@ -152,7 +152,7 @@ class PoseFeed:
                 return f"no pose has come yet to @{self.address}, where it listens: senders connect to it"
             return f"no pose has come {where} yet"
         away = (stamp - self._history.last_ns) / _NS
-        if abs(away) > _ANOTHER_CLOCK:
+        if abs(away) > ANOTHER_CLOCK:
             return (
                 f"the last pose {where} is {abs(away):.0f} s away from the frame: are these the same clock?"
             )
@@ -165,7 +165,7 @@ class PoseFeed:
 
 
 class _FeedSocket:
-    """The SUB socket, made anew when nothing has come for a while."""
+    """SUB socket that is opened anew after a silence."""
 
     def __init__(self, address: str) -> None:
         self.binds = address.startswith("@")
@@ -183,11 +183,11 @@ class _FeedSocket:
             raise
 
     def receive(self, seconds: float) -> list[bytes] | None:
-        """The frames of the next message; None when none comes in time."""
+        """Receive the frames of the next message; None when none comes in time."""
         if self._socket.poll(round(seconds * 1000)):
-            self._heard = time.monotonic()
+            self._last_received = time.monotonic()
             return self._socket.recv_multipart()
-        if not self.binds and time.monotonic() - self._heard > _SILENCE:
+        if not self.binds and time.monotonic() - self._last_received > RECONNECT_AFTER:
             self._socket.close()
             self._socket = sockets.pose_feed(self._context, MAX_BYTES)
             self._open()
@@ -197,7 +197,7 @@ class _FeedSocket:
         self._context.destroy(linger=0)
 
     def _open(self) -> None:
-        self._heard = time.monotonic()
+        self._last_received = time.monotonic()
         if self.binds:
             self.endpoint = sockets.bind_one(self._socket, self._target)
         else:

@@ -12,10 +12,10 @@ from tsfusion.scanner.localization.pose_feed.pose_history import PoseHistory
 
 
 class MapDeformation:
-    """How a corrected graph moves odometry's world, by time.
+    """Motion of odometry's world by corrected poses, as a function of time.
 
-    At each of the graph's stamps it is the corrected pose times the inverse of the one sent before. Between
-    two of them it goes evenly from one to the other; before the first and after the last it stays.
+    At each corrected timestamp it is the corrected pose times the inverse of the pose sent before. Between
+    two timestamps it is interpolated; before the first and after the last it is constant.
     """
 
     def __init__(self) -> None:
@@ -23,16 +23,16 @@ class MapDeformation:
         self._moves: list[se3.Transform] = []
         self._T_corrected_world = np.eye(4)
         self._loops = 0
-        self._news = False
+        self._is_new = False
         self._anchors: dict[int, tuple[int, se3.Transform]] = {}
         self._revision = 0
 
     def add(self, anchor: int, stamp_ns: int, T_world_camera: se3.Transform) -> None:
-        """A tracking keyframe."""
+        """Add a tracking keyframe."""
         self._anchors[anchor] = stamp_ns, T_world_camera
 
     def apply(self, corrected: FeedCorrections, history: PoseHistory, max_gap_ns: int) -> int:
-        """Take a graph for the truth; how many of its stamps no pose is known of."""
+        """Apply new corrections; return the number of their timestamps without a known pose."""
         before = [history.at(stamp, max_gap_ns=max_gap_ns) for stamp in corrected.stamps_ns]
         known = [
             (stamp, after @ se3.inverse(T))
@@ -46,14 +46,14 @@ class MapDeformation:
             self._T_corrected_world = (
                 last if corrected.T_corrected_world is None else corrected.T_corrected_world
             )
-            self._loops, self._news = corrected.loops, True
+            self._loops, self._is_new = corrected.loops, True
         return unknown
 
     def new_corrections(self) -> PoseCorrections | None:
-        """What the graph means for every tracking keyframe since `reset`, once."""
-        if not self._news:
+        """Corrected poses of all tracking keyframes since `reset`; None if they were returned before."""
+        if not self._is_new:
             return None
-        self._news, self._revision = False, self._revision + 1
+        self._is_new, self._revision = False, self._revision + 1
         return PoseCorrections(
             revision=self._revision,
             anchors={
@@ -64,7 +64,7 @@ class MapDeformation:
         )
 
     def reset(self) -> None:
-        """Forget the tracking keyframes; what the graph says stays true."""
+        """Forget the tracking keyframes; the corrections stay."""
         self._anchors.clear()
         self._revision = 0
 

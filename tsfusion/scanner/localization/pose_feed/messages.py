@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""What another process may say on a pose feed.
+"""Messages of a pose feed, and their decoding.
 
 A message is one frame, JSON or MessagePack, a map of:
 
 - `stamp_ns`: integer, of the clock that stamps the frames.
 - `pose`: `[tx, ty, tz, qx, qy, qz, qw]`, or the 16 numbers of T_world_camera row by row; of the sensor whose
   frames are followed, OpenCV axes (a LiDAR: its own). It is odometry: it must not jump when a loop is closed.
-- `lost`: true instead of a pose: the sender does not know where the sensor was.
-- `corrections`: what loop closure found, alone or beside a pose. A map of `stamps_ns`, of poses sent before;
+- `lost`: true instead of a pose: the sender does not know the pose.
+- `corrections`: result of loop closure, alone or beside a pose. A map of `stamps_ns`, of poses sent before;
   `poses`, their corrected ones, each as above; `loops`, closed so far (optional); and `T_corrected_world`, as
   a pose, which moves odometry poses from now on (optional; RTAB-Map's map_to_odom). The newest replaces all
   others.
 
-Keys that are not known are passed over.
+Unknown keys are ignored.
 """
 
 from typing import Annotated
@@ -26,8 +26,8 @@ from tsfusion.geometry.keyframe import check_pose
 from tsfusion.geometry.se3 import Transform
 from tsfusion.geometry.trajectory import rigid
 
-MAX_BYTES = 1 << 20  # of a message: corrections of 5,000 poses in JSON, 15,000 in MessagePack
-_FARTHEST = 1e7  # metres from the origin
+MAX_BYTES = 1 << 20  # a message: corrections of 5,000 poses in JSON, 15,000 in MessagePack
+MAX_DISTANCE = 1e7  # metres from the origin
 
 Stamp = Annotated[int, Meta(ge=1, le=2**63 - 1)]
 Numbers = Annotated[list[float], Meta(min_length=7, max_length=16)]
@@ -48,7 +48,7 @@ class _RawMessage(Struct):
 
 
 class FeedCorrections(Struct, frozen=True, kw_only=True):
-    """Corrected poses of moments, in order of their stamps."""
+    """Corrected poses in order of their timestamps."""
 
     stamps_ns: list[int]
     poses: list[Transform]
@@ -57,7 +57,7 @@ class FeedCorrections(Struct, frozen=True, kw_only=True):
 
 
 class FeedMessage(Struct, frozen=True, kw_only=True):
-    """One message. `pose` None with a stamp: the sender is lost."""
+    """One message. `pose` is None with a timestamp when the sender is lost."""
 
     stamp_ns: int | None
     pose: Transform | None
@@ -69,7 +69,11 @@ _msgpack = msgspec.msgpack.Decoder(_RawMessage)
 
 
 def decode(message: bytes) -> FeedMessage:
-    """Raises DecodeError for anything that is not as described above."""
+    """Decode a message of either encoding.
+
+    Raises:
+        DecodeError: the message is not as described above.
+    """
     try:
         # A map never begins with `{` in MessagePack.
         raw = (_json if message.lstrip()[:1] == b"{" else _msgpack).decode(message)
@@ -99,7 +103,7 @@ def _corrections(raw: _RawCorrections) -> FeedCorrections:
 
 
 def _matrix(numbers: list[float]) -> Transform:
-    """(4, 4) from 7 or 16 numbers. Raises DecodeError or InvalidKeyframe."""
+    """Convert 7 or 16 numbers to (4, 4). Raises DecodeError or InvalidKeyframe."""
     values = np.array(numbers, dtype=np.float64)
     if len(values) == 16:
         T = values.reshape(4, 4)
@@ -110,6 +114,6 @@ def _matrix(numbers: list[float]) -> Transform:
         T = rigid(values[3:] / norm, values[:3])
     else:
         raise DecodeError(f"a pose has 7 or 16 numbers, got {len(values)}")
-    if not np.abs(T).max() <= _FARTHEST:
-        raise DecodeError(f"a pose must lie within {_FARTHEST:g} m")
+    if not np.abs(T).max() <= MAX_DISTANCE:
+        raise DecodeError(f"a pose must lie within {MAX_DISTANCE:g} m")
     return check_pose(T)

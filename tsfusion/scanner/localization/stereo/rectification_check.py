@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Whether a stereo pair is as well rectified as it claims: seen from its own images, without a target.
+"""Check of a stereo pair's rectification from its own images, without a calibration target.
 
-Rows: a corner of the left image and its match in the right one must lie in the same row. Disparity: one that
-is off by the same amount everywhere bends space, and that shows when the camera moves (see `reprojection`).
-Both come from a wrong or an old calibration.
+Rows: a corner of the left image and its match in the right one must lie in the same row. Disparity: an error
+that is the same everywhere bends space, which shows when the camera moves (see `reprojection`). Both errors
+come from a wrong or an old calibration.
 """
 
 import logging
@@ -16,30 +16,29 @@ from tsfusion.scanner.localization.features import Pixels
 
 _log = logging.getLogger(__name__)
 
-ROWS_LIMIT = 0.8  # pixels; seen: KITTI 06 0.6
-DISPARITY_LIMIT = 0.4  # pixels; KITTI 06 shows 0.1
-_PAIRS = 8
-_FEWEST = 30  # matches of one pair
-_SURE = 3.0  # standard deviations
-_TRUSTED = 0.3  # pixels of an offset's standard deviation: more says that the sensor did not move enough
-_TURNS = 3
-_SWAPPED_BY = 2.0  # pixels
-_MOST = 0.7  # of the matches
+ROWS_LIMIT = 0.8  # pixels; KITTI 06 has 0.6
+DISPARITY_LIMIT = 0.4  # pixels; KITTI 06 has 0.1
+SAMPLES = 8  # pairs, and motions, until the verdict
+MIN_MATCHES = 30  # of one pair
+SIGNIFICANT = 3.0  # standard deviations
+MAX_OFFSET_SIGMA = 0.3  # pixels: with more, the sensor did not move enough to tell
+FIT_ROUNDS = 3
+MIN_SWAP, MIN_SWAPPED_SHARE = 2.0, 0.7  # pixels to the wrong side, and share of the matches that are there
 
 
 @dataclass(frozen=True, kw_only=True)
 class RectificationCheck:
-    """What the first pairs say of their rectification.
+    """Rectification errors found in the first pairs.
 
     Attributes:
-        pairs: how many were looked at.
-        matches: corners compared.
-        rows_px: by how many rows the right image's points lie lower than the left's, at the image's centre.
+        pairs: number of pairs compared.
+        matches: number of corners compared.
+        rows_px: rows by which the right image's points lie lower than the left's, at the image's centre.
         roll_deg: clockwise turn of the right image against the left one, seen along the view.
         stretch: factor of the right image's height against the left's.
         worst_rows_px: the largest row error of these three within the image.
-        disparity_px: by how much every disparity is too high; None = cannot be told yet (too little motion).
-        problems: for a person, each with what to do; empty = nothing was found.
+        disparity_px: pixels by which every disparity is too high; None = not known yet (too little motion).
+        problems: texts for the user, each with what to do; empty = nothing was found.
     """
 
     pairs: int
@@ -53,15 +52,15 @@ class RectificationCheck:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing was found."""
+        """Whether no problem was found."""
         return not self.problems
 
 
 class RectificationMonitor:
-    """Collects what pairs and motions show, and warns once of each thing that is wrong.
+    """Collect errors of pairs and motions, and warn once of each problem.
 
     Attributes:
-        check: the verdict; None until enough pairs were seen.
+        check: result so far; None until there were enough pairs.
     """
 
     def __init__(self) -> None:
@@ -73,17 +72,17 @@ class RectificationMonitor:
 
     @property
     def wants_pair(self) -> bool:
-        """Whether another pair's matches are of use."""
-        return len(self._left) < _PAIRS
+        """Whether another pair is needed."""
+        return len(self._left) < SAMPLES
 
     @property
     def wants_motion(self) -> bool:
-        """Whether another motion's offset is of use."""
-        return len(self._offsets) < _PAIRS
+        """Whether another motion's offset is needed."""
+        return len(self._offsets) < SAMPLES
 
     def add_pair(self, left: Pixels, right: Pixels, shape: tuple[int, ...]) -> None:
-        """(n, 2) pixels of the same corners in both images of one pair."""
-        if len(left) < _FEWEST:
+        """Add the (n, 2) pixels of the same corners in both images of one pair."""
+        if len(left) < MIN_MATCHES:
             return
         self._left.append(left)
         self._right.append(right)
@@ -94,8 +93,8 @@ class RectificationMonitor:
             self._check_disparity()
 
     def add_motion(self, offset: float, sigma: float) -> None:
-        """What one motion says all disparities lack, pixels."""
-        if np.isfinite([offset, sigma]).all() and sigma < _TRUSTED:
+        """Add the offset of all disparities that one motion gives, pixels."""
+        if np.isfinite([offset, sigma]).all() and sigma < MAX_OFFSET_SIGMA:
             self._offsets.append(offset)
             self._sigmas.append(sigma)
             self._check_disparity()
@@ -125,7 +124,7 @@ def _check_rows(left: list[Pixels], right: list[Pixels], shape: tuple[int, ...])
             f"{roll:+.2f}°, height ×{1 + by_row:.4f}): the pair is not rectified; calibrate the two cameras "
             "again, or rectify the images",
         )
-    if np.mean(second[:, 0] > first[:, 0] + _SWAPPED_BY) > _MOST:
+    if np.mean(second[:, 0] > first[:, 0] + MIN_SWAP) > MIN_SWAPPED_SHARE:
         problems += ("points lie farther right in the right image: left and right are swapped",)
     return RectificationCheck(
         pairs=len(left),
@@ -148,19 +147,19 @@ def _disparity_problem(too_high: float) -> str:
 
 
 def _sure_offset(offsets: NDArray[np.float64], sigmas: NDArray[np.float64]) -> float:
-    """The motions' median, or 0 where that may be chance."""
+    """Median of the motions' offsets, or 0 where it is not significant."""
     middle = float(np.median(offsets))
     spread = 1.4826 * float(np.median(np.abs(offsets - middle)))
     error = max(spread, float(np.median(sigmas))) / np.sqrt(len(offsets))
-    return middle if abs(middle) > _SURE * error else 0.0
+    return middle if abs(middle) > SIGNIFICANT * error else 0.0
 
 
 def _plane(centred: NDArray[np.floating], rows: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(shift, by column, by row) of the row differences: least squares, mismatches left out by turns."""
+    """Fit (shift, by column, by row) to the row differences by least squares, without mismatches."""
     A = np.column_stack([np.ones(len(centred)), centred]).astype(np.float64)
     kept = np.abs(rows - np.median(rows)) < 4.0
     solution = np.zeros(3)
-    for _ in range(_TURNS):
+    for _ in range(FIT_ROUNDS):
         solution = np.linalg.lstsq(A[kept], rows[kept], rcond=None)[0]
         residual = np.abs(rows - A @ solution)
         kept = residual < max(3 * 1.4826 * float(np.median(residual)), 0.1)
