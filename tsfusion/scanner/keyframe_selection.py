@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which frames become keyframes of the map. (A tracker's own keyframes are another matter.)"""
+"""Selection of the map's keyframes. (Trackers have keyframes of their own.)"""
 
 from collections.abc import Callable
 
@@ -11,15 +11,16 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 
 INDOORS, OUTDOORS = 0.1, 2.0  # metres between keyframes
-_STEP = 16  # pixels between those whose overlap is looked at
+_STRIDE = 16  # pixels between those whose overlap is computed
 
 
 class KeyframeSelector:
-    """A frame becomes a keyframe when it sees enough that is new.
+    """Select frames that see enough new surface.
 
-    It does when less than `min_overlap` of the last keyframe's pixels (those with a depth) lie in its view,
-    or the sensor has moved by `distance` or turned by `angle` since, but not sooner than `max_rate` allows.
-    Stereo pairs and points have no overlap: their depth is not known yet, or all around.
+    A frame becomes a keyframe when less than `min_overlap` of the last keyframe's pixels (those with a depth)
+    lie in its view, or the sensor has moved by `distance` or turned by `angle` since, but not sooner than
+    `max_rate` allows.
+    Stereo pairs and points have no overlap: their depth is unknown yet, or on all sides.
 
     Args:
         config: the rules.
@@ -30,10 +31,10 @@ class KeyframeSelector:
         self._config = config
         self._distance = config.distance or (OUTDOORS if outdoors else INDOORS)
         self._last: tuple[NDArray[np.float64], int] | None = None
-        self._seen: Callable[[NDArray[np.float64]], float] | None = None
+        self._overlap: Callable[[NDArray[np.float64]], float] | None = None
 
     def reason(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> str | None:
-        """Why this frame is to be a keyframe: `first`, `distance`, `angle` or `overlap`; None = it is not."""
+        """Rule that selects the frame: `first`, `distance`, `angle` or `overlap`; None = not selected."""
         if self._last is None:
             return "first"
         T_world_last, stamp = self._last
@@ -45,39 +46,39 @@ class KeyframeSelector:
             return "distance"
         if np.degrees(se3.angle(T_last_now)) >= self._config.angle:
             return "angle"
-        if self._seen is not None and self._seen(se3.inverse(T_last_now)) < self._config.min_overlap:
+        if self._overlap is not None and self._overlap(se3.inverse(T_last_now)) < self._config.min_overlap:
             return "overlap"
         return None
 
     def accept(self, frame: Frame, T_world_camera: NDArray[np.float64]) -> None:
-        """This frame is a keyframe now: the next are compared to it."""
+        """Make the frame the last keyframe, which the next ones are compared with."""
         self._last = (T_world_camera, frame.timestamp_ns)
-        self._seen = _overlap(frame)
+        self._overlap = _overlap(frame)
 
     def reset(self) -> None:
-        """The next frame is the first of a new world."""
-        self._last = self._seen = None
+        """Make the next frame the first of a new world."""
+        self._last = self._overlap = None
 
 
 def _overlap(frame: Frame) -> Callable[[NDArray[np.float64]], float] | None:
-    """T_now_last → share of this frame's pixels that lie in the view of the camera there."""
+    """Function from T_now_last to the share of this frame's pixels that are in the view from there."""
     K, depth = frame.intrinsics, frame.depth_m
     if depth is None or K is None:
         return None
     height, width = depth.shape
-    z = depth[_STEP // 2 :: _STEP, _STEP // 2 :: _STEP].astype(np.float64)
+    z = depth[_STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE].astype(np.float64)
     v, u = np.nonzero(z)
     z = z[v, u]
     if not len(z):
         return None
-    u, v = u * _STEP + _STEP // 2, v * _STEP + _STEP // 2
+    u, v = u * _STRIDE + _STRIDE // 2, v * _STRIDE + _STRIDE // 2
     points = np.stack([(u - K.cx) / K.fx * z, (v - K.cy) / K.fy * z, z], axis=1)
 
-    def seen(T_now_last: NDArray[np.float64]) -> float:
+    def overlap(T_now_last: NDArray[np.float64]) -> float:
         x, y, z = se3.apply(T_now_last, points).T
         ahead = z > 0
         column, row = K.fx * x[ahead] / z[ahead] + K.cx, K.fy * y[ahead] / z[ahead] + K.cy
         inside = (column >= 0) & (column <= width - 1) & (row >= 0) & (row <= height - 1)
         return float(inside.sum() / len(points))
 
-    return seen
+    return overlap

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The scanner: a source of frames, a localizer, the choice of keyframes, and the client that sends them.
+"""The scanner: a source of frames, a localizer, keyframe selection, and the client that sends keyframes.
 
-No Taichi here: it runs on the robot.
+It runs on the robot, without Taichi.
 """
 
 import logging
@@ -29,14 +29,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(eq=False)
 class Submap:
-    """A world of its own: everything between two losses.
+    """Frames tracked in one world, between two losses.
 
     Attributes:
-        name: of the map it goes into.
-        client: sends its keyframes.
-        located: its frames, in order.
-        corrections: the newest of loop closure, None = there were none.
-        corrected_seq: number of the last keyframe whose correction the client was told.
+        name: name of its map.
+        client: client that sends its keyframes.
+        located: its frames with a pose, in order.
+        corrections: the newest from loop closure; None = there were none.
+        corrected_seq: number of the last keyframe whose corrected pose was handed to the client.
     """
 
     name: str
@@ -46,25 +46,25 @@ class Submap:
     corrected_seq: int = 0
 
     def correct(self) -> None:
-        """Have the client say where its keyframes were, by the newest corrections."""
+        """Hand the corrected poses of all keyframes to the client."""
         assert self.corrections is not None
         seqs, poses = self.located.keyframes(self.corrections)
         if len(seqs):
             self.corrected_seq = int(seqs[-1])
-            said = dict(zip(seqs.tolist(), poses, strict=True))
-            self.client.correct(said, T_map_odometry=self.corrections.T_corrected_world)
+            corrected = dict(zip(seqs.tolist(), poses, strict=True))
+            self.client.correct(corrected, T_map_odometry=self.corrections.T_corrected_world)
 
 
 class ScanState(msgspec.Struct, frozen=True, kw_only=True):
-    """How a scan is doing.
+    """Progress of a scan.
 
     Attributes:
-        why: what a lost sensor lacks.
-        selected: keyframes by the rule that chose them.
-        loops: closed so far, over all submaps.
-        stats: of all clients together.
-        link: why the server takes nothing at the moment; empty when it does.
-        keyframe_delay_ms: captured to fused, of the newest keyframe that is known; None = none yet.
+        why: reason of the last loss; empty while tracking.
+        selected: number of keyframes by the rule that selected them.
+        loops: number of closed loops over all submaps.
+        stats: sums over all clients.
+        link: why the server takes no keyframes at the moment; empty when it does.
+        keyframe_delay_ms: from capture to fusion, of the newest fused keyframe; None = none yet.
     """
 
     state: State
@@ -82,20 +82,20 @@ class ScanState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Scanner:
-    """Takes frames one by one; `run` takes all of a source.
+    """Localize frames and send keyframes.
 
     A lost sensor sends nothing. When it is not found again within `patience` seconds of the frames' clock,
     the localizer begins a new world, whose keyframes go into a map of their own: NAME-2, NAME-3, …; it is
     opened when there is a pose again.
 
     Args:
-        localizer: says where each frame was taken.
-        config: when a keyframe is taken, and how long to be patient.
+        localizer: finds the pose of each frame.
+        config: rules of keyframe selection, and `patience`.
         connect: opens a client that sends to the map of that name.
-        map_name: of the first submap.
+        map_name: name of the first submap.
         taken: names that no submap may have.
         outdoors: see `KeyframeSelector`.
-        most: submaps; a sensor that is lost once more has to find back into the last. None = any number.
+        most: largest number of submaps; then a lost sensor has to be found again in the last one. None = any.
     """
 
     def __init__(
@@ -122,13 +122,13 @@ class Scanner:
         self.submaps: list[Submap] = [Submap(map_name, connect(map_name))]
 
     def run(self, frames: Iterable[Frame], watch: Callable[["Scanner"], None]) -> None:
-        """Take every frame, and let `watch` look after each."""
+        """Process every frame, and call `watch` after each."""
         for frame in frames:
             self.process(frame)
             watch(self)
 
     def process(self, frame: Frame) -> None:
-        """Find the frame's pose, and send it if it is a keyframe."""
+        """Localize a frame, and send it if it is a keyframe."""
         before = time.process_time()
         found = self._localizer.track(frame)
         self._tracking_cpu += time.process_time() - before
@@ -142,18 +142,18 @@ class Scanner:
             self._correct(corrections)
 
     def finish(self) -> None:
-        """No frame comes any more: keyframes since the last loops are moved by what those said, too."""
+        """Correct the keyframes since the last loop closure too. Call it after the last frame."""
         for submap in self.submaps:
             if submap.corrections is not None and submap.located.last_seq > submap.corrected_seq:
                 submap.correct()
 
     @property
     def tracking_cpu_ms(self) -> float:
-        """CPU milliseconds of the process while the localizer was at work, a frame."""
+        """CPU milliseconds of the process in the localizer, per frame."""
         return 1000 * self._tracking_cpu / max(self._frames, 1)
 
     def state(self) -> ScanState:
-        """What to show."""
+        """Progress so far."""
         clients = [submap.client for submap in self.submaps]
         return ScanState(
             state=self._state,
@@ -224,7 +224,7 @@ class Scanner:
 
 
 def _total(stats: list[ClientStats]) -> ClientStats:
-    """Sums of the counts; of the state, the first that is not well."""
+    """Sum the counts; of the state, take the first that is not ok."""
 
     def together(values: list[Any]) -> Any:
         if isinstance(values[0], dict):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A trajectory that grows for hours: its frames' poses in plain numbers, some 300 bytes each."""
+"""Trajectory that may grow for hours: the poses of its frames in about 300 bytes each."""
 
 from array import array
 
@@ -18,22 +18,22 @@ Poses = NDArray[np.float64]  # (n, 4, 4)
 
 
 class TrackedTrajectory:
-    """Frames that have a pose, in order.
+    """Frames with a pose, in order.
 
-    The number of a frame as a keyframe is -1 where it is none, or was left out.
+    The keyframe number is -1 for frames that are no keyframes, or were dropped.
     """
 
     def __init__(self) -> None:
-        self._numbers = array("q")  # stamp, anchor, seq, place of the reference
+        self._numbers = array("q")  # timestamp, anchor, seq, index of the reference
         self._poses = array("d")  # T_world_camera, T_anchor_camera
         self._references = array("d")
 
     def add(self, pose: Pose, reference: Transform | None, seq: int | None) -> None:
-        """The next frame.
+        """Append a frame.
 
         Args:
-            reference: (4, 4), what the source itself said of the pose; None = nothing.
-            seq: its number as a keyframe, if it is one.
+            reference: (4, 4), the source's own pose; None = it has none.
+            seq: keyframe number; None = no keyframe.
         """
         at = _NONE
         if reference is not None:
@@ -47,30 +47,30 @@ class TrackedTrajectory:
 
     @property
     def stamps_ns(self) -> list[int]:
-        """Of the frames."""
+        """Timestamps of the frames, nanoseconds."""
         return self._numbers[::_COLUMNS].tolist()
 
     @property
     def seqs(self) -> NDArray[np.int64]:
-        """(n,): numbers of keyframes; -1 where a frame is none."""
+        """Keyframe numbers of the frames, (n,); -1 where a frame is none."""
         return np.array(self._numbers[2::_COLUMNS], dtype=np.int64)
 
     @property
     def last_seq(self) -> int:
-        """Number of the last keyframe; -1 = there is none."""
+        """Number of the last keyframe; -1 without one."""
         return int(self.seqs.max(initial=_NONE))
 
     def poses(self, corrections: PoseCorrections | None = None) -> Poses:
-        """(n, 4, 4) T_world_camera, as tracked, or after loop closure."""
+        """Poses of all frames, (n, 4, 4) T_world_camera: as tracked, or corrected."""
         return self._corrected(corrections, np.arange(len(self)))
 
     def keyframes(self, corrections: PoseCorrections | None = None) -> tuple[NDArray[np.int64], Poses]:
-        """The numbers of the keyframes, (m,), and (m, 4, 4) T_world_camera."""
+        """Keyframe numbers, (m,), and poses, (m, 4, 4) T_world_camera: as tracked, or corrected."""
         chosen = np.flatnonzero(self.seqs != _NONE)
         return self.seqs[chosen], self._corrected(corrections, chosen)
 
     def with_reference(self) -> tuple[NDArray[np.int64], Poses]:
-        """Which frames the source itself said a pose of, (m,), and (m, 4, 4) those."""
+        """Indices of the frames with a pose of the source's own, (m,), and those poses, (m, 4, 4)."""
         references = np.array(self._references).reshape(-1, 3, 4)
         return np.flatnonzero(self._columns[:, 3] != _NONE), _matrices(references)
 
@@ -83,8 +83,8 @@ class TrackedTrajectory:
         numbers, which = np.unique(self._columns[chosen, 1], return_inverse=True)
         known = np.array([number in corrections.anchors for number in numbers.tolist()], dtype=bool)
         anchors = np.array([corrections.anchors.get(number, np.eye(4)) for number in numbers.tolist()])
-        hang = known[which]
-        poses[hang] = anchors.reshape(-1, 4, 4)[which[hang]] @ _matrices(pairs[hang, 1])
+        anchored = known[which]
+        poses[anchored] = anchors.reshape(-1, 4, 4)[which[anchored]] @ _matrices(pairs[anchored, 1])
         return poses
 
     @property
@@ -101,6 +101,6 @@ def _bytes(T: Transform) -> bytes:
 
 
 def _matrices(rows: NDArray[np.float64]) -> Poses:
-    """(…, 4, 4) from (…, 3, 4)."""
+    """Append the row 0 0 0 1: (…, 3, 4) → (…, 4, 4)."""
     bottom = np.broadcast_to(np.array(_BOTTOM), (*rows.shape[:-2], 1, 4))
     return np.concatenate([rows, bottom], axis=-2)

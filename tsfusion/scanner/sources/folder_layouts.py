@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which files of a folder make up a frame, when a file is wholly written, and the camera of the folder."""
+"""Layouts of watched folders: the files of a frame, whether they are complete, and the camera."""
 
 import re
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ EXPECTED = (
 CAMERAS = ("camera-intrinsics.txt", "K.txt", "camera_intrinsic.json", "camera_intrinsics.json")
 COLOR = ("color", "rgb", "image", "images")
 
-_NOT_MEASURED = 65535  # how 7-Scenes marks it
+_NOT_MEASURED = 65535  # 7-Scenes' value for pixels without depth
 _IMAGES = r"\.(?:png|jpe?g)"
 _ANY_IMAGE, _PNG, _SCAN = (re.compile(rf"([^.].*){ending}") for ending in (_IMAGES, r"\.png", r"\.bin"))
 _FLAT_DEPTH, _FLAT_COLOR = re.compile(r"(frame-.+)\.depth\.png"), re.compile(rf"(frame-.+)\.color{_IMAGES}")
@@ -36,14 +36,14 @@ _NANOSECONDS = 19  # digits of a time of this century
 
 @dataclass(frozen=True)
 class FolderLayout:
-    """Where the files of a frame are: (folder, pattern of file names whose group is the frame's name)."""
+    """Folder and pattern of a frame's first and second file; the pattern's group is the frame's name."""
 
     kind: Kind
     first: tuple[Path, re.Pattern[str]]
     second: tuple[Path, re.Pattern[str]] | None = None
 
     def partner(self, name: str) -> Path | None:
-        """The second file of a frame, if it is there."""
+        """Second file of a frame; None = not there."""
         if self.second is None:
             return None
         where, pattern = self.second
@@ -53,7 +53,7 @@ class FolderLayout:
 
 
 def layout_of(root: Path) -> FolderLayout | None:
-    """The layout of what is in the folder so far; None = nothing that is known."""
+    """Recognise the layout of the files so far; None = unknown."""
     if (root / "depth").is_dir():
         color = next((root / name for name in COLOR if (root / name).is_dir()), root / COLOR[0])
         return FolderLayout("depth", (root / "depth", _PNG), (color, _ANY_IMAGE))
@@ -70,20 +70,20 @@ def layout_of(root: Path) -> FolderLayout | None:
 
 
 def order(name: str) -> Key:
-    """Names in the order of their numbers: 9 before 10, 1.25 before 1.5."""
+    """Sort key of names by their numbers: 9 before 10, 1.25 before 1.5."""
     parts = re.findall(r"([0-9]+(?:\.[0-9]+)?)|([^0-9]+)", name)
     return tuple((0, Decimal(number), "") if number else (1, Decimal(0), text) for number, text in parts)
 
 
 def time_of(name: str) -> int | None:
-    """Nanoseconds, of a name that is decimal seconds (TUM) or nanoseconds (EuRoC)."""
+    """Timestamp in a name, nanoseconds: of decimal seconds (TUM) or nanoseconds (EuRoC); None = neither."""
     if re.fullmatch(r"\d+\.\d+", name, re.ASCII):
         return int(Decimal(name) * 1_000_000_000)
     return int(name) if re.fullmatch(rf"\d{{{_NANOSECONDS}}}", name, re.ASCII) else None
 
 
 def whole_image(path: Path, flags: int) -> NDArray[Any] | None:
-    """The image, decoded as OpenCV's `flags` say; None while not wholly written, or if damaged."""
+    """Decode an image with OpenCV's `flags`; None while it is incomplete, or if it is damaged."""
     raw = path.read_bytes()
     if not raw.endswith(_PNG_END if path.suffix == ".png" else _JPEG_END):
         return None
@@ -91,7 +91,7 @@ def whole_image(path: Path, flags: int) -> NDArray[Any] | None:
 
 
 def whole_scan(path: Path) -> NDArray[np.float32] | None:
-    """(n, 3) float32 points of x, y, z, intensity; None where the file does not hold whole ones."""
+    """Read (n, 3) float32 points from x, y, z, intensity; None if the file ends within a point."""
     raw = path.read_bytes()
     if not raw or len(raw) % _POINT:
         return None
@@ -99,17 +99,17 @@ def whole_scan(path: Path) -> NDArray[np.float32] | None:
 
 
 def depth_of(image: NDArray[Any]) -> NDArray[Any]:
-    """A depth image with 0 for what was not measured."""
+    """Set pixels that were not measured to 0, in place."""
     if image.dtype == np.uint16:
         image[image == _NOT_MEASURED] = 0
     return image
 
 
 def camera_of(root: Path) -> Intrinsics | None:
-    """The intrinsics written in the folder (`CAMERAS`), in it or one above; None = not there (yet).
+    """Read the intrinsics (`CAMERAS`) from the folder or its parent; None = not there (yet).
 
     Raises:
-        DatasetError: the file is malformed, or only half written.
+        DatasetError: the file is malformed or incomplete.
     """
     for place in (root, root.parent):
         for name in CAMERAS:
@@ -120,10 +120,10 @@ def camera_of(root: Path) -> Intrinsics | None:
 
 
 def baseline_of(root: Path) -> float | None:
-    """Metres, from `baseline.txt`; None = not there (yet).
+    """Read the baseline, metres, from `baseline.txt`; None = not there (yet).
 
     Raises:
-        DatasetError: it is not one number above 0.
+        DatasetError: the file does not hold one number > 0.
     """
     path = root / "baseline.txt"
     if not path.is_file():

@@ -24,17 +24,17 @@ _LENSES = {
     "kannala_brandt4": "equidistant",
 }
 _ADVICE = "Close other programs that use it, or try another cable and USB 3 port"
-_SLICE_MS = 100  # between two looks at whether the source was closed
-_APART = 0.75  # of a period: images further apart are not of one exposure
-_REORDERED = 16  # sets that librealsense could have under way
-_OLDEST_S = 1.0  # the stamp of a camera's frame that seems older is of another clock
+_WAIT_MS = 100  # between two checks whether the source was closed
+_MAX_SKEW = 0.75  # of a period: images further apart are not of one exposure
+_MAX_REORDERED = 16  # framesets that librealsense may have under way
+_OLDEST_S = 1.0  # timestamps of frames that seem older are of another clock
 
 
 class RealSense(LiveSource):
-    """Depth brought onto colour, or the rectified infrared pair, of one RealSense.
+    """Depth registered to colour, or the rectified infrared pair, of one RealSense.
 
-    The projector and all other options stay as they are on the camera. A live camera hands out its newest
-    frames; those that a slow consumer misses count as `dropped`. A recording hands out all of them.
+    The projector and all other options stay as they are on the camera. A live camera yields its newest
+    frames; those that a slow consumer misses count as `dropped`. A recording yields all of them.
 
     Args:
         camera: serial number; default the first one found.
@@ -42,10 +42,10 @@ class RealSense(LiveSource):
         device: a `pyrealsense2.device` of this process instead (a software device).
         images: `depth`, or `infrared`: the pair of the stereo cameras. Switch the dot projector off for it:
             its dots move with the camera.
-        color: with the colour camera, where there is one; without it depth stays on its own pixels.
+        color: whether to use the colour camera, where there is one; without it depth keeps its own pixels.
         size: (height, width) of all images of a camera.
         fps: frames a second of a camera.
-        real_time: play a recording at the speed it was taken, with what that drops.
+        real_time: whether to play a recording at its own speed, which may drop frames.
         deadline: seconds without a frame after which a camera counts as stopped.
         sensor: sensor model; default `realsense`, `tof` for a camera without a baseline, `stereo` for the
             infrared pair.
@@ -77,7 +77,7 @@ class RealSense(LiveSource):
         recording = None if recording is None else Path(recording).expanduser()
         super().__init__(f"RealSense {camera or (recording.name if recording else '')}".strip(), "realsense")
         self.live = recording is None or real_time
-        self._played, self._deadline, self._number = recording is not None, deadline, -_REORDERED
+        self._played, self._deadline, self._number = recording is not None, deadline, -_MAX_REORDERED
         try:
             self._stream, self._color = realsense_frames.open_stream(
                 self._rs, camera=camera, recording=recording, device=device, images=images, color=color,
@@ -117,7 +117,7 @@ class RealSense(LiveSource):
 
     def _next(self) -> Any:
         try:
-            return self._stream.wait(_SLICE_MS)
+            return self._stream.wait(_WAIT_MS)
         except RuntimeError as error:
             if self._closed.is_set():
                 return None
@@ -129,7 +129,7 @@ class RealSense(LiveSource):
         return SourceError(f"{self.name} delivered no complete frames for {self._deadline:g} s. {_ADVICE}")
 
     def _prepare(self) -> None:
-        """Read the calibration of the streams in use."""
+        """Read the calibration of the streams."""
         stream = self._rs.stream
         if self._infrared:
             left, right = (self._stream.profile(stream.infrared, index) for index in (1, 2))
@@ -152,7 +152,7 @@ class RealSense(LiveSource):
     def _depth(self, frames: Any) -> Frame | None:
         depth = frames.get_depth_frame()
         color = frames.get_color_frame() if self._color else None
-        if not self._whole(depth, color, needed=self._color):
+        if not self._is_complete(depth, color, needed=self._color):
             return None
         timestamp_ns, captured_ns = self._stamps(depth)
         if self._color:
@@ -178,7 +178,7 @@ class RealSense(LiveSource):
 
     def _infrared_pair(self, frames: Any) -> Frame | None:
         left, right = frames.get_infrared_frame(1), frames.get_infrared_frame(2)
-        if not self._whole(left, right, needed=True):
+        if not self._is_complete(left, right, needed=True):
             return None
         timestamp_ns, captured_ns = self._stamps(left)
         grey = np.array(left.get_data())
@@ -193,13 +193,13 @@ class RealSense(LiveSource):
             captured_ns=captured_ns,
         )
 
-    def _whole(self, first: Any, second: Any, *, needed: bool) -> bool:
-        """Whether the set has a new first image and its second of the same exposure; counts what has not.
+    def _is_complete(self, first: Any, second: Any, *, needed: bool) -> bool:
+        """Whether a frameset has a new first image and a second of the same exposure; count those without.
 
-        Numbers left out were dropped; a set may repeat an image beside the next one of the other stream;
-        a number that is much smaller comes from a camera that began anew.
+        Missing frame numbers were dropped; a set may repeat an image beside the next one of the other stream;
+        a number that is much smaller comes from a camera that was restarted.
         """
-        if not first or 0 <= self._number - first.frame_number < _REORDERED:
+        if not first or 0 <= self._number - first.frame_number < _MAX_REORDERED:
             return False
         if 0 <= self._number < first.frame_number - 1:
             self._skip("dropped", first.frame_number - 1 - self._number)
@@ -208,7 +208,7 @@ class RealSense(LiveSource):
             return True
         period_ms = 1000 / first.profile.fps()
         one_clock = second and first.frame_timestamp_domain == second.frame_timestamp_domain
-        if not second or (one_clock and abs(first.timestamp - second.timestamp) > _APART * period_ms):
+        if not second or (one_clock and abs(first.timestamp - second.timestamp) > _MAX_SKEW * period_ms):
             self._skip("incomplete")
             return False
         return True
@@ -222,7 +222,7 @@ class RealSense(LiveSource):
 
 
 def _undistorter(profile: Any, name: str) -> Undistorter | None:
-    """For colour cameras that are not corrected in the camera (D455, D405); None for all others.
+    """Undistorter of colour cameras whose images are distorted (D455, D405); None for all others.
 
     Librealsense projects with the forward polynomial in all three Brown-Conrady models (`rs2_project`).
     """

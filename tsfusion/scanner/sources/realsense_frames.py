@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Sets of frames from librealsense: through its pipeline, or from the sensors of a device in this process.
+"""Streams of framesets from librealsense: its pipeline, or the sensors of a device in this process.
 
-Everything here raises RuntimeError where librealsense does.
+Every function raises RuntimeError where librealsense does.
 """
 
 from pathlib import Path
@@ -19,7 +19,7 @@ _QUEUE = 4  # framesets a syncer keeps; the oldest goes first
 
 
 class RealSenseStream(Protocol):
-    """Where framesets come from.
+    """Stream of framesets.
 
     Attributes:
         device: `pyrealsense2.device`.
@@ -28,20 +28,20 @@ class RealSenseStream(Protocol):
     device: Any
 
     def wait(self, milliseconds: int) -> Any:
-        """The next frameset; None if there is none in time."""
+        """Wait for the next frameset; None if there is none in time."""
 
     def over(self) -> bool:
-        """Whether nothing more will be added to what waits already."""
+        """Whether no frameset will follow those that are queued."""
 
     def profile(self, stream: Any, index: int = -1) -> Any:
-        """The video stream profile in use."""
+        """Video stream profile in use."""
 
     def stop(self) -> None:
         """Stop streaming; may be called twice and from another thread."""
 
 
 class PipelineStream:
-    """A camera or a recording, as `config` says; `real_time` is None for a camera."""
+    """Camera or recording of a librealsense `config`; `real_time` is None for a camera."""
 
     def __init__(self, rs: Any, config: Any, *, real_time: bool | None) -> None:
         self._stopped = rs.playback_status.stopped
@@ -72,7 +72,7 @@ class PipelineStream:
 
 
 class DeviceStream:
-    """The streams wanted of a device, matched by librealsense's syncer.
+    """Streams of a device, matched by librealsense's syncer.
 
     Args:
         wanted: (stream, index or -1) of each.
@@ -125,7 +125,7 @@ def open_stream(
     fps: int,
     real_time: bool,
 ) -> tuple[RealSenseStream, bool]:
-    """The feed, and whether it has colour.
+    """Open the stream; also return whether it has colour.
 
     Raises:
         SourceError: there is no such camera.
@@ -155,14 +155,14 @@ def open_stream(
 
 
 def plugged_in(rs: Any, device: Any) -> bool:
-    """Whether the camera is still there."""
+    """Whether the camera is still connected."""
     if not device.supports(rs.camera_info.serial_number):
         return bool(device.is_connected())
     return bool(device.is_connected()) or device.get_info(rs.camera_info.serial_number) in _cameras(rs)
 
 
 def baseline(rs: Any, device: Any) -> float | None:
-    """Metres between the stereo cameras; None for other kinds."""
+    """Baseline of the stereo cameras, metres; None for other kinds of camera."""
     for sensor in device.query_sensors():
         if sensor.supports(rs.option.stereo_baseline):
             return abs(float(sensor.get_option(rs.option.stereo_baseline))) / 1000
@@ -170,7 +170,7 @@ def baseline(rs: Any, device: Any) -> float | None:
 
 
 def bgr(rs: Any, frame: Any) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8, a copy.
+    """Copy a colour frame as (H, W, 3) uint8 BGR.
 
     Raises:
         SourceError: a pixel format other than bgr8 and rgb8.
@@ -197,7 +197,7 @@ def _camera(rs: Any, serial: str | None) -> Any:
 
 
 def _cameras(rs: Any) -> dict[str, Any]:
-    """Serial number → device."""
+    """Connected devices by serial number."""
     key = rs.camera_info.serial_number
     return {device.get_info(key): device for device in rs.context().query_devices() if device.supports(key)}
 

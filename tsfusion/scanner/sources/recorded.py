@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A recorded dataset as a source of frames."""
+"""Sources that play a recorded dataset, or the first frames of another source."""
 
 import dataclasses
 import time
@@ -13,10 +13,10 @@ from tsfusion.scanner.sources.source import LiveSource, Source
 
 
 class RecordedSource(LiveSource):
-    """The frames of a dataset, in order; as if they came from a sensor.
+    """Play a dataset's frames in order, as if they came from a sensor.
 
     Args:
-        dataset: opened without poses, or with.
+        dataset: opened with poses or without.
         rate: frames a second; None = as fast as they are taken.
     """
 
@@ -29,7 +29,7 @@ class RecordedSource(LiveSource):
         self._dataset, self._rate = dataset, rate
 
     def __iter__(self) -> Iterator[Frame]:
-        """Frames with the recording's times, or nominal ones where it has none."""
+        """Yield frames with the recording's timestamps, or nominal ones where it has none."""
         due = time.monotonic()
         for index in range(len(self._dataset)):
             if self._rate is not None and index:
@@ -45,7 +45,7 @@ class RecordedSource(LiveSource):
 
 
 class LimitedSource:
-    """At most `limit` frames of a source, which is closed with it."""
+    """The first `limit` frames of a source; closes the source with itself."""
 
     def __init__(self, source: Source, limit: int) -> None:
         self.name, self.sensor, self.skipped = source.name, source.sensor, source.skipped
@@ -54,7 +54,7 @@ class LimitedSource:
         self._source, self._limit = source, limit
 
     def __iter__(self) -> Iterator[Frame]:
-        """Its frames, as they come."""
+        """Yield the source's frames, up to the limit."""
         return islice(iter(self._source), self._limit)
 
     def close(self) -> None:

@@ -19,7 +19,7 @@ _FORMS = "realsense, realsense:SERIAL, realsense:FILE.db3, camera:NUMBER|DEVICE|
 
 
 def is_live(spec: str) -> bool:
-    """Whether it names a live source, here or in an installed package; else it is a dataset's path."""
+    """Whether `spec` names a live source, of tsfusion or an installed package; otherwise it is a path."""
     name = spec.partition(":")[0]
     return name in _OWN or name in _others()
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a source of frames is."""
+"""The `Source` protocol, and the base of sources that wait for frames."""
 
 import queue
 import time
@@ -16,11 +16,11 @@ class Source(Protocol):
     """Frames in time order: a sensor, a folder that is being written to, a recording.
 
     Attributes:
-        name: what to call it in a report.
+        name: name for reports.
         sensor: name of the sensor model of its frames.
-        live: whether frames pass by while nobody takes them; those of a recording or a folder wait.
-        length: how many frames it has; None = nobody knows.
-        skipped: frames that were not handed out, by reason, so far.
+        live: whether frames are lost while nobody takes them; those of a recording or a folder wait.
+        length: number of frames; None = unknown.
+        skipped: number of frames left out so far, by reason.
     """
 
     name: str
@@ -30,14 +30,14 @@ class Source(Protocol):
     skipped: dict[str, int]
 
     def __iter__(self) -> Iterator[Frame]:
-        """Each frame as soon as it is there; ends when the source does.
+        """Yield each frame as soon as it arrives; end when the source does.
 
         Raises:
-            SourceError: the sensor stopped, with what to do about it.
+            SourceError: the sensor stopped; the message says what to do.
         """
 
     def close(self) -> None:
-        """Let go of the sensor; may be called twice, and from another thread to end the iteration."""
+        """Release the sensor; may be called twice, and from another thread to end the iteration."""
 
     def __enter__(self) -> "Source": ...
 
@@ -51,14 +51,14 @@ _Self = TypeVar("_Self", bound="LiveSource")
 
 
 class CloseFlag:
-    """A `threading.Event` that a signal's handler may set while its own thread waits for it."""
+    """Like `threading.Event`, but a signal handler may set it while its own thread waits."""
 
     def __init__(self) -> None:
         self._set = False
         self._wakeups: queue.SimpleQueue[None] = queue.SimpleQueue()  # its `put` is reentrant; a lock is not
 
     def set(self) -> None:
-        """From now on `is_set`, and whoever waits is woken."""
+        """Set the flag and wake the waiting thread."""
         self._set = True
         self._wakeups.put(None)
 
@@ -75,7 +75,7 @@ class CloseFlag:
 
 
 class LiveSource(ABC):
-    """A `Source`; `close` ends the iteration, which looks at `_closed` whenever it waits."""
+    """Base of sources: `close` ends the iteration, which checks `_closed` whenever it waits."""
 
     live = True
     length: int | None = None
@@ -87,10 +87,10 @@ class LiveSource(ABC):
 
     @abstractmethod
     def __iter__(self) -> Iterator[Frame]:
-        """Each frame as soon as it is there."""
+        """Yield each frame as soon as it arrives."""
 
     def close(self) -> None:
-        """End the iteration; more than once does no harm."""
+        """End the iteration; may be called twice."""
         self._closed.set()
 
     def __enter__(self: _Self) -> _Self:
@@ -102,11 +102,11 @@ class LiveSource(ABC):
         self.close()
 
     def _skip(self, reason: str, count: int = 1) -> None:
-        """Count frames that are not handed out."""
+        """Count frames that are left out."""
         self.skipped[reason] = self.skipped.get(reason, 0) + count
 
 
 def monotonic_of(wall_ns: int, *, oldest_s: float) -> int:
-    """`time.monotonic_ns()` at a moment of the wall clock; now, where that lies ahead or too far back."""
+    """Convert a wall clock time to `time.monotonic_ns()`; now, if it is in the future or too old."""
     now, age = time.monotonic_ns(), time.time_ns() - wall_ns
     return now - age if 0 <= age <= oldest_s * SECOND else now

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What makes raw stereo images a rectified pair."""
+"""Rectification of raw stereo images, and the frames made of them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 
 # A folder as a calibration: the files of the left and the right camera, or of intrinsics and extrinsics.
-TOGETHER = (
+FILE_PAIRS = (
     ("cam0/sensor.yaml", "cam1/sensor.yaml"),
     ("mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml"),
     ("left.yaml", "right.yaml"),
@@ -25,7 +25,7 @@ TOGETHER = (
 
 
 class PairRectifier(Protocol):
-    """A stereo camera's calibration at work; a `calibration.Rectifier` is one."""
+    """Rectifies pairs of images, as `calibration.Rectifier` does."""
 
     @property
     def intrinsics(self) -> Intrinsics: ...
@@ -37,12 +37,12 @@ class PairRectifier(Protocol):
     def size(self) -> Size: ...
 
     def pair(self, left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Both images rectified."""
+        """Rectify both images."""
 
 
 @dataclass(frozen=True)
 class AlreadyRectified:
-    """For images that are rectified already."""
+    """`PairRectifier` for images that are rectified already."""
 
     intrinsics: Intrinsics
     baseline_m: float
@@ -50,29 +50,29 @@ class AlreadyRectified:
 
     @property
     def baseline_fx(self) -> float:
-        """Metre · pixels."""
+        """Baseline times focal length, metre · pixels."""
         return self.baseline_m * self.intrinsics.fx
 
     def pair(self, left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Both images as they are."""
+        """Return both images as they are."""
         return left, right
 
 
 def read_rectifier(calibration: str | Path, *, size: Size | None) -> Rectifier:
-    """From a file, or from a folder that holds two which belong together (`TOGETHER`).
+    """Read a calibration from a file, or from a folder with a pair of files (`FILE_PAIRS`).
 
     Args:
-        size: (height, width) of one image, for files that do not say.
+        size: (height, width) of one image, for files without one.
 
     Raises:
-        SourceError: it cannot be read, and what was expected.
+        SourceError: it cannot be read; the message says what was expected.
     """
     path = Path(calibration).expanduser()
     files = [path]
     if path.is_dir():
-        found = [names for names in TOGETHER if all((path / name).is_file() for name in names)]
+        found = [names for names in FILE_PAIRS if all((path / name).is_file() for name in names)]
         if not found:
-            expected = "; ".join(" and ".join(names) for names in TOGETHER)
+            expected = "; ".join(" and ".join(names) for names in FILE_PAIRS)
             raise SourceError(f"{path} holds no calibration of a stereo camera; expected one of {expected}")
         files = [path / name for name in found[0]]
     try:
@@ -96,7 +96,7 @@ def frame_of(
     timestamp_ns: int,
     captured_ns: int,
 ) -> Frame:
-    """Raw images, grey or BGR, (H, W) or (H, W, 3) uint8, as a rectified frame with the left one's colour."""
+    """Make a rectified frame of raw images, (H, W) grey or (H, W, 3) BGR uint8; colour is the left one's."""
     left, right = pairs.pair(left, right)
     return Frame(
         sensor=sensor,

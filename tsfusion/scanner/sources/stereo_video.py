@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A stereo camera that shows both images side by side in one: through OpenCV's VideoCapture, or in a file."""
+"""Source of stereo pairs side by side in one picture, from a camera, a stream or a video file (OpenCV)."""
 
 import logging
 import os
@@ -23,23 +23,23 @@ from tsfusion.scanner.sources.stereo_pairs import AlreadyRectified, PairRectifie
 
 log = logging.getLogger(__name__)
 
-_SLICE_S = 0.1  # between two looks at whether the source was closed
-_JOIN_S = 2.0  # a driver that hangs is left to its own thread
+_WAIT_S = 0.1  # seconds between two checks whether the source was closed
+_JOIN_S = 2.0  # seconds to wait for a driver that hangs
 
 
 class StereoVideo(LiveSource):
-    """Left and right halves of one picture, as rectified pairs.
+    """Rectified pairs from the left and right halves of pictures.
 
-    Of a camera or a network stream the newest picture is handed out, and those in between count as
-    `dropped`; of a file every one.
+    A camera or a network stream yields its newest picture, and those in between count as `dropped`; a file
+    yields every picture.
 
     Args:
         place: the camera's number or device (`0`, `/dev/video0`), a stream's URL, or a file (or a pattern of
             files, `%06d.png`).
-        calibration: file or folder, as `pairs.rectifier` reads it.
-        intrinsics, baseline: instead, for pictures that are rectified already; pixels, metres.
-        size: (height, width) of one half, asked of the camera; default the calibration's, else the camera's.
-        fps: pictures a second asked of the camera; default its own.
+        calibration: file or folder, as `stereo_pairs.read_rectifier` reads it.
+        intrinsics, baseline: instead, for rectified pictures; pixels, metres.
+        size: (height, width) of one half to set the camera to; default the calibration's or the camera's.
+        fps: pictures a second to set the camera to; default its own.
         deadline: seconds without a picture after which a camera counts as stopped.
 
     Raises:
@@ -68,11 +68,11 @@ class StereoVideo(LiveSource):
         super().__init__(f"camera {place}", sensor)
         self._place, self._deadline = str(place), deadline
         self._file, self._reading = _is_file(self._place), threading.RLock()
-        pairs = None if calibration is None else _when_it_says(calibration, size)
+        pairs = None if calibration is None else _rectifier_of_known_size(calibration, size)
         wanted = size or (None if pairs is None else pairs.size)
         self._capture = _open(self._place, self._file, wanted, fps, deadline)
         try:
-            shown = _shown(self._capture)
+            shown = _half_size(self._capture)
             if calibration is None:
                 assert intrinsics is not None
                 assert baseline is not None
@@ -85,17 +85,17 @@ class StereoVideo(LiveSource):
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT) if self._file else 0
         self.length = int(count) if count > 0 else None
         self.live = not self._file
-        self._grabber = None if self._file else CameraThread(self._capture)
+        self._thread = None if self._file else CameraThread(self._capture)
 
     def __iter__(self) -> Iterator[Frame]:
-        for picture in self._all() if self._grabber is None else self._newest(self._grabber):
+        for picture in self._all() if self._thread is None else self._newest(self._thread):
             yield self._frame(picture)
 
     def close(self) -> None:
-        """Let go of the camera; a blocked iteration ends within a tenth of a second."""
+        """Release the camera; a blocked iteration ends within a tenth of a second."""
         super().close()
-        if self._grabber is not None:
-            self._grabber.close()
+        if self._thread is not None:
+            self._thread.close()
         else:
             with self._reading:
                 self._capture.release()
@@ -114,19 +114,19 @@ class StereoVideo(LiveSource):
         if not count and not self._closed.is_set():
             raise SourceError(f"{self._place} holds no pictures that can be decoded; expected a video")
 
-    def _newest(self, grabber: "CameraThread") -> Iterator["VideoPicture"]:
+    def _newest(self, thread: "CameraThread") -> Iterator["VideoPicture"]:
         last = time.monotonic()
         while not self._closed.is_set():
-            picture = grabber.take(_SLICE_S)
-            if grabber.dropped:
-                self.skipped["dropped"] = grabber.dropped
+            picture = thread.take(_WAIT_S)
+            if thread.dropped:
+                self.skipped["dropped"] = thread.dropped
             if picture is not None:
                 yield picture
                 last = time.monotonic()
             elif self._closed.is_set():
                 return
-            elif grabber.ended or time.monotonic() - last > self._deadline:
-                how = "stopped" if grabber.ended else f"delivered no picture for {self._deadline:g} s"
+            elif thread.ended or time.monotonic() - last > self._deadline:
+                how = "stopped" if thread.ended else f"delivered no picture for {self._deadline:g} s"
                 raise SourceError(
                     f"{self.name} {how}; is it still plugged in, "
                     "and is the USB port fast enough for its pictures?"
@@ -152,7 +152,7 @@ class StereoVideo(LiveSource):
 
 @dataclass(frozen=True, eq=False)
 class VideoPicture:
-    """One image as captured."""
+    """One picture with its times."""
 
     image: NDArray[np.uint8]
     timestamp_ns: int
@@ -160,11 +160,11 @@ class VideoPicture:
 
 
 class CameraThread:
-    """A thread that keeps a camera's newest picture, so that none waits in the driver's queue.
+    """Thread that keeps a camera's newest picture, so that none grows old in the driver's queue.
 
     Attributes:
-        dropped: pictures that a newer one replaced.
-        ended: the camera gives no more.
+        dropped: number of pictures replaced by a newer one.
+        ended: whether the camera has stopped.
     """
 
     def __init__(self, capture: Any) -> None:
@@ -176,14 +176,14 @@ class CameraThread:
         self._thread.start()
 
     def take(self, timeout: float) -> VideoPicture | None:
-        """The newest picture nobody took yet; None if there is none in time."""
+        """Remove and return the newest picture; None if there is none in time."""
         with self._changed:
             self._changed.wait_for(lambda: self._newest or self.ended or self._closed, timeout)
             picture, self._newest = self._newest, None
             return picture
 
     def close(self) -> None:
-        """The thread releases the camera: while it reads, nobody else may."""
+        """Stop the thread, which releases the camera: while it reads, no other thread may."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -211,8 +211,8 @@ class CameraThread:
             self._changed.notify_all()
 
 
-def _when_it_says(calibration: str | Path, size: Size | None) -> PairRectifier | None:
-    """The rectifier, unless the file leaves the size of its images to the camera."""
+def _rectifier_of_known_size(calibration: str | Path, size: Size | None) -> PairRectifier | None:
+    """Read the rectifier; None if the file has no image size, which the camera then tells."""
     try:
         return read_rectifier(calibration, size=size)
     except SourceError:
@@ -239,7 +239,7 @@ def _open(place: str, file: bool, size: Size | None, fps: float | None, deadline
     else:
         capture = cv2.VideoCapture(int(place)) if place.isdigit() else cv2.VideoCapture(place, cv2.CAP_V4L2)
     if not capture.isOpened():
-        raise SourceError(f"camera {place} cannot be opened: {_why(place, file)}")
+        raise SourceError(f"camera {place} cannot be opened: {_cause(place, file)}")
     if not file and "://" not in place:
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         if size is not None:
@@ -250,7 +250,7 @@ def _open(place: str, file: bool, size: Size | None, fps: float | None, deadline
     return capture
 
 
-def _why(place: str, file: bool) -> str:
+def _cause(place: str, file: bool) -> str:
     if file:
         return "expected a video that OpenCV can decode"
     if "://" in place:
@@ -268,7 +268,7 @@ def _why(place: str, file: bool) -> str:
     )
 
 
-def _shown(capture: Any) -> Size:
-    """(height, width) of one half."""
+def _half_size(capture: Any) -> Size:
+    """Size of one half, (height, width)."""
     width, height = (capture.get(p) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     return int(height), int(width) // 2

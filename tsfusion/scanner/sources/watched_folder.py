@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A folder that another program writes frames to."""
+"""Source of frames that another program writes to a folder."""
 
 import logging
 import os
@@ -21,41 +21,42 @@ from tsfusion.scanner.sources.source import LiveSource, monotonic_of
 
 log = logging.getLogger(__name__)
 
-ENDS = ("DONE", ".end")  # a file of this name: nothing more will be written
+END_MARKERS = ("DONE", ".end")  # a file of this name ends the source
 SENSORS = {"depth": "kinect", "pair": "stereo", "points": "lidar"}
 
-_REST = 10  # times as long as listing the folder took, at least, until it is listed again
-_SETTLED_S = 0.5  # a format without an end counts as wholly written when it did not change for so long
-_OLDEST_S = 600.0  # the time of a file written longer ago is of another clock
-_WAIT = object()  # a frame whose files are not all there
+_PAUSE_FACTOR = 10  # pause between two listings, at least, in times a listing took
+_SETTLED_S = 0.5  # seconds without a change after which a file without an end mark counts as complete
+_OLDEST_S = 600.0  # file times before this are of another clock
+_WAIT = object()  # the frame's files are not complete yet
 
 
 class WatchedFolder(LiveSource):
-    """Frames in the order of their names, each as soon as its files are wholly written.
+    """Frames in the order of their names, each as soon as its files are complete.
 
-    Layouts: `layouts.EXPECTED`. What is there already comes first. A frame waits for the one before it if
-    that is begun; after `deadline` without a change it is left out. Colour must lie on depth, pixel by
-    pixel. Times are those in the names (decimal seconds, or nanoseconds), else when the file was written.
+    Layouts: `folder_layouts.EXPECTED`. Existing files come first. A frame waits for an incomplete one
+    before it, which is left out after `deadline` without a change. Colour must be registered to depth.
+    Timestamps are those in the names (decimal seconds, or nanoseconds), or the times of the files.
 
-    It ends when a file `DONE` or `.end` appears, or after `idle` seconds without anything new. The name of
+    It ends when a file `DONE` or `.end` appears, or after `idle` seconds without a new frame. The name of
     every frame is remembered (100 bytes each).
 
     Args:
-        path: an existing folder; its layout and its camera may still come.
-        intrinsics: default from the folder or the one above (`layouts.CAMERAS`).
-        calibration: instead, a camera's file; for left/ and right/ a stereo camera's (`pairs.rectifier`),
-            default in the folder, or else intrinsics and `baseline.txt` of images that are rectified.
-        baseline: metres, of left/ and right/ that are rectified.
+        path: an existing folder; its layout and its camera may be written later.
+        intrinsics: default from the folder or its parent (`folder_layouts.CAMERAS`).
+        calibration: a camera's file instead; for left/ and right/ a stereo camera's, as
+            `stereo_pairs.read_rectifier` reads it, by default from the folder; without one the images are
+            taken as rectified, with intrinsics and `baseline.txt`.
+        baseline: metres, of rectified images in left/ and right/.
         depth_scale: metres per unit.
         idle: seconds; None = wait for ever.
-        deadline: seconds that a begun frame or a missing camera is waited for.
-        poll: seconds between two looks.
+        deadline: seconds to wait for an incomplete frame or a missing camera.
+        poll: seconds between two listings of the folder, at least.
 
     Raises:
         SourceError: no such folder or calibration.
     """
 
-    live = False  # what was written stays there
+    live = False  # files stay until they are read
 
     def __init__(
         self,
@@ -85,21 +86,21 @@ class WatchedFolder(LiveSource):
         self._handled: set[str] = set()  # names of first files
         self._last: folder_layouts.Key = ()
         self._colored: bool | None = None  # whether frames come with colour; None = not known yet
-        self._camera: Any = None  # Intrinsics, an Undistorter, or Pairs
-        self._begun: Any = None  # what the frame that is waited for consists of so far
+        self._camera: Any = None  # Intrinsics, an Undistorter, or a PairRectifier
+        self._begun: Any = None  # state of the incomplete frame's files
         self._since = time.monotonic()  # when something last changed
 
     def __iter__(self) -> Iterator[Frame]:
         self._since = time.monotonic()
         while not self._closed.is_set():
-            ended = any((self._root / name).exists() for name in ENDS)
+            ended = any((self._root / name).exists() for name in END_MARKERS)
             looked = time.monotonic()
             waiting = self._list()
-            pause = max(self._poll, _REST * (time.monotonic() - looked))
+            pause = max(self._poll, _PAUSE_FACTOR * (time.monotonic() - looked))
             for name, first in waiting:
                 if self._closed.is_set():
                     return
-                frame = self._take(name, first, final=ended)
+                frame = self._read(name, first, final=ended)
                 if frame is _WAIT:
                     break
                 self._handled.add(first.name)
@@ -113,7 +114,7 @@ class WatchedFolder(LiveSource):
             self._closed.wait(pause)
 
     def _list(self) -> list[tuple[str, Path]]:
-        """(name, first file) of the frames that are new, in order."""
+        """List (name, first file) of new frames, in order."""
         try:
             if self._layout is None or not self._handled:  # the folder of colour may still come
                 self._layout = folder_layouts.layout_of(self._root)
@@ -135,8 +136,8 @@ class WatchedFolder(LiveSource):
                 found.append((match[1], where / file))
         return sorted(found, key=lambda item: folder_layouts.order(item[0]))
 
-    def _take(self, name: str, first: Path, *, final: bool) -> Any:
-        """The frame, None if it is left out, or `_WAIT`."""
+    def _read(self, name: str, first: Path, *, final: bool) -> Any:
+        """Read a frame; None if it is left out, or `_WAIT`."""
         assert self._layout is not None
         kind, second = self._layout.kind, self._layout.partner(name)
         state = (name, *(_state(path) for path in (first, second)))
@@ -149,7 +150,7 @@ class WatchedFolder(LiveSource):
                 return _WAIT
             if kind == "pair" or self._colored:
                 return self._skip("without its other image")
-            self._colored = False  # there is none, of any frame
+            self._colored = False  # no frame has colour
         images: list[Any]
         try:
             if kind == "points":
@@ -159,7 +160,7 @@ class WatchedFolder(LiveSource):
                 ]
             else:
                 images = [_image(first, kind)] + ([] if second is None else [_image(second, "pair")])
-        except OSError:  # taken away again
+        except OSError:  # deleted meanwhile
             images = [None]
         if any(image is None for image in images):
             return self._skip("damaged") if final else _WAIT
@@ -168,7 +169,7 @@ class WatchedFolder(LiveSource):
         self._colored = self._colored or (kind == "depth" and len(images) == 2)
         try:
             return self._frame(kind, images, *self._stamps(name, first))
-        except OSError:  # taken away again
+        except OSError:  # deleted meanwhile
             return self._skip("damaged")
         except (InvalidKeyframe, InvalidConfig, cv2.error) as error:
             if "malformed" not in self.skipped:
@@ -188,7 +189,7 @@ class WatchedFolder(LiveSource):
             )
         depth = color = K = None
         if kind == "depth":
-            depth, color, K = self._flat(
+            depth, color, K = self._undistorted(
                 folder_layouts.depth_of(images[0]), images[1] if images[1:] else None
             )
         return Frame(
@@ -202,8 +203,8 @@ class WatchedFolder(LiveSource):
             captured_ns=captured_ns,
         )
 
-    def _flat(self, depth: NDArray[Any], color: Any) -> tuple[NDArray[Any], Any, Intrinsics]:
-        """Without the distortion of the calibration's lens."""
+    def _undistorted(self, depth: NDArray[Any], color: Any) -> tuple[NDArray[Any], Any, Intrinsics]:
+        """Undistort depth and colour by the calibration; also return the intrinsics."""
         if color is not None and color.ndim == 2:
             color = cv2.cvtColor(color, cv2.COLOR_GRAY2BGR)
         if not isinstance(self._camera, Undistorter):
@@ -212,7 +213,7 @@ class WatchedFolder(LiveSource):
         return self._camera.depth(depth), color, self._camera.intrinsics
 
     def _find_camera(self, kind: str, image: NDArray[Any], *, final: bool) -> bool:
-        """Read the camera once there is an image to know its size by."""
+        """Read the camera, for which the size of an image is needed; return whether it is there."""
         try:
             self._camera = self._pairs(image) if kind == "pair" else self._one_camera(image)
         except DatasetError as error:  # it may be half written
@@ -234,7 +235,7 @@ class WatchedFolder(LiveSource):
 
     def _pairs(self, image: NDArray[Any]) -> stereo_pairs.PairRectifier | None:
         size = image.shape[0], image.shape[1]
-        there = any(all((self._root / name).is_file() for name in names) for names in stereo_pairs.TOGETHER)
+        there = any(all((self._root / name).is_file() for name in names) for names in stereo_pairs.FILE_PAIRS)
         if self._calibration is not None or there:
             return stereo_pairs.read_rectifier(self._calibration or self._root, size=size)
         intrinsics = self._intrinsics or folder_layouts.camera_of(self._root)
@@ -244,7 +245,7 @@ class WatchedFolder(LiveSource):
         return stereo_pairs.AlreadyRectified(intrinsics, baseline, size)
 
     def _stamps(self, name: str, first: Path) -> tuple[int, int]:
-        """`timestamp_ns` and `captured_ns`; the first grows, also where files were written out of order."""
+        """`timestamp_ns`, which always grows, and `captured_ns`."""
         written_ns = first.stat().st_mtime_ns
         self._stamp = max(folder_layouts.time_of(name) or written_ns, self._stamp + 1)
         own = written_ns >= self._opened_ns
