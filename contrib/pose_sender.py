@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: MIT
-"""Publishes poses for `tsfusion scan --localizer feed --feed tcp://127.0.0.1:5570`; needs pyzmq alone.
+"""Publish poses for `tsfusion scan --localizer feed --feed tcp://127.0.0.1:5570`; needs pyzmq alone.
 
     your_slam | python3 pose_sender.py tcp://127.0.0.1:5570
 
 Reads lines `seconds tx ty tz qx qy qz qw` (TUM's format: T_world_camera, OpenCV axes), or `seconds lost` when
-your SLAM does not know where it is. Blank lines and those that begin with # are skipped, bad ones are told
-on stderr. For a file use `tsfusion scan --trajectory FILE`: here its poses are out before anybody listens.
+your SLAM is lost. Blank lines and those that begin with # are skipped, bad ones are reported on stderr. For a
+file use `tsfusion scan --trajectory FILE`: here its poses would be sent before anybody listens.
 `pose_sender.py ADDRESS connect` is for `--feed @ADDRESS`.
 """
 

@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: MIT
-"""ROS 1 → tsfusion: poses to a pose feed, and keyframes to a server. README.md beside this says how.
+"""Bridge from ROS 1: poses to a pose feed, and keyframes to a server. README.md beside it explains the use.
 
 The feed needs rospy, tf2_ros and pyzmq (Debian: python3-rospy python3-tf2-ros python3-zmq); keyframes also
 need tsfusion in the same Python.
@@ -54,7 +54,7 @@ class Bridge:
         rospy.Subscriber(args.camera_info, CameraInfo, self.on_info, queue_size=30)
 
     def on_pose(self, raw):
-        """PoseStamped, PoseWithCovarianceStamped, Odometry or TransformStamped."""
+        """Publish a PoseStamped, PoseWithCovarianceStamped, Odometry or TransformStamped."""
         message = roslib.message.get_message_class(raw._connection_header["type"])()
         message.deserialize(raw._buff)
         pose = getattr(message, "pose", None) or message.transform
@@ -65,16 +65,16 @@ class Bridge:
         transform.transform.translation = getattr(pose, "position", None) or pose.translation
         transform.transform.rotation = getattr(pose, "orientation", None) or pose.rotation
         self.buffer.set_transform(transform, "bridge")
-        self.tell(message.header.stamp, transform.transform)
+        self.publish(message.header.stamp, transform.transform)
 
     def on_info(self, message):
-        """The camera's calibration, and with tf the moments to look poses up for."""
+        """Keep the camera's calibration; with tf, publish the pose at its timestamp."""
         self.info = message
         if not self.args.pose:
-            self.tell(message.header.stamp, self.pose_at(message.header.stamp))
+            self.publish(message.header.stamp, self.pose_at(message.header.stamp))
 
     def pose_at(self, stamp):
-        """The camera's pose, waited for a moment; None where tf does not know it."""
+        """Look up the camera's pose, waiting 0.2 s at most; None where tf does not know it."""
         try:
             found = self.buffer.lookup_transform(
                 self.args.world, self.args.camera, stamp, rospy.Duration(0.2)
@@ -84,8 +84,8 @@ class Bridge:
             return None
         return found.transform
 
-    def tell(self, stamp, pose):
-        """One message of the feed."""
+    def publish(self, stamp, pose):
+        """Send one message of the feed."""
         if self.feed is None:
             return
         message = {"stamp_ns": stamp.to_nsec()}
@@ -94,7 +94,7 @@ class Bridge:
             self.feed.send(json.dumps(message).encode())
 
     def on_depth(self, message):
-        """A keyframe every `--distance` metres or `--angle` degrees."""
+        """Send a keyframe every `--distance` metres or `--angle` degrees."""
         pose = None if self.info is None else self.pose_at(message.header.stamp)
         if pose is None or not self.moved(numbers(pose)):
             return
@@ -114,7 +114,7 @@ class Bridge:
         self.last = numbers(pose)
 
     def moved(self, pose):
-        """Whether it is far enough from the last keyframe's."""
+        """Whether a pose is far enough from the last keyframe's."""
         if self.last is None:
             return True
         cosine = abs(sum(a * b for a, b in zip(pose[3:], self.last[3:], strict=True)))
@@ -123,13 +123,13 @@ class Bridge:
 
 
 def numbers(pose):
-    """tx ty tz qx qy qz qw."""
+    """Convert a pose to tx ty tz qx qy qz qw."""
     t, q = pose.translation, pose.rotation
     return [t.x, t.y, t.z, q.x, q.y, q.z, q.w]
 
 
 def matrix(pose):
-    """T_world_camera (4, 4) of seven numbers."""
+    """Convert seven numbers to a (4, 4) T_world_camera."""
     import numpy as np
 
     x, y, z, w = np.array(pose[3:]) / math.hypot(*pose[3:])
@@ -144,7 +144,7 @@ def matrix(pose):
 
 
 def array(image):
-    """A sensor_msgs/Image as NumPy: (H, W), or (H, W, 3) BGR."""
+    """Convert a sensor_msgs/Image to (H, W), or (H, W, 3) BGR."""
     import numpy as np
 
     kind, channels = DTYPES[image.encoding]

@@ -2,8 +2,8 @@
 """Cameras with distorted lenses: undistortion, and rectification of stereo pairs.
 
 Lens models are OpenCV's: `radtan` (Brown-Conrady; ROS: plumb_bob, rational_polynomial) and `equidistant`
-(Kannala-Brandt; OpenCV: fisheye). What comes out is a pinhole camera of the same size with square pixels,
-cut so that all its pixels were seen, or widened so that all that was seen is kept.
+(Kannala-Brandt; OpenCV: fisheye). The result is a pinhole camera of the same size with square pixels, cut to
+the pixels that the original saw, or widened to keep all that it saw.
 """
 
 from dataclasses import dataclass
@@ -27,21 +27,21 @@ MODELS: dict[str, Model] = {
     "kannala_brandt4": "equidistant",
 }  # fmt: skip
 _COEFFICIENTS = {"pinhole": (0,), "radtan": (4, 5, 8, 12, 14), "equidistant": (4,)}
-_WIDEST_ANGLE = np.radians(60)  # from the axis: flattened, more of a fisheye's field takes too many pixels
-_INSET = 0.5  # pixels of the border that interpolation could blend with what lies outside
-_EDGE = 33  # points along each border of the image
-_ITERATIONS = 50
-_CLOSE = 1e-10
+_MAX_ANGLE = np.radians(60)  # from the axis: the flat image of a wider fisheye would take too many pixels
+_INSET = 0.5  # pixels of the border that interpolation could blend with the outside
+_EDGE_POINTS = 33  # along each border of the image
+_MAX_ITERATIONS = 50
+_MAX_RESIDUAL = 1e-10  # on the unit plane
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera as calibrated.
+    """Calibrated camera with a lens model.
 
     Attributes:
         intrinsics: pixels.
         size: (height, width) of its images.
-        model: of the lens.
+        model: lens model.
         distortion: radtan: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]]; equidistant: k1 k2 k3 k4.
 
     Raises:
@@ -75,7 +75,7 @@ class Camera:
 
     @classmethod
     def named(cls, K: Any, size: Size, model: str, distortion: Any = ()) -> "Camera":
-        """From a 3×3 matrix (or its 9 numbers, or fx fy cx cy) and any of the names in `MODELS`.
+        """Make a camera of a 3×3 matrix (or its 9 numbers, or fx fy cx cy) and a model name of `MODELS`.
 
         Coefficients that are all 0 make it a pinhole camera.
         """
@@ -98,7 +98,7 @@ class Camera:
         )
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(n, 3) points in the camera's axes, z > 0 → (n, 2) pixels."""
+        """Project (n, 3) points in the camera's axes, z > 0, to (n, 2) pixels."""
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 1, 3)
         if not len(points):
             return np.zeros((0, 2))
@@ -110,48 +110,48 @@ class Camera:
         return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
     def rays(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(n, 2) pixels → (n, 2) x/z and y/z of what they see, cut off at 60° from the axis."""
+        """Rays of (n, 2) pixels as (n, 2) x/z and y/z, limited to 60° from the axis."""
         K = self.intrinsics
         distorted = (np.asarray(pixels, dtype=np.float64).reshape(-1, 2) - (K.cx, K.cy)) / (K.fx, K.fy)
         if self.model == "equidistant":
             return _cut(_from_fisheye(distorted, self.distortion))
         rays = distorted
-        for _ in range(_ITERATIONS):  # as cv2.undistortPoints does, to the end
+        for _ in range(_MAX_ITERATIONS):  # as cv2.undistortPoints does, to the end
             ones = np.ones((len(rays), 1))
             seen = (self.project(np.hstack([rays, ones])) - (K.cx, K.cy)) / (K.fx, K.fy)
             missing = distorted - seen
             rays = _cut(rays + missing)
-            if np.abs(missing).max(initial=0) < _CLOSE:
+            if np.abs(missing).max(initial=0) < _MAX_RESIDUAL:
                 break
         return rays
 
 
 def _from_fisheye(distorted: NDArray[np.float64], k: tuple[float, ...]) -> NDArray[np.float64]:
-    """(n, 2) x, y on the distorted unit plane → x/z, y/z: Newton's method on r = θ(1 + Σ kᵢ θ²ⁱ)."""
+    """Undistort (n, 2) x, y of the unit plane to x/z, y/z: Newton's method on r = θ(1 + Σ kᵢ θ²ⁱ)."""
     powers = np.array([0, 1, 2, 3, 4])
     c = np.array([1.0, *k])
     r = np.linalg.norm(distorted, axis=1)
-    angle = np.minimum(r, _WIDEST_ANGLE)
-    for _ in range(_ITERATIONS):
+    angle = np.minimum(r, _MAX_ANGLE)
+    for _ in range(_MAX_ITERATIONS):
         terms = angle[:, None] ** (2 * powers)
         slope = terms @ (c * (2 * powers + 1))
-        angle = np.clip(angle - (angle * (terms @ c) - r) / np.maximum(slope, 0.1), 0, _WIDEST_ANGLE)
+        angle = np.clip(angle - (angle * (terms @ c) - r) / np.maximum(slope, 0.1), 0, _MAX_ANGLE)
     rays: NDArray[np.float64] = distorted * (np.tan(angle) / np.maximum(r, 1e-12))[:, None]
     return rays
 
 
 def _cut(rays: NDArray[np.float64]) -> NDArray[np.float64]:
     length = np.linalg.norm(rays, axis=1, keepdims=True)
-    cut: NDArray[np.float64] = rays * np.minimum(1, np.tan(_WIDEST_ANGLE) / np.maximum(length, 1e-12))
+    cut: NDArray[np.float64] = rays * np.minimum(1, np.tan(_MAX_ANGLE) / np.maximum(length, 1e-12))
     return cut
 
 
 class Undistorter:
-    """Turns a camera's images into those of a pinhole camera, `intrinsics` and `size`.
+    """Undistort a camera's images to those of a pinhole camera with `intrinsics` and `size`.
 
     Args:
-        keep: 0 cuts to the largest upright picture whose every pixel was seen; 1 keeps all that was seen
-            (up to 60° from the axis), with black where nothing was; or between.
+        keep: 0 cuts to the largest upright rectangle that the camera saw whole; 1 keeps all that it saw (up
+            to 60° from the axis), with black elsewhere; values between are allowed.
     """
 
     def __init__(self, camera: Camera, *, keep: float = 0.0) -> None:
@@ -160,13 +160,13 @@ class Undistorter:
         self._maps = _Maps(camera, np.eye(3), self.intrinsics, camera.size)
 
     def image(self, image: NDArray[Any]) -> NDArray[Any]:
-        """(H, W) or (H, W, channels), interpolated; 0 where the camera did not see."""
+        """Undistort an image, (H, W) or (H, W, channels), interpolated; 0 where the camera did not see."""
         return self._maps.image(image)
 
     def depth(self, depth: NDArray[Any]) -> NDArray[Any]:
-        """(H, W) of any type, each pixel the nearest one's; 0 where the camera did not see.
+        """Undistort depth, (H, W) of any type, without interpolation; 0 where the camera did not see.
 
-        Depth along the optical axis is the same in both: the camera does not turn.
+        Depth along the optical axis does not change: the camera does not turn.
         """
         return self._maps.nearest(depth)
 
@@ -193,10 +193,10 @@ class StereoRig:
 
 
 class Rectifier:
-    """Turns a rig's pairs into those of two equal pinhole cameras whose rows match.
+    """Rectify a rig's pairs to those of two equal pinhole cameras whose rows match.
 
     Attributes:
-        intrinsics, size: of both.
+        intrinsics, size: those of both cameras.
         baseline_m, baseline_fx: metres; metre · pixels.
         T_left_rectified: (4, 4), a rotation: `T_world_rectified = T_world_left @ T_left_rectified`.
 
@@ -204,7 +204,7 @@ class Rectifier:
         keep: as for `Undistorter`.
 
     Raises:
-        InvalidConfig: the cameras stand above each other, or are swapped.
+        InvalidConfig: one camera is above the other, or they are swapped.
     """
 
     def __init__(self, rig: StereoRig, *, keep: float = 0.0) -> None:
@@ -228,12 +228,12 @@ class Rectifier:
         self._left, self._right = (_Maps(camera, R, self.intrinsics, self.size) for camera, R in turned)
 
     def pair(self, left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Both images rectified; 0 where a camera did not see."""
+        """Rectify both images; 0 where a camera did not see."""
         return self._left.image(left), self._right.image(right)
 
 
 class _Maps:
-    """Where each pixel of the flat image lies in the camera's own, in fixed point (1/32 px)."""
+    """Maps from the pixels of the flat image to those of the camera, in fixed point (1/32 px)."""
 
     def __init__(self, camera: Camera, R: NDArray[np.float64], flat: Intrinsics, size: Size) -> None:
         self._size = camera.size
@@ -265,7 +265,7 @@ class _Maps:
 
 
 def _flat(cameras: list[tuple[Camera, NDArray[np.float64]]], size: Size, keep: float) -> Intrinsics:
-    """The pinhole camera that shows what all of these, turned by their rotations, see."""
+    """Intrinsics of the pinhole camera that shows what all cameras, turned by their rotations, see."""
     if not 0 <= keep <= 1:
         raise InvalidConfig(f"keep must be between 0 and 1, got {keep}")
     inner, outer = np.array([_seen(camera, R) for camera, R in cameras]).swapaxes(0, 1)
@@ -283,17 +283,17 @@ def _flat(cameras: list[tuple[Camera, NDArray[np.float64]]], size: Size, keep: f
 
 
 def _seen(camera: Camera, R: NDArray[np.float64]) -> tuple[list[float], list[float]]:
-    """The largest rectangle inside the image on the turned camera's unit plane and the smallest around it.
+    """Largest rectangle inside a turned camera's image on the unit plane, and the smallest around it.
 
-    Each as left, top, right, bottom.
+    Each is left, top, right, bottom.
     """
     last_row, last_column = (side - 1 - _INSET for side in camera.size)
-    along = np.linspace(0, 1, _EDGE)
+    along = np.linspace(0, 1, _EDGE_POINTS)
     u, v = _INSET + along * (last_column - _INSET), _INSET + along * (last_row - _INSET)
     edges = []
     for columns, rows in ((_INSET, v), (u, _INSET), (last_column, v), (u, last_row)):
         pixels = np.stack(np.broadcast_arrays(columns, rows), axis=1)
-        turned = np.column_stack([camera.rays(pixels), np.ones(_EDGE)]) @ R.T
+        turned = np.column_stack([camera.rays(pixels), np.ones(_EDGE_POINTS)]) @ R.T
         edges.append(turned[:, :2] / turned[:, 2:])
     inner, outer = np.zeros(4), np.zeros(4)
     for axis, (a, b) in enumerate(((edges[0], edges[2]), (edges[1], edges[3]))):

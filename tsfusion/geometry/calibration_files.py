@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Calibrations as people keep them on disk.
+"""Reading of calibration files.
 
 Kalibr's camchain (`cam0`, `cam1`), EuRoC's sensor.yaml, ROS camera_info (which OpenCV's calibration sample
 writes too) and OpenCV's stereo files (M1 D1 M2 D2 R T, or LEFT.K … RIGHT.P as ORB-SLAM has them). YAML,
-JSON and XML are taken apart by OpenCV's FileStorage.
+JSON and XML are parsed by OpenCV's FileStorage.
 """
 
 import re
@@ -26,13 +26,13 @@ Tree = dict[str, Any]
 
 
 def read_camera(path: str | Path, *, size: Size | None = None) -> Camera:
-    """The one camera of a file (of a Kalibr chain: `cam0`).
+    """Read the camera of a file (of a Kalibr chain: `cam0`).
 
     Args:
-        size: (height, width) for a file that does not say.
+        size: (height, width) for a file without one.
 
     Raises:
-        DatasetError: no such file, a format not known here, a value that is missing or wrong.
+        DatasetError: no such file, an unknown format, a missing or wrong value.
     """
     path = Path(path)
     try:
@@ -42,10 +42,10 @@ def read_camera(path: str | Path, *, size: Size | None = None) -> Camera:
 
 
 def read_rig(*paths: str | Path, size: Size | None = None) -> StereoRig:
-    """A stereo rig from one file, or from the left and the right camera's, or from intrinsics and extrinsics.
+    """Read a stereo rig from one file, the left and the right camera's, or intrinsics and extrinsics.
 
     Raises:
-        DatasetError: as `read_camera`; also when there is nothing about how the cameras stand.
+        DatasetError: as `read_camera`; also when the transform between the cameras is missing.
     """
     files = [Path(path) for path in paths]
     trees = [read_tree(path) for path in files]
@@ -56,7 +56,7 @@ def read_rig(*paths: str | Path, size: Size | None = None) -> StereoRig:
 
 
 def rig_of_camera_info(left: Camera, right: Camera, R: Any, P: Any) -> StereoRig:
-    """From two ROS CameraInfo messages: `R` and `P` are the (left, right) `r` and `p` of them, as numbers."""
+    """Make a rig of two ROS CameraInfo messages; `R` and `P` are (left, right) pairs of their `r` and `p`."""
     R_left, R_right = (np.asarray(each, dtype=np.float64).reshape(3, 3) for each in R)
     P_right = np.asarray(P[1], dtype=np.float64).reshape(3, 4)
     T = np.eye(4)
@@ -66,10 +66,10 @@ def rig_of_camera_info(left: Camera, right: Camera, R: Any, P: Any) -> StereoRig
 
 
 def read_tree(path: Path) -> Tree:
-    """A YAML, JSON or XML file as nested dictionaries and lists; numbers are floats.
+    """Read a YAML, JSON or XML file as nested dictionaries and lists; numbers become floats.
 
     Raises:
-        DatasetError: it cannot be read as one.
+        DatasetError: the file cannot be read or parsed.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -79,11 +79,11 @@ def read_tree(path: Path) -> Tree:
         raise DatasetError(f"{path} is not a text file; expected {EXPECTED}") from error
     except OSError as error:
         raise DatasetError(f"cannot read {path}: {error.strerror}") from error
-    if _is_monstrous(text):
+    if _is_too_large(text):
         raise DatasetError(f"{path} is far too large or too deep for a calibration; expected {EXPECTED}")
     try:
-        storage = cv2.FileStorage(_palatable(text), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        tree = _unfolded(storage.root())
+        storage = cv2.FileStorage(_for_opencv(text), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        tree = _plain(storage.root())
     except (cv2.error, SystemError) as error:  # the second is how OpenCV's constructor fails in Python
         raise DatasetError(
             f"{path} is not YAML, JSON or XML that OpenCV can read; expected {EXPECTED}"
@@ -93,8 +93,8 @@ def read_tree(path: Path) -> Tree:
     return tree
 
 
-def _is_monstrous(text: str) -> bool:
-    """Whether it is larger or deeper than any calibration: OpenCV's parser runs out of stack and crashes."""
+def _is_too_large(text: str) -> bool:
+    """Whether text is larger or deeper than any calibration: it could crash OpenCV's parser."""
     if len(text) > _MAX_TEXT or re.search(rf"^ {{{_MAX_INDENTATION}}}", text, re.MULTILINE):
         return True
     depth = 0
@@ -106,8 +106,8 @@ def _is_monstrous(text: str) -> bool:
     return False
 
 
-def _palatable(text: str) -> str:
-    """OpenCV wants a header, and the dashes of a list deeper than its name."""
+def _for_opencv(text: str) -> str:
+    """Adapt YAML to OpenCV, which requires a header and lists indented deeper than their name."""
     if text.lstrip().startswith(("{", "<")):
         return text
     lines = [line.rstrip() for line in text.splitlines()]
@@ -115,16 +115,16 @@ def _palatable(text: str) -> str:
     return "%YAML:1.0\n---\n" + "\n".join(re.sub(r"^( *)- ", r"\1    - ", line) for line in kept) + "\n"
 
 
-def _unfolded(node: Any) -> Any:
+def _plain(node: Any) -> Any:
     if node.isMap():
-        return {name: _unfolded(node.getNode(name)) for name in node.keys()}  # noqa: SIM118
+        return {name: _plain(node.getNode(name)) for name in node.keys()}  # noqa: SIM118
     if node.isSeq():
-        return [_unfolded(node.at(index)) for index in range(node.size())]
+        return [_plain(node.at(index)) for index in range(node.size())]
     return node.string() if node.isString() else node.real() if not node.isNone() else None
 
 
 def _camera(tree: Tree, size: Size | None) -> tuple[Camera, Tree]:
-    """The camera and the part of the file that is about it."""
+    """Read the camera; also return its part of the file."""
     if isinstance(tree.get("cam0"), dict):
         tree = tree["cam0"]
     if "intrinsics" in tree:  # Kalibr and EuRoC
@@ -191,7 +191,7 @@ def _opencv_rig(tree: Tree, size: Size | None) -> StereoRig:
 
 
 def _numbers(value: Any) -> NDArray[np.float64]:
-    """A list, or a matrix with its `data`, as one row."""
+    """Flatten a list, or the `data` of a matrix."""
     return np.asarray(value["data"] if isinstance(value, dict) else value, dtype=np.float64).ravel()
 
 

@@ -9,16 +9,16 @@ from tsfusion.core.errors import InvalidConfig
 from tsfusion.geometry.keyframe import Intrinsics, check_pose
 
 Size = tuple[int, int]  # height, width
-_FAR = np.float32(65.535)  # metres: where a pixel without depth is taken to be
-_OVERLAP = 1.2  # how much wider than its share a depth pixel is drawn: no gaps on slanted surfaces
-_OCCLUDED = np.float32(1.03)  # behind what the colour camera sees, times its depth
+_FAR = np.float32(65.535)  # metres: assumed depth of pixels without depth
+_OVERLAP = 1.2  # width at which a depth pixel is drawn, in pixels: no gaps on slanted surfaces
+_OCCLUDED = np.float32(1.03)  # times the depth that the colour camera sees: points farther away are hidden
 
 
 class Registration:
-    """A depth and a colour camera that stand still to each other, both without distortion.
+    """Registration of a depth and a colour camera that are fixed to each other, both without distortion.
 
     Args:
-        depth, color: their intrinsics.
+        depth, color: the cameras' intrinsics.
         size, color_size: (height, width) of their images; `color_size` None = the same.
         T_color_depth: (4, 4), `p_color = T_color_depth @ p_depth`, metres.
 
@@ -48,10 +48,10 @@ class Registration:
         self._reach = _OVERLAP / 2 * np.array([color.fx / depth.fx, abs(color.fy / depth.fy)])
 
     def color_of_depth(self, color: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """The colour of every depth pixel: (H, W, 3) uint8 of the depth's size.
+        """Colour of every depth pixel: (H, W, 3) uint8 of the depth's size.
 
-        A pixel without depth (0) gets what lies far away there; one beyond the colour image's border, the
-        border's; one that the colour camera cannot see, what hides it: `visible` tells.
+        A pixel without depth (0) gets the colour far away there; one outside of the colour image, the colour
+        of its border; one hidden from the colour camera, the colour of what hides it (see `visible`).
         """
         u, v, _ = self._pixels(np.where(depth_m > 0, depth_m, _FAR))
         if color.shape[:2] != self.color_size:
@@ -60,7 +60,7 @@ class Registration:
         return seen
 
     def visible(self, depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(H, W): the pixel has depth, and the colour camera sees its point with nothing before it."""
+        """Whether pixels have depth and the colour camera sees their points: (H, W)."""
         u, v, z = self._pixels(np.where(depth_m > 0, depth_m, _FAR))
         height, width = self.color_size
         column, row = np.rint(u), np.rint(v)
@@ -72,9 +72,9 @@ class Registration:
         return seen
 
     def depth_of_color(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The depth of every colour pixel: (H, W) float32 metres of the colour's size, 0 = none.
+        """Depth of every colour pixel: (H, W) float32 metres of the colour's size, 0 = none.
 
-        Each depth pixel is drawn as large as it is there and a fifth larger, the nearest in front.
+        Each depth pixel is drawn a fifth larger than it appears there, the nearest in front.
         """
         u, v, z = self._pixels(np.where(depth_m > 0, depth_m, np.float32(0)))
         height, width = self.color_size
@@ -95,7 +95,7 @@ class Registration:
         return nearest.reshape(height, width)
 
     def _pixels(self, z: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
-        """Column, row and depth in the colour camera of every depth pixel."""
+        """Columns, rows and depths of all depth pixels in the colour camera."""
         if z.shape != self.size:
             raise InvalidConfig(f"depth must be of size {self.size}, got {z.shape}")
         x, y, there = (z * each + moved for each, moved in zip(self._at_infinity, self._moved, strict=True))

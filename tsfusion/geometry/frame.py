@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The frame: what a sensor measured at one moment, before anyone knows from where."""
+"""Frames: what a sensor measured at one moment, before its pose is known."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -19,19 +19,19 @@ Kind = Literal["depth", "disparity", "points", "pair"]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Frame:
-    """One measurement without a pose. Give one of `depth`, `disparity`, `points`, or `left` and `right`.
+    """One measurement, its pose unknown. Give one of `depth`, `disparity`, `points`, or `left` and `right`.
 
-    Fields that a `Keyframe` has too mean the same and are checked the same way, at construction.
+    Fields of the same name mean the same as in a `Keyframe` and are checked in the same way.
 
     Attributes:
         sensor: name of the sensor model (`kinect`, `tof`, `realsense`, `stereo`, `lidar`, `scanner`).
         timestamp_ns: the sensor's clock; 0 = unknown.
         captured_ns: `time.monotonic_ns()` at capture; 0 = unknown.
-        T_world_camera: (4, 4) float64, what the source itself says of the pose (ground truth, another
-            SLAM); None = nothing. Only the localizer `given` looks at it.
+        T_world_camera: (4, 4) float64, the source's own pose (ground truth, another SLAM); None = it has
+            none. Only the localizer `given` uses it.
         left, right: (H, W) uint8 grey, rectified, with `intrinsics` of both and `baseline_fx`.
         color: (H, W, 3) uint8 BGR of the depth or of the left image, or (N, 3) of the points.
-        point_times_s: (N,) float32 seconds from `timestamp_ns` of each point; None = all at once.
+        point_times_s: (N,) float32 seconds of each point after `timestamp_ns`; None = all at once.
 
     Raises:
         InvalidKeyframe: naming the field, its value and what was expected.
@@ -75,7 +75,7 @@ class Frame:
 
     @classmethod
     def of(cls, keyframe: Keyframe, sensor: str) -> "Frame":
-        """A keyframe's measurement; its pose becomes what the source says."""
+        """Make a frame of a keyframe; its pose becomes the source's own."""
         names = {f.name for f in dataclasses.fields(cls) if f.init} & {
             f.name for f in dataclasses.fields(keyframe) if f.init
         }
@@ -83,7 +83,7 @@ class Frame:
         return cls(**{**fields, "sensor": keyframe.sensor or sensor})
 
     def keyframe(self, T_world_camera: NDArray[np.float64]) -> Keyframe:
-        """The frame as a keyframe; of a stereo pair the disparity is matched here, at full resolution."""
+        """Make a keyframe of the frame; match a stereo pair's disparity at full resolution."""
         if self.kind != "pair":
             return self._at(T_world_camera)
         assert self.left is not None
@@ -92,7 +92,7 @@ class Frame:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(H, W) of the image, or (N,) of the points."""
+        """Shape of the measurement: (H, W) of images, (N,) of points."""
         for array in (self.depth, self.disparity, self.left):
             if array is not None:
                 return tuple(array.shape)
@@ -101,7 +101,7 @@ class Frame:
 
     @cached_property
     def gray(self) -> NDArray[np.uint8] | None:
-        """(H, W) uint8: the left image, or the colour's luminance; None where there is no image."""
+        """Grey image, (H, W) uint8: the left one, or the colour's luminance; None without an image."""
         if self.left is not None:
             return self.left
         if self.color is None or self.points is not None:
@@ -111,7 +111,7 @@ class Frame:
 
     @cached_property
     def depth_m(self) -> NDArray[np.float32] | None:
-        """(H, W) float32 metres along the optical axis, 0 = none; None for points and stereo pairs."""
+        """Depth along the optical axis, (H, W) float32 metres, 0 = none; None for points and stereo pairs."""
         if self.depth is not None:
             if self.depth.dtype == np.uint16:
                 metres: NDArray[np.float32] = self.depth * np.float32(self.depth_scale)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The keyframe: one posed measurement, of any sensor, checked once at the door."""
+"""Keyframes: measurements of any sensor with a pose, checked once at construction."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -34,11 +34,11 @@ class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """The 3×3 float64 camera matrix K."""
+        """Camera matrix K, (3, 3) float64."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def scaled(self, factor: float) -> "Intrinsics":
-        """The same camera with its image resized by `factor` (pixel centres at integers)."""
+        """Intrinsics of the image resized by `factor` (pixel centres at integers)."""
         return Intrinsics(
             self.fx * factor,
             self.fy * factor,
@@ -49,7 +49,7 @@ class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Keyframe:
-    """One posed measurement. Give exactly one of `depth`, `disparity` and `points`.
+    """One measurement with a pose. Give exactly one of `depth`, `disparity` and `points`.
 
     Arrays are read, never written; they are made contiguous and native, and float64 points become float32
     (0.01 mm at 100 m). Pixels or points without a return are not errors: depth 0, NaN or negative,
@@ -120,14 +120,14 @@ class Keyframe:
 
     @cached_property
     def shape(self) -> tuple[int, ...]:
-        """(H, W) of the image, or (N,) of the points."""
+        """Shape of the measurement: (H, W) of images, (N,) of points."""
         if self.points is not None:
             return (len(self.points),)
         return tuple(self.measurement.shape)
 
     @property
     def measurement(self) -> NDArray[Any]:
-        """The one array that was given: depth, disparity or points."""
+        """The array that was given: depth, disparity or points."""
         for array in (self.depth, self.disparity, self.points):
             if array is not None:
                 return array
@@ -188,7 +188,7 @@ class Keyframe:
 
 
 def check_intrinsics(intrinsics: Intrinsics) -> Intrinsics:
-    """The four as Python floats; raises InvalidKeyframe unless they are finite, `fx > 0` and `fy != 0`."""
+    """Convert to Python floats; raise InvalidKeyframe unless finite, `fx > 0` and `fy != 0`."""
     try:
         fx, fy, cx, cy = map(float, msgspec.structs.astuple(intrinsics))
     except (TypeError, ValueError) as error:
@@ -199,7 +199,7 @@ def check_intrinsics(intrinsics: Intrinsics) -> Intrinsics:
 
 
 def check_pose(pose: Any) -> NDArray[np.float64]:
-    """A proper rigid transform as (4, 4) float64; a rotation within 1e-3 is made exact.
+    """Check a rigid transform and return it as (4, 4) float64; a rotation within 1e-3 is made exact.
 
     Idempotent to the bit, so that a keyframe checked at both ends of a wire keeps its map.
     """
@@ -252,7 +252,7 @@ def _array(name: str, value: Any, dtypes: tuple[type, ...], shape: tuple[int | N
 
 
 def _single(name: str, value: Any, shape: tuple[int | None, ...]) -> NDArray[np.float32]:
-    """float32 from float32 or float64; what is too large for it becomes infinite, which is no return."""
+    """Convert float32 or float64 to float32; what is too large becomes infinite, which is no return."""
     with np.errstate(over="ignore"):
         return _array(name, value, (np.float32, np.float64), shape).astype(np.float32, copy=False)
 

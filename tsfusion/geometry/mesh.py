@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A triangle mesh and the files it becomes."""
+"""Triangle meshes, and their files."""
 
 import os
 from dataclasses import dataclass
@@ -32,10 +32,10 @@ class Mesh:
     colors: NDArray[np.uint8] | None = None
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write PLY (binary), GLB or OBJ by the file's ending; complete or not at all.
+        """Write PLY (binary), GLB or OBJ by the file's suffix; complete or not at all.
 
         Raises:
-            OutputError: for another ending, an empty mesh, or a place that cannot be written.
+            OutputError: for another suffix, an empty mesh, or a path that cannot be written.
         """
         path = Path(path)
         if path.suffix.lower() not in FORMATS:
@@ -52,8 +52,8 @@ class Mesh:
         return path
 
     def encode(self, suffix: str) -> bytes:
-        """The file's bytes for `.ply`, `.glb` or `.obj`."""
-        with process.uninterrupted():  # trimesh passes over whatever is raised while it is imported
+        """Encode the mesh as the content of a `.ply`, `.glb` or `.obj` file."""
+        with process.uninterrupted():  # trimesh ignores exceptions while it is imported
             import trimesh
 
         colors = self.colors

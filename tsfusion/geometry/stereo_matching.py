@@ -12,22 +12,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-UNITS = 16  # of disparity in a pixel, as OpenCV counts
+UNITS = 16  # units of OpenCV's disparity in a pixel
 
 
 @dataclass(frozen=True, kw_only=True)
 class Matcher:
-    """`matcher(left, right)` → (H, W) uint16 disparity in 1/16 px; 0 where it cannot be trusted.
+    """Stereo matcher: `matcher(left, right)` → (H, W) uint16 disparity in 1/16 px; 0 = uncertain.
 
     OpenCV's 3-way mode ignores `disp12MaxDiff`, so the pair is matched both ways and compared here: on
     KITTI 06 this takes disagreements of more than 2 px between frames from 5.7 % to 2.9 %. Both images are
     widened by the search range first, which keeps the image's left edge.
 
     Attributes:
-        search: pixels of disparity searched, a multiple of 16; None = a twelfth of the width, at least 32.
-        block: pixels, odd.
+        search: range of disparities, pixels, a multiple of 16; None = a twelfth of the width, at least 32.
+        block: side of the compared blocks, pixels, odd.
         uniqueness: percent by which the best match must beat the second.
-        agreement: pixels between the two directions' disparities, at most.
+        agreement: largest difference of the two directions' disparities, pixels.
         speckle: smallest connected region kept, pixels.
     """
 
@@ -60,9 +60,9 @@ class Matcher:
 
 
 def quick_disparity(left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(H, W) float32 pixels of disparity, matched at half the resolution and one way; 0 = none.
+    """Match at half the resolution and in one direction: (H, W) float32 pixels of disparity; 0 = none.
 
-    For following a sensor, where a seventh of `Matcher`'s time counts more than its edges.
+    For tracking: it takes a seventh of `Matcher`'s time, and is less exact at edges.
     """
     small = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in (left, right)]
     search = max(32, -(-small[0].shape[1] // (12 * 16)) * 16)
@@ -91,7 +91,7 @@ def _match(matcher: Any, left: NDArray[np.uint8], right: NDArray[np.uint8], sear
 
 
 def _agree(left: NDArray[np.int16], right: NDArray[np.int16], tolerance: float) -> NDArray[np.bool_]:
-    """Where the right image's disparity, at the place the left one points to, is the same."""
+    """Whether the right image's disparity, at the pixel the left one points to, is the same: (H, W)."""
     width = left.shape[1]
     column = np.arange(width) - (left + UNITS // 2) // UNITS
     other = np.take_along_axis(right, np.clip(column, 0, width - 1), axis=1)

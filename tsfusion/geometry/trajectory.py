@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tsfusion.geometry.se3 import Transform
 
-_EXACT_NS = 1_000_000  # a pose this near in time needs no neighbour
+_EXACT_NS = 1_000_000  # nanoseconds within which a pose is taken as it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Trajectory:
     quaternions: NDArray[np.float64]
 
     def at(self, timestamp_ns: int, *, max_gap_ns: int) -> Transform | None:
-        """The pose at a time: SLERP and linear between the neighbours, never beyond the ends.
+        """Interpolate the pose at a time: SLERP and linear between the neighbours, never beyond the ends.
 
         None when the neighbours are more than `max_gap_ns` apart, unless one is within a millisecond.
         """
@@ -45,7 +45,7 @@ class Trajectory:
 
 
 def slerp(q0: NDArray[np.float64], q1: NDArray[np.float64], share: float) -> NDArray[np.float64]:
-    """The unit quaternion `share` of the way from `q0` to `q1`, the short way round."""
+    """Interpolate between unit quaternions, `share` of the short way from `q0` to `q1` (SLERP)."""
     cosine = float(q0 @ q1)
     if cosine < 0:
         q1, cosine = -q1, -cosine
@@ -59,7 +59,7 @@ def slerp(q0: NDArray[np.float64], q1: NDArray[np.float64], share: float) -> NDA
 
 
 def rigid(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> Transform:
-    """(4, 4) from a unit quaternion (x y z w) and a translation."""
+    """Make a (4, 4) transform of a unit quaternion (x y z w) and a translation."""
     x, y, z, w = quaternion
     T = np.eye(4)
     T[:3, :3] = [
@@ -72,7 +72,7 @@ def rigid(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> 
 
 
 def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) rotation → (4,) unit quaternion x y z w with w >= 0."""
+    """Convert a (3, 3) rotation to a (4,) unit quaternion x y z w with w >= 0."""
     # The largest of the four squares is at least 1/4: dividing by its root loses no digits.
     squares = np.array(
         [
