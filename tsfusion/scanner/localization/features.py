@@ -73,21 +73,24 @@ def resection(
     *,
     guess: se3.Transform | None = None,
     tolerance: float = 2.0,
-    seed: int = 0,
+    minimum: int = 6,
+    iterations: int = 100,
+    method: int = cv2.SOLVEPNP_ITERATIVE,
 ) -> tuple[se3.Transform, NDArray[np.bool_]] | None:
     """Find the camera pose from (n, 3) points and their (n, 2) pixels, by RANSAC and refinement (PnP).
 
     Args:
         guess: T_points_camera to begin with.
         tolerance: pixels by which an inlier may be off.
-        seed: seed of the random choice; equal input gives equal poses.
+        minimum: number of inliers that must agree.
+        iterations, method: of RANSAC; `cv2.SOLVEPNP_…`.
 
     Returns:
-        T_points_camera (4, 4) and the (n,) inliers; None without at least 6 that agree.
+        T_points_camera (4, 4) and the (n,) inliers; None where fewer than `minimum` agree.
     """
-    if len(points) < 6:
+    if len(points) < minimum:
         return None
-    cv2.setRNGSeed(seed)
+    cv2.setRNGSeed(0)  # equal input gives equal poses
     rvec = tvec = None
     if guess is not None:
         T_camera_points = se3.inverse(guess)
@@ -95,9 +98,10 @@ def resection(
         tvec = T_camera_points[:3, 3].reshape(3, 1).copy()
     points3, pixels2 = points.astype(np.float64), pixels.astype(np.float64)
     found, rvec, tvec, chosen = cv2.solvePnPRansac(
-        points3, pixels2, intrinsics.matrix, None, rvec, tvec, guess is not None, 100, tolerance, 0.999
-    )
-    if not found or chosen is None or len(chosen) < 6:
+        points3, pixels2, intrinsics.matrix, None, rvec, tvec, guess is not None,
+        iterations, tolerance, 0.999, flags=method,
+    )  # fmt: skip
+    if not found or chosen is None or len(chosen) < minimum:
         return None
     inliers = np.zeros(len(points), bool)
     inliers[chosen.ravel()] = True

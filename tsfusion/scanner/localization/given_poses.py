@@ -11,13 +11,13 @@ from tsfusion.datasets.readers import read_lines
 from tsfusion.datasets.trajectory_files import nanoseconds, read_kitti, read_tum
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.trajectory import Trajectory, quaternion
-from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
+from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
 from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
 
 _TUM_COLUMNS, _KITTI_COLUMNS = 8, 12
 
 
-class TrajectoryFilePoses:
+class TrajectoryFilePoses(Localizer):
     """`Localizer` that interpolates the poses of a file at each frame's timestamp.
 
     A file in KITTI's format has no times. They are read from `times.txt` (seconds, a line a pose), beside the
@@ -53,10 +53,6 @@ class TrajectoryFilePoses:
         if T is None:
             return Lost(reason=self._missing(frame.timestamp_ns, stamp), timestamp_ns=frame.timestamp_ns)
         return self._anchors.pose(T, frame.timestamp_ns)
-
-    def corrections(self) -> PoseCorrections | None:
-        """Return None: the poses of a file are not corrected."""
-        return None
 
     def reset(self) -> None:
         """Begin a new tracking keyframe; the world stays the trajectory's."""
@@ -122,7 +118,7 @@ def _in_time(stamps: Sequence[int], poses: Sequence[np.ndarray], path: Path) -> 
     return Trajectory(times, translations, np.array([quaternion(T[:3, :3]) for T in poses]))
 
 
-class GivenPoses:
+class GivenPoses(Localizer):
     """`Localizer` that takes `frame.T_world_camera`, the source's own pose."""
 
     absolute = True
@@ -135,10 +131,6 @@ class GivenPoses:
         if frame.T_world_camera is None:
             return Lost(reason="the source gives no pose for this frame", timestamp_ns=frame.timestamp_ns)
         return self._anchors.pose(frame.T_world_camera, frame.timestamp_ns)
-
-    def corrections(self) -> PoseCorrections | None:
-        """Return None: given poses are not corrected."""
-        return None
 
     def reset(self) -> None:
         """Begin a new tracking keyframe; the world stays the source's."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import InvalidKeyframe, MissingDependency
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
-from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
+from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
 from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
 
 Points = NDArray[np.float64]  # (n, 3) metres
@@ -33,7 +33,7 @@ MAX_MISSED_SCANS = 5  # without a pose, through which the motion is thought to g
 KEYFRAME_DISTANCE = 2.0  # voxels to the next tracking keyframe
 
 
-class LidarLocalizer:
+class LidarLocalizer(Localizer):
     """`Localizer` of point clouds, z up. Needs the extra `lidar`.
 
     KISS-ICP alone fails when the sensor moves fast from the first scan on: rings on the ground look the same
@@ -90,10 +90,6 @@ class LidarLocalizer:
                 return self._fail(frame, problem)
         T = se3.nearest(self._accept(T, map_points, frame))
         return self._anchors.pose(T, frame.timestamp_ns, quality=quality)
-
-    def corrections(self) -> PoseCorrections | None:
-        """Return None: odometry closes no loops."""
-        return None
 
     def reset(self) -> None:
         """Begin a new world at the next frame."""

@@ -79,7 +79,8 @@ class Localizer(Protocol):
         """
 
     def corrections(self) -> PoseCorrections | None:
-        """Return corrections that are new since the last call; None = there are none."""
+        """Return corrections that are new since the last call; None = there are none, as in odometry."""
+        return None
 
     def reset(self) -> None:
         """Forget the world: the next pose begins a new one, unrelated to the old."""

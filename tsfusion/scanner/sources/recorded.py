@@ -5,7 +5,6 @@ import dataclasses
 import time
 from collections.abc import Iterator
 from itertools import islice
-from types import TracebackType
 
 from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, frame_of
 from tsfusion.geometry.frame import Frame
@@ -44,12 +43,12 @@ class RecordedSource(LiveSource):
             yield dataclasses.replace(frame, timestamp_ns=stamp, captured_ns=time.monotonic_ns())
 
 
-class LimitedSource:
+class LimitedSource(LiveSource):
     """The first `limit` frames of a source; closes the source with itself."""
 
     def __init__(self, source: Source, limit: int) -> None:
-        self.name, self.sensor, self.skipped = source.name, source.sensor, source.skipped
-        self.live = source.live
+        super().__init__(source.name, source.sensor)
+        self.live, self.skipped = source.live, source.skipped
         self.length = None if source.length is None else min(source.length, limit)
         self._source, self._limit = source, limit
 
@@ -60,11 +59,3 @@ class LimitedSource:
     def close(self) -> None:
         """Close the source."""
         self._source.close()
-
-    def __enter__(self) -> "LimitedSource":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

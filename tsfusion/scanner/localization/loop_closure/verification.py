@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
+from tsfusion.scanner.localization import features
 from tsfusion.scanner.localization.loop_closure.dense_alignment import Agreement, agreement, refine
 from tsfusion.scanner.localization.loop_closure.place_index import PlaceView
 
@@ -103,26 +104,22 @@ def _pose(
     points: NDArray[np.float32], pixels: NDArray[np.float32], camera: PlaceView
 ) -> tuple[se3.Transform, NDArray[np.bool_]] | None:
     """T_points_camera by RANSAC over three points (P3P) and refinement, and (n,) which points agree."""
-    known = np.flatnonzero(np.isfinite(points[:, 2]))
-    if len(known) < 8:
-        return None
-    cv2.setRNGSeed(0)
+    known = np.isfinite(points[:, 2])
     tolerance = PIXEL_TOLERANCE * max(camera.size[0] / 640, 0.5)
-    points3, pixels2 = points[known].astype(np.float64), pixels[known].astype(np.float64)
-    K = camera.intrinsics.matrix
-    found, rvec, tvec, chosen = cv2.solvePnPRansac(
-        points3, pixels2, K, None, iterationsCount=150, reprojectionError=tolerance, confidence=0.999,
-        flags=cv2.SOLVEPNP_P3P,
-    )  # fmt: skip
-    if not found or chosen is None or len(chosen) < 8:
+    found = features.resection(
+        points[known],
+        pixels[known],
+        camera.intrinsics,
+        tolerance=tolerance,
+        minimum=8,
+        iterations=150,
+        method=cv2.SOLVEPNP_P3P,
+    )
+    if found is None:
         return None
-    rows = chosen.ravel()
-    rvec, tvec = cv2.solvePnPRefineLM(points3[rows], pixels2[rows], K, None, rvec, tvec)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(rvec)[0], tvec.ravel()
     inliers = np.zeros(len(points), bool)
-    inliers[known[rows]] = True
-    return se3.inverse(T), inliers
+    inliers[known] = found[1]
+    return found[0], inliers
 
 
 def _hull(pixels: NDArray[np.float32], size: tuple[int, int]) -> float:

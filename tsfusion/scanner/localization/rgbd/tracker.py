@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization import features
-from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
+from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
 from tsfusion.scanner.localization.rgbd import point_to_plane, pose_acceptance, pose_solver
 from tsfusion.scanner.localization.rgbd.rgbd_frame import RGBDFrame, TrackingKeyframe
 
@@ -42,7 +42,7 @@ class _Attempt:
     evidence: pose_acceptance.PoseEvidence
 
 
-class RGBDLocalizer:
+class RGBDLocalizer(Localizer):
     """`Localizer` of depth cameras, with colour where there is some.
 
     Corners are followed from the tracking keyframe (Lucas and Kanade); the pose they give begins a
@@ -66,10 +66,6 @@ class RGBDLocalizer:
         self._last_ns = self._interval_ns = 0
         self._motion: se3.Transform | None = None  # between the last two frames; None = not known
         self._is_lost = False
-
-    def corrections(self) -> PoseCorrections | None:
-        """Return None: odometry closes no loops."""
-        return None
 
     def track(self, frame: Frame) -> Pose | Lost:
         """Find the camera's pose.

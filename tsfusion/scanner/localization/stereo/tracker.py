@@ -12,7 +12,7 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.stereo_matching import quick_disparity
 from tsfusion.scanner.localization import features
-from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
+from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose
 from tsfusion.scanner.localization.stereo.rectification_check import RectificationCheck, RectificationMonitor
 from tsfusion.scanner.localization.stereo.reprojection import StereoCamera, refine
 from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
@@ -67,7 +67,7 @@ class _DisparityImage:
         return pixels, features.bilinear(self.disparity, pixels)
 
 
-class StereoLocalizer:
+class StereoLocalizer(Localizer):
     """`Localizer` of rectified stereo pairs; also of disparity or depth images with an image beside them.
 
     A frame is compared with the last one that had a pose and had moved: a few bad frames are bridged, and a
@@ -117,10 +117,6 @@ class StereoLocalizer:
                 self._reference = seen
                 self._anchors.distance = KEYFRAME_DISTANCE * seen.median_depth
         return self._anchors.pose(T, frame.timestamp_ns, quality=quality)
-
-    def corrections(self) -> PoseCorrections | None:
-        """Return None: odometry closes no loops."""
-        return None
 
     def reset(self) -> None:
         """Begin a new world at the next frame."""
