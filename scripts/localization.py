@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""How well the scanner finds its way: the trajectory error of every localizer on every scene, in one table.
+"""Trajectory error of every localizer on every scene, in one table.
 
     python scripts/localization.py                  all scenes
     python scripts/localization.py --only kitchen   those whose name holds it
     python scripts/localization.py --json           a JSON line a scene instead
     python scripts/localization.py --write-docs     the tables of docs/localization.md
 
-Recorded scenes are found under TSFUSION_DATA (default ../shared/data); what is missing is said and left out.
+Recorded scenes are found under TSFUSION_DATA (default ../shared/data); missing ones are reported.
 Every scene runs in a fresh process, with one thread: `cpu_ms` is processor time of the localizer a frame,
 `peak_rss_mb` the process's peak while it tracks (where no synthetic world is rendered in it).
 
 Peers are followed frame to frame, with their defaults: Open3D's hybrid odometry (`bench` extra) and OpenCV's.
 
-`mesh`: the kitchen scanned by `tsfusion scan` with poses of its own and with the true ones; how far the depth
-that either mesh predicts for frames that were not fused is from the depth measured there.
+`mesh`: the kitchen scanned by `tsfusion scan` with its own poses and with the true ones; error of the depth
+that either mesh predicts for frames that were not fused.
 """
 
 import argparse
@@ -54,7 +54,7 @@ BEGIN, END = "<!-- table: python scripts/localization.py --write-docs -->", "<!-
 
 
 class Scene(NamedTuple):
-    """One row.
+    """One row of the table.
 
     Attributes:
         loops: whether loops are closed.
@@ -147,7 +147,7 @@ def _cases() -> list[tuple[str, Callable[[], dict[str, Any]]]]:
 
 
 def _fresh(index: int) -> dict[str, Any]:
-    """A scene in a process of its own."""
+    """Run a scene in a process of its own."""
     command = [sys.executable, __file__, "--scene", str(index)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
     if done.returncode:
@@ -157,7 +157,7 @@ def _fresh(index: int) -> dict[str, Any]:
 
 
 def _track(scene: Scene) -> dict[str, Any]:
-    """Follow one scene from its beginning to its end."""
+    """Track one scene from its beginning to its end."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -209,14 +209,14 @@ def _localizer(scene: Scene, first: Frame) -> Localizer:
 def _verdict(
     scene: Scene, row: dict[str, Any], before: TrajectoryError, after: TrajectoryError
 ) -> dict[str, Any]:
-    """Loops must help where there are some, and none be found where all rooms are alike."""
+    """Whether loops reduce the error, or none was found where all rooms are alike."""
     if "identical" in scene.name:
         return {"bar": "no loop", "reached": row["loops"] == 0}
     return {"bar": "0.3 times", "reached": row["loops"] > 0 and after.rmse <= 0.3 * before.rmse}
 
 
 def _meshes() -> dict[str, Any]:
-    """`tsfusion scan` of the kitchen with poses of its own and with the true ones."""
+    """Scan the kitchen with its own poses and with the true ones; compare the meshes."""
     if not (DATA / KITCHEN).exists():
         return {"name": "mesh", "error": f"no {KITCHEN} in {DATA}"}
     from tsfusion.evaluation.held_out_views import compare_scans
@@ -238,7 +238,7 @@ def _meshes() -> dict[str, Any]:
 
 
 def _report(rows: list[dict[str, Any]]) -> str:
-    """The table as the paper prints it, what it costs, and what is missing."""
+    """Tables of errors and costs, and the scenes that are missing."""
     tracked = [row for row in rows if not row["error"] and "ate" in row]
     lines = []
     if tracked:

@@ -90,7 +90,7 @@ _OWN: dict[str, Callable[[], Callable[..., Source]]] = {
 
 
 def _like(opener: Callable[..., Source], source: Callable[..., Any]) -> Callable[..., Source]:
-    """The opener, which takes the options of the source's class."""
+    """Give an opener the signature of the source's class, whose options it takes."""
     opener.__signature__ = inspect.signature(source)  # type: ignore[attr-defined]
     return opener
 

@@ -117,7 +117,7 @@ class StereoVideo(LiveSource):
     def _newest(self, thread: "CameraThread") -> Iterator["VideoPicture"]:
         last = time.monotonic()
         while not self._closed.is_set():
-            picture = thread.take(_WAIT_S)
+            picture = thread.newest(_WAIT_S)
             if thread.dropped:
                 self.skipped["dropped"] = thread.dropped
             if picture is not None:
@@ -175,7 +175,7 @@ class CameraThread:
         self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
         self._thread.start()
 
-    def take(self, timeout: float) -> VideoPicture | None:
+    def newest(self, timeout: float) -> VideoPicture | None:
         """Remove and return the newest picture; None if there is none in time."""
         with self._changed:
             self._changed.wait_for(lambda: self._newest or self.ended or self._closed, timeout)
@@ -212,7 +212,7 @@ class CameraThread:
 
 
 def _rectifier_of_known_size(calibration: str | Path, size: Size | None) -> PairRectifier | None:
-    """Read the rectifier; None if the file has no image size, which the camera then tells."""
+    """Read the rectifier; None if the file has no image size, which then comes from the camera."""
     try:
         return read_rectifier(calibration, size=size)
     except SourceError:

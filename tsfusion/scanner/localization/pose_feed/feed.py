@@ -24,7 +24,7 @@ from tsfusion.wire import sockets
 
 log = logging.getLogger(__name__)
 
-WAIT = 0.1  # seconds for a pose that is under way; docs/localization.md says so
+WAIT = 0.1  # seconds to wait for a pose; also in docs/localization.md
 MAX_RECEIVE = 0.1  # seconds of receiving messages for one frame, so that a flood cannot hold it up
 RECONNECT_AFTER = 5.0  # seconds of silence; libzmq gives some connections up for good
 ANOTHER_CLOCK = 3600.0  # seconds between pose and frame

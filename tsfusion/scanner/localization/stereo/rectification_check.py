@@ -21,7 +21,7 @@ DISPARITY_LIMIT = 0.4  # pixels; KITTI 06 has 0.1
 SAMPLES = 8  # pairs, and motions, until the verdict
 MIN_MATCHES = 30  # of one pair
 SIGNIFICANT = 3.0  # standard deviations
-MAX_OFFSET_SIGMA = 0.3  # pixels: with more, the sensor did not move enough to tell
+MAX_OFFSET_SIGMA = 0.3  # pixels: with more, the sensor did not move enough
 FIT_ROUNDS = 3
 MIN_SWAP, MIN_SWAPPED_SHARE = 2.0, 0.7  # pixels to the wrong side, and share of the matches that are there
 

@@ -28,7 +28,7 @@ SUDDEN_DISTANCE = 0.1  # of the points' median depth by which a motion may diffe
 SUDDEN_ANGLE = np.radians(10)
 KEYFRAME_DISTANCE = 0.15  # of the points' median depth to the next tracking keyframe
 HINT = " (is the view blank, the pair rectified, and left the left camera's?)"
-DEPTH_CAMERA_BASELINE_FX = 43.0  # px·m, for depth cameras that do not tell theirs (Kinect: 0.075 m × 575 px)
+DEPTH_CAMERA_BASELINE_FX = 43.0  # px·m, of depth cameras without a known one (Kinect: 0.075 m × 575 px)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
