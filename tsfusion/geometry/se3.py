@@ -128,7 +128,7 @@ def _identity(batch: tuple[int, ...]) -> Transform:
 
 def _length(v: NDArray[np.floating]) -> NDArray[np.float64]:
     """(…, 3) → (…), at least `_TINY`."""
-    length: NDArray[np.float64] = np.maximum(np.sqrt((v * v).sum(axis=-1)), _TINY)
+    length: NDArray[np.float64] = np.maximum(np.sqrt(np.einsum("...i,...i", v, v)), _TINY)
     return length
 
 
