@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Writing the messages of a journal into one MCAP file of the profile `ros2`."""
 
-import os
 import re
 from collections import Counter
-from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -52,21 +50,12 @@ def export(place: JournalPlace, out: Path, watch: Watcher) -> Export:
         or out.resolve().parent == place.path.resolve()
     ):
         raise OutputError(f"cannot write {out}: it is in the journal that is read")
-    partial = out.with_name(f".{out.name}.partial")
     try:
-        with partial.open("wb") as stream:
+        with durable_files.replacing(out) as stream:
             exporter = _Exporter(_Bag(stream, store), Converter(store.types))
             exporter.run(place, watch)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(partial, out)
-        durable_files.sync_folder(out.absolute().parent)
-    except BaseException as error:  # an interrupted one leaves no part either
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise OutputError(f"cannot write {out}: {error.strerror}") from error
-        raise
+    except OSError as error:
+        raise OutputError(f"cannot write {out}: {error.strerror}") from error
     return exporter.result(out)
 
 
@@ -197,6 +186,3 @@ class _Exporter:
             messages=dict(sorted(self._bag.messages.items())),
             problems=self._problems,
         )
-
-
-__all__ = ["Export", "export"]

@@ -243,17 +243,13 @@ def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, c
     Raises:
         JournalError: when the disk refuses.
     """
-    partial = path.with_name(f".{path.name}.partial")
     identity, now_ns = secrets.token_bytes(mcap_layout.IDENTITY_BYTES), time.time_ns()
     try:
-        with partial.open("wb") as file:
+        with durable_files.replacing(path) as file:
             writer = mcap_layout.start(file, identity, now_ns)
             mcap_layout.add(writer, mcap_layout.pack(frames, identity, session, seq, client), seq, now_ns)
             writer.finish()
-        partial.replace(path)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
         raise failed("write", path, error) from error
 
 

@@ -10,6 +10,7 @@ The folder is its owner's alone (0700), every file 0600 from its first byte, and
 """
 
 import logging
+import math
 import os
 import re
 import stat
@@ -21,9 +22,9 @@ import msgspec
 import zmq
 from msgspec import Meta, Struct
 
-from tsfusion.core import durable_files
+from tsfusion.core import durable_files, folder_lock
 from tsfusion.core.config import ClientName
-from tsfusion.core.errors import InvalidConfig
+from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.wire import curve
 
 log = logging.getLogger(__name__)
@@ -64,8 +65,9 @@ def create(folder: Folder, name: str, *, force: bool = False) -> Pair:
         OutputError: when the files cannot be written.
     """
     check_name(name)
-    place = durable_files.made(Path(folder).expanduser())
-    with durable_files.locked(place):
+    place = Path(folder).expanduser()
+    durable_files.make_private_folder(place)
+    with folder_lock.hold(place, wait=math.inf):
         paths = [place / f"{name}{ending}" for ending in (curve.SECRET, curve.PUBLIC)]
         for path in paths:
             if path.exists() and not force:
@@ -73,10 +75,10 @@ def create(folder: Folder, name: str, *, force: bool = False) -> Pair:
         public, secret = _draw()
         lines = f'curve\n    public-key = "{public}"\n'
         secret_line = f'    secret-key = "{secret}"\n'
-        durable_files.write(paths[0], _PAIR_HEAD.format("**Secret** Certificate") + lines + secret_line)
-        durable_files.write(paths[1], _PAIR_HEAD.format("Public Certificate") + lines)
+        _write(paths[0], _PAIR_HEAD.format("**Secret** Certificate") + lines + secret_line)
+        _write(paths[1], _PAIR_HEAD.format("Public Certificate") + lines)
         if name == curve.SERVER and not (place / ALLOWED).exists():
-            durable_files.write(place / ALLOWED, _dumps(Allowed()))
+            _write(place / ALLOWED, _dumps(Allowed()))
     return Pair(name, public)
 
 
@@ -96,7 +98,7 @@ def allow(folder: Folder, name: str, key: str) -> str | None:
     check_name(name)
     public = curve.public_key(key)
     place = _existing(folder)
-    with durable_files.locked(place):
+    with folder_lock.hold(place, wait=math.inf):
         own = curve.server_keys(place).public
         listed = read_list(place) if has_list(place) else Allowed()
         earlier = listed.allowed.get(name)
@@ -106,7 +108,7 @@ def allow(folder: Folder, name: str, key: str) -> str | None:
         revoked = {key: was for key, was in listed.revoked.items() if key != public}
         if earlier is not None:
             revoked[earlier] = name
-        durable_files.write(place / ALLOWED, _dumps(Allowed({**listed.allowed, name: public}, revoked)))
+        _write(place / ALLOWED, _dumps(Allowed({**listed.allowed, name: public}, revoked)))
     return earlier
 
 
@@ -118,14 +120,14 @@ def revoke(folder: Folder, name: str) -> str:
         OutputError: when the list cannot be written.
     """
     place = _existing(folder)
-    with durable_files.locked(place):
+    with folder_lock.hold(place, wait=math.inf):
         listed = read_list(place)
         if name not in listed.allowed:
             names = ", ".join(sorted(listed.allowed)) or "nobody is allowed"
             raise InvalidConfig(f"no key is allowed under the name {name!r}, but: {names}")
         left = dict(listed.allowed)
         key = left.pop(name)
-        durable_files.write(place / ALLOWED, _dumps(Allowed(left, {**listed.revoked, key: name})))
+        _write(place / ALLOWED, _dumps(Allowed(left, {**listed.revoked, key: name})))
     return key
 
 
@@ -158,7 +160,7 @@ def read_list(folder: Folder) -> Allowed:
             content = file.read(_MAX_LIST_BYTES + 1)
     except OSError as error:
         raise InvalidConfig(f"cannot read the allow-list {path}: {error.strerror}") from error
-    if durable_files.others_can_change(mode):
+    if durable_files.others_can_write(mode):
         raise InvalidConfig(f"others can change the allow-list {path} (mode {stat.S_IMODE(mode):04o})")
     return _loads(content, path)
 
@@ -200,7 +202,7 @@ class AllowList:
             return False
         before, self._seen = self._names, seen
         try:
-            durable_files.checked(self._folder)
+            durable_files.check_private_folder(self._folder)
             listed = read_list(self._folder)
         except InvalidConfig as error:
             self._fail(str(error))
@@ -245,13 +247,23 @@ class AllowList:
 
 
 def _existing(folder: Folder) -> Path:
+    place = Path(folder).expanduser()
     try:
-        return durable_files.checked(Path(folder).expanduser())
+        durable_files.check_private_folder(place)
     except InvalidConfig as error:
         raise InvalidConfig(
             f"{error}; `tsfusion keys new {curve.SERVER}` makes a server's folder of keys, "
             "`tsfusion keys new NAME` a scanner's"
         ) from error
+    return place
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        with durable_files.replacing(path, private=True) as file:
+            file.write(text.encode())
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
 
 
 def _loads(content: bytes, path: Path) -> Allowed:
