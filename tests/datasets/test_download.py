@@ -256,7 +256,7 @@ def test_a_server_that_never_ends_does_not_fill_the_disk(
     disk = small_disk(4)
     server.with_length, server.files["file.bin"] = False, bytes(32 << 20)
     monkeypatch.setattr(download_http, "_RESERVE_BYTES", 1 << 20)
-    with pytest.raises(OutputError, match=r"1 MB are to come, \d MB are free on that disk"):
+    with pytest.raises(OutputError, match=r"1 MB are needed, \d MB are free on that disk"):
         fetch(one(server.url), disk, silent)
     assert shutil.disk_usage(disk).free >= 1 << 20
 
@@ -308,7 +308,7 @@ def test_a_disk_without_room_is_said_before(
     server: Server, small_disk: Callable[[int], Path], tmp_path: Path
 ) -> None:
     disk = small_disk(4)
-    with pytest.raises(OutputError, match=r"3 MB are to come, 4 MB are free"):
+    with pytest.raises(OutputError, match=r"3 MB are needed, 4 MB are free"):
         fetch(one(server.url), disk, silent)
 
 
@@ -417,7 +417,7 @@ def test_archives_that_unfold_to_more_than_the_disk_holds_are_refused(
     monkeypatch.setattr(archives, "_RESERVE_BYTES", 1 << 20)
     disk = small_disk(4)
     (disk / name).write_bytes(content)
-    with pytest.raises(OutputError, match=r"it unpacks to 8 MB, \d MB are free on that disk"):
+    with pytest.raises(OutputError, match=r"8 MB are needed, \d MB are free on that disk"):
         fetch(one(server.url, name), disk, silent)
     assert sorted(path.name for path in disk.iterdir()) == [name, f"{name}.sha256"]
 
