@@ -76,7 +76,7 @@ def _open(
     process.raise_file_limit()
     state = Path(server.state)
     stack.enter_context(lock_folder(state, "state", "server"))
-    for name in state_folder.names(state):
+    for name in state_folder.map_names(state):
         if len(volumes) < server.max_maps:
             volumes.setdefault(name, volumes[DEFAULT_MAP])
     context: zmq.Context[Any] = zmq.Context()

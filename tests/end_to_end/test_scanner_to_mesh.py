@@ -126,7 +126,8 @@ def test_a_killed_server_loses_nothing_acknowledged(tmp_path: Path, offline_hash
             assert again.terminate() == 0
         assert client.stats.fused == COUNT
     assert (status.keyframes_durable, status.keyframes_fused, status.map_hash) == (COUNT, COUNT, offline_hash)
-    assert tsfusion.Volume.load(state_folder.folder(state, "default") / "map.tsf").map_hash() == offline_hash
+    checkpoint = state_folder.map_folder(state, "default") / "map.tsf"
+    assert tsfusion.Volume.load(checkpoint).map_hash() == offline_hash
 
 
 def test_a_stop_drains_and_a_start_goes_on(tmp_path: Path, offline_hash: str) -> None:
@@ -149,7 +150,8 @@ def test_a_stop_drains_and_a_start_goes_on(tmp_path: Path, offline_hash: str) ->
         status = fetch_status(server.address)
         assert (status.sessions, status.keyframes_fused, status.map_hash) == (2, COUNT, offline_hash)
         assert server.terminate() == 0
-    for segment in (state_folder.folder(tmp_path, "default") / "journal").iterdir():  # somebody makes room
+    journal_folder = state_folder.map_folder(tmp_path, "default") / "journal"
+    for segment in journal_folder.iterdir():  # somebody makes room
         segment.unlink()
     with serving(tmp_path) as server:
         with Client(server.address) as client:

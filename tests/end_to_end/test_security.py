@@ -102,7 +102,7 @@ def test_the_allowed_come_in_and_their_name_is_in_the_journal(site: Site, server
         assert {one.client for one in health.clients} == {"robot"}
     assert len(fetch_mesh(server.address, min_weight=0.5, keys=site.of("cart")).faces) > 0
     journal = site.state / "maps/default/journal"
-    (found,) = tsfusion.journal.scan(journal / "000001.mcap")[0]
+    (found,) = tsfusion.journal.list_records(journal / "000001.mcap")[0]
     assert found.client == "robot"
 
 

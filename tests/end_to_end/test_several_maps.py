@@ -70,7 +70,7 @@ def test_two_scanners_two_maps(tmp_path: Path) -> None:
         with pytest.raises(TransportError, match="no map attic is open"):
             fetch_status(server.address, map_name="attic")
         assert server.terminate() == 0
-    assert state_folder.names(tmp_path) == ["default", "yard-2"]
+    assert state_folder.map_names(tmp_path) == ["default", "yard-2"]
     with pytest.raises(JournalError, match=r"has several maps \(default, yard-2\): choose one with --map"):
         JournalRecording(tmp_path)
     assert len(JournalRecording(tmp_path, "yard-2")) == len(JournalRecording(tmp_path / "maps/yard-2")) == 8
@@ -84,7 +84,7 @@ def test_a_server_opens_only_so_many_maps(tmp_path: Path) -> None:
     refused = pytest.raises(ServerUnreachable, match=r"map attic cannot be opened: .* open \(max_maps\)")
     with serving(tmp_path, max_maps=1) as server, Client(server.address, map="attic") as client, refused:
         client.connect(timeout=5)
-    assert state_folder.names(tmp_path) == ["default"]
+    assert state_folder.map_names(tmp_path) == ["default"]
 
 
 def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(

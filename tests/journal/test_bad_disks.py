@@ -343,7 +343,7 @@ def test_a_segment_that_cannot_be_read_is_not_passed_over(
         JournalError, match=r"cannot read .*000002\.mcap: .*; make it readable, or move it away"
     ):
         Journal(tmp_path, BIG)
-    place = state_folder.find(tmp_path)
+    place = state_folder.find_journal(tmp_path)
     info, verdict = inspection.summarize(place, lambda *_: None), inspection.verify(place, lambda *_: None)
     assert [one.segment for one in info.problems] == ["000002.mcap"]
     assert (info.keyframes, verdict.intact) == (readable, False)

@@ -197,8 +197,8 @@ def run_journal(content: bytes) -> str:
     path = journal.segment_path(folder, 1)
     path.write_bytes(content)
     try:
-        steps = list(journal.walk(path))
-        found, lost = journal.scan(path)
+        steps = list(journal.scan_records(path))
+        found, lost = journal.list_records(path)
     except JournalError as error:
         return f"JournalError {error}"
     whole = [one for one in steps if isinstance(one, journal.Record)]

@@ -44,7 +44,7 @@ class Damage(Struct, frozen=True):
     torn: bool = False
 
 
-def walk(path: Path) -> Iterator[Record | Damage]:
+def scan_records(path: Path) -> Iterator[Record | Damage]:
     """All that a segment file holds, in order of place; reads one record at a time.
 
     Raises:
@@ -54,7 +54,7 @@ def walk(path: Path) -> Iterator[Record | Damage]:
         with SegmentFile(path) as source:
             yield from _Walk(source, segment_number(path)).steps()
     except OSError as error:
-        raise failed("read", path, error) from error
+        raise journal_error("read", path, error) from error
 
 
 def segment_number(path: Path) -> int:
@@ -62,7 +62,7 @@ def segment_number(path: Path) -> int:
     return int(path.stem) if re.fullmatch(r"[0-9]{6,9}", path.stem) else 0
 
 
-def failed(verb: str, path: Path, error: OSError) -> JournalError:
+def journal_error(verb: str, path: Path, error: OSError) -> JournalError:
     """The error for something the disk refused."""
     return JournalError(f"cannot {verb} {path}: {error.strerror or error}")
 

@@ -31,7 +31,7 @@ class JournalRecording:
     """
 
     def __init__(self, path: str | os.PathLike[str], map_name: str | None = None) -> None:
-        place = state_folder.find(Path(path), map_name)
+        place = state_folder.find_journal(Path(path), map_name)
         self.name = str(place.path)
         self._places = _places(place)
         if not self._places:

@@ -9,8 +9,9 @@ from msgspec import Struct
 
 from tsfusion.core.errors import JournalError
 from tsfusion.journal.mcap_layout import Position, Record
-from tsfusion.journal.record_scan import Damage, failed, segment_number, walk
-from tsfusion.journal.segments import segment_path, segments
+from tsfusion.journal.quarantine import quarantined_files
+from tsfusion.journal.record_scan import Damage, journal_error, scan_records, segment_number
+from tsfusion.journal.segments import is_segment, segment_path, segments
 
 MAPS_FOLDER = "maps"
 JOURNAL_FOLDER = "journal"
@@ -21,12 +22,12 @@ PREVIOUS_FILE = "map.previous.tsf"
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")  # as config.MapName
 
 
-def folder(state: str | Path, name: str) -> Path:
+def map_folder(state: str | Path, name: str) -> Path:
     """Where a map is, or will be."""
     return Path(state) / MAPS_FOLDER / name
 
 
-def names(state: str | Path) -> list[str]:
+def map_names(state: str | Path) -> list[str]:
     """The maps that a state folder holds."""
     return sorted(
         path.name
@@ -35,12 +36,12 @@ def names(state: str | Path) -> list[str]:
     )
 
 
-def is_state(path: Path) -> bool:
+def is_state_folder(path: Path) -> bool:
     """Whether it is a server's state folder."""
     return (path / MAPS_FOLDER).is_dir()
 
 
-def resolve(path: Path, name: str | None = None) -> Path:
+def resolve_map(path: Path, name: str | None = None) -> Path:
     """The map's folder when `path` is a state folder; any other path as it is.
 
     Args:
@@ -49,15 +50,15 @@ def resolve(path: Path, name: str | None = None) -> Path:
     Raises:
         JournalError: when it holds no map of that name, or several and none was named.
     """
-    if not is_state(path):
+    if not is_state_folder(path):
         if name is not None:
             raise JournalError(f"--map has no effect on {path}: only a state folder has several maps")
         return path
-    found = names(path)
+    found = map_names(path)
     if name is None and len(found) == 1:
-        return folder(path, found[0])
+        return map_folder(path, found[0])
     if name in found:
-        return folder(path, name)
+        return map_folder(path, name)
     there = ", ".join(found) or "none"
     if name is None and found:
         raise JournalError(
@@ -85,14 +86,15 @@ class JournalPlace(Struct, frozen=True):
     corrections: Path | None = None
 
     def files(self) -> list[Path]:
-        """Its segments, oldest first.
+        """Its segments, oldest first; of a quarantine its files.
 
         Raises:
             JournalError: when the folder cannot be listed.
         """
         if not self.path.is_dir():
             return [self.path]
-        return [segment_path(self.path, number) for number in segments(self.path)]
+        numbered = [segment_path(self.path, number) for number in segments(self.path)]
+        return numbered + quarantined_files(self.path)
 
     def quarantined(self) -> list[Path]:
         """The files in quarantine, by name.
@@ -105,7 +107,7 @@ class JournalPlace(Struct, frozen=True):
         try:
             return sorted(path for path in self.quarantine.iterdir() if path.suffix == ".mcap")
         except OSError as error:
-            raise failed("list", self.quarantine, error) from error
+            raise journal_error("list", self.quarantine, error) from error
 
     def steps(self, watch: Watcher = lambda _done, _all: None) -> Iterator[tuple[Path, Record | Damage]]:
         """Each record and each damaged place, with its file. A file that cannot be read is one such place."""
@@ -113,7 +115,7 @@ class JournalPlace(Struct, frozen=True):
         total, before = sum(size for _, size in files), 0
         for path, size in files:
             try:
-                for step in walk(path):
+                for step in scan_records(path):
                     yield path, step
                     watch(before + min(step.position.offset, size), total)
             except JournalError as error:
@@ -122,7 +124,7 @@ class JournalPlace(Struct, frozen=True):
             watch(before, total)
 
 
-def find(path: Path, map_name: str | None = None) -> JournalPlace:
+def find_journal(path: Path, map_name: str | None = None) -> JournalPlace:
     """The journal at a path: a state folder, a map's folder in it, a folder of segments, or one segment.
 
     Args:
@@ -135,7 +137,7 @@ def find(path: Path, map_name: str | None = None) -> JournalPlace:
         raise JournalError(
             f"{path} does not exist; expected a state folder, a map's, a journal or an .mcap file"
         )
-    path = resolve(path, map_name)
+    path = resolve_map(path, map_name)
     if (path / JOURNAL_FOLDER).is_dir():
         return _of_map(path)
     if path.name == JOURNAL_FOLDER and _is_map(path.parent):
@@ -145,6 +147,19 @@ def find(path: Path, map_name: str | None = None) -> JournalPlace:
     if path.suffix != ".mcap":
         raise JournalError(f"{path} is no journal; expected a folder or an .mcap file")
     return JournalPlace(path)
+
+
+def is_journal(path: Path) -> bool:
+    """Whether there is something to read at a path that `find_journal` takes.
+
+    Raises:
+        JournalError: when a folder cannot be listed.
+    """
+    if not path.is_dir():
+        return is_segment(path)
+    inside = path / JOURNAL_FOLDER
+    place = JournalPlace(inside if inside.is_dir() else path)
+    return is_state_folder(path) or any(map(is_segment, place.files()))
 
 
 def _of_map(folder: Path) -> JournalPlace:

@@ -14,8 +14,8 @@ from tsfusion.core import durable_files
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import mcap_layout
 from tsfusion.journal.mcap_layout import Position
-from tsfusion.journal.record_scan import failed
-from tsfusion.journal.segments import Scan, scan, segment_path, segments
+from tsfusion.journal.record_scan import journal_error
+from tsfusion.journal.segments import RecordEntry, list_records, segment_path, segments
 
 log = logging.getLogger(__name__)
 
@@ -55,12 +55,12 @@ class Journal:
         self._identity = b""
         self._first = 0  # where the open segment's first record starts
         self._closed: dict[int, int] = {}  # bytes by number, oldest first
-        self.found: list[Scan] = []
+        self.found: list[RecordEntry] = []
         self.damaged = 0
         try:
             durable_files.make_folder(self.folder)
         except OSError as error:
-            raise failed("create the journal", self.folder, error) from error
+            raise journal_error("create the journal", self.folder, error) from error
         self._recover()
 
     def _recover(self) -> None:
@@ -69,10 +69,10 @@ class Journal:
             path = segment_path(self.folder, number)
             self._closed[number] = 0
             try:
-                found, damaged = scan(path)
+                found, damaged = list_records(path)
                 self._closed[number] = path.stat().st_size
             except OSError as error:
-                raise _unopened(failed("read", path, error)) from error
+                raise _unopened(journal_error("read", path, error)) from error
             except JournalError as error:
                 raise _unopened(error) from error
             self.found += found
@@ -134,7 +134,7 @@ class Journal:
             self._flush()
         except OSError as error:
             self._abandon(position.offset)
-            raise failed("write", self.folder, error) from error
+            raise journal_error("write", self.folder, error) from error
         except BaseException:  # interrupted in between
             self._abandon(position.offset)
             raise
@@ -153,7 +153,7 @@ class Journal:
         try:
             self.rotate()
         except OSError as error:
-            log.warning("%s", failed("close", segment_path(self.folder, self._number), error))
+            log.warning("%s", journal_error("close", segment_path(self.folder, self._number), error))
             self._abandon()
 
     def rotate(self) -> None:
@@ -170,7 +170,7 @@ class Journal:
             self.rotate()
         except OSError as error:
             self._abandon()
-            raise failed("close", self.folder, error) from error
+            raise journal_error("close", self.folder, error) from error
 
     def forget(self, number: int) -> None:
         """Delete a closed segment whose keyframes are safe elsewhere.
@@ -182,7 +182,7 @@ class Journal:
         try:
             path.unlink()
         except OSError as error:
-            raise failed("delete", path, error) from error
+            raise journal_error("delete", path, error) from error
         self._closed.pop(number, None)
 
     def retire(self, below: int, limit: int) -> int:
@@ -250,7 +250,7 @@ def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, c
             mcap_layout.add(writer, mcap_layout.pack(frames, identity, session, seq, client), seq, now_ns)
             writer.finish()
     except OSError as error:
-        raise failed("write", path, error) from error
+        raise journal_error("write", path, error) from error
 
 
 def _unopened(error: JournalError) -> JournalError:
