@@ -141,5 +141,5 @@ def _check_addresses(server: ServerConfig) -> None:
         if address is not None:
             sockets.check_reachable(address, has_keys=server.keys is not None)
             sockets.check_free(address)
-    if server.control is None and sockets.split(server.listen)[1]:
+    if server.control is None and sockets.parse_address(server.listen)[1]:
         sockets.check_free(sockets.control_address(server.listen))

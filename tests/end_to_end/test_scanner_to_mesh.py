@@ -28,7 +28,7 @@ from tsfusion.core.errors import (
 )
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.journal import state_folder
-from tsfusion.journal.recording import read_keyframes
+from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec, messages, sockets
 from tsfusion.wire.messages import Command
 from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_status, request
@@ -95,7 +95,7 @@ def test_five_lines_reach_the_map(tmp_path: Path, offline_hash: str) -> None:
         assert all(b - a >= -2 * times.clock_bound_ns for a, b in pairwise(stages)), times
         assert 0 < times.clock_bound_ns < 5e7
     assert list((tmp_path / "spool").glob("*.mcap")) == []
-    assert [keyframe.timestamp_ns for keyframe in read_keyframes(tmp_path / "state")] == [
+    assert [keyframe.timestamp_ns for keyframe in JournalRecording(tmp_path / "state")] == [
         10**9 + i for i in range(COUNT)
     ]
 

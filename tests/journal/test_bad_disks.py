@@ -195,12 +195,12 @@ def test_everything_is_on_the_disk_in_the_order_that_recovery_needs(
     happened.clear()
     first, second = fill(log, 2)
     # The start of a segment before its name, and both before its first record.
-    assert happened[:2] == [f"000001.mcap {mcap_layout.intro_bytes()}", "journal"]
+    assert happened[:2] == [f"000001.mcap {mcap_layout.segment_start_bytes()}", "journal"]
     assert happened[2:] == [f"000001.mcap {second.offset}", f"000001.mcap {log.nbytes}"]
     happened.clear()
     log.close()
     assert happened == [f"000001.mcap {log.nbytes}"]
-    assert first.offset == mcap_layout.intro_bytes()
+    assert first.offset == mcap_layout.segment_start_bytes()
 
 
 def test_order_is_by_place_whatever_the_clock_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,7 @@ from tsfusion import journal
 from tsfusion.core.errors import JournalError
 from tsfusion.delivery.spool import Spool
 from tsfusion.journal import Journal, Position, segment_path
-from tsfusion.journal.recording import JournalRecording, read_keyframes
+from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec
 
 SESSION = bytes(16)
@@ -195,7 +195,7 @@ def test_a_journal_is_a_dataset_of_its_keyframes(tmp_path: Path) -> None:
     assert len(recording) == 6
     for i, keyframe in enumerate(recording):
         assert np.array_equal(keyframe.depth, wall(i).depth)
-    assert len(list(read_keyframes(tmp_path / "journal"))) == 6
+    assert len(JournalRecording(tmp_path / "journal")) == 6
     assert 0 < len(JournalRecording(segment_path(tmp_path / "journal", 1))) < 6
 
 

@@ -47,7 +47,7 @@ class Segment:
         self.whole = self.path.read_bytes()
         self.records = {record.position: plain(record) for record in journal.records(self.path)}
         assert list(self.records) == self.places
-        raw = [mcap_layout.head(self.whole[place.offset :]) for place in self.places]
+        raw = [mcap_layout.parse_head(self.whole[place.offset :]) for place in self.places]
         self.ends = [place.offset + head.nbytes for place, head in zip(self.places, raw, strict=True) if head]
 
     def read(self, content: bytes) -> tuple[list[Position], list[Damage]]:
@@ -295,9 +295,9 @@ def test_whatever_happens_to_a_segment_no_wrong_record_comes_back(kept: Segment,
 @EXAMPLES
 @given(st.binary(max_size=3000))
 def test_bytes_of_any_kind_are_read_without_a_complaint(kept: Segment, content: bytes) -> None:
-    mcap_layout.find_intro(content)
-    mcap_layout.head(content)
-    assert mcap_layout.unpack(content, Position(1, 0)) is None
-    for prefix in (b"", mcap_layout.OPENING, kept.whole[: mcap_layout.intro_bytes()]):
+    mcap_layout.parse_segment_chunk(content)
+    mcap_layout.parse_head(content)
+    assert mcap_layout.parse_record(content, Position(1, 0)) is None
+    for prefix in (b"", mcap_layout.OPENING, kept.whole[: mcap_layout.segment_start_bytes()]):
         kept.path.write_bytes(prefix + content)
         assert not [step for step in scan_records(kept.path) if isinstance(step, Record)]

@@ -58,11 +58,6 @@ class JournalRecording:
         return (self[index] for index in range(len(self)))
 
 
-def read_keyframes(path: str | os.PathLike[str]) -> Iterator[Keyframe]:
-    """The keyframes of a `JournalRecording`, one after the other."""
-    return iter(JournalRecording(path))
-
-
 def _places(place: state_folder.JournalPlace) -> list[tuple[Path, int]]:
     """Segment file and offset of each keyframe."""
     found, last = [], dict[bytes, int]()

@@ -82,7 +82,7 @@ _COUNT = struct.Struct("<Q")
 _MAX_SUMMARY_BYTES = 1 << 28
 
 
-class Seal(Struct, frozen=True):
+class SegmentEnd(Struct, frozen=True):
     """What the end of a segment says.
 
     `open`: it was never closed, or the cut went through its end. `broken`: closed, and damaged since.
@@ -93,7 +93,7 @@ class Seal(Struct, frozen=True):
     keyframes: int | None = None  # that the segment held when it was closed
 
 
-def read(source: SegmentFile) -> Seal:
+def read_segment_end(source: SegmentFile) -> SegmentEnd:
     """Look at the end of a segment."""
     closing = (
         source.read(source.size - len(MAGIC), len(MAGIC)) == MAGIC if source.size > len(MAGIC) else False
@@ -101,10 +101,10 @@ def read(source: SegmentFile) -> Seal:
     at = source.size - len(MAGIC) - _FOOTER.size
     summary = _summary(source, at) if at > 0 else None
     if summary is None:
-        return Seal("broken" if closing else "open")
+        return SegmentEnd("broken" if closing else "open")
     start, content = summary
     keyframes = _keyframes(content)
-    return Seal("whole" if closing else "broken", start - len(END_OF_DATA), keyframes)
+    return SegmentEnd("whole" if closing else "broken", start - len(END_OF_DATA), keyframes)
 
 
 def _summary(source: SegmentFile, footer_at: int) -> tuple[int, bytes] | None:

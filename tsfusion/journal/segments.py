@@ -68,9 +68,9 @@ def read_at(path: Path, offset: int) -> Record:
     """
     try:
         with SegmentFile(path) as source:
-            head = mcap_layout.head(source.read(offset, mcap_layout.HEAD_BYTES))
+            head = mcap_layout.parse_head(source.read(offset, mcap_layout.HEAD_BYTES))
             raw = b"" if head is None else source.read(offset, head.nbytes)
-            record = mcap_layout.unpack(raw, Position(segment_number(path), offset))
+            record = mcap_layout.parse_record(raw, Position(segment_number(path), offset))
             if record is None and source.failed:
                 raise OSError(errno.EIO, os.strerror(errno.EIO))
     except OSError as error:
@@ -125,7 +125,7 @@ def is_closed(path: Path) -> bool:
     """Whether a segment ends with an index, as normal MCAP readers need it; False when it cannot be read."""
     try:
         with SegmentFile(path) as source:
-            return segment_file.read(source).state == "whole"
+            return segment_file.read_segment_end(source).state == "whole"
     except OSError:
         return False
 

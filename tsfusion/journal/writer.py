@@ -128,8 +128,11 @@ class Journal:
         try:
             file = self._open()
             position = Position(self._number, file.tell())
-            mcap_layout.add(
-                self._writer, mcap_layout.pack(frames, self._identity, session, seq, client), seq, now_ns
+            mcap_layout.write_record(
+                self._writer,
+                mcap_layout.pack_record(frames, self._identity, session, seq, client),
+                seq,
+                now_ns,
             )
             self._flush()
         except OSError as error:
@@ -210,7 +213,7 @@ class Journal:
             self._first = 0
             self._file = segment_path(self.folder, self._number).open("xb")
             self._identity = secrets.token_bytes(mcap_layout.IDENTITY_BYTES)
-            self._writer = mcap_layout.start(self._file, self._identity, time.time_ns())
+            self._writer = mcap_layout.begin_segment(self._file, self._identity, time.time_ns())
             # Before the first record: what a reader needs to find its way is never the end that a cut takes.
             self._flush()
             if self._sync:
@@ -246,8 +249,10 @@ def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, c
     identity, now_ns = secrets.token_bytes(mcap_layout.IDENTITY_BYTES), time.time_ns()
     try:
         with durable_files.replacing(path) as file:
-            writer = mcap_layout.start(file, identity, now_ns)
-            mcap_layout.add(writer, mcap_layout.pack(frames, identity, session, seq, client), seq, now_ns)
+            writer = mcap_layout.begin_segment(file, identity, now_ns)
+            mcap_layout.write_record(
+                writer, mcap_layout.pack_record(frames, identity, session, seq, client), seq, now_ns
+            )
             writer.finish()
     except OSError as error:
         raise journal_error("write", path, error) from error

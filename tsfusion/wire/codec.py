@@ -18,14 +18,12 @@ from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, MAX_POINTS, Keyframe, check_intrinsics, check_pose
 from tsfusion.wire import array_encoding, image_headers
 from tsfusion.wire.keyframe_header import (
-    VERSION,
     ArrayCodec,
     ArrayName,
     Buffer,
     KeyframeHeader,
     Refused,
     pack,
-    stamp,
     unpack,
 )
 
@@ -242,6 +240,3 @@ def _unpack(buffer: Buffer, frame: Any) -> NDArray[Any]:
     if buffer.codec == "mm+dzp+zstd":
         return array_encoding.unpack_mm(frame, buffer.shape)
     return array_encoding.unpack_image(frame, dtype, buffer.shape)
-
-
-__all__ = ["VERSION", "Buffer", "KeyframeHeader", "Refused", "check", "decode", "encode", "stamp", "unpack"]

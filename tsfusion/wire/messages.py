@@ -189,7 +189,7 @@ def _decode(decoder: Any, frame: Any) -> Any:
         raise DecodeError(f"not a control message: {error}") from error
 
 
-def said(frames: Sequence[Any]) -> ToServer:
+def decode_frames_to_server(frames: Sequence[Any]) -> ToServer:
     """What a control message says. Only corrections have frames behind their head.
 
     Raises:

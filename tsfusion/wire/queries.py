@@ -35,7 +35,7 @@ def fetch_health(
         NotAllowed: when the server turns the connection away.
         ServerUnreachable: when nobody answers in `timeout` seconds.
     """
-    reply, _ = _ask(address, control, Command(name="health"), timeout, keys)
+    reply, _ = _request_if_present(address, control, Command(name="health"), timeout, keys)
     if reply.health is None:
         raise TransportError(f"the server at {address} answered without its health")
     return reply.health
@@ -54,7 +54,7 @@ def fetch_status(
     Raises:
         TransportError: when the server cannot say.
     """
-    reply, _ = _ask(address, control, Command(name="status", map=map_name), timeout, keys)
+    reply, _ = _request_if_present(address, control, Command(name="status", map=map_name), timeout, keys)
     if reply.status is None:
         raise TransportError(f"the server at {address} answered without a status")
     return reply.status
@@ -83,7 +83,7 @@ def fetch_mesh(
     while True:
         try:
             left = max(deadline - time.monotonic(), 0.0)
-            reply, frames = _ask(address, control, command, left, keys)
+            reply, frames = _request_if_present(address, control, command, left, keys)
             break
         except TransportError as error:
             if not str(error).endswith(ASK_AGAIN) or time.monotonic() + 2 * _AGAIN_INTERVAL > deadline:
@@ -94,11 +94,11 @@ def fetch_mesh(
     return mesh_of(reply.mesh, frames)
 
 
-def _ask(
+def _request_if_present(
     address: str, control: str | None, command: Command, timeout: float, keys: ClientKeys | None
 ) -> tuple[Reply, list[memoryview]]:
     """The fuser's answer. That takes its time, so it is asked first whether anybody is there."""
-    address = control_address(sockets.target(address), control)
+    address = control_address(sockets.connect_address(address), control)
     if timeout > _ANSWER_TIMEOUT:
         request(address, Command(name="ping"), timeout=_ANSWER_TIMEOUT, keys=keys)
     return request(address, command, timeout=timeout, keys=keys)
@@ -124,8 +124,8 @@ def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:
     return Mesh(*arrays)
 
 
-_LOOK_EVERY = 0.2  # seconds
-_LONGEST = 1e6  # seconds; a poll takes no more than 2³¹ ms
+_POLL_S = 0.2  # seconds
+_MAX_TIMEOUT_S = 1e6  # seconds; a poll takes no more than 2³¹ ms
 
 
 def request(
@@ -143,13 +143,13 @@ def request(
         ServerUnreachable: when nobody answered within `timeout` seconds.
         TransportError: when the server answered that it cannot.
     """
-    address, timeout = sockets.target(address), min(timeout, _LONGEST)
+    address, timeout = sockets.connect_address(address), min(timeout, _MAX_TIMEOUT_S)
     context: zmq.Context[Any] = zmq.Context()
     link = sockets.dealer(context, keys)
     monitor = ConnectionMonitor(link, address, keys)
     try:
         link.connect(address)
-        head, *frames = _exchange(link, monitor, command, timeout)
+        head, *frames = _send_until_answered(link, monitor, command, timeout)
         reply = messages.decode_to_client(head.buffer)
     except DecodeError as error:
         raise TransportError(f"what answers at {address} is no tsfusion server: {error}") from error
@@ -164,7 +164,7 @@ def request(
     return reply, [frame.buffer for frame in frames]
 
 
-def _exchange(
+def _send_until_answered(
     link: sockets.AnySocket, monitor: ConnectionMonitor, command: messages.Command, timeout: float
 ) -> list[zmq.Frame]:
     """Send the question on each connection that is made, until there is an answer; its frames."""
@@ -173,7 +173,7 @@ def _exchange(
     while (left := deadline - time.monotonic()) > 0:
         wanted = zmq.POLLIN | (zmq.POLLOUT if monitor.made > asked else 0)
         polled = [(link, wanted), (monitor.socket, zmq.POLLIN)]
-        events = dict(zmq.zmq_poll(polled, int(min(left, _LOOK_EVERY) * 1000) + 1)).get(link, 0)
+        events = dict(zmq.zmq_poll(polled, int(min(left, _POLL_S) * 1000) + 1)).get(link, 0)
         if events & zmq.POLLIN:
             return link.recv_multipart(copy=False)
         if events & zmq.POLLOUT:

@@ -118,7 +118,7 @@ def _make(
     return made
 
 
-def split(address: str) -> tuple[str, int]:
+def parse_address(address: str) -> tuple[str, int]:
     """Host and port of `tcp://host:port` (port `*` or 0 = random).
 
     Raises:
@@ -132,7 +132,7 @@ def split(address: str) -> tuple[str, int]:
     raise InvalidConfig(f"an address looks like tcp://127.0.0.1:5555, got {address!r}")
 
 
-def join(host: str, port: int) -> str:
+def format_address(host: str, port: int) -> str:
     """`tcp://host:port`."""
     return f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
 
@@ -140,28 +140,28 @@ def join(host: str, port: int) -> str:
 def control_address(address: str, control: str | None = None) -> str:
     """The control socket that belongs to a data address: the next port, unless given."""
     if control is not None:
-        return join(*split(control))
-    return _following(address, "control")
+        return format_address(*parse_address(control))
+    return _next_port(address, "control")
 
 
-def _following(address: str, purpose: str) -> str:
-    host, port = split(address)
+def _next_port(address: str, purpose: str) -> str:
+    host, port = parse_address(address)
     if port == LAST_PORT:
         raise InvalidConfig(f"{address} has no next port for {purpose}: choose a lower one")
-    return join(host, port + 1)
+    return format_address(host, port + 1)
 
 
-def target(address: str) -> str:
+def connect_address(address: str) -> str:
     """An address to connect to, in its plain form. Raises InvalidConfig."""
-    host, port = split(address)
+    host, port = parse_address(address)
     if port == 0:
         raise InvalidConfig(f"connecting needs a port, got {address}")
-    return join(host, port)
+    return format_address(host, port)
 
 
 def check_reachable(address: str, *, has_keys: bool) -> None:
     """Raise InvalidConfig when others can reach the address and there are no keys to tell them apart by."""
-    if has_keys or is_loopback(split(address)[0]):
+    if has_keys or is_loopback(parse_address(address)[0]):
         return
     raise InvalidConfig(
         f"without keys the server listens on tcp://127.0.0.1 only, got {address}; run `tsfusion keys new "
@@ -173,7 +173,7 @@ def check_reachable(address: str, *, has_keys: bool) -> None:
 
 def check_own_machine(address: str) -> None:
     """Raise InvalidConfig when others can reach the address."""
-    if not is_loopback(split(address)[0]):
+    if not is_loopback(parse_address(address)[0]):
         raise InvalidConfig(
             f"there are no keys here, so that only tcp://127.0.0.1 can be bound, got {address}; let the "
             "sender bind, or come through an ssh tunnel"
@@ -190,7 +190,7 @@ def is_loopback(host: str) -> bool:
 
 def check_free(address: str) -> None:
     """Raise TransportError when a server could not listen here. Opens no port to anyone."""
-    host, port = split(address)
+    host, port = parse_address(address)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -206,14 +206,14 @@ def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, t
     Raises:
         TransportError: when a port is taken (a random one is drawn again until its neighbours are free).
     """
-    host, port = split(listen)
+    host, port = parse_address(listen)
     tries = _RANDOM_PORT_TRIES if port == 0 else 1
     for last in reversed(range(tries)):
         bound: list[tuple[AnySocket, str]] = []
         try:
-            bound.append((data, bind_one(data, join(host, port))))
-            bound.append((control, bind_one(control, control_address(bound[0][1], to))))
-            bound.append((publish, bind_one(publish, _following(bound[1][1], "mesh updates"))))
+            bound.append((data, bind_socket(data, format_address(host, port))))
+            bound.append((control, bind_socket(control, control_address(bound[0][1], to))))
+            bound.append((publish, bind_socket(publish, _next_port(bound[1][1], "mesh updates"))))
             return Addresses(*(address for _, address in bound))
         except (TransportError, InvalidConfig):
             for made, address in bound:
@@ -223,11 +223,11 @@ def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, t
     raise AssertionError("the last try returns or raises")
 
 
-def bind_one(made: AnySocket, address: str) -> str:
+def bind_socket(made: AnySocket, address: str) -> str:
     """Bind a socket; its address with the real port number. Raises TransportError."""
-    host, port = split(address)
+    host, port = parse_address(address)
     try:
-        made.bind(join(host, port) if port else join(host, 0).replace(":0", ":*"))
+        made.bind(format_address(host, port) if port else format_address(host, 0).replace(":0", ":*"))
     except zmq.ZMQError as error:
         raise TransportError(f"cannot listen on {address}: {error.strerror}") from error
     return made.getsockopt_string(zmq.LAST_ENDPOINT)
