@@ -342,10 +342,10 @@ def test_a_bad_setting_is_named_once(here: Here, tmp_path: Path, toml: str, word
 
 
 def test_settings_may_be_numpy_scalars() -> None:
-    made = config.make(config.VolumeConfig, {"voxel_size": np.float32(0.25), "threads": np.int64(2)})
+    made = config.make_settings(config.VolumeConfig, {"voxel_size": np.float32(0.25), "threads": np.int64(2)})
     assert (made.voxel_size, made.threads) == (0.25, 2)
     with pytest.raises(InvalidConfig, match=r"^voxel_size must be > 0, got -1.0$"):
-        config.make(config.VolumeConfig, {"voxel_size": np.float32(-1)})
+        config.make_settings(config.VolumeConfig, {"voxel_size": np.float32(-1)})
 
 
 def test_ctrl_c_while_modules_load_is_no_traceback() -> None:

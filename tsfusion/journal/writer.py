@@ -128,12 +128,8 @@ class Journal:
         try:
             file = self._open()
             position = Position(self._number, file.tell())
-            mcap_layout.write_record(
-                self._writer,
-                mcap_layout.pack_record(frames, self._identity, session, seq, client),
-                seq,
-                now_ns,
-            )
+            payload = mcap_layout.pack_record(frames, self._identity, session, seq, client)
+            mcap_layout.write_record(self._writer, payload, seq, now_ns)
             self._flush()
         except OSError as error:
             self._abandon(position.offset)
@@ -250,9 +246,8 @@ def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, c
     try:
         with durable_files.replacing(path) as file:
             writer = mcap_layout.begin_segment(file, identity, now_ns)
-            mcap_layout.write_record(
-                writer, mcap_layout.pack_record(frames, identity, session, seq, client), seq, now_ns
-            )
+            payload = mcap_layout.pack_record(frames, identity, session, seq, client)
+            mcap_layout.write_record(writer, payload, seq, now_ns)
             writer.finish()
     except OSError as error:
         raise journal_error("write", path, error) from error

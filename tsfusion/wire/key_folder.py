@@ -30,7 +30,6 @@ from tsfusion.wire import curve
 log = logging.getLogger(__name__)
 
 ALLOWED = "allowed.toml"
-DEFAULT_FOLDER = "tsfusion-keys"
 
 _MAX_LIST_BYTES = 1 << 20
 _RETRY = 1.0  # seconds
