@@ -398,7 +398,7 @@ def test_hostile_messages_are_counted_and_change_nothing(shared: tuple[Server, P
 
 def test_another_clients_session_cannot_be_corrected(tmp_path: Path) -> None:
     robot = secured(tmp_path)
-    key_folder.allow(tmp_path / "server", "cart", key_folder.create(tmp_path / "cart", "cart").public)
+    key_folder.allow(tmp_path / "server", "cart", key_folder.create_pair(tmp_path / "cart", "cart").public)
     cart = Secured({}, {**robot.client, "key": str(tmp_path / "cart" / "cart.key_secret")})
     with (
         serving(tmp_path / "state", **robot.server) as server,  # type: ignore[arg-type]

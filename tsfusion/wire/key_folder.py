@@ -53,7 +53,7 @@ class Pair(Struct, frozen=True):
     public: str
 
 
-def create(folder: Folder, name: str, *, force: bool = False) -> Pair:
+def create_pair(folder: Folder, name: str, *, force: bool = False) -> Pair:
     """Make a pair of keys under this name.
 
     Args:
@@ -71,7 +71,7 @@ def create(folder: Folder, name: str, *, force: bool = False) -> Pair:
         for path in paths:
             if path.exists() and not force:
                 raise InvalidConfig(f"{path} exists; choose another name, or replace it by --force")
-        public, secret = _draw()
+        public, secret = _new_pair()
         lines = f'curve\n    public-key = "{public}"\n'
         secret_line = f'    secret-key = "{secret}"\n'
         _write(paths[0], _PAIR_HEAD.format("**Secret** Certificate") + lines + secret_line)
@@ -96,12 +96,12 @@ def allow(folder: Folder, name: str, key: str) -> str | None:
     """
     check_name(name)
     public = curve.public_key(key)
-    place = _existing(folder)
+    place = _existing_folder(folder)
     with folder_lock.hold(place, wait=math.inf):
         own = curve.server_keys(place).public
-        listed = read_list(place) if has_list(place) else Allowed()
+        listed = read_allow_list(place) if has_allow_list(place) else Allowed()
         earlier = listed.allowed.get(name)
-        _check_free(name, public, own, listed)
+        _check_not_taken(name, public, own, listed)
         if earlier == public:
             return None
         revoked = {key: was for key, was in listed.revoked.items() if key != public}
@@ -118,9 +118,9 @@ def revoke(folder: Folder, name: str) -> str:
         InvalidConfig: when no key is allowed under the name.
         OutputError: when the list cannot be written.
     """
-    place = _existing(folder)
+    place = _existing_folder(folder)
     with folder_lock.hold(place, wait=math.inf):
-        listed = read_list(place)
+        listed = read_allow_list(place)
         if name not in listed.allowed:
             names = ", ".join(sorted(listed.allowed)) or "nobody is allowed"
             raise InvalidConfig(f"no key is allowed under the name {name!r}, but: {names}")
@@ -130,23 +130,23 @@ def revoke(folder: Folder, name: str) -> str:
     return key
 
 
-def pairs(folder: Folder) -> list[Pair]:
+def list_pairs(folder: Folder) -> list[Pair]:
     """The folder's own pairs, by name.
 
     Raises:
         InvalidConfig: when the folder or a pair cannot be read.
     """
-    place = _existing(folder)
+    place = _existing_folder(folder)
     found = sorted(place.glob(f"*{curve.SECRET}"))
     return [Pair(path.name.removesuffix(curve.SECRET), curve.read_pair(path)[0]) for path in found]
 
 
-def has_list(folder: Folder) -> bool:
+def has_allow_list(folder: Folder) -> bool:
     """Whether it is a server's folder."""
     return os.path.lexists(Path(folder).expanduser() / ALLOWED)
 
 
-def read_list(folder: Folder) -> Allowed:
+def read_allow_list(folder: Folder) -> Allowed:
     """The allow-list of a server's folder.
 
     Raises:
@@ -202,7 +202,7 @@ class AllowList:
         before, self._seen = self._names, seen
         try:
             durable_files.check_private_folder(self._folder)
-            listed = read_list(self._folder)
+            listed = read_allow_list(self._folder)
         except InvalidConfig as error:
             self._fail(str(error))
         else:
@@ -219,7 +219,7 @@ class AllowList:
         """The name that a public key is allowed under; None = it is not."""
         return self._names.get(key) if key is not None else None
 
-    def why_not(self, key: str) -> str:
+    def rejection_reason(self, key: str) -> str:
         """A word for why a key is not allowed."""
         if self.problem:
             return "allow-list"
@@ -245,7 +245,7 @@ class AllowList:
         self._names, self._revoked = {}, {}
 
 
-def _existing(folder: Folder) -> Path:
+def _existing_folder(folder: Folder) -> Path:
     place = Path(folder).expanduser()
     try:
         durable_files.check_private_folder(place)
@@ -286,7 +286,7 @@ def _dumps(listed: Allowed) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _check_free(name: str, public: str, own: str, listed: Allowed) -> None:
+def _check_not_taken(name: str, public: str, own: str, listed: Allowed) -> None:
     if name == curve.SERVER or public == own:
         raise InvalidConfig("that is the server's own: a client has a name and a pair of keys of its own")
     for other, key in listed.allowed.items():
@@ -296,7 +296,7 @@ def _check_free(name: str, public: str, own: str, listed: Allowed) -> None:
             )
 
 
-def _draw() -> tuple[str, str]:
+def _new_pair() -> tuple[str, str]:
     """A new pair whose public key cannot be taken for an option."""
     while True:
         public, secret = (key.decode("ascii") for key in zmq.curve_keypair())
