@@ -135,19 +135,19 @@ def test_a_flood_is_cut_short_and_counted() -> None:
     assert [limiter.allows(record("%s", i)) for i in range(5)] == [True] * 3 + [False] * 2
     assert limiter.allows(record(line=2)), "another place has a count of its own"
     now[0] += 9.9
-    assert list(limiter.over()) == []
+    assert list(limiter.finished_periods()) == []
     now[0] += 0.2
-    (summary,) = limiter.over()
+    (summary,) = limiter.finished_periods()
     assert summary.getMessage() == "2 more like this were left out in 10 s: 4"
     assert summary.levelno == logging.WARNING
     assert limiter.allows(record()), "a new period"
-    assert list(limiter.over(everything=True)) == []
+    assert list(limiter.finished_periods(everything=True)) == []
 
 
 def test_errors_are_never_left_out() -> None:
     limiter = logs.Limiter(most=1)
     assert all(limiter.allows(record(level=level)) for level in (logging.ERROR, logging.CRITICAL) * 50)
-    assert list(limiter.over(everything=True)) == []
+    assert list(limiter.finished_periods(everything=True)) == []
 
 
 def test_what_was_left_out_is_said_though_nothing_follows(said: Said) -> None:

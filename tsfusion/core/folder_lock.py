@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One process at a time in a folder."""
+"""Locks that let only one process at a time use a folder."""
 
 import fcntl
 import os

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The folder a run leaves behind: whole, or not there."""
+"""The output folder of a run: complete, or not there."""
 
 import os
 import secrets
@@ -20,8 +20,8 @@ def building(out: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary folder whose files move to the folder `out` when the block ends without an error.
 
     A new `out` appears in one rename. In an existing one each file replaces its namesake and everything else
-    stays; its old `run.json` goes first and the new one comes last, so a `run.json` always describes its
-    neighbours. An error leaves nothing, no parent folder either; what a killed run left goes with the next.
+    stays; its old `run.json` is deleted first and the new one comes last, so that it always describes its
+    neighbours. An error leaves nothing, no parent folder either; the next run removes the rest of a killed one.
 
     Raises:
         OutputError: at once, when `out` cannot be written.
@@ -36,7 +36,7 @@ def building(out: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def _parents(out: Path) -> Iterator[None]:
-    """The folders above `out`; those made here go when the block fails and nothing else came into them."""
+    """Make the folders above `out`; when the block fails, those that are still empty are removed."""
     missing = [parent for parent in out.parents if not os.path.exists(parent)]  # innermost first
     try:
         try:
