@@ -21,7 +21,7 @@ def building(out: str | os.PathLike[str]) -> Iterator[Path]:
 
     A new `out` appears in one rename. In an existing one each file replaces its namesake and everything else
     stays; its old `run.json` is deleted first and the new one comes last, so that it always describes its
-    neighbours. An error leaves nothing, no parent folder either; the next run removes the rest of a killed one.
+    neighbours. An error leaves nothing, no parent folder either; the next run clears up after a killed one.
 
     Raises:
         OutputError: at once, when `out` cannot be written.

@@ -65,7 +65,7 @@ class Record(Struct, frozen=True):
     position: Position
     session: bytes
     seq: int
-    client: str  # that the key was allowed under which it came; empty = no keys
+    client: str  # name that the sender's key is allowed under; empty = no keys
     logged_ns: int  # wall clock
     frames: list[memoryview]
 
@@ -118,7 +118,7 @@ class ChunkHead(NamedTuple):
 
     @property
     def message_index(self) -> bytes:
-        """What the writer puts behind the chunk."""
+        """The bytes that the writer puts behind the chunk."""
         return _index(_KEYFRAMES, self.logged_ns, 0)
 
 
@@ -127,7 +127,7 @@ def _index(channel: int, logged_ns: int, offset: int) -> bytes:
 
 
 def begin_segment(stream: IO[bytes], identity: bytes, now_ns: int) -> Any:
-    """Begin a segment; returns the MCAP writer for `write_record`."""
+    """Write the first bytes of a segment; returns the MCAP writer for `write_record`."""
     writer = Writer(stream, chunk_size=1, compression=CompressionType.NONE)
     writer.start(library=LIBRARY.decode())
     schema = writer.register_schema("tsfusion.keyframe", "", _LAYOUT)
@@ -147,7 +147,7 @@ def pack_record(frames: Sequence[Any], identity: bytes, session: bytes, seq: int
     """Frames and their origin as the message of one record.
 
     Raises:
-        JournalError: for a name that is too long, rather than cut it to another one's.
+        JournalError: for a name that is too long; a cut one could be another client's.
     """
     name = client.encode()
     if len(name) > CLIENT_BYTES:
@@ -158,7 +158,7 @@ def pack_record(frames: Sequence[Any], identity: bytes, session: bytes, seq: int
 
 
 def parse_head(raw: bytes) -> ChunkHead | None:
-    """The head of a keyframe's chunk; None when this is none."""
+    """Read the head of a keyframe's chunk; None when the bytes are not one."""
     if len(raw) < HEAD_BYTES:
         return None
     parsed = ChunkHead(*_HEAD.unpack_from(raw))
@@ -166,7 +166,7 @@ def parse_head(raw: bytes) -> ChunkHead | None:
 
 
 def parse_record(raw: bytes, position: Position) -> Record | None:
-    """The record in a chunk; None unless all of it is there and its CRC agrees."""
+    """Read the record in a chunk; None unless all of it is there and its CRC agrees."""
     parsed = parse_head(raw)
     if parsed is None or len(raw) != parsed.nbytes:
         return None
@@ -194,16 +194,16 @@ class SegmentChunk(NamedTuple):
     layout: bytes
     identity: bytes
     end: int
-    message_index: bytes  # what the writer puts behind the chunk
+    message_index: bytes  # that the writer puts behind the chunk
 
     @property
     def is_ours(self) -> bool:
-        """Whether this module can read the rest."""
+        """Whether this version can read the segment."""
         return self.layout == _SEGMENT_MAGIC
 
 
 def parse_segment_chunk(raw: bytes) -> SegmentChunk | None:
-    """The segment's own chunk, from the start of a file; None when it is not there or damaged."""
+    """Read the segment's own chunk from the first bytes of a file; None when it is missing or damaged."""
     at = len(OPENING)
     if len(raw) < at + _CHUNK.size:
         return None

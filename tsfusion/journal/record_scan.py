@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""From record to record through a segment, over whatever lies between.
+"""Reading the records of a segment one after the other, past damaged places.
 
-Behind a damaged place the walk searches for the next chunk by its shape, its segment's identity and its CRC,
-so damage costs the records it hit and no other.
+Behind a damaged place the scan searches for the next chunk by its shape, its segment's identity and its CRC,
+so that damage costs the records it hit and no other.
 """
 
 import errno
@@ -33,8 +33,8 @@ class Damage(Struct, frozen=True):
     """A stretch of a segment that is not as it was written.
 
     Attributes:
-        lost: keyframes that are gone with it, at least; 0 = it only held what readers can do without.
-        torn: the end of the last write, cut off before it was acknowledged: nothing that counted is gone.
+        lost: lower bound of the keyframes that it destroyed; 0 = only parts that readers do not need.
+        torn: the end of the last write, cut off before it was acknowledged: no keyframe is lost.
     """
 
     position: Position
@@ -45,7 +45,7 @@ class Damage(Struct, frozen=True):
 
 
 def scan_records(path: Path) -> Iterator[Record | Damage]:
-    """All that a segment file holds, in order of place; reads one record at a time.
+    """The records and damaged places of a segment file in their order; one record at a time is read.
 
     Raises:
         JournalError: when the file cannot be opened or read.
@@ -58,12 +58,12 @@ def scan_records(path: Path) -> Iterator[Record | Damage]:
 
 
 def segment_number(path: Path) -> int:
-    """The number a segment file is named for; 0 = it is named otherwise."""
+    """The number in a segment file's name; 0 = it has another name."""
     return int(path.stem) if re.fullmatch(r"[0-9]{6,9}", path.stem) else 0
 
 
 def journal_error(verb: str, path: Path, error: OSError) -> JournalError:
-    """The error for something the disk refused."""
+    """The JournalError for what the disk refused: `cannot read FILE: reason`."""
     return JournalError(f"cannot {verb} {path}: {error.strerror or error}")
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A journal, spool or segment as a dataset of keyframes: what was scanned live can be replayed offline."""
+"""A journal, spool or segment as a dataset of keyframes: live scans can be replayed offline."""
 
 import logging
 import os

@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 
 class RecordEntry(Struct, frozen=True):
-    """A record that a scan found, without its frames."""
+    """A record without its frames, as a list of a journal holds it."""
 
     position: Position
     session: bytes
@@ -30,7 +30,7 @@ class RecordEntry(Struct, frozen=True):
 
 
 def segments(folder: Path) -> list[int]:
-    """The numbers of a folder's segments, oldest first. Files that are named otherwise are not looked at.
+    """The numbers of a folder's segments, oldest first. Files with other names are passed over.
 
     Raises:
         JournalError: when the folder cannot be listed.
@@ -100,7 +100,7 @@ def list_records(path: Path) -> tuple[list[RecordEntry], int]:
 
 
 def describe(path: Path, damage: Damage) -> str:
-    """A damaged place in a line."""
+    """Describe a damaged place in one line."""
     if damage.torn:
         outcome = "; nothing that was acknowledged is lost"
     else:

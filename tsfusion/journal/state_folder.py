@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where a server keeps its maps: `STATE/maps/NAME/`, each with its journal and its last checkpoint."""
+"""The folders of a server's maps, `STATE/maps/NAME/`, and the journals in them."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -23,12 +23,12 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")  # as config.MapName
 
 
 def map_folder(state: str | Path, name: str) -> Path:
-    """Where a map is, or will be."""
+    """The folder in which a map is, or will be."""
     return Path(state) / MAPS_FOLDER / name
 
 
 def map_names(state: str | Path) -> list[str]:
-    """The maps that a state folder holds."""
+    """Names of the maps in a state folder."""
     return sorted(
         path.name
         for path in (Path(state) / MAPS_FOLDER).glob("*")
@@ -37,7 +37,7 @@ def map_names(state: str | Path) -> list[str]:
 
 
 def is_state_folder(path: Path) -> bool:
-    """Whether it is a server's state folder."""
+    """Whether a folder is a server's state folder."""
     return (path / MAPS_FOLDER).is_dir()
 
 
@@ -45,7 +45,7 @@ def resolve_map(path: Path, name: str | None = None) -> Path:
     """The map's folder when `path` is a state folder; any other path as it is.
 
     Args:
-        name: which of several.
+        name: of the map, where the state folder has several.
 
     Raises:
         JournalError: when it holds no map of that name, or several and none was named.
@@ -77,7 +77,7 @@ class JournalPlace(Struct, frozen=True):
 
     Attributes:
         path: a folder of segments, or one segment file.
-        quarantine: where the server of its map keeps what could not be fused; None = it is no map's.
+        quarantine: folder of the keyframes that could not be fused; None = the journal is no map's.
         corrections: where it keeps corrected poses; None = it is no map's.
     """
 
@@ -110,7 +110,7 @@ class JournalPlace(Struct, frozen=True):
             raise journal_error("list", self.quarantine, error) from error
 
     def steps(self, watch: Watcher = lambda _done, _all: None) -> Iterator[tuple[Path, Record | Damage]]:
-        """Each record and each damaged place, with its file. A file that cannot be read is one such place."""
+        """Records and damaged places, each with its file; a file that cannot be read is a damaged place."""
         files = [(path, _size(path)) for path in self.files()]
         total, before = sum(size for _, size in files), 0
         for path, size in files:
@@ -128,7 +128,7 @@ def find_journal(path: Path, map_name: str | None = None) -> JournalPlace:
     """The journal at a path: a state folder, a map's folder in it, a folder of segments, or one segment.
 
     Args:
-        map_name: which map of a state folder with several.
+        map_name: of the map, where the state folder has several.
 
     Raises:
         JournalError: when there is none, or no single one.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Writing the log: append, wait for the disk, begin the next segment, let old ones go."""
+"""Writing a journal: append, wait for the disk, begin the next segment, delete old ones."""
 
 import contextlib
 import logging
@@ -30,12 +30,12 @@ class Journal:
         min_free_bytes: what `append` leaves free on the disk.
 
     Attributes:
-        found: what the segments of earlier runs hold, in journal order; the caller may empty it.
-        damaged: how many of their records are damaged. A segment that is so from end to end counts as one.
+        found: records in the segments of earlier runs, in journal order; the caller may empty the list.
+        damaged: number of their damaged records. A segment that is damaged from end to end counts as one.
 
     Raises:
         JournalError: when the folder cannot be made or listed, or one of its segments cannot be read or is
-            of another version: what it holds would be passed over for ever.
+            of another version: its records would be passed over for ever.
     """
 
     def __init__(
@@ -72,9 +72,9 @@ class Journal:
                 found, damaged = list_records(path)
                 self._closed[number] = path.stat().st_size
             except OSError as error:
-                raise _unopened(journal_error("read", path, error)) from error
+                raise _advise(journal_error("read", path, error)) from error
             except JournalError as error:
-                raise _unopened(error) from error
+                raise _advise(error) from error
             self.found += found
             self.damaged += damaged
         self._number = numbers[-1] + 1 if numbers else 1
@@ -95,7 +95,7 @@ class Journal:
 
     @property
     def first(self) -> int:
-        """The number of the oldest segment; more than 1 = older ones were let go."""
+        """The number of the oldest segment; more than 1 = older ones were deleted."""
         return next(iter(self._closed), self._number)
 
     @property
@@ -115,14 +115,14 @@ class Journal:
         """Write one message; it is on the disk when this returns.
 
         Args:
-            client: the name of who sent it, at most 32 bytes of UTF-8.
+            client: name of the sender, at most 32 bytes of UTF-8.
             logged_ns: wall clock; None = now.
 
         Raises:
             JournalError: when the disk refuses, or too little would stay free. Nothing of the message
                 counts then.
         """
-        self._room.take(sum(memoryview(frame).nbytes for frame in frames))
+        self._room.reserve(sum(memoryview(frame).nbytes for frame in frames))
         now_ns = time.time_ns() if logged_ns is None else logged_ns
         position = Position(self._number, 0)
         try:
@@ -148,7 +148,7 @@ class Journal:
             os.fdatasync(self._file.fileno())
 
     def _rotate_or_abandon(self) -> None:
-        """The keyframe is on the disk, whatever becomes of the index that readers can do without."""
+        """Close the segment; an error is logged only, for the keyframe is on the disk without the index, too."""
         try:
             self.rotate()
         except OSError as error:
@@ -218,7 +218,7 @@ class Journal:
         return self._file
 
     def _abandon(self, end: int | None = None) -> None:
-        """Leave the segment. What lies behind `end` was told as failed: it must not be found later on."""
+        """Leave the segment. Bytes behind `end` were reported as not written: nobody may find them later."""
         if self._file is None:
             return
         path, number = segment_path(self.folder, self._number), self._number
@@ -237,7 +237,7 @@ class Journal:
 
 
 def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, client: str = "") -> None:
-    """One message as a file of its own, in the form of a segment, whole or not at all.
+    """Write one message into a file of its own that has the form of a segment, whole or not at all.
 
     Raises:
         JournalError: when the disk refuses.
@@ -253,39 +253,39 @@ def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, c
         raise journal_error("write", path, error) from error
 
 
-def _unopened(error: JournalError) -> JournalError:
+def _advise(error: JournalError) -> JournalError:
     return JournalError(f"{error}; make it readable, or move it away to go on without its keyframes")
 
 
 def _cut(path: Path, end: int) -> None:
-    """Shorten a file, for good."""
+    """Shorten a file; it is so on the disk when this returns."""
     with path.open("r+b") as file:
         file.truncate(end)
         os.fsync(file.fileno())
 
 
-_LOOK_BYTES = 16 << 20  # written between two looks at the disk, at most
-_LOOK_SECONDS = 1.0
+_CHECK_BYTES = 16 << 20  # written between two checks of the disk, at most
+_CHECK_S = 1.0
 
 
 class FreeSpace:
-    """The room for writing on a folder's disk, of which `min_free_bytes` are not for us."""
+    """Room to write on a folder's disk, of which `min_free_bytes` stay free."""
 
     def __init__(self, folder: Path, min_free_bytes: int) -> None:
         self._folder = folder
         self._kept = min_free_bytes
-        self._left = 0  # may be written without another look
-        self._look_at = 0.0
+        self._left = 0  # bytes to write before the next check
+        self._check_at = 0.0
 
-    def take(self, nbytes: int) -> None:
+    def reserve(self, nbytes: int) -> None:
         """Raise JournalError when writing so much would leave too little."""
         now = time.monotonic()
-        if self._kept and (now >= self._look_at or nbytes > self._left):
+        if self._kept and (now >= self._check_at or nbytes > self._left):
             spare = self.free_bytes - self._kept
-            self._left = min(spare, max(_LOOK_BYTES, nbytes))
-            self._look_at = now + _LOOK_SECONDS
+            self._left = min(spare, max(_CHECK_BYTES, nbytes))
+            self._check_at = now + _CHECK_S
             if nbytes > spare:
-                self._look_at = 0.0
+                self._check_at = 0.0
                 raise JournalError(
                     f"cannot write {self._folder}: its disk has {_mb(spare + self._kept)} free, "
                     f"and {_mb(self._kept)} must stay so: free some space"
