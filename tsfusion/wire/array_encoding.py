@@ -65,7 +65,7 @@ def pack_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
 
 
 def unpack_image(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """A JPEG or PNG whose file header was checked to announce `shape` (see `images.size`).
+    """A JPEG or PNG whose file header was checked to announce `shape` (see `image_headers.size`).
 
     Raises:
         Refused: `payload` unless it decodes to exactly that array.

@@ -28,7 +28,7 @@ from tsfusion.wire.keyframe_header import (
 )
 
 MIN_FRAMES, MAX_FRAMES = 2, 5
-_MAX_DECODED_BYTES = 256 << 20  # what a small message may unfold to
+_MAX_DECODED_BYTES = 256 << 20  # that a small message may unfold to
 _MAX_FRAME_BYTES = 32 << 20
 _MEASUREMENTS = ("depth", "disparity", "points")
 _ZSTD = ("dzp+zstd", "mm+dzp+zstd")
@@ -57,7 +57,7 @@ def encode(
     map_name: str = DEFAULT_MAP,
     jpeg_quality: int,
 ) -> list[bytes]:
-    """A keyframe as frames: the header, then one frame an array.
+    """Encode a keyframe as frames: the header, then one frame for each array.
 
     Depth, disparity, points, origins and confidence come back bit for bit; the colour image is JPEG.
     `sent_ns` is 0 until `stamp` fills it in.
@@ -95,7 +95,7 @@ def encode(
 
 
 def decode(frames: Sequence[Any]) -> Keyframe:
-    """The keyframe of a message.
+    """Decode the keyframe of a message.
 
     Raises:
         DecodeError: when the bytes are not a keyframe.
@@ -119,7 +119,7 @@ def decode(frames: Sequence[Any]) -> Keyframe:
 
 
 def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> KeyframeHeader:
-    """Everything that can be known of a message without decompressing it.
+    """Check everything that can be checked in a message without decompressing it; returns its header.
 
     Raises:
         Refused: (a DecodeError) with the `reason` it is counted under: `frames`, `header`, `magic`,
@@ -138,7 +138,7 @@ def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> Key
 
 
 def measurement(header: KeyframeHeader) -> str:
-    """`depth`, `disparity` or `points`."""
+    """The measurement that a keyframe carries: `depth`, `disparity` or `points`."""
     return next(buffer.name for buffer in header.buffers if buffer.name in _MEASUREMENTS)
 
 

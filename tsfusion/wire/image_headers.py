@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""What a PNG or JPEG says of itself, read before it is decoded and more strictly than decoders do.
+"""The size in the header of a PNG or JPEG, read before decoding and more strictly than decoders do.
 
 OpenCV's decoders believe what they read: a PNG of fifty bytes can have them take two gigabytes, and a JPEG
-can show its reader one size and them another. So only files are taken that can be read in one way alone.
+can have one size here and another one there. So only files are accepted that can be read in one way alone.
 """
 
 import re
@@ -44,7 +44,7 @@ _SCAN = re.compile(rb"\xff\xda")
 
 
 def size(frame: Any) -> tuple[int, int]:
-    """(height, width) that a PNG or JPEG announces, without decoding it.
+    """Read (height, width) of a PNG or JPEG without decoding it.
 
     Raises:
         Refused: `payload` when it is neither, or could cost its decoder more than an image of that size.

@@ -40,14 +40,14 @@ Folder = str | os.PathLike[str]
 
 
 class Allowed(Struct, frozen=True, forbid_unknown_fields=True):
-    """An allow-list. No key is in it twice."""
+    """The allow-list of a server. No key is in it twice."""
 
     allowed: dict[ClientName, Annotated[str, Meta(max_length=64)]] = {}  # name → public key
     revoked: dict[str, ClientName] = {}  # public key → the name it had
 
 
 class Pair(Struct, frozen=True):
-    """One of a folder's own pairs."""
+    """The name and public key of a pair in the folder."""
 
     name: str
     public: str
@@ -82,7 +82,7 @@ def create_pair(folder: Folder, name: str, *, force: bool = False) -> Pair:
 
 
 def allow(folder: Folder, name: str, key: str) -> str | None:
-    """Let a client with this public key in, under this name. The name's earlier key no longer is.
+    """Allow a client with this public key under this name; the name's earlier key is revoked.
 
     Args:
         key: 40 characters, or a file.
@@ -112,7 +112,7 @@ def allow(folder: Folder, name: str, key: str) -> str | None:
 
 
 def revoke(folder: Folder, name: str) -> str:
-    """Keep the client of this name out; returns its key.
+    """Revoke the key of the client of this name; returns the key.
 
     Raises:
         InvalidConfig: when no key is allowed under the name.
@@ -131,7 +131,7 @@ def revoke(folder: Folder, name: str) -> str:
 
 
 def list_pairs(folder: Folder) -> list[Pair]:
-    """The folder's own pairs, by name.
+    """List the folder's own pairs by name.
 
     Raises:
         InvalidConfig: when the folder or a pair cannot be read.
@@ -142,12 +142,12 @@ def list_pairs(folder: Folder) -> list[Pair]:
 
 
 def has_allow_list(folder: Folder) -> bool:
-    """Whether it is a server's folder."""
+    """Whether a folder has an allow-list: whether it is a server's."""
     return os.path.lexists(Path(folder).expanduser() / ALLOWED)
 
 
 def read_allow_list(folder: Folder) -> Allowed:
-    """The allow-list of a server's folder.
+    """Read the allow-list of a server's folder.
 
     Raises:
         InvalidConfig: when it is missing or malformed, or others could change it.
@@ -165,7 +165,7 @@ def read_allow_list(folder: Folder) -> Allowed:
 
 
 def check_name(name: str) -> None:
-    """Raise InvalidConfig unless a client can be called so."""
+    """Raise InvalidConfig unless a client can have this name."""
     try:
         msgspec.convert(name, ClientName)
     except msgspec.ValidationError as error:
@@ -175,10 +175,10 @@ def check_name(name: str) -> None:
 
 
 class AllowList:
-    """Who may connect, as the file says now. Nobody, while it cannot be read.
+    """Names and keys of the clients that may connect, as in the file now; nobody while it cannot be read.
 
     Attributes:
-        problem: why it cannot be read; empty = it can.
+        problem: reason why the file cannot be read; empty = it can.
     """
 
     def __init__(self, folder: Folder) -> None:
@@ -192,10 +192,7 @@ class AllowList:
         self.refresh()
 
     def refresh(self) -> bool:
-        """Read the file again if it has changed; microseconds if not. Whether anyone is no longer who it was.
-
-        Never raises.
-        """
+        """Read the file again if it has changed; returns whether a key has lost its name. Never raises."""
         seen = self._stamp()
         if seen == self._seen and not (self.problem and time.monotonic() > self._again):
             return False
@@ -216,18 +213,18 @@ class AllowList:
         return any(self._names.get(key) != name for key, name in before.items())
 
     def name_of(self, key: str | None) -> str | None:
-        """The name that a public key is allowed under; None = it is not."""
+        """The name under which a public key is allowed; None = it is not allowed."""
         return self._names.get(key) if key is not None else None
 
     def rejection_reason(self, key: str) -> str:
-        """A word for why a key is not allowed."""
+        """One word for the reason why a key is not allowed."""
         if self.problem:
             return "allow-list"
         return "revoked" if key in self._revoked else "unknown"
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Everybody who is allowed."""
+        """Names of all clients that are allowed."""
         return tuple(sorted(self._names.values()))
 
     def _stamp(self) -> tuple[int, ...] | None:
@@ -297,7 +294,7 @@ def _check_not_taken(name: str, public: str, own: str, listed: Allowed) -> None:
 
 
 def _new_pair() -> tuple[str, str]:
-    """A new pair whose public key cannot be taken for an option."""
+    """Draw a pair whose public key cannot be taken for an option."""
     while True:
         public, secret = (key.decode("ascii") for key in zmq.curve_keypair())
         if re.match("[0-9a-zA-Z]", public):

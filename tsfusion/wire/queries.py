@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a running server can be asked: its health, a map's status, a map's mesh."""
+"""Queries to a running server: its health, the status of a map, the mesh of a map."""
 
 import time
 from contextlib import suppress
@@ -20,13 +20,13 @@ from tsfusion.wire.messages import ASK_AGAIN, Command, Reply
 from tsfusion.wire.sockets import control_address
 
 _AGAIN_INTERVAL = 0.25  # seconds
-_ANSWER_TIMEOUT = 5.0  # seconds; the gateway is never busy, so who says nothing for so long is not there
+_PING_TIMEOUT = 5.0  # seconds; the gateway is never busy: without an answer for so long there is none
 
 
 def fetch_health(
     address: str, *, control: str | None = None, timeout: float = 10.0, keys: ClientKeys | None = None
 ) -> Health:
-    """How the server at a data address is doing; answered at once, whatever its fusers do.
+    """Ask the server at a data address for its health; it answers at once, whatever its fusers do.
 
     Args:
         keys: of `curve.client_keys`, for a server with keys.
@@ -49,7 +49,7 @@ def fetch_status(
     timeout: float = 10.0,
     keys: ClientKeys | None = None,
 ) -> Status:
-    """How a map of the server at a data address is doing. See `fetch_health`.
+    """Ask the server at a data address for the status of a map. See `fetch_health`.
 
     Raises:
         TransportError: when the server cannot say.
@@ -69,7 +69,7 @@ def fetch_mesh(
     timeout: float = 60.0,
     keys: ClientKeys | None = None,
 ) -> Mesh:
-    """The whole mesh of a map of the server at a data address, as of now. See `fetch_health`.
+    """Ask the server at a data address for the present mesh of a map. See `fetch_health`.
 
     A server makes one at a time, and none while keyframes have to come first: it is asked again.
 
@@ -97,15 +97,15 @@ def fetch_mesh(
 def _request_if_present(
     address: str, control: str | None, command: Command, timeout: float, keys: ClientKeys | None
 ) -> tuple[Reply, list[memoryview]]:
-    """The fuser's answer. That takes its time, so it is asked first whether anybody is there."""
+    """Send a command that may take long to answer, after a ping has shown that the server is there."""
     address = control_address(sockets.connect_address(address), control)
-    if timeout > _ANSWER_TIMEOUT:
-        request(address, Command(name="ping"), timeout=_ANSWER_TIMEOUT, keys=keys)
+    if timeout > _PING_TIMEOUT:
+        request(address, Command(name="ping"), timeout=_PING_TIMEOUT, keys=keys)
     return request(address, command, timeout=timeout, keys=keys)
 
 
 def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:
-    """A mesh from its frames (see `MeshLayout`).
+    """Build a mesh from its frames (see `MeshLayout`).
 
     Raises:
         TransportError: when the frames are not what the layout says.
@@ -167,7 +167,7 @@ def request(
 def _send_until_answered(
     link: sockets.AnySocket, monitor: ConnectionMonitor, command: messages.Command, timeout: float
 ) -> list[zmq.Frame]:
-    """Send the question on each connection that is made, until there is an answer; its frames."""
+    """Send a command on each connection that is made, until there is an answer; returns its frames."""
     deadline = time.monotonic() + timeout
     why, asked = "", 0  # on which connection
     while (left := deadline - time.monotonic()) > 0:
@@ -178,7 +178,7 @@ def _send_until_answered(
             return link.recv_multipart(copy=False)
         if events & zmq.POLLOUT:
             asked = monitor.made
-            with suppress(zmq.Again):  # gone again already: it is asked again on the next connection
+            with suppress(zmq.Again):  # the connection has ended: the command is sent on the next one
                 link.send(messages.encode(command), zmq.NOBLOCK)
         news = monitor.problem()
         why = why if news is None else news

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Every ZeroMQ socket is made here, so that limits and keys are set in one place.
+"""ZeroMQ sockets with their limits and keys: every socket of the package is made here.
 
-No ZeroMQ heartbeats: a full PULL stops reading them and drops live connections (libzmq #3937). Nothing
-lingers: what must survive is in the spool.
+No ZeroMQ heartbeats: a full PULL stops reading them and drops live connections (libzmq #3937). No
+socket lingers: keyframes that must survive are in the spool.
 """
 
 import re
@@ -34,7 +34,7 @@ AnySocket = zmq.Socket[Any]
 
 
 class Addresses(Struct, frozen=True):
-    """Where a server listens, with the real port numbers."""
+    """Addresses on which a server listens, with the real port numbers."""
 
     data: str
     control: str
@@ -69,19 +69,19 @@ def publisher(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> An
 
 
 def mesh_topic(map_name: str) -> bytes:
-    """Of a map's mesh updates. No map's is the beginning of another's."""
+    """Topic of a map's mesh updates. No map's topic is the beginning of another map's."""
     return _MESH_TOPIC + map_name.encode() + b"/"
 
 
 def is_mesh_topic(topic: bytes) -> bool:
-    """Whether it asks for one map's updates, or for all of them. Anything else is nobody's to ask for."""
+    """Whether a subscription is for the updates of one map or of all maps; no other is allowed."""
     return _MESH_TOPIC.startswith(topic) or _MAPS_TOPIC.fullmatch(topic) is not None
 
 
 def subscriber(
     context: "zmq.Context[Any]", keys: ClientKeys | None = None, *, map_name: str = DEFAULT_MAP
 ) -> AnySocket:
-    """A viewer's socket for a map's updates: topic, `work.Meshed`, cells (n, 3) int32, then a mesh's frames.
+    """A viewer's socket for a map's updates: topic, `Meshed`, cells (n, 3) int32, then a mesh's frames.
 
     The triangles replace all earlier ones in these cells (blocks of 8³ voxels).
     """
@@ -91,7 +91,7 @@ def subscriber(
 
 
 def pose_feed(context: "zmq.Context[Any]", max_frame_bytes: int) -> AnySocket:
-    """Where a scanner hears the poses of another process; a flood of them fills the queue, no more."""
+    """A scanner's socket for the poses of another process; a flood of them fills its queue and no more."""
     limits: dict[int, int] = {zmq.IMMEDIATE: 0, zmq.RCVHWM: 256, zmq.MAXMSGSIZE: max_frame_bytes}
     made = _make(context, zmq.SUB, {**_CONNECTING, **limits})
     made.setsockopt(zmq.SUBSCRIBE, b"")
@@ -99,7 +99,7 @@ def pose_feed(context: "zmq.Context[Any]", max_frame_bytes: int) -> AnySocket:
 
 
 def pair(context: "zmq.Context[Any]") -> AnySocket:
-    """Gateway and fuser, over a file only this user can open."""
+    """The socket between gateway and fuser, over a file that only this user can open."""
     return _make(context, zmq.PAIR, {zmq.SNDHWM: 64, zmq.RCVHWM: 64})
 
 
@@ -138,7 +138,7 @@ def format_address(host: str, port: int) -> str:
 
 
 def control_address(address: str, control: str | None = None) -> str:
-    """The control socket that belongs to a data address: the next port, unless given."""
+    """The control address of a server: `control` if given, else the port after that of the data address."""
     if control is not None:
         return format_address(*parse_address(control))
     return _next_port(address, "control")
@@ -152,7 +152,7 @@ def _next_port(address: str, purpose: str) -> str:
 
 
 def connect_address(address: str) -> str:
-    """An address to connect to, in its plain form. Raises InvalidConfig."""
+    """Check an address to connect to; returns its plain form. Raises InvalidConfig."""
     host, port = parse_address(address)
     if port == 0:
         raise InvalidConfig(f"connecting needs a port, got {address}")
@@ -160,7 +160,7 @@ def connect_address(address: str) -> str:
 
 
 def check_reachable(address: str, *, has_keys: bool) -> None:
-    """Raise InvalidConfig when others can reach the address and there are no keys to tell them apart by."""
+    """Raise InvalidConfig when other machines can reach the address and there are no keys."""
     if has_keys or is_loopback(parse_address(address)[0]):
         return
     raise InvalidConfig(
@@ -172,7 +172,7 @@ def check_reachable(address: str, *, has_keys: bool) -> None:
 
 
 def check_own_machine(address: str) -> None:
-    """Raise InvalidConfig when others can reach the address."""
+    """Raise InvalidConfig when other machines can reach the address."""
     if not is_loopback(parse_address(address)[0]):
         raise InvalidConfig(
             f"there are no keys here, so that only tcp://127.0.0.1 can be bound, got {address}; let the "
@@ -189,7 +189,7 @@ def is_loopback(host: str) -> bool:
 
 
 def check_free(address: str) -> None:
-    """Raise TransportError when a server could not listen here. Opens no port to anyone."""
+    """Raise TransportError when a server could not listen on an address; no port is opened for that."""
     host, port = parse_address(address)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -224,7 +224,7 @@ def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, t
 
 
 def bind_socket(made: AnySocket, address: str) -> str:
-    """Bind a socket; its address with the real port number. Raises TransportError."""
+    """Bind a socket; returns its address with the real port number. Raises TransportError."""
     host, port = parse_address(address)
     try:
         made.bind(format_address(host, port) if port else format_address(host, 0).replace(":0", ":*"))
