@@ -148,7 +148,7 @@ class Journal:
             os.fdatasync(self._file.fileno())
 
     def _rotate_or_abandon(self) -> None:
-        """Close the segment; an error is only logged: the keyframe is on the disk, its index is not needed."""
+        """Close the segment; an error is only logged: the keyframe is on the disk, with or without index."""
         try:
             self.rotate()
         except OSError as error:
