@@ -4,13 +4,14 @@
 import signal
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 from keyframes_and_servers import DEADLINE
 
 from tsfusion.core.errors import JournalError, MapError
-from tsfusion.core.folder_lock import FolderLock, hold, lock_folder
+from tsfusion.core.folder_lock import hold, lock_folder
 
 _OTHER = """
 import sys, time
@@ -22,7 +23,7 @@ time.sleep(600)
 """
 
 
-def lock_map(folder: Path, wait: float) -> FolderLock:
+def lock_map(folder: Path, wait: float) -> ExitStack:
     """As a fuser does it."""
     return lock_folder(folder, "map", "fuser", name="fuser.lock", wait=wait, error_type=MapError)
 

@@ -4,7 +4,7 @@
 import fcntl
 import os
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from tsfusion.core import durable_files
@@ -13,27 +13,8 @@ from tsfusion.core.errors import JournalError, TsfusionError
 _POLL_S = 0.05
 
 
-class FolderLock:
-    """The lock of a folder, held until `close` or the end of this process; made by `hold`."""
-
-    def __init__(self, descriptor: int) -> None:
-        self.descriptor = descriptor
-
-    def __enter__(self) -> "FolderLock":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Let go of the folder; a second call does nothing."""
-        if self.descriptor >= 0:
-            os.close(self.descriptor)
-            self.descriptor = -1
-
-
-def hold(folder: Path, name: str | None = None, *, wait: float = 0.0) -> FolderLock:
-    """Keep other processes that call this out of a folder.
+def hold(folder: Path, name: str | None = None, *, wait: float = 0.0) -> ExitStack:
+    """Keep other processes that call this out of a folder, until `close` or the end of this process.
 
     Args:
         name: of the file in the folder that is locked, made when absent; None = the folder itself.
@@ -47,12 +28,10 @@ def hold(folder: Path, name: str | None = None, *, wait: float = 0.0) -> FolderL
         descriptor = os.open(folder, os.O_RDONLY)
     else:
         descriptor = os.open(folder / name, os.O_RDWR | os.O_CREAT, 0o666)
-    try:
+    with ExitStack() as lock:
+        lock.callback(os.close, descriptor)
         _lock(descriptor, time.monotonic() + wait)
-    except BaseException:
-        os.close(descriptor)
-        raise
-    return FolderLock(descriptor)
+        return lock.pop_all()
 
 
 def _lock(descriptor: int, deadline: float) -> None:
@@ -74,7 +53,7 @@ def lock_folder(
     name: str = "lock",
     wait: float = 0.0,
     error_type: type[TsfusionError] = JournalError,
-) -> FolderLock:
+) -> ExitStack:
     """Make a folder and hold it for this process; the lock file `name` says which process that is.
 
     Args:
@@ -85,20 +64,19 @@ def lock_folder(
     Raises:
         TsfusionError: of `error_type`, when the folder cannot be written, or another process holds it.
     """
+    path = folder / name
     try:
         durable_files.make_folder(folder)
         lock = hold(folder, name, wait=wait)
     except BlockingIOError as error:
         with suppress(OSError):
-            if pid := (folder / name).read_text(encoding="ascii", errors="replace"):
+            if pid := path.read_text(encoding="ascii", errors="replace"):
                 owner += f" (pid {pid})"
-        raise error_type(
-            f"the {kind} folder {folder} is in use by another {owner}: end that first"
-        ) from error
+        in_use = f"the {kind} folder {folder} is in use by another {owner}: end that first"
+        raise error_type(in_use) from error
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL
         reason = getattr(error, "strerror", error)
         raise error_type(f"cannot write the {kind} folder {folder}: {reason}") from error
     with suppress(OSError):  # only a message to whoever has to wait
-        os.truncate(lock.descriptor, 0)
-        os.pwrite(lock.descriptor, b"%d" % os.getpid(), 0)
+        path.write_text(str(os.getpid()), encoding="ascii")
     return lock

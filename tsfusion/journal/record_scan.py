@@ -24,9 +24,7 @@ _MAX_SEGMENT_CHUNK_BYTES = 1 << 16
 # have each byte begin a chunk that ends with the file.
 _PATIENCE = 64
 # The head of a keyframe's chunk, with lengths under 2^40 (see `mcap_layout.ChunkHead`).
-_HEAD_SHAPE = re.compile(
-    rb"\x06(?=.{5}\0{3}.{16}.{5}\0{3}.{4}\0{4}.{5}\0{3}\x05.{5}\0{3}\x01\0)", re.DOTALL
-)  # fmt: skip
+_HEAD_SHAPE = re.compile(rb"(?s)\x06(?=.{5}\0{3}.{16}.{5}\0{3}.{4}\0{4}.{5}\0{3}\x05.{5}\0{3}\x01\0)")
 
 
 class Damage(Struct, frozen=True):

@@ -6,6 +6,7 @@ length, magic, struct limits, lengths against shapes, what the compressed frames
 and proper rotation, CRC. Decompression is left to `decode`.
 """
 
+import math
 import zlib
 from collections.abc import Sequence
 from typing import Any
@@ -212,7 +213,7 @@ def _pose(header: KeyframeHeader) -> NDArray[np.float64]:
 
 
 def _decoded_bytes(buffer: Buffer) -> int:
-    return int(np.prod(buffer.shape, dtype=np.int64)) * np.dtype(buffer.dtype).itemsize
+    return math.prod(buffer.shape) * np.dtype(buffer.dtype).itemsize
 
 
 def _arrays(keyframe: Keyframe) -> list[tuple[ArrayName, NDArray[Any]]]:

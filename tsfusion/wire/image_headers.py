@@ -17,22 +17,7 @@ _PNG_HEADER = struct.Struct(">I4sII")  # length, kind, width, height
 _PNG_CHUNK = struct.Struct(">I4s")
 _PNG_AROUND = 12  # bytes of a chunk besides its content
 # No animation (other sizes), and nothing compressed but the image: zTXt, iTXt, iCCP unfold at will.
-_PNG_KINDS = frozenset(
-    (
-        b"PLTE",
-        b"IDAT",
-        b"tRNS",
-        b"gAMA",
-        b"cHRM",
-        b"sRGB",
-        b"sBIT",
-        b"bKGD",
-        b"pHYs",
-        b"tIME",
-        b"tEXt",
-        b"oFFs",
-    )
-)
+_PNG_KINDS = frozenset(b"PLTE IDAT tRNS gAMA cHRM sRGB sBIT bKGD pHYs tIME tEXt oFFs".split())
 _MAX_PNG_CHUNKS = 1 << 14  # writers of PNG begin a new one every 8 kB or more
 
 _JPEG = b"\xff\xd8"

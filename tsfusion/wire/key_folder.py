@@ -206,10 +206,9 @@ class AllowList:
             self.problem = ""
             self._names = {key: name for name, key in listed.allowed.items()}
             self._revoked = dict(listed.revoked)
-            log.log(
-                logging.INFO if self._names else logging.WARNING,
-                "clients that may connect: %d, keys revoked: %d", len(self._names), len(self._revoked),
-            )  # fmt: skip
+            level = logging.INFO if self._names else logging.WARNING
+            counts = len(self._names), len(self._revoked)
+            log.log(level, "clients that may connect: %d, keys revoked: %d", *counts)
         return any(self._names.get(key) != name for key, name in before.items())
 
     def name_of(self, key: str | None) -> str | None:

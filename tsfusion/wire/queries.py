@@ -110,9 +110,8 @@ def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:
     Raises:
         TransportError: when the frames are not what the layout says.
     """
-    wanted: list[tuple[int, type]] = [
-        (layout.vertices, np.float32), (layout.faces, np.int32), (layout.vertices, np.float32),
-    ]  # fmt: skip
+    wanted: list[tuple[int, type]] = [(layout.vertices, np.float32), (layout.faces, np.int32)]
+    wanted.append((layout.vertices, np.float32))
     if layout.colors:
         wanted.append((layout.vertices, np.uint8))
     sizes = [rows * 3 * np.dtype(dtype).itemsize for rows, dtype in wanted]

@@ -22,9 +22,8 @@ CONTROL_MAX_BYTES = 64 << 10
 TOPIC_MAX_BYTES = 512
 _MESH_TOPIC = b"mesh/"
 _ANY: dict[int, int] = {zmq.HANDSHAKE_IVL: 5000}  # ms; then a connection that is not made is closed
-_CONNECTING = {
-    **_ANY, zmq.RECONNECT_IVL: 100, zmq.RECONNECT_IVL_MAX: 1000, zmq.TCP_KEEPALIVE: 1, zmq.IMMEDIATE: 1
-}  # fmt: skip
+_RECONNECTING = {zmq.RECONNECT_IVL: 100, zmq.RECONNECT_IVL_MAX: 1000}  # ms
+_CONNECTING = {**_ANY, **_RECONNECTING, zmq.TCP_KEEPALIVE: 1, zmq.IMMEDIATE: 1}
 _RANDOM_PORT_TRIES = 32
 LAST_PORT = 65535
 _MAPS_TOPIC = re.compile(rb"mesh/([a-z0-9][a-z0-9_-]{0,31}/?)?")  # or a part; names as config.MapName
