@@ -75,7 +75,7 @@ class Watchdog:
         try:
             self._socket.sendto(message.encode(errors="replace"), self._address)
         except OSError as error:  # full or closed: the next report repeats this one, and fusing goes on
-            log.warning("the service manager cannot be told %s: %s", message.partition("\n")[0], error)
+            log.warning("cannot send %s to the service manager: %s", message.partition("\n")[0], error)
 
 
 def _interval(environment: Mapping[str, str]) -> float | None:

@@ -37,7 +37,7 @@ class Problem(Struct, frozen=True):
     what: str
 
 
-class SegmentInfo(Struct, kw_only=True):
+class SegmentSummary(Struct, kw_only=True):
     """One file. `state`: closed with an index, or open: being written, or its writer was killed."""
 
     name: str
@@ -47,7 +47,7 @@ class SegmentInfo(Struct, kw_only=True):
     state: Literal["closed", "open", "damaged"] = "open"
 
 
-class SessionInfo(Struct, kw_only=True):
+class SessionSummary(Struct, kw_only=True):
     """The keyframes of one spool: `seq` numbers them, `client` is whose key they came under.
 
     Attributes:
@@ -69,15 +69,15 @@ class SessionInfo(Struct, kw_only=True):
     turned_deg: float = 0.0
 
 
-class JournalInfo(Struct, kw_only=True):
+class JournalSummary(Struct, kw_only=True):
     """A journal at a glance."""
 
     path: str
     keyframes: int
     nbytes: int
     lost: int
-    segments: list[SegmentInfo]
-    sessions: list[SessionInfo]
+    segments: list[SegmentSummary]
+    sessions: list[SessionSummary]
     problems: list[Problem]
     quarantined: list[dict[str, Any]]  # name, bytes
 
@@ -94,14 +94,14 @@ class Verdict(Struct, kw_only=True):
     problems: list[Problem]
 
 
-def summarize(place: JournalPlace, watch: Watcher) -> JournalInfo:
+def summarize(place: JournalPlace, watch: Watcher) -> JournalSummary:
     """Read every record's CRC and head; nothing is decoded.
 
     Raises:
         JournalError: when the folder cannot be listed.
     """
     segments = {path: _segment(path) for path in place.files()}
-    sessions: dict[bytes, SessionInfo] = {}
+    sessions: dict[bytes, SessionSummary] = {}
     problems: list[Problem] = []
     moves = _Moves(_corrections(place, problems))
     for path, step in place.steps(watch):
@@ -113,7 +113,7 @@ def summarize(place: JournalPlace, watch: Watcher) -> JournalInfo:
         else:
             segment.keyframes += 1
             moves.note(_count(sessions, step), step)
-    return JournalInfo(
+    return JournalSummary(
         path=str(place.path),
         keyframes=sum(segment.keyframes for segment in segments.values()),
         nbytes=sum(segment.nbytes for segment in segments.values()),
@@ -125,12 +125,14 @@ def summarize(place: JournalPlace, watch: Watcher) -> JournalInfo:
     )
 
 
-def _segment(path: Path) -> SegmentInfo:
+def _segment(path: Path) -> SegmentSummary:
     try:
         nbytes = path.stat().st_size
     except OSError:
         nbytes = 0
-    return SegmentInfo(name=path.name, nbytes=nbytes, state="closed" if journal.is_closed(path) else "open")
+    return SegmentSummary(
+        name=path.name, nbytes=nbytes, state="closed" if journal.is_closed(path) else "open"
+    )
 
 
 def _corrections(place: JournalPlace, problems: list[Problem]) -> dict[bytes, SessionCorrections]:
@@ -147,7 +149,7 @@ class _Moves:
     def __init__(self, said: dict[bytes, SessionCorrections]) -> None:
         self._said = said
 
-    def note(self, session: SessionInfo, record: Record) -> None:
+    def note(self, session: SessionSummary, record: Record) -> None:
         said = self._said.get(record.session)
         if said is None:
             return
@@ -168,10 +170,10 @@ def _rows(pose: tuple[float, ...]) -> list[tuple[float, ...]]:
     return [pose[at : at + 4] for at in (0, 4, 8)]
 
 
-def _count(sessions: dict[bytes, SessionInfo], record: Record) -> SessionInfo:
+def _count(sessions: dict[bytes, SessionSummary], record: Record) -> SessionSummary:
     known = sessions.get(record.session)
     if known is None:
-        known = sessions[record.session] = SessionInfo(
+        known = sessions[record.session] = SessionSummary(
             session=record.session.hex(),
             client=record.client,
             keyframes=0,
