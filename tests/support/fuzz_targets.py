@@ -25,7 +25,7 @@ from tsfusion.wire.codec import measurement
 from tsfusion.wire.corrections import Corrections, SessionCorrections
 from tsfusion.wire.health import ClientHealth, Health, MapHealth, MeshLayout
 from tsfusion.wire.keyframe_header import Refused, stamp, unpack
-from tsfusion.wire.messages import said
+from tsfusion.wire.messages import decode_frames_to_server
 
 MAX_BYTES = 1 << 16  # of a case
 
@@ -299,7 +299,7 @@ def _corrections_of(content: bytes) -> SessionCorrections:
         path.write_bytes(content)
         return corrections.load(path)
     frames = fuzz_mutate.split(content)
-    head = said(frames)
+    head = decode_frames_to_server(frames)
     if not isinstance(head, Corrections):
         raise DecodeError(f"a {type(head).__name__}")
     return corrections.unpack(head, frames[1:])

@@ -325,13 +325,13 @@ def test_secrets_are_not_printed(server: Path) -> None:
 def test_the_list_is_read_again_only_when_it_changes(server: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one, two = key(), key()
     allowed = AllowList(server)
-    reads, real = [], key_folder.read_list
+    reads, real = [], key_folder.read_allow_list
 
     def counted(folder: Path) -> key_folder.Allowed:
         reads.append(folder)
         return real(folder)
 
-    monkeypatch.setattr(key_folder, "read_list", counted)
+    monkeypatch.setattr(key_folder, "read_allow_list", counted)
     assert not allowed.refresh()
     assert not reads
     key_folder.allow(server, "robot1", one)

@@ -36,11 +36,11 @@ LogFormat = Literal["text", "json"]
 LogLevel = Literal["debug", "info", "warning", "error"]
 DEFAULT_MAP = "default"
 MAP_NAME_LENGTH = 32
+MAP_NAME = rf"[a-z0-9][a-z0-9_-]{{0,{MAP_NAME_LENGTH - 1}}}"
 # Becomes a folder's name, so it is no path: \A and \Z, because `$` would let a newline through.
-MapName = Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9_-]{0,31}\Z")]
+MapName = Annotated[str, Meta(pattern=rf"\A{MAP_NAME}\Z")]
 ClientName = Annotated[str, Meta(pattern=r"\A[A-Za-z0-9][A-Za-z0-9_.-]{0,31}\Z")]
 Bytes = Annotated[int, Meta(ge=1 << 20)]
-Port = Annotated[int, Meta(ge=0, le=65535)]
 
 
 class Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a journal holds, and whether all of it is as it was written."""
+"""Summary of a journal, and verification that all of it is as it was written."""
 
 import math
 from collections.abc import Iterator
@@ -25,8 +25,8 @@ from tsfusion.wire.keyframe_header import unpack
 class Problem(Struct, frozen=True):
     """A place in a journal that is not as it should be.
 
-    `torn`: the end of a write that was cut off before it was acknowledged. `note`: nothing is wrong with
-    what is there. Both are no damage.
+    `torn`: the end of a write that was cut off before it was acknowledged. `note`: a person may want to know,
+    though no record is wrong. Neither is damage.
     """
 
     kind: Literal["damage", "torn", "note"]
@@ -38,7 +38,7 @@ class Problem(Struct, frozen=True):
 
 
 class SegmentSummary(Struct, kw_only=True):
-    """One file. `state`: closed with an index, or open: being written, or its writer was killed."""
+    """One segment. `state`: closed = with an index; open = being written, or its writer was killed."""
 
     name: str
     nbytes: int
@@ -70,7 +70,7 @@ class SessionSummary(Struct, kw_only=True):
 
 
 class JournalSummary(Struct, kw_only=True):
-    """A journal at a glance."""
+    """Contents of a journal."""
 
     path: str
     keyframes: int
@@ -83,7 +83,7 @@ class JournalSummary(Struct, kw_only=True):
 
 
 class Verdict(Struct, kw_only=True):
-    """Whether a journal is whole. `lost`: keyframes that cannot be had any more, at least."""
+    """Result of a verification. `lost`: lower bound of the keyframes that cannot be read any more."""
 
     path: str
     intact: bool
@@ -95,7 +95,7 @@ class Verdict(Struct, kw_only=True):
 
 
 def summarize(place: JournalPlace, watch: Watcher) -> JournalSummary:
-    """Read every record's CRC and head; nothing is decoded.
+    """Summarize a journal from the CRC and head of each record; no keyframe is decoded.
 
     Raises:
         JournalError: when the folder cannot be listed.
@@ -189,7 +189,7 @@ def _count(sessions: dict[bytes, SessionSummary], record: Record) -> SessionSumm
 
 
 def problem(path: Path, damage: Damage) -> Problem:
-    """A damaged place as a report names it."""
+    """A damaged place as a problem of a report."""
     kind: Literal["damage", "torn"] = "torn" if damage.torn else "damage"
     return Problem(kind, path.name, damage.position.offset, damage.nbytes, damage.lost, damage.what)
 
@@ -209,7 +209,7 @@ def verify(place: JournalPlace, watch: Watcher) -> Verdict:
             problems.append(problem(path, step))
         else:
             keyframes += 1
-            problems += checks.of(path, step)
+            problems += checks.check(path, step)
     return Verdict(
         path=str(place.path),
         intact=not any(one.kind == "damage" for one in problems),
@@ -230,13 +230,13 @@ def _missing(files: list[Path]) -> Iterator[Problem]:
 
 
 class _Checks:
-    """What can be wrong with a record whose CRC is right."""
+    """Checks of records whose CRC is right: their order and contents."""
 
     def __init__(self) -> None:
         self._last: dict[bytes, int] = {}
         self._seen: set[tuple[bytes, int]] = set()
 
-    def of(self, path: Path, record: Record) -> list[Problem]:
+    def check(self, path: Path, record: Record) -> list[Problem]:
         found = [*self._order(record), *_content(record)]
         at, nbytes = record.position.offset, record.nbytes
         return [Problem(kind, path.name, at, nbytes, lost, what) for kind, lost, what in found]
@@ -259,8 +259,8 @@ def _content(record: Record) -> Iterator[tuple[Literal["damage"], int, str]]:
         yield "damage", 1, f"{_name(record)} is no keyframe: {error}"
         return
     if (header.session, header.seq) != (record.session, record.seq):
-        said = f"{header.seq} of session {header.session.hex()[:8]}"
-        yield "damage", 0, f"{_name(record)} says of itself that it is {said}"
+        other = f"{header.seq} of session {header.session.hex()[:8]}"
+        yield "damage", 0, f"{_name(record)} says of itself that it is {other}"
 
 
 def _name(record: Record) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
+from tsfusion.core.config import MAP_NAME
 from tsfusion.core.errors import JournalError
 from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.quarantine import quarantined_files
@@ -19,7 +20,6 @@ QUARANTINE_FOLDER = "quarantine"
 CORRECTIONS_FOLDER = "corrections"
 MAP_FILE = "map.tsf"
 PREVIOUS_FILE = "map.previous.tsf"
-_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")  # as config.MapName
 
 
 def map_folder(state: str | Path, name: str) -> Path:
@@ -32,7 +32,7 @@ def map_names(state: str | Path) -> list[str]:
     return sorted(
         path.name
         for path in (Path(state) / MAPS_FOLDER).glob("*")
-        if path.is_dir() and _NAME.fullmatch(path.name)
+        if path.is_dir() and re.fullmatch(MAP_NAME, path.name)
     )
 
 

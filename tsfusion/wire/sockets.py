@@ -13,7 +13,7 @@ from typing import Any
 import zmq
 from msgspec import Struct
 
-from tsfusion.core.config import DEFAULT_MAP
+from tsfusion.core.config import DEFAULT_MAP, MAP_NAME
 from tsfusion.core.errors import InvalidConfig, TransportError
 from tsfusion.wire.curve import ClientKeys, ServerKeys
 
@@ -26,7 +26,7 @@ _RECONNECTING: dict[int, int] = {zmq.RECONNECT_IVL: 100, zmq.RECONNECT_IVL_MAX: 
 _CONNECTING = {**_ANY, **_RECONNECTING, zmq.TCP_KEEPALIVE: 1, zmq.IMMEDIATE: 1}
 _RANDOM_PORT_TRIES = 32
 LAST_PORT = 65535
-_MAPS_TOPIC = re.compile(rb"mesh/([a-z0-9][a-z0-9_-]{0,31}/?)?")  # or a part; names as config.MapName
+_MAPS_TOPIC = re.compile(rf"mesh/({MAP_NAME}/?)?".encode())  # or its beginning
 _ADDRESS = re.compile(r"tcp://((?P<host>[\w.*-]+)|\[(?P<host6>[\w:.%]+)\]):(?P<port>[0-9]{1,5}|\*)", re.ASCII)
 
 AnySocket = zmq.Socket[Any]
