@@ -231,7 +231,7 @@ def test_another_version_is_named(shared: Server) -> None:
 
 
 def test_a_client_of_another_version_says_so(shared: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tsfusion.delivery.control_session.VERSION", VERSION + 1)
+    monkeypatch.setattr(codec, "VERSION", VERSION + 1)
     with (
         Client(shared.address) as client,
         pytest.raises(ServerUnreachable, match=r"version 1 of the wire format, this client 2"),

@@ -10,7 +10,7 @@ import typer
 from tsfusion.cli import options
 
 if TYPE_CHECKING:
-    from tsfusion.journal.inspection import JournalSummary, Problem, SessionSummary, Verdict
+    from tsfusion.journal.inspection import JournalInfo, Problem, SessionInfo, Verdict
     from tsfusion.journal.state_folder import JournalPlace
 
 _MOST_LINES = 20  # of one kind, for a person; --json has all
@@ -176,7 +176,7 @@ def _loss(lost: int) -> str:
     return f"{_count(lost, 'keyframe')} lost, at least" if lost else "no keyframe is lost"
 
 
-def _describe_info(found: "JournalSummary") -> str:
+def _describe_info(found: "JournalInfo") -> str:
     from tsfusion.cli.output import size
 
     lines = [
@@ -198,7 +198,7 @@ def _describe_info(found: "JournalSummary") -> str:
     return "\n".join([*lines, *_problem_lines(found.problems)])
 
 
-def _session(one: "SessionSummary") -> str:
+def _session(one: "SessionInfo") -> str:
     first, last = _clock(one.first_logged_ns), _clock(one.last_logged_ns)
     return (
         f"  {one.session[:8]}  {one.client or 'no key':<12} {one.keyframes:>7} keyframes  "
@@ -206,7 +206,7 @@ def _session(one: "SessionSummary") -> str:
     )
 
 
-def _corrected(one: "SessionSummary") -> str:
+def _corrected(one: "SessionInfo") -> str:
     if not one.revision:
         return ""
     most = f"{one.moved_m:.3g} m, {one.turned_deg:.2g}°"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Summary of a journal, and verification that all of it is as it was written."""
+"""What a journal holds, and whether all of it is as it was written."""
 
 import math
 from collections.abc import Iterator
@@ -25,8 +25,8 @@ from tsfusion.wire.keyframe_header import unpack
 class Problem(Struct, frozen=True):
     """A place in a journal that is not as it should be.
 
-    `torn`: the end of a write that was cut off before it was acknowledged. `note`: a person may want to know,
-    though no record is wrong. Neither is damage.
+    `torn`: the end of a write that was cut off before it was acknowledged. `note`: nothing is wrong with
+    what is there. Both are no damage.
     """
 
     kind: Literal["damage", "torn", "note"]
@@ -37,8 +37,8 @@ class Problem(Struct, frozen=True):
     what: str
 
 
-class SegmentSummary(Struct, kw_only=True):
-    """One segment. `state`: closed = with an index; open = being written, or its writer was killed."""
+class SegmentInfo(Struct, kw_only=True):
+    """One file. `state`: closed with an index, or open: being written, or its writer was killed."""
 
     name: str
     nbytes: int
@@ -47,7 +47,7 @@ class SegmentSummary(Struct, kw_only=True):
     state: Literal["closed", "open", "damaged"] = "open"
 
 
-class SessionSummary(Struct, kw_only=True):
+class SessionInfo(Struct, kw_only=True):
     """The keyframes of one spool: `seq` numbers them, `client` is whose key they came under.
 
     Attributes:
@@ -69,21 +69,21 @@ class SessionSummary(Struct, kw_only=True):
     turned_deg: float = 0.0
 
 
-class JournalSummary(Struct, kw_only=True):
-    """Contents of a journal."""
+class JournalInfo(Struct, kw_only=True):
+    """A journal at a glance."""
 
     path: str
     keyframes: int
     nbytes: int
     lost: int
-    segments: list[SegmentSummary]
-    sessions: list[SessionSummary]
+    segments: list[SegmentInfo]
+    sessions: list[SessionInfo]
     problems: list[Problem]
     quarantined: list[dict[str, Any]]  # name, bytes
 
 
 class Verdict(Struct, kw_only=True):
-    """Result of a verification. `lost`: lower bound of the keyframes that cannot be read any more."""
+    """Whether a journal is whole. `lost`: keyframes that cannot be had any more, at least."""
 
     path: str
     intact: bool
@@ -94,14 +94,14 @@ class Verdict(Struct, kw_only=True):
     problems: list[Problem]
 
 
-def summarize(place: JournalPlace, watch: Watcher) -> JournalSummary:
-    """Summarize a journal from the CRC and head of each record; no keyframe is decoded.
+def summarize(place: JournalPlace, watch: Watcher) -> JournalInfo:
+    """Read every record's CRC and head; nothing is decoded.
 
     Raises:
         JournalError: when the folder cannot be listed.
     """
     segments = {path: _segment(path) for path in place.files()}
-    sessions: dict[bytes, SessionSummary] = {}
+    sessions: dict[bytes, SessionInfo] = {}
     problems: list[Problem] = []
     moves = _Moves(_corrections(place, problems))
     for path, step in place.steps(watch):
@@ -113,7 +113,7 @@ def summarize(place: JournalPlace, watch: Watcher) -> JournalSummary:
         else:
             segment.keyframes += 1
             moves.note(_count(sessions, step), step)
-    return JournalSummary(
+    return JournalInfo(
         path=str(place.path),
         keyframes=sum(segment.keyframes for segment in segments.values()),
         nbytes=sum(segment.nbytes for segment in segments.values()),
@@ -125,14 +125,12 @@ def summarize(place: JournalPlace, watch: Watcher) -> JournalSummary:
     )
 
 
-def _segment(path: Path) -> SegmentSummary:
+def _segment(path: Path) -> SegmentInfo:
     try:
         nbytes = path.stat().st_size
     except OSError:
         nbytes = 0
-    return SegmentSummary(
-        name=path.name, nbytes=nbytes, state="closed" if journal.is_closed(path) else "open"
-    )
+    return SegmentInfo(name=path.name, nbytes=nbytes, state="closed" if journal.is_closed(path) else "open")
 
 
 def _corrections(place: JournalPlace, problems: list[Problem]) -> dict[bytes, SessionCorrections]:
@@ -149,7 +147,7 @@ class _Moves:
     def __init__(self, said: dict[bytes, SessionCorrections]) -> None:
         self._said = said
 
-    def note(self, session: SessionSummary, record: Record) -> None:
+    def note(self, session: SessionInfo, record: Record) -> None:
         said = self._said.get(record.session)
         if said is None:
             return
@@ -170,10 +168,10 @@ def _rows(pose: tuple[float, ...]) -> list[tuple[float, ...]]:
     return [pose[at : at + 4] for at in (0, 4, 8)]
 
 
-def _count(sessions: dict[bytes, SessionSummary], record: Record) -> SessionSummary:
+def _count(sessions: dict[bytes, SessionInfo], record: Record) -> SessionInfo:
     known = sessions.get(record.session)
     if known is None:
-        known = sessions[record.session] = SessionSummary(
+        known = sessions[record.session] = SessionInfo(
             session=record.session.hex(),
             client=record.client,
             keyframes=0,
@@ -189,7 +187,7 @@ def _count(sessions: dict[bytes, SessionSummary], record: Record) -> SessionSumm
 
 
 def problem(path: Path, damage: Damage) -> Problem:
-    """A damaged place as a problem of a report."""
+    """A damaged place as a report names it."""
     kind: Literal["damage", "torn"] = "torn" if damage.torn else "damage"
     return Problem(kind, path.name, damage.position.offset, damage.nbytes, damage.lost, damage.what)
 
@@ -209,7 +207,7 @@ def verify(place: JournalPlace, watch: Watcher) -> Verdict:
             problems.append(problem(path, step))
         else:
             keyframes += 1
-            problems += checks.check(path, step)
+            problems += checks.of(path, step)
     return Verdict(
         path=str(place.path),
         intact=not any(one.kind == "damage" for one in problems),
@@ -230,13 +228,13 @@ def _missing(files: list[Path]) -> Iterator[Problem]:
 
 
 class _Checks:
-    """Checks of records whose CRC is right: their order and contents."""
+    """What can be wrong with a record whose CRC is right."""
 
     def __init__(self) -> None:
         self._last: dict[bytes, int] = {}
         self._seen: set[tuple[bytes, int]] = set()
 
-    def check(self, path: Path, record: Record) -> list[Problem]:
+    def of(self, path: Path, record: Record) -> list[Problem]:
         found = [*self._order(record), *_content(record)]
         at, nbytes = record.position.offset, record.nbytes
         return [Problem(kind, path.name, at, nbytes, lost, what) for kind, lost, what in found]
@@ -259,8 +257,8 @@ def _content(record: Record) -> Iterator[tuple[Literal["damage"], int, str]]:
         yield "damage", 1, f"{_name(record)} is no keyframe: {error}"
         return
     if (header.session, header.seq) != (record.session, record.seq):
-        other = f"{header.seq} of session {header.session.hex()[:8]}"
-        yield "damage", 0, f"{_name(record)} says of itself that it is {other}"
+        said = f"{header.seq} of session {header.session.hex()[:8]}"
+        yield "damage", 0, f"{_name(record)} says of itself that it is {said}"
 
 
 def _name(record: Record) -> str:

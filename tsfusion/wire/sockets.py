@@ -180,7 +180,7 @@ def check_own_machine(address: str) -> None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host name or address is this machine's own, which no other machine can reach."""
+    """Whether a host, name or number, is this machine."""
     try:
         return host == "localhost" or ip_address(host).is_loopback
     except ValueError:
