@@ -90,14 +90,14 @@ class ConnectionMonitor:
             except zmq.Again:
                 break
             event, value = struct.unpack("=HI", head)
-            problem = self._on(event, value)
+            problem = self._handle_event(event, value)
             news = news if problem is None else problem
         if self._ended_at and not self.gave_up and time.monotonic() - self._ended_at > _RETRY_S:
             self.gave_up = True
             news = f"what answers at {self.address} is no tsfusion server, or was garbled on the way"
         return news
 
-    def _on(self, event: int, value: int) -> str | None:
+    def _handle_event(self, event: int, value: int) -> str | None:
         if event == zmq.EVENT_CONNECTED:
             self._connected_at, self._ended_at = time.monotonic(), 0.0
         elif event == zmq.EVENT_CONNECT_RETRIED:
@@ -112,18 +112,20 @@ class ConnectionMonitor:
             self._ended_at = time.monotonic()
         elif event == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
             self.refused = self.gave_up = True
-            return self._unknown()
+            return self._unknown_key()
         elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
             self.gave_up = True
             self.refused = value == _MISMATCH
             return (
-                self._mismatch() if self.refused else f"what answers at {self.address} is no tsfusion server"
+                self._keys_on_one_side()
+                if self.refused
+                else f"what answers at {self.address} is no tsfusion server"
             )
         else:
-            return self._turned_away()
+            return self._handshake_failed()
         return None
 
-    def _turned_away(self) -> str | None:
+    def _handshake_failed(self) -> str | None:
         if time.monotonic() - self._connected_at > _REFUSAL_S:
             return f"the server at {self.address} takes the connection, but says nothing"
         self._failures += 1
@@ -139,7 +141,7 @@ class ConnectionMonitor:
             "for keys and this client has none"
         )
 
-    def _unknown(self) -> str:
+    def _unknown_key(self) -> str:
         key = shlex.quote(self._key)
         key = f"-- {key}" if self._key.startswith("-") else key  # no option
         return (
@@ -147,7 +149,7 @@ class ConnectionMonitor:
             f"on the server, run `tsfusion keys allow NAME {key}`"
         )
 
-    def _mismatch(self) -> str:
+    def _keys_on_one_side(self) -> str:
         if self._key:
             return (
                 f"this client has keys, but the server at {self.address} was started without: leave them out"

@@ -77,7 +77,7 @@ def create_pair(folder: Folder, name: str, *, force: bool = False) -> Pair:
         _write(paths[0], _PAIR_HEAD.format("**Secret** Certificate") + lines + secret_line)
         _write(paths[1], _PAIR_HEAD.format("Public Certificate") + lines)
         if name == curve.SERVER and not (place / ALLOWED).exists():
-            _write(place / ALLOWED, _dumps(Allowed()))
+            _write(place / ALLOWED, _format_list(Allowed()))
     return Pair(name, public)
 
 
@@ -107,7 +107,7 @@ def allow(folder: Folder, name: str, key: str) -> str | None:
         revoked = {key: was for key, was in listed.revoked.items() if key != public}
         if earlier is not None:
             revoked[earlier] = name
-        _write(place / ALLOWED, _dumps(Allowed({**listed.allowed, name: public}, revoked)))
+        _write(place / ALLOWED, _format_list(Allowed({**listed.allowed, name: public}, revoked)))
     return earlier
 
 
@@ -126,7 +126,7 @@ def revoke(folder: Folder, name: str) -> str:
             raise InvalidConfig(f"no key is allowed under the name {name!r}, but: {names}")
         left = dict(listed.allowed)
         key = left.pop(name)
-        _write(place / ALLOWED, _dumps(Allowed(left, {**listed.revoked, key: name})))
+        _write(place / ALLOWED, _format_list(Allowed(left, {**listed.revoked, key: name})))
     return key
 
 
@@ -161,7 +161,7 @@ def read_allow_list(folder: Folder) -> Allowed:
         raise InvalidConfig(f"cannot read the allow-list {path}: {error.strerror}") from error
     if durable_files.others_can_write(mode):
         raise InvalidConfig(f"others can change the allow-list {path} (mode {stat.S_IMODE(mode):04o})")
-    return _loads(content, path)
+    return _parse_list(content, path)
 
 
 def check_name(name: str) -> None:
@@ -261,7 +261,7 @@ def _write(path: Path, text: str) -> None:
         raise OutputError(f"cannot write {path}: {error.strerror}") from error
 
 
-def _loads(content: bytes, path: Path) -> Allowed:
+def _parse_list(content: bytes, path: Path) -> Allowed:
     try:
         listed = msgspec.toml.decode(content, type=Allowed)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -274,7 +274,7 @@ def _loads(content: bytes, path: Path) -> Allowed:
     return listed
 
 
-def _dumps(listed: Allowed) -> str:
+def _format_list(listed: Allowed) -> str:
     lines = [_LIST_HEAD, "[allowed]"]  # a Z85 key has no quote and no backslash
     lines += [f'"{name}" = "{key}"' for name, key in sorted(listed.allowed.items())]
     lines += ["", "[revoked]"]
