@@ -116,11 +116,9 @@ class ConnectionMonitor:
         elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
             self.gave_up = True
             self.refused = value == _MISMATCH
-            return (
-                self._keys_on_one_side()
-                if self.refused
-                else f"what answers at {self.address} is no tsfusion server"
-            )
+            if self.refused:
+                return self._keys_on_one_side()
+            return f"what answers at {self.address} is no tsfusion server"
         else:
             return self._handshake_failed()
         return None
