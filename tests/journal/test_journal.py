@@ -95,7 +95,9 @@ def test_a_torn_tail_costs_only_itself(tmp_path: Path, kept: float) -> None:
         journal.read(tmp_path, last)
 
 
-def test_a_flipped_bit_costs_one_record_and_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_flipped_bit_costs_one_record_and_is_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     positions = write(tmp_path, 5)
     path = segment_path(tmp_path, 1)
     stored = bytearray(path.read_bytes())
@@ -109,7 +111,7 @@ def test_a_flipped_bit_costs_one_record_and_is_told(tmp_path: Path, caplog: pyte
         journal.read(tmp_path, positions[2])
 
 
-def test_a_damaged_length_costs_one_record_and_is_told(tmp_path: Path) -> None:
+def test_a_damaged_length_costs_one_record_and_is_logged(tmp_path: Path) -> None:
     positions = write(tmp_path, 5)
     path = segment_path(tmp_path, 1)
     stored = bytearray(path.read_bytes())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Every cut and every flipped bit of a segment: what comes back is what was written, and the rest is told."""
+"""Every cut and every flipped bit of a segment: what comes back is what was written, and the rest is reported."""
 
 import errno
 import os
@@ -74,7 +74,7 @@ def flipped(whole: bytes, at: int, bit: int) -> bytes:
 
 
 def check_flip(segment: Segment, at: int, bit: int) -> None:
-    """One flipped bit costs the record it is in, or nothing; and it is told."""
+    """One flipped bit costs the record it is in, or nothing; and it is reported."""
     found, damages = segment.read(flipped(segment.whole, at, bit))
     missing = set(segment.places) - set(found)
     hit = {place for place, end in zip(segment.places, segment.ends, strict=True) if place.offset <= at < end}
