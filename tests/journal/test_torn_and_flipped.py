@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Every cut and every flipped bit of a segment: what comes back is what was written, and the rest is reported."""
+"""Every cut and every flipped bit of a segment: what was written comes back, and damage is reported."""
 
 import errno
 import os
