@@ -53,20 +53,6 @@ def test_an_error_leaves_the_old_file_and_no_part(path: Path, error: BaseExcepti
     assert list(path.parent.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_a_disk_that_refuses_leaves_the_old_file(
-    path: Path, monkeypatch: pytest.MonkeyPatch, call: str
-) -> None:
-    def refuse(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, call, refuse)
-    with pytest.raises(OSError, match="No space left"):
-        replace(path, b"new")
-    assert path.read_bytes() == b"old"
-    assert list(path.parent.iterdir()) == [path]
-
-
 def test_a_killed_writer_leaves_the_old_file_and_the_next_one_clears_up(path: Path) -> None:
     assert subprocess.run([sys.executable, "-c", _KILLED, str(path)], check=False).returncode != 0
     assert path.read_bytes() == b"old"
