@@ -2,10 +2,11 @@
 """What the ablation's rows become: a file of JSON lines, Markdown tables and plots."""
 
 import json
-import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from tsfusion.core import durable_files
 
 Rows = dict[str, dict[str, Any]]  # by name
 ROWS, TABLES = "rows.jsonl", "tables.md"
@@ -79,9 +80,8 @@ def read(folder: Path) -> Rows:
 def keep(folder: Path, rows: Rows) -> None:
     """Write the rows of a folder, all of them or none."""
     folder.mkdir(parents=True, exist_ok=True)
-    partial = folder / f".{ROWS}.partial"
-    partial.write_text("".join(json.dumps(row) + "\n" for row in rows.values()), encoding="utf-8")
-    os.replace(partial, folder / ROWS)
+    with durable_files.replacing(folder / ROWS) as file:
+        file.writelines(f"{json.dumps(row)}\n".encode() for row in rows.values())
 
 
 def write(folder: Path, rows: Rows, order: list[str]) -> list[Path]:

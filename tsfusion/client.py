@@ -81,8 +81,8 @@ class Client:
         }
         self._config = override(config or ClientConfig(), map=map, policy=policy, **keys)
         connection_keys = client_keys(self._config.key, self._config.server_key)
-        address = sockets.target(address)
-        self._control = sockets.target(control_address(address, control))
+        address = sockets.connect_address(address)
+        self._control = sockets.connect_address(control_address(address, control))
         segment_bytes = min(self._config.segment_bytes, self._config.spool_bytes // _SEGMENTS)
         self._outbox = Outbox(Spool(spool, segment_bytes, map_name=self._config.map))
         self._pressure = Backpressure(self._outbox, self._config)

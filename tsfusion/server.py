@@ -76,7 +76,7 @@ def _open(
     process.raise_file_limit()
     state = Path(server.state)
     stack.enter_context(lock_folder(state, "state", "server"))
-    for name in state_folder.names(state):
+    for name in state_folder.map_names(state):
         if len(volumes) < server.max_maps:
             volumes.setdefault(name, volumes[DEFAULT_MAP])
     context: zmq.Context[Any] = zmq.Context()
@@ -141,5 +141,5 @@ def _check_addresses(server: ServerConfig) -> None:
         if address is not None:
             sockets.check_reachable(address, has_keys=server.keys is not None)
             sockets.check_free(address)
-    if server.control is None and sockets.split(server.listen)[1]:
+    if server.control is None and sockets.parse_address(server.listen)[1]:
         sockets.check_free(sockets.control_address(server.listen))

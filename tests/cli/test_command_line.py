@@ -210,7 +210,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("here first")
     (tmp_path / "garbage.tsf").write_bytes(bytes(range(200)))
-    monkeypatch.setattr("tsfusion.wire.queries._ANSWER_TIMEOUT", 0.2)
+    monkeypatch.setattr("tsfusion.wire.queries._PING_TIMEOUT", 0.2)
     done = here(*arguments)
     assert words in one_line(done)
     left = {path.name for path in tmp_path.rglob("*")} - {
@@ -317,7 +317,7 @@ def test_a_sensor_chosen_in_the_environment_counts(
 def test_flags_of_the_environment_are_not_refused(here: Here, monkeypatch: pytest.MonkeyPatch) -> None:
     """They may be meant for other commands."""
     monkeypatch.setenv("TSFUSION_VOXEL_SIZE", "0.5")
-    monkeypatch.setattr("tsfusion.wire.queries._ANSWER_TIMEOUT", 0.2)
+    monkeypatch.setattr("tsfusion.wire.queries._PING_TIMEOUT", 0.2)
     assert "no server" in one_line(here("mesh", NOBODY, "a.ply"))
 
 
@@ -342,10 +342,10 @@ def test_a_bad_setting_is_named_once(here: Here, tmp_path: Path, toml: str, word
 
 
 def test_settings_may_be_numpy_scalars() -> None:
-    made = config.make(config.VolumeConfig, {"voxel_size": np.float32(0.25), "threads": np.int64(2)})
+    made = config.make_settings(config.VolumeConfig, {"voxel_size": np.float32(0.25), "threads": np.int64(2)})
     assert (made.voxel_size, made.threads) == (0.25, 2)
     with pytest.raises(InvalidConfig, match=r"^voxel_size must be > 0, got -1.0$"):
-        config.make(config.VolumeConfig, {"voxel_size": np.float32(-1)})
+        config.make_settings(config.VolumeConfig, {"voxel_size": np.float32(-1)})
 
 
 def test_ctrl_c_while_modules_load_is_no_traceback() -> None:

@@ -21,7 +21,7 @@ from tsfusion.core.errors import JournalError
 from tsfusion.geometry import se3
 from tsfusion.journal import Journal, segment_path
 from tsfusion.journal.recording import JournalRecording
-from tsfusion.journal.state_folder import find
+from tsfusion.journal.state_folder import find_journal
 from tsfusion.wire import codec, corrections
 from tsfusion.wire.corrections import SessionCorrections
 
@@ -93,19 +93,19 @@ def state(tmp_path: Path) -> Path:
 def test_a_journal_is_found_by_any_folder_above_it(state: Path) -> None:
     hall = state / "maps" / "hall"
     for path in (state, hall, hall / "journal"):
-        place = find(path)
+        place = find_journal(path)
         assert (place.path, place.quarantine) == (hall / "journal", hall / "quarantine")
-    assert find(state, "hall") == find(state)
-    assert find(segment_path(hall / "journal", 1)).files() == [segment_path(hall / "journal", 1)]
+    assert find_journal(state, "hall") == find_journal(state)
+    assert find_journal(segment_path(hall / "journal", 1)).files() == [segment_path(hall / "journal", 1)]
 
 
 def test_several_maps_must_be_told_apart(state: Path) -> None:
     fill(state / "maps" / "attic" / "journal", 2)
     with pytest.raises(JournalError, match=r"several maps \(attic, hall\): choose one with --map NAME"):
-        find(state)
-    assert find(state, "attic").path == state / "maps" / "attic" / "journal"
+        find_journal(state)
+    assert find_journal(state, "attic").path == state / "maps" / "attic" / "journal"
     with pytest.raises(JournalError, match=r"no map cellar; it has: attic, hall"):
-        find(state, "cellar")
+        find_journal(state, "cellar")
 
 
 def test_a_path_without_a_journal_says_what_was_expected(state: Path, tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_a_path_without_a_journal_says_what_was_expected(state: Path, tmp_path: 
         (state / "maps" / "hall", "hall", "--map has no effect"),
     ):
         with pytest.raises(JournalError, match=message):
-            find(path, name)
+            find_journal(path, name)
 
 
 # --- info ---
@@ -284,7 +284,7 @@ def test_what_is_whole_is_saved_in_order_into_closed_segments(state: Path, tmp_p
     done = json.loads(out)
     assert (status, done["keyframes"], done["lost"], done["copies"]) == (1, 4, 1, 0)
     assert sorted(one["kind"] for one in done["problems"]) == ["damage", "torn"]
-    saved = [one for path in find(tmp_path / "saved").files() for one in journal.records(path)]
+    saved = [one for path in find_journal(tmp_path / "saved").files() for one in journal.records(path)]
     for old, new in zip(whole, saved, strict=True):
         assert (old.session, old.seq, old.client, old.logged_ns) == (
             new.session,
@@ -293,7 +293,7 @@ def test_what_is_whole_is_saved_in_order_into_closed_segments(state: Path, tmp_p
             new.logged_ns,
         )
         assert [bytes(frame) for frame in old.frames] == [bytes(frame) for frame in new.frames]
-    for path in find(tmp_path / "saved").files():
+    for path in find_journal(tmp_path / "saved").files():
         with path.open("rb") as file:
             assert list(make_reader(file, validate_crcs=True).iter_messages())
     assert run("verify", tmp_path / "saved")[0] == 0

@@ -19,17 +19,17 @@ from tsfusion.core import logs
 SESSION = bytes(range(0xA0, 0xB0))
 LINE = {"time", "level", "process", "logger", "message"}
 log = logging.getLogger("tsfusion.test")
-Said = Callable[[], list[str]]
+ReadLines = Callable[[], list[str]]
 
 
 @pytest.fixture
-def said(capsys: pytest.CaptureFixture[str]) -> Said:
-    """The lines since it was last called."""
+def lines(capsys: pytest.CaptureFixture[str]) -> ReadLines:
+    """Log lines since the last call."""
 
-    def lines() -> list[str]:
+    def read() -> list[str]:
         return capsys.readouterr().err.splitlines()
 
-    return lines
+    return read
 
 
 def record(
@@ -38,30 +38,30 @@ def record(
     return logging.LogRecord("tsfusion.x", level, "x.py", line, message, arguments or ("b",), None)
 
 
-def test_text_is_a_line_that_says_what_it_is_about(said: Said) -> None:
+def test_text_is_a_line_that_says_what_it_is_about(lines: ReadLines) -> None:
     logs.configure("text", "info")
     log.warning("a message is refused: %s", "too large", extra=logs.about(map="yard", session=SESSION, seq=7))
     log.info("ready")
-    assert said() == [
+    assert lines() == [
         "tsfusion: WARNING: a message is refused: too large (map yard, session a0a1a2a3, seq 7)",
         "tsfusion: INFO: ready",
     ]
     logs.configure("text", "info", "fuser")
     log.error("no checkpoint")
-    assert said() == ["tsfusion fuser: ERROR: no checkpoint"]
+    assert lines() == ["tsfusion fuser: ERROR: no checkpoint"]
     logs.configure("text", "info", "fuser", map="yard")
     log.error("no checkpoint")
     log.error("another's", extra=logs.about(map="shed"))
-    assert said() == [
+    assert lines() == [
         "tsfusion fuser: ERROR: no checkpoint (map yard)",
         "tsfusion fuser: ERROR: another's (map shed)",
     ]
 
 
-def test_json_is_an_object_a_line(said: Said) -> None:
+def test_json_is_an_object_a_line(lines: ReadLines) -> None:
     logs.configure("json", "info", "fuser")
     log.warning("refused", extra=logs.about(map="yard", session=SESSION, seq=0, client="cart", reason="gap"))
-    (line,) = said()
+    (line,) = lines()
     fields = json.loads(line)
     assert fields.keys() == {*LINE, "map", "session", "seq", "client", "reason"}
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z", fields.pop("time"))
@@ -71,23 +71,23 @@ def test_json_is_an_object_a_line(said: Said) -> None:
     }  # fmt: skip
 
 
-def test_a_traceback_is_a_field(said: Said) -> None:
+def test_a_traceback_is_a_field(lines: ReadLines) -> None:
     logs.configure("json", "info")
     try:
         raise ValueError("first\nsecond")
     except ValueError:
         log.exception("broken")
-    (line,) = said()
+    (line,) = lines()
     assert json.loads(line)["exception"].endswith("ValueError: first\nsecond")
     logs.configure("text", "info")
     log.error("broken", exc_info=ValueError("once"))
-    assert said() == ["tsfusion: ERROR: broken", "ValueError: once"]
+    assert lines() == ["tsfusion: ERROR: broken", "ValueError: once"]
 
 
-def test_only_what_is_known_is_shown(said: Said) -> None:
+def test_only_what_is_known_is_shown(lines: ReadLines) -> None:
     logs.configure("json", "info")
     log.warning("x", extra={"about": {"password": "secret", "seq": 1}, "other": 2})
-    (line,) = said()
+    (line,) = lines()
     assert json.loads(line).keys() == {*LINE, "seq"}
     assert logs.about(map=None, client="", reason=None, session=None) == {"about": {}}
 
@@ -96,37 +96,37 @@ def test_only_what_is_known_is_shown(said: Said) -> None:
 @given(text=st.text())
 def test_nothing_in_a_message_breaks_a_line_or_a_terminal(format: str, text: str) -> None:
     made = logs.TextFormatter("server") if format == "text" else logs.JsonFormatter("server")
-    told = record("%s", text)
-    told.__dict__.update(logs.about(map=text, reason=text))
-    line = made.format(told)
+    entry = record("%s", text)
+    entry.__dict__.update(logs.about(map=text, reason=text))
+    line = made.format(entry)
     assert len(line.splitlines()) == 1
     assert line.isprintable()
 
 
-def test_long_messages_are_cut(said: Said) -> None:
+def test_long_messages_are_cut(lines: ReadLines) -> None:
     logs.configure("text", "info")
     log.warning("%s", "x" * 1_000_000)
-    (line,) = said()
+    (line,) = lines()
     assert len(line) < logs.MESSAGE_CHARACTERS + 100
     assert line.endswith("x…")
 
 
-def test_levels_are_those_of_our_own_loggers(said: Said) -> None:
+def test_levels_are_those_of_our_own_loggers(lines: ReadLines) -> None:
     logs.configure("text", "debug")
     log.debug("ours")
     logging.getLogger("asyncio").debug("theirs")
     logging.getLogger("asyncio").warning("theirs, and important")
-    assert said() == ["tsfusion: DEBUG: ours", "tsfusion: WARNING: theirs, and important"]
+    assert lines() == ["tsfusion: DEBUG: ours", "tsfusion: WARNING: theirs, and important"]
     logs.configure("text", "error")
     log.warning("ours")
-    assert said() == []
+    assert lines() == []
 
 
-def test_configuring_again_does_not_double_lines(said: Said) -> None:
+def test_configuring_again_does_not_double_lines(lines: ReadLines) -> None:
     for _ in range(3):
         logs.configure("text", "info")
     log.info("once")
-    assert said() == ["tsfusion: INFO: once"]
+    assert lines() == ["tsfusion: INFO: once"]
 
 
 def test_a_flood_is_cut_short_and_counted() -> None:
@@ -135,22 +135,22 @@ def test_a_flood_is_cut_short_and_counted() -> None:
     assert [limiter.allows(record("%s", i)) for i in range(5)] == [True] * 3 + [False] * 2
     assert limiter.allows(record(line=2)), "another place has a count of its own"
     now[0] += 9.9
-    assert list(limiter.over()) == []
+    assert list(limiter.finished_periods()) == []
     now[0] += 0.2
-    (summary,) = limiter.over()
+    (summary,) = limiter.finished_periods()
     assert summary.getMessage() == "2 more like this were left out in 10 s: 4"
     assert summary.levelno == logging.WARNING
     assert limiter.allows(record()), "a new period"
-    assert list(limiter.over(everything=True)) == []
+    assert list(limiter.finished_periods(everything=True)) == []
 
 
 def test_errors_are_never_left_out() -> None:
     limiter = logs.Limiter(most=1)
     assert all(limiter.allows(record(level=level)) for level in (logging.ERROR, logging.CRITICAL) * 50)
-    assert list(limiter.over(everything=True)) == []
+    assert list(limiter.finished_periods(everything=True)) == []
 
 
-def test_what_was_left_out_is_said_though_nothing_follows(said: Said) -> None:
+def test_left_out_lines_are_counted_though_nothing_follows(lines: ReadLines) -> None:
     now = [100.0]
     logs.configure("json", "info")
     (handler,) = (h for h in logging.root.handlers if isinstance(h, logs.Stderr))
@@ -158,16 +158,16 @@ def test_what_was_left_out_is_said_though_nothing_follows(said: Said) -> None:
     for i in range(5):
         log.warning("rubbish %d", i, extra=logs.about(seq=i))
     logs.tell_left_out()
-    assert len(said()) == 2
+    assert len(lines()) == 2
     now[0] += 10.0
     logs.tell_left_out()
     logs.tell_left_out()
-    (line,) = said()
+    (line,) = lines()
     assert json.loads(line)["message"] == "3 more like this were left out in 10 s: rubbish 4"
     assert json.loads(line).keys() == LINE
 
 
-def test_a_flood_from_many_threads_is_bounded(said: Said) -> None:
+def test_a_flood_from_many_threads_is_bounded(lines: ReadLines) -> None:
     logs.configure("text", "info")
 
     def flood() -> None:
@@ -179,11 +179,11 @@ def test_a_flood_from_many_threads_is_bounded(said: Said) -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(said()) == logs.MOST
+    assert len(lines()) == logs.MOST
     for handler in logging.root.handlers:
         if isinstance(handler, logs.Stderr):
             handler.close()
-    (line,) = said()
+    (line,) = lines()
     assert f" {4000 - logs.MOST} more like this" in line
 
 

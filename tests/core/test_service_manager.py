@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a service manager is told, read from the other end of a real datagram socket."""
+"""Messages to a service manager, read from the other end of a real datagram socket."""
 
 import os
 import secrets
@@ -21,8 +21,8 @@ class Manager:
         self._socket.bind("\0" + address[1:] if address.startswith("@") else address)
         self._socket.setblocking(False)
 
-    def heard(self) -> list[str]:
-        """The messages since it was last called."""
+    def received(self) -> list[str]:
+        """Messages since the last call."""
         messages = []
         while True:
             try:
@@ -43,15 +43,15 @@ def manager(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Manager]
     made.close()
 
 
-def test_a_life_is_told(manager: Manager) -> None:
+def test_start_status_and_end_are_reported(manager: Manager) -> None:
     dog = Watchdog(manager.environment)
     dog.ready("2 maps")
     dog.pet("2 maps")
     dog.pet("2 maps, 1 keyframe waiting")
     dog.stopping()
     dog.close()
-    dog.pet("nobody hears this")
-    assert manager.heard() == [
+    dog.pet("sent to nobody")
+    assert manager.received() == [
         "READY=1\nSTATUS=2 maps", "STATUS=2 maps, 1 keyframe waiting", "STOPPING=1",
     ]  # fmt: skip
 
@@ -60,12 +60,12 @@ def test_it_is_petted_twice_an_interval(manager: Manager) -> None:
     now = [50.0]
     dog = Watchdog({**manager.environment, "WATCHDOG_USEC": "10000000"}, lambda: now[0])
     assert dog.interval == 10.0
-    heard = []
+    received = []
     for _ in range(200):
         dog.pet()
-        heard += manager.heard()
+        received += manager.received()
         now[0] += 0.1
-    assert heard == ["WATCHDOG=1"] * 4
+    assert received == ["WATCHDOG=1"] * 4
     dog.close()
 
 
@@ -87,7 +87,7 @@ def test_only_the_process_that_is_watched_is_petted(
     dog = Watchdog({**manager.environment, **given})
     assert dog.interval == interval
     dog.pet()
-    assert manager.heard() == (["WATCHDOG=1"] if interval else [])
+    assert manager.received() == (["WATCHDOG=1"] if interval else [])
     dog.close()
 
 
@@ -107,15 +107,15 @@ def test_the_environment_is_what_counts(manager: Manager, monkeypatch: pytest.Mo
     dog = Watchdog()
     dog.ready()
     dog.close()
-    assert manager.heard() == ["READY=1"]
+    assert manager.received() == ["READY=1"]
 
 
 def test_a_status_is_one_line(manager: Manager) -> None:
     dog = Watchdog(manager.environment)
     dog.ready("disk full\nWATCHDOG=trigger \udc80" + "x" * 1000)
-    (heard,) = manager.heard()
-    assert len(heard.splitlines()) == 2
-    assert len(heard) < 300
+    (message,) = manager.received()
+    assert len(message.splitlines()) == 2
+    assert len(message) < 300
     dog.close()
 
 
@@ -125,9 +125,9 @@ def test_a_manager_that_went_away_or_does_not_read_stops_nobody(
     dog = Watchdog({**manager.environment, "WATCHDOG_USEC": "1"})
     for i in range(2000):  # more than its socket holds
         dog.pet(f"{i}")
-    assert "cannot be told" in caplog.text
+    assert "cannot send" in caplog.text
     manager.close()
     caplog.clear()
     dog.stopping()
-    assert "cannot be told STOPPING=1" in caplog.text
+    assert "cannot send STOPPING=1" in caplog.text
     dog.close()

@@ -19,7 +19,7 @@ from tsfusion.core.errors import JournalError
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.journal.recording import read_keyframes
+from tsfusion.journal.recording import JournalRecording
 from tsfusion.scanner.localization.localizer import Lost, Pose
 from tsfusion.scanner.localization.pose_feed.feed import PoseFeed
 
@@ -130,7 +130,7 @@ def test_a_lost_camera_is_said_to_be_lost(ros: dict[str, str]) -> None:
 
 def kept(spool: Path) -> list[Keyframe]:
     with suppress(JournalError):
-        return list(read_keyframes(spool))
+        return list(JournalRecording(spool))
     return []
 
 

@@ -28,7 +28,7 @@ from tsfusion.core.errors import (
 )
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.journal import state_folder
-from tsfusion.journal.recording import read_keyframes
+from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec, messages, sockets
 from tsfusion.wire.messages import Command
 from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_status, request
@@ -95,7 +95,7 @@ def test_five_lines_reach_the_map(tmp_path: Path, offline_hash: str) -> None:
         assert all(b - a >= -2 * times.clock_bound_ns for a, b in pairwise(stages)), times
         assert 0 < times.clock_bound_ns < 5e7
     assert list((tmp_path / "spool").glob("*.mcap")) == []
-    assert [keyframe.timestamp_ns for keyframe in read_keyframes(tmp_path / "state")] == [
+    assert [keyframe.timestamp_ns for keyframe in JournalRecording(tmp_path / "state")] == [
         10**9 + i for i in range(COUNT)
     ]
 
@@ -126,7 +126,8 @@ def test_a_killed_server_loses_nothing_acknowledged(tmp_path: Path, offline_hash
             assert again.terminate() == 0
         assert client.stats.fused == COUNT
     assert (status.keyframes_durable, status.keyframes_fused, status.map_hash) == (COUNT, COUNT, offline_hash)
-    assert tsfusion.Volume.load(state_folder.folder(state, "default") / "map.tsf").map_hash() == offline_hash
+    checkpoint = state_folder.map_folder(state, "default") / "map.tsf"
+    assert tsfusion.Volume.load(checkpoint).map_hash() == offline_hash
 
 
 def test_a_stop_drains_and_a_start_goes_on(tmp_path: Path, offline_hash: str) -> None:
@@ -149,7 +150,8 @@ def test_a_stop_drains_and_a_start_goes_on(tmp_path: Path, offline_hash: str) ->
         status = fetch_status(server.address)
         assert (status.sessions, status.keyframes_fused, status.map_hash) == (2, COUNT, offline_hash)
         assert server.terminate() == 0
-    for segment in (state_folder.folder(tmp_path, "default") / "journal").iterdir():  # somebody makes room
+    journal_folder = state_folder.map_folder(tmp_path, "default") / "journal"
+    for segment in journal_folder.iterdir():  # somebody makes room
         segment.unlink()
     with serving(tmp_path) as server:
         with Client(server.address) as client:
@@ -366,7 +368,7 @@ def test_a_busy_port_a_busy_folder_and_a_bad_folder_are_one_clear_line(
         f"TransportError: cannot listen on {shared.address}: Address already in use"
     )
     state = str(Path(fetch_status(shared.address).state).parent.parent)
-    assert refusal(Path(state)) == f"JournalError: the state folder {state} is in use by another server"
+    assert f"JournalError: the state folder {state} is in use by another server" in refusal(Path(state))
     (tmp_path / "file").write_text("")
     assert refusal(tmp_path / "file") == (
         f"JournalError: cannot write the state folder {tmp_path / 'file'}: File exists"

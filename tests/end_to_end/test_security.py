@@ -32,10 +32,10 @@ class Site:
         self.folder = folder
         self.keys = folder / "server-keys"
         self.state = folder / "state"
-        key_folder.create(self.keys, "server")
+        key_folder.create_pair(self.keys, "server")
         self.public = server_keys(self.keys).public
         for name in ("robot", "cart", "stranger"):
-            key_folder.create(folder / name, name)
+            key_folder.create_pair(folder / name, name)
         for name in ("robot", "cart"):
             key_folder.allow(self.keys, name, str(folder / name / f"{name}.key"))
 
@@ -102,7 +102,7 @@ def test_the_allowed_come_in_and_their_name_is_in_the_journal(site: Site, server
         assert {one.client for one in health.clients} == {"robot"}
     assert len(fetch_mesh(server.address, min_weight=0.5, keys=site.of("cart")).faces) > 0
     journal = site.state / "maps/default/journal"
-    (found,) = tsfusion.journal.scan(journal / "000001.mcap")[0]
+    (found,) = tsfusion.journal.list_records(journal / "000001.mcap")[0]
     assert found.client == "robot"
 
 
@@ -231,7 +231,7 @@ def test_a_new_key_under_the_old_name_goes_on_with_the_spool(tmp_path: Path) -> 
         with site.client(server, "robot", tmp_path / "spool") as robot:
             robot.send(wall(0))
             robot.flush(timeout=DEADLINE)
-        key_folder.create(site.folder / "robot", "robot", force=True)
+        key_folder.create_pair(site.folder / "robot", "robot", force=True)
         key_folder.allow(site.keys, "robot", str(site.folder / "robot/robot.key"))
         with site.client(server, "robot", tmp_path / "spool") as robot:
             robot.send(wall(1))

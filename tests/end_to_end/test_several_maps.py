@@ -70,7 +70,7 @@ def test_two_scanners_two_maps(tmp_path: Path) -> None:
         with pytest.raises(TransportError, match="no map attic is open"):
             fetch_status(server.address, map_name="attic")
         assert server.terminate() == 0
-    assert state_folder.names(tmp_path) == ["default", "yard-2"]
+    assert state_folder.map_names(tmp_path) == ["default", "yard-2"]
     with pytest.raises(JournalError, match=r"has several maps \(default, yard-2\): choose one with --map"):
         JournalRecording(tmp_path)
     assert len(JournalRecording(tmp_path, "yard-2")) == len(JournalRecording(tmp_path / "maps/yard-2")) == 8
@@ -84,7 +84,7 @@ def test_a_server_opens_only_so_many_maps(tmp_path: Path) -> None:
     refused = pytest.raises(ServerUnreachable, match=r"map attic cannot be opened: .* open \(max_maps\)")
     with serving(tmp_path, max_maps=1) as server, Client(server.address, map="attic") as client, refused:
         client.connect(timeout=5)
-    assert state_folder.names(tmp_path) == ["default"]
+    assert state_folder.map_names(tmp_path) == ["default"]
 
 
 def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
@@ -120,7 +120,7 @@ def test_a_map_takes_only_so_many_sessions(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["../up", "a/b", "", "A", "a" * 33, "a\n", "a\0", "ä", "."])
 def test_a_name_is_never_a_path(name: str) -> None:
     with pytest.raises(tsfusion.InvalidConfig):
-        config.make(config.ClientConfig, {"map": name})
+        config.make_settings(config.ClientConfig, {"map": name})
     hello = messages.encode(messages.Hello(bytes(16), VERSION, map=name))
     with pytest.raises(tsfusion.DecodeError):
         messages.decode_to_server(hello)
@@ -134,7 +134,7 @@ def test_maps_have_settings_of_their_own(tmp_path: Path) -> None:
     path.write_text('[volume]\nvoxel_size = 0.05\n[maps.yard]\nvoxel_size = 0.2\nsensor = "lidar"\n')
     loaded = config.load(path)
     assert loaded.volumes() == {"yard": VolumeConfig(voxel_size=0.2, sensor="lidar")}
-    path.write_text(core_config.dumps(loaded))
+    path.write_text(core_config.to_toml(loaded))
     assert config.load(path) == loaded
     path.write_text("[maps.yard]\nvoxel_size = -1.0\n")
     with pytest.raises(tsfusion.InvalidConfig, match=r"\[maps\.yard\]: voxel_size must be > 0, got -1\.0"):

@@ -12,12 +12,11 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from keyframes_and_servers import DEADLINE, alive, serving, until, wall
+from keyframes_and_servers import alive, serving, until, wall
 
 import tsfusion
 from tsfusion import VolumeConfig
-from tsfusion.core.errors import CheckpointError, InvalidConfig, MapError
-from tsfusion.core.folder_lock import hold
+from tsfusion.core.errors import CheckpointError, InvalidConfig
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.fuser import Fuser
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
@@ -329,7 +328,7 @@ def test_no_question_ends_the_fuser(tmp_path: Path, min_weight: float) -> None:
     assert "min_weight must be" in link.last().error
 
 
-# --- one fuser a map ---
+# --- the fuser and its gateway ---
 
 
 def started(code: str) -> tuple[subprocess.Popen[str], str]:
@@ -337,23 +336,6 @@ def started(code: str) -> tuple[subprocess.Popen[str], str]:
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     return process, process.stdout.readline()
-
-
-def test_a_map_has_one_fuser_for_as_long_as_it_lives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tsfusion.core.folder_lock._PATIENCE", 0.1)
-    code = "import time; from pathlib import Path; from tsfusion.core.folder_lock import hold;"
-    code += f"hold(Path({str(tmp_path)!r})); print('held', flush=True); time.sleep(600)"
-    with started(code)[0] as other:
-        with pytest.raises(MapError, match=rf"in use by another fuser \(pid {other.pid}\)"):
-            hold(tmp_path)
-        other.send_signal(signal.SIGSTOP)  # stopped or not
-        with pytest.raises(MapError, match="in use"):
-            hold(tmp_path)
-        other.kill()
-        monkeypatch.setattr("tsfusion.core.folder_lock._PATIENCE", DEADLINE)
-        os.close(hold(tmp_path))
-    with pytest.raises(MapError, match=r"cannot lock .*No such file"):
-        hold(tmp_path / "missing")
 
 
 def test_a_stopped_fuser_does_not_outlive_its_gateway(tmp_path: Path) -> None:

@@ -96,7 +96,7 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
             command = (sys.executable, "-c", _FAKE.replace("{body}", body))
             monkeypatch.setattr(fuser_process, "COMMAND", command)
             monkeypatch.setattr(fuser_supervisor, "_END_DEADLINE", 0.1)
-            writer = Journal(state_folder.folder(tmp_path, "default") / "journal", 1 << 20)
+            writer = Journal(state_folder.map_folder(tmp_path, "default") / "journal", 1 << 20)
             for i in range(5):
                 writer.append([b"head", b"body"], session=bytes(16), seq=i + 1)
             writer.close()
@@ -137,7 +137,7 @@ def test_a_keyframe_that_kills_the_fuser_twice_is_quarantined(
     said = caplog.records[-1]
     assert said.getMessage() == "a keyframe is not in the map: crash"
     assert {"map": "default", "seq": 3, "reason": "crash"}.items() <= vars(said)["about"].items()
-    (kept,) = (state_folder.folder(tmp_path, "default") / "quarantine").iterdir()
+    (kept,) = (state_folder.map_folder(tmp_path, "default") / "quarantine").iterdir()
     assert kept.name == "00000000-3-crash.mcap"
     (record,) = journal.records(kept)
     assert (record.seq, [bytes(frame) for frame in record.frames]) == (3, [b"head", b"body"])

@@ -293,7 +293,7 @@ def test_a_configuration_that_is_not_text_is_one_clear_error(tmp_path: Path) -> 
 )
 def test_an_address_that_is_none_is_refused(address: str) -> None:
     with pytest.raises(InvalidConfig, match="an address looks like"):
-        sockets.split(address)
+        sockets.parse_address(address)
 
 
 def test_the_last_port_has_no_next_one() -> None:

@@ -195,12 +195,12 @@ def test_everything_is_on_the_disk_in_the_order_that_recovery_needs(
     happened.clear()
     first, second = fill(log, 2)
     # The start of a segment before its name, and both before its first record.
-    assert happened[:2] == [f"000001.mcap {mcap_layout.intro_bytes()}", "journal"]
+    assert happened[:2] == [f"000001.mcap {mcap_layout.segment_start_bytes()}", "journal"]
     assert happened[2:] == [f"000001.mcap {second.offset}", f"000001.mcap {log.nbytes}"]
     happened.clear()
     log.close()
     assert happened == [f"000001.mcap {log.nbytes}"]
-    assert first.offset == mcap_layout.intro_bytes()
+    assert first.offset == mcap_layout.segment_start_bytes()
 
 
 def test_order_is_by_place_whatever_the_clock_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -343,7 +343,7 @@ def test_a_segment_that_cannot_be_read_is_not_passed_over(
         JournalError, match=r"cannot read .*000002\.mcap: .*; make it readable, or move it away"
     ):
         Journal(tmp_path, BIG)
-    place = state_folder.find(tmp_path)
+    place = state_folder.find_journal(tmp_path)
     info, verdict = inspection.summarize(place, lambda *_: None), inspection.verify(place, lambda *_: None)
     assert [one.segment for one in info.problems] == ["000002.mcap"]
     assert (info.keyframes, verdict.intact) == (readable, False)

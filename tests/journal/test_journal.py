@@ -16,7 +16,7 @@ from tsfusion import journal
 from tsfusion.core.errors import JournalError
 from tsfusion.delivery.spool import Spool
 from tsfusion.journal import Journal, Position, segment_path
-from tsfusion.journal.recording import JournalRecording, read_keyframes
+from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec
 
 SESSION = bytes(16)
@@ -95,7 +95,9 @@ def test_a_torn_tail_costs_only_itself(tmp_path: Path, kept: float) -> None:
         journal.read(tmp_path, last)
 
 
-def test_a_flipped_bit_costs_one_record_and_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_flipped_bit_costs_one_record_and_is_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     positions = write(tmp_path, 5)
     path = segment_path(tmp_path, 1)
     stored = bytearray(path.read_bytes())
@@ -109,7 +111,7 @@ def test_a_flipped_bit_costs_one_record_and_is_told(tmp_path: Path, caplog: pyte
         journal.read(tmp_path, positions[2])
 
 
-def test_a_damaged_length_costs_one_record_and_is_told(tmp_path: Path) -> None:
+def test_a_damaged_length_costs_one_record_and_is_logged(tmp_path: Path) -> None:
     positions = write(tmp_path, 5)
     path = segment_path(tmp_path, 1)
     stored = bytearray(path.read_bytes())
@@ -195,7 +197,7 @@ def test_a_journal_is_a_dataset_of_its_keyframes(tmp_path: Path) -> None:
     assert len(recording) == 6
     for i, keyframe in enumerate(recording):
         assert np.array_equal(keyframe.depth, wall(i).depth)
-    assert len(list(read_keyframes(tmp_path / "journal"))) == 6
+    assert len(JournalRecording(tmp_path / "journal")) == 6
     assert 0 < len(JournalRecording(segment_path(tmp_path / "journal", 1))) < 6
 
 

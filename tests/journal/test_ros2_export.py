@@ -17,7 +17,7 @@ from tsfusion.datasets import Dataset, open_dataset
 from tsfusion.evaluation.view_prediction import points_world
 from tsfusion.journal import Journal, read, records, segment_path
 from tsfusion.journal.ros2_export import Export, export
-from tsfusion.journal.ros2_messages import depth_image, quaternion
+from tsfusion.journal.ros2_messages import depth_image
 from tsfusion.journal.state_folder import JournalPlace
 from tsfusion.wire import codec
 from tsfusion.wire.keyframe_header import unpack
@@ -217,16 +217,6 @@ def test_depth_is_millimetres_or_metres(depth: np.ndarray, scale: float, expecte
     given = Keyframe(T_world_camera=pose(), depth=depth, depth_scale=scale, intrinsics=CAMERA)
     assert depth_image(given).dtype == expected.dtype
     assert np.array_equal(depth_image(given), expected, equal_nan=True)
-
-
-def test_every_rotation_has_its_quaternion() -> None:
-    spatial = pytest.importorskip("scipy.spatial.transform")
-    rotations = spatial.Rotation.random(200, random_state=1).as_matrix()
-    turns = spatial.Rotation.from_euler(
-        "xyz", [(180, 0, 0), (0, 180, 0), (0, 0, 180), (0, 0, 0)], degrees=True
-    )
-    for R in (*rotations, *turns.as_matrix()):
-        assert np.allclose(spatial.Rotation.from_quat(quaternion(R)).as_matrix(), R, atol=1e-12)
 
 
 def test_mcap_s_own_reader_takes_the_file(tmp_path: Path) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Every cut and every flipped bit of a segment: what comes back is what was written, and the rest is told."""
+"""Every cut and every flipped bit of a segment: what was written comes back, and damage is reported."""
 
 import errno
 import os
@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from tsfusion import journal
 from tsfusion.core.errors import JournalError
-from tsfusion.journal import Damage, Journal, Position, Record, mcap_layout, segment_path, walk
+from tsfusion.journal import Damage, Journal, Position, Record, mcap_layout, scan_records, segment_path
 
 BIG = 1 << 30
 COUNT = 4
@@ -47,14 +47,14 @@ class Segment:
         self.whole = self.path.read_bytes()
         self.records = {record.position: plain(record) for record in journal.records(self.path)}
         assert list(self.records) == self.places
-        raw = [mcap_layout.head(self.whole[place.offset :]) for place in self.places]
+        raw = [mcap_layout.parse_head(self.whole[place.offset :]) for place in self.places]
         self.ends = [place.offset + head.nbytes for place, head in zip(self.places, raw, strict=True) if head]
 
     def read(self, content: bytes) -> tuple[list[Position], list[Damage]]:
-        """What a walk over altered bytes finds; fails unless each record is one that was written."""
+        """What a scan of altered bytes finds; fails unless each record is one that was written."""
         self.path.write_bytes(content)
         found, damages = [], []
-        for step in walk(self.path):
+        for step in scan_records(self.path):
             if isinstance(step, Damage):
                 damages.append(step)
             else:
@@ -74,7 +74,7 @@ def flipped(whole: bytes, at: int, bit: int) -> bytes:
 
 
 def check_flip(segment: Segment, at: int, bit: int) -> None:
-    """One flipped bit costs the record it is in, or nothing; and it is told."""
+    """One flipped bit costs the record it is in, or nothing; and it is reported."""
     found, damages = segment.read(flipped(segment.whole, at, bit))
     missing = set(segment.places) - set(found)
     hit = {place for place, end in zip(segment.places, segment.ends, strict=True) if place.offset <= at < end}
@@ -135,10 +135,10 @@ def test_a_keyframe_cannot_pass_off_its_own_bytes_as_records(tmp_path: Path) -> 
     whole = path.read_bytes()
     for at in (1, 4, 30, 60, 90):  # opcode, lengths, CRC, message, identity
         path.write_bytes(flipped(whole, places[0].offset + at, 1))
-        assert [found.seq for found in journal.scan(path)[0]] == [2]
+        assert [found.seq for found in journal.list_records(path)[0]] == [2]
     for end in range(places[1].offset, len(whole), 7):
         path.write_bytes(whole[:end])
-        assert [found.seq for found in journal.scan(path)[0]] in ([1], [1, 2])
+        assert [found.seq for found in journal.list_records(path)[0]] in ([1], [1, 2])
 
 
 def test_a_segment_of_another_version_is_not_taken_for_a_damaged_one(
@@ -150,7 +150,7 @@ def test_a_segment_of_another_version_is_not_taken_for_a_damaged_one(
         fill(log)
         log.close()
     with pytest.raises(JournalError, match="another version of tsfusion wrote it"):
-        journal.scan(segment_path(tmp_path, 1))
+        journal.list_records(segment_path(tmp_path, 1))
     with pytest.raises(JournalError, match="another version of tsfusion wrote it; make it readable, or move"):
         Journal(tmp_path, BIG, sync=False)
 
@@ -230,7 +230,7 @@ def test_a_file_of_heads_that_lie_is_read_in_bounded_time(tmp_path: Path) -> Non
         struct.pack_into("<Q", head, 50, stored - 9)
         content += head
     segment.path.write_bytes(content + bytes(size - len(content)))
-    assert [step for step in walk(segment.path) if isinstance(step, Record)] == []
+    assert [step for step in scan_records(segment.path) if isinstance(step, Record)] == []
 
 
 def failing_sectors(bad: range) -> Callable[[int, int, int], bytes]:
@@ -250,7 +250,7 @@ def test_a_bad_sector_costs_the_records_in_it(tmp_path: Path, monkeypatch: pytes
     log.close()
     sector = places[3].offset + 50_000
     monkeypatch.setattr(os, "pread", failing_sectors(range(sector, sector + 512)))
-    found, lost = journal.scan(segment_path(tmp_path, 1))
+    found, lost = journal.list_records(segment_path(tmp_path, 1))
     seqs = {record.seq for record in found}
     assert {1, 2, 3, 6, 7, 8} <= seqs
     assert 4 not in seqs
@@ -260,7 +260,7 @@ def test_a_bad_sector_costs_the_records_in_it(tmp_path: Path, monkeypatch: pytes
 def test_an_unreadable_end_is_no_torn_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     segment = Segment(tmp_path, closed=False)
     monkeypatch.setattr(os, "pread", failing_sectors(range(segment.places[-1].offset, len(segment.whole))))
-    damages = [step for step in walk(segment.path) if isinstance(step, Damage)]
+    damages = [step for step in scan_records(segment.path) if isinstance(step, Damage)]
     assert sum(damage.lost for damage in damages) >= 1
     assert not any(damage.torn for damage in damages)
 
@@ -285,7 +285,7 @@ def test_whatever_happens_to_a_segment_no_wrong_record_comes_back(kept: Segment,
         content[at : at + gone] = data.draw(st.binary(max_size=300))
     kept.path.write_bytes(content)
     written = [record[1:] for record in kept.records.values()]
-    for step in walk(kept.path):
+    for step in scan_records(kept.path):
         if isinstance(step, Record):
             assert plain(step)[1:] in written
         else:
@@ -295,9 +295,9 @@ def test_whatever_happens_to_a_segment_no_wrong_record_comes_back(kept: Segment,
 @EXAMPLES
 @given(st.binary(max_size=3000))
 def test_bytes_of_any_kind_are_read_without_a_complaint(kept: Segment, content: bytes) -> None:
-    mcap_layout.find_intro(content)
-    mcap_layout.head(content)
-    assert mcap_layout.unpack(content, Position(1, 0)) is None
-    for prefix in (b"", mcap_layout.OPENING, kept.whole[: mcap_layout.intro_bytes()]):
+    mcap_layout.parse_segment_chunk(content)
+    mcap_layout.parse_head(content)
+    assert mcap_layout.parse_record(content, Position(1, 0)) is None
+    for prefix in (b"", mcap_layout.OPENING, kept.whole[: mcap_layout.segment_start_bytes()]):
         kept.path.write_bytes(prefix + content)
-        assert not [step for step in walk(kept.path) if isinstance(step, Record)]
+        assert not [step for step in scan_records(kept.path) if isinstance(step, Record)]

@@ -13,7 +13,7 @@ import zmq
 from zmq.utils import z85
 
 from tsfusion.wire.curve import ClientKeys
-from tsfusion.wire.sockets import split
+from tsfusion.wire.sockets import parse_address
 
 _TIMEOUT = 10.0
 _MAC, _KEY, _COOKIE = 16, 32, 96
@@ -59,7 +59,7 @@ class Peer:
     def __init__(
         self, address: str, keys: ClientKeys, claims: dict[bytes, bytes], poses_as: str | None = None
     ) -> None:
-        self._socket = socket.create_connection(split(address), _TIMEOUT)
+        self._socket = socket.create_connection(parse_address(address), _TIMEOUT)
         self._number = 0
         secret, server = z85.decode(keys.secret), z85.decode(keys.server)
         shown = z85.decode(poses_as or keys.public)

@@ -39,7 +39,7 @@ def verify(state: Path, keyframes: int, map_hash: str) -> list[str]:
     for folder in journals(state):
         for number in journal.segments(folder):
             path = journal.segment_path(folder, number)
-            if damaged := journal.scan(path)[1]:
+            if damaged := journal.list_records(path)[1]:
                 problems.append(f"{damaged} damaged records in {path.name}")
             for record in journal.records(path):
                 i = unpack(record.frames[0]).timestamp_ns - NUMBERED_NS

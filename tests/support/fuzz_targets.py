@@ -25,7 +25,7 @@ from tsfusion.wire.codec import measurement
 from tsfusion.wire.corrections import Corrections, SessionCorrections
 from tsfusion.wire.health import ClientHealth, Health, MapHealth, MeshLayout
 from tsfusion.wire.keyframe_header import Refused, stamp, unpack
-from tsfusion.wire.messages import said
+from tsfusion.wire.messages import decode_frames_to_server
 
 MAX_BYTES = 1 << 16  # of a case
 
@@ -197,8 +197,8 @@ def run_journal(content: bytes) -> str:
     path = journal.segment_path(folder, 1)
     path.write_bytes(content)
     try:
-        steps = list(journal.walk(path))
-        found, lost = journal.scan(path)
+        steps = list(journal.scan_records(path))
+        found, lost = journal.list_records(path)
     except JournalError as error:
         return f"JournalError {error}"
     whole = [one for one in steps if isinstance(one, journal.Record)]
@@ -299,7 +299,7 @@ def _corrections_of(content: bytes) -> SessionCorrections:
         path.write_bytes(content)
         return corrections.load(path)
     frames = fuzz_mutate.split(content)
-    head = said(frames)
+    head = decode_frames_to_server(frames)
     if not isinstance(head, Corrections):
         raise DecodeError(f"a {type(head).__name__}")
     return corrections.unpack(head, frames[1:])

@@ -80,8 +80,8 @@ UNSECURED = Secured({}, {})
 
 def secured(folder: Path) -> Secured:
     """A server's keys, and those of a robot that it lets in."""
-    key_folder.create(folder / "server", "server")
-    key_folder.allow(folder / "server", "robot", key_folder.create(folder / "robot", "robot").public)
+    key_folder.create_pair(folder / "server", "server")
+    key_folder.allow(folder / "server", "robot", key_folder.create_pair(folder / "robot", "robot").public)
     public = folder / "server" / "server.key"
     return Secured(
         {"keys": str(folder / "server")},

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.journal.ros2_messages import quaternion
+from tsfusion.geometry.trajectory import quaternion
 
 FORMS = ("ros1", "ros1-lz4", "sqlite3", "mcap", "mcap-zstd")
 WORLD, BODY, OPTICAL = "map", "base_link", "camera_color_optical_frame"

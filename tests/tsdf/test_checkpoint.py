@@ -203,50 +203,6 @@ print(checkpoint.read(folder / "map.tsf")[0].keyframes)
     assert small_disk.run(tmp_path / "disk", "2m", code) == "120\n"
 
 
-def test_an_interrupted_save_leaves_no_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    volume = small()
-    path = volume.save(tmp_path / "map.tsf")
-
-    def interrupted(_: int) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(os, "fsync", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        volume.save(path)
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_what_a_killed_writer_left_is_neither_read_nor_kept(tmp_path: Path) -> None:
-    volume = small()
-    path = volume.save(tmp_path / "map.tsf")
-    left = tmp_path / ".map.tsf.partial"
-    left.write_bytes(path.read_bytes()[:1000])
-    assert Volume.load(path).map_hash() == volume.map_hash()
-    volume.save(path)
-    assert list(tmp_path.iterdir()) == [path]
-    assert Volume.load(path).map_hash() == volume.map_hash()
-
-
-def test_the_file_is_on_the_disk_before_its_name_and_its_name_before_it_counts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    volume, happened = small(), []
-    fsync, replace = os.fsync, os.replace
-
-    def watched_fsync(descriptor: int) -> None:
-        happened.append(("fsync", Path(os.readlink(f"/proc/self/fd/{descriptor}")).name))
-        fsync(descriptor)
-
-    def watched_replace(old: Path, new: Path) -> None:
-        happened.append(("rename", new.name))
-        replace(old, new)
-
-    monkeypatch.setattr(os, "fsync", watched_fsync)
-    monkeypatch.setattr(os, "replace", watched_replace)
-    volume.save(tmp_path / "map.tsf")
-    assert happened == [("fsync", ".map.tsf.partial"), ("rename", "map.tsf"), ("fsync", tmp_path.name)]
-
-
 def test_a_loaded_map_knows_how_full_its_voxels_are(tmp_path: Path) -> None:
     volume = Volume(voxel_size=0.02)
     view = formula_scenes.sphere_views(0.4, 1)[0]

@@ -28,7 +28,7 @@ from tsfusion.gateway import correction_store
 from tsfusion.gateway.correction_store import Revisions
 from tsfusion.geometry import se3
 from tsfusion.journal.inspection import summarize
-from tsfusion.journal.state_folder import find
+from tsfusion.journal.state_folder import find_journal
 from tsfusion.wire import codec, corrections, key_folder, messages, sockets
 from tsfusion.wire.corrections import Corrections, SessionCorrections, checked, nothing
 from tsfusion.wire.keyframe_header import Refused
@@ -281,7 +281,7 @@ def test_corrections_reach_the_servers_disk(shared: tuple[Server, Path], tmp_pat
         (own,) = [one for one in health.clients if one.session == session.hex()[:8]]
         assert (own.revision, own.corrected) == (found.revision, 3)
         assert health.maps["default"].corrections > 0
-    info = summarize(find(state), lambda *_: None)
+    info = summarize(find_journal(state), lambda *_: None)
     (shown,) = [one for one in info.sessions if one.session == session.hex()]
     assert (shown.revision, shown.corrected) == (found.revision, 3)
     moves = [se3.inverse(pose(0.03 * i)) @ T for i, T in enumerate(found.poses)]
@@ -398,7 +398,7 @@ def test_hostile_messages_are_counted_and_change_nothing(shared: tuple[Server, P
 
 def test_another_clients_session_cannot_be_corrected(tmp_path: Path) -> None:
     robot = secured(tmp_path)
-    key_folder.allow(tmp_path / "server", "cart", key_folder.create(tmp_path / "cart", "cart").public)
+    key_folder.allow(tmp_path / "server", "cart", key_folder.create_pair(tmp_path / "cart", "cart").public)
     cart = Secured({}, {**robot.client, "key": str(tmp_path / "cart" / "cart.key_secret")})
     with (
         serving(tmp_path / "state", **robot.server) as server,  # type: ignore[arg-type]

@@ -25,4 +25,4 @@ def dump(config: options.ConfigFile = None, json: options.Json = False) -> None:
 
         output.as_json(loaded)
     else:
-        typer.echo(core_config.dumps(loaded), nl=False)
+        typer.echo(core_config.to_toml(loaded), nl=False)

@@ -163,9 +163,9 @@ def export(
 
 
 def _find(path: Path, map_name: str | None) -> "JournalPlace":
-    from tsfusion.journal.state_folder import find
+    from tsfusion.journal.state_folder import find_journal
 
-    return find(path, map_name)
+    return find_journal(path, map_name)
 
 
 def _count(number: int, noun: str) -> str:

@@ -49,7 +49,7 @@ def new(
     """
     from tsfusion.wire import curve, key_folder
 
-    made = key_folder.create(folder, name, force=force)
+    made = key_folder.create_pair(folder, name, force=force)
     typer.echo(f"public key of {name}: {made.public}")
     if name == curve.SERVER:
         place, at = (
@@ -101,8 +101,8 @@ def list_(*, folder: Dir = _FOLDER, json: options.Json = False) -> None:
     """Show the folder's own pairs (public halves), and on a server who is allowed and who was revoked."""
     from tsfusion.wire import key_folder
 
-    own = key_folder.pairs(folder)
-    listed = key_folder.read_list(folder) if key_folder.has_list(folder) else None
+    own = key_folder.list_pairs(folder)
+    listed = key_folder.read_allow_list(folder) if key_folder.has_allow_list(folder) else None
     if json:
         from tsfusion.cli import output
 

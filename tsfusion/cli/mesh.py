@@ -93,7 +93,7 @@ def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bo
     from tsfusion.journal import state_folder
     from tsfusion.journal.recording import JournalRecording
 
-    source = state_folder.resolve(source, name)
+    source = state_folder.resolve_map(source, name)
     recording = JournalRecording(source)
     saved = source / state_folder.MAP_FILE
     if saved.is_file() and not given:

@@ -105,7 +105,9 @@ def replay(
 
 def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dataset":
     """A dataset, or a journal; `given` are settings of a dataset, None = left out."""
-    if _is_journal(path):
+    from tsfusion.journal.state_folder import is_journal
+
+    if is_journal(path):
         from tsfusion.core.errors import DatasetError
         from tsfusion.journal.recording import JournalRecording
 
@@ -124,16 +126,6 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
 def _is_synthetic(path: Path) -> bool:
     """Whether there is nothing to be found out: the first frame would have to be rendered."""
     return str(path).startswith("synthetic:")
-
-
-def _is_journal(path: Path) -> bool:
-    """Whether it is a journal of ours, or a place with one; a ROS recording may be an `.mcap` too."""
-    from tsfusion.datasets.rosbag import dataset as rosbag_dataset
-    from tsfusion.journal import state_folder
-
-    if state_folder.is_state(path) or any(path.glob("journal/*.mcap")):
-        return True
-    return (path.suffix == ".mcap" or any(path.glob("*.mcap"))) and not rosbag_dataset.recognises(path)
 
 
 def _warn(dataset: "Dataset") -> None:

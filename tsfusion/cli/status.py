@@ -68,7 +68,7 @@ def _asker(address: str, control: str | None, key: str | None, server_key: str |
     from tsfusion.wire.queries import request
     from tsfusion.wire.sockets import control_address
 
-    to, keys = control_address(sockets.target(address), control), client_keys(key, server_key)
+    to, keys = control_address(sockets.connect_address(address), control), client_keys(key, server_key)
 
     def ask(command: Command, timeout: float) -> Reply:
         reply, _ = request(to, command, timeout=timeout, keys=keys)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Every setting, its default, its unit and its bounds. Nothing else in the package holds a default.
+"""Every setting, its default, its unit and its bounds, and the TOML files they are read from.
 
-A TOML file has one table a struct (`[volume]`, `[server]`, `[client]`, `[scan]`); unknown keys are errors.
+Nothing else in the package holds a default. A TOML file has one table for each struct (`[volume]`,
+`[server]`, `[client]`, `[scan]`); unknown keys are errors.
 """
 
 import inspect
@@ -35,15 +36,15 @@ LogFormat = Literal["text", "json"]
 LogLevel = Literal["debug", "info", "warning", "error"]
 DEFAULT_MAP = "default"
 MAP_NAME_LENGTH = 32
+MAP_NAME = rf"[a-z0-9][a-z0-9_-]{{0,{MAP_NAME_LENGTH - 1}}}"
 # Becomes a folder's name, so it is no path: \A and \Z, because `$` would let a newline through.
-MapName = Annotated[str, Meta(pattern=r"\A[a-z0-9][a-z0-9_-]{0,31}\Z")]
+MapName = Annotated[str, Meta(pattern=rf"\A{MAP_NAME}\Z")]
 ClientName = Annotated[str, Meta(pattern=r"\A[A-Za-z0-9][A-Za-z0-9_.-]{0,31}\Z")]
 Bytes = Annotated[int, Meta(ge=1 << 20)]
-Port = Annotated[int, Meta(ge=0, le=65535)]
 
 
 class Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What all settings have in common: no infinity, no NaN (both are legal TOML)."""
+    """Base of all settings: no infinity and no NaN, though both are legal TOML."""
 
     def __post_init__(self) -> None:
         for key in self.__struct_fields__:
@@ -53,7 +54,7 @@ class Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class SensorModel(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Depth noise of a sensor, and what follows from it.
+    """Depth noise of a sensor, and the settings that suit it.
 
     σ(z) = sigma_floor + sigma_slope · (z − sigma_z0)², metres; z = depth along the optical axis
     (ray length for points). With a known baseline·fx, `disparity_sigma` px replaces the slope:
@@ -131,7 +132,7 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     max_blocks_per_keyframe: Annotated[int, Meta(ge=1, le=1 << 19)] = 1 << 17
 
     def model(self, sensor: str | None = None) -> SensorModel:
-        """The sensor model of a keyframe (default: the map's), with this config's own choices on top."""
+        """The sensor model of a keyframe (default: the map's), changed by what this config sets."""
         name = sensor or self.sensor
         if name not in SENSORS:
             raise InvalidConfig(f"sensor must be one of {', '.join(SENSORS)}, got {name!r}")
@@ -146,8 +147,13 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 # Settings of a map that change nothing stored in it (smoothness: unless it smooths along rays): a saved one
 # can be read with others.
 VIEW_SETTINGS = (
-    "min_weight", "surface", "smoothness", "field_smoothness", "field_edge", "field_reweightings"
-)  # fmt: skip
+    "min_weight",
+    "surface",
+    "smoothness",
+    "field_smoothness",
+    "field_edge",
+    "field_reweightings",
+)
 
 
 class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -157,7 +163,7 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     control: str | None = None  # None = the port after `listen`'s
     state: str = "tsfusion-state"  # folder: maps/NAME/journal/, maps/NAME/map.tsf
     keys: str | None = None  # folder of `tsfusion keys`; None = no keys, reachable from this machine only
-    max_maps: Annotated[int, Meta(ge=1, le=64)] = 4  # open at once; each has a fuser process
+    max_maps: Annotated[int, Meta(ge=1, le=64)] = 4  # open at the same time; each has a fuser process
     metrics: str | None = None  # loopback address of Prometheus' page and health checks: 127.0.0.1:9464
     max_frame_bytes: Annotated[int, Meta(ge=1024, le=32 << 20)] = 32 << 20  # the fuser takes no larger one
     segment_bytes: Annotated[int, Meta(ge=1 << 16)] = 256 << 20
@@ -165,10 +171,10 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     window_bytes: Annotated[int, Meta(ge=1 << 16)] = 16 << 20
     checkpoint_every: Annotated[int, Meta(ge=0)] = 500  # keyframes; 0 = only at shutdown
     mesh_interval: NonNegative = 0.2  # seconds between incremental meshes while busy
-    journal_bytes: Bytes | None = None  # per map; what a checkpoint has goes first; None = keep all
-    min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left on the disk: below, keyframes have to wait
-    quarantine_bytes: Bytes = 256 << 20  # per map; keyframes that could not be fused, the oldest go first
-    memory_bytes: Bytes = 512 << 20  # of the gateway; above, all connections are dropped and made anew
+    journal_bytes: Bytes | None = None  # per map; the oldest keyframes are deleted first; None = keep all
+    min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left free on the disk; keyframes wait for that
+    quarantine_bytes: Bytes = 256 << 20  # per map; keyframes that could not be fused, the newest ones
+    memory_bytes: Bytes = 512 << 20  # of the gateway; with more, all connections are dropped and made anew
     fuser_memory_bytes: Annotated[int, Meta(ge=1 << 28)] | None = (
         None  # of each fuser; None = three quarters of the machine's
     )
@@ -177,8 +183,8 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     quota_keyframes: Positive = 1000.0  # a second, of each client
     quota_points: Annotated[int, Meta(ge=1)] = 8 << 20  # points or pixels a keyframe
     quota_extent: Positive = 100_000.0  # metres from the map's origin to a sensor
-    log_format: LogFormat = "text"  # of what goes to stderr: lines, or one JSON object a line
-    log_level: LogLevel = "info"  # what is less than that is left out
+    log_format: LogFormat = "text"  # on stderr: lines of text, or one JSON object a line
+    log_level: LogLevel = "info"  # less important lines are left out
 
 
 class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -191,8 +197,8 @@ class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     server_key: str | None = None  # the server's public key: a file, or the 40 characters
     policy: Policy = "thin"  # when keyframes come faster than the server takes them
     backlog: Annotated[int, Meta(ge=1, le=10_000)] = 8  # keyframes behind at which the policy begins to act
-    spool_bytes: Bytes = 8 << 30  # of the disk; what comes then is skipped and counted
-    min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left on the spool's disk
+    spool_bytes: Bytes = 8 << 30  # on the disk; when they are full, keyframes are skipped and counted
+    min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left free on the spool's disk
     jpeg_quality: Annotated[int, Meta(ge=1, le=100)] = 90
     segment_bytes: Annotated[int, Meta(ge=1 << 16)] = 64 << 20
     connect_timeout: Positive = 10.0  # seconds
@@ -207,8 +213,8 @@ class ScanConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True
     feed: str | None = None  # for the localizer `feed`: address where another process publishes poses
     max_gap: Positive = 0.2  # seconds between two given poses; across a longer gap there is none
     time_offset: float = 0.0  # seconds to add to a frame's time before its pose is looked up
-    loop_closure: bool = True  # look for places seen before, and correct the poses since
-    min_overlap: Annotated[float, Meta(ge=0, le=1)] = 0.8  # of the last keyframe's view; below: a new one
+    loop_closure: bool = True  # recognise places seen before, and correct the poses since then
+    min_overlap: Annotated[float, Meta(ge=0, le=1)] = 0.8  # with the last keyframe; with less: a new one
     distance: Positive | None = None  # metres to the next keyframe; None = 0.1, for stereo and LiDAR 2
     angle: Positive = 10.0  # degrees to the next keyframe
     max_rate: Positive | None = None  # keyframes a second, at most
@@ -225,7 +231,7 @@ class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     maps: dict[MapName, dict[str, Any]] = {}  # [maps.NAME]: what differs there from [volume]
 
     def volumes(self) -> dict[str, VolumeConfig]:
-        """The settings of the maps that have some of their own.
+        """The settings of each map that has a `[maps.NAME]` table.
 
         Raises:
             InvalidConfig: for an unknown key or a bad value.
@@ -239,7 +245,30 @@ class Config(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return found
 
 
+# --- settings from names and values ---
+
 AnyStruct = TypeVar("AnyStruct", bound=Struct)
+
+
+def make_settings(struct: type[AnyStruct], settings: dict[str, Any]) -> AnyStruct:
+    """Build a config struct, checking names, types and bounds.
+
+    Raises:
+        InvalidConfig: naming the key and what was expected.
+    """
+    plain = {key: v.item() if isinstance(v, np.generic) else v for key, v in settings.items()}
+    try:
+        return msgspec.convert(plain, struct)
+    except msgspec.ValidationError as error:
+        raise InvalidConfig(_message(struct, plain, str(error))) from error
+
+
+def override(config: AnyStruct, **changes: Any) -> AnyStruct:
+    """Change the settings whose new value is not None; the result is checked as `make_settings` does."""
+    settings = msgspec.structs.asdict(config)
+    settings.update({key: value for key, value in changes.items() if value is not None})
+    return make_settings(type(config), settings)
+
 
 _KINDS = {
     "float": "a number",
@@ -251,21 +280,8 @@ _KINDS = {
 _NAME = "1 to 32 of a-z, 0-9, - and _, a letter or digit first"  # MapName, the one pattern in a configuration
 
 
-def make(struct: type[AnyStruct], settings: dict[str, Any]) -> AnyStruct:
-    """Build a config struct, checking names, types and bounds.
-
-    Raises:
-        InvalidConfig: naming the key and what was expected.
-    """
-    plain = {key: v.item() if isinstance(v, np.generic) else v for key, v in settings.items()}
-    try:
-        return msgspec.convert(plain, struct)
-    except msgspec.ValidationError as error:
-        raise InvalidConfig(_explain(struct, plain, str(error))) from error
-
-
-def _explain(struct: type[Struct], settings: dict[str, Any], problem: str) -> str:
-    """msgspec's message in our words: `voxel_size must be > 0, got -0.05`; of a file, with the table."""
+def _message(struct: type[Struct], settings: dict[str, Any], problem: str) -> str:
+    """Put msgspec's message into plain words: `volume.voxel_size must be > 0, got -0.05`."""
     problem, _, place = problem.partition(" - at `$.")
     *tables, key = place.rstrip("`").split(".")
     if unknown := re.search(r"unknown field `(.+)`", problem):
@@ -283,17 +299,20 @@ def _explain(struct: type[Struct], settings: dict[str, Any], problem: str) -> st
     return f"{'.'.join((*tables, key))} must be {must_be}, got {value[key]!r}"
 
 
+# --- TOML ---
+
+
 def load(path: str | Path | None, **volume: Any) -> Config:
     """Read a TOML file; None gives the defaults.
 
     Args:
-        volume: settings of the map that hold where the file says nothing of them.
+        volume: settings of the map that apply where the file does not name them.
 
     Raises:
         InvalidConfig: when the file is missing, not TOML, or holds an unknown key or a bad value.
     """
     if path is None:
-        return Config(volume=make(VolumeConfig, volume))
+        return Config(volume=make_settings(VolumeConfig, volume))
     try:
         content = Path(path).read_bytes()
     except OSError as error:
@@ -305,57 +324,45 @@ def load(path: str | Path | None, **volume: Any) -> Config:
     if isinstance(given := tables.get("volume", {}), dict):
         tables["volume"] = {**volume, **given}
     try:
-        made = make(Config, tables)
+        made = make_settings(Config, tables)
         made.volumes()
         return made
     except InvalidConfig as error:
         raise InvalidConfig(f"{path}: {error}") from error
 
 
-def override(config: AnyStruct, **changes: Any) -> AnyStruct:
-    """`config` with every change that is not None, checked again."""
-    settings = msgspec.structs.asdict(config)
-    settings.update({key: value for key, value in changes.items() if value is not None})
-    return make(type(config), settings)
-
-
-# A long line as the formatter breaks it: the value and its comment in brackets of their own.
-_BROKEN = re.compile(r"= \(\n +(.+)\n +\)$", re.MULTILINE)
-_FIELD = re.compile(r"^    (\w+): .*?(?:  # (?P<comment>.+))?$")
-
-
-def dumps(config: Config) -> str:
-    """TOML that `config.load` reads back as an equal Config; settings at None are commented out."""
-    tables = [table(name, getattr(config, name)) for name in ("volume", "server", "client", "scan")]
+def to_toml(config: Config) -> str:
+    """Write TOML that `load` reads back as an equal Config; settings at None are commented out."""
+    tables = [_toml_table(name, getattr(config, name)) for name in ("volume", "server", "client", "scan")]
     for name, settings in config.maps.items():
-        lines = (f"{key} = {_literal(value)}\n" for key, value in settings.items())
+        lines = (f"{key} = {_toml_value(value)}\n" for key, value in settings.items())
         tables.append("".join((f"[maps.{name}]\n", *lines)))
     return "\n".join(tables)
 
 
-def table(name: str, struct: Struct) -> str:
-    """One `[name]` table, a line a setting with its bounds and meaning."""
+def _toml_table(name: str, struct: Struct) -> str:
+    """Write one `[name]` table: a line for each setting, with its bounds and meaning."""
     summary = inspect.cleandoc(type(struct).__doc__ or "").splitlines()[0]
     lines = [f"# {summary}", f"[{name}]"]
-    comments = _comments(type(struct))
+    comments = _field_comments(type(struct))
     for field in msgspec.inspect.type_info(type(struct)).fields:  # type: ignore[attr-defined]
         value = getattr(struct, field.name)
-        setting = f"# {field.name} =" if value is None else f"{field.name} = {_literal(value)}"
-        notes = [note for note in (_allowed(field.type), comments.get(field.name)) if note]
+        setting = f"# {field.name} =" if value is None else f"{field.name} = {_toml_value(value)}"
+        notes = [note for note in (_bounds(field.type), comments.get(field.name)) if note]
         lines.append(setting + (f"  # {'; '.join(notes)}" if notes else ""))
     return "\n".join(lines) + "\n"
 
 
-def _literal(value: Any) -> str:
+def _toml_value(value: Any) -> str:
     if isinstance(value, float):
         return repr(value)
     return json.dumps(value, ensure_ascii=False)  # booleans, integers and strings are written alike
 
 
-def _allowed(kind: msgspec.inspect.Type) -> str:
-    """The bounds of a number or the list of words, in words."""
+def _bounds(kind: msgspec.inspect.Type) -> str:
+    """Describe the bounds of a number, or list the words that are allowed."""
     if isinstance(kind, msgspec.inspect.UnionType):
-        return "; ".join(note for note in map(_allowed, kind.types) if note)
+        return "; ".join(note for note in map(_bounds, kind.types) if note)
     if isinstance(kind, msgspec.inspect.LiteralType):
         return " | ".join(map(str, kind.values))
     signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
@@ -367,11 +374,16 @@ def _allowed(kind: msgspec.inspect.Type) -> str:
     return ", ".join(bounds)
 
 
-def _comments(struct: type[Struct]) -> dict[str, str]:
-    """The comments beside the fields in config.py, so that no setting is explained twice."""
+# A long line as the formatter breaks it: the value and its comment in brackets of their own.
+_WRAPPED_FIELD = re.compile(r"= \(\n +(.+)\n +\)$", re.MULTILINE)
+_FIELD = re.compile(r"^    (\w+): .*?(?:  # (?P<comment>.+))?$")
+
+
+def _field_comments(struct: type[Struct]) -> dict[str, str]:
+    """Read the comments beside the fields in this file, so that no setting is explained twice."""
     try:
         source = inspect.getsource(struct)
     except OSError:  # installed without sources
         return {}
-    matches = filter(None, map(_FIELD.match, _BROKEN.sub(r"= \1", source).splitlines()))
+    matches = filter(None, map(_FIELD.match, _WRAPPED_FIELD.sub(r"= \1", source).splitlines()))
     return {match[1]: match["comment"] for match in matches if match["comment"]}

@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""What makes a file outlast a power cut, and how much room is left for it."""
+"""Files that outlast a power cut, folders that only their owner can change, and the room on a disk."""
 
-import contextlib
-import fcntl
+import errno
 import os
-import secrets
 import shlex
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from tsfusion.core.errors import InvalidConfig, OutputError
+
+_RESERVE_BYTES = 16 << 20
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def make_folder(folder: Path) -> None:
@@ -34,20 +36,33 @@ def sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def replace(path: Path, parts: Iterable[bytes]) -> None:
-    """Write a file: on the disk when this returns, and the one before until then; raises OSError."""
+@contextmanager
+def replacing(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
+    """A new file for the block to write, which takes the place of `path` at the end of the block.
+
+    It is on the disk by then. Until then, and after an error, the file before it stays as it was; what a
+    killed process left of its new file is overwritten.
+
+    Args:
+        private: only the owner may read the file (0600), from its first byte.
+
+    Raises:
+        OSError: when the disk refuses.
+    """
     partial = path.with_name(f".{path.name}.partial")
+    mode = 0o600 if private else 0o666
     try:
-        with partial.open("wb") as file:
-            file.writelines(parts)
+        partial.unlink(missing_ok=True)  # its mode may be another one
+        with open(partial, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+            yield file
             file.flush()
             os.fsync(file.fileno())
-        partial.replace(path)
-    except BaseException:  # an interrupted one leaves no part either
-        with contextlib.suppress(OSError):
+        os.replace(partial, path)
+        sync_folder(path.parent)
+    except BaseException:  # an interrupted block leaves no part either
+        with suppress(OSError):
             partial.unlink(missing_ok=True)
         raise
-    sync_folder(path.parent)
 
 
 def free_bytes(folder: Path) -> int:
@@ -56,88 +71,43 @@ def free_bytes(folder: Path) -> int:
     return disk.f_bavail * disk.f_frsize
 
 
-_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+def require_room(folder: Path, nbytes: int) -> None:
+    """Raise OSError (ENOSPC) when so many bytes more would leave less than 16 MB of a folder's disk."""
+    free = free_bytes(folder)
+    if nbytes + _RESERVE_BYTES > free:
+        needed = f"{nbytes / 1e6:.0f} MB are needed, {free / 1e6:.0f} MB are free on that disk"
+        raise OSError(errno.ENOSPC, needed)
 
 
-def made(folder: Path) -> Path:
-    """The folder, made (0700) if it is not there.
+def make_private_folder(folder: Path) -> None:
+    """Make a folder that only its owner can open (0700), unless it is there.
 
     Raises:
-        InvalidConfig: when others can change it.
+        InvalidConfig: when others can change the folder that is there.
         OutputError: when it cannot be made.
     """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot make the folder {folder}: {error.strerror}") from error
-    return checked(folder)
+    check_private_folder(folder)
 
 
-def checked(folder: Path) -> Path:
-    """The folder, if nobody else could put other files into it.
-
-    Raises:
-        InvalidConfig: when it is not there or others can change it.
-    """
+def check_private_folder(folder: Path) -> None:
+    """Raise InvalidConfig when a folder is not there, or when others could put other files into it."""
     try:
         mode = folder.stat().st_mode
     except OSError as error:
         raise InvalidConfig(f"cannot read the folder {folder}: {error.strerror}") from error
     if not stat.S_ISDIR(mode):
         raise InvalidConfig(f"{folder} is not a folder")
-    if others_can_change(mode):
+    if others_can_write(mode):
         raise InvalidConfig(
             f"others can change the folder {folder} (mode {stat.S_IMODE(mode):04o}): run "
             f"`chmod 700 {shlex.quote(str(folder))}`, or choose another"
         )
-    return folder
 
 
-def others_can_change(mode: int) -> bool:
-    """Whether a file of this mode is not its owner's alone to change."""
+def others_can_write(mode: int) -> bool:
+    """Whether a file or folder of this mode can be changed by others than its owner."""
     return bool(mode & _OTHERS_WRITE)
-
-
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Let only one process at a time run such a block."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)
-
-
-def write(path: Path, text: str) -> None:
-    """Put a file (0600) in its place, whole and on the disk; what is there is replaced.
-
-    Raises:
-        OutputError: when it cannot be written; what was there is still there.
-    """
-    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    try:
-        _write_new(partial, text)
-        partial.replace(path)
-        _sync(path.parent)
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
-    finally:
-        with suppress(OSError):  # it has its name by now, or was never made
-            partial.unlink()
-
-
-def _write_new(path: Path, text: str) -> None:
-    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(handle, "w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(handle)
-
-
-def _sync(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -1,78 +1,82 @@
 # SPDX-License-Identifier: MIT
-"""One process at a time in a folder."""
+"""Locks that let only one process at a time use a folder."""
 
 import fcntl
 import os
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
 
 from tsfusion.core import durable_files
-from tsfusion.core.errors import JournalError, MapError
+from tsfusion.core.errors import JournalError, TsfusionError
 
-if TYPE_CHECKING:
-    pass
+_POLL_S = 0.05
 
 
-def lock_folder(folder: Path, kind: str, owner: str) -> BinaryIO:
-    """Make a folder and hold it for this process until the returned file is closed.
+def hold(folder: Path, name: str | None = None, *, wait: float = 0.0) -> ExitStack:
+    """Keep other processes that call this out of a folder, until `close` or the end of this process.
+
+    Args:
+        name: of the file in the folder that is locked, made when absent; None = the folder itself.
+        wait: seconds to wait for a process that has the lock.
 
     Raises:
-        JournalError: when it cannot be written, or another process holds it.
+        BlockingIOError: when another process has the lock.
+        OSError: when the file or folder cannot be opened.
     """
+    if name is None:
+        descriptor = os.open(folder, os.O_RDONLY)
+    else:
+        descriptor = os.open(folder / name, os.O_RDWR | os.O_CREAT, 0o666)
+    with ExitStack() as lock:
+        lock.callback(os.close, descriptor)
+        _lock(descriptor, time.monotonic() + wait)
+        return lock.pop_all()
+
+
+def _lock(descriptor: int, deadline: float) -> None:
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if time.monotonic() >= deadline:
+                raise
+            time.sleep(_POLL_S)
+
+
+def lock_folder(
+    folder: Path,
+    kind: str,
+    owner: str,
+    *,
+    name: str = "lock",
+    wait: float = 0.0,
+    error_type: type[TsfusionError] = JournalError,
+) -> ExitStack:
+    """Make a folder and hold it for this process; the lock file `name` says which process that is.
+
+    Args:
+        kind: the folder, in the words of an error: `spool`, `state`, `map`.
+        owner: the program that uses such a folder: `scanner`, `server`, `fuser`.
+        wait: seconds to wait for another owner.
+
+    Raises:
+        TsfusionError: of `error_type`, when the folder cannot be written, or another process holds it.
+    """
+    path = folder / name
     try:
         durable_files.make_folder(folder)
-        file = (folder / "lock").open("ab")
+        lock = hold(folder, name, wait=wait)
+    except BlockingIOError as error:
+        with suppress(OSError):
+            if pid := path.read_text(encoding="ascii", errors="replace"):
+                owner += f" (pid {pid})"
+        in_use = f"the {kind} folder {folder} is in use by another {owner}: end that first"
+        raise error_type(in_use) from error
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL
-        raise JournalError(
-            f"cannot write the {kind} folder {folder}: {getattr(error, 'strerror', error)}"
-        ) from error
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        file.close()
-        raise JournalError(f"the {kind} folder {folder} is in use by another {owner}") from error
-    return file
-
-
-_LOCK_FILE = "fuser.lock"
-_PATIENCE = 60.0  # seconds for another fuser to end: it may be reading a large map
-
-
-def hold(folder: Path) -> int:
-    """Keep other fusers off a map for as long as this process lives; one that is ending is waited for.
-
-    Returns:
-        A descriptor; closing it lets go.
-
-    Raises:
-        MapError: when another one has the map, or the folder cannot be written.
-    """
-    path, deadline = folder / _LOCK_FILE, time.monotonic() + _PATIENCE
-    held = None
-    try:
-        held = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        while not _lock(held):
-            if time.monotonic() >= deadline:
-                owner = os.pread(held, 32, 0).decode("ascii", "replace").strip()
-                raise MapError(f"the map {folder} is in use by another fuser (pid {owner}): end that first")
-            time.sleep(0.05)
-    except (OSError, MapError) as error:
-        if held is not None:
-            os.close(held)
-        if isinstance(error, OSError):
-            raise MapError(f"cannot lock {path}: {error.strerror}") from error
-        raise
-    with suppress(OSError):  # it only helps whoever has to wait
-        os.truncate(held, 0)
-        os.pwrite(held, b"%d" % os.getpid(), 0)
-    return held
-
-
-def _lock(descriptor: int) -> bool:
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
+        reason = getattr(error, "strerror", error)
+        raise error_type(f"cannot write the {kind} folder {folder}: {reason}") from error
+    with suppress(OSError):  # only a message to whoever has to wait
+        path.write_text(str(os.getpid()), encoding="ascii")
+    return lock

@@ -18,7 +18,7 @@ else:
     _Handler = logging.StreamHandler  # takes no type before Python 3.11
 
 
-ABOUT = ("map", "session", "seq", "client", "reason")  # what a line may say it is about
+ABOUT = ("map", "session", "seq", "client", "reason")  # the subjects that a line may name
 MESSAGE_CHARACTERS = 2000  # messages quote what peers sent
 TRACE_CHARACTERS = 20_000
 MOST, PERIOD = 20, 60.0  # lines from one place in the code, in so many seconds
@@ -30,7 +30,7 @@ def configure(format: LogFormat, level: LogLevel, process: str = "server", *, ma
     """Log to stderr from now on; `process` (server or fuser) stands in every line.
 
     Args:
-        map: what every line is about that does not say otherwise.
+        map: the subject of every line that names no other map.
 
     Only tsfusion's own loggers are set to `level`; other packages log warnings and errors.
     """
@@ -54,7 +54,7 @@ def about(
     client: str | None = None,
     reason: str | None = None,
 ) -> dict[str, Any]:
-    """What a line is about: `log.warning("…", extra=logs.about(session=key, seq=7))`.
+    """Name the subject of a line: `log.warning("…", extra=logs.about(session=key, seq=7))`.
 
     A session is shown by its first 8 hexadecimal digits; whatever is None or empty is left out.
     """
@@ -64,14 +64,14 @@ def about(
 
 
 def tell_left_out() -> None:
-    """Say how many lines were left out, once their period is over. Call it about once a second."""
+    """Log how many lines were left out, once their period is over. Call it about once a second."""
     for handler in logging.root.handlers:
         if isinstance(handler, Stderr):
             handler.tell_left_out()
 
 
 def printable(text: str, most: int = MESSAGE_CHARACTERS) -> str:
-    """The text on one line, without terminal commands: what cannot be printed is escaped; `…` if cut."""
+    """Put text on one line without terminal commands: unprintable characters are escaped; `…` where cut."""
     cut = text if len(text) <= most else text[:most] + "…"
     if cut.isprintable():
         return cut
@@ -95,7 +95,7 @@ class TextFormatter(logging.Formatter):
 
 
 class JsonFormatter(logging.Formatter):
-    """An object a line: time (UTC), level, process, logger, message, what it is about, exception."""
+    """One JSON object for each line: time (UTC), level, process, logger, message, subject, exception."""
 
     def __init__(self, process: str, map: str | None = None) -> None:
         super().__init__()
@@ -103,7 +103,7 @@ class JsonFormatter(logging.Formatter):
         self._process = process
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line, ASCII: nothing in it breaks a line or a terminal."""
+        """One line of ASCII: no character in it breaks a line or a terminal."""
         at = datetime.fromtimestamp(record.created, timezone.utc).isoformat(timespec="milliseconds")
         fields = {
             "time": at.replace("+00:00", "Z"),
@@ -130,26 +130,26 @@ def _trace(record: logging.LogRecord) -> str:
 
 
 class Stderr(_Handler):
-    """Standard error, by leave of a limiter."""
+    """Handler that writes to standard error what its limiter lets through."""
 
     def __init__(self, limiter: "Limiter") -> None:
         super().__init__(sys.stderr)
         self._limiter = limiter
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write it, unless there were too many like it; the handler's lock is held."""
-        self._write(self._limiter.over())
+        """Write a record, unless there were too many like it; the handler's lock is held."""
+        self._write(self._limiter.finished_periods())
         if self._limiter.allows(record):
             super().emit(record)
 
     def tell_left_out(self) -> None:
-        """Write what `Limiter.over` has to say."""
+        """Write the summaries of `Limiter.finished_periods`."""
         with self.lock:  # type: ignore[union-attr]
-            self._write(self._limiter.over())
+            self._write(self._limiter.finished_periods())
 
     def close(self) -> None:
         """Say what was left out, however young."""
-        self._write(self._limiter.over(everything=True))
+        self._write(self._limiter.finished_periods(everything=True))
         super().close()
 
     def _write(self, records: Iterator[logging.LogRecord]) -> None:
@@ -158,20 +158,20 @@ class Stderr(_Handler):
 
 
 class Limiter:
-    """Lets through so many lines a period from each place in the code, and counts the rest.
+    """Limit of `most` lines in each period from each place in the code; further lines are counted.
 
-    Errors always pass: they may tell of lost data.
+    Errors always pass: they may report lost data.
     """
 
     def __init__(
         self, most: int = MOST, period: float = PERIOD, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._most, self._period, self._clock = most, period, clock
-        # The place and not the message is the key: its number is bounded, whatever peers send.
+        # The key is the place and not the message: places are few, whatever peers send.
         self._places: dict[tuple[str, int], _Place] = {}
 
     def allows(self, record: logging.LogRecord) -> bool:
-        """Whether to write it; if not, it is counted."""
+        """Whether to write a record; if not, it is counted."""
         if record.levelno >= logging.ERROR:
             return True
         place = self._places.setdefault((record.pathname, record.lineno), _Place(self._clock()))
@@ -181,8 +181,8 @@ class Limiter:
         place.last = record
         return False
 
-    def over(self, *, everything: bool = False) -> Iterator[logging.LogRecord]:
-        """A line for each place that had to leave some out and whose period is over; then it begins anew."""
+    def finished_periods(self, *, everything: bool = False) -> Iterator[logging.LogRecord]:
+        """End the periods that are over; a summary for each place that left lines out."""
         before = self._clock() - self._period
         for key, place in list(self._places.items()):
             if everything or place.began <= before:
@@ -206,5 +206,5 @@ def _summary(last: logging.LogRecord, count: int, period: float) -> logging.LogR
 
 
 def _log_unexpected(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """An error that nobody handled, as one object a line like everything else."""
+    """Log an error that nobody handled, as one JSON object like every other line."""
     log.critical("unexpected: %s", error or kind.__name__, exc_info=(kind, error, trace))

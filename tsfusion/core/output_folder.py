@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
-"""The folder a run leaves behind: whole, or not there."""
+"""The output folder of a run: complete, or not there."""
 
-import fcntl
 import os
 import secrets
 import shutil
@@ -10,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from tsfusion.core import folder_lock
 from tsfusion.core.errors import OutputError
 
 RECORD = "run.json"
@@ -20,8 +20,8 @@ def building(out: str | os.PathLike[str]) -> Iterator[Path]:
     """A temporary folder whose files move to the folder `out` when the block ends without an error.
 
     A new `out` appears in one rename. In an existing one each file replaces its namesake and everything else
-    stays; its old `run.json` goes first and the new one comes last, so a `run.json` always describes its
-    neighbours. An error leaves nothing, no parent folder either; what a killed run left goes with the next.
+    stays; its old `run.json` is deleted first and the new one comes last, so that it always describes its
+    neighbours. An error leaves nothing, no parent folder either; the next run clears up after a killed one.
 
     Raises:
         OutputError: at once, when `out` cannot be written.
@@ -36,7 +36,7 @@ def building(out: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def _parents(out: Path) -> Iterator[None]:
-    """The folders above `out`; those made here go when the block fails and nothing else came into them."""
+    """Make the folders above `out`; when the block fails, those that are still empty are removed."""
     missing = [parent for parent in out.parents if not os.path.exists(parent)]  # innermost first
     try:
         try:
@@ -60,35 +60,23 @@ def _workplace(out: Path) -> Iterator[Path]:
     work = (out if out.is_dir() else out.parent) / (prefix + secrets.token_hex(4))
     try:
         work.mkdir()
-        lock = _lock(work)
+        lock = folder_lock.hold(work)
     except OSError as error:
         raise OutputError(f"cannot write to {out}: {error.strerror}") from error
     try:
         yield work
     finally:
         shutil.rmtree(work, ignore_errors=True)
-        os.close(lock)
-
-
-def _lock(folder: Path) -> int:
-    """A handle that holds the folder until it is closed, by us or by our death; raises OSError."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(handle)
-        raise
-    return handle
+        lock.close()
 
 
 def _sweep(place: Path, prefix: str) -> None:
     """Remove the work folders whose owner is dead."""
     with suppress(OSError):
         for path in [path for path in place.iterdir() if path.name.startswith(prefix)]:
-            with suppress(OSError):  # somebody is at work there, or it is not ours to remove
-                lock = _lock(path)
+            # another run is at work there, or the folder is not ours to remove
+            with suppress(OSError), folder_lock.hold(path):
                 shutil.rmtree(path, ignore_errors=True)
-                os.close(lock)
 
 
 def _move(work: Path, out: Path) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the operating system knows of this process."""
+"""Memory, limits, signals and the end of this process, as the operating system offers them."""
 
 import ctypes
 import os
@@ -17,10 +17,10 @@ _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
 def peak_rss_bytes() -> int:
-    """The most memory this process has held, bytes."""
+    """Peak resident memory of this process, bytes."""
     if sys.platform == "linux":
-        # not getrusage: its maximum survives exec, so a child would report its parent's
-        with suppress(OSError):  # no file descriptor is left: better that figure than none
+        # not getrusage: its maximum survives exec, so that a child would report its parent's
+        with suppress(OSError):  # no file descriptor is left: the other figure is better than none
             for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
                 if line.startswith("VmHWM:"):
                     return int(line.split()[1]) * 1024
@@ -29,7 +29,7 @@ def peak_rss_bytes() -> int:
 
 
 def rss_bytes() -> int:
-    """The memory this process holds now, bytes; 0 where the system does not tell."""
+    """Resident memory of this process now, bytes; 0 where the system does not tell."""
     with suppress(OSError):
         pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
         return int(pages) * resource.getpagesize()
@@ -37,13 +37,13 @@ def rss_bytes() -> int:
 
 
 def give_back_memory() -> None:
-    """Return to the system what was freed but is kept for later (glibc; elsewhere nothing happens)."""
+    """Return freed memory that the allocator keeps to the system (glibc; elsewhere nothing happens)."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def data_bytes() -> int:
-    """The memory this process has set aside, used or not, bytes; 0 where the system does not tell."""
+    """Memory that this process has reserved, used or not, bytes; 0 where the system does not tell."""
     with suppress(OSError):
         for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
             if line.startswith("VmData:"):
@@ -52,27 +52,27 @@ def data_bytes() -> int:
 
 
 def limit_memory(most: int) -> None:
-    """From here on an allocation beyond so many bytes fails, in Python as MemoryError (Linux)."""
+    """Let allocations beyond `most` bytes fail from now on; in Python with MemoryError (Linux)."""
     if sys.platform == "linux":
         _, hard = resource.getrlimit(resource.RLIMIT_DATA)
         resource.setrlimit(resource.RLIMIT_DATA, (most if hard < 0 else min(most, hard), hard))
 
 
 def end_first() -> None:
-    """Should the machine's memory run out, the system ends this process before others (Linux)."""
+    """Let the system end this process before others when the machine's memory runs out (Linux)."""
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("500", encoding="ascii")
 
 
 def on_parent_end(number: signal.Signals) -> None:
-    """From here on this process gets that signal when the thread that started it ends (Linux)."""
+    """Send this process a signal when the thread that started it ends (Linux)."""
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):
             ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(number), 0, 0, 0)
 
 
 def raise_file_limit() -> None:
-    """As many open files as this user may have: each connection needs one."""
+    """Allow as many open files as this user may have: each connection needs one."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != hard:
         with suppress(OSError, ValueError):  # a system that allows less than it says
@@ -80,7 +80,7 @@ def raise_file_limit() -> None:
 
 
 def physical_memory_bytes() -> int:
-    """The machine's memory, or what its container or service may have of it."""
+    """Memory of the machine, or the part of it that this container or service may use, bytes."""
     limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
     group = "/"
     with suppress(OSError):
@@ -93,7 +93,7 @@ def physical_memory_bytes() -> int:
 
 
 def oom_kills() -> int:
-    """How many processes the system has ended for want of memory; 0 where it does not tell."""
+    """Number of processes that the system has ended for lack of memory; 0 where it does not tell."""
     with suppress(OSError):
         for line in Path("/proc/vmstat").read_text(encoding="ascii").splitlines():
             if line.startswith("oom_kill "):
@@ -105,7 +105,7 @@ def oom_kills() -> int:
 def uninterrupted() -> Iterator[None]:
     """Hold Ctrl-C and SIGTERM back until the end of the block.
 
-    What must happen whole happens whole, or not at all; and who swallows exceptions swallows none of these.
+    The block runs to its end, and code in it that swallows exceptions cannot swallow these signals.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # signals only ever interrupt the main thread
@@ -125,7 +125,7 @@ def uninterrupted() -> Iterator[None]:
         for number, handler in usual.items():
             signal.signal(number, handler)
     for number, frame in came:
-        handler = signal.getsignal(number)  # of the first one's making, perhaps
+        handler = signal.getsignal(number)  # the first signal's handler may have set it
         if callable(handler):
             handler(number, frame)
         elif handler == signal.SIG_DFL:

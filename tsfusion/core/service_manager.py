@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""What a service manager is told: ready, alive, stopping (systemd's sd_notify protocol).
+"""Messages to the service manager: ready, alive, stopping (systemd's sd_notify protocol).
 
-Nothing is done where no service manager listens, and nothing is ever waited for.
+Without a service manager nothing is sent; sending never waits.
 """
 
 import logging
@@ -21,7 +21,7 @@ class Watchdog:
     """The link to the service manager that started this process, if one did.
 
     Attributes:
-        interval: seconds within which `pet` has to be called (WatchdogSec); None = nobody watches.
+        interval: seconds within which `pet` has to be called (WatchdogSec); None = no watchdog.
     """
 
     def __init__(
@@ -42,44 +42,44 @@ class Watchdog:
         self._next_pet = clock()
 
     def ready(self, status: str = "") -> None:
-        """Keyframes are welcome: the start is over."""
+        """Report that the start is over: keyframes are accepted."""
         self._status = status
-        self._tell("READY=1", _line(status))
+        self._send("READY=1", _line(status))
 
     def pet(self, status: str = "") -> None:
-        """The loop is alive. Call it as often as you like: one message each half of the interval.
+        """Report that the loop is alive; call it as often as you like.
 
-        A new status is told at once.
+        A message is sent once in each half of the interval, and at once when the status is new.
         """
         if status and status != self._status:
             self._status = status
-            self._tell(_line(status))
+            self._send(_line(status))
         if self.interval is not None and self._clock() >= self._next_pet:
             self._next_pet = self._clock() + self.interval / 2
-            self._tell("WATCHDOG=1")
+            self._send("WATCHDOG=1")
 
     def stopping(self, status: str = "") -> None:
-        """The end has begun: keyframes are fused that wait, and the map is saved."""
-        self._tell("STOPPING=1", _line(status))
+        """Report that the end has begun: waiting keyframes are fused, and the map is saved."""
+        self._send("STOPPING=1", _line(status))
 
     def close(self) -> None:
-        """Say no more."""
+        """Close the link; later reports are not sent."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
-    def _tell(self, *lines: str) -> None:
+    def _send(self, *lines: str) -> None:
         if self._socket is None:
             return
         message = "\n".join(line for line in lines if line)
         try:
             self._socket.sendto(message.encode(errors="replace"), self._address)
-        except OSError as error:  # full or gone: what is told next says the same, and fusing goes on
-            log.warning("the service manager cannot be told %s: %s", message.partition("\n")[0], error)
+        except OSError as error:  # full or closed: the next report repeats this one, and fusing goes on
+            log.warning("cannot send %s to the service manager: %s", message.partition("\n")[0], error)
 
 
 def _interval(environment: Mapping[str, str]) -> float | None:
-    """Seconds, if it is this process that is watched."""
+    """Watchdog interval in seconds; None when it is not this process that is watched."""
     if environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return None
     microseconds = environment.get("WATCHDOG_USEC", "")

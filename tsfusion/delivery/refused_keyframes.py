@@ -3,54 +3,39 @@
 
 import logging
 
-from tsfusion import journal
 from tsfusion.core.errors import JournalError
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.spool import Waiting
+from tsfusion.journal.quarantine import Quarantine
 
 FOLDER = "refused"  # inside the spool; opens like any journal
 MAX_BYTES = 64 << 20
-_FILE_OVERHEAD = 2048
 
 log = logging.getLogger(__name__)
 
 
 class RefusedFolder:
-    """A small journal inside the spool, one segment a keyframe; the oldest go first.
-
-    A temporary spool keeps nothing.
-    """
+    """The refused keyframes of a spool, in a folder inside it. A temporary spool keeps none."""
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
-        self._folder = outbox.spool.folder / FOLDER
-        self._journal: journal.Journal | None = None
+        self._kept = Quarantine(outbox.spool.folder / FOLDER, MAX_BYTES)
 
     def give_up(self, entry: Waiting, reason: str, message: str, *, readable: bool = True) -> None:
         """Take a keyframe out of the queue for good. Not while holding `changed`: this uses the disk."""
         log.error("keyframe %d is lost (%s): %s", entry.seq, reason, message)
-        if readable and not self._outbox.spool.temporary and entry.nbytes + _FILE_OVERHEAD <= MAX_BYTES:
-            try:
-                self._keep(entry)
-            except (JournalError, OSError) as error:
-                log.warning("keyframe %d could not be kept aside: %s", entry.seq, error)
+        if readable and not self._outbox.spool.temporary:
+            self._keep(entry, reason)
         with self._outbox.changed:
             self._outbox.refuse(entry, reason, message)
 
-    def _keep(self, entry: Waiting) -> None:
+    def _keep(self, entry: Waiting, reason: str) -> None:
         spool = self._outbox.spool
-        frames = spool.read(entry)
-        if self._journal is None:
-            self._journal = journal.Journal(self._folder, 1, sync=False)
-            self._journal.found = []
-        for number in journal.segments(self._folder):
-            if self._journal.nbytes + entry.nbytes + _FILE_OVERHEAD <= MAX_BYTES:
-                break
-            self._journal.forget(number)
-        position = self._journal.append(frames, session=spool.session, seq=entry.seq)
-        log.info("keyframe %d is in %s", entry.seq, journal.segment_path(self._folder, position.segment))
-
-    def close(self) -> None:
-        """Finish; what was kept stays."""
-        if self._journal is not None:
-            self._journal.close()
+        try:
+            frames = spool.read(entry)
+        except (JournalError, OSError) as error:
+            log.warning("keyframe %d could not be kept aside: %s", entry.seq, error)
+            return
+        path = self._kept.keep(frames, session=spool.session, seq=entry.seq, reason=reason)
+        if path is not None:
+            log.info("keyframe %d is in %s", entry.seq, path)

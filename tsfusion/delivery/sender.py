@@ -88,7 +88,6 @@ class Sender:
             self._data.close()
             self._waker.close()
             self._woken.close()
-            self._refused.close()
             context.term()
 
     def _step(self) -> None:

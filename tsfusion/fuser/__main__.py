@@ -12,11 +12,13 @@ import zmq
 
 from tsfusion.core import logs, process
 from tsfusion.core.config import LogFormat, LogLevel
-from tsfusion.core.errors import TsfusionError
-from tsfusion.core.folder_lock import hold
+from tsfusion.core.errors import MapError, TsfusionError
+from tsfusion.core.folder_lock import lock_folder
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.fuser import Fuser
 from tsfusion.wire import sockets
+
+_LOCK_WAIT_S = 60.0  # for another fuser to end: it may be reading a large map
 
 
 def run(endpoint: str) -> int:
@@ -74,7 +76,10 @@ def _serve(link: sockets.AnySocket) -> int:
 def _begin(link: sockets.AnySocket, message: fuser_messages.Begin) -> Fuser | None:
     try:
         process.end_first()
-        hold(Path(message.folder))
+        # held until this process ends
+        lock_folder(
+            Path(message.folder), "map", "fuser", name="fuser.lock", wait=_LOCK_WAIT_S, error_type=MapError
+        )
         fuser = Fuser(link, message)
     except TsfusionError as error:
         name = next(

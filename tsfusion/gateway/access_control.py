@@ -42,7 +42,7 @@ class AccessControl:
             self._allowed = AllowList(Path(folder))
             if self._allowed.problem:  # who starts a server is there to mend it; later, nobody is let in
                 raise InvalidConfig(self._allowed.problem)
-            self._zap = ZapHandler(context, self._allowed.name_of, self._allowed.why_not)
+            self._zap = ZapHandler(context, self._allowed.name_of, self._allowed.rejection_reason)
         self.poll = [] if self._zap is None else [self._zap.socket]
 
     @property

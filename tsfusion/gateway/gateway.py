@@ -31,7 +31,7 @@ from tsfusion.wire import messages, sockets
 from tsfusion.wire.corrections import Corrections
 from tsfusion.wire.health import Health
 from tsfusion.wire.keyframe_header import VERSION
-from tsfusion.wire.messages import said
+from tsfusion.wire.messages import decode_frames_to_server
 from tsfusion.wire.sockets import mesh_topic
 
 log = logging.getLogger(__name__)
@@ -194,7 +194,7 @@ class Gateway:
             return
         identity, *rest = frames
         try:
-            message = said([frame.buffer for frame in rest])
+            message = decode_frames_to_server([frame.buffer for frame in rest])
         except DecodeError as error:
             self._refused["control"] += 1
             log.debug("%s", error)

@@ -50,7 +50,7 @@ class HostedMap:
         clients: Clients,
     ) -> None:
         self.name = name
-        self.folder = state_folder.folder(server.state, name)
+        self.folder = state_folder.map_folder(server.state, name)
         self.warm = False
         self.problem = ""
         self._server = server

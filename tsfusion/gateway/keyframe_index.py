@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from msgspec import Struct
 
 from tsfusion.gateway.sessions import Session, Sessions
-from tsfusion.journal import Position, Scan
+from tsfusion.journal import Position, RecordEntry
 from tsfusion.wire.keyframe_times import Stamps
 
 
@@ -41,7 +41,7 @@ class KeyframeIndex:
     def __len__(self) -> int:
         return len(self._columns["seq"])
 
-    def recover(self, found: Iterable[Scan], sessions: Sessions) -> None:
+    def recover(self, found: Iterable[RecordEntry], sessions: Sessions) -> None:
         """Take over what the journal's scan found. A keyframe journaled twice counts once.
 
         (The disk refused, the client sent it again, and the first copy had been written after all.)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core import process
+from tsfusion.core import durable_files, process
 from tsfusion.core.errors import OutputError
 
 FORMATS = (".ply", ".glb", ".obj")
@@ -42,12 +42,11 @@ class Mesh:
             raise OutputError(f"a mesh is saved as {', '.join(FORMATS)}, got {path.name!r}")
         if not len(self.faces):
             raise OutputError(f"nothing to write to {path}: the mesh has no triangles (yet)")
-        partial = path.with_name(f".{path.name}.partial")
+        content = self.encode(path.suffix.lower())
         try:
-            partial.write_bytes(self.encode(path.suffix.lower()))
-            os.replace(partial, path)
+            with durable_files.replacing(path) as file:
+                file.write(content)
         except OSError as error:
-            partial.unlink(missing_ok=True)
             raise OutputError(f"cannot write {path}: {error.strerror}") from error
         return path
 

@@ -6,15 +6,16 @@ new segment. One chunk a keyframe, uncompressed: the arrays are compressed alrea
 """
 
 from tsfusion.journal.mcap_layout import Position, Record
-from tsfusion.journal.record_scan import Damage, segment_number, walk
+from tsfusion.journal.record_scan import Damage, scan_records, segment_number
 from tsfusion.journal.segments import (
-    Scan,
+    RecordEntry,
     describe,
     is_closed,
+    is_segment,
+    list_records,
     read,
     read_at,
     records,
-    scan,
     segment_path,
     segments,
 )
@@ -25,16 +26,17 @@ __all__ = [
     "Journal",
     "Position",
     "Record",
-    "Scan",
+    "RecordEntry",
     "describe",
     "is_closed",
+    "is_segment",
+    "list_records",
     "read",
     "read_at",
     "records",
-    "scan",
+    "scan_records",
     "segment_number",
     "segment_path",
     "segments",
-    "walk",
     "write_file",
 ]

@@ -65,7 +65,7 @@ class Record(Struct, frozen=True):
     position: Position
     session: bytes
     seq: int
-    client: str  # that the key was allowed under which it came; empty = no keys
+    client: str  # name that the sender's key is allowed under; empty = no keys
     logged_ns: int  # wall clock
     frames: list[memoryview]
 
@@ -75,7 +75,7 @@ class Record(Struct, frozen=True):
         return sum(frame.nbytes for frame in self.frames)
 
 
-class Head(NamedTuple):
+class ChunkHead(NamedTuple):
     """The first bytes of a keyframe's chunk, up to its table of frames."""
 
     opcode: int
@@ -118,7 +118,7 @@ class Head(NamedTuple):
 
     @property
     def message_index(self) -> bytes:
-        """What the writer puts behind the chunk."""
+        """The bytes that the writer puts behind the chunk."""
         return _index(_KEYFRAMES, self.logged_ns, 0)
 
 
@@ -126,8 +126,8 @@ def _index(channel: int, logged_ns: int, offset: int) -> bytes:
     return _INDEX.pack(Opcode.MESSAGE_INDEX, _INDEX.size - _LENGTH_BYTES, channel, 16, logged_ns, offset)
 
 
-def start(stream: IO[bytes], identity: bytes, now_ns: int) -> Any:
-    """Begin a segment; returns the MCAP writer for `add`."""
+def begin_segment(stream: IO[bytes], identity: bytes, now_ns: int) -> Any:
+    """Write the first bytes of a segment; returns the MCAP writer for `write_record`."""
     writer = Writer(stream, chunk_size=1, compression=CompressionType.NONE)
     writer.start(library=LIBRARY.decode())
     schema = writer.register_schema("tsfusion.keyframe", "", _LAYOUT)
@@ -138,16 +138,16 @@ def start(stream: IO[bytes], identity: bytes, now_ns: int) -> Any:
     return writer
 
 
-def add(writer: Any, payload: bytes, seq: int, now_ns: int) -> None:
-    """Write one record that `pack` made."""
+def write_record(writer: Any, payload: bytes, seq: int, now_ns: int) -> None:
+    """Write one record that `pack_record` made."""
     writer.add_message(_KEYFRAMES, now_ns, payload, now_ns, sequence=seq % 2**32)
 
 
-def pack(frames: Sequence[Any], identity: bytes, session: bytes, seq: int, client: str) -> bytes:
-    """The message of one record.
+def pack_record(frames: Sequence[Any], identity: bytes, session: bytes, seq: int, client: str) -> bytes:
+    """Frames and their origin as the message of one record.
 
     Raises:
-        JournalError: for a name that is too long, rather than cut it to another one's.
+        JournalError: for a name that is too long; a cut one could be another client's.
     """
     name = client.encode()
     if len(name) > CLIENT_BYTES:
@@ -157,17 +157,17 @@ def pack(frames: Sequence[Any], identity: bytes, session: bytes, seq: int, clien
     return b"".join([_RECORD.pack(identity, session, seq, name, len(views)), lengths, *views])
 
 
-def head(raw: bytes) -> Head | None:
-    """The head of a keyframe's chunk; None when this is none."""
+def parse_head(raw: bytes) -> ChunkHead | None:
+    """Read the head of a keyframe's chunk; None when the bytes are not one."""
     if len(raw) < HEAD_BYTES:
         return None
-    parsed = Head(*_HEAD.unpack_from(raw))
+    parsed = ChunkHead(*_HEAD.unpack_from(raw))
     return parsed if parsed.is_sound else None
 
 
-def unpack(raw: bytes, position: Position) -> Record | None:
-    """The record in a chunk; None unless all of it is there and its CRC agrees."""
-    parsed = head(raw)
+def parse_record(raw: bytes, position: Position) -> Record | None:
+    """Read the record in a chunk; None unless all of it is there and its CRC agrees."""
+    parsed = parse_head(raw)
     if parsed is None or len(raw) != parsed.nbytes:
         return None
     body = memoryview(raw)
@@ -188,22 +188,22 @@ def unpack(raw: bytes, position: Position) -> Record | None:
     return Record(position, parsed.session, parsed.seq, client, parsed.logged_ns, frames)
 
 
-class Intro(NamedTuple):
+class SegmentChunk(NamedTuple):
     """The first chunk of a segment."""
 
     layout: bytes
     identity: bytes
     end: int
-    message_index: bytes  # what the writer puts behind the chunk
+    message_index: bytes  # that the writer puts behind the chunk
 
     @property
     def is_ours(self) -> bool:
-        """Whether this module can read the rest."""
+        """Whether this version can read the segment."""
         return self.layout == _SEGMENT_MAGIC
 
 
-def find_intro(raw: bytes) -> Intro | None:
-    """The segment's own chunk, from the start of a file; None when it is not there or damaged."""
+def parse_segment_chunk(raw: bytes) -> SegmentChunk | None:
+    """Read the segment's own chunk from the first bytes of a file; None when it is missing or damaged."""
     at = len(OPENING)
     if len(raw) < at + _CHUNK.size:
         return None
@@ -218,12 +218,12 @@ def find_intro(raw: bytes) -> Intro | None:
     magic, identity = _IDENTITY.unpack_from(raw, message + _MESSAGE.size)
     if (channel, magic[:6]) != (_SEGMENT, _SEGMENT_MAGIC[:6]) or not first_ns == last_ns == logged_ns:
         return None
-    return Intro(magic, identity, end, _index(channel, logged_ns, message - inner))
+    return SegmentChunk(magic, identity, end, _index(channel, logged_ns, message - inner))
 
 
 @cache
-def intro_bytes() -> int:
+def segment_start_bytes() -> int:
     """Bytes of a segment before its first keyframe."""
     stream = BytesIO()
-    start(stream, bytes(IDENTITY_BYTES), 0)
+    begin_segment(stream, bytes(IDENTITY_BYTES), 0)
     return len(stream.getvalue())

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Keyframes that could not be fused, each a file of its own, so that a person can look into why.
+"""Keyframes put aside, each in a file of its own, so that a person can see what was wrong with them.
 
-They are in the journal too, but that may be pruned; and a file here can be sent to whoever can help.
+A server keeps those that it could not fuse, a scanner those that the server refused.
 """
 
 import logging
+import re
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -17,6 +18,8 @@ from tsfusion.core.errors import JournalError
 log = logging.getLogger(__name__)
 
 _MAX_FILES = 1000
+_FILE_NAME = re.compile(r"([0-9a-f]{8})-([0-9]+)-([a-z0-9_]+)\.mcap")
+_MAX_REASON_LENGTH = 32
 
 
 class Quarantine:
@@ -37,8 +40,13 @@ class Quarantine:
     def keep(
         self, frames: Sequence[Any], *, session: bytes, seq: int, client: str = "", reason: str
     ) -> Path | None:
-        """Put a keyframe message aside; its file, or None when the disk refuses (which is logged)."""
-        path = self.folder / f"{session[:4].hex()}-{seq}-{reason}.mcap"
+        """Put a keyframe message aside; its file, or None when the disk refuses (which is logged).
+
+        Args:
+            reason: a word; it becomes a part of the file's name without what could lead out of the folder.
+        """
+        word = re.sub("[^a-z0-9]", "_", reason.lower())[:_MAX_REASON_LENGTH] or "unknown"
+        path = self.folder / f"{session[:4].hex()}-{seq}-{word}.mcap"
         try:
             durable_files.make_folder(self.folder)
             journal.write_file(path, frames, session=session, seq=seq, client=client)
@@ -58,6 +66,12 @@ class Quarantine:
             self._nbytes -= self._files.pop(path)
             with suppress(OSError):
                 path.unlink()
+
+
+def quarantined_files(folder: Path) -> list[Path]:
+    """The files that `Quarantine` has put into a folder, by session and number."""
+    found = [(match, path) for path in folder.iterdir() if (match := _FILE_NAME.fullmatch(path.name))]
+    return [path for match, path in sorted(found, key=lambda one: (one[0][1], int(one[0][2]), one[0][3]))]
 
 
 def _by_age(folder: Path) -> list[tuple[Path, int]]:

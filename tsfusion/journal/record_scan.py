@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""From record to record through a segment, over whatever lies between.
+"""Reading the records of a segment one after the other, past damaged places.
 
-Behind a damaged place the walk searches for the next chunk by its shape, its segment's identity and its CRC,
-so damage costs the records it hit and no other.
+Behind a damaged place the scan searches for the next chunk by its shape, its segment's identity and its CRC,
+so that damage costs the records it hit and no other.
 """
 
 import errno
@@ -19,22 +19,20 @@ from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.segment_file import SegmentFile
 
 _WINDOW_BYTES = 1 << 20
-_MAX_INTRO_BYTES = 1 << 16
+_MAX_SEGMENT_CHUNK_BYTES = 1 << 16
 # Bytes that a search may spend on chunks whose CRC then differs, in sizes of the file: a made-up file could
 # have each byte begin a chunk that ends with the file.
 _PATIENCE = 64
-# The head of a keyframe's chunk, with lengths under 2^40 (see `layout.Head`).
-_HEAD_SHAPE = re.compile(
-    rb"\x06(?=.{5}\0{3}.{16}.{5}\0{3}.{4}\0{4}.{5}\0{3}\x05.{5}\0{3}\x01\0)", re.DOTALL
-)  # fmt: skip
+# The head of a keyframe's chunk, with lengths under 2^40 (see `mcap_layout.ChunkHead`).
+_HEAD_SHAPE = re.compile(rb"(?s)\x06(?=.{5}\0{3}.{16}.{5}\0{3}.{4}\0{4}.{5}\0{3}\x05.{5}\0{3}\x01\0)")
 
 
 class Damage(Struct, frozen=True):
     """A stretch of a segment that is not as it was written.
 
     Attributes:
-        lost: keyframes that are gone with it, at least; 0 = it only held what readers can do without.
-        torn: the end of the last write, cut off before it was acknowledged: nothing that counted is gone.
+        lost: lower bound of the keyframes that it destroyed; 0 = only parts that readers do not need.
+        torn: the end of the last write, cut off before it was acknowledged: no keyframe is lost.
     """
 
     position: Position
@@ -44,26 +42,26 @@ class Damage(Struct, frozen=True):
     torn: bool = False
 
 
-def walk(path: Path) -> Iterator[Record | Damage]:
-    """All that a segment file holds, in order of place; reads one record at a time.
+def scan_records(path: Path) -> Iterator[Record | Damage]:
+    """The records and damaged places of a segment file in their order; one record at a time is read.
 
     Raises:
         JournalError: when the file cannot be opened or read.
     """
     try:
         with SegmentFile(path) as source:
-            yield from _Walk(source, segment_number(path)).steps()
+            yield from _Scan(source, segment_number(path)).steps()
     except OSError as error:
-        raise failed("read", path, error) from error
+        raise journal_error("read", path, error) from error
 
 
 def segment_number(path: Path) -> int:
-    """The number a segment file is named for; 0 = it is named otherwise."""
+    """The number in a segment file's name; 0 = it has another name."""
     return int(path.stem) if re.fullmatch(r"[0-9]{6,9}", path.stem) else 0
 
 
-def failed(verb: str, path: Path, error: OSError) -> JournalError:
-    """The error for something the disk refused."""
+def journal_error(verb: str, path: Path, error: OSError) -> JournalError:
+    """The JournalError for what the disk refused: `cannot read FILE: reason`."""
     return JournalError(f"cannot {verb} {path}: {error.strerror or error}")
 
 
@@ -72,12 +70,12 @@ def _was_index(raw: bytes) -> bool:
     return mcap_layout.INDEX_START[:1] == raw[:1] or mcap_layout.INDEX_START[1:9] == raw[1:9]
 
 
-class _Walk:
+class _Scan:
     def __init__(self, source: SegmentFile, number: int) -> None:
         self._source = source
         self._number = number
-        self._seal = segment_file.read(source)
-        self._end = source.size if self._seal.data_end is None else self._seal.data_end
+        self._segment_end = segment_file.read_segment_end(source)
+        self._end = source.size if self._segment_end.data_end is None else self._segment_end.data_end
         self._identity: bytes | None = None
         self._next: tuple[int, int | None] | None = None  # the last search: from where, what it found
         self._patience = _PATIENCE * source.size
@@ -110,15 +108,15 @@ class _Walk:
 
     def _is_end_of_data(self, at: int) -> bool:
         marker = mcap_layout.END_OF_DATA
-        return self._seal.data_end is None and self._source.read(at, len(marker)) == marker
+        return self._segment_end.data_end is None and self._source.read(at, len(marker)) == marker
 
-    def _record_at(self, at: int) -> tuple[Record, mcap_layout.Head] | None:
-        head = mcap_layout.head(self._source.read(at, mcap_layout.HEAD_BYTES, self._end))
+    def _record_at(self, at: int) -> tuple[Record, mcap_layout.ChunkHead] | None:
+        head = mcap_layout.parse_head(self._source.read(at, mcap_layout.HEAD_BYTES, self._end))
         if head is None or at + head.nbytes > self._end:
             return None
         if self._identity is not None and head.segment != self._identity:
             return None
-        record = mcap_layout.unpack(self._source.read(at, head.nbytes), Position(self._number, at))
+        record = mcap_layout.parse_record(self._source.read(at, head.nbytes), Position(self._number, at))
         if record is None:
             self._patience -= head.nbytes
             return None
@@ -131,11 +129,11 @@ class _Walk:
         """Returns where the first record starts."""
         expected, size = mcap_layout.OPENING, self._source.size
         opening = self._source.read(0, len(expected))
-        if self._seal.state == "open" and size < mcap_layout.intro_bytes():
+        if self._segment_end.state == "open" and size < mcap_layout.segment_start_bytes():
             if size:
                 yield self._note(0, size, "its first write was cut off", torn=True)
             return size
-        known = mcap_layout.find_intro(self._source.read(0, _MAX_INTRO_BYTES, self._end))
+        known = mcap_layout.parse_segment_chunk(self._source.read(0, _MAX_SEGMENT_CHUNK_BYTES, self._end))
         if known is not None and not known.is_ours:
             raise JournalError(f"cannot read {self._source.path}: another version of tsfusion wrote it")
         first = self._search(len(expected)) if known is None else None
@@ -151,7 +149,7 @@ class _Walk:
             self._identity = known.identity
             return self._behind(known.end, known.message_index)
         end = self._end if first is None else first
-        lost = int(end != mcap_layout.intro_bytes())
+        lost = int(end != mcap_layout.segment_start_bytes())
         self._lost += lost
         yield self._note(len(expected), end - len(expected), "the segment's own chunk is damaged", lost=lost)
         return end
@@ -161,9 +159,9 @@ class _Walk:
     def _damage(self, at: int) -> Damage:
         """What is wrong at a place where a record should start, and how far it reaches."""
         raw = self._source.read(at, mcap_layout.HEAD_BYTES, self._end)
-        head = mcap_layout.head(raw)
+        head = mcap_layout.parse_head(raw)
         end = at + head.nbytes if head is not None else None
-        is_open = self._seal.state == "open"
+        is_open = self._segment_end.state == "open"
         if is_open and end is not None and end > self._end:
             return self._torn(at)  # no search in there: all its lengths agree, it was cut off
         following = self._search(at + 1)
@@ -215,15 +213,15 @@ class _Walk:
     # --- the end ---
 
     def _closing(self, at: int) -> Iterator[Damage]:
-        seal_, size = self._seal, self._source.size
-        if seal_.keyframes is not None and seal_.keyframes > self._found + self._lost:
-            missing = seal_.keyframes - self._found - self._lost
-            yield self._note(at, 0, f"its index counts {seal_.keyframes} keyframes", lost=missing)
-        if seal_.data_end is not None:
+        end, size = self._segment_end, self._source.size
+        if end.keyframes is not None and end.keyframes > self._found + self._lost:
+            missing = end.keyframes - self._found - self._lost
+            yield self._note(at, 0, f"its index counts {end.keyframes} keyframes", lost=missing)
+        if end.data_end is not None:
             marker = mcap_layout.END_OF_DATA
-            if self._source.read(seal_.data_end, len(marker)) != marker:
-                yield self._note(seal_.data_end, len(marker), "the mark after the last keyframe is damaged")
-        if seal_.state == "broken":
+            if self._source.read(end.data_end, len(marker)) != marker:
+                yield self._note(end.data_end, len(marker), "the mark after the last keyframe is damaged")
+        if end.state == "broken":
             yield self._note(at, size - at, "its index is damaged")
-        elif seal_.state == "open" and at < size:
+        elif end.state == "open" and at < size:
             yield self._note(at, size - at, "its index was cut off", torn=True)

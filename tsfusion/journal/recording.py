@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A journal, spool or segment as a dataset of keyframes: what was scanned live can be replayed offline."""
+"""A journal, spool or segment as a dataset of keyframes: live scans can be replayed offline."""
 
 import logging
 import os
@@ -31,7 +31,7 @@ class JournalRecording:
     """
 
     def __init__(self, path: str | os.PathLike[str], map_name: str | None = None) -> None:
-        place = state_folder.find(Path(path), map_name)
+        place = state_folder.find_journal(Path(path), map_name)
         self.name = str(place.path)
         self._places = _places(place)
         if not self._places:
@@ -56,11 +56,6 @@ class JournalRecording:
 
     def __iter__(self) -> Iterator[Keyframe]:
         return (self[index] for index in range(len(self)))
-
-
-def read_keyframes(path: str | os.PathLike[str]) -> Iterator[Keyframe]:
-    """The keyframes of a `JournalRecording`, one after the other."""
-    return iter(JournalRecording(path))
 
 
 def _places(place: state_folder.JournalPlace) -> list[tuple[Path, int]]:

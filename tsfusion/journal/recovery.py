@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Everything that is whole in a damaged journal, as a new one."""
+"""Copying everything that is whole in a damaged journal into a new one."""
 
 import os
 from contextlib import closing, suppress
@@ -17,7 +17,7 @@ from tsfusion.journal.writer import Journal
 
 
 class Recovery(Struct, kw_only=True):
-    """What was saved. `copies`: keyframes that stood in the journal twice and are in the new one once."""
+    """Result of a recovery. `copies`: keyframes that the journal held twice, the new one holds once."""
 
     path: str
     keyframes: int
@@ -85,7 +85,7 @@ def _check(place: JournalPlace, out: Path) -> None:
 
 
 def _sync(folder: Path) -> int:
-    """Wait until the files of a folder are on the disk; how many there are."""
+    """Wait until the files of a folder are on the disk; returns their number."""
     files = list(folder.iterdir())
     for path in files:
         with path.open("rb") as file:

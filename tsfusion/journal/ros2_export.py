@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Writing the messages of a journal into one MCAP file of the profile `ros2`."""
 
-import os
 import re
 from collections import Counter
-from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -27,7 +25,7 @@ _LAST_SECOND = 2**31 - 1  # of a ROS 2 time stamp
 
 
 class Export(Struct, kw_only=True):
-    """What was written. `lost`: keyframes that are not in it because they are damaged."""
+    """Result of an export. `lost`: keyframes that are not in the file because they are damaged."""
 
     path: str
     nbytes: int
@@ -52,21 +50,12 @@ def export(place: JournalPlace, out: Path, watch: Watcher) -> Export:
         or out.resolve().parent == place.path.resolve()
     ):
         raise OutputError(f"cannot write {out}: it is in the journal that is read")
-    partial = out.with_name(f".{out.name}.partial")
     try:
-        with partial.open("wb") as stream:
+        with durable_files.replacing(out) as stream:
             exporter = _Exporter(_Bag(stream, store), Converter(store.types))
             exporter.run(place, watch)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(partial, out)
-        durable_files.sync_folder(out.absolute().parent)
-    except BaseException as error:  # an interrupted one leaves no part either
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise OutputError(f"cannot write {out}: {error.strerror}") from error
-        raise
+    except OSError as error:
+        raise OutputError(f"cannot write {out}: {error.strerror}") from error
     return exporter.result(out)
 
 
@@ -124,7 +113,7 @@ class _Exporter:
         self._keyframes = 0
 
     def run(self, place: JournalPlace, watch: Watcher) -> None:
-        """Everything that is whole, each keyframe once."""
+        """Write everything that is whole, each keyframe once."""
         for path, step in place.steps(watch):
             if isinstance(step, Damage):
                 self._problems.append(problem(path, step))
@@ -140,7 +129,7 @@ class _Exporter:
     def _take(self, path: Path, record: Record) -> None:
         """Write a keyframe, once it is known whether its session has a sensor's clock.
 
-        One that says 0 and is a session's first may come from a clock that started with it, or from none.
+        A first keyframe at time 0 may come from a clock that started with it, or from a sensor without one.
         """
         try:
             has_stamp = unpack(record.frames[0]).timestamp_ns > 0
@@ -176,7 +165,7 @@ class _Exporter:
         self._problems.append(Problem("damage", path.name, at, record.nbytes, 1, f"no keyframe: {error}"))
 
     def _name(self, record: Record) -> str:
-        """A name for the session that ROS takes: its client's, numbered from the second session on."""
+        """A session's name that ROS accepts: its client's, numbered from the second session on."""
         if record.session not in self._names:
             base = re.sub(r"[^A-Za-z0-9_]", "_", record.client) or "scanner"
             base = base if base[0].isalpha() else f"scanner_{base}"
@@ -188,7 +177,7 @@ class _Exporter:
         return self._names[record.session]
 
     def result(self, out: Path) -> Export:
-        """What has been written to `out`."""
+        """Report what has been written to `out`."""
         return Export(
             path=str(out),
             nbytes=out.stat().st_size,
@@ -197,6 +186,3 @@ class _Exporter:
             messages=dict(sorted(self._bag.messages.items())),
             problems=self._problems,
         )
-
-
-__all__ = ["Export", "export"]

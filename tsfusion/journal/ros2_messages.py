@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
+from tsfusion.geometry.trajectory import quaternion
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.wire.keyframe_header import KeyframeHeader
 
@@ -185,18 +186,3 @@ def _metres(depth: NDArray[Any]) -> NDArray[np.float32]:
         is_return = np.isfinite(depth) & (depth > 0)
     metres: NDArray[np.float32] = np.where(is_return, depth, np.nan).astype(np.float32)
     return metres
-
-
-def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """x, y, z, w of a rotation, from its largest component (Shepperd 1978)."""
-    trace = float(np.trace(R))
-    largest = int(np.argmax([*np.diag(R), trace]))
-    q = np.empty(4)
-    if largest == 3:
-        q[:] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1 + trace
-    else:
-        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
-        q[i] = 1 - trace + 2 * R[i, i]
-        q[j], q[k], q[3] = R[j, i] + R[i, j], R[k, i] + R[i, k], R[k, j] - R[j, k]
-    unit: NDArray[np.float64] = q / np.linalg.norm(q)
-    return unit

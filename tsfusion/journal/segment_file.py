@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A segment file as bytes by offset, bad sectors included."""
+"""Reading a segment file by byte offsets, bad sectors included, and the index at its end."""
 
 import errno
 import logging
@@ -21,11 +21,11 @@ log = logging.getLogger(__name__)
 
 
 class SegmentFile:
-    """A file as it is now: what a writer adds later is not seen.
+    """A segment file at its present length: bytes that a writer adds later are not seen.
 
     Attributes:
-        failed: whether some of it could not be read.
-        answered: whether any of it could.
+        failed: whether the disk could not read some part that was asked for.
+        answered: whether the disk has read any part.
 
     Raises:
         OSError: as `open` does.
@@ -46,7 +46,7 @@ class SegmentFile:
     def read(self, at: int, count: int, end: int | None = None) -> bytes:
         """Up to `count` bytes, none of them at or behind `end` (default: the file's).
 
-        What the disk cannot read is zeros: it fails the CRC of the record it was in, and no other.
+        A part that the disk cannot read is zeros: the CRC of its record fails, and no other.
         """
         count = min(count, (self.size if end is None else end) - at)
         if count <= 0:
@@ -82,29 +82,32 @@ _COUNT = struct.Struct("<Q")
 _MAX_SUMMARY_BYTES = 1 << 28
 
 
-class Seal(Struct, frozen=True):
-    """What the end of a segment says.
+class SegmentEnd(Struct, frozen=True):
+    """The index at the end of a segment.
 
-    `open`: it was never closed, or the cut went through its end. `broken`: closed, and damaged since.
+    Attributes:
+        state: `whole`; `open` = never closed, or cut off within the index; `broken` = closed, then damaged.
+        data_end: offset at which the last record ends.
+        keyframes: number of keyframes in the segment when it was closed.
     """
 
     state: Literal["whole", "broken", "open"]
-    data_end: int | None = None  # where the last record ends
-    keyframes: int | None = None  # that the segment held when it was closed
+    data_end: int | None = None
+    keyframes: int | None = None
 
 
-def read(source: SegmentFile) -> Seal:
-    """Look at the end of a segment."""
+def read_segment_end(source: SegmentFile) -> SegmentEnd:
+    """Read the index at the end of a segment."""
     closing = (
         source.read(source.size - len(MAGIC), len(MAGIC)) == MAGIC if source.size > len(MAGIC) else False
     )
     at = source.size - len(MAGIC) - _FOOTER.size
     summary = _summary(source, at) if at > 0 else None
     if summary is None:
-        return Seal("broken" if closing else "open")
+        return SegmentEnd("broken" if closing else "open")
     start, content = summary
     keyframes = _keyframes(content)
-    return Seal("whole" if closing else "broken", start - len(END_OF_DATA), keyframes)
+    return SegmentEnd("whole" if closing else "broken", start - len(END_OF_DATA), keyframes)
 
 
 def _summary(source: SegmentFile, footer_at: int) -> tuple[int, bytes] | None:

@@ -13,14 +13,14 @@ from msgspec import Struct
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import mcap_layout, segment_file
 from tsfusion.journal.mcap_layout import Position, Record
-from tsfusion.journal.record_scan import Damage, failed, segment_number, walk
+from tsfusion.journal.record_scan import Damage, journal_error, scan_records, segment_number
 from tsfusion.journal.segment_file import SegmentFile
 
 log = logging.getLogger(__name__)
 
 
-class Scan(Struct, frozen=True):
-    """A record that a scan found, without its frames."""
+class RecordEntry(Struct, frozen=True):
+    """A record without its frames, as a list of a journal holds it."""
 
     position: Position
     session: bytes
@@ -30,7 +30,7 @@ class Scan(Struct, frozen=True):
 
 
 def segments(folder: Path) -> list[int]:
-    """The numbers of a folder's segments, oldest first. Files that are named otherwise are not looked at.
+    """The numbers of a folder's segments, oldest first. Files with other names are passed over.
 
     Raises:
         JournalError: when the folder cannot be listed.
@@ -38,7 +38,7 @@ def segments(folder: Path) -> list[int]:
     try:
         names = os.listdir(folder)
     except OSError as error:
-        raise failed("list", folder, error) from error
+        raise journal_error("list", folder, error) from error
     return sorted(
         int(name[:-5])
         for name in names
@@ -68,19 +68,19 @@ def read_at(path: Path, offset: int) -> Record:
     """
     try:
         with SegmentFile(path) as source:
-            head = mcap_layout.head(source.read(offset, mcap_layout.HEAD_BYTES))
+            head = mcap_layout.parse_head(source.read(offset, mcap_layout.HEAD_BYTES))
             raw = b"" if head is None else source.read(offset, head.nbytes)
-            record = mcap_layout.unpack(raw, Position(segment_number(path), offset))
+            record = mcap_layout.parse_record(raw, Position(segment_number(path), offset))
             if record is None and source.failed:
                 raise OSError(errno.EIO, os.strerror(errno.EIO))
     except OSError as error:
-        raise failed("read", path, error) from error
+        raise journal_error("read", path, error) from error
     if record is None:
         raise JournalError(f"{path} holds no whole keyframe at byte {offset}")
     return record
 
 
-def scan(path: Path) -> tuple[list[Scan], int]:
+def list_records(path: Path) -> tuple[list[RecordEntry], int]:
     """Every whole record of a segment in order, and how many keyframes are lost to damage between them.
 
     A torn tail was never acknowledged and does not count as damage. Each damaged place is logged.
@@ -89,18 +89,18 @@ def scan(path: Path) -> tuple[list[Scan], int]:
         JournalError: when the file cannot be opened or read.
     """
     found, lost = [], 0
-    for step in walk(path):
+    for step in scan_records(path):
         if isinstance(step, Damage):
             lost += step.lost
             level = logging.ERROR if step.lost else logging.WARNING
             log.log(level, "%s", describe(path, step))
         else:
-            found.append(Scan(step.position, step.session, step.seq, step.client, step.nbytes))
+            found.append(RecordEntry(step.position, step.session, step.seq, step.client, step.nbytes))
     return found, lost
 
 
 def describe(path: Path, damage: Damage) -> str:
-    """A damaged place in a line."""
+    """Describe a damaged place in one line."""
     if damage.torn:
         outcome = "; nothing that was acknowledged is lost"
     else:
@@ -108,11 +108,24 @@ def describe(path: Path, damage: Damage) -> str:
     return f"{path}, byte {damage.position.offset}: {damage.what}{outcome}"
 
 
+def is_segment(path: Path) -> bool:
+    """Whether an `.mcap` file is a journal's, damaged or not, and no recording of another program."""
+    if path.suffix != ".mcap":
+        return False
+    try:
+        with path.open("rb") as file:
+            opening = file.read(len(mcap_layout.OPENING))
+    except OSError:  # to be reported by who reads it
+        return True
+    is_whole = len(opening) == len(mcap_layout.OPENING) and opening.startswith(mcap_layout.MAGIC)
+    return opening == mcap_layout.OPENING or not is_whole
+
+
 def is_closed(path: Path) -> bool:
     """Whether a segment ends with an index, as normal MCAP readers need it; False when it cannot be read."""
     try:
         with SegmentFile(path) as source:
-            return segment_file.read(source).state == "whole"
+            return segment_file.read_segment_end(source).state == "whole"
     except OSError:
         return False
 
@@ -123,4 +136,4 @@ def records(path: Path) -> Iterator[Record]:
     Raises:
         JournalError: when the file cannot be opened or read.
     """
-    return (step for step in walk(path) if isinstance(step, Record))
+    return (step for step in scan_records(path) if isinstance(step, Record))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where a server keeps its maps: `STATE/maps/NAME/`, each with its journal and its last checkpoint."""
+"""The folders of a server's maps, `STATE/maps/NAME/`, and the journals in them."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -7,10 +7,12 @@ from pathlib import Path
 
 from msgspec import Struct
 
+from tsfusion.core.config import MAP_NAME
 from tsfusion.core.errors import JournalError
 from tsfusion.journal.mcap_layout import Position, Record
-from tsfusion.journal.record_scan import Damage, failed, segment_number, walk
-from tsfusion.journal.segments import segment_path, segments
+from tsfusion.journal.quarantine import quarantined_files
+from tsfusion.journal.record_scan import Damage, journal_error, scan_records, segment_number
+from tsfusion.journal.segments import is_segment, segment_path, segments
 
 MAPS_FOLDER = "maps"
 JOURNAL_FOLDER = "journal"
@@ -18,46 +20,45 @@ QUARANTINE_FOLDER = "quarantine"
 CORRECTIONS_FOLDER = "corrections"
 MAP_FILE = "map.tsf"
 PREVIOUS_FILE = "map.previous.tsf"
-_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")  # as config.MapName
 
 
-def folder(state: str | Path, name: str) -> Path:
-    """Where a map is, or will be."""
+def map_folder(state: str | Path, name: str) -> Path:
+    """The folder in which a map is, or will be."""
     return Path(state) / MAPS_FOLDER / name
 
 
-def names(state: str | Path) -> list[str]:
-    """The maps that a state folder holds."""
+def map_names(state: str | Path) -> list[str]:
+    """Names of the maps in a state folder."""
     return sorted(
         path.name
         for path in (Path(state) / MAPS_FOLDER).glob("*")
-        if path.is_dir() and _NAME.fullmatch(path.name)
+        if path.is_dir() and re.fullmatch(MAP_NAME, path.name)
     )
 
 
-def is_state(path: Path) -> bool:
-    """Whether it is a server's state folder."""
+def is_state_folder(path: Path) -> bool:
+    """Whether a folder is a server's state folder."""
     return (path / MAPS_FOLDER).is_dir()
 
 
-def resolve(path: Path, name: str | None = None) -> Path:
+def resolve_map(path: Path, name: str | None = None) -> Path:
     """The map's folder when `path` is a state folder; any other path as it is.
 
     Args:
-        name: which of several.
+        name: of the map, where the state folder has several.
 
     Raises:
         JournalError: when it holds no map of that name, or several and none was named.
     """
-    if not is_state(path):
+    if not is_state_folder(path):
         if name is not None:
             raise JournalError(f"--map has no effect on {path}: only a state folder has several maps")
         return path
-    found = names(path)
+    found = map_names(path)
     if name is None and len(found) == 1:
-        return folder(path, found[0])
+        return map_folder(path, found[0])
     if name in found:
-        return folder(path, name)
+        return map_folder(path, name)
     there = ", ".join(found) or "none"
     if name is None and found:
         raise JournalError(
@@ -76,7 +77,7 @@ class JournalPlace(Struct, frozen=True):
 
     Attributes:
         path: a folder of segments, or one segment file.
-        quarantine: where the server of its map keeps what could not be fused; None = it is no map's.
+        quarantine: folder of the keyframes that could not be fused; None = the journal is no map's.
         corrections: where it keeps corrected poses; None = it is no map's.
     """
 
@@ -85,14 +86,15 @@ class JournalPlace(Struct, frozen=True):
     corrections: Path | None = None
 
     def files(self) -> list[Path]:
-        """Its segments, oldest first.
+        """Its segments, oldest first; of a quarantine its files.
 
         Raises:
             JournalError: when the folder cannot be listed.
         """
         if not self.path.is_dir():
             return [self.path]
-        return [segment_path(self.path, number) for number in segments(self.path)]
+        numbered = [segment_path(self.path, number) for number in segments(self.path)]
+        return numbered + quarantined_files(self.path)
 
     def quarantined(self) -> list[Path]:
         """The files in quarantine, by name.
@@ -105,15 +107,15 @@ class JournalPlace(Struct, frozen=True):
         try:
             return sorted(path for path in self.quarantine.iterdir() if path.suffix == ".mcap")
         except OSError as error:
-            raise failed("list", self.quarantine, error) from error
+            raise journal_error("list", self.quarantine, error) from error
 
     def steps(self, watch: Watcher = lambda _done, _all: None) -> Iterator[tuple[Path, Record | Damage]]:
-        """Each record and each damaged place, with its file. A file that cannot be read is one such place."""
+        """Records and damaged places, each with its file; a file that cannot be read is a damaged place."""
         files = [(path, _size(path)) for path in self.files()]
         total, before = sum(size for _, size in files), 0
         for path, size in files:
             try:
-                for step in walk(path):
+                for step in scan_records(path):
                     yield path, step
                     watch(before + min(step.position.offset, size), total)
             except JournalError as error:
@@ -122,11 +124,11 @@ class JournalPlace(Struct, frozen=True):
             watch(before, total)
 
 
-def find(path: Path, map_name: str | None = None) -> JournalPlace:
+def find_journal(path: Path, map_name: str | None = None) -> JournalPlace:
     """The journal at a path: a state folder, a map's folder in it, a folder of segments, or one segment.
 
     Args:
-        map_name: which map of a state folder with several.
+        map_name: of the map, where the state folder has several.
 
     Raises:
         JournalError: when there is none, or no single one.
@@ -135,7 +137,7 @@ def find(path: Path, map_name: str | None = None) -> JournalPlace:
         raise JournalError(
             f"{path} does not exist; expected a state folder, a map's, a journal or an .mcap file"
         )
-    path = resolve(path, map_name)
+    path = resolve_map(path, map_name)
     if (path / JOURNAL_FOLDER).is_dir():
         return _of_map(path)
     if path.name == JOURNAL_FOLDER and _is_map(path.parent):
@@ -145,6 +147,19 @@ def find(path: Path, map_name: str | None = None) -> JournalPlace:
     if path.suffix != ".mcap":
         raise JournalError(f"{path} is no journal; expected a folder or an .mcap file")
     return JournalPlace(path)
+
+
+def is_journal(path: Path) -> bool:
+    """Whether there is something to read at a path that `find_journal` takes.
+
+    Raises:
+        JournalError: when a folder cannot be listed.
+    """
+    if not path.is_dir():
+        return is_segment(path)
+    inside = path / JOURNAL_FOLDER
+    place = JournalPlace(inside if inside.is_dir() else path)
+    return is_state_folder(path) or any(map(is_segment, place.files()))
 
 
 def _of_map(folder: Path) -> JournalPlace:

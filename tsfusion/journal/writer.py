@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Writing the log: append, wait for the disk, begin the next segment, let old ones go."""
+"""Writing a journal: append, wait for the disk, begin the next segment, delete old ones."""
 
 import contextlib
 import logging
@@ -14,8 +14,8 @@ from tsfusion.core import durable_files
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import mcap_layout
 from tsfusion.journal.mcap_layout import Position
-from tsfusion.journal.record_scan import failed
-from tsfusion.journal.segments import Scan, scan, segment_path, segments
+from tsfusion.journal.record_scan import journal_error
+from tsfusion.journal.segments import RecordEntry, list_records, segment_path, segments
 
 log = logging.getLogger(__name__)
 
@@ -30,12 +30,12 @@ class Journal:
         min_free_bytes: what `append` leaves free on the disk.
 
     Attributes:
-        found: what the segments of earlier runs hold, in journal order; the caller may empty it.
-        damaged: how many of their records are damaged. A segment that is so from end to end counts as one.
+        found: records in the segments of earlier runs, in journal order; the caller may empty the list.
+        damaged: number of their damaged records. A segment that is damaged from end to end counts as one.
 
     Raises:
         JournalError: when the folder cannot be made or listed, or one of its segments cannot be read or is
-            of another version: what it holds would be passed over for ever.
+            of another version: its records would be passed over for ever.
     """
 
     def __init__(
@@ -55,12 +55,12 @@ class Journal:
         self._identity = b""
         self._first = 0  # where the open segment's first record starts
         self._closed: dict[int, int] = {}  # bytes by number, oldest first
-        self.found: list[Scan] = []
+        self.found: list[RecordEntry] = []
         self.damaged = 0
         try:
             durable_files.make_folder(self.folder)
         except OSError as error:
-            raise failed("create the journal", self.folder, error) from error
+            raise journal_error("create the journal", self.folder, error) from error
         self._recover()
 
     def _recover(self) -> None:
@@ -69,12 +69,12 @@ class Journal:
             path = segment_path(self.folder, number)
             self._closed[number] = 0
             try:
-                found, damaged = scan(path)
+                found, damaged = list_records(path)
                 self._closed[number] = path.stat().st_size
             except OSError as error:
-                raise _unopened(failed("read", path, error)) from error
+                raise _advise(journal_error("read", path, error)) from error
             except JournalError as error:
-                raise _unopened(error) from error
+                raise _advise(error) from error
             self.found += found
             self.damaged += damaged
         self._number = numbers[-1] + 1 if numbers else 1
@@ -95,7 +95,7 @@ class Journal:
 
     @property
     def first(self) -> int:
-        """The number of the oldest segment; more than 1 = older ones were let go."""
+        """The number of the oldest segment; more than 1 = older ones were deleted."""
         return next(iter(self._closed), self._number)
 
     @property
@@ -115,26 +115,25 @@ class Journal:
         """Write one message; it is on the disk when this returns.
 
         Args:
-            client: the name of who sent it, at most 32 bytes of UTF-8.
+            client: name of the sender, at most 32 bytes of UTF-8.
             logged_ns: wall clock; None = now.
 
         Raises:
             JournalError: when the disk refuses, or too little would stay free. Nothing of the message
                 counts then.
         """
-        self._room.take(sum(memoryview(frame).nbytes for frame in frames))
+        self._room.reserve(sum(memoryview(frame).nbytes for frame in frames))
         now_ns = time.time_ns() if logged_ns is None else logged_ns
         position = Position(self._number, 0)
         try:
             file = self._open()
             position = Position(self._number, file.tell())
-            mcap_layout.add(
-                self._writer, mcap_layout.pack(frames, self._identity, session, seq, client), seq, now_ns
-            )
+            payload = mcap_layout.pack_record(frames, self._identity, session, seq, client)
+            mcap_layout.write_record(self._writer, payload, seq, now_ns)
             self._flush()
         except OSError as error:
             self._abandon(position.offset)
-            raise failed("write", self.folder, error) from error
+            raise journal_error("write", self.folder, error) from error
         except BaseException:  # interrupted in between
             self._abandon(position.offset)
             raise
@@ -149,11 +148,11 @@ class Journal:
             os.fdatasync(self._file.fileno())
 
     def _rotate_or_abandon(self) -> None:
-        """The keyframe is on the disk, whatever becomes of the index that readers can do without."""
+        """Close the segment; an error is only logged: the keyframe is on the disk, with or without index."""
         try:
             self.rotate()
         except OSError as error:
-            log.warning("%s", failed("close", segment_path(self.folder, self._number), error))
+            log.warning("%s", journal_error("close", segment_path(self.folder, self._number), error))
             self._abandon()
 
     def rotate(self) -> None:
@@ -170,7 +169,7 @@ class Journal:
             self.rotate()
         except OSError as error:
             self._abandon()
-            raise failed("close", self.folder, error) from error
+            raise journal_error("close", self.folder, error) from error
 
     def forget(self, number: int) -> None:
         """Delete a closed segment whose keyframes are safe elsewhere.
@@ -182,7 +181,7 @@ class Journal:
         try:
             path.unlink()
         except OSError as error:
-            raise failed("delete", path, error) from error
+            raise journal_error("delete", path, error) from error
         self._closed.pop(number, None)
 
     def retire(self, below: int, limit: int) -> int:
@@ -210,7 +209,7 @@ class Journal:
             self._first = 0
             self._file = segment_path(self.folder, self._number).open("xb")
             self._identity = secrets.token_bytes(mcap_layout.IDENTITY_BYTES)
-            self._writer = mcap_layout.start(self._file, self._identity, time.time_ns())
+            self._writer = mcap_layout.begin_segment(self._file, self._identity, time.time_ns())
             # Before the first record: what a reader needs to find its way is never the end that a cut takes.
             self._flush()
             if self._sync:
@@ -219,7 +218,7 @@ class Journal:
         return self._file
 
     def _abandon(self, end: int | None = None) -> None:
-        """Leave the segment. What lies behind `end` was told as failed: it must not be found later on."""
+        """Leave the segment. Bytes behind `end` were reported as not written: nobody may find them later."""
         if self._file is None:
             return
         path, number = segment_path(self.folder, self._number), self._number
@@ -238,58 +237,55 @@ class Journal:
 
 
 def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, client: str = "") -> None:
-    """One message as a file of its own, in the form of a segment, whole or not at all.
+    """Write one message into a file of its own that has the form of a segment, whole or not at all.
 
     Raises:
         JournalError: when the disk refuses.
     """
-    partial = path.with_name(f".{path.name}.partial")
     identity, now_ns = secrets.token_bytes(mcap_layout.IDENTITY_BYTES), time.time_ns()
     try:
-        with partial.open("wb") as file:
-            writer = mcap_layout.start(file, identity, now_ns)
-            mcap_layout.add(writer, mcap_layout.pack(frames, identity, session, seq, client), seq, now_ns)
+        with durable_files.replacing(path) as file:
+            writer = mcap_layout.begin_segment(file, identity, now_ns)
+            payload = mcap_layout.pack_record(frames, identity, session, seq, client)
+            mcap_layout.write_record(writer, payload, seq, now_ns)
             writer.finish()
-        partial.replace(path)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
-        raise failed("write", path, error) from error
+        raise journal_error("write", path, error) from error
 
 
-def _unopened(error: JournalError) -> JournalError:
+def _advise(error: JournalError) -> JournalError:
     return JournalError(f"{error}; make it readable, or move it away to go on without its keyframes")
 
 
 def _cut(path: Path, end: int) -> None:
-    """Shorten a file, for good."""
+    """Shorten a file; it is so on the disk when this returns."""
     with path.open("r+b") as file:
         file.truncate(end)
         os.fsync(file.fileno())
 
 
-_LOOK_BYTES = 16 << 20  # written between two looks at the disk, at most
-_LOOK_SECONDS = 1.0
+_CHECK_BYTES = 16 << 20  # written between two checks of the disk, at most
+_CHECK_S = 1.0
 
 
 class FreeSpace:
-    """The room for writing on a folder's disk, of which `min_free_bytes` are not for us."""
+    """Room to write on a folder's disk, of which `min_free_bytes` stay free."""
 
     def __init__(self, folder: Path, min_free_bytes: int) -> None:
         self._folder = folder
         self._kept = min_free_bytes
-        self._left = 0  # may be written without another look
-        self._look_at = 0.0
+        self._left = 0  # bytes to write before the next check
+        self._check_at = 0.0
 
-    def take(self, nbytes: int) -> None:
+    def reserve(self, nbytes: int) -> None:
         """Raise JournalError when writing so much would leave too little."""
         now = time.monotonic()
-        if self._kept and (now >= self._look_at or nbytes > self._left):
+        if self._kept and (now >= self._check_at or nbytes > self._left):
             spare = self.free_bytes - self._kept
-            self._left = min(spare, max(_LOOK_BYTES, nbytes))
-            self._look_at = now + _LOOK_SECONDS
+            self._left = min(spare, max(_CHECK_BYTES, nbytes))
+            self._check_at = now + _CHECK_S
             if nbytes > spare:
-                self._look_at = 0.0
+                self._check_at = 0.0
                 raise JournalError(
                     f"cannot write {self._folder}: its disk has {_mb(spare + self._kept)} free, "
                     f"and {_mb(self._kept)} must stay so: free some space"

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core import durable_files
 from tsfusion.core.errors import OutputError
 from tsfusion.geometry.mesh import Mesh
 
@@ -207,14 +208,12 @@ def _write_png(rgb: NDArray[np.uint8], path: Path) -> None:
     import cv2
 
     done, encoded = cv2.imencode(".png", rgb[..., ::-1])
-    partial = path.with_name(f".{path.name}.partial")
+    if not done:
+        raise OutputError(f"cannot encode the picture {path}")
     try:
-        if not done:
-            raise OutputError(f"cannot encode the picture {path}")
-        partial.write_bytes(encoded.tobytes())
-        os.replace(partial, path)
+        with durable_files.replacing(path) as file:
+            file.write(encoded.tobytes())
     except OSError as error:
-        partial.unlink(missing_ok=True)
         raise OutputError(f"cannot write {path}: {error.strerror}") from error
 
 

@@ -97,7 +97,7 @@ def serving(server: ServerConfig, volume: VolumeConfig, scratch: Path) -> Iterat
         TransportError: when it does not get ready.
     """
     settings = scratch / "server.toml"
-    settings.write_text(config.dumps(Config(server=server, volume=volume)), encoding="utf-8")
+    settings.write_text(config.to_toml(Config(server=server, volume=volume)), encoding="utf-8")
     log = scratch / "server.log"
     with log.open("w", encoding="utf-8") as stderr:
         child = ServerChild(_start(settings, stderr), log)

@@ -7,7 +7,6 @@ The header is msgpack; a chunk is one zstd frame with the keys and then each lay
 blocks in key order; the digest is blake2b-128 of everything before it.
 """
 
-import contextlib
 import hashlib
 import os
 import struct
@@ -57,20 +56,11 @@ def write(
         CheckpointError: when the disk refuses.
     """
     header.blocks = len(keys)
-    partial = path.with_name(f".{path.name}.partial")
     try:
-        with partial.open("wb") as file:
+        with durable_files.replacing(path) as file:
             _write_body(file, header, keys, slots, layers)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-        durable_files.sync_folder(path.parent)
-    except BaseException as error:  # an interrupted one leaves no part either
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise CheckpointError(f"cannot write the map {path}: {error.strerror}") from error
-        raise
+    except OSError as error:
+        raise CheckpointError(f"cannot write the map {path}: {error.strerror}") from error
     return path
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import process
-from tsfusion.core.config import VIEW_SETTINGS, SensorModel, Surface, VolumeConfig, make, override
+from tsfusion.core.config import VIEW_SETTINGS, SensorModel, Surface, VolumeConfig, make_settings, override
 from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.geometry.mesh import Mesh
@@ -63,7 +63,7 @@ class Volume:
 
     def __init__(self, config: VolumeConfig | None = None, **settings: Any) -> None:
         if config is None:
-            config = make(VolumeConfig, settings)
+            config = make_settings(VolumeConfig, settings)
         elif settings:
             config = override(config, **settings)
         model = config.model()

@@ -1,4 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""What travels between scanner, server and viewers: the keyframe codec, control messages, and the sockets and
-keys they travel with.
-"""
+"""Messages between scanner, server and viewers: keyframe codec, control messages, sockets and keys."""

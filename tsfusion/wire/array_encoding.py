@@ -6,6 +6,7 @@ planes → zstd level 1. Neighbours in a depth image are alike, so the high plan
 `mm+dzp+zstd`: float32 metres that are whole millimetres, as int32.
 """
 
+import math
 from typing import Any
 
 import cv2
@@ -33,7 +34,7 @@ def unpack(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[
     Raises:
         Refused: `payload` unless the frame holds exactly this array.
     """
-    size = _count(shape) * dtype.itemsize
+    size = math.prod(shape) * dtype.itemsize
     check_zstd(frame, size)
     try:
         planes = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW_BYTES).decompress(
@@ -65,7 +66,7 @@ def pack_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
 
 
 def unpack_image(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """A JPEG or PNG whose file header was checked to announce `shape` (see `images.size`).
+    """A JPEG or PNG whose file header was checked to announce `shape` (see `image_headers.size`).
 
     Raises:
         Refused: `payload` unless it decodes to exactly that array.
@@ -147,7 +148,3 @@ def _whole_mm(points: NDArray[np.float32]) -> bool:
     if not bool((np.abs(points) < _MM_LIMIT / 1000).all()):
         return False
     return bool(np.array_equal(_from_mm(_to_mm(points)).view(np.uint32), points.view(np.uint32)))
-
-
-def _count(shape: tuple[int, ...]) -> int:
-    return int(np.prod(shape, dtype=np.int64))

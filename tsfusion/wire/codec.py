@@ -6,6 +6,7 @@ length, magic, struct limits, lengths against shapes, what the compressed frames
 and proper rotation, CRC. Decompression is left to `decode`.
 """
 
+import math
 import zlib
 from collections.abc import Sequence
 from typing import Any
@@ -18,19 +19,17 @@ from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, MAX_POINTS, Keyframe, check_intrinsics, check_pose
 from tsfusion.wire import array_encoding, image_headers
 from tsfusion.wire.keyframe_header import (
-    VERSION,
     ArrayCodec,
     ArrayName,
     Buffer,
     KeyframeHeader,
     Refused,
     pack,
-    stamp,
     unpack,
 )
 
 MIN_FRAMES, MAX_FRAMES = 2, 5
-_MAX_DECODED_BYTES = 256 << 20  # what a small message may unfold to
+_MAX_DECODED_BYTES = 256 << 20  # that a small message may unfold to
 _MAX_FRAME_BYTES = 32 << 20
 _MEASUREMENTS = ("depth", "disparity", "points")
 _ZSTD = ("dzp+zstd", "mm+dzp+zstd")
@@ -59,7 +58,7 @@ def encode(
     map_name: str = DEFAULT_MAP,
     jpeg_quality: int,
 ) -> list[bytes]:
-    """A keyframe as frames: the header, then one frame an array.
+    """Encode a keyframe as frames: the header, then one frame for each array.
 
     Depth, disparity, points, origins and confidence come back bit for bit; the colour image is JPEG.
     `sent_ns` is 0 until `stamp` fills it in.
@@ -97,7 +96,7 @@ def encode(
 
 
 def decode(frames: Sequence[Any]) -> Keyframe:
-    """The keyframe of a message.
+    """Decode the keyframe of a message.
 
     Raises:
         DecodeError: when the bytes are not a keyframe.
@@ -121,7 +120,7 @@ def decode(frames: Sequence[Any]) -> Keyframe:
 
 
 def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> KeyframeHeader:
-    """Everything that can be known of a message without decompressing it.
+    """Check everything that can be checked in a message without decompressing it; returns its header.
 
     Raises:
         Refused: (a DecodeError) with the `reason` it is counted under: `frames`, `header`, `magic`,
@@ -140,7 +139,7 @@ def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> Key
 
 
 def measurement(header: KeyframeHeader) -> str:
-    """`depth`, `disparity` or `points`."""
+    """The measurement that a keyframe carries: `depth`, `disparity` or `points`."""
     return next(buffer.name for buffer in header.buffers if buffer.name in _MEASUREMENTS)
 
 
@@ -214,7 +213,7 @@ def _pose(header: KeyframeHeader) -> NDArray[np.float64]:
 
 
 def _decoded_bytes(buffer: Buffer) -> int:
-    return int(np.prod(buffer.shape, dtype=np.int64)) * np.dtype(buffer.dtype).itemsize
+    return math.prod(buffer.shape) * np.dtype(buffer.dtype).itemsize
 
 
 def _arrays(keyframe: Keyframe) -> list[tuple[ArrayName, NDArray[Any]]]:
@@ -242,6 +241,3 @@ def _unpack(buffer: Buffer, frame: Any) -> NDArray[Any]:
     if buffer.codec == "mm+dzp+zstd":
         return array_encoding.unpack_mm(frame, buffer.shape)
     return array_encoding.unpack_image(frame, dtype, buffer.shape)
-
-
-__all__ = ["VERSION", "Buffer", "KeyframeHeader", "Refused", "check", "decode", "encode", "stamp", "unpack"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What happens on a client's connection, in words for a person.
+"""Why a client's connection is not made, in words for a person.
 
 libzmq's `send` succeeds while the other side turns the connection away, so its events are watched instead.
 Measured with libzmq 4.3.5:
@@ -36,23 +36,23 @@ _EVENTS = (
     | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 )
 _MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
-_TURNED_AWAY = 1.0  # seconds: who closes the connection later than this has not judged it, but is stuck
-_IN_A_ROW = 2  # one may be a server that ends
-_RETRIED_WITHIN = 0.5  # seconds: libzmq says at once when it is going to try again
+_REFUSAL_S = 1.0  # a server that closes the connection later than this has not refused it, but is stuck
+_MIN_FAILURES = 2  # one may be a server that ends
+_RETRY_S = 0.5  # libzmq reports at once when it is going to try again
 _numbers = itertools.count()
 
 
 class ConnectionMonitor:
-    """Watches one connecting socket; make it before `connect`, close it before the socket.
+    """Monitor of one connecting socket; make it before `connect`, close it before the socket.
 
     Attributes:
-        socket: becomes readable when something has happened. Call `problem` then, and every now and then.
+        socket: becomes readable when something has happened; call `problem` then, and from time to time.
         connected: whether the handshake is done and the connection stands.
-        made: connections that stood, this one included. What was sent on an earlier one may be lost: send it
-            again when this rises, not before, or it goes where the last one went.
-        lost: connections that stood and have ended.
+        made: number of connections made so far, this one included. Messages on earlier ones may be lost: send
+            them again when this rises; before that they would be lost, too.
+        lost: number of connections that were made and have ended.
         gave_up: libzmq will not try again, whatever the server does: close the socket and make another.
-        refused: the server has certainly turned us away.
+        refused: the server has certainly refused this client.
     """
 
     def __init__(self, socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = None) -> None:
@@ -65,7 +65,7 @@ class ConnectionMonitor:
         self._watched = socket
         self._key = keys.public if keys else ""
         self._connected_at = 0.0
-        self._ended_at = 0.0  # 0 = it stands, or is being tried
+        self._ended_at = 0.0  # 0 = connected, or about to be
         self._failures = 0
         # A name of its own: pyzmq names the endpoint by a file descriptor, which may be in use again.
         endpoint = f"inproc://tsfusion-monitor-{next(_numbers)}"
@@ -82,7 +82,7 @@ class ConnectionMonitor:
         self.socket.close()
 
     def problem(self) -> str | None:
-        """What keeps the connection from being made; empty = it is made; None = nothing new."""
+        """The reason why there is no connection; empty = it is made; None = nothing new."""
         news: str | None = None
         while True:
             try:
@@ -90,14 +90,14 @@ class ConnectionMonitor:
             except zmq.Again:
                 break
             event, value = struct.unpack("=HI", head)
-            said = self._on(event, value)
-            news = news if said is None else said
-        if self._ended_at and not self.gave_up and time.monotonic() - self._ended_at > _RETRIED_WITHIN:
+            problem = self._handle_event(event, value)
+            news = news if problem is None else problem
+        if self._ended_at and not self.gave_up and time.monotonic() - self._ended_at > _RETRY_S:
             self.gave_up = True
             news = f"what answers at {self.address} is no tsfusion server, or was garbled on the way"
         return news
 
-    def _on(self, event: int, value: int) -> str | None:
+    def _handle_event(self, event: int, value: int) -> str | None:
         if event == zmq.EVENT_CONNECTED:
             self._connected_at, self._ended_at = time.monotonic(), 0.0
         elif event == zmq.EVENT_CONNECT_RETRIED:
@@ -112,22 +112,22 @@ class ConnectionMonitor:
             self._ended_at = time.monotonic()
         elif event == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
             self.refused = self.gave_up = True
-            return self._unknown()
+            return self._unknown_key()
         elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
             self.gave_up = True
             self.refused = value == _MISMATCH
-            return (
-                self._mismatch() if self.refused else f"what answers at {self.address} is no tsfusion server"
-            )
+            if self.refused:
+                return self._keys_on_one_side()
+            return f"what answers at {self.address} is no tsfusion server"
         else:
-            return self._turned_away()
+            return self._handshake_failed()
         return None
 
-    def _turned_away(self) -> str | None:
-        if time.monotonic() - self._connected_at > _TURNED_AWAY:
+    def _handshake_failed(self) -> str | None:
+        if time.monotonic() - self._connected_at > _REFUSAL_S:
             return f"the server at {self.address} takes the connection, but says nothing"
         self._failures += 1
-        if self._failures < _IN_A_ROW:
+        if self._failures < _MIN_FAILURES:
             return None
         if self._key:
             return (
@@ -139,7 +139,7 @@ class ConnectionMonitor:
             "for keys and this client has none"
         )
 
-    def _unknown(self) -> str:
+    def _unknown_key(self) -> str:
         key = shlex.quote(self._key)
         key = f"-- {key}" if self._key.startswith("-") else key  # no option
         return (
@@ -147,7 +147,7 @@ class ConnectionMonitor:
             f"on the server, run `tsfusion keys allow NAME {key}`"
         )
 
-    def _mismatch(self) -> str:
+    def _keys_on_one_side(self) -> str:
         if self._key:
             return (
                 f"this client has keys, but the server at {self.address} was started without: leave them out"

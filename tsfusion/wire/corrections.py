@@ -256,7 +256,8 @@ def write(path: Path, corrections: SessionCorrections) -> None:
     for part in parts:
         digest.update(part)
     try:
-        durable_files.replace(path, [*parts, digest.digest()])
+        with durable_files.replacing(path) as file:
+            file.writelines([*parts, digest.digest()])
     except OSError as error:
         raise JournalError(f"cannot write {path}: {error.strerror or error}") from error
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""CURVE keys: their files, and how a socket gets them.
+"""CURVE keys: reading their files, and setting them on sockets.
 
 A key is 40 characters (Z85 of 32 bytes). Files are ZeroMQ certificates, as `zmq.auth.load_certificate` reads
 them: `NAME.key` holds the public key, `NAME.key_secret` both.
@@ -19,7 +19,7 @@ from zmq.utils import z85
 
 from tsfusion.core.errors import InvalidConfig
 
-DOMAIN = b"tsfusion"  # of the questions to `zap.Zap`
+DOMAIN = b"tsfusion"  # of the requests to the ZAP handler
 PUBLIC, SECRET = ".key", ".key_secret"
 SERVER = "server"  # the name of a server's own pair in its folder
 
@@ -83,7 +83,7 @@ def server_keys(folder: str | os.PathLike[str]) -> ServerKeys:
 
 
 def client_keys(key: str | None, server_key: str | None) -> ClientKeys | None:
-    """What `ClientConfig.key` and `ClientConfig.server_key` say; None when neither is given.
+    """Read the keys that `ClientConfig.key` and `.server_key` name; None when neither is given.
 
     Args:
         key: the client's own secret key, a file.
@@ -105,7 +105,7 @@ def client_keys(key: str | None, server_key: str | None) -> ClientKeys | None:
 
 
 def public_key(given: str) -> str:
-    """A public key, from a file or from its 40 characters.
+    """Read a public key from a file, or take its 40 characters.
 
     Raises:
         InvalidConfig: when it is neither.
@@ -124,7 +124,7 @@ def public_key(given: str) -> str:
 
 
 def read_pair(path: Path) -> tuple[str, str]:
-    """Public and secret key of a file that only its owner can read.
+    """Read public and secret key from a file that only its owner can read.
 
     Raises:
         InvalidConfig: for a file that is missing or malformed, or that others can read.
@@ -138,7 +138,7 @@ def read_pair(path: Path) -> tuple[str, str]:
 
 
 def is_key(text: str) -> bool:
-    """Whether these are 40 characters that stand for 32 bytes."""
+    """Whether a text is a key: 40 characters that stand for 32 bytes."""
     try:
         return len(z85.decode(text)) == _KEY_BYTES
     except (ValueError, KeyError, struct.error):  # wrong length, other characters, more than 32 bits in five
@@ -146,7 +146,7 @@ def is_key(text: str) -> bool:
 
 
 def _read(path: Path, *, secret: bool) -> dict[str, str]:
-    """The keys that a file holds, by kind."""
+    """Read the keys in a file, by kind."""
     try:
         with path.open("rb") as file:
             mode = os.fstat(file.fileno()).st_mode

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Health and status: how a server and a map are doing."""
+"""Health and status of a server and its maps, as they are sent to whoever asks."""
 
 from typing import Any, Literal
 
@@ -9,7 +9,7 @@ from tsfusion.wire.keyframe_times import Spread
 
 
 class MeshLayout(Struct, frozen=True, kw_only=True):
-    """Shapes of the frames that follow: vertices float32, faces int32, normals float32, colors uint8."""
+    """Row counts of the frames that follow: vertices float32, faces int32, normals float32, colors uint8."""
 
     vertices: int
     faces: int
@@ -20,15 +20,15 @@ MapState = Literal["opening", "idle", "busy", "restarting", "failed"]
 
 
 class MapHealth(Struct, frozen=True, kw_only=True):
-    """How one map is doing, as far as the gateway knows without asking its fuser.
+    """Health of one map, as far as the gateway knows it without asking the fuser.
 
     Attributes:
-        problem: what keeps it from taking or fusing keyframes; empty = nothing.
-        waiting: durable, not yet fused or rejected.
-        rejected: journaled, but not fusable: reason → count.
-        quarantined: keyframes kept aside for inspection.
-        last_keyframe_s: seconds since the last one was journaled; None = none since the server began.
-        delay_bound_ms: the delays are right to within so much (half the best round trip, the worst client's).
+        problem: reason why keyframes are not accepted or not fused; empty = they are.
+        waiting: number of keyframes that are durable, but not yet fused or rejected.
+        rejected: number of journaled keyframes that could not be fused, by reason.
+        quarantined: number of keyframes kept aside for inspection.
+        last_keyframe_s: seconds since the last keyframe was journaled; None = none since the server began.
+        delay_bound_ms: error bound of the delays (half the best round trip of the worst client).
     """
 
     state: MapState
@@ -51,14 +51,14 @@ class MapHealth(Struct, frozen=True, kw_only=True):
 
 
 class ClientHealth(Struct, frozen=True, kw_only=True):
-    """One session that was heard since the server began.
+    """Health of one session that sent a message since the server began.
 
     Attributes:
-        client: the name its key is allowed under; empty without keys.
-        session: the first 8 hexadecimal digits.
+        client: name that its key is allowed under; empty without keys.
+        session: first 8 hexadecimal digits of its number.
         heard_s: seconds since its last message.
-        waiting, skipped: as its last Ping said.
-        held: why nothing is taken from it now; empty = it is.
+        waiting, skipped: as in its last Ping.
+        held: reason why no keyframe of it is accepted now; empty = they are.
         revision, corrected: of its corrections the newest, and how many keyframes they name.
     """
 
@@ -77,9 +77,9 @@ class ClientHealth(Struct, frozen=True, kw_only=True):
 
 
 class Health(Struct, frozen=True, kw_only=True):
-    """How a server is doing, answered at once whatever its fusers do. Counts are since it began.
+    """Health of a server, answered at once whatever its fusers do. Counts begin with its start.
 
-    `ready`: keyframes are accepted, journaled and fused. `problems`: why not, or what needs a person.
+    `ready`: keyframes are accepted, journaled and fused. `problems`: why not, or what a person must do.
     """
 
     ready: bool
@@ -94,7 +94,7 @@ class Health(Struct, frozen=True, kw_only=True):
 
 
 class Status(Struct, frozen=True, kw_only=True):
-    """How a map is doing. Counts are of the whole journal and map; the delay of this process."""
+    """Status of a map. Counts are of the whole journal and map, the delay is of this process."""
 
     epoch: str
     map: str
@@ -117,6 +117,6 @@ class Status(Struct, frozen=True, kw_only=True):
     fuser_restarts: int
     peak_rss_bytes: dict[str, int]  # server (gateway), fuser
     delay_ms: Spread  # capture to fused, of the last 1024 keyframes
-    delay_bound_ms: float  # that is right to within so much
+    delay_bound_ms: float  # error bound of the delay
     config: dict[str, Any]  # server and volume settings
     versions: dict[str, str]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""What a PNG or JPEG says of itself, read before it is decoded and more strictly than decoders do.
+"""The size in the header of a PNG or JPEG, read before decoding and more strictly than decoders do.
 
 OpenCV's decoders believe what they read: a PNG of fifty bytes can have them take two gigabytes, and a JPEG
-can show its reader one size and them another. So only files are taken that can be read in one way alone.
+can have one size here and another one there. So only files are accepted that can be read in one way alone.
 """
 
 import re
@@ -17,22 +17,7 @@ _PNG_HEADER = struct.Struct(">I4sII")  # length, kind, width, height
 _PNG_CHUNK = struct.Struct(">I4s")
 _PNG_AROUND = 12  # bytes of a chunk besides its content
 # No animation (other sizes), and nothing compressed but the image: zTXt, iTXt, iCCP unfold at will.
-_PNG_KINDS = frozenset(
-    (
-        b"PLTE",
-        b"IDAT",
-        b"tRNS",
-        b"gAMA",
-        b"cHRM",
-        b"sRGB",
-        b"sBIT",
-        b"bKGD",
-        b"pHYs",
-        b"tIME",
-        b"tEXt",
-        b"oFFs",
-    )
-)
+_PNG_KINDS = frozenset(b"PLTE IDAT tRNS gAMA cHRM sRGB sBIT bKGD pHYs tIME tEXt oFFs".split())
 _MAX_PNG_CHUNKS = 1 << 14  # writers of PNG begin a new one every 8 kB or more
 
 _JPEG = b"\xff\xd8"
@@ -44,7 +29,7 @@ _SCAN = re.compile(rb"\xff\xda")
 
 
 def size(frame: Any) -> tuple[int, int]:
-    """(height, width) that a PNG or JPEG announces, without decoding it.
+    """Read (height, width) of a PNG or JPEG without decoding it.
 
     Raises:
         Refused: `payload` when it is neither, or could cost its decoder more than an image of that size.

@@ -10,6 +10,7 @@ The folder is its owner's alone (0700), every file 0600 from its first byte, and
 """
 
 import logging
+import math
 import os
 import re
 import stat
@@ -21,15 +22,14 @@ import msgspec
 import zmq
 from msgspec import Meta, Struct
 
-from tsfusion.core import durable_files
+from tsfusion.core import durable_files, folder_lock
 from tsfusion.core.config import ClientName
-from tsfusion.core.errors import InvalidConfig
+from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.wire import curve
 
 log = logging.getLogger(__name__)
 
 ALLOWED = "allowed.toml"
-DEFAULT_FOLDER = "tsfusion-keys"
 
 _MAX_LIST_BYTES = 1 << 20
 _RETRY = 1.0  # seconds
@@ -40,20 +40,20 @@ Folder = str | os.PathLike[str]
 
 
 class Allowed(Struct, frozen=True, forbid_unknown_fields=True):
-    """An allow-list. No key is in it twice."""
+    """The allow-list of a server. No key is in it twice."""
 
     allowed: dict[ClientName, Annotated[str, Meta(max_length=64)]] = {}  # name → public key
     revoked: dict[str, ClientName] = {}  # public key → the name it had
 
 
 class Pair(Struct, frozen=True):
-    """One of a folder's own pairs."""
+    """The name and public key of a pair in the folder."""
 
     name: str
     public: str
 
 
-def create(folder: Folder, name: str, *, force: bool = False) -> Pair:
+def create_pair(folder: Folder, name: str, *, force: bool = False) -> Pair:
     """Make a pair of keys under this name.
 
     Args:
@@ -64,24 +64,25 @@ def create(folder: Folder, name: str, *, force: bool = False) -> Pair:
         OutputError: when the files cannot be written.
     """
     check_name(name)
-    place = durable_files.made(Path(folder).expanduser())
-    with durable_files.locked(place):
+    place = Path(folder).expanduser()
+    durable_files.make_private_folder(place)
+    with folder_lock.hold(place, wait=math.inf):
         paths = [place / f"{name}{ending}" for ending in (curve.SECRET, curve.PUBLIC)]
         for path in paths:
             if path.exists() and not force:
                 raise InvalidConfig(f"{path} exists; choose another name, or replace it by --force")
-        public, secret = _draw()
+        public, secret = _new_pair()
         lines = f'curve\n    public-key = "{public}"\n'
         secret_line = f'    secret-key = "{secret}"\n'
-        durable_files.write(paths[0], _PAIR_HEAD.format("**Secret** Certificate") + lines + secret_line)
-        durable_files.write(paths[1], _PAIR_HEAD.format("Public Certificate") + lines)
+        _write(paths[0], _PAIR_HEAD.format("**Secret** Certificate") + lines + secret_line)
+        _write(paths[1], _PAIR_HEAD.format("Public Certificate") + lines)
         if name == curve.SERVER and not (place / ALLOWED).exists():
-            durable_files.write(place / ALLOWED, _dumps(Allowed()))
+            _write(place / ALLOWED, _format_list(Allowed()))
     return Pair(name, public)
 
 
 def allow(folder: Folder, name: str, key: str) -> str | None:
-    """Let a client with this public key in, under this name. The name's earlier key no longer is.
+    """Allow a client with this public key under this name; the name's earlier key is revoked.
 
     Args:
         key: 40 characters, or a file.
@@ -95,58 +96,58 @@ def allow(folder: Folder, name: str, key: str) -> str | None:
     """
     check_name(name)
     public = curve.public_key(key)
-    place = _existing(folder)
-    with durable_files.locked(place):
+    place = _existing_folder(folder)
+    with folder_lock.hold(place, wait=math.inf):
         own = curve.server_keys(place).public
-        listed = read_list(place) if has_list(place) else Allowed()
+        listed = read_allow_list(place) if has_allow_list(place) else Allowed()
         earlier = listed.allowed.get(name)
-        _check_free(name, public, own, listed)
+        _check_not_taken(name, public, own, listed)
         if earlier == public:
             return None
         revoked = {key: was for key, was in listed.revoked.items() if key != public}
         if earlier is not None:
             revoked[earlier] = name
-        durable_files.write(place / ALLOWED, _dumps(Allowed({**listed.allowed, name: public}, revoked)))
+        _write(place / ALLOWED, _format_list(Allowed({**listed.allowed, name: public}, revoked)))
     return earlier
 
 
 def revoke(folder: Folder, name: str) -> str:
-    """Keep the client of this name out; returns its key.
+    """Revoke the key of the client of this name; returns the key.
 
     Raises:
         InvalidConfig: when no key is allowed under the name.
         OutputError: when the list cannot be written.
     """
-    place = _existing(folder)
-    with durable_files.locked(place):
-        listed = read_list(place)
+    place = _existing_folder(folder)
+    with folder_lock.hold(place, wait=math.inf):
+        listed = read_allow_list(place)
         if name not in listed.allowed:
             names = ", ".join(sorted(listed.allowed)) or "nobody is allowed"
             raise InvalidConfig(f"no key is allowed under the name {name!r}, but: {names}")
         left = dict(listed.allowed)
         key = left.pop(name)
-        durable_files.write(place / ALLOWED, _dumps(Allowed(left, {**listed.revoked, key: name})))
+        _write(place / ALLOWED, _format_list(Allowed(left, {**listed.revoked, key: name})))
     return key
 
 
-def pairs(folder: Folder) -> list[Pair]:
-    """The folder's own pairs, by name.
+def list_pairs(folder: Folder) -> list[Pair]:
+    """List the folder's own pairs by name.
 
     Raises:
         InvalidConfig: when the folder or a pair cannot be read.
     """
-    place = _existing(folder)
+    place = _existing_folder(folder)
     found = sorted(place.glob(f"*{curve.SECRET}"))
     return [Pair(path.name.removesuffix(curve.SECRET), curve.read_pair(path)[0]) for path in found]
 
 
-def has_list(folder: Folder) -> bool:
-    """Whether it is a server's folder."""
+def has_allow_list(folder: Folder) -> bool:
+    """Whether a folder has an allow-list: whether it is a server's."""
     return os.path.lexists(Path(folder).expanduser() / ALLOWED)
 
 
-def read_list(folder: Folder) -> Allowed:
-    """The allow-list of a server's folder.
+def read_allow_list(folder: Folder) -> Allowed:
+    """Read the allow-list of a server's folder.
 
     Raises:
         InvalidConfig: when it is missing or malformed, or others could change it.
@@ -158,13 +159,13 @@ def read_list(folder: Folder) -> Allowed:
             content = file.read(_MAX_LIST_BYTES + 1)
     except OSError as error:
         raise InvalidConfig(f"cannot read the allow-list {path}: {error.strerror}") from error
-    if durable_files.others_can_change(mode):
+    if durable_files.others_can_write(mode):
         raise InvalidConfig(f"others can change the allow-list {path} (mode {stat.S_IMODE(mode):04o})")
-    return _loads(content, path)
+    return _parse_list(content, path)
 
 
 def check_name(name: str) -> None:
-    """Raise InvalidConfig unless a client can be called so."""
+    """Raise InvalidConfig unless a client can have this name."""
     try:
         msgspec.convert(name, ClientName)
     except msgspec.ValidationError as error:
@@ -174,10 +175,10 @@ def check_name(name: str) -> None:
 
 
 class AllowList:
-    """Who may connect, as the file says now. Nobody, while it cannot be read.
+    """Names and keys of the clients that may connect, as in the file now; nobody while it cannot be read.
 
     Attributes:
-        problem: why it cannot be read; empty = it can.
+        problem: reason why the file cannot be read; empty = it can.
     """
 
     def __init__(self, folder: Folder) -> None:
@@ -191,42 +192,38 @@ class AllowList:
         self.refresh()
 
     def refresh(self) -> bool:
-        """Read the file again if it has changed; microseconds if not. Whether anyone is no longer who it was.
-
-        Never raises.
-        """
+        """Read the file again if it has changed; returns whether a key has lost its name. Never raises."""
         seen = self._stamp()
         if seen == self._seen and not (self.problem and time.monotonic() > self._again):
             return False
         before, self._seen = self._names, seen
         try:
-            durable_files.checked(self._folder)
-            listed = read_list(self._folder)
+            durable_files.check_private_folder(self._folder)
+            listed = read_allow_list(self._folder)
         except InvalidConfig as error:
             self._fail(str(error))
         else:
             self.problem = ""
             self._names = {key: name for name, key in listed.allowed.items()}
             self._revoked = dict(listed.revoked)
-            log.log(
-                logging.INFO if self._names else logging.WARNING,
-                "clients that may connect: %d, keys revoked: %d", len(self._names), len(self._revoked),
-            )  # fmt: skip
+            level = logging.INFO if self._names else logging.WARNING
+            counts = len(self._names), len(self._revoked)
+            log.log(level, "clients that may connect: %d, keys revoked: %d", *counts)
         return any(self._names.get(key) != name for key, name in before.items())
 
     def name_of(self, key: str | None) -> str | None:
-        """The name that a public key is allowed under; None = it is not."""
+        """The name under which a public key is allowed; None = it is not allowed."""
         return self._names.get(key) if key is not None else None
 
-    def why_not(self, key: str) -> str:
-        """A word for why a key is not allowed."""
+    def rejection_reason(self, key: str) -> str:
+        """One word for the reason why a key is not allowed."""
         if self.problem:
             return "allow-list"
         return "revoked" if key in self._revoked else "unknown"
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Everybody who is allowed."""
+        """Names of all clients that are allowed."""
         return tuple(sorted(self._names.values()))
 
     def _stamp(self) -> tuple[int, ...] | None:
@@ -244,17 +241,27 @@ class AllowList:
         self._names, self._revoked = {}, {}
 
 
-def _existing(folder: Folder) -> Path:
+def _existing_folder(folder: Folder) -> Path:
+    place = Path(folder).expanduser()
     try:
-        return durable_files.checked(Path(folder).expanduser())
+        durable_files.check_private_folder(place)
     except InvalidConfig as error:
         raise InvalidConfig(
             f"{error}; `tsfusion keys new {curve.SERVER}` makes a server's folder of keys, "
             "`tsfusion keys new NAME` a scanner's"
         ) from error
+    return place
 
 
-def _loads(content: bytes, path: Path) -> Allowed:
+def _write(path: Path, text: str) -> None:
+    try:
+        with durable_files.replacing(path, private=True) as file:
+            file.write(text.encode())
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _parse_list(content: bytes, path: Path) -> Allowed:
     try:
         listed = msgspec.toml.decode(content, type=Allowed)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -267,7 +274,7 @@ def _loads(content: bytes, path: Path) -> Allowed:
     return listed
 
 
-def _dumps(listed: Allowed) -> str:
+def _format_list(listed: Allowed) -> str:
     lines = [_LIST_HEAD, "[allowed]"]  # a Z85 key has no quote and no backslash
     lines += [f'"{name}" = "{key}"' for name, key in sorted(listed.allowed.items())]
     lines += ["", "[revoked]"]
@@ -275,7 +282,7 @@ def _dumps(listed: Allowed) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _check_free(name: str, public: str, own: str, listed: Allowed) -> None:
+def _check_not_taken(name: str, public: str, own: str, listed: Allowed) -> None:
     if name == curve.SERVER or public == own:
         raise InvalidConfig("that is the server's own: a client has a name and a pair of keys of its own")
     for other, key in listed.allowed.items():
@@ -285,8 +292,8 @@ def _check_free(name: str, public: str, own: str, listed: Allowed) -> None:
             )
 
 
-def _draw() -> tuple[str, str]:
-    """A new pair whose public key cannot be taken for an option."""
+def _new_pair() -> tuple[str, str]:
+    """Draw a pair whose public key cannot be taken for an option."""
     while True:
         public, secret = (key.decode("ascii") for key in zmq.curve_keypair())
         if re.match("[0-9a-zA-Z]", public):

@@ -25,7 +25,7 @@ Natural = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
 
 
 class Refused(DecodeError):
-    """A message that is not a keyframe; `reason` is the short name it is counted under."""
+    """A message that is not a keyframe; `reason` is the word under which it is counted."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
@@ -44,7 +44,7 @@ class Buffer(Struct, frozen=True, kw_only=True):
 
 
 class KeyframeHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """Everything of a keyframe but its arrays.
+    """All of a keyframe except its arrays.
 
     Attributes:
         session: 16 random bytes, one value a spool.
@@ -77,7 +77,7 @@ _DECODER = msgspec.msgpack.Decoder(KeyframeHeader)
 
 
 def pack(header: KeyframeHeader) -> bytes:
-    """The bytes of frame 0."""
+    """Encode frame 0."""
     return _PREFIX + msgspec.msgpack.encode(header)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The stamps of a keyframe, its stages, their spread."""
+"""Time stamps of a keyframe, the stages between them, and statistics over many keyframes."""
 
 from typing import Annotated
 
@@ -11,7 +11,7 @@ Seq = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
 
 
 class Stamps(Struct, frozen=True, array_like=True):
-    """When the server did what with one keyframe; 0 = not yet."""
+    """Server times of one keyframe, monotonic nanoseconds; 0 = not yet."""
 
     seq: Seq
     received_ns: int = 0
@@ -22,7 +22,7 @@ class Stamps(Struct, frozen=True, array_like=True):
 
 
 class Spread(Struct, frozen=True, kw_only=True):
-    """Milliseconds over so many keyframes; all 0 where there is none."""
+    """Statistics of a duration over `count` keyframes, milliseconds; all 0 where there is none."""
 
     count: int = 0
     mean: float = 0.0
@@ -50,7 +50,7 @@ class KeyframeTimes(Struct, kw_only=True):
     clock_bound_ns: int = 0
 
 
-# A stage lasts from one stamp to the next; together they are the way of a keyframe.
+# A stage lasts from one stamp to the next; together they are a keyframe's way from capture to mesh.
 STAGES: dict[str, tuple[str, str]] = {
     "encode": ("captured_ns", "sent_ns"),
     "wire": ("sent_ns", "received_ns"),

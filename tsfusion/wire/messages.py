@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What scanner and server say to each other on the control socket (msgpack of tagged structs).
+"""Control messages between scanner and server (msgpack of tagged structs).
 
 All `*_ns` stamps of the server are its own monotonic clock; the client shifts them to its own.
 """
@@ -74,9 +74,9 @@ class Nack(Struct, frozen=True, tag="nack"):
 
 
 class Hold(Struct, frozen=True, tag="hold"):
-    """Nothing is taken from this session for so long: keep everything, then go on from durable + 1.
+    """No keyframe of this session is accepted for `seconds`: keep all, then go on from durable + 1.
 
-    `reason`: `disk` (full or failing) or `quota`; `message` says it to a person.
+    `reason`: `disk` (full or failing) or `quota`; `message` explains it to a person.
     """
 
     session: SessionId
@@ -118,13 +118,14 @@ class Denied(Struct, frozen=True, tag="denied"):
 
 
 class Ping(Struct, frozen=True, tag="ping", omit_defaults=True):
-    """A client is alive, and how it is doing.
+    """Sign of life of a client, and how it is doing.
 
     Attributes:
-        offset_ns: what the client takes the server's clock minus its own to be (None = not yet known).
-        bound_ns: the most that this can be wrong.
-        waiting: keyframes in its spool.
-        skipped: keyframes that were never spooled or left it unsent, by reason, since the client began.
+        offset_ns: the client's estimate of the server's clock minus its own (None = not yet known).
+        bound_ns: error bound of this estimate.
+        waiting: number of keyframes in its spool.
+        skipped: number of keyframes that were not spooled or left the spool unsent, by reason, since the
+            client began.
     """
 
     session: Annotated[bytes, Meta(max_length=16)]
@@ -136,6 +137,8 @@ class Ping(Struct, frozen=True, tag="ping", omit_defaults=True):
 
 
 class Pong(Struct, frozen=True, tag="pong"):
+    """The answer to a Ping."""
+
     epoch: str
     ping_sent_ns: int
     received_ns: int
@@ -173,12 +176,12 @@ encode = msgspec.msgpack.encode
 
 
 def decode_to_server(frame: Any) -> ToServer:
-    """Raises DecodeError for anything but a message to the server."""
+    """Decode a message to the server; raises DecodeError for anything else."""
     return _decode(_TO_SERVER, frame)  # type: ignore[no-any-return]
 
 
 def decode_to_client(frame: Any) -> ToClient:
-    """Raises DecodeError for anything but a message to the client."""
+    """Decode a message to the client; raises DecodeError for anything else."""
     return _decode(_TO_CLIENT, frame)  # type: ignore[no-any-return]
 
 
@@ -189,8 +192,8 @@ def _decode(decoder: Any, frame: Any) -> Any:
         raise DecodeError(f"not a control message: {error}") from error
 
 
-def said(frames: Sequence[Any]) -> ToServer:
-    """What a control message says. Only corrections have frames behind their head.
+def decode_frames_to_server(frames: Sequence[Any]) -> ToServer:
+    """Decode a control message of several frames; only corrections have any behind the first.
 
     Raises:
         DecodeError: for anything but a message to the server.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a running server can be asked: its health, a map's status, a map's mesh."""
+"""Queries to a running server: its health, the status of a map, the mesh of a map."""
 
 import time
 from contextlib import suppress
@@ -20,13 +20,13 @@ from tsfusion.wire.messages import ASK_AGAIN, Command, Reply
 from tsfusion.wire.sockets import control_address
 
 _AGAIN_INTERVAL = 0.25  # seconds
-_ANSWER_TIMEOUT = 5.0  # seconds; the gateway is never busy, so who says nothing for so long is not there
+_PING_TIMEOUT = 5.0  # seconds; the gateway is never busy: without an answer for so long there is none
 
 
 def fetch_health(
     address: str, *, control: str | None = None, timeout: float = 10.0, keys: ClientKeys | None = None
 ) -> Health:
-    """How the server at a data address is doing; answered at once, whatever its fusers do.
+    """Ask the server at a data address for its health; it answers at once, whatever its fusers do.
 
     Args:
         keys: of `curve.client_keys`, for a server with keys.
@@ -35,7 +35,7 @@ def fetch_health(
         NotAllowed: when the server turns the connection away.
         ServerUnreachable: when nobody answers in `timeout` seconds.
     """
-    reply, _ = _ask(address, control, Command(name="health"), timeout, keys)
+    reply, _ = _request_if_present(address, control, Command(name="health"), timeout, keys)
     if reply.health is None:
         raise TransportError(f"the server at {address} answered without its health")
     return reply.health
@@ -49,12 +49,12 @@ def fetch_status(
     timeout: float = 10.0,
     keys: ClientKeys | None = None,
 ) -> Status:
-    """How a map of the server at a data address is doing. See `fetch_health`.
+    """Ask the server at a data address for the status of a map. See `fetch_health`.
 
     Raises:
         TransportError: when the server cannot say.
     """
-    reply, _ = _ask(address, control, Command(name="status", map=map_name), timeout, keys)
+    reply, _ = _request_if_present(address, control, Command(name="status", map=map_name), timeout, keys)
     if reply.status is None:
         raise TransportError(f"the server at {address} answered without a status")
     return reply.status
@@ -69,7 +69,7 @@ def fetch_mesh(
     timeout: float = 60.0,
     keys: ClientKeys | None = None,
 ) -> Mesh:
-    """The whole mesh of a map of the server at a data address, as of now. See `fetch_health`.
+    """Ask the server at a data address for the present mesh of a map. See `fetch_health`.
 
     A server makes one at a time, and none while keyframes have to come first: it is asked again.
 
@@ -83,7 +83,7 @@ def fetch_mesh(
     while True:
         try:
             left = max(deadline - time.monotonic(), 0.0)
-            reply, frames = _ask(address, control, command, left, keys)
+            reply, frames = _request_if_present(address, control, command, left, keys)
             break
         except TransportError as error:
             if not str(error).endswith(ASK_AGAIN) or time.monotonic() + 2 * _AGAIN_INTERVAL > deadline:
@@ -94,25 +94,24 @@ def fetch_mesh(
     return mesh_of(reply.mesh, frames)
 
 
-def _ask(
+def _request_if_present(
     address: str, control: str | None, command: Command, timeout: float, keys: ClientKeys | None
 ) -> tuple[Reply, list[memoryview]]:
-    """The fuser's answer. That takes its time, so it is asked first whether anybody is there."""
-    address = control_address(sockets.target(address), control)
-    if timeout > _ANSWER_TIMEOUT:
-        request(address, Command(name="ping"), timeout=_ANSWER_TIMEOUT, keys=keys)
+    """Send a command that may take long to answer, after a ping has shown that the server is there."""
+    address = control_address(sockets.connect_address(address), control)
+    if timeout > _PING_TIMEOUT:
+        request(address, Command(name="ping"), timeout=_PING_TIMEOUT, keys=keys)
     return request(address, command, timeout=timeout, keys=keys)
 
 
 def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:
-    """A mesh from its frames (see `MeshLayout`).
+    """Build a mesh from its frames (see `MeshLayout`).
 
     Raises:
         TransportError: when the frames are not what the layout says.
     """
-    wanted: list[tuple[int, type]] = [
-        (layout.vertices, np.float32), (layout.faces, np.int32), (layout.vertices, np.float32),
-    ]  # fmt: skip
+    wanted: list[tuple[int, type]] = [(layout.vertices, np.float32), (layout.faces, np.int32)]
+    wanted.append((layout.vertices, np.float32))
     if layout.colors:
         wanted.append((layout.vertices, np.uint8))
     sizes = [rows * 3 * np.dtype(dtype).itemsize for rows, dtype in wanted]
@@ -124,8 +123,8 @@ def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:
     return Mesh(*arrays)
 
 
-_LOOK_EVERY = 0.2  # seconds
-_LONGEST = 1e6  # seconds; a poll takes no more than 2³¹ ms
+_POLL_S = 0.2  # seconds
+_MAX_TIMEOUT_S = 1e6  # seconds; a poll takes no more than 2³¹ ms
 
 
 def request(
@@ -143,13 +142,13 @@ def request(
         ServerUnreachable: when nobody answered within `timeout` seconds.
         TransportError: when the server answered that it cannot.
     """
-    address, timeout = sockets.target(address), min(timeout, _LONGEST)
+    address, timeout = sockets.connect_address(address), min(timeout, _MAX_TIMEOUT_S)
     context: zmq.Context[Any] = zmq.Context()
     link = sockets.dealer(context, keys)
     monitor = ConnectionMonitor(link, address, keys)
     try:
         link.connect(address)
-        head, *frames = _exchange(link, monitor, command, timeout)
+        head, *frames = _send_until_answered(link, monitor, command, timeout)
         reply = messages.decode_to_client(head.buffer)
     except DecodeError as error:
         raise TransportError(f"what answers at {address} is no tsfusion server: {error}") from error
@@ -164,21 +163,21 @@ def request(
     return reply, [frame.buffer for frame in frames]
 
 
-def _exchange(
+def _send_until_answered(
     link: sockets.AnySocket, monitor: ConnectionMonitor, command: messages.Command, timeout: float
 ) -> list[zmq.Frame]:
-    """Send the question on each connection that is made, until there is an answer; its frames."""
+    """Send a command on each connection that is made, until there is an answer; returns its frames."""
     deadline = time.monotonic() + timeout
     why, asked = "", 0  # on which connection
     while (left := deadline - time.monotonic()) > 0:
         wanted = zmq.POLLIN | (zmq.POLLOUT if monitor.made > asked else 0)
         polled = [(link, wanted), (monitor.socket, zmq.POLLIN)]
-        events = dict(zmq.zmq_poll(polled, int(min(left, _LOOK_EVERY) * 1000) + 1)).get(link, 0)
+        events = dict(zmq.zmq_poll(polled, int(min(left, _POLL_S) * 1000) + 1)).get(link, 0)
         if events & zmq.POLLIN:
             return link.recv_multipart(copy=False)
         if events & zmq.POLLOUT:
             asked = monitor.made
-            with suppress(zmq.Again):  # gone again already: it is asked again on the next connection
+            with suppress(zmq.Again):  # the connection has ended: the command is sent on the next one
                 link.send(messages.encode(command), zmq.NOBLOCK)
         news = monitor.problem()
         why = why if news is None else news

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Every ZeroMQ socket is made here, so that limits and keys are set in one place.
+"""ZeroMQ sockets with their limits and keys: every socket of the package is made here.
 
-No ZeroMQ heartbeats: a full PULL stops reading them and drops live connections (libzmq #3937). Nothing
-lingers: what must survive is in the spool.
+No ZeroMQ heartbeats: a full PULL stops reading them and drops live connections (libzmq #3937). No
+socket lingers: keyframes that must survive are in the spool.
 """
 
 import re
@@ -13,7 +13,7 @@ from typing import Any
 import zmq
 from msgspec import Struct
 
-from tsfusion.core.config import DEFAULT_MAP
+from tsfusion.core.config import DEFAULT_MAP, MAP_NAME
 from tsfusion.core.errors import InvalidConfig, TransportError
 from tsfusion.wire.curve import ClientKeys, ServerKeys
 
@@ -22,19 +22,18 @@ CONTROL_MAX_BYTES = 64 << 10
 TOPIC_MAX_BYTES = 512
 _MESH_TOPIC = b"mesh/"
 _ANY: dict[int, int] = {zmq.HANDSHAKE_IVL: 5000}  # ms; then a connection that is not made is closed
-_CONNECTING = {
-    **_ANY, zmq.RECONNECT_IVL: 100, zmq.RECONNECT_IVL_MAX: 1000, zmq.TCP_KEEPALIVE: 1, zmq.IMMEDIATE: 1
-}  # fmt: skip
+_RECONNECTING: dict[int, int] = {zmq.RECONNECT_IVL: 100, zmq.RECONNECT_IVL_MAX: 1000}  # ms
+_CONNECTING = {**_ANY, **_RECONNECTING, zmq.TCP_KEEPALIVE: 1, zmq.IMMEDIATE: 1}
 _RANDOM_PORT_TRIES = 32
 LAST_PORT = 65535
-_MAPS_TOPIC = re.compile(rb"mesh/([a-z0-9][a-z0-9_-]{0,31}/?)?")  # or a part; names as config.MapName
+_MAPS_TOPIC = re.compile(rf"mesh/({MAP_NAME}/?)?".encode())  # or its beginning
 _ADDRESS = re.compile(r"tcp://((?P<host>[\w.*-]+)|\[(?P<host6>[\w:.%]+)\]):(?P<port>[0-9]{1,5}|\*)", re.ASCII)
 
 AnySocket = zmq.Socket[Any]
 
 
 class Addresses(Struct, frozen=True):
-    """Where a server listens, with the real port numbers."""
+    """Addresses on which a server listens, with the real port numbers."""
 
     data: str
     control: str
@@ -69,19 +68,19 @@ def publisher(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> An
 
 
 def mesh_topic(map_name: str) -> bytes:
-    """Of a map's mesh updates. No map's is the beginning of another's."""
+    """Topic of a map's mesh updates. No map's topic is the beginning of another map's."""
     return _MESH_TOPIC + map_name.encode() + b"/"
 
 
 def is_mesh_topic(topic: bytes) -> bool:
-    """Whether it asks for one map's updates, or for all of them. Anything else is nobody's to ask for."""
+    """Whether a subscription is for the updates of one map or of all maps; no other is allowed."""
     return _MESH_TOPIC.startswith(topic) or _MAPS_TOPIC.fullmatch(topic) is not None
 
 
 def subscriber(
     context: "zmq.Context[Any]", keys: ClientKeys | None = None, *, map_name: str = DEFAULT_MAP
 ) -> AnySocket:
-    """A viewer's socket for a map's updates: topic, `work.Meshed`, cells (n, 3) int32, then a mesh's frames.
+    """A viewer's socket for a map's updates: topic, `Meshed`, cells (n, 3) int32, then a mesh's frames.
 
     The triangles replace all earlier ones in these cells (blocks of 8³ voxels).
     """
@@ -91,7 +90,7 @@ def subscriber(
 
 
 def pose_feed(context: "zmq.Context[Any]", max_frame_bytes: int) -> AnySocket:
-    """Where a scanner hears the poses of another process; a flood of them fills the queue, no more."""
+    """A scanner's socket for the poses of another process; a flood of them fills its queue and no more."""
     limits: dict[int, int] = {zmq.IMMEDIATE: 0, zmq.RCVHWM: 256, zmq.MAXMSGSIZE: max_frame_bytes}
     made = _make(context, zmq.SUB, {**_CONNECTING, **limits})
     made.setsockopt(zmq.SUBSCRIBE, b"")
@@ -99,7 +98,7 @@ def pose_feed(context: "zmq.Context[Any]", max_frame_bytes: int) -> AnySocket:
 
 
 def pair(context: "zmq.Context[Any]") -> AnySocket:
-    """Gateway and fuser, over a file only this user can open."""
+    """The socket between gateway and fuser, over a file that only this user can open."""
     return _make(context, zmq.PAIR, {zmq.SNDHWM: 64, zmq.RCVHWM: 64})
 
 
@@ -118,7 +117,7 @@ def _make(
     return made
 
 
-def split(address: str) -> tuple[str, int]:
+def parse_address(address: str) -> tuple[str, int]:
     """Host and port of `tcp://host:port` (port `*` or 0 = random).
 
     Raises:
@@ -132,36 +131,36 @@ def split(address: str) -> tuple[str, int]:
     raise InvalidConfig(f"an address looks like tcp://127.0.0.1:5555, got {address!r}")
 
 
-def join(host: str, port: int) -> str:
+def format_address(host: str, port: int) -> str:
     """`tcp://host:port`."""
     return f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
 
 
 def control_address(address: str, control: str | None = None) -> str:
-    """The control socket that belongs to a data address: the next port, unless given."""
+    """The control address of a server: `control` if given, else the port after that of the data address."""
     if control is not None:
-        return join(*split(control))
-    return _following(address, "control")
+        return format_address(*parse_address(control))
+    return _next_port(address, "control")
 
 
-def _following(address: str, purpose: str) -> str:
-    host, port = split(address)
+def _next_port(address: str, purpose: str) -> str:
+    host, port = parse_address(address)
     if port == LAST_PORT:
         raise InvalidConfig(f"{address} has no next port for {purpose}: choose a lower one")
-    return join(host, port + 1)
+    return format_address(host, port + 1)
 
 
-def target(address: str) -> str:
-    """An address to connect to, in its plain form. Raises InvalidConfig."""
-    host, port = split(address)
+def connect_address(address: str) -> str:
+    """Check an address to connect to; returns its plain form. Raises InvalidConfig."""
+    host, port = parse_address(address)
     if port == 0:
         raise InvalidConfig(f"connecting needs a port, got {address}")
-    return join(host, port)
+    return format_address(host, port)
 
 
 def check_reachable(address: str, *, has_keys: bool) -> None:
-    """Raise InvalidConfig when others can reach the address and there are no keys to tell them apart by."""
-    if has_keys or _is_loopback(split(address)[0]):
+    """Raise InvalidConfig when other machines can reach the address and there are no keys."""
+    if has_keys or is_loopback(parse_address(address)[0]):
         return
     raise InvalidConfig(
         f"without keys the server listens on tcp://127.0.0.1 only, got {address}; run `tsfusion keys new "
@@ -172,15 +171,16 @@ def check_reachable(address: str, *, has_keys: bool) -> None:
 
 
 def check_own_machine(address: str) -> None:
-    """Raise InvalidConfig when others can reach the address."""
-    if not _is_loopback(split(address)[0]):
+    """Raise InvalidConfig when other machines can reach the address."""
+    if not is_loopback(parse_address(address)[0]):
         raise InvalidConfig(
             f"there are no keys here, so that only tcp://127.0.0.1 can be bound, got {address}; let the "
             "sender bind, or come through an ssh tunnel"
         )
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
+    """Whether a host, name or number, is this machine."""
     try:
         return host == "localhost" or ip_address(host).is_loopback
     except ValueError:
@@ -188,8 +188,8 @@ def _is_loopback(host: str) -> bool:
 
 
 def check_free(address: str) -> None:
-    """Raise TransportError when a server could not listen here. Opens no port to anyone."""
-    host, port = split(address)
+    """Raise TransportError when a server could not listen on an address; no port is opened for that."""
+    host, port = parse_address(address)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -205,14 +205,14 @@ def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, t
     Raises:
         TransportError: when a port is taken (a random one is drawn again until its neighbours are free).
     """
-    host, port = split(listen)
+    host, port = parse_address(listen)
     tries = _RANDOM_PORT_TRIES if port == 0 else 1
     for last in reversed(range(tries)):
         bound: list[tuple[AnySocket, str]] = []
         try:
-            bound.append((data, bind_one(data, join(host, port))))
-            bound.append((control, bind_one(control, control_address(bound[0][1], to))))
-            bound.append((publish, bind_one(publish, _following(bound[1][1], "mesh updates"))))
+            bound.append((data, bind_socket(data, format_address(host, port))))
+            bound.append((control, bind_socket(control, control_address(bound[0][1], to))))
+            bound.append((publish, bind_socket(publish, _next_port(bound[1][1], "mesh updates"))))
             return Addresses(*(address for _, address in bound))
         except (TransportError, InvalidConfig):
             for made, address in bound:
@@ -222,11 +222,11 @@ def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, t
     raise AssertionError("the last try returns or raises")
 
 
-def bind_one(made: AnySocket, address: str) -> str:
-    """Bind a socket; its address with the real port number. Raises TransportError."""
-    host, port = split(address)
+def bind_socket(made: AnySocket, address: str) -> str:
+    """Bind a socket; returns its address with the real port number. Raises TransportError."""
+    host, port = parse_address(address)
     try:
-        made.bind(join(host, port) if port else join(host, 0).replace(":0", ":*"))
+        made.bind(format_address(host, port) if port else format_address(host, 0).replace(":0", ":*"))
     except zmq.ZMQError as error:
         raise TransportError(f"cannot listen on {address}: {error.strerror}") from error
     return made.getsockopt_string(zmq.LAST_ENDPOINT)

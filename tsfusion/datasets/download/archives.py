@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Recordings as they are downloaded: archives, unpacked beside themselves."""
 
-import errno
 import lzma
 import shutil
 import stat
@@ -15,7 +14,6 @@ from tsfusion.core import durable_files
 from tsfusion.core.errors import DatasetError
 
 _CHUNK_BYTES = 1 << 20
-_RESERVE_BYTES = 16 << 20  # left on the disk
 _SUFFIXES = (".tar.gz", ".tar.bz2", ".tar.xz", ".tgz", ".tbz2", ".txz", ".tar", ".zip")
 
 
@@ -91,7 +89,7 @@ def _extract_tar(path: Path, into: Path) -> None:
             if member.isdir():
                 target.mkdir(parents=True, exist_ok=True)
                 continue
-            _require_room(member.size, into)
+            durable_files.require_room(into, member.size)
             content = tar.extractfile(member)
             assert content is not None
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -101,20 +99,11 @@ def _extract_tar(path: Path, into: Path) -> None:
 
 def _extract_zip(path: Path, into: Path) -> None:
     with zipfile.ZipFile(path) as archive:
-        _require_room(sum(member.file_size for member in archive.infolist()), into)
+        durable_files.require_room(into, sum(member.file_size for member in archive.infolist()))
         for member in archive.infolist():
             member.filename = member.filename.replace("\\", "/")
             _require_inside(member.filename, is_link=stat.S_ISLNK(member.external_attr >> 16))
             archive.extract(member, into)
-
-
-def _require_room(nbytes: int, into: Path) -> None:
-    """Raise OSError where what is to be unpacked, as the archive says, would fill the disk."""
-    free = durable_files.free_bytes(into)
-    if nbytes + _RESERVE_BYTES > free:
-        raise OSError(
-            errno.ENOSPC, f"it unpacks to {nbytes / 1e6:.0f} MB, {free / 1e6:.0f} MB are free on that disk"
-        )
 
 
 def _require_inside(name: str, *, is_link: bool) -> None:

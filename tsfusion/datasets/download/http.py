@@ -5,7 +5,6 @@ A part goes on only where the server says that it still has the same file (RFC 9
 """
 
 import errno
-import fcntl
 import http.client
 import re
 import time
@@ -17,7 +16,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import IO, Any
 
-from tsfusion.core import durable_files
+from tsfusion.core import durable_files, folder_lock
 from tsfusion.core.errors import DatasetError, OutputError
 
 Watcher = Callable[[int, int], None]  # bytes there, bytes of all (0 = unknown)
@@ -26,7 +25,6 @@ _CHUNK_BYTES = 1 << 20
 _TIMEOUT_S = 30.0
 _GIVE_UP_AFTER = 4  # attempts in a row that brought nothing
 _PAUSE_S = 1.0
-_RESERVE_BYTES = 16 << 20  # left on the disk
 
 
 def download(url: str, part: Path, watch: Watcher) -> None:
@@ -114,9 +112,7 @@ def _copy(answer: Any, part: Path, at: int, total: int, watch: Watcher) -> None:
 def _locked(part: Path) -> Iterator[IO[bytes]]:
     """The part, open for nobody else."""
     try:
-        part.open("ab").close()
-        with part.open("r+b") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with folder_lock.hold(part.parent, part.name), part.open("r+b") as file:
             yield file
     except BlockingIOError as error:
         raise OutputError(f"cannot write {part}: another download of it is under way") from error
@@ -171,13 +167,9 @@ def _nbytes(part: Path) -> int:
 
 def _require_room(part: Path, more: int) -> None:
     try:
-        free = durable_files.free_bytes(part.parent)
+        durable_files.require_room(part.parent, more)
     except OSError as error:
         raise _not_written(part, error) from error
-    if more + _RESERVE_BYTES > free:
-        raise OutputError(
-            f"cannot write {part}: {more / 1e6:.0f} MB are to come, {free / 1e6:.0f} MB are free on that disk"
-        )
 
 
 def _not_written(part: Path, error: OSError) -> OutputError:

@@ -23,7 +23,6 @@ from tsfusion.datasets.rosbag.reader import (
     BagRecording,
     Message,
     MessagePlace,
-    is_journal,
     recording,
 )
 from tsfusion.datasets.rosbag.topics import Modality, TopicChooser, recorded_scale
@@ -31,6 +30,7 @@ from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
+from tsfusion.journal import is_segment
 
 log = logging.getLogger(__name__)
 
@@ -287,10 +287,9 @@ def _place(path: Path) -> Path:
         return found
     if not path.exists():
         raise DatasetError(f"{path} does not exist; expected {EXPECTED}")
-    if is_journal(path):
-        raise DatasetError(f"{path} is a journal of tsfusion, no ROS recording: `tsfusion replay` takes it")
     if path.is_file():
-        raise DatasetError(f"{path} does not begin as a ROS recording; expected {EXPECTED}")
+        hint = " (`tsfusion replay` reads a journal of tsfusion)" if is_segment(path) else ""
+        raise DatasetError(f"{path} does not begin as a ROS recording{hint}; expected {EXPECTED}")
     several = sorted(str(child) for child in path.glob("*.*") if child.suffix in ENDINGS)
     holds = f"holds {len(several)} files ({', '.join(several[:8])})" if several else "holds no ROS recording"
     raise DatasetError(f"{path} {holds}; expected {EXPECTED}")

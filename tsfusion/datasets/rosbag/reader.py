@@ -13,11 +13,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tsfusion.core.errors import DatasetError, MissingDependency
-from tsfusion.journal.mcap_layout import MAGIC, OPENING
+from tsfusion.journal import is_segment
+from tsfusion.journal.mcap_layout import MAGIC
 
 log = logging.getLogger(__name__)
 
 ENDINGS = (".bag", ".db3", ".mcap")
+_SQLITE = b"SQLite format 3"
 METADATA = "metadata.yaml"
 _INSTALL = "ROS recordings are read by rosbags; install it with: pip install 'tsfusion[ros]'"
 _HINTS = {
@@ -55,11 +57,6 @@ class Message(NamedTuple):
     content: Any
 
 
-def is_journal(path: Path) -> bool:
-    """Whether a file is a segment of tsfusion's own journal, which is MCAP too."""
-    return bool(_opening(path) == OPENING)
-
-
 def recording(path: Path) -> Path | None:
     """What is to be opened of a path: itself, or the one recording in a folder; None = there is none.
 
@@ -80,15 +77,14 @@ def _is_bag(path: Path) -> bool:
     if path.suffix == ".bag":
         return start.startswith(b"#ROSBAG")
     if path.suffix == ".db3":
-        return start.startswith(b"SQLite format 3")
-    whole = len(start) == len(OPENING) and bool(start != OPENING)
-    return path.suffix == ".mcap" and whole and start.startswith(bytes(MAGIC))
+        return start.startswith(_SQLITE)
+    return path.suffix == ".mcap" and start.startswith(bytes(MAGIC)) and not is_segment(path)
 
 
 def _opening(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            return file.read(len(OPENING))
+            return file.read(len(_SQLITE))
     except OSError:
         return b""
 

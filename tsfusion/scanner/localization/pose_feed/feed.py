@@ -172,7 +172,7 @@ class _FeedSocket:
         plain = address.removeprefix("@")
         if self.binds:
             sockets.check_own_machine(plain)
-        self._target = plain if self.binds else sockets.target(plain)
+        self._target = plain if self.binds else sockets.connect_address(plain)
         self._context: zmq.Context[Any] = zmq.Context()
         self._socket = sockets.pose_feed(self._context, MAX_BYTES)
         self.endpoint = self._target
@@ -199,6 +199,6 @@ class _FeedSocket:
     def _open(self) -> None:
         self._last_received = time.monotonic()
         if self.binds:
-            self.endpoint = sockets.bind_one(self._socket, self._target)
+            self.endpoint = sockets.bind_socket(self._socket, self._target)
         else:
             self._socket.connect(self._target)

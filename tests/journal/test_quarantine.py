@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: MIT
+"""Keyframes put aside: a bounded folder that opens like a journal."""
+
+import os
+from pathlib import Path
+
+import pytest
+from keyframes_and_servers import wall
+
+from tsfusion.journal import quarantine
+from tsfusion.journal.quarantine import Quarantine
+from tsfusion.journal.recording import JournalRecording
+from tsfusion.wire import codec
+
+SESSION = bytes(range(16))
+
+
+def test_the_quarantine_keeps_to_its_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(quarantine, "_MAX_FILES", 5)
+
+    def keep(kept: Quarantine, seq: int, size: int = 100) -> Path:
+        path = kept.keep([bytes(size)], session=SESSION, seq=seq, reason="crc")
+        assert path is not None
+        os.utime(path, ns=(seq, seq))
+        return path
+
+    def seqs() -> list[int]:
+        return sorted(int(path.name.split("-")[1]) for path in tmp_path.glob("*.mcap"))
+
+    kept = Quarantine(tmp_path, 1 << 20)
+    for seq in range(1, 9):
+        keep(kept, seq)
+    assert (len(kept), seqs()) == (5, [4, 5, 6, 7, 8])
+    keep(kept, 4)  # again: now it is the newest
+    os.utime(keep(kept, 4), ns=(9, 9))
+    assert len(kept) == 5
+    kept = Quarantine(tmp_path, 1 << 20)  # as a new process finds it
+    assert len(kept) == 5
+    keep(kept, 10)
+    assert seqs() == [4, 6, 7, 8, 10]
+    keep(kept, 11, (1 << 20) - 1000)
+    assert seqs()[-1] == 11
+    keep(kept, 12, 2 << 20)  # the newest stays, whatever its size
+    assert (len(kept), seqs()) == (1, [12])
+
+
+def test_the_quarantine_does_not_look_at_every_file_for_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = Quarantine(tmp_path, 1 << 20)
+    monkeypatch.setattr(Path, "glob", None)
+    assert kept.keep([b"x"], session=SESSION, seq=1, reason="crc") is not None
+    assert len(kept) == 1
+
+
+def test_a_folder_of_quarantined_keyframes_opens_like_a_journal(tmp_path: Path) -> None:
+    kept = Quarantine(tmp_path, 1 << 20)
+    for seq in (2, 10, 9):
+        frames = codec.encode(wall(seq), session=SESSION, seq=seq, jpeg_quality=90)
+        kept.keep(frames, session=SESSION, seq=seq, reason="crc")
+    found = [keyframe.timestamp_ns - 10**9 for keyframe in JournalRecording(tmp_path)]
+    assert found == [2, 9, 10]
+
+
+@pytest.mark.parametrize("reason", ["../../x", "a/b", "", "no\nsense", "x" * 300])
+def test_no_reason_leads_out_of_the_folder(tmp_path: Path, reason: str) -> None:
+    """A scanner's come from a server."""
+    kept = Quarantine(tmp_path / "refused", 1 << 20).keep([b"x"], session=SESSION, seq=1, reason=reason)
+    assert kept is not None
+    assert list(tmp_path.rglob("*.mcap")) == [kept]
+    assert quarantine.quarantined_files(tmp_path / "refused") == [kept]
