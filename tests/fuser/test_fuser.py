@@ -16,7 +16,15 @@ from keyframes_and_servers import DEADLINE, alive, serving, until, wall
 
 import tsfusion
 from tsfusion import VolumeConfig
-from tsfusion.core.errors import CheckpointError, InvalidConfig, MapError
+from tsfusion.core.errors import (
+    CheckpointError,
+    DamagedCheckpoint,
+    InvalidConfig,
+    JournalError,
+    MapError,
+    MapFull,
+    TsfusionError,
+)
 from tsfusion.core.folder_lock import hold
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.fuser import Fuser
@@ -375,3 +383,21 @@ def test_a_process_at_work_ends_with_the_one_that_started_it() -> None:
     with parent:
         parent.kill()
         until(lambda: not alive(int(word)))
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "raised"),
+    [
+        (InvalidConfig("of other settings"), "config", InvalidConfig),
+        (DamagedCheckpoint("cut short"), "checkpoint", CheckpointError),
+        (MapFull("too many blocks"), "map", MapError),
+        (JournalError("cannot read"), "other", TsfusionError),
+    ],
+)
+def test_the_kind_of_a_failure_reaches_the_gateway(
+    error: TsfusionError, kind: str, raised: type[TsfusionError]
+) -> None:
+    sent = fuser_messages.to_gateway.decode(fuser_messages.encode(fuser_messages.Failed.of(error)))
+    assert isinstance(sent, fuser_messages.Failed)
+    again = sent.error()
+    assert (sent.kind, type(again), str(again)) == (kind, raised, str(error))

@@ -72,7 +72,7 @@ def fusing(line: str) -> str:
 
 _CRASHES_ON_2 = fusing("if message.index == 2: sys.exit(7)")
 _DIES = "sys.exit(9)"
-_FAILS = "say(fuser_messages.Failed('InvalidConfig', 'no such setting')); link.recv()"
+_FAILS = "say(fuser_messages.Failed('config', 'no such setting')); link.recv()"
 _CANNOT_COME_BACK = """
     import pathlib
     mark = pathlib.Path(begin.folder) / "once"

@@ -130,14 +130,14 @@ class Map:
     def __init__(self) -> None:
         self.fuser: Any = self
         self.asked: list[fuser_messages.FuserQuery] = []
-        self.is_calm = True
+        self.is_idle = True
 
     def send(self, ask: fuser_messages.FuserQuery) -> bool:
         self.asked.append(ask)
         return True
 
-    def calm(self, since: float) -> bool:
-        return self.is_calm
+    def idle_since(self, since: float) -> bool:
+        return self.is_idle
 
 
 class Asking:
@@ -147,7 +147,7 @@ class Asking:
         self.map = Map()
         self.errors: list[str | None] = []
         self.frames: list[Any] = []
-        self.questions = FuserQueries(self._on_answer, most_bytes)
+        self.queries = FuserQueries(self._on_answer, most_bytes)
 
     def _on_answer(self, identity: bytes, message: messages.ToClient, frames: Any = ()) -> None:
         assert isinstance(message, messages.Reply)
@@ -157,14 +157,14 @@ class Asking:
     def ask(self, identity: bytes, client: str = "", map_name: str = "default") -> bool:
         """Whether the mesh was passed on."""
         before = len(self.map.asked)
-        self.questions.ask(identity, Command(name="mesh", map=map_name), self.map, client)
+        self.queries.submit(identity, Command(name="mesh", map=map_name), self.map, client)
         return len(self.map.asked) > before
 
     def make(self, nbytes: int) -> None:
         """The one that was asked for last."""
         layout = health.MeshLayout(vertices=0, faces=0, colors=False)
         frames = [zmq.Frame(bytes(nbytes // 2)), zmq.Frame(bytes(nbytes // 2))]
-        self.questions.answered(
+        self.queries.on_reply(
             fuser_messages.FuserReply(self.map.asked[-1].number, layout=layout), None, frames
         )
 
@@ -175,7 +175,7 @@ def test_a_fuser_makes_one_mesh_at_a_time() -> None:
     assert not asking.ask(b"2")
     assert asking.errors == ["another mesh is being made; ask again"]
     assert asking.ask(b"3", map_name="yard")
-    asking.questions.give_up("default")
+    asking.queries.give_up("default")
     assert asking.ask(b"2")
 
 
@@ -193,17 +193,17 @@ def test_after_a_mesh_it_is_the_keyframes_turn(monkeypatch: pytest.MonkeyPatch) 
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     asking = Asking()
-    asking.map.is_calm = False
+    asking.map.is_idle = False
     assert asking.ask(b"1")
     now[0] = 102.0
     asking.make(100)
     now[0] = 107.9
     assert not asking.ask(b"2")
     assert asking.errors[-1] == "a mesh was just made, now it is the keyframes' turn; ask again"
-    asking.map.is_calm = True  # nobody scans: nobody has to wait
+    asking.map.is_idle = True  # nobody scans: nobody has to wait
     assert asking.ask(b"2")
     asking.make(100)
-    asking.map.is_calm = False
+    asking.map.is_idle = False
     now[0] = 108.0
     assert asking.ask(b"3")
 
@@ -215,12 +215,12 @@ def test_meshes_that_nobody_reads_are_few() -> None:
         asking.make(300)
     assert not asking.ask(b"4")
     assert "do not read" in (asking.errors[-1] or "")
-    assert asking.questions.nbytes == 900
+    assert asking.queries.nbytes == 900
     asking.frames.clear()
-    until(lambda: asking.questions.nbytes == 0)
+    until(lambda: asking.queries.nbytes == 0)
     assert asking.ask(b"5")
     asking.make(5000)  # one may be larger than all should be
-    assert asking.questions.nbytes == 5000
+    assert asking.queries.nbytes == 5000
     assert not asking.ask(b"6")
 
 
@@ -354,10 +354,9 @@ def test_who_answers_with_nonsense_is_named(caplog: pytest.LogCaptureFixture) ->
 
 def test_a_mesh_is_asked_for_again_when_the_server_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(queries, "_AGAIN_INTERVAL", 0.01)
-    again, settled = (
-        messages.encode(messages.Reply(name="mesh", error=error)) for error in ("busy; ask again", "no room")
-    )
+    again = messages.encode(messages.Reply(name="mesh", error="busy", retry=True))
+    settled = messages.encode(messages.Reply(name="mesh", error="no room; do not ask again"))
     with answering(again, again, settled) as address, pytest.raises(TransportError, match="no room"):
         fetch_mesh(address, timeout=5.0)
-    with answering(again) as address, pytest.raises(TransportError, match="busy; ask again"):
+    with answering(again) as address, pytest.raises(TransportError, match="busy"):
         fetch_mesh(address, timeout=0.3)

@@ -77,10 +77,7 @@ def _begin(link: sockets.AnySocket, message: fuser_messages.Begin) -> Fuser | No
         hold(Path(message.folder))
         fuser = Fuser(link, message)
     except TsfusionError as error:
-        name = next(
-            kind.__name__ for kind in type(error).__mro__ if kind.__module__ == "tsfusion.core.errors"
-        )
-        link.send(fuser_messages.encode(fuser_messages.Failed(name, str(error))))
+        link.send(fuser_messages.encode(fuser_messages.Failed.of(error)))
         return None
     link.send(fuser_messages.encode(fuser.ready()))
     return fuser

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from tsfusion import journal
 from tsfusion.core import process
-from tsfusion.core.errors import TsfusionError
+from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.geometry.mesh import Mesh
@@ -156,7 +156,7 @@ class Fuser:
                 record = journal.read(self._folder / state_folder.JOURNAL_FOLDER, order.position)
                 self._volume.integrate(codec.decode(record.frames))
             except TsfusionError as error:
-                if _may_pass(error):
+                if isinstance(error, JournalError) and error.temporary:
                     log.error("%s: another process tries again, from the checkpoint", error)
                     self.exit_status = 1
                     return  # still marked as at work on it: the gateway bears with a keyframe only so often
@@ -234,12 +234,6 @@ def _mesh_frames(mesh: Mesh) -> tuple[MeshLayout, list[Any]]:
         arrays.append(mesh.colors)
     layout = MeshLayout(vertices=len(mesh.vertices), faces=len(mesh.faces), colors=mesh.colors is not None)
     return layout, [np.ascontiguousarray(array).data for array in arrays]
-
-
-def _may_pass(error: TsfusionError) -> bool:
-    """Whether the system refused to read what is there: no fault of the keyframe's."""
-    cause = error.__cause__
-    return isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError)
 
 
 def _reason(error: TsfusionError) -> str:

@@ -91,7 +91,7 @@ def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
         _set_aside(path, error)
         return None
     except CheckpointError as error:
-        if isinstance(error.__cause__, FileNotFoundError):
+        if error.missing:
             return None
         raise
     except MemoryError as error:

@@ -5,12 +5,13 @@ The gateway hands out journal positions, a few ahead; the fuser answers each wit
 keyframes for the other: the queue is the journal.
 """
 
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 from msgspec import Struct
 
 from tsfusion.core.config import VolumeConfig
+from tsfusion.core.errors import CheckpointError, InvalidConfig, MapError, TsfusionError
 from tsfusion.journal import Position
 from tsfusion.wire.health import MeshLayout
 from tsfusion.wire.messages import Command
@@ -103,11 +104,29 @@ class Saved(Struct, frozen=True, tag="saved"):
     written: bool
 
 
-class Failed(Struct, frozen=True, tag="failed"):
-    """The map cannot be opened. `error` is the name of a class in `tsfusion.core.errors`."""
+FailureKind = Literal["config", "checkpoint", "map", "other"]
+_FAILURES: dict[FailureKind, type[TsfusionError]] = {  # the first that fits counts
+    "config": InvalidConfig,
+    "checkpoint": CheckpointError,
+    "map": MapError,
+    "other": TsfusionError,
+}
 
-    error: str
+
+class Failed(Struct, frozen=True, tag="failed"):
+    """The map cannot be opened."""
+
+    kind: FailureKind
     message: str
+
+    @classmethod
+    def of(cls, error: TsfusionError) -> "Failed":
+        """The message about an error."""
+        return cls(next(kind for kind, one in _FAILURES.items() if isinstance(error, one)), str(error))
+
+    def error(self) -> TsfusionError:
+        """The error, to be raised in the gateway."""
+        return _FAILURES[self.kind](self.message)
 
 
 class Done(Struct, frozen=True, tag="done"):

@@ -13,9 +13,9 @@ from typing import Any
 import msgspec
 import zmq
 
-from tsfusion.core import errors, logs, process
+from tsfusion.core import logs, process
 from tsfusion.core.config import ServerConfig, VolumeConfig
-from tsfusion.core.errors import MapError, TsfusionError
+from tsfusion.core.errors import MapError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.fuser_process import FuserProcess
 from tsfusion.wire import sockets
@@ -137,8 +137,7 @@ class FuserSupervisor:
         if isinstance(message, fuser_messages.Failed) and self._was_ready:
             log.error("the fuser cannot open the map: %s", message.message)
         elif isinstance(message, fuser_messages.Failed):
-            kind = getattr(errors, message.error, TsfusionError)
-            raise kind(message.message)
+            raise message.error()
         if isinstance(message, fuser_messages.Started):
             self.send(msgspec.structs.replace(self._begin, working=str(self._process.working_file)))
         elif isinstance(message, fuser_messages.Ready):

@@ -68,7 +68,7 @@ class Gateway:
         self._intake = KeyframeIntake(server, self.maps, door, self)
         self._refused = self._intake.refused
         self._corrector = Corrector(server, self.maps, self._intake)
-        self._questions = FuserQueries(self._answer, server.memory_bytes // _MESHES_SHARE)
+        self._queries = FuserQueries(self._answer, server.memory_bytes // _MESHES_SHARE)
         self._topics = Subscriptions()
         self._watched: dict[str, bool] = {}  # what each fuser knows of it
         self._memory = MemoryGuard(server.memory_bytes)
@@ -132,7 +132,7 @@ class Gateway:
             log.warning("a key was revoked: every connection is made anew")
             self._refused["revoked"] += 1
         else:
-            held = self._memory.excess(self._questions.nbytes)
+            held = self._memory.excess(self._queries.nbytes)
             if not held:
                 return False
             log.error(
@@ -161,7 +161,7 @@ class Gateway:
         for hosted in self.maps:
             if not hosted.fuser.ready:
                 self._watched.pop(hosted.name, None)
-                self._questions.give_up(hosted.name)
+                self._queries.give_up(hosted.name)
                 continue
             watched = self._topics.watched(hosted.name)
             if watched != self._watched.get(hosted.name) and hosted.fuser.send(
@@ -181,7 +181,7 @@ class Gateway:
                 if message.status is None
                 else fuser_queries.status(hosted, message.status, self.health(), self._server)
             )
-            self._questions.answered(message, status, frames)
+            self._queries.on_reply(message, status, frames)
         elif frames:
             send_now(self.ports.publish, [mesh_topic(hosted.name), fuser_messages.encode(message), *frames])
 
@@ -266,7 +266,7 @@ class Gateway:
         elif command.name == "health":
             self._answer(identity, messages.Reply(name="health", health=self.health()))
         else:
-            self._questions.ask(identity, command, self.maps.get(command.map), client)
+            self._queries.submit(identity, command, self.maps.get(command.map), client)
 
     def _on_subscription(self, frames: list[zmq.Frame]) -> None:
         change, topic = frames[0].bytes[:1], frames[0].bytes[1:]

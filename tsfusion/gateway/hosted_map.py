@@ -92,7 +92,7 @@ class HostedMap:
         """Drained, or never to be: its fuser cannot be kept alive."""
         return self.drained or bool(self.fuser.failed)
 
-    def calm(self, since: float) -> bool:
+    def idle_since(self, since: float) -> bool:
         """Whether no keyframe waits, nor came since then (`time.monotonic()`)."""
         return self.drained and (self._last is None or self._last < since)
 

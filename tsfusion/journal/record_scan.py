@@ -64,7 +64,7 @@ def segment_number(path: Path) -> int:
 
 def failed(verb: str, path: Path, error: OSError) -> JournalError:
     """The error for something the disk refused."""
-    return JournalError(f"cannot {verb} {path}: {error.strerror or error}")
+    return JournalError(f"cannot {verb} {path}: {error.strerror or error}", error.errno or errno.EIO)
 
 
 def _was_index(raw: bytes) -> bool:
