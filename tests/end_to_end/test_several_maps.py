@@ -19,7 +19,9 @@ from tsfusion.core import config as core_config
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import JournalError, ServerUnreachable, TransportError
 from tsfusion.gateway import map_registry
+from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.map_registry import MapRegistry
+from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.journal import state_folder
 from tsfusion.journal.recording import JournalRecording
@@ -94,7 +96,9 @@ def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
         raise JournalError("no room")
 
     monkeypatch.setattr(map_registry, "HostedMap", fail)
-    found: Any = MapRegistry(zmq.Context.instance(), ServerConfig(state=str(tmp_path)), None)  # type: ignore[arg-type]
+    found: Any = MapRegistry(
+        zmq.Context.instance(), ServerConfig(state=str(tmp_path)), ClientRoutes(lambda *_: None), Metrics()
+    )
     found._volumes = {"default": VolumeConfig()}
     for i in range(200):
         assert found.open_for_client(f"map{i}") is None

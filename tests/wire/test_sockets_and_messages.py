@@ -169,8 +169,12 @@ def test_sessions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sessions.room_for(SESSION)
 
 
+def unsent(*_: object) -> None:
+    """Drop a message to a client."""
+
+
 def test_strangers_do_not_grow_the_sessions() -> None:
-    sessions, routes = Sessions(), ClientRoutes()
+    sessions, routes = Sessions(), ClientRoutes(unsent)
     for i in range(3000):
         routes.connect(i.to_bytes(16, "big"), "default", b"id")
         assert sessions.admit(i.to_bytes(16, "big"), 1, 0) == "next"
@@ -180,12 +184,12 @@ def test_strangers_do_not_grow_the_sessions() -> None:
 
 
 def test_a_live_session_is_not_taken_over() -> None:
-    routes = ClientRoutes()
+    routes = ClientRoutes(unsent)
     route = routes.connect(SESSION, "default", b"1", "robot")
     assert not route.open_to("thief")
     assert routes.connect(SESSION, "default", b"3", "robot") is route
     assert route.identity == b"3"
-    route.heard -= 3600
+    route.last_message -= 3600
     assert route.open_to("heir")
     assert routes.connect(SESSION, "default", b"4", "heir") is not route
     assert len(list(routes)) == 1
@@ -196,7 +200,7 @@ def key_of(number: int) -> bytes:
 
 
 def test_a_flood_of_greetings_pushes_out_those_of_its_own_name_only() -> None:
-    routes = ClientRoutes()
+    routes = ClientRoutes(unsent)
     routes.connect(SESSION, "default", b"1", "cart")
     for number in range(3000):
         routes.connect(key_of(number), "default", b"2", "robot")
@@ -205,7 +209,7 @@ def test_a_flood_of_greetings_pushes_out_those_of_its_own_name_only() -> None:
 
 
 def test_many_names_share_the_routes_fairly() -> None:
-    routes = ClientRoutes()
+    routes = ClientRoutes(unsent)
     routes.connect(SESSION, "default", b"1", "cart")
     for number in range(6000):
         routes.connect(key_of(number), "default", b"2", f"robot{number % 40}")
@@ -214,8 +218,9 @@ def test_many_names_share_the_routes_fairly() -> None:
 
 
 def test_who_scans_is_not_pushed_out_by_who_only_greets() -> None:
-    routes = ClientRoutes()
-    routes.heard(routes.connect(SESSION, "default", b"1"), scans=True)
+    routes = ClientRoutes(unsent)
+    routes.connect(SESSION, "default", b"1")
+    routes.mark_alive(SESSION, "", scans=True)
     routes.connect(b"known".ljust(16), "default", b"1", scans=True)
     for number in range(3000):
         routes.connect(key_of(number), "default", b"2")
@@ -224,7 +229,7 @@ def test_who_scans_is_not_pushed_out_by_who_only_greets() -> None:
 
 
 def test_who_scanned_once_shuts_nobody_out() -> None:
-    routes = ClientRoutes()
+    routes = ClientRoutes(unsent)
     for number in range(2000):
         routes.connect(key_of(number), "default", b"2", scans=True)
     route = routes.connect(SESSION, "default", b"1")
@@ -247,7 +252,7 @@ def test_the_fuser_takes_from_each_client_in_turn() -> None:
     while (session := turns.next()) is not None:
         served.append((session.client, index[session.entries[session.handed]].stamps.seq))
         session.handed += 1
-        turns.served()
+        turns.rotate()
     assert served[:4] == [("a", 1), ("b", 1), ("a", 1), ("b", 2)]
     assert len(served) == 14
     assert turns.next() is None
@@ -324,10 +329,10 @@ def test_a_delay_that_cannot_be_does_not_count() -> None:
 
 @pytest.mark.parametrize("clock", [(1 << 62, 0), (-(1 << 62), 0), (5, -1), (5, 1 << 62), (5, 3601 * 10**9)])
 def test_a_clock_that_cannot_be_is_not_believed(clock: tuple[int, int]) -> None:
-    route = ClientRoutes().connect(SESSION, "default", b"1")
-    route.said(Ping(SESSION, 1, 7, 3, waiting=2))
+    route = ClientRoutes(unsent).connect(SESSION, "default", b"1")
+    route.update(Ping(SESSION, 1, 7, 3, waiting=2))
     assert (route.offset_ns, route.bound_ns, route.waiting) == (7, 3, 2)
-    route.said(Ping(SESSION, 1, *clock, waiting=4))
+    route.update(Ping(SESSION, 1, *clock, waiting=4))
     assert (route.offset_ns, route.bound_ns, route.waiting) == (None, 0, 4)
 
 

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""What people ask a map's fuser: passed on, answered when it answers, given up when it dies.
+"""Commands for a map's fuser (status, mesh): passed on, answered with its answer, refused when it dies.
 
-A mesh takes the fuser's time and our memory, and costs the asker nothing: there is one at a time, with
-pauses while keyframes come, and only so much of what was made may wait to be read.
+A mesh takes the fuser's time and the gateway's memory, and costs whoever asks nothing: one is made at a time,
+with pauses while keyframes come, and only so many bytes of meshes may wait to be read.
 """
 
 import time
 from collections.abc import Sequence
-from typing import Protocol
 
 import msgspec
 import zmq
@@ -16,33 +15,15 @@ from msgspec import Struct
 from tsfusion.core import process
 from tsfusion.core.config import ServerConfig
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.memory_guard import PendingReplies
+from tsfusion.gateway.ports import SendReply
 from tsfusion.wire import health, messages
 from tsfusion.wire.health import Health, Status
 
 _MAX_PENDING = 32
 _REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
 _RESTARTS = "the fuser restarts"
-
-
-class SendReply(Protocol):
-    """Sends a message to a connection of the control socket."""
-
-    def __call__(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
-        """Send it now, or drop it."""
-
-
-class QueriedMap(Protocol):
-    """An open map, as far as queries need it."""
-
-    @property
-    def fuser(self) -> FuserSupervisor:
-        """The process that answers."""
-
-    def idle_since(self, since: float) -> bool:
-        """Whether no keyframe waits, nor came since then (`time.monotonic()`)."""
 
 
 class PendingQuery(Struct, frozen=True):
@@ -95,41 +76,41 @@ class FuserQueries:
         return min(self._unread.nbytes, max(self._max_bytes, self._unread.largest))
 
     def submit(
-        self, identity: bytes, command: messages.Command, queried: QueriedMap | None, client: str = ""
+        self, identity: bytes, command: messages.Command, hosted: HostedMap | None, client: str = ""
     ) -> None:
         """Pass a command on to the map's fuser, or reply why not.
 
         Args:
-            queried: the map; None = it is not open.
+            hosted: the map; None = it is not open.
             client: the name that the sender's key is allowed under; empty without keys.
         """
         query = PendingQuery(identity, client.encode() or identity, command, time.monotonic())
-        if queried is None:
+        if hosted is None:
             self._refuse(query, f"no map {command.map} is open")
-        elif queried.fuser.failed and not queried.fuser.ready:
-            self._refuse(query, queried.fuser.failed)
-        elif problem := self._pass_on(query, queried):
+        elif hosted.fuser.failed and not hosted.fuser.ready:
+            self._refuse(query, hosted.fuser.failed)
+        elif problem := self._pass_on(query, hosted):
             self._refuse(query, problem, retry=True)
 
     def _refuse(self, query: PendingQuery, problem: str, *, retry: bool = False) -> None:
         error = f"{problem}; ask again" if retry else problem
         self._send(query.identity, messages.Reply(name=query.command.name, error=error, retry=retry))
 
-    def _pass_on(self, query: PendingQuery, queried: QueriedMap) -> str:
+    def _pass_on(self, query: PendingQuery, hosted: HostedMap) -> str:
         """Why the fuser cannot be asked now; empty = it was."""
-        if not queried.fuser.ready:
+        if not hosted.fuser.ready:
             return _RESTARTS
-        if query.command.name == "mesh" and (problem := self._why_no_mesh(query, queried)):
+        if query.command.name == "mesh" and (problem := self._why_no_mesh(query, hosted)):
             return problem
         self._count += 1
-        if len(self._pending) >= _MAX_PENDING or not queried.fuser.send(
+        if len(self._pending) >= _MAX_PENDING or not hosted.fuser.send(
             fuser_messages.FuserQuery(self._count, query.command)
         ):
             return "too many questions at once"
         self._pending[self._count] = query
         return ""
 
-    def _why_no_mesh(self, query: PendingQuery, queried: QueriedMap) -> str:
+    def _why_no_mesh(self, query: PendingQuery, hosted: HostedMap) -> str:
         """Why this mesh is not to be made now; empty = it may."""
         under_way = [one for one in self._pending.values() if one.command.name == "mesh"]
         if any(one.owner == query.owner for one in under_way) or self._unread.pending(query.owner):
@@ -140,7 +121,7 @@ class FuserQueries:
         if not self._has_memory_for([name, *(one.command.map for one in under_way)]):
             return "meshes that others asked for and do not read fill the memory"
         last = self._last_meshes.get(name)
-        if last is not None and query.asked_at < last.rest_until and not queried.idle_since(last.asked_at):
+        if last is not None and query.asked_at < last.rest_until and not hosted.idle_since(last.asked_at):
             return "a mesh was just made, now it is the keyframes' turn"
         return ""
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the gateway knows of sessions and keyframes: policy and bookkeeping, no sockets."""
+"""The sessions of a map, how far each is, and the fair queue in which the fuser takes from them."""
 
 from array import array
 from collections import OrderedDict, deque
@@ -16,11 +16,12 @@ class Session(Struct, eq=False):
     """One client's stream of keyframes.
 
     Attributes:
-        number: its place in `Sessions`.
-        client: whose it is: the name that its key is allowed under; empty = it came without keys.
+        key: 16 bytes that the client drew.
+        number: position in `Sessions`.
+        client: the name that the owner's key is allowed under; empty = it came without keys.
         durable: the highest seq that is journaled.
-        fused: the highest that the map has taken or refused.
-        in_map: the same of the fuser that lives: after a death it begins at the checkpoint again.
+        fused: the highest seq that the map has taken or rejected.
+        in_map: the same for the present fuser: one that takes over begins at the checkpoint again.
         entries: the indices of its keyframes that are not forgotten.
         handed: how many of these the fuser was given.
     """
@@ -36,18 +37,18 @@ class Session(Struct, eq=False):
 
     @property
     def owner(self) -> str:
-        """Whom to be fair to: the client, or where there are no keys the session."""
+        """The name that gets a turn in the fair queue: the client, or where there are no keys the session."""
         return self.client or self.key.hex()
 
     def belongs_to(self, client: str) -> bool:
-        """Whether this client may go on with it. What came without keys is anyone's."""
+        """Whether a client may go on with the session. One that came without keys is anyone's."""
         return not self.client or not client or self.client == client
 
     def admit(self, seq: int, previous: int) -> Verdict:
-        """What to do with keyframe `seq` of a client that offers none between `previous` and it.
+        """Whether keyframe `seq` may be journaled, when the client has none between `previous` and it.
 
-        Taking them only in order makes one number a session enough to know every keyframe that ever came:
-        exact de-duplication in constant memory.
+        Keyframes are taken in order only, so one number a session is enough to know every keyframe that ever
+        came: exact de-duplication in constant memory.
         """
         if seq <= self.durable:
             return "duplicate"
@@ -68,11 +69,11 @@ class Sessions:
         return len(self._all)
 
     def get(self, key: bytes) -> Session | None:
-        """A session that has something in the journal, or None."""
+        """The session of a key, or None when it has no keyframe in the journal."""
         return self._by_key.get(key)
 
     def room_for(self, key: bytes) -> bool:
-        """Whether it is one of them, or may become one."""
+        """Whether a key has a session, or may still get one."""
         return key in self._by_key or len(self) < _MAX_SESSIONS
 
     def open(self, key: bytes, client: str = "") -> Session:
@@ -84,7 +85,7 @@ class Sessions:
         return session
 
     def admit(self, key: bytes, seq: int, previous: int) -> Verdict:
-        """As `Session.admit`, for a session that may not exist yet."""
+        """The verdict of `Session.admit`, for a session that may not exist yet."""
         return (self._by_key.get(key) or Session(key, -1)).admit(seq, previous)
 
     def progress(self, key: bytes) -> tuple[int, int]:
@@ -98,25 +99,25 @@ class Sessions:
 
 
 class FairQueue:
-    """Whose keyframe the fuser gets next: one of each client in turn, and of its sessions in turn."""
+    """Sessions with keyframes for the fuser: each client gets its turn, and each session of a client."""
 
     def __init__(self) -> None:
         self._owners: OrderedDict[str, deque[Session]] = OrderedDict()
 
     def add(self, session: Session) -> None:
-        """It has something to hand out (again)."""
+        """Add a session with keyframes to hand out, unless it is there already."""
         queue = self._owners.setdefault(session.owner, deque())
         if session not in queue:
             queue.append(session)
 
     def next(self) -> Session | None:
-        """The one whose turn it is; it stays so until `served`."""
+        """The session whose turn it is; it stays the same until `rotate`."""
         for queue in self._owners.values():
             return queue[0]
         return None
 
-    def served(self) -> None:
-        """The next one got its turn; if it has more, it gets another when the others had theirs."""
+    def rotate(self) -> None:
+        """End the turn of the next session; if it has more keyframes, it waits behind the others."""
         owner, queue = self._owners.popitem(last=False)
         session = queue.popleft()
         if session.handed < len(session.entries):
@@ -125,5 +126,5 @@ class FairQueue:
             self._owners[owner] = queue
 
     def clear(self) -> None:
-        """Nothing is to be handed out."""
+        """Remove every session."""
         self._owners.clear()
