@@ -228,7 +228,6 @@ def test_meshes_that_nobody_reads_are_few() -> None:
 _SLOW = """
 import sys, time, zmq
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.journal import Position
 from tsfusion.wire import sockets
 
 link = sockets.pair(zmq.Context())

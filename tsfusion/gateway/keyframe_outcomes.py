@@ -100,7 +100,7 @@ class KeyframeOutcomes:
             reported = done.index in self._reported_rejections
         if reported:
             return  # by a fuser that died before it wrote a checkpoint
-        self._index.fused(done.index, done.fuse_start_ns, done.fused_ns)
+        self._index.set_fused(done.index, done.fuse_start_ns, done.fused_ns)
         entry = self._index[done.index]
         session.fused = max(session.fused, entry.stamps.seq)
         if done.reason is None:
