@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What gateway and fuser say to each other (msgpack of tagged structs, over a PAIR socket).
+"""The messages between gateway and fuser (msgpack of tagged structs, over a PAIR socket).
 
 The gateway hands out journal positions, a few ahead; the fuser answers each with `Done`. Neither holds
 keyframes for the other: the queue is the journal.
@@ -16,7 +16,7 @@ from tsfusion.journal import Position
 from tsfusion.wire.health import MeshLayout
 from tsfusion.wire.messages import Command
 
-NOT_WORKING = -1
+NOT_WORKING = -1  # instead of a keyframe's index
 WORKING_FILE = "working"  # in the folder of the socket
 
 
@@ -24,23 +24,29 @@ class Begin(Struct, frozen=True, tag="begin"):
     """Open the map in `folder` and compile the kernels.
 
     Attributes:
+        mesh_interval: seconds between two meshes, at least.
+        checkpoint_every: keyframes; 0 = only on request and at the end.
         working: a file of 8 bytes: the index of the keyframe that is being fused, little-endian, or
-            `NOT_WORKING`. Read when the process has died, so that the death is put down to the right one.
-        keep_previous: also keep the checkpoint before the last: the journal will not go back to the start.
-        memory_bytes: what the process may allocate.
+            `NOT_WORKING`. Read when the process has died, so that the right keyframe is blamed.
+        keep_previous: whether to keep the checkpoint before the last, too: the journal may be cut.
+        memory_bytes: that the process may allocate.
     """
 
     folder: str
     volume: VolumeConfig
-    mesh_interval: float  # seconds
-    checkpoint_every: int  # keyframes
+    mesh_interval: float
+    checkpoint_every: int
     working: str
     keep_previous: bool
     memory_bytes: int
 
 
 class SessionProgress(Struct, frozen=True, array_like=True):
-    """How far the map is with a session: fused or rejected up to `seq`; `client` owns the session."""
+    """How far a map is with a session: every keyframe up to `seq` is fused or rejected.
+
+    Attributes:
+        client: the owner of the session.
+    """
 
     seq: int
     client: str
@@ -49,7 +55,8 @@ class SessionProgress(Struct, frozen=True, array_like=True):
 class Fuse(Struct, frozen=True, tag="fuse"):
     """Fuse the keyframe at a journal position, unless the map has it already.
 
-    `skip`: count it as rejected for this reason instead.
+    Attributes:
+        skip: the reason to reject the keyframe for, without a try.
     """
 
     index: int
@@ -61,20 +68,20 @@ class Fuse(Struct, frozen=True, tag="fuse"):
 
 
 class FuserQuery(Struct, frozen=True, tag="ask"):
-    """Answer a person's command between two keyframes."""
+    """Answer a command between two keyframes."""
 
     number: int
     command: Command
 
 
 class Publish(Struct, frozen=True, tag="publish"):
-    """Whether anyone watches: send the triangles with `Meshed`, or keep them."""
+    """Send the triangles with `Meshed` from now on, or do not: whether the map has viewers."""
 
     wanted: bool
 
 
 class Save(Struct, frozen=True, tag="save"):
-    """Write a checkpoint: the journal wants room."""
+    """Write a checkpoint, so that the journal can be cut."""
 
 
 class Finish(Struct, frozen=True, tag="finish"):
@@ -82,11 +89,17 @@ class Finish(Struct, frozen=True, tag="finish"):
 
 
 class Started(Struct, frozen=True, tag="started"):
-    """The process is there and waits for `Begin`."""
+    """The process runs and waits for `Begin`."""
 
 
 class Ready(Struct, frozen=True, tag="ready"):
-    """Kernels are warm. `done`: how far the map is, by session. `rejected`: reason → count."""
+    """The map is open and the kernels are compiled.
+
+    Attributes:
+        done: session → how far the map is with it.
+        keyframes: in the map.
+        rejected: reason → number of keyframes.
+    """
 
     done: dict[bytes, SessionProgress]
     keyframes: int = 0
@@ -96,9 +109,10 @@ class Ready(Struct, frozen=True, tag="ready"):
 
 
 class Saved(Struct, frozen=True, tag="saved"):
-    """The checkpoint holds everything that was answered with `Done` before this.
+    """The checkpoint holds every keyframe that was answered with `Done` before this message.
 
-    `written`: it is a new one; else the one before held all of it already.
+    Attributes:
+        written: whether it is a new one; otherwise the one before held them all already.
     """
 
     written: bool
@@ -140,9 +154,9 @@ class Done(Struct, frozen=True, tag="done"):
 
 
 class Meshed(Struct, frozen=True, tag="meshed"):
-    """The mesh has the first `count` keyframes that this process answered; the changed part may follow.
+    """The mesh has the first `count` keyframes that this process answered; its changed part may follow.
 
-    What keyframes changed comes as fused first, and again, with `blocks` = 0, once it is regularised.
+    The changed part comes with the raw surface first, and again, with `blocks` = 0, once it is regularised.
     """
 
     count: int
@@ -169,7 +183,7 @@ class FuserStatus(Struct, frozen=True):
 
 
 class FuserReply(Struct, frozen=True, tag="answer"):
-    """To an Ask; arrays of a mesh follow as frames."""
+    """The answer to a FuserQuery; arrays of a mesh follow as frames."""
 
     number: int
     error: str | None = None
