@@ -161,7 +161,7 @@ class FuserQueries:
 def status(
     hosted: HostedMap, fuser: fuser_messages.FuserStatus, health: Health, server: ServerConfig
 ) -> Status:
-    """The answer to a person who asks how a map is doing."""
+    """A map's status: what its fuser knows, and what the gateway knows."""
     own = health.maps[hosted.name]
     return Status(
         epoch=health.epoch,

@@ -37,8 +37,8 @@ from tsfusion.wire.sockets import mesh_topic
 
 log = logging.getLogger(__name__)
 
-_LISTEN_TICK_MS = 10
 _TICK_MS = 100  # within which a signal or a fuser's death is noticed
+_RENEW_TICK_MS = 10  # while the sockets are made anew
 _SNAPSHOT_INTERVAL = 1.0  # seconds
 _MESHES_SHARE = 4  # one fourth of the memory is for meshes that wait to be read
 Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
@@ -48,6 +48,8 @@ class Gateway:
     """One server's state between clients, journals and fusers. Call `step` again and again.
 
     Attributes:
+        ports: the sockets.
+        maps: the open maps.
         epoch: a new one tells clients that the messages under way are lost.
     """
 
@@ -100,7 +102,7 @@ class Gateway:
         handlers = self._handlers()
         fusers = [hosted.fuser.socket for hosted in self.maps]
         polled = [(socket, zmq.POLLIN) for socket in (*self._access.poll, *fusers, *handlers)]
-        events = dict(zmq.zmq_poll(polled, _TICK_MS if handlers else _LISTEN_TICK_MS))
+        events = dict(zmq.zmq_poll(polled, _TICK_MS if handlers else _RENEW_TICK_MS))
         if not self._drop_connections():
             for socket, handle in handlers.items():
                 if socket in events:
@@ -148,6 +150,7 @@ class Gateway:
         return True
 
     def _snapshot(self) -> None:
+        """Give the metrics a new health snapshot, about once a second."""
         now = time.monotonic()
         if now < self._next_snapshot:
             return
@@ -173,11 +176,8 @@ class Gateway:
         """Pass a fuser's message to its map's viewers, or to whoever asked."""
         message, frames = passed
         if isinstance(message, fuser_messages.FuserReply):
-            status = (
-                None
-                if message.status is None
-                else fuser_queries.status(hosted, message.status, self.health(), self._server)
-            )
+            own = message.status
+            status = fuser_queries.status(hosted, own, self.health(), self._server) if own else None
             self._queries.on_reply(message, status, frames)
         elif frames:
             self.ports.publish(mesh_topic(hosted.name), fuser_messages.encode(message), frames)
