@@ -91,7 +91,7 @@ def _open(
         log.info("figures and health checks are at http://%s", metrics.serve(server.metrics))
     gateway = Gateway(context, server, ports, access, metrics)
     stack.callback(gateway.maps.close)
-    gateway.maps.begin(volumes)
+    gateway.maps.open_at_start(volumes)
     return gateway, Watchdog()
 
 

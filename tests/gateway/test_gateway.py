@@ -109,7 +109,7 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
             stack.callback(ports.close)
             gateway = Gateway(context, server, ports, access, Metrics())
             stack.callback(gateway.maps.close)
-            gateway.maps.begin({"default": VolumeConfig()})
+            gateway.maps.open_at_start({"default": VolumeConfig()})
             return gateway
 
         yield begin

@@ -41,6 +41,7 @@ class FuserSupervisor:
     Attributes:
         ready: whether the process has opened the map and compiled the kernels.
         in_flight: indices of the keyframes that it has not answered, oldest first.
+        finishing: whether `finish` was called.
         restarts: how often a new process had to take over.
         failed: why no process stays alive; empty = one does. It is tried again, ever more rarely.
     """
@@ -62,7 +63,7 @@ class FuserSupervisor:
         )
         self._early_deaths = 0  # in a row, of processes that were not at work on a keyframe
         self._blame: dict[int, int] = {}  # index of a keyframe → weight of the deaths at it
-        self._finishing = self._finish_sent = False
+        self.finishing = self._finish_sent = False
         self.restarts = 0
         self.failed = ""
         self._was_ready = False
@@ -99,7 +100,7 @@ class FuserSupervisor:
     @property
     def wants_work(self) -> bool:
         """Whether another keyframe may be handed out."""
-        return self.ready and not self._finishing and len(self.in_flight) < _MAX_IN_FLIGHT
+        return self.ready and not self.finishing and len(self.in_flight) < _MAX_IN_FLIGHT
 
     def send(self, message: fuser_messages.ToFuser) -> bool:
         """Send a message; False when its queue is full now. What a dead fuser has not read is lost."""
@@ -230,17 +231,12 @@ class FuserSupervisor:
         if not self._finish_sent:
             self._finish_sent = self.send(fuser_messages.Finish())
             self._last_message = time.monotonic()
-        self._finishing = True
+        self.finishing = True
 
     @property
     def finished_well(self) -> bool:
         """Whether the process has ended with its checkpoint on the disk."""
-        return self._finishing and self._process.status == 0
-
-    @property
-    def finishing(self) -> bool:
-        """Whether `finish` was called."""
-        return self._finishing
+        return self.finishing and self._process.status == 0
 
     def close(self) -> None:
         """End the process, at once if need be. The next one fuses what it had not saved from the journal."""

@@ -86,7 +86,7 @@ class Gateway:
     def accept(self) -> None:
         """Begin to take keyframes."""
         self._accepting = True
-        self.maps.begun()
+        self.maps.end_start()
         self._next_snapshot = 0.0  # health checks are to see it at once
 
     def stop_accepting(self) -> None:

@@ -57,7 +57,7 @@ class MapRegistry:
         kept = hosted.revisions.of(session)
         return kept.revision, kept.keyframes
 
-    def begin(self, volumes: Mapping[str, VolumeConfig]) -> None:
+    def open_at_start(self, volumes: Mapping[str, VolumeConfig]) -> None:
         """Open maps by name with their settings; those that clients ask for get those of the default map.
 
         Raises:
@@ -67,8 +67,8 @@ class MapRegistry:
         for name in volumes:
             self._open_map(name)
 
-    def begun(self) -> None:
-        """End the start: from here on a map that cannot be opened is no reason to end the server."""
+    def end_start(self) -> None:
+        """Go on when a map cannot be opened, from here on; before, that is an error of the server."""
         self._started = True
 
     def open_for_client(self, name: str) -> HostedMap | None:

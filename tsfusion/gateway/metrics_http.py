@@ -13,11 +13,11 @@ import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from http import HTTPStatus
-from ipaddress import ip_address
 
 from msgspec import Struct
 
 from tsfusion.core.errors import InvalidConfig, TransportError
+from tsfusion.wire.sockets import is_loopback
 
 DEADLINE = 5.0  # seconds for a request and its answer
 CONNECTIONS = 32  # at once; the oldest makes room for a new one
@@ -146,7 +146,7 @@ def _listen(address: str) -> socket.socket:
     host, _, digits = address.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     port = int(digits) if digits.isascii() and digits.isdigit() else _LAST_PORT + 1
-    if not _is_loopback(host) or port > _LAST_PORT:
+    if not is_loopback(host) or port > _LAST_PORT:
         raise InvalidConfig(
             f"metrics must be HOST:PORT on this machine, such as 127.0.0.1:9464, got {address!r}; "
             "let others in by a reverse proxy that asks who they are, or by `ssh -L`"
@@ -158,13 +158,6 @@ def _listen(address: str) -> socket.socket:
     except OSError as error:
         why = error.strerror or error
         raise TransportError(f"cannot serve metrics on {address}: {why}; choose another port") from error
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return host == "localhost" or ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def _text(host: str, port: int) -> str:

@@ -161,7 +161,7 @@ def target(address: str) -> str:
 
 def check_reachable(address: str, *, has_keys: bool) -> None:
     """Raise InvalidConfig when others can reach the address and there are no keys to tell them apart by."""
-    if has_keys or _is_loopback(split(address)[0]):
+    if has_keys or is_loopback(split(address)[0]):
         return
     raise InvalidConfig(
         f"without keys the server listens on tcp://127.0.0.1 only, got {address}; run `tsfusion keys new "
@@ -173,14 +173,15 @@ def check_reachable(address: str, *, has_keys: bool) -> None:
 
 def check_own_machine(address: str) -> None:
     """Raise InvalidConfig when others can reach the address."""
-    if not _is_loopback(split(address)[0]):
+    if not is_loopback(split(address)[0]):
         raise InvalidConfig(
             f"there are no keys here, so that only tcp://127.0.0.1 can be bound, got {address}; let the "
             "sender bind, or come through an ssh tunnel"
         )
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
+    """Whether a host, name or number, is this machine."""
     try:
         return host == "localhost" or ip_address(host).is_loopback
     except ValueError:
