@@ -92,7 +92,7 @@ def test_a_server_opens_only_so_many_maps(tmp_path: Path) -> None:
 def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise JournalError("no room")
 
     monkeypatch.setattr(map_registry, "HostedMap", fail)
