@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import zmq
@@ -97,7 +97,7 @@ def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
 
     monkeypatch.setattr(map_registry, "HostedMap", fail)
     found: Any = MapRegistry(
-        zmq.Context.instance(), ServerConfig(state=str(tmp_path)), ClientRoutes(lambda *_: None), Metrics()
+        zmq.Context.instance(), ServerConfig(state=str(tmp_path)), cast(ClientRoutes, None), Metrics()
     )
     found._volumes = {"default": VolumeConfig()}
     for i in range(200):

@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import pytest
@@ -26,6 +26,7 @@ from tsfusion.gateway import fuser_process
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.fuser_queries import FuserQueries
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
+from tsfusion.gateway.ports import Ports
 from tsfusion.journal import Position
 from tsfusion.wire import codec, health, messages, queries, sockets
 from tsfusion.wire.keyframe_header import Refused, pack, unpack
@@ -64,7 +65,7 @@ def test_a_stranger_cannot_unsubscribe_a_viewer(shared: Server) -> None:
 
 
 def test_strangers_do_not_push_out_a_client_that_is_heard() -> None:
-    routes = ClientRoutes(lambda *_: None)
+    routes = ClientRoutes(cast(Ports, None))
     client = routes.connect(b"client", "default", b"1")
     for number in range(3000):
         routes.connect(number.to_bytes(16, "big"), "default", b"2")
@@ -146,9 +147,9 @@ class Asking:
         self.map: Any = Map()
         self.errors: list[str | None] = []
         self.frames: list[Any] = []
-        self.queries = FuserQueries(self._on_answer, most_bytes)
+        self.queries = FuserQueries(cast(Ports, self), most_bytes)
 
-    def _on_answer(self, identity: bytes, message: messages.ToClient, frames: Any = ()) -> None:
+    def reply(self, identity: bytes, message: messages.ToClient, frames: Any = ()) -> None:
         assert isinstance(message, messages.Reply)
         self.errors.append(message.error)
         self.frames += frames  # which nobody reads

@@ -42,11 +42,7 @@ class Begin(Struct, frozen=True, tag="begin"):
 
 
 class SessionProgress(Struct, frozen=True, array_like=True):
-    """How far a map is with a session: every keyframe up to `seq` is fused or rejected.
-
-    Attributes:
-        client: the owner of the session.
-    """
+    """How far a map is with a client's session: every keyframe up to `seq` is fused or rejected."""
 
     seq: int
     client: str
@@ -55,8 +51,7 @@ class SessionProgress(Struct, frozen=True, array_like=True):
 class Fuse(Struct, frozen=True, tag="fuse"):
     """Fuse the keyframe at a journal position, unless the map has it already.
 
-    Attributes:
-        skip: the reason to reject the keyframe for, without a try.
+    `skip`: reject it without a try, for this reason.
     """
 
     index: int
@@ -93,13 +88,7 @@ class Started(Struct, frozen=True, tag="started"):
 
 
 class Ready(Struct, frozen=True, tag="ready"):
-    """The map is open and the kernels are compiled.
-
-    Attributes:
-        done: session → how far the map is with it.
-        keyframes: in the map.
-        rejected: reason → number of keyframes.
-    """
+    """Kernels are warm. `done`: how far the map is, by session. `rejected`: keyframes, by reason."""
 
     done: dict[bytes, SessionProgress]
     keyframes: int = 0
@@ -111,8 +100,7 @@ class Ready(Struct, frozen=True, tag="ready"):
 class Saved(Struct, frozen=True, tag="saved"):
     """The checkpoint holds every keyframe that was answered with `Done` before this message.
 
-    Attributes:
-        written: whether it is a new one; otherwise the one before held them all already.
+    `written`: whether it is a new one; otherwise the one before held them all already.
     """
 
     written: bool

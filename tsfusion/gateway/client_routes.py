@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from msgspec import Struct, field
 
-from tsfusion.gateway.ports import SendReply
+from tsfusion.gateway.ports import Ports
 from tsfusion.wire.health import ClientHealth
 from tsfusion.wire.messages import Ping, ToClient
 
@@ -96,8 +96,8 @@ class ClientRoutes:
     greetings push out the clients of others. Within a name, those that never sent a keyframe go first.
     """
 
-    def __init__(self, send: SendReply) -> None:
-        self._send = send
+    def __init__(self, ports: Ports) -> None:
+        self._ports = ports
         self._by_session: dict[bytes, ClientRoute] = {}
         self._names: dict[str, _NameRoutes] = {}
 
@@ -161,7 +161,7 @@ class ClientRoutes:
         """Send a message to a session's client, if that is connected."""
         route = self._by_session.get(session)
         if route is not None:
-            self._send(route.identity, message)
+            self._ports.reply(route.identity, message)
 
     def clear(self) -> None:
         """Forget all clients: every connection was dropped."""

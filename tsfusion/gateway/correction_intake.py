@@ -74,8 +74,8 @@ class Corrector:
     ) -> Uncorrected | None:
         """A message costs what is written for it: the whole file."""
         now = time.monotonic()
-        if seconds := hosted.pause_left(now):
-            return self._later(head, seconds, "disk", hosted.problem)
+        if seconds := hosted.disk.seconds_left(now):
+            return self._later(head, seconds, "disk", hosted.disk.problem)
         nbytes = kept_bytes + corrections.file_bytes(head.count)
         if seconds := self._quotas.wait(client, nbytes, now):
             return self._later(head, seconds, "quota", "a client's corrections have a quota, too")

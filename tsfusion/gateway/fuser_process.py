@@ -55,11 +55,6 @@ class FuserProcess:
             raise
 
     @property
-    def pid(self) -> int:
-        """The process id."""
-        return self._process.pid
-
-    @property
     def status(self) -> int | None:
         """The exit status; None = it runs."""
         return self._process.poll()

@@ -17,7 +17,7 @@ from tsfusion.core.config import ServerConfig
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.memory_guard import PendingReplies
-from tsfusion.gateway.ports import SendReply
+from tsfusion.gateway.ports import Ports
 from tsfusion.wire import health, messages
 from tsfusion.wire.health import Health, Status
 
@@ -58,12 +58,11 @@ class FuserQueries:
     """The commands that wait for a fuser's answer.
 
     Args:
-        send: sends replies.
         max_bytes: of meshes that wait to be read; a single one may be larger.
     """
 
-    def __init__(self, send: SendReply, max_bytes: int) -> None:
-        self._send = send
+    def __init__(self, ports: Ports, max_bytes: int) -> None:
+        self._ports = ports
         self._max_bytes = max_bytes
         self._pending: dict[int, PendingQuery] = {}
         self._count = 0
@@ -94,7 +93,7 @@ class FuserQueries:
 
     def _refuse(self, query: PendingQuery, problem: str, *, retry: bool = False) -> None:
         error = f"{problem}; ask again" if retry else problem
-        self._send(query.identity, messages.Reply(name=query.command.name, error=error, retry=retry))
+        self._ports.reply(query.identity, messages.Reply(name=query.command.name, error=error, retry=retry))
 
     def _pass_on(self, query: PendingQuery, hosted: HostedMap) -> str:
         """Why the fuser cannot be asked now; empty = it was."""
@@ -147,7 +146,7 @@ class FuserQueries:
             nbytes = sum(frame.buffer.nbytes for frame in frames)
             rest_until = now + _REST_FACTOR * (now - query.asked_at)
             self._last_meshes[query.command.map] = LastMesh(nbytes, query.asked_at, rest_until)
-        self._send(query.identity, reply, self._unread.wrap(query.owner, frames) if frames else ())
+        self._ports.reply(query.identity, reply, self._unread.wrap(query.owner, frames) if frames else ())
 
     def give_up(self, map_name: str) -> None:
         """Refuse what a map's fuser was asked: it has ended."""

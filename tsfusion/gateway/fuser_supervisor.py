@@ -88,11 +88,6 @@ class FuserSupervisor:
         return self._process.socket
 
     @property
-    def pid(self) -> int:
-        """The id of the present process."""
-        return self._process.pid
-
-    @property
     def idle(self) -> bool:
         """Whether the process is ready and has answered every keyframe that was handed out."""
         return self.ready and not self.in_flight

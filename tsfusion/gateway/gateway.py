@@ -65,13 +65,13 @@ class Gateway:
         self._server = server
         self._access = access
         self._metrics = metrics
-        self._routes = ClientRoutes(ports.reply)
+        self._routes = ClientRoutes(ports)
         self._admission = Admission(access, self._routes)
         self._refused = self._admission.refused
         self.maps = MapRegistry(context, server, self._routes, metrics)
         self._intake = KeyframeIntake(server, self.maps, self._admission, self._routes)
         self._corrector = Corrector(server, self.maps, self._admission)
-        self._queries = FuserQueries(ports.reply, server.memory_bytes // _MESHES_SHARE)
+        self._queries = FuserQueries(ports, server.memory_bytes // _MESHES_SHARE)
         self._subscriptions = Subscriptions()
         self._publishing: dict[str, bool] = {}  # map → whether its fuser was told to send triangles
         self._memory = MemoryGuard(server.memory_bytes)

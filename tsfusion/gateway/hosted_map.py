@@ -3,7 +3,7 @@
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,13 @@ from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.correction_store import Revisions
+from tsfusion.gateway.fuser_backlog import FuserBacklog
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.journal_retention import JournalRetention
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes
 from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.sessions import FairQueue, Session, Sessions
+from tsfusion.gateway.sessions import Sessions
 from tsfusion.journal import Journal, state_folder
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import keyframe_times
@@ -38,10 +39,10 @@ class HostedMap:
     """An open map. Call `step` again and again, and `accept` for each keyframe.
 
     Attributes:
-        folder: the map's folder in the state folder.
-        sessions: the sessions of its journal.
+        folder: in the state folder.
+        disk: why keyframes are not taken now, and for how long.
+        outcomes: what the map has, by its fuser's answers.
         revisions: the corrected poses of its keyframes.
-        fuser: the process that works through the journal.
         warm: whether the fuser has been ready once: from then on it is known what the map has.
     """
 
@@ -63,14 +64,14 @@ class HostedMap:
         self._last_keyframe: float | None = None  # time.monotonic()
         self._loss = ""
         self._journal = _open_journal(self.folder, server)
-        self._disk = DiskPause(self._journal, server.min_free_bytes, name)
+        self.disk = DiskPause(self._journal, server.min_free_bytes, name)
         self.revisions = Revisions(self.folder / state_folder.CORRECTIONS_FOLDER, server.min_free_bytes)
         self._quarantine = Quarantine(self.folder / state_folder.QUARANTINE_FOLDER, server.quarantine_bytes)
         self._index = KeyframeIndex()
         self._index.recover(self._journal.found, self.sessions)
         self._journal.found = []
         self._backlog = FuserBacklog(self._index, self.sessions)
-        self._outcomes = KeyframeOutcomes(
+        self.outcomes = KeyframeOutcomes(
             name,
             self._index,
             self.sessions,
@@ -106,27 +107,18 @@ class HostedMap:
 
     # --- keyframes ---
 
-    @property
-    def problem(self) -> str:
-        """Why keyframes are not taken now; empty = they are."""
-        return self._disk.problem
-
-    def pause_left(self, now: float) -> float:
-        """Seconds for which no keyframe is taken because the disk refused one."""
-        return self._disk.seconds_left(now)
-
     def accept(self, header: KeyframeHeader, frames: Sequence[Any], client: str, received_ns: int) -> None:
         """Write the session's next keyframe to the journal, and acknowledge it.
 
         Raises:
-            JournalError: when the disk refuses; `pause_left` says for how long no keyframe is taken.
+            JournalError: when the disk refuses.
         """
         try:
             position = self._journal.append(frames, session=header.session, seq=header.seq, client=client)
         except JournalError as error:
-            self._disk.begin(error)
+            self.disk.begin(error)
             raise
-        self._disk.end()
+        self.disk.end()
         session = self.sessions.open(header.session, client)
         session.durable = header.seq
         durable_ns = time.monotonic_ns()
@@ -141,13 +133,9 @@ class HostedMap:
         self._last_keyframe = durable_ns / 1e9
         self._backlog.add(session)
         self._metrics.observe(self.name, "journal", (durable_ns - received_ns) / 1e9)
-        self._outcomes.acknowledge(
+        self.outcomes.acknowledge(
             header.session, [keyframe_times.Stamps(header.seq, received_ns, durable_ns)]
         )
-
-    def acknowledge(self, key: bytes, *, resend: bool = False) -> None:
-        """Tell a client how far its session is."""
-        self._outcomes.acknowledge(key, resend=resend)
 
     # --- fuser ---
 
@@ -166,21 +154,21 @@ class HostedMap:
             message, frames = received
             if isinstance(message, fuser_messages.Done):
                 self._backlog.waiting -= 1
-                self._outcomes.on_done(message)
+                self.outcomes.on_done(message)
             elif isinstance(message, fuser_messages.Ready):
                 self._on_ready(message)
             elif isinstance(message, fuser_messages.Saved):
                 self._retention.on_saved(message)
             elif isinstance(message, fuser_messages.Meshed):
-                self._outcomes.on_meshed(message)
+                self.outcomes.on_meshed(message)
                 for_people.append((message, frames))
             elif isinstance(message, fuser_messages.FuserReply):
                 for_people.append((message, frames))
         if ended and not self.fuser.finishing:
             self.fuser.restart()
         self._backlog.hand_out(self.fuser)
-        self._disk.step()
-        self._retention.step(self.fuser, self._outcomes.unmeshed)
+        self.disk.step()
+        self._retention.step(self.fuser, self.outcomes.unmeshed)
         return for_people
 
     def _on_ready(self, ready: fuser_messages.Ready) -> None:
@@ -189,7 +177,7 @@ class HostedMap:
             session.durable = max(session.durable, progress.seq)
             session.fused = max(session.fused, progress.seq)
         self._backlog.restart(ready.done)
-        self._outcomes.on_ready(ready)
+        self.outcomes.on_ready(ready)
         self._retention.on_ready()
         if not self.warm:
             self.warm = True
@@ -228,10 +216,10 @@ class HostedMap:
 
     def health(self) -> MapHealth:
         """How the map is doing, as far as it is known without asking the fuser."""
-        now, outcomes = time.monotonic(), self._outcomes
+        now, outcomes = time.monotonic(), self.outcomes
         return MapHealth(
             state=self.state,
-            problem=self.problem or self.fuser.failed,
+            problem=self.disk.problem or self.fuser.failed,
             keyframes_durable=outcomes.fused + outcomes.rejected.total() + self._backlog.waiting,
             keyframes_fused=outcomes.fused,
             waiting=self._backlog.waiting,
@@ -256,49 +244,6 @@ def _open_journal(folder: Path, server: ServerConfig) -> Journal:
     if server.journal_bytes is not None:
         segment_bytes = min(segment_bytes, server.journal_bytes // _SEGMENTS_KEPT)
     return Journal(folder / state_folder.JOURNAL_FOLDER, segment_bytes, min_free_bytes=server.min_free_bytes)
-
-
-class FuserBacklog:
-    """The journaled keyframes that a map's fuser has not answered, handed out to it in fair order.
-
-    Attributes:
-        waiting: how many there are.
-    """
-
-    def __init__(self, index: KeyframeIndex, sessions: Sessions) -> None:
-        self.waiting = len(index)
-        self._index = index
-        self._sessions = sessions
-        self._queue = FairQueue()
-
-    def add(self, session: Session) -> None:
-        """Add the keyframe of a session that was journaled just now."""
-        self.waiting += 1
-        self._queue.add(session)
-
-    def restart(self, done: Mapping[bytes, fuser_messages.SessionProgress]) -> None:
-        """Go back to what a new fuser has, by session: all that follows is handed out (again)."""
-        self._queue.clear()
-        self.waiting = 0
-        for session in self._sessions:
-            progress = done.get(session.key)
-            session.in_map = progress.seq if progress else 0
-            session.handed = self._index.after(session, progress.seq) if progress else 0
-            self.waiting += len(session.entries) - session.handed
-            if session.handed < len(session.entries):
-                self._queue.add(session)
-
-    def hand_out(self, fuser: FuserSupervisor) -> None:
-        """Hand keyframes out to the fuser, as many as it wants."""
-        while fuser.wants_work and (session := self._queue.next()) is not None:
-            entry = self._index[session.entries[session.handed]]
-            order = fuser_messages.Fuse(
-                entry.index, entry.position, session.key, entry.stamps.seq, session.client
-            )
-            if not fuser.fuse(order):
-                return
-            session.handed += 1
-            self._queue.rotate()
 
 
 class DiskPause:

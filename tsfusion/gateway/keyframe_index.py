@@ -13,17 +13,11 @@ from tsfusion.wire.keyframe_times import Stamps
 
 
 class IndexEntry(Struct, frozen=True):
-    """One journaled keyframe.
-
-    Attributes:
-        index: its number in the journal's order, from 0.
-        session: `Session.number`.
-        captured_ns: the client's monotonic clock; 0 = unknown.
-    """
+    """One journaled keyframe."""
 
     index: int
     position: Position
-    session: int
+    session: int  # its number in `Sessions`
     stamps: Stamps
     captured_ns: int
 

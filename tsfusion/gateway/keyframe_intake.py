@@ -80,8 +80,8 @@ class KeyframeIntake:
             if now < route.held_until:
                 self._refused["held"] += 1
                 return True
-        if seconds := hosted.pause_left(now):
-            self._hold(key, seconds, "disk", hosted.problem)
+        if seconds := hosted.disk.seconds_left(now):
+            self._hold(key, seconds, "disk", hosted.disk.problem)
             return True
         if seconds := self._quotas.wait(client, nbytes, now):
             rates = f"{self._server.quota_keyframes:g} keyframes and {self._server.quota_bytes >> 20} MB"
@@ -111,7 +111,7 @@ class KeyframeIntake:
             self.duplicates += verdict == "duplicate"
             self._refused["gap"] += verdict == "gap"
             self._routes.mark_alive(header.session, client, scans=verdict == "duplicate")
-            hosted.acknowledge(header.session, resend=verdict == "gap")
+            hosted.outcomes.acknowledge(header.session, resend=verdict == "gap")
             return
         try:
             codec.check(buffers, self._server.max_frame_bytes)
@@ -121,7 +121,9 @@ class KeyframeIntake:
         except Refused as error:
             self._refuse(error, client, header)
         except JournalError:
-            self._hold(header.session, hosted.pause_left(time.monotonic()), "disk", hosted.problem)
+            self._hold(
+                header.session, hosted.disk.seconds_left(time.monotonic()), "disk", hosted.disk.problem
+            )
 
     def _refuse(self, error: Refused, client: str, header: KeyframeHeader | None = None) -> None:
         """Count a bad message; if its session is known, tell the client not to send it again."""

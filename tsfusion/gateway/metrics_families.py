@@ -110,12 +110,7 @@ def _of_clients(clients: Iterable[ClientHealth], age: float) -> Iterator[Metric]
     skipped = (
         ((client, reason), n) for client, own in by_name.items() for reason, n in _skipped(own).items()
     )
-    yield _gauge(
-        "client_skipped_keyframes",
-        "Keyframes never sent, as reported.",
-        ("client", "reason"),
-        skipped,
-    )
+    yield _gauge("client_skipped_keyframes", "Never sent, as reported.", ("client", "reason"), skipped)
 
 
 def _grouped(clients: Iterable[ClientHealth]) -> dict[str, list[ClientHealth]]:

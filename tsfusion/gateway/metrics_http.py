@@ -30,12 +30,7 @@ log = logging.getLogger(__name__)
 
 
 class HttpResponse(Struct, frozen=True):
-    """The answer to a request.
-
-    Attributes:
-        body: text, which gets a line break at its end, or bytes.
-        kind: the Content-Type.
-    """
+    """The answer to a request. Text gets a line break at its end."""
 
     status: int
     body: str | bytes

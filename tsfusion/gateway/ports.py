@@ -4,7 +4,7 @@
 import logging
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import zmq
 
@@ -19,13 +19,6 @@ log = logging.getLogger(__name__)
 _MESSAGES_A_STEP = 16
 _REBIND_INTERVAL = 0.01  # seconds
 Handler: TypeAlias = Callable[[list[zmq.Frame]], None]
-
-
-class SendReply(Protocol):
-    """Sends a message to a connection of the control socket."""
-
-    def __call__(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
-        """Send it now, or drop it."""
 
 
 class Ports:

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The sessions of a map, how far each is, and the fair queue in which the fuser takes from them."""
+"""The sessions of a map, and how far each is."""
 
 from array import array
-from collections import OrderedDict, deque
 from collections.abc import Iterator
 from typing import Literal
 
@@ -96,35 +95,3 @@ class Sessions:
     def numbered(self, number: int) -> Session:
         """A session by its number."""
         return self._all[number]
-
-
-class FairQueue:
-    """Sessions with keyframes for the fuser: each client gets its turn, and each session of a client."""
-
-    def __init__(self) -> None:
-        self._owners: OrderedDict[str, deque[Session]] = OrderedDict()
-
-    def add(self, session: Session) -> None:
-        """Add a session with keyframes to hand out, unless it is there already."""
-        queue = self._owners.setdefault(session.owner, deque())
-        if session not in queue:
-            queue.append(session)
-
-    def next(self) -> Session | None:
-        """The session whose turn it is; it stays the same until `rotate`."""
-        for queue in self._owners.values():
-            return queue[0]
-        return None
-
-    def rotate(self) -> None:
-        """End the turn of the next session; if it has more keyframes, it waits behind the others."""
-        owner, queue = self._owners.popitem(last=False)
-        session = queue.popleft()
-        if session.handed < len(session.entries):
-            queue.append(session)
-        if queue:
-            self._owners[owner] = queue
-
-    def clear(self) -> None:
-        """Remove every session."""
-        self._owners.clear()
