@@ -17,7 +17,7 @@ from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.keyframe_outcomes import DelayStatistics
 from tsfusion.gateway.ports import Ports, Subscriptions
-from tsfusion.gateway.sessions import Session, Sessions
+from tsfusion.gateway.sessions import Sessions
 from tsfusion.journal import Position, Scan, quarantine
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import messages, sockets
@@ -151,12 +151,15 @@ def test_the_clock_estimate_stays_within_its_bound(seed: int) -> None:
 
 
 def test_each_keyframe_is_admitted_once_and_in_order() -> None:
-    session = Session(SESSION, 0)
-    assert session.admit(1, 0) == "next"
+    sessions = Sessions()
+    session = sessions.open(SESSION)
+    assert sessions.admit(SESSION, 1, 0) == "next"
     session.durable = 5
-    assert [session.admit(seq, seq - 1) for seq in (5, 6, 7)] == ["duplicate", "next", "gap"]
-    assert session.admit(9, 5) == session.admit(9, 0) == "next"  # the client dropped 6 to 8
-    assert session.admit(9, 6) == "gap"
+    assert [sessions.admit(SESSION, seq, seq - 1) for seq in (5, 6, 7)] == ["duplicate", "next", "gap"]
+    assert (
+        sessions.admit(SESSION, 9, 5) == sessions.admit(SESSION, 9, 0) == "next"
+    )  # the client dropped 6 to 8
+    assert sessions.admit(SESSION, 9, 6) == "gap"
 
 
 def test_sessions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,16 +43,6 @@ class Session(Struct, eq=False):
         """Whether a client may go on with the session. One that came without keys is anyone's."""
         return not self.client or not client or self.client == client
 
-    def admit(self, seq: int, previous: int) -> Verdict:
-        """Whether keyframe `seq` may be journaled, when the client has none between `previous` and it.
-
-        Keyframes are taken in order only, so one number a session is enough to know every keyframe that ever
-        came: exact de-duplication in constant memory.
-        """
-        if seq <= self.durable:
-            return "duplicate"
-        return "next" if previous <= self.durable else "gap"
-
 
 class Sessions:
     """All sessions of a map's journal."""
@@ -84,8 +74,15 @@ class Sessions:
         return session
 
     def admit(self, key: bytes, seq: int, previous: int) -> Verdict:
-        """The verdict of `Session.admit`, for a session that may not exist yet."""
-        return (self._by_key.get(key) or Session(key, -1)).admit(seq, previous)
+        """Whether keyframe `seq` may be journaled, when the client has none between `previous` and it.
+
+        Keyframes are taken in order only, so one number a session is enough to know every keyframe that ever
+        came: exact de-duplication in constant memory.
+        """
+        durable, _ = self.progress(key)
+        if seq <= durable:
+            return "duplicate"
+        return "next" if previous <= durable else "gap"
 
     def progress(self, key: bytes) -> tuple[int, int]:
         """The highest seq of a session that is durable, and that is fused."""
