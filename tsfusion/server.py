@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The server: a gateway that journals and acknowledges keyframes, and the fusers it keeps at work."""
+"""The server: a gateway that journals and acknowledges keyframes, and the fuser processes that it starts."""
 
 import logging
 import signal
@@ -81,18 +81,17 @@ def _open(
             volumes.setdefault(name, volumes[DEFAULT_MAP])
     context: zmq.Context[Any] = zmq.Context()
     stack.callback(context.term)
-    door = AccessControl(context, server.keys)
-    stack.callback(door.close)
-    ports = Ports(context, server, door.keys)
+    access = AccessControl(context, server.keys)
+    stack.callback(access.close)
+    ports = Ports(context, server, access.keys)
     stack.callback(ports.close)
-    metrics = None
+    metrics = Metrics(server)
+    stack.callback(metrics.close)
     if server.metrics is not None:
-        metrics = Metrics(server)
-        stack.callback(metrics.close)
         log.info("figures and health checks are at http://%s", metrics.serve(server.metrics))
-    gateway = Gateway(context, server, ports, door, metrics)
+    gateway = Gateway(context, server, ports, access, metrics)
     stack.callback(gateway.maps.close)
-    gateway.maps.begin(volumes)
+    gateway.maps.open_at_start(volumes)
     return gateway, Watchdog()
 
 
@@ -115,14 +114,13 @@ def _serve(gateway: Gateway, signals: list[int], watchdog: Watchdog) -> int:
 
 @contextmanager
 def _signals() -> Iterator[list[int]]:
-    """The signals to stop that have come, as they come."""
+    """A list to which each signal to stop is appended when it comes."""
     came: list[int] = []
-
     last = 0.0
 
     def note(number: int, _frame: FrameType | None) -> None:
         nonlocal last
-        # `timeout` and some supervisors signal a process and then its group: one request, not two
+        # `timeout` and some supervisors signal a process and then its group: that is one request, not two.
         if not came or time.monotonic() - last > _SECOND_SIGNAL:
             came.append(number)
             last = time.monotonic()
@@ -136,7 +134,7 @@ def _signals() -> Iterator[list[int]]:
 
 
 def _check_addresses(server: ServerConfig) -> None:
-    """Fail now, not after the kernels are compiled."""
+    """Raise for addresses that cannot be bound now, not after the kernels are compiled."""
     for address in (server.listen, server.control):
         if address is not None:
             sockets.check_reachable(address, has_keys=server.keys is not None)

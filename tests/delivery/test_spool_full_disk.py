@@ -310,7 +310,7 @@ def test_a_shortage_of_descriptors_loses_nothing(tmp_path: Path, monkeypatch: py
 
     def scarce(folder: Path, position: journal.Position) -> journal.Record:
         if failing[0]:
-            raise JournalError("cannot read") from OSError(errno.EMFILE, "Too many open files")
+            raise JournalError("cannot read", errno.EMFILE)
         return read(folder, position)
 
     with scripted() as server, joined(server, spool=tmp_path) as client:
@@ -332,7 +332,7 @@ def test_a_keyframe_that_stays_unreadable_is_given_up(
     def damaged(folder: Path, position: journal.Position) -> journal.Record:
         record = read(folder, position)
         if record.seq == 2:
-            raise JournalError("cannot read") from OSError(errno.EIO, "Input/output error")
+            raise JournalError("cannot read", errno.EIO)
         return record
 
     with scripted() as server, joined(server, spool=tmp_path) as client:

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import zmq
@@ -19,7 +19,9 @@ from tsfusion.core import config as core_config
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import JournalError, ServerUnreachable, TransportError
 from tsfusion.gateway import map_registry
+from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.map_registry import MapRegistry
+from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.journal import state_folder
 from tsfusion.journal.recording import JournalRecording
@@ -90,11 +92,13 @@ def test_a_server_opens_only_so_many_maps(tmp_path: Path) -> None:
 def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise JournalError("no room")
 
     monkeypatch.setattr(map_registry, "HostedMap", fail)
-    found: Any = MapRegistry(zmq.Context.instance(), ServerConfig(state=str(tmp_path)), None)  # type: ignore[arg-type]
+    found: Any = MapRegistry(
+        zmq.Context.instance(), ServerConfig(state=str(tmp_path)), cast(ClientRoutes, None), Metrics()
+    )
     found._volumes = {"default": VolumeConfig()}
     for i in range(200):
         assert found.open_for_client(f"map{i}") is None

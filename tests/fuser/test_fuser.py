@@ -17,6 +17,8 @@ from keyframes_and_servers import alive, serving, until, wall
 import tsfusion
 from tsfusion import VolumeConfig
 from tsfusion.core.errors import CheckpointError, InvalidConfig
+from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, JournalError, MapError, MapFull, TsfusionError
+from tsfusion.core.folder_lock import hold
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.fuser import Fuser
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
@@ -76,7 +78,7 @@ def opened(state: Path, volume: VolumeConfig = VOLUME, **settings: Any) -> tuple
 
 
 def status(fuser: Fuser, link: Link) -> fuser_messages.FuserStatus:
-    fuser.take(fuser_messages.FuserQuery(1, Command(name="status")))
+    fuser.handle(fuser_messages.FuserQuery(1, Command(name="status")))
     answer = link.last()
     assert answer.status is not None
     return msgspec.structs.replace(answer.status, peak_rss_bytes=0)  # of this whole process
@@ -88,13 +90,13 @@ def test_keyframes_are_fused_meshed_and_checkpointed(tmp_path: Path) -> None:
     assert fuser.ready().done == {}
     assert not fuser.mesh_due(idle=True)
     for index, position in enumerate(positions):
-        fuser.take(order(index, position))
+        fuser.handle(order(index, position))
         done = link.last()
         assert (done.index, done.reason, done.fused_ns > done.fuse_start_ns > 0) == (index, None, True)
     assert fuser.mesh_due(idle=True)
     fuser.mesh()
     assert (link.last().count, link.sent[-1][1]) == (3, [])
-    fuser.take(fuser_messages.Finish())
+    fuser.handle(fuser_messages.Finish())
     assert fuser.exit_status == 0
     again, link_again = opened(tmp_path)
     assert again.ready().done == {SESSION: fuser_messages.SessionProgress(3, "robot")}
@@ -104,8 +106,8 @@ def test_keyframes_are_fused_meshed_and_checkpointed(tmp_path: Path) -> None:
 def test_watchers_get_the_triangles(tmp_path: Path) -> None:
     (position,) = fill(tmp_path, 1)
     fuser, link = opened(tmp_path)
-    fuser.take(fuser_messages.Publish(True))
-    fuser.take(order(0, position))
+    fuser.handle(fuser_messages.Publish(True))
+    fuser.handle(order(0, position))
     fuser.mesh()
     meshed, frames = link.sent[-1]
     assert isinstance(meshed, fuser_messages.Meshed)
@@ -119,8 +121,8 @@ def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
     monkeypatch.setattr("tsfusion.fuser.fuser._REFINED_AT_ONCE", 10)
     (position,) = fill(tmp_path, 1)
     fuser, link = opened(tmp_path)
-    fuser.take(fuser_messages.Publish(True))
-    fuser.take(order(0, position))
+    fuser.handle(fuser_messages.Publish(True))
+    fuser.handle(order(0, position))
     fuser.mesh()
     before = len(link.sent)
     while fuser.refine_due:
@@ -132,16 +134,16 @@ def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
     cells = np.concatenate([np.frombuffer(frames[0], np.int32).reshape(-1, 3) for _, frames in refined])
     assert len(np.unique(cells, axis=0)) == len(cells)
     fuser.mesh()
-    fuser.take(fuser_messages.Publish(False))
+    fuser.handle(fuser_messages.Publish(False))
     assert not fuser.refine_due
 
 
 def test_what_cannot_be_fused_is_counted_also_after_a_restart(tmp_path: Path) -> None:
     positions = fill(tmp_path, 2)
     fuser, link = opened(tmp_path, checkpoint_every=1)
-    fuser.take(order(0, Position(7, 42)))
+    fuser.handle(order(0, Position(7, 42)))
     assert link.done().reason == "JournalError"
-    fuser.take(order(1, positions[0], skip="crash"))
+    fuser.handle(order(1, positions[0], skip="crash"))
     assert link.done().reason == "crash"
     rejected = {"JournalError": 1, "crash": 1}
     assert status(fuser, link).keyframes_rejected == rejected
@@ -214,7 +216,7 @@ def test_a_keyframe_that_the_map_has_is_not_fused_again(tmp_path: Path) -> None:
     positions = fill(tmp_path, 2)
     fuser, link = opened(tmp_path)
     for index in (0, 1, 0):
-        fuser.take(order(index, positions[index]))
+        fuser.handle(order(index, positions[index]))
     assert (link.last().index, link.last().reason) == (0, None)
     assert status(fuser, link).keyframes_fused == 2
 
@@ -223,11 +225,11 @@ def test_a_checkpoint_on_request_keeps_the_one_before(tmp_path: Path) -> None:
     """The journal forgets what both hold, so a damaged one is made good by the other."""
     positions = fill(tmp_path, 3)
     fuser, link = opened(tmp_path, keep_previous=True)
-    fuser.take(fuser_messages.Save())
+    fuser.handle(fuser_messages.Save())
     assert link.last() == fuser_messages.Saved(written=False)
     for index in (0, 1):
-        fuser.take(order(index, positions[index]))
-        fuser.take(fuser_messages.Save())
+        fuser.handle(order(index, positions[index]))
+        fuser.handle(fuser_messages.Save())
         assert link.last() == fuser_messages.Saved(written=True)
     assert (tmp_path / PREVIOUS_FILE).exists()
     (tmp_path / MAP_FILE).write_bytes(b"")
@@ -279,10 +281,10 @@ def test_what_it_works_at_shows_from_outside(tmp_path: Path, monkeypatch: pytest
 
     monkeypatch.setattr(codec, "decode", decoder_bug)
     with pytest.raises(RuntimeError):
-        fuser.take(order(0, position))
+        fuser.handle(order(0, position))
     assert (tmp_path / "working").read_bytes() == bytes(8)
     monkeypatch.undo()
-    fuser.take(order(0, position))
+    fuser.handle(order(0, position))
     assert link.last().reason is None
     assert (tmp_path / "working").read_bytes() == b"\xff" * 8
 
@@ -298,12 +300,12 @@ def test_a_record_that_cannot_be_read_now_is_left_to_another_process(
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(os, "pread", refused)
-    fuser.take(order(0, position))
+    fuser.handle(order(0, position))
     assert (fuser.exit_status, link.sent, fuser.ready().done) == (1, [], {})
     assert (tmp_path / "working").read_bytes() == bytes(8)  # it was at this one
     monkeypatch.undo()
     again, link = opened(tmp_path)
-    again.take(order(0, position))
+    again.handle(order(0, position))
     assert link.done().reason is None
 
 
@@ -315,7 +317,7 @@ def test_no_memory_for_a_keyframe_is_no_crash(tmp_path: Path, monkeypatch: pytes
         raise MemoryError("no room for 9 GB")
 
     monkeypatch.setattr(codec, "decode", too_large)
-    fuser.take(order(0, position))
+    fuser.handle(order(0, position))
     assert (link.last().reason, link.last().message) == ("memory", "no memory to fuse it: no room for 9 GB")
 
 
@@ -323,8 +325,8 @@ def test_no_memory_for_a_keyframe_is_no_crash(tmp_path: Path, monkeypatch: pytes
 def test_no_question_ends_the_fuser(tmp_path: Path, min_weight: float) -> None:
     (position,) = fill(tmp_path, 1)
     fuser, link = opened(tmp_path)
-    fuser.take(order(0, position))
-    fuser.take(fuser_messages.FuserQuery(1, Command(name="mesh", min_weight=min_weight)))
+    fuser.handle(order(0, position))
+    fuser.handle(fuser_messages.FuserQuery(1, Command(name="mesh", min_weight=min_weight)))
     assert "min_weight must be" in link.last().error
 
 
@@ -357,3 +359,21 @@ def test_a_process_at_work_ends_with_the_one_that_started_it() -> None:
     with parent:
         parent.kill()
         until(lambda: not alive(int(word)))
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "raised"),
+    [
+        (InvalidConfig("of other settings"), "config", InvalidConfig),
+        (DamagedCheckpoint("cut short"), "checkpoint", CheckpointError),
+        (MapFull("too many blocks"), "map", MapError),
+        (JournalError("cannot read"), "other", TsfusionError),
+    ],
+)
+def test_the_kind_of_a_failure_reaches_the_gateway(
+    error: TsfusionError, kind: str, raised: type[TsfusionError]
+) -> None:
+    sent = fuser_messages.to_gateway.decode(fuser_messages.encode(fuser_messages.Failed.of(error)))
+    assert isinstance(sent, fuser_messages.Failed)
+    again = sent.error()
+    assert (sent.kind, type(again), str(again)) == (kind, raised, str(error))

@@ -25,6 +25,7 @@ from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import fuser_process, fuser_supervisor
 from tsfusion.gateway.access_control import AccessControl
 from tsfusion.gateway.gateway import Gateway
+from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Ports
 from tsfusion.journal import Journal, state_folder
 from tsfusion.wire.health import MapHealth
@@ -72,7 +73,7 @@ def fusing(line: str) -> str:
 
 _CRASHES_ON_2 = fusing("if message.index == 2: sys.exit(7)")
 _DIES = "sys.exit(9)"
-_FAILS = "say(fuser_messages.Failed('InvalidConfig', 'no such setting')); link.recv()"
+_FAILS = "say(fuser_messages.Failed('config', 'no such setting')); link.recv()"
 _CANNOT_COME_BACK = """
     import pathlib
     mark = pathlib.Path(begin.folder) / "once"
@@ -103,12 +104,12 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
             server = ServerConfig(state=str(tmp_path), **settings)
             context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
             stack.callback(context.term)
-            door = AccessControl(context, None)
+            access = AccessControl(context, None)
             ports = Ports(context, server)
             stack.callback(ports.close)
-            gateway = Gateway(context, server, ports, door)
+            gateway = Gateway(context, server, ports, access, Metrics())
             stack.callback(gateway.maps.close)
-            gateway.maps.begin({"default": VolumeConfig()})
+            gateway.maps.open_at_start({"default": VolumeConfig()})
             return gateway
 
         yield begin

@@ -9,7 +9,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import pytest
@@ -26,6 +26,7 @@ from tsfusion.gateway import fuser_process
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.fuser_queries import FuserQueries
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
+from tsfusion.gateway.ports import Ports
 from tsfusion.journal import Position
 from tsfusion.wire import codec, health, messages, queries, sockets
 from tsfusion.wire.keyframe_header import Refused, pack, unpack
@@ -64,13 +65,12 @@ def test_a_stranger_cannot_unsubscribe_a_viewer(shared: Server) -> None:
 
 
 def test_strangers_do_not_push_out_a_client_that_is_heard() -> None:
-    routes = ClientRoutes()
+    routes = ClientRoutes(cast(Ports, None))
     client = routes.connect(b"client", "default", b"1")
-    assert client is not None
     for number in range(3000):
         routes.connect(number.to_bytes(16, "big"), "default", b"2")
         if number % 500 == 0:
-            routes.heard(client)
+            routes.mark_alive(b"client", "")
     assert routes.get(b"client") is client
 
 
@@ -130,26 +130,26 @@ class Map:
     def __init__(self) -> None:
         self.fuser: Any = self
         self.asked: list[fuser_messages.FuserQuery] = []
-        self.is_calm = True
+        self.is_idle = True
 
     def send(self, ask: fuser_messages.FuserQuery) -> bool:
         self.asked.append(ask)
         return True
 
-    def calm(self, since: float) -> bool:
-        return self.is_calm
+    def idle_since(self, since: float) -> bool:
+        return self.is_idle
 
 
 class Asking:
     """FuserQueries about a map, and the errors that they were answered with."""
 
     def __init__(self, most_bytes: int = 1 << 30) -> None:
-        self.map = Map()
+        self.map: Any = Map()
         self.errors: list[str | None] = []
         self.frames: list[Any] = []
-        self.questions = FuserQueries(self._on_answer, most_bytes)
+        self.queries = FuserQueries(cast(Ports, self), most_bytes)
 
-    def _on_answer(self, identity: bytes, message: messages.ToClient, frames: Any = ()) -> None:
+    def reply(self, identity: bytes, message: messages.ToClient, frames: Any = ()) -> None:
         assert isinstance(message, messages.Reply)
         self.errors.append(message.error)
         self.frames += frames  # which nobody reads
@@ -157,14 +157,14 @@ class Asking:
     def ask(self, identity: bytes, client: str = "", map_name: str = "default") -> bool:
         """Whether the mesh was passed on."""
         before = len(self.map.asked)
-        self.questions.ask(identity, Command(name="mesh", map=map_name), self.map, client)
+        self.queries.submit(identity, Command(name="mesh", map=map_name), self.map, client)
         return len(self.map.asked) > before
 
     def make(self, nbytes: int) -> None:
         """The one that was asked for last."""
         layout = health.MeshLayout(vertices=0, faces=0, colors=False)
         frames = [zmq.Frame(bytes(nbytes // 2)), zmq.Frame(bytes(nbytes // 2))]
-        self.questions.answered(
+        self.queries.on_reply(
             fuser_messages.FuserReply(self.map.asked[-1].number, layout=layout), None, frames
         )
 
@@ -175,7 +175,7 @@ def test_a_fuser_makes_one_mesh_at_a_time() -> None:
     assert not asking.ask(b"2")
     assert asking.errors == ["another mesh is being made; ask again"]
     assert asking.ask(b"3", map_name="yard")
-    asking.questions.give_up("default")
+    asking.queries.give_up("default")
     assert asking.ask(b"2")
 
 
@@ -193,17 +193,17 @@ def test_after_a_mesh_it_is_the_keyframes_turn(monkeypatch: pytest.MonkeyPatch) 
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     asking = Asking()
-    asking.map.is_calm = False
+    asking.map.is_idle = False
     assert asking.ask(b"1")
     now[0] = 102.0
     asking.make(100)
     now[0] = 107.9
     assert not asking.ask(b"2")
     assert asking.errors[-1] == "a mesh was just made, now it is the keyframes' turn; ask again"
-    asking.map.is_calm = True  # nobody scans: nobody has to wait
+    asking.map.is_idle = True  # nobody scans: nobody has to wait
     assert asking.ask(b"2")
     asking.make(100)
-    asking.map.is_calm = False
+    asking.map.is_idle = False
     now[0] = 108.0
     assert asking.ask(b"3")
 
@@ -215,12 +215,12 @@ def test_meshes_that_nobody_reads_are_few() -> None:
         asking.make(300)
     assert not asking.ask(b"4")
     assert "do not read" in (asking.errors[-1] or "")
-    assert asking.questions.nbytes == 900
+    assert asking.queries.nbytes == 900
     asking.frames.clear()
-    until(lambda: asking.questions.nbytes == 0)
+    until(lambda: asking.queries.nbytes == 0)
     assert asking.ask(b"5")
     asking.make(5000)  # one may be larger than all should be
-    assert asking.questions.nbytes == 5000
+    assert asking.queries.nbytes == 5000
     assert not asking.ask(b"6")
 
 
@@ -229,7 +229,6 @@ def test_meshes_that_nobody_reads_are_few() -> None:
 _SLOW = """
 import sys, time, zmq
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.journal import Position
 from tsfusion.wire import sockets
 
 link = sockets.pair(zmq.Context())
@@ -354,10 +353,9 @@ def test_who_answers_with_nonsense_is_named(caplog: pytest.LogCaptureFixture) ->
 
 def test_a_mesh_is_asked_for_again_when_the_server_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(queries, "_AGAIN_INTERVAL", 0.01)
-    again, settled = (
-        messages.encode(messages.Reply(name="mesh", error=error)) for error in ("busy; ask again", "no room")
-    )
+    again = messages.encode(messages.Reply(name="mesh", error="busy", retry=True))
+    settled = messages.encode(messages.Reply(name="mesh", error="no room; do not ask again"))
     with answering(again, again, settled) as address, pytest.raises(TransportError, match="no room"):
         fetch_mesh(address, timeout=5.0)
-    with answering(again) as address, pytest.raises(TransportError, match="busy; ask again"):
+    with answering(again) as address, pytest.raises(TransportError, match="busy"):
         fetch_mesh(address, timeout=0.3)

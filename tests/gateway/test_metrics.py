@@ -65,7 +65,7 @@ def test_a_snapshot_becomes_figures() -> None:
         client("cart", waiting=2, skipped={"thinned": 3}, held="disk", heard_s=7.0),
         client("cart", waiting=1, skipped={"thinned": 1, "spool": 5}),
         client("drone"),
-        client("drone", waiting=50, held="disk", heard_s=metrics_families.HEARD + 1),
+        client("drone", waiting=50, held="disk", heard_s=metrics_families.RECENT + 1),
         refused={"header": 4}, duplicates=9, problems=("disk full",), ready=False,
         maps={
             "yard": map_health(state="busy", waiting=2, fuser_restarts=1, corrections=4),

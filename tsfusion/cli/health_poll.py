@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Asking a server how it is, once or again and again, and judging what it says."""
 
-import re
 import time
 from collections.abc import Callable
 from typing import Any
@@ -12,6 +11,7 @@ from msgspec import Struct
 from tsfusion.core.errors import ServerUnreachable, TransportError
 from tsfusion.wire.health import Health, MapHealth, Status
 from tsfusion.wire.messages import Command, Reply
+from tsfusion.wire.queries import CommandRefused
 
 READY, NOT_READY = 0, 3  # exit statuses; 1 is every error's, also that nobody answers
 _AGAIN = 0.5  # seconds between the looks that tell a stall from a pause
@@ -169,7 +169,7 @@ class Watcher:
                     unavailable[name] = f"its fuser did not answer within {wait:.1f} s"
                     continue
                 except TransportError as error:
-                    unavailable[name] = re.sub(r"^the server at \S+: ", "", str(error))
+                    unavailable[name] = error.reason if isinstance(error, CommandRefused) else str(error)
                     continue
             if status is not None:
                 self._told[name] = (version, status)

@@ -24,6 +24,8 @@
 The command line prints any of these as one line and exits with status 1.
 """
 
+from errno import ENOENT
+
 
 class TsfusionError(Exception):
     """Base of all errors raised on purpose."""
@@ -50,7 +52,20 @@ class DecodeError(TsfusionError):
 
 
 class JournalError(TsfusionError):
-    """The journal or spool cannot be read or written."""
+    """The journal or spool cannot be read or written.
+
+    Attributes:
+        errno: why the operating system refused; None = it did not, the journal itself is wrong.
+    """
+
+    def __init__(self, message: str, errno: int | None = None) -> None:
+        super().__init__(message)
+        self.errno = errno
+
+    @property
+    def temporary(self) -> bool:
+        """Whether a record that is there may be readable later: the system refused to read it now."""
+        return self.errno not in (None, ENOENT)
 
 
 class MapError(TsfusionError):
@@ -66,7 +81,15 @@ class WeightOverflow(MapError):
 
 
 class CheckpointError(MapError):
-    """A saved map is missing, unreadable or of another version."""
+    """A saved map is missing, unreadable or of another version.
+
+    Attributes:
+        missing: whether there is no such file.
+    """
+
+    def __init__(self, message: str, *, missing: bool = False) -> None:
+        super().__init__(message)
+        self.missing = missing
 
 
 class DamagedCheckpoint(CheckpointError):

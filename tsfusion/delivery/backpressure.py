@@ -74,7 +74,7 @@ class Backpressure:
         try:
             entry = box.spool.write(frames)
         except JournalError as error:
-            if not isinstance(error.__cause__, OSError):
+            if error.errno is None:
                 raise
             with box.changed:
                 self._room.failed(error)

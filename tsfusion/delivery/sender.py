@@ -172,10 +172,8 @@ class Sender:
         return frames
 
     def _on_unread(self, entry: Waiting, error: JournalError, now: float) -> None:
-        cause = error.__cause__
-        number = cause.errno if isinstance(cause, OSError) else None
         self._unread += 1
-        if number in _SCARCE or (number == errno.EIO and self._unread < _READ_TRIES):
+        if error.errno in _SCARCE or (error.errno == errno.EIO and self._unread < _READ_TRIES):
             log.log(logging.WARNING if self._unread == 1 else logging.DEBUG, "%s; it is tried again", error)
             self._read_due = now + _READ_AGAIN
             with self._outbox.changed:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The process loop: python -m tsfusion.fuser."""
+"""The fuser process, `python -m tsfusion.fuser`: a loop over the gateway's messages and the mesh."""
 
 import select
 import signal
@@ -22,7 +22,7 @@ _LOCK_WAIT_S = 60.0  # for another fuser to end: it may be reading a large map
 
 
 def run(endpoint: str) -> int:
-    """Serve the gateway at `endpoint` until it says so or goes away; the exit status."""
+    """Serve the gateway at `endpoint` until that orders the end, or ends itself; the exit status."""
     context: zmq.Context[Any] = zmq.Context()
     link = sockets.pair(context)
     try:
@@ -32,20 +32,21 @@ def run(endpoint: str) -> int:
     finally:
         link.close(linger=1000)
         context.term()
-        _remove(endpoint)
+        if select.select([sys.stdin], [], [], 0)[0]:
+            _remove_scratch_folder(endpoint)
 
 
-def _remove(endpoint: str) -> None:
-    """Clear up behind a gateway that was killed; one that lives has use for the folder, or removes it."""
-    if select.select([sys.stdin], [], [], 0)[0]:
-        file = Path(endpoint.removeprefix("ipc://"))
-        with suppress(OSError):
-            for left in (file, file.parent / fuser_messages.WORKING_FILE):
-                left.unlink(missing_ok=True)
-            file.parent.rmdir()
+def _remove_scratch_folder(endpoint: str) -> None:
+    """Clear up behind a gateway that was killed; one that lives needs the folder, or removes it itself."""
+    socket_file = Path(endpoint.removeprefix("ipc://"))
+    with suppress(OSError):
+        for file in (socket_file, socket_file.parent / fuser_messages.WORKING_FILE):
+            file.unlink(missing_ok=True)
+        socket_file.parent.rmdir()
 
 
 def _serve(link: sockets.AnySocket) -> int:
+    """Handle messages, mesh when it is time, and refine the mesh when there is nothing else to do."""
     poller = zmq.Poller()
     poller.register(link, zmq.POLLIN)
     poller.register(sys.stdin.fileno(), zmq.POLLIN)
@@ -58,22 +59,23 @@ def _serve(link: sockets.AnySocket) -> int:
         if idle and fuser is not None and fuser.refine_due:
             fuser.refine()
             continue
-        process.on_parent_end(signal.SIGCONT)  # were it stopped, it could not see the gateway go
+        process.on_parent_end(signal.SIGCONT)  # a stopped process would not notice the gateway's end
         events = dict(poller.poll())
-        if sys.stdin.fileno() in events:  # nothing is ever written there: the gateway has gone
+        if sys.stdin.fileno() in events:  # nothing is ever written there: the gateway has ended
             return 1
         message = fuser_messages.to_fuser.decode(link.recv())
         if isinstance(message, fuser_messages.Begin):
-            fuser = _begin(link, message)
+            fuser = _open_map(link, message)
             if fuser is None:
                 return 1
         elif fuser is not None:
             process.on_parent_end(signal.SIGKILL)
-            fuser.take(message)
+            fuser.handle(message)
     return fuser.exit_status
 
 
-def _begin(link: sockets.AnySocket, message: fuser_messages.Begin) -> Fuser | None:
+def _open_map(link: sockets.AnySocket, message: fuser_messages.Begin) -> Fuser | None:
+    """Open the map and report that, or why it cannot be opened; None = it cannot."""
     try:
         process.end_first()
         # held until this process ends
@@ -82,17 +84,14 @@ def _begin(link: sockets.AnySocket, message: fuser_messages.Begin) -> Fuser | No
         )
         fuser = Fuser(link, message)
     except TsfusionError as error:
-        name = next(
-            kind.__name__ for kind in type(error).__mro__ if kind.__module__ == "tsfusion.core.errors"
-        )
-        link.send(fuser_messages.encode(fuser_messages.Failed(name, str(error))))
+        link.send(fuser_messages.encode(fuser_messages.Failed.of(error)))
         return None
     link.send(fuser_messages.encode(fuser.ready()))
     return fuser
 
 
 def main() -> int:
-    """`python -m tsfusion.fuser ENDPOINT FORMAT LEVEL MAP`, as the gateway starts it."""
+    """Run the fuser process with the arguments that the gateway gives it: ENDPOINT FORMAT LEVEL MAP."""
     endpoint, format_, level, map_name = sys.argv[1:]
     logs.configure(cast("LogFormat", format_), cast("LogLevel", level), "fuser", map=map_name)
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The fuser: the one process with Taichi. Reads the journal where the gateway points, and adds to the map.
+"""The fuser: reads keyframes from the journal at the positions the gateway sends, and adds them to the map.
 
-It ends when the gateway does, at whatever moment: the last checkpoint and the journal are enough to begin
-again. Opening the map or waiting, it sees its standard input close and clears up; at work, the system ends it
-(Linux), however long it would take.
+Its process ends when the gateway does, at whatever moment: the last checkpoint and the journal are enough to
+begin again. While it opens the map or waits, it sees its standard input close and clears up; while it works,
+the system ends it (Linux), however long the work would take.
 """
 
 import logging
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from tsfusion import journal
 from tsfusion.core import process
-from tsfusion.core.errors import TsfusionError
+from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.geometry.mesh import Mesh
@@ -31,16 +31,20 @@ from tsfusion.wire import codec, sockets
 from tsfusion.wire.health import MeshLayout
 from tsfusion.wire.keyframe_header import Refused
 
-_SET_ASIDE = 2 << 30  # bytes that Taichi asks for and hardly uses
+_TAICHI_RESERVES = 2 << 30  # bytes that Taichi asks for and hardly uses
 _KEPT_FREE = 256 << 20  # bytes that keyframes leave to meshes and checkpoints
 _REFINED_AT_ONCE = 256  # blocks: about 50 ms
-_FUSING_SHARE = 3  # a busy fuser meshes for at most a quarter of its time
+_REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
 
 log = logging.getLogger(__name__)
 
 
 class Fuser:
-    """The map of one state folder, and what to do with each message of the gateway."""
+    """One map, and the work for each message of the gateway.
+
+    Attributes:
+        exit_status: of the process, which has to end; None = it goes on.
+    """
 
     def __init__(self, link: sockets.AnySocket, begin: fuser_messages.Begin) -> None:
         self._link = link
@@ -48,27 +52,27 @@ class Fuser:
         self._folder = Path(begin.folder)
         self._since_checkpoint = 0
         self._watched = False
-        self._answered = self._meshed = 0  # keyframes, by this process
+        self._answered = self._meshed = 0  # keyframes of this process
         self._next_mesh = 0.0
-        self._rough = np.zeros((0, 3), np.int32)  # cells that viewers have as fused only
-        self._hashes: tuple[int, str, str] | None = None
-        self._working = CurrentKeyframe(begin.working)
-        self._most = process.data_bytes() + _SET_ASIDE + begin.memory_bytes
-        process.limit_memory(self._most)
+        self._unrefined = np.zeros((0, 3), np.int32)  # cells that viewers have with the raw surface
+        self._hashes: tuple[int, str, str] | None = None  # keyframes answered, map hash, colour hash
+        self._current = CurrentKeyframe(begin.working)
+        self._memory_limit = process.data_bytes() + _TAICHI_RESERVES + begin.memory_bytes
+        process.limit_memory(self._memory_limit)
         self.exit_status: int | None = None
         self._map = MapCheckpoints(self._folder, begin.volume, keep_previous=begin.keep_previous)
         self._volume = self._map.volume
         self._volume.warm_up()
 
     def ready(self) -> fuser_messages.Ready:
-        """How far the map is."""
+        """The message that the map is open, and how far it is."""
         stats = self._volume.stats()
         return fuser_messages.Ready(
             self._map.done, self._volume.keyframes, self._map.rejected, stats.blocks, stats.bytes
         )
 
-    def take(self, message: fuser_messages.ToFuser) -> None:
-        """Do what the gateway says."""
+    def handle(self, message: fuser_messages.ToFuser) -> None:
+        """Do the work for a message of the gateway."""
         if isinstance(message, fuser_messages.Fuse):
             self._fuse(message)
         elif isinstance(message, fuser_messages.FuserQuery):
@@ -76,21 +80,21 @@ class Fuser:
         elif isinstance(message, fuser_messages.Publish):
             self._watched = message.wanted
             if not self._watched:
-                self._rough = self._rough[:0]
+                self._unrefined = self._unrefined[:0]
         elif isinstance(message, fuser_messages.Save):
             self._checkpoint()
         elif isinstance(message, fuser_messages.Finish):
             self.exit_status = 0 if self._checkpoint() else 1
 
     def mesh_due(self, idle: bool) -> bool:
-        """Whether the mesh is behind and it is time: at once when idle, else so that fusing comes first."""
+        """Whether the mesh is behind and it is time for it: at once when idle, otherwise after a pause."""
         behind = self._answered > self._meshed
         return behind and (idle or time.monotonic() >= self._next_mesh)
 
     def mesh(self) -> None:
-        """Bring the mesh up to date with the map: as fused, because the next keyframe may be near.
+        """Bring the mesh up to date with the raw surface: it is fast, and the next keyframe may be near.
 
-        Without the memory for it, viewers miss a part; a mesh on request is whole, once there is.
+        Without enough memory, viewers miss a part; a mesh on request is whole, once there is enough.
         """
         try:
             self._mesh()
@@ -107,39 +111,41 @@ class Fuser:
         cells = cells_of(blocks)
         mesh = self._volume.extract_mesh(blocks=cells, surface="raw")
         self._meshed = self._answered
-        pause = max(self._begin.mesh_interval, _FUSING_SHARE * (time.monotonic() - started))
+        pause = max(self._begin.mesh_interval, _REST_FACTOR * (time.monotonic() - started))
         self._next_mesh = time.monotonic() + pause
-        stamp = time.monotonic_ns()
+        meshed_ns = time.monotonic_ns()
         if self._watched:
-            self._publish(stamp, len(blocks), cells, mesh)
+            self._publish(meshed_ns, len(blocks), cells, mesh)
             if self._volume.model.surface != "raw":
-                rough = np.concatenate([self._rough, self._volume.cells_to_mesh(blocks)])
-                self._rough = np.unique(rough, axis=0)
+                unrefined = np.concatenate([self._unrefined, self._volume.cells_to_mesh(blocks)])
+                self._unrefined = np.unique(unrefined, axis=0)
         else:
-            self._send(self._meshed_message(stamp))
+            self._send(self._meshed_message(meshed_ns))
 
     @property
     def refine_due(self) -> bool:
-        """Whether what viewers have is not yet the surface that the settings ask for."""
-        return len(self._rough) > 0
+        """Whether viewers have cells that do not yet show the surface that the settings ask for."""
+        return len(self._unrefined) > 0
 
     def refine(self) -> None:
-        """Mesh a part of what was meshed as fused again, as the settings ask: only while there is nothing
-        else to do, and little at a time, because a keyframe that comes meanwhile waits."""
-        cells, self._rough = self._rough[:_REFINED_AT_ONCE], self._rough[_REFINED_AT_ONCE:]
-        with suppress(MemoryError):  # it stays as fused
+        """Mesh some cells again, with the surface that the settings ask for.
+
+        Call it only while there is nothing else to do: a keyframe that comes meanwhile waits.
+        """
+        cells, self._unrefined = self._unrefined[:_REFINED_AT_ONCE], self._unrefined[_REFINED_AT_ONCE:]
+        with suppress(MemoryError):  # the raw surface stays
             self._publish(time.monotonic_ns(), 0, cells, self._volume.extract_mesh(blocks=cells))
 
-    def _publish(self, stamp: int, blocks: int, cells: NDArray[np.int32], mesh: Mesh) -> None:
+    def _publish(self, meshed_ns: int, blocks: int, cells: NDArray[np.int32], mesh: Mesh) -> None:
         layout, frames = _mesh_frames(mesh)
-        tiles = np.ascontiguousarray(cells).data
-        self._send(self._meshed_message(stamp, blocks, layout), [tiles, *frames])
+        frames.insert(0, np.ascontiguousarray(cells).data)
+        self._send(self._meshed_message(meshed_ns, blocks, layout), frames)
 
     def _meshed_message(
-        self, stamp: int, blocks: int = 0, layout: MeshLayout | None = None
+        self, meshed_ns: int, blocks: int = 0, layout: MeshLayout | None = None
     ) -> fuser_messages.Meshed:
         stats = self._volume.stats()
-        return fuser_messages.Meshed(self._meshed, stamp, blocks, stats.blocks, stats.bytes, layout)
+        return fuser_messages.Meshed(self._meshed, meshed_ns, blocks, stats.blocks, stats.bytes, layout)
 
     def _fuse(self, order: fuser_messages.Fuse) -> None:
         start = time.monotonic_ns()
@@ -150,21 +156,21 @@ class Fuser:
             return
         reason, message = order.skip, ""
         if reason is None:
-            self._working.at(order.index)
-            process.limit_memory(self._most - min(_KEPT_FREE, self._begin.memory_bytes // 2))
+            self._current.set(order.index)
+            process.limit_memory(self._memory_limit - min(_KEPT_FREE, self._begin.memory_bytes // 2))
             try:
                 record = journal.read(self._folder / state_folder.JOURNAL_FOLDER, order.position)
                 self._volume.integrate(codec.decode(record.frames))
             except TsfusionError as error:
-                if _may_pass(error):
+                if isinstance(error, JournalError) and error.temporary:
                     log.error("%s: another process tries again, from the checkpoint", error)
                     self.exit_status = 1
-                    return  # still marked as at work on it: the gateway bears with a keyframe only so often
+                    return  # marked as at work on it: the gateway gives a keyframe up after a few deaths
                 reason, message = _reason(error), str(error)
             except MemoryError as error:
                 reason, message = "memory", f"no memory to fuse it: {error}"
-            process.limit_memory(self._most)
-            self._working.at(fuser_messages.NOT_WORKING)  # not if it ended the process, however it did
+            process.limit_memory(self._memory_limit)
+            self._current.set(fuser_messages.NOT_WORKING)  # not reached if the keyframe ended the process
         if reason is not None:
             self._map.rejected[reason] = self._map.rejected.get(reason, 0) + 1
         self._map.done[order.session] = fuser_messages.SessionProgress(order.seq, order.client)
@@ -181,16 +187,16 @@ class Fuser:
         self._send(fuser_messages.Saved(written))
         return not self._since_checkpoint
 
-    def _answer(self, ask: fuser_messages.FuserQuery) -> None:
+    def _answer(self, query: fuser_messages.FuserQuery) -> None:
         try:
-            if ask.command.name == "mesh":
-                layout, frames = _mesh_frames(self._volume.extract_mesh(ask.command.min_weight))
-                self._send(fuser_messages.FuserReply(ask.number, layout=layout), frames)
+            if query.command.name == "mesh":
+                layout, frames = _mesh_frames(self._volume.extract_mesh(query.command.min_weight))
+                self._send(fuser_messages.FuserReply(query.number, layout=layout), frames)
             else:
-                self._send(fuser_messages.FuserReply(ask.number, status=self._status()))
+                self._send(fuser_messages.FuserReply(query.number, status=self._status()))
         except (TsfusionError, ArithmeticError, ValueError, MemoryError) as error:
-            # whatever was asked, the map goes on: a crash would be blamed on the next keyframe
-            self._send(fuser_messages.FuserReply(ask.number, error=str(error) or type(error).__name__))
+            # The process goes on whatever was asked: a crash would be blamed on the next keyframe.
+            self._send(fuser_messages.FuserReply(query.number, error=str(error) or type(error).__name__))
 
     def _status(self) -> fuser_messages.FuserStatus:
         stats = self._volume.stats()
@@ -217,14 +223,14 @@ class Fuser:
 
 
 class CurrentKeyframe:
-    """A word of memory that outlives the process: which keyframe it is at."""
+    """The file that says which keyframe the process is at, also after its death."""
 
     def __init__(self, path: str) -> None:
         with Path(path).open("r+b") as file:
             self._word = mmap.mmap(file.fileno(), 8)
 
-    def at(self, index: int) -> None:
-        """It is this one; `work.NOT_WORKING` = none."""
+    def set(self, index: int) -> None:
+        """Write the index of the keyframe; `messages.NOT_WORKING` = none."""
         struct.pack_into("<q", self._word, 0, index)
 
 
@@ -236,11 +242,6 @@ def _mesh_frames(mesh: Mesh) -> tuple[MeshLayout, list[Any]]:
     return layout, [np.ascontiguousarray(array).data for array in arrays]
 
 
-def _may_pass(error: TsfusionError) -> bool:
-    """Whether the system refused to read what is there: no fault of the keyframe's."""
-    cause = error.__cause__
-    return isinstance(cause, OSError) and not isinstance(cause, FileNotFoundError)
-
-
 def _reason(error: TsfusionError) -> str:
+    """The word under which a rejected keyframe is counted."""
     return error.reason if isinstance(error, Refused) else type(error).__name__

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A map on a server's disk: its last checkpoint, the one before, and how far each session was in it."""
+"""The checkpoints of a map on a server's disk: the last, the one before, and how far each session was."""
 
 import logging
 import os
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
 
 
-# Settings that may differ between a map and the server that goes on with it: none changes the sums.
+# Settings that may differ between a checkpoint and the server that goes on with it: none changes the sums.
 _FREE_SETTINGS = ("threads", "max_blocks", "max_blocks_per_keyframe", *VIEW_SETTINGS)
 _NEW_FILE = "map.new.tsf"
 
@@ -28,17 +28,17 @@ class MapCheckpoints:
     """The checkpoints in a map's folder.
 
     Args:
-        keep_previous: the journal may not go back to the start, so keep the checkpoint before the last, too.
+        keep_previous: whether to keep the checkpoint before the last, too: the journal may be cut.
 
     Attributes:
-        volume: the map; as of the last checkpoint when it was opened.
-        done: how far it is, by session.
-        rejected: keyframes that it could not take: reason → count.
+        volume: the map, at first as it was in the last checkpoint.
+        done: session → how far the map is with it.
+        rejected: reason → number of keyframes that the map could not take.
 
     Raises:
         InvalidConfig: when the map was made with other settings.
-        CheckpointError: when it is not a server's, cannot be read now or is of another version. What is
-            damaged is set aside.
+        CheckpointError: when it is not a server's, cannot be read now or is of another version. A damaged
+            one is set aside.
     """
 
     def __init__(self, folder: Path, config: VolumeConfig, *, keep_previous: bool) -> None:
@@ -46,7 +46,7 @@ class MapCheckpoints:
 
         self._path, self._previous = folder / state_folder.MAP_FILE, folder / state_folder.PREVIOUS_FILE
         self._new = folder / _NEW_FILE
-        with suppress(OSError):  # of a process that was killed
+        with suppress(OSError):  # left by a process that was killed
             self._new.unlink()
         self._keep_previous = keep_previous
         self.done: dict[bytes, SessionProgress] = {}
@@ -61,7 +61,7 @@ class MapCheckpoints:
     def save(self) -> bool:
         """Write a checkpoint; False when that failed, which is logged.
 
-        Nothing is lost then: the next start fuses the journal from the checkpoint before this one. Until the
+        Nothing is lost then: the next start goes on from the checkpoint before, with the journal. Until the
         new one is on the disk, the old ones keep their names.
         """
         done = {key.hex(): [progress.seq, progress.client] for key, progress in self.done.items()}
@@ -79,9 +79,9 @@ class MapCheckpoints:
 
 
 def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
-    """The volume that was saved there; None when there is none, or it is damaged.
+    """The volume of a checkpoint; None when there is none, or when it is damaged.
 
-    Nothing else is None: what cannot be read now is good when it can be, and must not be begun anew.
+    All else raises: a checkpoint that cannot be read now may be good, and the map must not begin anew.
     """
     from tsfusion.tsdf.volume import Volume
 
@@ -91,7 +91,7 @@ def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
         _set_aside(path, error)
         return None
     except CheckpointError as error:
-        if isinstance(error.__cause__, FileNotFoundError):
+        if error.missing:
             return None
         raise
     except MemoryError as error:
@@ -109,7 +109,7 @@ def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
 
 
 def _set_aside(path: Path, error: DamagedCheckpoint) -> None:
-    """Out of the way, beside what was set aside before."""
+    """Rename a damaged checkpoint, and leave those that were renamed before."""
     names = (path.with_name(f"{path.stem}.damaged{number}") for number in ("", *range(2, 1_000_000)))
     try:
         aside = next(name for name in names if not os.path.lexists(name))
@@ -117,6 +117,7 @@ def _set_aside(path: Path, error: DamagedCheckpoint) -> None:
     except OSError as refusal:
         raise CheckpointError(f"{error}, and it cannot be set aside: {refusal.strerror}") from refusal
     log.error(
-        "%s; it is kept as %s, and the map is built again from the journal, or goes on from the checkpoint "
-        "before it", error, aside,
-    )  # fmt: skip
+        "%s; it is kept as %s, and the map is built again from the journal, or from the checkpoint before it",
+        error,
+        aside,
+    )

@@ -1,21 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""What gateway and fuser say to each other (msgpack of tagged structs, over a PAIR socket).
+"""The messages between gateway and fuser (msgpack of tagged structs, over a PAIR socket).
 
 The gateway hands out journal positions, a few ahead; the fuser answers each with `Done`. Neither holds
 keyframes for the other: the queue is the journal.
 """
 
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 from msgspec import Struct
 
 from tsfusion.core.config import VolumeConfig
+from tsfusion.core.errors import CheckpointError, InvalidConfig, MapError, TsfusionError
 from tsfusion.journal import Position
 from tsfusion.wire.health import MeshLayout
 from tsfusion.wire.messages import Command
 
-NOT_WORKING = -1
+NOT_WORKING = -1  # instead of a keyframe's index
 WORKING_FILE = "working"  # in the folder of the socket
 
 
@@ -23,23 +24,25 @@ class Begin(Struct, frozen=True, tag="begin"):
     """Open the map in `folder` and compile the kernels.
 
     Attributes:
+        mesh_interval: seconds between two meshes, at least.
+        checkpoint_every: keyframes; 0 = only on request and at the end.
         working: a file of 8 bytes: the index of the keyframe that is being fused, little-endian, or
-            `NOT_WORKING`. Read when the process has died, so that the death is put down to the right one.
-        keep_previous: also keep the checkpoint before the last: the journal will not go back to the start.
-        memory_bytes: what the process may allocate.
+            `NOT_WORKING`. Read when the process has died, so that the right keyframe is blamed.
+        keep_previous: whether to keep the checkpoint before the last, too: the journal may be cut.
+        memory_bytes: that the process may allocate.
     """
 
     folder: str
     volume: VolumeConfig
-    mesh_interval: float  # seconds
-    checkpoint_every: int  # keyframes
+    mesh_interval: float
+    checkpoint_every: int
     working: str
     keep_previous: bool
     memory_bytes: int
 
 
 class SessionProgress(Struct, frozen=True, array_like=True):
-    """How far the map is with a session: fused or rejected up to `seq`; `client` owns the session."""
+    """How far a map is with a client's session: every keyframe up to `seq` is fused or rejected."""
 
     seq: int
     client: str
@@ -48,7 +51,7 @@ class SessionProgress(Struct, frozen=True, array_like=True):
 class Fuse(Struct, frozen=True, tag="fuse"):
     """Fuse the keyframe at a journal position, unless the map has it already.
 
-    `skip`: count it as rejected for this reason instead.
+    `skip`: reject it without a try, for this reason.
     """
 
     index: int
@@ -60,20 +63,20 @@ class Fuse(Struct, frozen=True, tag="fuse"):
 
 
 class FuserQuery(Struct, frozen=True, tag="ask"):
-    """Answer a person's command between two keyframes."""
+    """Answer a command between two keyframes."""
 
     number: int
     command: Command
 
 
 class Publish(Struct, frozen=True, tag="publish"):
-    """Whether anyone watches: send the triangles with `Meshed`, or keep them."""
+    """Send the triangles with `Meshed` from now on, or do not: whether the map has viewers."""
 
     wanted: bool
 
 
 class Save(Struct, frozen=True, tag="save"):
-    """Write a checkpoint: the journal wants room."""
+    """Write a checkpoint, so that the journal can be cut."""
 
 
 class Finish(Struct, frozen=True, tag="finish"):
@@ -81,11 +84,11 @@ class Finish(Struct, frozen=True, tag="finish"):
 
 
 class Started(Struct, frozen=True, tag="started"):
-    """The process is there and waits for `Begin`."""
+    """The process runs and waits for `Begin`."""
 
 
 class Ready(Struct, frozen=True, tag="ready"):
-    """Kernels are warm. `done`: how far the map is, by session. `rejected`: reason → count."""
+    """Kernels are warm. `done`: how far the map is, by session. `rejected`: keyframes, by reason."""
 
     done: dict[bytes, SessionProgress]
     keyframes: int = 0
@@ -95,19 +98,37 @@ class Ready(Struct, frozen=True, tag="ready"):
 
 
 class Saved(Struct, frozen=True, tag="saved"):
-    """The checkpoint holds everything that was answered with `Done` before this.
+    """The checkpoint holds every keyframe that was answered with `Done` before this message.
 
-    `written`: it is a new one; else the one before held all of it already.
+    `written`: whether it is a new one; otherwise the one before held them all already.
     """
 
     written: bool
 
 
-class Failed(Struct, frozen=True, tag="failed"):
-    """The map cannot be opened. `error` is the name of a class in `tsfusion.core.errors`."""
+FailureKind = Literal["config", "checkpoint", "map", "other"]
+_FAILURES: dict[FailureKind, type[TsfusionError]] = {  # the first that fits counts
+    "config": InvalidConfig,
+    "checkpoint": CheckpointError,
+    "map": MapError,
+    "other": TsfusionError,
+}
 
-    error: str
+
+class Failed(Struct, frozen=True, tag="failed"):
+    """The map cannot be opened."""
+
+    kind: FailureKind
     message: str
+
+    @classmethod
+    def of(cls, error: TsfusionError) -> "Failed":
+        """The message about an error."""
+        return cls(next(kind for kind, one in _FAILURES.items() if isinstance(error, one)), str(error))
+
+    def error(self) -> TsfusionError:
+        """The error, to be raised in the gateway."""
+        return _FAILURES[self.kind](self.message)
 
 
 class Done(Struct, frozen=True, tag="done"):
@@ -121,9 +142,9 @@ class Done(Struct, frozen=True, tag="done"):
 
 
 class Meshed(Struct, frozen=True, tag="meshed"):
-    """The mesh has the first `count` keyframes that this process answered; the changed part may follow.
+    """The mesh has the first `count` keyframes that this process answered; its changed part may follow.
 
-    What keyframes changed comes as fused first, and again, with `blocks` = 0, once it is regularised.
+    The changed part comes with the raw surface first, and again, with `blocks` = 0, once it is regularised.
     """
 
     count: int
@@ -150,7 +171,7 @@ class FuserStatus(Struct, frozen=True):
 
 
 class FuserReply(Struct, frozen=True, tag="answer"):
-    """To an Ask; arrays of a mesh follow as frames."""
+    """The answer to a FuserQuery; arrays of a mesh follow as frames."""
 
     number: int
     error: str | None = None

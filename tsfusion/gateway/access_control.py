@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Who may come in: keys and the allow-list, checked when a connection is made and again at every message."""
+"""Who may connect: keys and the allow-list, checked when a connection is made and again at every message."""
 
 import logging
 import time
@@ -19,14 +19,14 @@ log = logging.getLogger(__name__)
 
 
 class AccessControl:
-    """The allow-list of one server; without a folder of keys everybody who can reach it may come in.
+    """The allow-list of one server; without a folder of keys everybody who can reach the server may connect.
 
     Args:
-        folder: made by `tsfusion keys`; None = no keys.
+        folder: the folder that `tsfusion keys` made; None = no keys.
 
     Attributes:
-        keys: the server's own pair, for its sockets.
-        poll: the sockets that `step` wants to be called for.
+        keys: the server's own pair, for its sockets; None without a folder.
+        poll: the sockets to poll before `step`.
 
     Raises:
         InvalidConfig: when the folder has no usable keys or allow-list.
@@ -40,14 +40,14 @@ class AccessControl:
         if folder is not None:
             self.keys = server_keys(folder)
             self._allowed = AllowList(Path(folder))
-            if self._allowed.problem:  # who starts a server is there to mend it; later, nobody is let in
+            if self._allowed.problem:  # an error at the start; later, nobody is let in
                 raise InvalidConfig(self._allowed.problem)
             self._zap = ZapHandler(context, self._allowed.name_of, self._allowed.rejection_reason)
         self.poll = [] if self._zap is None else [self._zap.socket]
 
     @property
     def problem(self) -> str:
-        """Why nobody at all is let in; empty = the allow-list can be read."""
+        """Why nobody may connect; empty = the allow-list can be read."""
         return "" if self._allowed is None else self._allowed.problem
 
     @property
@@ -56,7 +56,7 @@ class AccessControl:
         return Counter() if self._zap is None else self._zap.refused
 
     def step(self) -> bool:
-        """Answer who knocks. True when somebody no longer may: all connections have to be made anew."""
+        """Answer new connections. True when a key was revoked: every connection has to be made anew."""
         if self._allowed is None or self._zap is None:
             return False
         self._revoked |= self._allowed.refresh()
@@ -65,39 +65,44 @@ class AccessControl:
         return revoked
 
     def client_of(self, frame: zmq.Frame) -> str | None:
-        """The name its sender's key is allowed under: empty without keys, None when it is (no longer)."""
+        """The name that the sender's key is allowed under: empty without keys, None when it is not."""
         if self._allowed is None:
             return ""
-        self._revoked |= self._allowed.refresh()  # it may have been since the last step
+        self._revoked |= self._allowed.refresh()  # the file may have changed since the last step
         key = sender_of(frame)
         return None if key is None else self._allowed.name_of(key)
 
     def close(self) -> None:
-        """Nobody is answered any more."""
+        """Stop answering: nobody can connect any more."""
         if self._zap is not None:
             self._zap.close()
 
 
 _ENDPOINT = "inproc://zeromq.zap.01"
-_QUESTIONS_A_STEP = 100
-_LOG_EVERY = 60.0  # seconds; the same refusal is logged once, and few of them: keys cost nothing to make
+_REQUESTS_A_STEP = 100
+_LOG_EVERY = 60.0  # seconds, in which a refusal is logged once, and few are: keys cost nothing to make
 _LOGGED_AT_MOST = 20
 _KEY_BYTES = 32
 Allow = Callable[[str], str | None]
 
 
 class ZapHandler:
-    """Answers for one context. Make it before the sockets with keys bind; close it after them.
+    """The authenticator of one ZeroMQ context (RFC 27, ZAP).
+
+    Make it before the sockets with keys bind, and close it after them.
 
     Args:
         allow: the client's name by its public key (40 characters); None = it may not connect.
-        why_not: a word for the refusal, for the log and for `refused`.
+        why_not: a word for the reason, for the log and for `refused`.
+
+    Attributes:
+        refused: connections that were turned away, by reason.
     """
 
     def __init__(
         self, context: "zmq.Context[Any]", allow: Allow, why_not: Callable[[str], str] = lambda _: "unknown"
     ) -> None:
-        self.refused: Counter[str] = Counter()  # connections, by reason
+        self.refused: Counter[str] = Counter()
         self._allow = allow
         self._why_not = why_not
         self._logged: set[tuple[str, str]] = set()
@@ -107,8 +112,8 @@ class ZapHandler:
         self.socket.bind(_ENDPOINT)
 
     def answer_all(self) -> None:
-        """Answer what has been asked, up to a limit: then the other sockets get their turn. Never waits."""
-        for _ in range(_QUESTIONS_A_STEP):
+        """Answer the requests that came, up to a limit: other sockets get their turn. Never waits."""
+        for _ in range(_REQUESTS_A_STEP):
             try:
                 frames = self.socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
@@ -120,26 +125,26 @@ class ZapHandler:
         self.socket.close()
 
     def _answer(self, frames: Sequence[bytes]) -> None:
-        """Frames: asker, nothing, version, request, domain, address, identity, mechanism, credentials."""
+        """Answer one: peer, nothing, version, request, domain, address, identity, mechanism, credentials."""
         if len(frames) < 4:  # nothing that an answer could refer to
             self.refused["malformed"] += 1
             return
-        asker, delimiter, version, number, *question = frames
-        if delimiter or version != b"1.0" or len(question) < 4:
+        peer, delimiter, version, number, *request = frames
+        if delimiter or version != b"1.0" or len(request) < 4:
             key, reason = "", "malformed"
         else:
-            key, reason = self._judge(question)
+            key, reason = self._judge(request)
         if reason:
-            self._note(key, reason, question[1] if len(question) > 1 else b"")
+            self._note(key, reason, request[1] if len(request) > 1 else b"")
         verdict = [b"400", reason.encode(), b"", b""] if reason else [b"200", b"OK", key.encode(), b""]
         try:
-            self.socket.send_multipart([asker, b"", b"1.0", number, *verdict], zmq.NOBLOCK)
-        except zmq.ZMQError as error:  # the connection has gone meanwhile
+            self.socket.send_multipart([peer, b"", b"1.0", number, *verdict], zmq.NOBLOCK)
+        except zmq.ZMQError as error:  # the connection has ended meanwhile
             log.debug("an answer about a connection was not sent: %s", error)
 
-    def _judge(self, question: Sequence[bytes]) -> tuple[str, str]:
-        """The key, and why it may not connect; an empty reason = it may."""
-        domain, _address, _identity, mechanism, *credentials = question
+    def _judge(self, request: Sequence[bytes]) -> tuple[str, str]:
+        """The key, and the reason why it may not connect; an empty reason = it may."""
+        domain, _address, _identity, mechanism, *credentials = request
         if domain != DOMAIN:
             return "", "domain"
         if mechanism != b"CURVE":
@@ -162,9 +167,9 @@ class ZapHandler:
 
 
 def sender_of(frame: zmq.Frame) -> str | None:
-    """The public key (40 characters) of the client that sent this frame, received with `copy=False`.
+    """The public key (40 characters) of the client that sent a frame, received with `copy=False`.
 
-    Only of a socket with keys: one without takes whatever the other side claims.
+    Only for a socket with keys: one without takes whatever the other side claims.
     """
     try:
         return str(frame.get("User-Id"))

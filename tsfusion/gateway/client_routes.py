@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where the answers for a session go: the clients that said hello, and how they said they are doing."""
+"""The clients that are connected: where messages for a session go, and how each client is doing."""
 
 import time
 from collections import OrderedDict
@@ -7,30 +7,31 @@ from collections.abc import Iterator
 
 from msgspec import Struct, field
 
+from tsfusion.gateway.ports import Ports
 from tsfusion.wire.health import ClientHealth
-from tsfusion.wire.messages import Ping
+from tsfusion.wire.messages import Ping, ToClient
 
 _MAX_ROUTES = 1024
 _MAX_ROUTES_OF_A_NAME = 64  # where there are keys
-_NEW_ROUTES = 16  # so many of a name always have a place without having sent anything
-_TAKEN = 30.0  # seconds of silence after which another client may take a session that nothing came of
+_MIN_NEW_ROUTES = 16  # places of a name for clients that have sent no keyframe yet
+_ABANDONED_AFTER = 30.0  # seconds of silence after which another client may take over a session
 _LARGEST_OFFSET_NS = 10 * 366 * 86_400 * 10**9  # ten years; monotonic clocks begin when a machine does
 _LARGEST_BOUND_NS = 3600 * 10**9
 
 
 class ClientRoute(Struct, eq=False):
-    """A live client.
+    """A client that is connected.
 
     Attributes:
-        session: its key.
-        map: where the keyframes go.
-        identity: of its connection to the control socket.
+        session: 16 bytes.
+        map: the map that its keyframes go into.
+        identity: its connection to the control socket.
         client: the name its key is allowed under; empty = no keys.
-        offset_ns: server clock minus client clock, as the client measured it; true to within `bound_ns`.
-        waiting, skipped: as its last Ping said.
-        scans: a keyframe of it is in the journal.
-        heard: `time.monotonic()` of its last message.
-        held_until: nothing is taken from it until then, because of `held`.
+        offset_ns: server clock minus client clock, as the client measured it; right to within `bound_ns`.
+        waiting, skipped: figures of its last Ping.
+        scans: whether a keyframe of the session is in the journal.
+        last_message: `time.monotonic()`.
+        held_until: `time.monotonic()`; until then its keyframes are turned away, for `hold_reason`.
     """
 
     session: bytes
@@ -43,9 +44,9 @@ class ClientRoute(Struct, eq=False):
     skipped: dict[str, int] = field(default_factory=dict)
     received_bytes: int = 0
     scans: bool = False
-    heard: float = 0.0
+    last_message: float = 0.0
     held_until: float = 0.0
-    held: str = ""
+    hold_reason: str = ""
 
     @property
     def place(self) -> tuple[str, bytes]:
@@ -53,11 +54,11 @@ class ClientRoute(Struct, eq=False):
         return self.map, self.session
 
     def open_to(self, client: str) -> bool:
-        """Whether this client may go on with the session: it is its own, or its client is silent for long."""
-        return self.client == client or time.monotonic() - self.heard >= _TAKEN
+        """Whether a client may go on with the session: it is its own, or the other client is long silent."""
+        return self.client == client or time.monotonic() - self.last_message >= _ABANDONED_AFTER
 
-    def said(self, ping: Ping) -> None:
-        """How the client is doing. A clock that cannot be is not believed."""
+    def update(self, ping: Ping) -> None:
+        """Note how the client is doing. A clock offset that is impossible is not believed."""
         self.waiting, self.skipped = ping.waiting, ping.skipped
         possible = abs(ping.offset_ns or 0) <= _LARGEST_OFFSET_NS and 0 <= ping.bound_ns <= _LARGEST_BOUND_NS
         self.offset_ns, self.bound_ns = (ping.offset_ns, ping.bound_ns) if possible else (None, 0)
@@ -66,6 +67,7 @@ class ClientRoute(Struct, eq=False):
         """How the client is doing.
 
         Args:
+            now: `time.monotonic()`.
             progress: the highest seq that is durable, and that is fused.
             corrections: their newest revision, and how many keyframes they name.
         """
@@ -75,23 +77,27 @@ class ClientRoute(Struct, eq=False):
             client=self.client,
             session=self.session.hex()[:8],
             map=self.map,
-            heard_s=now - self.heard,
+            heard_s=now - self.last_message,
             durable=durable,
             fused=fused,
             received_bytes=self.received_bytes,
             waiting=self.waiting,
             skipped=self.skipped,
-            held=self.held if now < self.held_until else "",
+            held=self.hold_reason if now < self.held_until else "",
             revision=revision,
             corrected=corrected,
         )
 
 
 class ClientRoutes:
-    """The live clients, by session. When they are too many, the longest unheard of the largest name goes:
-    nobody's greetings push out others. Within a name, those that never sent a keyframe go first."""
+    """The connected clients, by session, and messages to them.
 
-    def __init__(self) -> None:
+    When there are too many, the name with the most loses its client that is silent for longest: nobody's
+    greetings push out the clients of others. Within a name, those that never sent a keyframe go first.
+    """
+
+    def __init__(self, ports: Ports) -> None:
+        self._ports = ports
         self._by_session: dict[bytes, ClientRoute] = {}
         self._names: dict[str, _NameRoutes] = {}
 
@@ -101,57 +107,70 @@ class ClientRoutes:
     def connect(
         self, session: bytes, map_name: str, identity: bytes, client: str = "", *, scans: bool = False
     ) -> ClientRoute:
-        """Answers for this session go to this connection from now on.
+        """Send messages for a session to this connection from now on.
 
         Args:
-            scans: there is something of it in the journal.
+            scans: whether a keyframe of the session is in the journal.
         """
         route = self._by_session.get(session)
         if route is None or route.client != client or route.map != map_name:
             self._drop(route)
             route = self._by_session[session] = ClientRoute(session, map_name, identity, client)
         route.identity = identity
-        route.scans |= scans
-        self.heard(route)
-        crowd = self._names[client]
-        if client and len(crowd) > _MAX_ROUTES_OF_A_NAME:
-            self._drop(crowd.least())
+        self._refresh(route, scans=scans)
+        of_name = self._names[client]
+        if client and len(of_name) > _MAX_ROUTES_OF_A_NAME:
+            self._drop(of_name.first_to_drop())
         if len(self._by_session) > _MAX_ROUTES:
-            self._drop(max(self._names.values(), key=len).least())
+            self._drop(max(self._names.values(), key=len).first_to_drop())
         return route
 
-    def heard(self, route: ClientRoute, *, scans: bool = False) -> None:
-        """It is alive: now the last of those that could be pushed out.
+    def mark_alive(self, session: bytes, client: str, *, scans: bool = False) -> ClientRoute | None:
+        """Note a message of a session's client; its route, or None when it is not connected.
 
         Args:
-            scans: it sent a keyframe.
+            scans: whether it was a good keyframe.
         """
-        route.heard = time.monotonic()
-        crowd = self._names.setdefault(route.client, _NameRoutes())
-        crowd.remove(route)
+        route = self._by_session.get(session)
+        if route is None or route.client != client:
+            return None
+        self._refresh(route, scans=scans)
+        return route
+
+    def _refresh(self, route: ClientRoute, *, scans: bool) -> None:
+        """Make a route the last of its name to be dropped."""
+        route.last_message = time.monotonic()
+        of_name = self._names.setdefault(route.client, _NameRoutes())
+        of_name.remove(route)
         route.scans |= scans
-        crowd.add(route)
+        of_name.add(route)
 
     def _drop(self, route: ClientRoute | None) -> None:
         if route is not None:
             del self._by_session[route.session]
-            crowd = self._names[route.client]
-            crowd.remove(route)
-            if not len(crowd):
+            of_name = self._names[route.client]
+            of_name.remove(route)
+            if not len(of_name):
                 del self._names[route.client]
 
     def get(self, session: bytes) -> ClientRoute | None:
-        """The connection of a session's client, if it said hello here."""
+        """The route to a session's client; None when it is not connected."""
         return self._by_session.get(session)
 
+    def send(self, session: bytes, message: ToClient) -> None:
+        """Send a message to a session's client, if that is connected."""
+        route = self._by_session.get(session)
+        if route is not None:
+            self._ports.reply(route.identity, message)
+
     def clear(self) -> None:
-        """All connections are gone."""
+        """Forget all clients: every connection was dropped."""
         self._by_session.clear()
         self._names.clear()
 
 
 class _NameRoutes:
-    """The routes of one client name, longest unheard first."""
+    """The routes of one client name; the one that is silent for longest comes first."""
 
     def __init__(self) -> None:
         self._new: OrderedDict[bytes, ClientRoute] = OrderedDict()
@@ -161,15 +180,15 @@ class _NameRoutes:
         return len(self._new) + len(self._scan)
 
     def add(self, route: ClientRoute) -> None:
-        """The last heard."""
+        """Add the route whose client sent the last message."""
         (self._scan if route.scans else self._new)[route.session] = route
 
     def remove(self, route: ClientRoute) -> None:
-        """If it is here."""
+        """Remove a route, if it is one of the name's."""
         self._new.pop(route.session, None)
         self._scan.pop(route.session, None)
 
-    def least(self) -> ClientRoute:
-        """Which to do without. Some are always new ones: nobody is shut out by all who ever scanned."""
-        crowd = self._new if len(self._new) > _NEW_ROUTES or not self._scan else self._scan
-        return next(iter(crowd.values()))
+    def first_to_drop(self) -> ClientRoute:
+        """The route to do without. Some places stay for new clients: old ones shut nobody out."""
+        routes = self._new if len(self._new) > _MIN_NEW_ROUTES or not self._scan else self._scan
+        return next(iter(routes.values()))

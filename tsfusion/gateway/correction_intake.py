@@ -15,8 +15,8 @@ from msgspec import structs
 from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import JournalError
+from tsfusion.gateway.admission import Admission
 from tsfusion.gateway.hosted_map import HostedMap
-from tsfusion.gateway.keyframe_intake import KeyframeIntake
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.wire import corrections
@@ -35,10 +35,10 @@ _RATE = 20.0  # messages a second of a client
 class Corrector:
     """The way from the control socket into the maps' corrections."""
 
-    def __init__(self, server: ServerConfig, maps: MapRegistry, intake: KeyframeIntake) -> None:
+    def __init__(self, server: ServerConfig, maps: MapRegistry, admission: Admission) -> None:
         self._server = server
         self._maps = maps
-        self._intake = intake
+        self._admission = admission
         share = max(server.quota_bytes // _SHARE, 1)
         self._quotas = Quotas(structs.replace(server, quota_bytes=share, quota_keyframes=_RATE))
 
@@ -46,10 +46,10 @@ class Corrector:
         """One message; the answer. None = none: its client will say hello, and send it again."""
         hosted = self._maps.get(head.map)
         if hosted is None or not hosted.warm:
-            self._intake.refused["map"] += 1
+            self._admission.refused["map"] += 1
             return None
         session = hosted.sessions.get(head.session)
-        if session is None or not self._intake.owns(hosted, head.session, client):
+        if session is None or not self._admission.owns(hosted.sessions, head.session, client):
             return self._refuse(head, Refused("session", "no keyframe of this session came from you"), client)
         kept = hosted.revisions.of(head.session)
         if head.revision <= kept.revision:
@@ -74,8 +74,8 @@ class Corrector:
     ) -> Uncorrected | None:
         """A message costs what is written for it: the whole file."""
         now = time.monotonic()
-        if seconds := hosted.held(now):
-            return self._later(head, seconds, "disk", hosted.problem)
+        if seconds := hosted.disk.seconds_left(now):
+            return self._later(head, seconds, "disk", hosted.disk.problem)
         nbytes = kept_bytes + corrections.file_bytes(head.count)
         if seconds := self._quotas.wait(client, nbytes, now):
             return self._later(head, seconds, "quota", "a client's corrections have a quota, too")
@@ -98,11 +98,11 @@ class Corrector:
             raise Refused("quota", f"a sensor may be {most:g} m from the origin, got {away:.0f} m")
 
     def _later(self, head: Corrections, seconds: float, reason: str, message: str) -> Uncorrected:
-        self._intake.refused["held"] += 1
+        self._admission.refused["held"] += 1
         return Uncorrected(head.session, head.revision, reason, message, min(max(seconds, 0.1), _LONGEST))
 
     def _refuse(self, head: Corrections, error: Refused, client: str) -> Uncorrected:
-        self._intake.refused[error.reason] += 1
+        self._admission.refused[error.reason] += 1
         subject = logs.about(map=head.map, session=head.session, client=client, reason=error.reason)
         log.warning("corrections are refused: %s", error, extra=subject)
         return Uncorrected(head.session, head.revision, error.reason, str(error))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One fuser process: its socket, and the word of memory that says which keyframe it is at."""
+"""One fuser process: its socket, and the file that says which keyframe it is at."""
 
 import shutil
 import struct
@@ -20,13 +20,17 @@ COMMAND = (sys.executable, "-m", "tsfusion.fuser")
 
 
 class FuserProcess:
-    """Started at once; `close` it when it has ended, or to end it.
+    """A process that is started at once. Call `close` when it has ended, or to end it.
 
     Args:
-        name: the map's, for its log lines.
+        name: of the map, for the log lines.
+
+    Attributes:
+        working_file: see `fuser.messages.Begin`.
+        socket: the gateway's end.
 
     Raises:
-        OSError, zmq.ZMQError: when the system has no room for it.
+        OSError, zmq.ZMQError: when the system cannot start it.
     """
 
     def __init__(
@@ -36,7 +40,7 @@ class FuserProcess:
         self.working_file = self._scratch / fuser_messages.WORKING_FILE
         self.socket = sockets.pair(context)
         try:
-            self.at_nothing()
+            self.clear_current_keyframe()
             endpoint = f"ipc://{self._scratch}/0"
             self.socket.bind(endpoint)
             self._process = subprocess.Popen(
@@ -51,40 +55,35 @@ class FuserProcess:
             raise
 
     @property
-    def pid(self) -> int:
-        """The process."""
-        return self._process.pid
-
-    @property
     def status(self) -> int | None:
-        """How it ended; None = it runs."""
+        """The exit status; None = it runs."""
         return self._process.poll()
 
     @property
-    def at(self) -> int:
-        """The keyframe that it is at, or `work.NOT_WORKING`."""
+    def current_keyframe(self) -> int:
+        """The index of the keyframe that it is at, or `fuser.messages.NOT_WORKING`."""
         try:
             (index,) = struct.unpack("<q", self.working_file.read_bytes())
         except (OSError, struct.error):
             return fuser_messages.NOT_WORKING
         return int(index)
 
-    def at_nothing(self) -> None:
-        """What it was at is known."""
+    def clear_current_keyframe(self) -> None:
+        """Write that it is at no keyframe."""
         self.working_file.write_bytes(struct.pack("<q", fuser_messages.NOT_WORKING))
 
     def kill(self) -> None:
-        """End it at once."""
+        """Kill the process, and wait until it has ended."""
         self._process.kill()
         self._process.wait()
 
-    def close(self, patience: float = 0.0) -> None:
-        """End it: at once, or when it has not ended by itself after so many seconds."""
+    def close(self, timeout: float = 0.0) -> None:
+        """End the process and clear up. It may end by itself within so many seconds; then it is killed."""
         assert self._process.stdin is not None
         with suppress(OSError):
             self._process.stdin.close()  # it ends when it sees that
         try:
-            self._process.wait(patience)
+            self._process.wait(timeout)
         except subprocess.TimeoutExpired:
             self.kill()
         self.socket.close()

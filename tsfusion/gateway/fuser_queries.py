@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""What people ask a map's fuser: passed on, answered when it answers, given up when it dies.
+"""Commands for a map's fuser (status, mesh): passed on, answered with its answer, refused when it dies.
 
-A mesh takes the fuser's time and our memory, and costs the asker nothing: there is one at a time, with
-pauses while keyframes come, and only so much of what was made may wait to be read.
+A mesh takes the fuser's time and the gateway's memory, and costs whoever asks nothing: one is made at a time,
+with pauses while keyframes come, and only so many bytes of meshes may wait to be read.
 """
 
 import time
 from collections.abc import Sequence
-from typing import Protocol
 
 import msgspec
 import zmq
@@ -16,151 +15,152 @@ from msgspec import Struct
 from tsfusion.core import process
 from tsfusion.core.config import ServerConfig
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.memory_guard import PendingReplies
+from tsfusion.gateway.ports import Ports
 from tsfusion.wire import health, messages
 from tsfusion.wire.health import Health, Status
 
-_MAX_QUESTIONS = 32
-_KEYFRAMES_SHARE = 3  # a mesh, then three times as long none: a quarter of a busy fuser's time
-_RESTARTS = f"the fuser restarts; {messages.ASK_AGAIN}"
+_MAX_PENDING = 32
+_REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
+_RESTARTS = "the fuser restarts"
 
 
-class SendReply(Protocol):
-    """How an answer leaves."""
+class PendingQuery(Struct, frozen=True):
+    """A command that a fuser has not answered yet.
 
-    def __call__(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
-        """To this connection."""
-
-
-class Asked(Protocol):
-    """A map that is open."""
-
-    @property
-    def fuser(self) -> FuserSupervisor:
-        """What answers."""
-
-    def calm(self, since: float) -> bool:
-        """Whether no keyframe waits, nor came since then (`time.monotonic()`)."""
-
-
-class Question(Struct, frozen=True):
-    """Who asked what of which map, and when. `owner`: the client, or without keys the connection."""
+    Attributes:
+        identity: the connection that sent it.
+        owner: the client, or without keys the connection: each may have one mesh under way.
+        asked_at: `time.monotonic()`.
+    """
 
     identity: bytes
     owner: bytes
     command: messages.Command
-    asked: float
+    asked_at: float
 
 
-class Made(Struct, frozen=True):
-    """The last mesh of a map that was made on request. `rest_until`: no other, if keyframes come."""
+class LastMesh(Struct, frozen=True):
+    """The last mesh of a map that was made on request.
+
+    Attributes:
+        nbytes: its size.
+        asked_at, rest_until: `time.monotonic()`; between them a map that gets keyframes makes no other.
+    """
 
     nbytes: int
-    asked: float
+    asked_at: float
     rest_until: float
 
 
 class FuserQueries:
-    """Those that are not answered yet, a few.
+    """The commands that wait for a fuser's answer.
 
     Args:
-        most_bytes: of meshes that wait to be read; a single one may be larger.
+        max_bytes: of meshes that wait to be read; a single one may be larger.
     """
 
-    def __init__(self, answer: SendReply, most_bytes: int) -> None:
-        self._answer = answer
-        self._most_bytes = most_bytes
-        self._open: dict[int, Question] = {}
+    def __init__(self, ports: Ports, max_bytes: int) -> None:
+        self._ports = ports
+        self._max_bytes = max_bytes
+        self._pending: dict[int, PendingQuery] = {}
         self._count = 0
-        self._meshes = PendingReplies()
-        self._made: dict[str, Made] = {}
+        self._unread = PendingReplies()
+        self._last_meshes: dict[str, LastMesh] = {}
 
     @property
     def nbytes(self) -> int:
-        """What waits to be read by those who asked for it, as far as it may."""
-        return min(self._meshes.nbytes, max(self._most_bytes, self._meshes.largest))
+        """Bytes of the meshes that wait to be read, up to what may wait."""
+        return min(self._unread.nbytes, max(self._max_bytes, self._unread.largest))
 
-    def ask(self, identity: bytes, command: messages.Command, asked: Asked | None, client: str = "") -> None:
-        """Pass a question on; or say why not.
+    def submit(
+        self, identity: bytes, command: messages.Command, hosted: HostedMap | None, client: str = ""
+    ) -> None:
+        """Pass a command on to the map's fuser, or reply why not.
 
         Args:
-            asked: the map; None = it is not open.
-            client: the name that the asker's key is allowed under; empty without keys.
+            hosted: the map; None = it is not open.
+            client: the name that the sender's key is allowed under; empty without keys.
         """
-        question = Question(identity, client.encode() or identity, command, time.monotonic())
-        if problem := self._pass_on(question, asked):
-            self._answer(identity, messages.Reply(name=command.name, error=problem))
+        query = PendingQuery(identity, client.encode() or identity, command, time.monotonic())
+        if hosted is None:
+            self._refuse(query, f"no map {command.map} is open")
+        elif hosted.fuser.failed and not hosted.fuser.ready:
+            self._refuse(query, hosted.fuser.failed)
+        elif problem := self._pass_on(query, hosted):
+            self._refuse(query, problem, retry=True)
 
-    def _pass_on(self, question: Question, asked: Asked | None) -> str:
-        if asked is None:
-            return f"no map {question.command.map} is open"
-        if not asked.fuser.ready:
-            return asked.fuser.failed or _RESTARTS
-        if question.command.name == "mesh" and (problem := self._no_mesh(question, asked)):
+    def _refuse(self, query: PendingQuery, problem: str, *, retry: bool = False) -> None:
+        error = f"{problem}; ask again" if retry else problem
+        self._ports.reply(query.identity, messages.Reply(name=query.command.name, error=error, retry=retry))
+
+    def _pass_on(self, query: PendingQuery, hosted: HostedMap) -> str:
+        """Why the fuser cannot be asked now; empty = it was."""
+        if not hosted.fuser.ready:
+            return _RESTARTS
+        if query.command.name == "mesh" and (problem := self._why_no_mesh(query, hosted)):
             return problem
         self._count += 1
-        if len(self._open) >= _MAX_QUESTIONS or not asked.fuser.send(
-            fuser_messages.FuserQuery(self._count, question.command)
+        if len(self._pending) >= _MAX_PENDING or not hosted.fuser.send(
+            fuser_messages.FuserQuery(self._count, query.command)
         ):
-            return f"too many questions at once; {messages.ASK_AGAIN}"
-        self._open[self._count] = question
+            return "too many questions at once"
+        self._pending[self._count] = query
         return ""
 
-    def _no_mesh(self, question: Question, asked: Asked) -> str:
+    def _why_no_mesh(self, query: PendingQuery, hosted: HostedMap) -> str:
         """Why this mesh is not to be made now; empty = it may."""
-        under_way = [one for one in self._open.values() if one.command.name == "mesh"]
-        if any(one.owner == question.owner for one in under_way) or self._meshes.pending(question.owner):
-            return f"the mesh that was asked for before is still on its way; {messages.ASK_AGAIN}"
-        name = question.command.map
+        under_way = [one for one in self._pending.values() if one.command.name == "mesh"]
+        if any(one.owner == query.owner for one in under_way) or self._unread.pending(query.owner):
+            return "the mesh that was asked for before is still on its way"
+        name = query.command.map
         if any(one.command.map == name for one in under_way):
-            return f"another mesh is being made; {messages.ASK_AGAIN}"
-        if not self._room([name, *(one.command.map for one in under_way)]):
-            return f"meshes that others asked for and do not read fill the memory; {messages.ASK_AGAIN}"
-        made = self._made.get(name)
-        if made is not None and question.asked < made.rest_until and not asked.calm(made.asked):
-            return f"a mesh was just made, now it is the keyframes' turn; {messages.ASK_AGAIN}"
+            return "another mesh is being made"
+        if not self._has_memory_for([name, *(one.command.map for one in under_way)]):
+            return "meshes that others asked for and do not read fill the memory"
+        last = self._last_meshes.get(name)
+        if last is not None and query.asked_at < last.rest_until and not hosted.idle_since(last.asked_at):
+            return "a mesh was just made, now it is the keyframes' turn"
         return ""
 
-    def _room(self, wanted: list[str]) -> bool:
-        """Whether meshes of these maps, as large as their last, may come to those that wait to be read."""
-        waiting = self._meshes.nbytes
-        if not waiting and len(wanted) == 1:
+    def _has_memory_for(self, maps: list[str]) -> bool:
+        """Whether meshes of these maps, as large as their last, may be added to the unread ones."""
+        waiting = self._unread.nbytes
+        if not waiting and len(maps) == 1:
             return True
-        coming = sum(self._made[name].nbytes for name in wanted if name in self._made)
-        return waiting + coming <= self._most_bytes
+        coming = sum(self._last_meshes[name].nbytes for name in maps if name in self._last_meshes)
+        return waiting + coming <= self._max_bytes
 
-    def answered(
+    def on_reply(
         self, answer: fuser_messages.FuserReply, status: health.Status | None, frames: Sequence[zmq.Frame]
     ) -> None:
-        """What the fuser says."""
-        question = self._open.pop(answer.number, None)
-        if question is None:
+        """Send a fuser's answer to the connection that asked."""
+        query = self._pending.pop(answer.number, None)
+        if query is None:
             return
-        name, identity = question.command.name, question.identity
+        name = query.command.name
         reply = messages.Reply(name=name, error=answer.error, status=status, mesh=answer.layout)
         if name == "mesh":
             now = time.monotonic()
             nbytes = sum(frame.buffer.nbytes for frame in frames)
-            rest_until = now + _KEYFRAMES_SHARE * (now - question.asked)
-            self._made[question.command.map] = Made(nbytes, question.asked, rest_until)
-        self._answer(identity, reply, self._meshes.wrap(question.owner, frames) if frames else ())
+            rest_until = now + _REST_FACTOR * (now - query.asked_at)
+            self._last_meshes[query.command.map] = LastMesh(nbytes, query.asked_at, rest_until)
+        self._ports.reply(query.identity, reply, self._unread.wrap(query.owner, frames) if frames else ())
 
     def give_up(self, map_name: str) -> None:
-        """The map's fuser is gone."""
-        self._made.pop(map_name, None)
-        for number, question in list(self._open.items()):
-            if question.command.map == map_name:
-                del self._open[number]
-                reply = messages.Reply(name=question.command.name, error=_RESTARTS)
-                self._answer(question.identity, reply)
+        """Refuse what a map's fuser was asked: it has ended."""
+        self._last_meshes.pop(map_name, None)
+        for number, query in list(self._pending.items()):
+            if query.command.map == map_name:
+                del self._pending[number]
+                self._refuse(query, _RESTARTS, retry=True)
 
 
 def status(
     hosted: HostedMap, fuser: fuser_messages.FuserStatus, health: Health, server: ServerConfig
 ) -> Status:
-    """The answer to a person who asks how a map is doing."""
+    """A map's status: what its fuser knows, and what the gateway knows."""
     own = health.maps[hosted.name]
     return Status(
         epoch=health.epoch,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The gateway's end of the fuser: start it, feed it journal positions, notice when it dies or hangs."""
+"""The fuser process of a map, seen from the gateway: started, given work, replaced when it dies or hangs."""
 
 import logging
 import signal
@@ -13,34 +13,37 @@ from typing import Any
 import msgspec
 import zmq
 
-from tsfusion.core import errors, logs, process
+from tsfusion.core import logs, process
 from tsfusion.core.config import ServerConfig, VolumeConfig
-from tsfusion.core.errors import MapError, TsfusionError
+from tsfusion.core.errors import MapError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.fuser_process import FuserProcess
 from tsfusion.wire import sockets
 
 log = logging.getLogger(__name__)
 
-_AHEAD = 4  # positions handed out before their answers: hides the gateway's disk waits
-_MAX_STARTS = 3  # in a row, without getting ready, before the map counts as failed
+_MAX_IN_FLIGHT = 4  # keyframes handed out before their answers: hides the gateway's disk waits
+_MAX_EARLY_DEATHS = 3  # in a row, before the map counts as failed
 _LONGEST_PAUSE = 60.0  # seconds between one start and the next
-_END_DEADLINE = 5.0
-# A keyframe is given up when the deaths put down to it weigh so much: two of its own making, or as many
-# kills from outside as no chance can aim at one keyframe.
-_ENOUGH, _OWN_DEATH, _KILLED = 6, 3, 1
-_WELL = 60.0  # seconds after which a process that goes on fusing is no reason to pause
-_PATIENCE = 10  # times as long, when it is no keyframe that takes so long: a mesh, a checkpoint
+_END_DEADLINE = 5.0  # seconds
+# A keyframe is given up after two crashes of the process that works at it, or six kills from outside: so many
+# kills do not hit the same keyframe by chance.
+GIVE_UP_AT = 6
+CRASH_WEIGHT = 3
+KILL_WEIGHT = 1
+_STEADY_AFTER = 60.0  # seconds of fusing, after which earlier deaths no longer count
+_BETWEEN_KEYFRAMES = 10  # times `fuser_timeout` for a mesh or a checkpoint, which may take longer
 
 
 class FuserSupervisor:
     """One fuser process after another, all at work on the same map.
 
     Attributes:
-        ready: the process has opened the map and compiled the kernels.
-        in_flight: the keyframes it has not answered, oldest first.
+        ready: whether the process has opened the map and compiled the kernels.
+        in_flight: indices of the keyframes that it has not answered, oldest first.
+        finishing: whether `finish` was called.
         restarts: how often a new process had to take over.
-        failed: why it cannot be kept alive; empty = it can. It is still tried again, ever more rarely.
+        failed: why no process stays alive; empty = one does. It is tried again, ever more rarely.
     """
 
     def __init__(
@@ -58,9 +61,9 @@ class FuserSupervisor:
             server.journal_bytes is not None,
             server.fuser_memory_bytes or process.physical_memory_bytes() * 3 // 4,
         )
-        self._ended_early = 0  # processes in a row that died of nothing that a keyframe did
-        self._blame: dict[int, int] = {}
-        self._finishing = self._finish_sent = False
+        self._early_deaths = 0  # in a row, of processes that were not at work on a keyframe
+        self._blame: dict[int, int] = {}  # index of a keyframe → weight of the deaths at it
+        self.finishing = self._finish_sent = False
         self.restarts = 0
         self.failed = ""
         self._was_ready = False
@@ -75,32 +78,27 @@ class FuserSupervisor:
         )
         self.ready = False
         self._restart_at = 0.0
-        self._heard = self._ready_since = time.monotonic()
+        self._last_message = self._ready_since = time.monotonic()
         self._oom_kills = process.oom_kills()
         self.in_flight: deque[int] = deque()
 
     @property
     def socket(self) -> sockets.AnySocket:
-        """Poll it for `receive`."""
+        """The socket to poll before `receive`."""
         return self._process.socket
 
     @property
-    def pid(self) -> int:
-        """The process that is running now."""
-        return self._process.pid
-
-    @property
     def idle(self) -> bool:
-        """Ready, and every keyframe handed out is answered."""
+        """Whether the process is ready and has answered every keyframe that was handed out."""
         return self.ready and not self.in_flight
 
     @property
     def wants_work(self) -> bool:
-        """Whether another position may be handed out."""
-        return self.ready and not self._finishing and len(self.in_flight) < _AHEAD
+        """Whether another keyframe may be handed out."""
+        return self.ready and not self.finishing and len(self.in_flight) < _MAX_IN_FLIGHT
 
     def send(self, message: fuser_messages.ToFuser) -> bool:
-        """Hand over a message; False when there is no room for it now. A dead fuser's are lost with it."""
+        """Send a message; False when its queue is full now. What a dead fuser has not read is lost."""
         try:
             self.socket.send(fuser_messages.encode(message), zmq.NOBLOCK)
         except zmq.Again:
@@ -109,14 +107,12 @@ class FuserSupervisor:
 
     def fuse(self, order: fuser_messages.Fuse) -> bool:
         """Hand out a keyframe; False when it has to be tried again."""
-        if self._blame.get(order.index, 0) >= _ENOUGH:
-            order = fuser_messages.Fuse(
-                order.index, order.position, order.session, order.seq, order.client, "crash"
-            )
+        if self._blame.get(order.index, 0) >= GIVE_UP_AT:
+            order = msgspec.structs.replace(order, skip="crash")
         if not self.send(order):
             return False
         if not self.in_flight:
-            self._heard = time.monotonic()
+            self._last_message = time.monotonic()
         self.in_flight.append(order.index)
         return True
 
@@ -124,62 +120,62 @@ class FuserSupervisor:
         """The next message and its frames, or None.
 
         Raises:
-            TsfusionError: when the fuser says it cannot open the map.
+            TsfusionError: when the fuser cannot open the map.
         """
-        if self._restart_at:  # its process is dead and buried: what that did comes again
+        if self._restart_at:  # the process is dead: the keyframes it answered late are fused once more
             return None
         try:
             head, *frames = self.socket.recv_multipart(zmq.NOBLOCK, copy=False)
         except zmq.Again:
             return None
-        self._heard = time.monotonic()
+        self._last_message = time.monotonic()
         message = fuser_messages.to_gateway.decode(head.buffer)
         if isinstance(message, fuser_messages.Failed) and self._was_ready:
             log.error("the fuser cannot open the map: %s", message.message)
         elif isinstance(message, fuser_messages.Failed):
-            kind = getattr(errors, message.error, TsfusionError)
-            raise kind(message.message)
+            raise message.error()
         if isinstance(message, fuser_messages.Started):
             self.send(msgspec.structs.replace(self._begin, working=str(self._process.working_file)))
         elif isinstance(message, fuser_messages.Ready):
             self.ready = self._was_ready = True
-            self._ready_since = self._heard
+            self._ready_since = self._last_message
         elif isinstance(message, fuser_messages.Done):
             self.in_flight.popleft()
-            if self._blame.get(message.index, 0) < _ENOUGH:  # a verdict stays: it may come again
+            if self._blame.get(message.index, 0) < GIVE_UP_AT:  # one that is given up stays so
                 self._blame.pop(message.index, None)
             self.failed = ""
-            if self._heard - self._ready_since > _WELL:
-                self._ended_early = 0
+            if self._last_message - self._ready_since > _STEADY_AFTER:
+                self._early_deaths = 0
         elif isinstance(message, fuser_messages.Saved) and message.written:
-            self._ended_early = 0
+            self._early_deaths = 0
         return message, frames
 
     def ended(self) -> bool:
-        """Whether the process is gone; one that hangs is ended here."""
+        """Whether the process has ended; one that hangs is killed here."""
         if self._process.status is not None:
             return True
         busy = bool(self.in_flight) or self._finish_sent
-        patience = self._server.fuser_timeout
-        if self._process.at == fuser_messages.NOT_WORKING:
-            patience *= _PATIENCE
-        if busy and self.ready and time.monotonic() - self._heard > patience:
+        timeout = self._server.fuser_timeout
+        if self._process.current_keyframe == fuser_messages.NOT_WORKING:
+            timeout *= _BETWEEN_KEYFRAMES
+        if busy and self.ready and time.monotonic() - self._last_message > timeout:
             subject = logs.about(map=self._map)
-            log.error("the fuser process has been silent for %.0f s: it is killed", patience, extra=subject)
-            self._put_down(_OWN_DEATH)
+            log.error("the fuser process has been silent for %.0f s: it is killed", timeout, extra=subject)
+            self._blame_current_keyframe(CRASH_WEIGHT)
             self._process.kill()
             return True
         return False
 
     def restart(self) -> None:
-        """Put a new process in the place of one that died: at once, or after a pause when that happens again
-        and again. It begins at the last checkpoint. Call it until `ended` is no longer true.
+        """Start a new process in the place of a dead one, after a pause when that happens again and again.
+
+        It begins at the last checkpoint. Call it until `ended` is no longer true.
 
         Raises:
-            MapError: when the first of all died before it was ready.
+            MapError: when the first process of all died before it was ready.
         """
         if not self._restart_at:
-            self._bury()
+            self._on_death()
         if time.monotonic() < self._restart_at:
             return
         dead = self._process
@@ -192,18 +188,19 @@ class FuserSupervisor:
         dead.close()
         self.restarts += 1
 
-    def _bury(self) -> None:
+    def _on_death(self) -> None:
+        """Find out what the process died of, and set the time of the next start."""
         status = self._process.status
         killed = status == -signal.SIGKILL and process.oom_kills() == self._oom_kills
         if not self.ready and self.restarts == 0 and not killed:
             raise MapError(f"the fuser process ended with status {status} before it was ready")
-        blamed = self._put_down(_KILLED if killed else _OWN_DEATH)
+        blamed = self._blame_current_keyframe(KILL_WEIGHT if killed else CRASH_WEIGHT)
         pause = 0.0
         if not blamed and not killed:
-            if self._ended_early >= _MAX_STARTS:
-                self.failed = f"its fuser process ended {self._ended_early} times, last with status {status}"
-            pause = min(2.0**self._ended_early - 1, _LONGEST_PAUSE)
-            self._ended_early += 1
+            if self._early_deaths >= _MAX_EARLY_DEATHS:
+                self.failed = f"its fuser process ended {self._early_deaths} times, last with status {status}"
+            pause = min(2.0**self._early_deaths - 1, _LONGEST_PAUSE)
+            self._early_deaths += 1
         self.in_flight.clear()
         self.ready = False
         self._restart_at = time.monotonic() + pause
@@ -214,33 +211,28 @@ class FuserSupervisor:
             extra=logs.about(map=self._map),
         )
 
-    def _put_down(self, weight: int) -> bool:
-        """A death to the keyframe it happened at; whether it was at one."""
-        index = self._process.at
+    def _blame_current_keyframe(self, weight: int) -> bool:
+        """Put a death down to the keyframe that the process was at; False when it was at none."""
+        index = self._process.current_keyframe
         if index == fuser_messages.NOT_WORKING:
             return False
         self._blame[index] = self._blame.get(index, 0) + weight
         with suppress(OSError):
-            self._process.at_nothing()
+            self._process.clear_current_keyframe()
         return True
 
     def finish(self) -> None:
-        """Ask for a checkpoint and the end of the process. Call it until `ended`: there may be no room."""
+        """Ask for a checkpoint and the end of the process. Call it until `ended`: the queue may be full."""
         if not self._finish_sent:
             self._finish_sent = self.send(fuser_messages.Finish())
-            self._heard = time.monotonic()
-        self._finishing = True
+            self._last_message = time.monotonic()
+        self.finishing = True
 
     @property
     def finished_well(self) -> bool:
         """Whether the process has ended with its checkpoint on the disk."""
-        return self._finishing and self._process.status == 0
-
-    @property
-    def finishing(self) -> bool:
-        """Whether `finish` was called."""
-        return self._finishing
+        return self.finishing and self._process.status == 0
 
     def close(self) -> None:
-        """End the process, at once if need be. The journal makes up for what it had not saved."""
+        """End the process, at once if need be. The next one fuses what it had not saved from the journal."""
         self._process.close(_END_DEADLINE if self.ready else 0.0)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The gateway: everything that must answer while a kernel runs.
 
-A Taichi kernel holds its process for as long as it takes, so this is another one. Each message is checked,
-journaled and acknowledged in one step; a map's fuser is told only where it lies in the journal.
+A Taichi kernel holds its process for as long as it takes, so the gateway is a process of its own. Each
+message is checked, journaled and acknowledged in one step; a map's fuser gets only its journal position.
 """
 
 import logging
@@ -18,15 +18,16 @@ from tsfusion.core.errors import DecodeError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import fuser_queries
 from tsfusion.gateway.access_control import AccessControl
-from tsfusion.gateway.client_routes import ClientRoute, ClientRoutes
+from tsfusion.gateway.admission import Admission
+from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.correction_intake import Corrector
 from tsfusion.gateway.fuser_queries import FuserQueries
-from tsfusion.gateway.hosted_map import HostedMap
+from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.keyframe_intake import KeyframeIntake
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.memory_guard import MemoryGuard
 from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.ports import Ports, Subscriptions, each, send_now
+from tsfusion.gateway.ports import Ports, Subscriptions, receive_some
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.corrections import Corrections
 from tsfusion.wire.health import Health
@@ -36,19 +37,20 @@ from tsfusion.wire.sockets import mesh_topic
 
 log = logging.getLogger(__name__)
 
-_LISTEN_TICK_MS = 10
-_TICK_MS = 100  # how long a signal or a fuser's death may go unnoticed
+_TICK_MS = 100  # within which a signal or a fuser's death is noticed
+_RENEW_TICK_MS = 10  # while the sockets are made anew
 _SNAPSHOT_INTERVAL = 1.0  # seconds
-_MESHES_SHARE = 4  # a quarter of the memory is for meshes that wait to be read
+_MESHES_SHARE = 4  # one fourth of the memory is for meshes that wait to be read
 Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
 
 class Gateway:
-    """One server's state between clients, journals and fusers. Call `step` for ever.
+    """One server's state between clients, journals and fusers. Call `step` again and again.
 
     Attributes:
-        epoch: a new one tells clients that what was under way is lost.
-        maps: those of the server.
+        ports: the sockets.
+        maps: the open maps.
+        epoch: a new one tells clients that the messages under way are lost.
     """
 
     def __init__(
@@ -56,21 +58,22 @@ class Gateway:
         context: "zmq.Context[Any]",
         server: ServerConfig,
         ports: Ports,
-        door: AccessControl,
-        metrics: Metrics | None = None,
+        access: AccessControl,
+        metrics: Metrics,
     ) -> None:
         self.ports = ports
-        self.maps = MapRegistry(context, server, self)
         self._server = server
-        self._door = door
+        self._access = access
         self._metrics = metrics
-        self._routes = ClientRoutes()
-        self._intake = KeyframeIntake(server, self.maps, door, self)
-        self._refused = self._intake.refused
-        self._corrector = Corrector(server, self.maps, self._intake)
-        self._questions = FuserQueries(self._answer, server.memory_bytes // _MESHES_SHARE)
-        self._topics = Subscriptions()
-        self._watched: dict[str, bool] = {}  # what each fuser knows of it
+        self._routes = ClientRoutes(ports)
+        self._admission = Admission(access, self._routes)
+        self._refused = self._admission.refused
+        self.maps = MapRegistry(context, server, self._routes, metrics)
+        self._intake = KeyframeIntake(server, self.maps, self._admission, self._routes)
+        self._corrector = Corrector(server, self.maps, self._admission)
+        self._queries = FuserQueries(ports, server.memory_bytes // _MESHES_SHARE)
+        self._subscriptions = Subscriptions()
+        self._publishing: dict[str, bool] = {}  # map → whether its fuser was told to send triangles
         self._memory = MemoryGuard(server.memory_bytes)
         self._accepting = self._stopped = False
         self._started = time.monotonic()
@@ -81,58 +84,59 @@ class Gateway:
         self.epoch = f"{time.monotonic_ns():x}"
 
     def accept(self) -> None:
-        """Take keyframes from here on."""
+        """Begin to take keyframes."""
         self._accepting = True
-        self.maps.begun()
-        self._next_snapshot = 0.0  # health checks are to know at once
+        self.maps.end_start()
+        self._next_snapshot = 0.0  # health checks are to see it at once
 
     def stop_accepting(self) -> None:
-        """Take no more keyframes; clients keep what is not acknowledged."""
+        """Take no more keyframes; clients keep those that are not acknowledged."""
         self._accepting, self._stopped = False, True
 
     def step(self) -> None:
-        """Wait for something to happen (a moment at most) and deal with it.
+        """Wait a moment for messages, and handle those that came.
 
         Raises:
             TsfusionError: when a map that was to be opened at the start cannot be.
         """
         handlers = self._handlers()
         fusers = [hosted.fuser.socket for hosted in self.maps]
-        polled = [(socket, zmq.POLLIN) for socket in (*self._door.poll, *fusers, *handlers)]
-        events = dict(zmq.zmq_poll(polled, _TICK_MS if handlers else _LISTEN_TICK_MS))
-        if not self._guard():
+        polled = [(socket, zmq.POLLIN) for socket in (*self._access.poll, *fusers, *handlers)]
+        events = dict(zmq.zmq_poll(polled, _TICK_MS if handlers else _RENEW_TICK_MS))
+        if not self._drop_connections():
             for socket, handle in handlers.items():
                 if socket in events:
-                    each(socket, handle)
+                    receive_some(socket, handle)
         self.ports.step()
-        self.maps.step(self._on_other)
-        self._tell_fusers()
+        for hosted, message in self.maps.step():
+            self._pass_to_people(hosted, message)
+        self._update_fusers()
         self._snapshot()
 
     def _handlers(self) -> Handlers:
-        """What to do with messages, by socket; nothing while these are made anew."""
+        """The handler of each socket's messages; none while the sockets are made anew."""
         if self.ports.problem:
             return {}
         handlers: Handlers = {
             self.ports.control: self._on_control,
-            self.ports.publish: self._on_subscription,
+            self.ports.viewers: self._on_subscription,
         }
         if self._accepting:
-            handlers[self.ports.keyframes] = self._intake.take
+            handlers[self.ports.keyframes] = self._intake.handle
         elif self._stopped:
             self.ports.keyframes.close()
         return handlers
 
-    def _guard(self) -> bool:
-        """Drop all connections when a key was revoked, or when they hold too much memory; whether it did.
+    def _drop_connections(self) -> bool:
+        """Drop all connections if a key was revoked, or if they hold too much memory; whether that was done.
 
         ZeroMQ limits a frame and a queue of whole messages, not a message that never ends.
         """
-        if self._door.step():
+        if self._access.step():
             log.warning("a key was revoked: every connection is made anew")
             self._refused["revoked"] += 1
         else:
-            held = self._memory.excess(self._questions.nbytes)
+            held = self._memory.excess(self._queries.nbytes)
             if not held:
                 return False
             log.error(
@@ -141,56 +145,48 @@ class Gateway:
             self._refused["memory"] += 1
         self.ports.renew()
         self._routes.clear()
-        self._topics.clear()
+        self._subscriptions.clear()
         self._new_epoch()
         return True
 
     def _snapshot(self) -> None:
+        """Give the metrics a new health snapshot, about once a second."""
         now = time.monotonic()
         if now < self._next_snapshot:
             return
         self._next_snapshot = now + _SNAPSHOT_INTERVAL
         logs.tell_left_out()
-        if self._metrics is not None:
-            self._metrics.health = self.health()
+        self._metrics.health = self.health()
 
     # --- maps ---
 
-    def _tell_fusers(self) -> None:
-        """Whether anybody watches their maps; and that nobody will answer where one has died."""
+    def _update_fusers(self) -> None:
+        """Tell each fuser whether its map has viewers; refuse the queries that a dead one will not answer."""
         for hosted in self.maps:
             if not hosted.fuser.ready:
-                self._watched.pop(hosted.name, None)
-                self._questions.give_up(hosted.name)
+                self._publishing.pop(hosted.name, None)
+                self._queries.give_up(hosted.name)
                 continue
-            watched = self._topics.watched(hosted.name)
-            if watched != self._watched.get(hosted.name) and hosted.fuser.send(
-                fuser_messages.Publish(watched)
-            ):
-                self._watched[hosted.name] = watched
+            watched = self._subscriptions.watched(hosted.name)
+            changed = watched != self._publishing.get(hosted.name)
+            if changed and hosted.fuser.send(fuser_messages.Publish(watched)):
+                self._publishing[hosted.name] = watched
 
-    def _on_other(
-        self,
-        hosted: HostedMap,
-        message: fuser_messages.Meshed | fuser_messages.FuserReply,
-        frames: Sequence[zmq.Frame],
-    ) -> None:
+    def _pass_to_people(self, hosted: HostedMap, passed: ForPeople) -> None:
+        """Pass a fuser's message to its map's viewers, or to whoever asked."""
+        message, frames = passed
         if isinstance(message, fuser_messages.FuserReply):
-            status = (
-                None
-                if message.status is None
-                else fuser_queries.status(hosted, message.status, self.health(), self._server)
-            )
-            self._questions.answered(message, status, frames)
+            own = message.status
+            status = fuser_queries.status(hosted, own, self.health(), self._server) if own else None
+            self._queries.on_reply(message, status, frames)
         elif frames:
-            send_now(self.ports.publish, [mesh_topic(hosted.name), fuser_messages.encode(message), *frames])
+            self.ports.publish(mesh_topic(hosted.name), fuser_messages.encode(message), frames)
 
     # --- control ---
 
     def _on_control(self, frames: list[zmq.Frame]) -> None:
-        client = self._door.client_of(frames[0])
+        client = self._admission.client_of(frames[0])
         if client is None:
-            self._refused["key"] += 1
             return
         identity, *rest = frames
         try:
@@ -206,7 +202,7 @@ class Gateway:
     ) -> None:
         if isinstance(message, Corrections):
             if self._accepting and (answer := self._corrector.take(message, arrays, client)) is not None:
-                self._answer(identity, answer)
+                self.ports.reply(identity, answer)
         elif isinstance(message, messages.Command):
             self._on_command(identity, message, client)
         elif isinstance(message, messages.Hello):
@@ -216,7 +212,7 @@ class Gateway:
 
     def _on_hello(self, identity: bytes, hello: messages.Hello, client: str) -> None:
         if denied := self._denial(identity, hello, client):
-            self._answer(identity, messages.Denied(hello.session, *denied))
+            self.ports.reply(identity, messages.Denied(hello.session, *denied))
             return
         durable, fused = self.maps.progress(hello.map, hello.session)
         welcome = messages.Welcome(
@@ -229,10 +225,10 @@ class Gateway:
             max_frame_bytes=self._server.max_frame_bytes,
             corrections=self.maps.corrected(hello.map, hello.session)[0],
         )
-        self._answer(identity, welcome)
+        self.ports.reply(identity, welcome)
 
     def _denial(self, identity: bytes, hello: messages.Hello, client: str) -> tuple[str, str] | None:
-        """Why a session is not opened, or None."""
+        """The reason and message why a session is not opened; None = it is, and its route is made."""
         if hello.version != VERSION:
             speaks = f"the server speaks version {VERSION} of the wire format"
             return "version", f"{speaks}, this client {hello.version}"
@@ -241,7 +237,7 @@ class Gateway:
             return "map", f"map {hello.map} cannot be opened: {self.maps.why_not(hello.map)}"
         if not hosted.warm:
             return "opening", f"map {hello.map} is being opened"
-        if not self._intake.owns(hosted, hello.session, client):
+        if not self._admission.owns(hosted.sessions, hello.session, client):
             return "session", "the session of this spool is another client's: use another spool folder"
         if not hosted.sessions.room_for(hello.session):
             return "session", f"map {hello.map} has {len(hosted.sessions)} sessions and takes no new one"
@@ -252,49 +248,48 @@ class Gateway:
     def _on_ping(self, identity: bytes, ping: messages.Ping, client: str) -> None:
         received_ns = time.monotonic_ns()
         progress = (0, 0)
-        route = self._routes.get(ping.session)
-        if route is not None and route.client == client:
-            self._routes.heard(route)
-            route.said(ping)
+        route = self._routes.mark_alive(ping.session, client)
+        if route is not None:
+            route.update(ping)
             progress = self.maps.progress(route.map, ping.session)
         pong = messages.Pong(self.epoch, ping.sent_ns, received_ns, time.monotonic_ns(), *progress)
-        self._answer(identity, pong)
+        self.ports.reply(identity, pong)
 
     def _on_command(self, identity: bytes, command: messages.Command, client: str) -> None:
         if command.name == "ping":
-            self._answer(identity, messages.Reply(name="ping"))
+            self.ports.reply(identity, messages.Reply(name="ping"))
         elif command.name == "health":
-            self._answer(identity, messages.Reply(name="health", health=self.health()))
+            self.ports.reply(identity, messages.Reply(name="health", health=self.health()))
         else:
-            self._questions.ask(identity, command, self.maps.get(command.map), client)
+            self._queries.submit(identity, command, self.maps.get(command.map), client)
 
     def _on_subscription(self, frames: list[zmq.Frame]) -> None:
         change, topic = frames[0].bytes[:1], frames[0].bytes[1:]
-        if change == b"\x01" and self._door.client_of(frames[0]) is None:
-            self._refused["key"] += 1
-        elif change == b"\x00":
-            self._topics.discard(topic)
-        elif change != b"\x01" or not self._topics.add(topic, (hosted.name for hosted in self.maps)):
+        if change == b"\x01" and self._admission.client_of(frames[0]) is None:
+            return
+        if change == b"\x00":
+            self._subscriptions.discard(topic)
+        elif change != b"\x01" or not self._subscriptions.add(topic, (hosted.name for hosted in self.maps)):
             self._refused["subscription"] += 1
 
-    # --- what is known ---
+    # --- health ---
 
     def health(self) -> Health:
         """How the server is doing."""
         now = time.monotonic()
         found, problems = self.maps.health()
-        if self._door.problem:
-            problems.insert(0, f"nobody may connect: {self._door.problem}")
+        if self._access.problem:
+            problems.insert(0, f"nobody may connect: {self._access.problem}")
         if self.ports.problem:
             problems.insert(0, self.ports.problem)
-        blocked = self.ports.problem or self._door.problem or any(one.problem for one in found.values())
+        blocked = self.ports.problem or self._access.problem or any(one.problem for one in found.values())
         return Health(
             ready=self._accepting and not blocked,
             problems=tuple(problems),
             epoch=self.epoch,
             uptime_s=now - self._started,
             rss_bytes=process.rss_bytes(),
-            refused=dict(self._refused + self._door.refused),
+            refused=dict(self._refused + self._access.refused),
             duplicates=self._intake.duplicates,
             maps=found,
             clients=tuple(
@@ -302,29 +297,3 @@ class Gateway:
                 for route in self._routes
             ),
         )
-
-    # --- sending: an answer that cannot leave at once is dropped, the asker will ask again ---
-
-    def send(self, session: bytes, message: messages.ToClient) -> None:
-        """Pass it to the session's client, if that is connected."""
-        route = self._routes.get(session)
-        if route is not None:
-            self._answer(route.identity, message)
-
-    def heard(self, session: bytes, client: str, *, scans: bool) -> None:
-        """A keyframe message of the session came."""
-        route = self._routes.get(session)
-        if route is not None and route.client == client:
-            self._routes.heard(route, scans=scans)
-
-    def route(self, session: bytes) -> ClientRoute | None:
-        """The connection of a session's client."""
-        return self._routes.get(session)
-
-    def observe(self, map_name: str, stage: str, seconds: float) -> None:
-        """A keyframe took so long for a stage."""
-        if self._metrics is not None:
-            self._metrics.observe(map_name, stage, seconds)
-
-    def _answer(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
-        send_now(self.ports.control, [identity, messages.encode(message), *frames])

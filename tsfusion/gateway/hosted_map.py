@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""One map of a server: its journal, its sessions, and the fuser that works through them."""
+"""One map of a server: its journal, its sessions, and the fuser that works through the journal."""
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import zmq
@@ -12,12 +13,15 @@ from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
+from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.correction_store import Revisions
+from tsfusion.gateway.fuser_backlog import FuserBacklog
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.journal_retention import JournalRetention
 from tsfusion.gateway.keyframe_index import KeyframeIndex
-from tsfusion.gateway.keyframe_outcomes import Clients, KeyframeOutcomes
-from tsfusion.gateway.sessions import FairQueue, Sessions
+from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes
+from tsfusion.gateway.metrics import Metrics
+from tsfusion.gateway.sessions import Sessions
 from tsfusion.journal import Journal, state_folder
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import keyframe_times
@@ -26,19 +30,20 @@ from tsfusion.wire.keyframe_header import KeyframeHeader
 
 log = logging.getLogger(__name__)
 
-_SEGMENTS_KEPT = 4  # a journal with a limit goes in pieces of a quarter of it
-
-
-Other = Callable[[fuser_messages.Meshed | fuser_messages.FuserReply, Sequence[zmq.Frame]], None]
+_SEGMENTS_KEPT = 4  # a journal with a limit is deleted in quarters of that limit
+_DISK_PAUSE = 1.0  # seconds without keyframes after the disk refused one
+ForPeople = tuple[fuser_messages.Meshed | fuser_messages.FuserReply, Sequence[zmq.Frame]]
 
 
 class HostedMap:
-    """Call `step` for ever, and `accept` for each keyframe.
+    """An open map. Call `step` again and again, and `accept` for each keyframe.
 
     Attributes:
-        warm: the fuser has been ready once: what the map has of each session is known.
-        problem: why keyframes are not taken now; empty = they are.
+        folder: in the state folder.
+        disk: why keyframes are not taken now, and for how long.
+        outcomes: what the map has, by its fuser's answers.
         revisions: the corrected poses of its keyframes.
+        warm: whether the fuser has been ready once: from then on it is known what the map has.
     """
 
     def __init__(
@@ -47,57 +52,53 @@ class HostedMap:
         name: str,
         server: ServerConfig,
         volume: VolumeConfig,
-        clients: Clients,
+        *,
+        routes: ClientRoutes,
+        metrics: Metrics,
     ) -> None:
         self.name = name
         self.folder = state_folder.map_folder(server.state, name)
+        self.sessions = Sessions()
         self.warm = False
-        self.problem = ""
-        self._server = server
-        self._clients = clients
-        most = server.journal_bytes
-        segment = server.segment_bytes if most is None else min(server.segment_bytes, most // _SEGMENTS_KEPT)
-        self._journal = Journal(
-            self.folder / state_folder.JOURNAL_FOLDER, segment, min_free_bytes=server.min_free_bytes
-        )
+        self._metrics = metrics
+        self._last_keyframe: float | None = None  # time.monotonic()
+        self._loss = ""
+        self._journal = _open_journal(self.folder, server)
+        self.disk = DiskPause(self._journal, server.min_free_bytes, name)
         self.revisions = Revisions(self.folder / state_folder.CORRECTIONS_FOLDER, server.min_free_bytes)
         self._quarantine = Quarantine(self.folder / state_folder.QUARANTINE_FOLDER, server.quarantine_bytes)
-        self.sessions = Sessions()
         self._index = KeyframeIndex()
         self._index.recover(self._journal.found, self.sessions)
         self._journal.found = []
-        self._turns = FairQueue()
-        self._waiting = len(self._index)
-        self._outcomes = KeyframeOutcomes(
+        self._backlog = FuserBacklog(self._index, self.sessions)
+        self.outcomes = KeyframeOutcomes(
             name,
             self._index,
             self.sessions,
-            clients,
+            routes,
+            metrics,
             journal=self._journal.folder,
             quarantine=self._quarantine,
         )
-        self._last: float | None = None
-        self._held_until = 0.0
-        self._lost = ""
-        self._retention = JournalRetention(self._journal, self._index, self.sessions, most)
+        self._retention = JournalRetention(self._journal, self._index, self.sessions, server.journal_bytes)
         self.fuser = FuserSupervisor(context, self.folder, server, volume)
 
     @property
     def drained(self) -> bool:
         """Whether the map has every keyframe of the journal."""
-        return self.fuser.idle and not self._waiting
+        return self.fuser.idle and not self._backlog.waiting
 
     @property
     def settled(self) -> bool:
-        """Drained, or never to be: its fuser cannot be kept alive."""
+        """Whether the map is drained, or never will be: its fuser cannot be kept alive."""
         return self.drained or bool(self.fuser.failed)
 
-    def calm(self, since: float) -> bool:
+    def idle_since(self, since: float) -> bool:
         """Whether no keyframe waits, nor came since then (`time.monotonic()`)."""
-        return self.drained and (self._last is None or self._last < since)
+        return self.drained and (self._last_keyframe is None or self._last_keyframe < since)
 
     def close(self) -> None:
-        """End the fuser and finish the journal; what the disk refuses of that is logged."""
+        """End the fuser and finish the journal. A journal that cannot be finished is logged."""
         self.fuser.close()
         try:
             self._journal.close()
@@ -106,26 +107,18 @@ class HostedMap:
 
     # --- keyframes ---
 
-    def held(self, now: float) -> float:
-        """Seconds for which nothing is taken because the disk refused."""
-        return max(self._held_until - now, 0.0)
-
     def accept(self, header: KeyframeHeader, frames: Sequence[Any], client: str, received_ns: int) -> None:
-        """Write the session's next keyframe to the journal, and say so.
+        """Write the session's next keyframe to the journal, and acknowledge it.
 
         Raises:
-            JournalError: when the disk refuses; `held` says for how long nothing is tried.
+            JournalError: when the disk refuses.
         """
         try:
             position = self._journal.append(frames, session=header.session, seq=header.seq, client=client)
         except JournalError as error:
-            if str(error) != self.problem:
-                log.error("no keyframes are taken: %s", error, extra=logs.about(map=self.name))
-            self.problem = str(error)
-            self._held_until = time.monotonic() + 1.0
+            self.disk.begin(error)
             raise
-        if self.problem:
-            self._recovered()
+        self.disk.end()
         session = self.sessions.open(header.session, client)
         session.durable = header.seq
         durable_ns = time.monotonic_ns()
@@ -137,112 +130,73 @@ class HostedMap:
             received_ns=received_ns,
             durable_ns=durable_ns,
         )
-        self._waiting += 1
-        self._last = durable_ns / 1e9
-        self._turns.add(session)
-        self._clients.observe(self.name, "journal", (durable_ns - received_ns) / 1e9)
-        self._outcomes.acknowledge(
+        self._last_keyframe = durable_ns / 1e9
+        self._backlog.add(session)
+        self._metrics.observe(self.name, "journal", (durable_ns - received_ns) / 1e9)
+        self.outcomes.acknowledge(
             header.session, [keyframe_times.Stamps(header.seq, received_ns, durable_ns)]
         )
 
-    def acknowledge(self, key: bytes, *, resend: bool = False) -> None:
-        """Tell a client how far its session is."""
-        self._outcomes.acknowledge(key, resend=resend)
-
     # --- fuser ---
 
-    def step(self, other: Other) -> None:
-        """Hear the fuser, bring it back if it died, give it work, keep the journal to its limit.
+    def step(self) -> list[ForPeople]:
+        """Read the fuser's messages, replace it if it died, give it work, keep the journal to its limit.
 
-        Args:
-            other: takes what the fuser says to people.
+        Returns:
+            The messages for viewers and for those who asked, with their frames.
 
         Raises:
             TsfusionError: when the map cannot be opened.
         """
-        ended = self.fuser.ended()  # before its last words are read
-        while (heard := self.fuser.receive()) is not None:
-            message, frames = heard
+        for_people: list[ForPeople] = []
+        ended = self.fuser.ended()  # before its last messages are read
+        while (received := self.fuser.receive()) is not None:
+            message, frames = received
             if isinstance(message, fuser_messages.Done):
-                self._waiting -= 1
-                self._outcomes.on_done(message)
+                self._backlog.waiting -= 1
+                self.outcomes.on_done(message)
             elif isinstance(message, fuser_messages.Ready):
                 self._on_ready(message)
             elif isinstance(message, fuser_messages.Saved):
                 self._retention.on_saved(message)
             elif isinstance(message, fuser_messages.Meshed):
-                self._outcomes.on_meshed(message)
-                other(message, frames)
+                self.outcomes.on_meshed(message)
+                for_people.append((message, frames))
             elif isinstance(message, fuser_messages.FuserReply):
-                other(message, frames)
+                for_people.append((message, frames))
         if ended and not self.fuser.finishing:
             self.fuser.restart()
-        self._hand_out()
-        self._look_for_room()
-        self._retention.step(self.fuser, self._outcomes.unmeshed)
-
-    def _look_for_room(self) -> None:
-        """Who waits for this server to be ready again may be who would send the next keyframe."""
-        now = time.monotonic()
-        if self.problem and now > self._held_until:
-            self._held_until = now + 1.0 if self._is_full() else 0.0
-            if not self._held_until:
-                self._recovered()
-
-    def _is_full(self) -> bool:
-        try:
-            return self._journal.free_bytes < self._server.min_free_bytes
-        except JournalError:
-            return True
-
-    def _recovered(self) -> None:
-        log.warning("keyframes are taken again", extra=logs.about(map=self.name))
-        self.problem = ""
-
-    def _hand_out(self) -> None:
-        while self.fuser.wants_work and (session := self._turns.next()) is not None:
-            entry = self._index[session.entries[session.handed]]
-            order = fuser_messages.Fuse(
-                entry.index, entry.position, session.key, entry.stamps.seq, session.client
-            )
-            if not self.fuser.fuse(order):
-                return
-            session.handed += 1
-            self._turns.served()
+        self._backlog.hand_out(self.fuser)
+        self.disk.step()
+        self._retention.step(self.fuser, self.outcomes.unmeshed)
+        return for_people
 
     def _on_ready(self, ready: fuser_messages.Ready) -> None:
         for key, progress in ready.done.items():
             session = self.sessions.open(key, progress.client)
             session.durable = max(session.durable, progress.seq)
             session.fused = max(session.fused, progress.seq)
-        self._turns.clear()
-        self._waiting = 0
-        for session in self.sessions:
-            done = ready.done.get(session.key)
-            session.in_map = done.seq if done else 0
-            session.handed = self._index.after(session, done.seq) if done else 0
-            self._waiting += len(session.entries) - session.handed
-            if session.handed < len(session.entries):
-                self._turns.add(session)
-        self._outcomes.on_ready(ready)
+        self._backlog.restart(ready.done)
+        self.outcomes.on_ready(ready)
         self._retention.on_ready()
         if not self.warm:
             self.warm = True
             log.info("the map is open", extra=logs.about(map=self.name))
-        self._check_begin(ready)
+        self._check_checkpoint(ready)
 
-    def _check_begin(self, ready: fuser_messages.Ready) -> None:
-        self._lost = ""
+    def _check_checkpoint(self, ready: fuser_messages.Ready) -> None:
+        """Report keyframes that are neither in a checkpoint nor in the journal."""
+        self._loss = ""
         if not ready.done and self._journal.first > 1:
             first = self._journal.first
-            self._lost = f"its checkpoints are lost, and with them what was journaled before segment {first}"
-            log.error("%s", self._lost, extra=logs.about(map=self.name))
+            self._loss = f"its checkpoints are lost, and with them what was journaled before segment {first}"
+            log.error("%s", self._loss, extra=logs.about(map=self.name))
 
-    # --- what people ask ---
+    # --- health ---
 
     @property
     def state(self) -> MapState:
-        """In a word."""
+        """The state in a word."""
         if self.fuser.failed:
             return "failed"
         if not self.warm:
@@ -253,32 +207,88 @@ class HostedMap:
 
     @property
     def notices(self) -> list[str]:
-        """What a person should know, though keyframes are taken and fused."""
+        """Losses that a person should know of, though keyframes are taken and fused."""
         damaged = self._journal.damaged
-        told = [f"{damaged} keyframes of its journal are damaged and lost"] if damaged else []
+        notices = [f"{damaged} keyframes of its journal are damaged and lost"] if damaged else []
         if self.revisions.damaged:
-            told.append(f"the corrections of {self.revisions.damaged} sessions are damaged and lost")
-        return [*told, self._lost] if self._lost else told
+            notices.append(f"the corrections of {self.revisions.damaged} sessions are damaged and lost")
+        return [*notices, self._loss] if self._loss else notices
 
     def health(self) -> MapHealth:
-        """As far as it is known without the fuser."""
-        now, told = time.monotonic(), self._outcomes
+        """How the map is doing, as far as it is known without asking the fuser."""
+        now, outcomes = time.monotonic(), self.outcomes
         return MapHealth(
             state=self.state,
-            problem=self.problem or self.fuser.failed,
-            keyframes_durable=told.fused + told.rejected.total() + self._waiting,
-            keyframes_fused=told.fused,
-            waiting=self._waiting,
-            rejected=dict(told.rejected),
+            problem=self.disk.problem or self.fuser.failed,
+            keyframes_durable=outcomes.fused + outcomes.rejected.total() + self._backlog.waiting,
+            keyframes_fused=outcomes.fused,
+            waiting=self._backlog.waiting,
+            rejected=dict(outcomes.rejected),
             quarantined=len(self._quarantine),
             sessions=len(self.sessions),
             journal_bytes=self._journal.nbytes,
             journal_damaged=self._journal.damaged,
             fuser_restarts=self.fuser.restarts,
-            blocks=told.blocks,
-            map_bytes=told.map_bytes,
-            last_keyframe_s=None if self._last is None else max(now - self._last, 0.0),
-            delay_ms=told.delays.summary(),
-            delay_bound_ms=told.delays.bound_ms,
+            blocks=outcomes.blocks,
+            map_bytes=outcomes.map_bytes,
+            last_keyframe_s=None if self._last_keyframe is None else max(now - self._last_keyframe, 0.0),
+            delay_ms=outcomes.delays.summary(),
+            delay_bound_ms=outcomes.delays.bound_ms,
             corrections=self.revisions.taken,
         )
+
+
+def _open_journal(folder: Path, server: ServerConfig) -> Journal:
+    """The map's journal, in segments small enough to keep it to its limit."""
+    segment_bytes = server.segment_bytes
+    if server.journal_bytes is not None:
+        segment_bytes = min(segment_bytes, server.journal_bytes // _SEGMENTS_KEPT)
+    return Journal(folder / state_folder.JOURNAL_FOLDER, segment_bytes, min_free_bytes=server.min_free_bytes)
+
+
+class DiskPause:
+    """The time after the disk refused a keyframe, in which no other is tried.
+
+    Attributes:
+        problem: why no keyframe is taken; empty = they are.
+    """
+
+    def __init__(self, journal: Journal, min_free_bytes: int, map_name: str) -> None:
+        self.problem = ""
+        self._journal = journal
+        self._min_free_bytes = min_free_bytes
+        self._map = map_name
+        self._until = 0.0  # time.monotonic()
+
+    def seconds_left(self, now: float) -> float:
+        """Seconds until a keyframe is tried again; 0 = none has to wait."""
+        return max(self._until - now, 0.0)
+
+    def begin(self, error: JournalError) -> None:
+        """Pause because of an error."""
+        if str(error) != self.problem:  # the same one is logged once
+            log.error("no keyframes are taken: %s", error, extra=logs.about(map=self._map))
+        self.problem = str(error)
+        self._until = time.monotonic() + _DISK_PAUSE
+
+    def end(self) -> None:
+        """Take keyframes (again)."""
+        if self.problem:
+            log.warning("keyframes are taken again", extra=logs.about(map=self._map))
+            self.problem = ""
+
+    def step(self) -> None:
+        """End the pause as soon as the disk has room, though no keyframe comes: clients may wait for that."""
+        now = time.monotonic()
+        if self.problem and now > self._until:
+            if self._is_full():
+                self._until = now + _DISK_PAUSE
+            else:
+                self._until = 0.0
+                self.end()
+
+    def _is_full(self) -> bool:
+        try:
+            return self._journal.free_bytes < self._min_free_bytes
+        except JournalError:
+            return True

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Keeps a map's journal to its limit: what two checkpoints hold may go, oldest first."""
+"""The limit of a map's journal: segments that two checkpoints hold are deleted, oldest first."""
 
 import logging
 import time
@@ -18,7 +18,11 @@ _SAVE_INTERVAL = 10.0  # seconds between checkpoints that are made only for the 
 
 
 class JournalRetention:
-    """Call `step` for ever. The limit is passed only by what came since the checkpoint before the last."""
+    """Keep a journal to its limit. It holds more only while two checkpoints do not have its keyframes.
+
+    Args:
+        max_bytes: None = no limit.
+    """
 
     def __init__(
         self, journal: Journal, index: KeyframeIndex, sessions: Sessions, max_bytes: int | None
@@ -27,24 +31,25 @@ class JournalRetention:
         self._index = index
         self._sessions = sessions
         self._max_bytes = max_bytes
-        self._covered = self._covering = 0  # segments below: in the checkpoint before the last, in the last
+        # All segments below these numbers are in the last checkpoint, and in the one before it.
+        self._in_last = self._in_previous = 0
         self._saving = False
-        self._saved = float("-inf")
+        self._saved_at = float("-inf")  # time.monotonic()
 
     def on_ready(self) -> None:
-        """A fuser has begun, at the last checkpoint."""
+        """Note that a fuser began with the last checkpoint."""
         self._saving = False
-        self._covering = self._coverage()
+        self._in_last = self._first_needed()
 
     def on_saved(self, saved: fuser_messages.Saved) -> None:
-        """The fuser wrote a checkpoint, or did not have to."""
+        """Note the end of a checkpoint, which was written only if there was something new."""
         self._saving = False
-        self._saved = time.monotonic()
+        self._saved_at = time.monotonic()
         if saved.written:
-            self._covered, self._covering = self._covering, self._coverage()
+            self._in_previous, self._in_last = self._in_last, self._first_needed()
 
-    def _coverage(self) -> int:
-        """The segments below this one hold only keyframes that the map has."""
+    def _first_needed(self) -> int:
+        """The number of the oldest segment with a keyframe that the map does not have."""
         unfused = (
             self._index.segment(session.entries[done])
             for session in self._sessions
@@ -53,18 +58,18 @@ class JournalRetention:
         return min(unfused, default=self._journal.segment)
 
     def step(self, fuser: FuserSupervisor, needed: Iterable[int]) -> None:
-        """Make room where there is need and it can be made.
+        """Delete segments if the journal is too large, and ask for a checkpoint if that is not enough.
 
         Args:
-            needed: indices of keyframes that somebody will ask for.
+            needed: indices of keyframes that must stay in the index.
         """
         if self._max_bytes is None or self._journal.nbytes <= self._max_bytes:
             return
         try:
-            self._journal.retire(self._covered, self._max_bytes)
+            self._journal.retire(self._in_previous, self._max_bytes)
             self._index.forget(self._journal.first, self._sessions, [*needed, *fuser.in_flight])
         except JournalError as error:
             log.warning("%s", error)
-        due = not self._saving and time.monotonic() - self._saved > _SAVE_INTERVAL
+        due = not self._saving and time.monotonic() - self._saved_at > _SAVE_INTERVAL
         if due and fuser.ready and self._journal.nbytes > self._max_bytes:
             self._saving = fuser.send(fuser_messages.Save())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Todo."""
+"""Where each journaled keyframe of a map lies, whose it is, and when it was received, durable and fused."""
 
 from array import array
 from bisect import bisect_left, bisect_right
@@ -17,7 +17,7 @@ class IndexEntry(Struct, frozen=True):
 
     index: int
     position: Position
-    session: int
+    session: int  # its number in `Sessions`
     stamps: Stamps
     captured_ns: int
 
@@ -29,20 +29,20 @@ _COLUMNS = (
 
 
 class KeyframeIndex:
-    """Every keyframe of the journal in order: 72 bytes each. Stamps are 0 for those of earlier runs.
+    """Every keyframe of the journal in order, 72 bytes each. Stamps are 0 for keyframes of earlier runs.
 
-    An index stays what it is when the keyframes before it are forgotten.
+    The index of a keyframe stays the same when those before it are forgotten.
     """
 
     def __init__(self) -> None:
         self._columns = {name: array("q") for name in _COLUMNS}
-        self._first = 0  # index that is not forgotten
+        self._first = 0  # the lowest index that is not forgotten
 
     def __len__(self) -> int:
         return len(self._columns["seq"])
 
     def recover(self, found: Iterable[RecordEntry], sessions: Sessions) -> None:
-        """Take over what the journal's scan found. A keyframe journaled twice counts once.
+        """Add the keyframes that a scan of the journal found. One that was journaled twice counts once.
 
         (The disk refused, the client sent it again, and the first copy had been written after all.)
         """
@@ -72,26 +72,28 @@ class KeyframeIndex:
         return index
 
     def forget(self, before_segment: int, sessions: Sessions, needed: Iterable[int] = ()) -> None:
-        """Let go of the keyframes whose segment is gone, up to the first that is still to be handed out.
+        """Forget the keyframes of deleted segments, up to the first that is still to be handed out.
 
         Args:
-            needed: indices that somebody will ask for.
+            before_segment: number of the oldest segment that is still there.
+            needed: indices of keyframes that must not be forgotten.
         """
-        if not bisect_left(self._columns["segment"], before_segment):
+        deleted = bisect_left(self._columns["segment"], before_segment)
+        if not deleted:
             return
-        stop = self._first + bisect_left(self._columns["segment"], before_segment)
+        stop = self._first + deleted
         waiting = (one.entries[one.handed] for one in sessions if one.handed < len(one.entries))
         stop = min(stop, min(waiting, default=stop), min(needed, default=stop))
         for session in sessions:
-            gone = bisect_left(session.entries, stop)
-            del session.entries[:gone]
-            session.handed -= gone
+            forgotten = bisect_left(session.entries, stop)
+            del session.entries[:forgotten]
+            session.handed -= forgotten
         for column in self._columns.values():
             del column[: stop - self._first]
         self._first = stop
 
-    def fused(self, index: int, fuse_start_ns: int, fused_ns: int) -> None:
-        """Note when a keyframe entered the map."""
+    def set_fused(self, index: int, fuse_start_ns: int, fused_ns: int) -> None:
+        """Write down when a keyframe entered the map."""
         self._columns["fuse_start_ns"][index - self._first] = fuse_start_ns
         self._columns["fused_ns"][index - self._first] = fused_ns
 
@@ -102,10 +104,10 @@ class KeyframeIndex:
         return IndexEntry(index, Position(segment, offset), session, Stamps(seq, *stamps), captured)
 
     def after(self, session: Session, seq: int) -> int:
-        """How many keyframes of a session, of those not forgotten, have a number up to `seq`."""
+        """How many keyframes of a session that are not forgotten have a sequence number up to `seq`."""
         seqs, first = self._columns["seq"], self._first
         return bisect_right(session.entries, seq, key=lambda index: seqs[index - first])
 
     def segment(self, index: int) -> int:
-        """The segment that holds a keyframe."""
+        """The number of the segment that holds a keyframe."""
         return self._columns["segment"][index - self._first]

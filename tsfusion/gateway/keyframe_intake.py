@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""What becomes of a keyframe message: checked, and journaled, held, refused or known already.
+"""Keyframe messages from the data socket: checked, then journaled, turned away for now, or refused.
 
-Cheapest first, and nothing is answered before it is known to be the session's own client that asks: a
-forged message must not have a good keyframe given up.
+The cheapest checks come first, and nothing is answered before the message is known to be from the session's
+own client: a forged message must not make a client give up a good keyframe.
 """
 
 import logging
 import time
-from collections import Counter
 from typing import Any
 
 import zmq
@@ -15,9 +14,9 @@ import zmq
 from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import JournalError
-from tsfusion.gateway.access_control import AccessControl
+from tsfusion.gateway.admission import Admission
+from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.hosted_map import HostedMap
-from tsfusion.gateway.keyframe_outcomes import Clients
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.wire import codec, messages
@@ -25,35 +24,34 @@ from tsfusion.wire.keyframe_header import KeyframeHeader, Refused, unpack
 
 log = logging.getLogger(__name__)
 
-_HOLDS = (0.25, 10.0)  # seconds, shortest and longest: each costs what was under way
+# Seconds for which a client is held off: the keyframes that were under way have to be sent again.
+_SHORTEST_HOLD = 0.25
+_LONGEST_HOLD = 10.0
 
 
 class KeyframeIntake:
     """The way from the data socket into the journals.
 
     Attributes:
-        refused: messages that were not journaled, by reason.
-        duplicates: those that were journaled before.
-        quotas: of every client, whatever it sends.
+        duplicates: messages with keyframes that were journaled before.
     """
 
     def __init__(
-        self, server: ServerConfig, maps: MapRegistry, door: AccessControl, clients: Clients
+        self, server: ServerConfig, maps: MapRegistry, admission: Admission, routes: ClientRoutes
     ) -> None:
-        self.refused: Counter[str] = Counter()
         self.duplicates = 0
         self._server = server
         self._maps = maps
-        self._door = door
-        self._clients = clients
-        self.quotas = Quotas(server)
+        self._admission = admission
+        self._refused = admission.refused
+        self._routes = routes
+        self._quotas = Quotas(server)
 
-    def take(self, frames: list[zmq.Frame]) -> None:
-        """One message."""
+    def handle(self, frames: list[zmq.Frame]) -> None:
+        """Check one message, and journal its keyframe or answer why not."""
         received_ns = time.monotonic_ns()
-        client = self._door.client_of(frames[0])
+        client = self._admission.client_of(frames[0])
         if client is None:
-            self.refused["key"] += 1
             return
         buffers = [frame.buffer for frame in frames]
         nbytes = sum(buffer.nbytes for buffer in buffers)
@@ -64,33 +62,28 @@ class KeyframeIntake:
             return
         hosted = self._maps.get(header.map)
         if hosted is None or not hosted.warm:  # its client will say hello, and send it again
-            self.refused["map"] += 1
+            self._refused["map"] += 1
         elif not hosted.sessions.room_for(header.session):  # its client is told when it says hello
-            self.refused["session"] += 1
-        elif not self.owns(hosted, header.session, client):
-            self.refused["session"] += 1
+            self._refused["session"] += 1
+        elif not self._admission.owns(hosted.sessions, header.session, client):
+            self._refused["session"] += 1
             subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
             log.warning("a keyframe is refused: its session is another client's", extra=subject)
         elif not self._has_to_wait(hosted, header.session, client, nbytes):
             self._on_checked(hosted, header, buffers, client, received_ns)
 
-    def owns(self, hosted: HostedMap, key: bytes, client: str) -> bool:
-        """Whether a session is this client's to go on with: it journaled it, or is the one who is heard."""
-        session, route = hosted.sessions.get(key), self._clients.route(key)
-        return (session is None or session.belongs_to(client)) and (route is None or route.open_to(client))
-
     def _has_to_wait(self, hosted: HostedMap, key: bytes, client: str, nbytes: int) -> bool:
-        route = self._clients.route(key)
+        route = self._routes.get(key)
         now = time.monotonic()
         if route is not None:
             route.received_bytes += nbytes
             if now < route.held_until:
-                self.refused["held"] += 1
+                self._refused["held"] += 1
                 return True
-        if seconds := hosted.held(now):
-            self._hold(key, seconds, "disk", hosted.problem)
+        if seconds := hosted.disk.seconds_left(now):
+            self._hold(key, seconds, "disk", hosted.disk.problem)
             return True
-        if seconds := self.quotas.wait(client, nbytes, now):
+        if seconds := self._quotas.wait(client, nbytes, now):
             rates = f"{self._server.quota_keyframes:g} keyframes and {self._server.quota_bytes >> 20} MB"
             self._hold(
                 key,
@@ -102,43 +95,44 @@ class KeyframeIntake:
         return False
 
     def _hold(self, key: bytes, seconds: float, reason: str, message: str) -> None:
-        self.refused["held"] += 1
-        seconds = min(max(seconds, _HOLDS[0]), _HOLDS[1])
-        route = self._clients.route(key)
+        self._refused["held"] += 1
+        seconds = min(max(seconds, _SHORTEST_HOLD), _LONGEST_HOLD)
+        route = self._routes.get(key)
         if route is not None:
-            route.held, route.held_until = reason, time.monotonic() + seconds
-        self._clients.send(key, messages.Hold(key, seconds, reason, message))
+            route.hold_reason, route.held_until = reason, time.monotonic() + seconds
+        self._routes.send(key, messages.Hold(key, seconds, reason, message))
 
     def _on_checked(
         self, hosted: HostedMap, header: KeyframeHeader, buffers: list[Any], client: str, received_ns: int
     ) -> None:
-        # before all else: what is journaled must not be refused when it comes again
+        # Duplicates come first: a keyframe that is journaled must not be refused when it is sent again.
         verdict = hosted.sessions.admit(header.session, header.seq, header.previous)
         if verdict != "next":
             self.duplicates += verdict == "duplicate"
-            self.refused["gap"] += verdict == "gap"
-            self._clients.heard(header.session, client, scans=verdict == "duplicate")
-            hosted.acknowledge(header.session, resend=verdict == "gap")
+            self._refused["gap"] += verdict == "gap"
+            self._routes.mark_alive(header.session, client, scans=verdict == "duplicate")
+            hosted.outcomes.acknowledge(header.session, resend=verdict == "gap")
             return
         try:
             codec.check(buffers, self._server.max_frame_bytes)
-            self.quotas.check(header)
-            self._clients.heard(header.session, client, scans=True)
+            self._quotas.check(header)
+            self._routes.mark_alive(header.session, client, scans=True)
             hosted.accept(header, buffers, client, received_ns)
         except Refused as error:
             self._refuse(error, client, header)
         except JournalError:
-            self._hold(header.session, hosted.held(time.monotonic()), "disk", hosted.problem)
+            self._hold(
+                header.session, hosted.disk.seconds_left(time.monotonic()), "disk", hosted.disk.problem
+            )
 
     def _refuse(self, error: Refused, client: str, header: KeyframeHeader | None = None) -> None:
-        """Count a bad message; answer it when it says whose it is, so that it is not sent for ever."""
-        self.refused[error.reason] += 1
+        """Count a bad message; if its session is known, tell the client not to send it again."""
+        self._refused[error.reason] += 1
         if header is None:
-            log.warning(
-                "a message is refused: %s", error, extra=logs.about(client=client, reason=error.reason)
-            )  # fmt: skip
+            subject = logs.about(client=client, reason=error.reason)
+            log.warning("a message is refused: %s", error, extra=subject)
             return
         key, seq = header.session, header.seq
         subject = logs.about(map=header.map, session=key, seq=seq, client=client, reason=error.reason)
         log.warning("a keyframe is refused: %s", error, extra=subject)
-        self._clients.send(key, messages.Nack(key, seq, "door", error.reason, str(error)))
+        self._routes.send(key, messages.Nack(key, seq, "door", error.reason, str(error)))

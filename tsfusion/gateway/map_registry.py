@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The maps of a server: those that are open, and why others cannot be."""
+"""The maps of a server: the open ones, and why others could not be opened."""
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import zmq
@@ -12,35 +11,37 @@ import zmq
 from tsfusion.core import logs
 from tsfusion.core.config import DEFAULT_MAP, ServerConfig, VolumeConfig
 from tsfusion.core.errors import TsfusionError
-from tsfusion.fuser import messages as fuser_messages
-from tsfusion.gateway.hosted_map import HostedMap
-from tsfusion.gateway.keyframe_outcomes import Clients
+from tsfusion.gateway.client_routes import ClientRoutes
+from tsfusion.gateway.hosted_map import ForPeople, HostedMap
+from tsfusion.gateway.metrics import Metrics
 from tsfusion.wire.health import MapHealth
 
 log = logging.getLogger(__name__)
 
 _MAX_UNOPENED = 64
 _RETRY_INTERVAL = 10.0  # seconds before a map that could not be opened is tried again
-Other = Callable[[HostedMap, fuser_messages.Meshed | fuser_messages.FuserReply, Sequence[zmq.Frame]], None]
 
 
 class MapRegistry:
-    """Opens maps, keeps all of them going, ends them."""
+    """The open maps of a server. Call `step` again and again."""
 
-    def __init__(self, context: "zmq.Context[Any]", server: ServerConfig, clients: Clients) -> None:
+    def __init__(
+        self, context: "zmq.Context[Any]", server: ServerConfig, routes: ClientRoutes, metrics: Metrics
+    ) -> None:
         self._context = context
         self._server = server
-        self._clients = clients
+        self._routes = routes
+        self._metrics = metrics
         self._volumes: Mapping[str, VolumeConfig] = {}
         self._open: dict[str, HostedMap] = {}
-        self._unopened: dict[str, tuple[str, float]] = {}  # why, when
-        self._started_up = False
+        self._unopened: dict[str, tuple[str, float]] = {}  # name → why, when
+        self._started = False
 
     def __iter__(self) -> Iterator[HostedMap]:
         return iter(self._open.values())
 
     def get(self, name: str) -> HostedMap | None:
-        """A map that is open."""
+        """An open map, by name."""
         return self._open.get(name)
 
     def progress(self, name: str, session: bytes) -> tuple[int, int]:
@@ -56,8 +57,8 @@ class MapRegistry:
         kept = hosted.revisions.of(session)
         return kept.revision, kept.keyframes
 
-    def begin(self, volumes: Mapping[str, VolumeConfig]) -> None:
-        """Open these maps with these settings; one that a client asks for gets those of the default map.
+    def open_at_start(self, volumes: Mapping[str, VolumeConfig]) -> None:
+        """Open maps by name with their settings; those that clients ask for get those of the default map.
 
         Raises:
             TsfusionError: when a journal cannot be opened.
@@ -66,12 +67,12 @@ class MapRegistry:
         for name in volumes:
             self._open_map(name)
 
-    def begun(self) -> None:
-        """From here on a map that cannot be opened is no reason to end the server."""
-        self._started_up = True
+    def end_start(self) -> None:
+        """Go on when a map cannot be opened, from here on; before, that is an error of the server."""
+        self._started = True
 
     def open_for_client(self, name: str) -> HostedMap | None:
-        """A map by name, opened when need be; None when it cannot be: `why_not`."""
+        """A map by name, opened when need be; None when it cannot be, and `why_not` says why."""
         hosted = self._open.get(name)
         if hosted is not None:
             return hosted
@@ -85,13 +86,15 @@ class MapRegistry:
             return None
 
     def why_not(self, name: str) -> str:
-        """Why a map is not open."""
+        """Why a map cannot be opened."""
         why, _ = self._unopened.get(name, (f"{self._server.max_maps} are open (max_maps)", 0.0))
         return why
 
     def _open_map(self, name: str) -> HostedMap:
         volume = self._volumes.get(name) or self._volumes[DEFAULT_MAP]
-        hosted = self._open[name] = HostedMap(self._context, name, self._server, volume, self._clients)
+        hosted = self._open[name] = HostedMap(
+            self._context, name, self._server, volume, routes=self._routes, metrics=self._metrics
+        )
         self._unopened.pop(name, None)
         return hosted
 
@@ -104,26 +107,28 @@ class MapRegistry:
         if hosted is not None:
             hosted.close()
 
-    def step(self, other: Other) -> None:
-        """Let every map do what it has to.
+    def step(self) -> list[tuple[HostedMap, ForPeople]]:
+        """Step every map.
 
-        Args:
-            other: takes what a fuser says to people.
+        Returns:
+            The fusers' messages for viewers and for those who asked.
 
         Raises:
             TsfusionError: when a map that was to be opened at the start cannot be.
         """
+        for_people: list[tuple[HostedMap, ForPeople]] = []
         for hosted in list(self):
             try:
-                hosted.step(partial(other, hosted))
+                for_people += ((hosted, one) for one in hosted.step())
             except TsfusionError as error:
-                if not self._started_up or hosted.warm:
+                if not self._started or hosted.warm:
                     raise
                 self._give_up(hosted.name, error)
+        return for_people
 
     @property
     def warm(self) -> bool:
-        """Whether every map that is open can take keyframes."""
+        """Whether every open map can take keyframes."""
         return all(hosted.warm for hosted in self)
 
     @property
@@ -137,7 +142,7 @@ class MapRegistry:
         return all(hosted.settled for hosted in self)
 
     def finish(self) -> bool:
-        """Have every fuser write its checkpoint and end; whether all have. Call it until then."""
+        """Have every fuser write its checkpoint and end; whether all have ended. Call it until they have."""
         for hosted in self:
             hosted.fuser.finish()
         return all(hosted.fuser.ended() for hosted in self)
@@ -153,7 +158,7 @@ class MapRegistry:
             hosted.close()
 
     def health(self) -> tuple[dict[str, MapHealth], list[str]]:
-        """How each map is doing, and what is wrong with any."""
+        """How each map is doing, by name, and the problems of all."""
         found = {hosted.name: hosted.health() for hosted in self}
         problems = [f"map {name}: {one.problem}" for name, one in found.items() if one.problem]
         problems += [f"map {hosted.name}: {notice}" for hosted in self for notice in hosted.notices]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Todo."""
+"""Limits on the gateway's memory: what connections hold in all, and large replies that nobody reads."""
 
 from collections.abc import Sequence
 
@@ -9,51 +9,54 @@ from tsfusion.core import process
 
 
 class MemoryGuard:
-    """When what connections hold in memory is too much, so that they have to be dropped.
+    """The check whether connections hold too much memory, so that they have to be dropped.
 
-    That frees it, but not at once (threads of ZeroMQ's do it) and perhaps not all (this process may need
-    it): who was told counts from what is held then, or would be told for ever.
+    Dropping them frees memory, but not at once (ZeroMQ's threads do it) and perhaps not all (this process may
+    need some). So after an alarm the bound rises above what is held then; otherwise it would never end.
+
+    Args:
+        max_bytes: of this process.
     """
 
-    def __init__(self, most: int) -> None:
-        self._most = self._bound = most
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = self._bound = max_bytes
 
-    def excess(self, elsewhere: int) -> int:
-        """What this process holds, bytes, when that is too much; else 0.
+    def excess(self, uncounted: int) -> int:
+        """Bytes that this process holds, when they are too many; otherwise 0.
 
         Args:
-            elsewhere: bytes that do not count.
+            uncounted: bytes of this process that are no connection's fault.
         """
-        held = process.rss_bytes() - elsewhere
+        held = process.rss_bytes() - uncounted
         if held > self._bound:  # perhaps freed already, and only kept for later
             process.give_back_memory()
-            held = process.rss_bytes() - elsewhere
-        told = held if held > self._bound else 0
-        reached = held + self._most // 8
-        self._bound = max(self._most, reached if told else min(self._bound, reached))
-        return told
+            held = process.rss_bytes() - uncounted
+        exceeded = held > self._bound
+        above = held + self._max_bytes // 8
+        self._bound = max(self._max_bytes, above if exceeded else min(self._bound, above))
+        return held if exceeded else 0
 
 
 class PendingReplies:
-    """Large answers that have not left yet, one a reader: who does not read must not fill our memory."""
+    """Large replies that have not left yet, one a reader: one that stops reading must not fill the memory."""
 
     def __init__(self) -> None:
         self._trackers: dict[bytes, tuple[zmq.MessageTracker, int]] = {}
 
     def pending(self, reader: bytes) -> bool:
-        """Whether an earlier one still waits for its reader. One whose reader is gone does not."""
+        """Whether an earlier reply still waits for this reader. None waits for a reader that disconnected."""
         self._forget()
         return reader in self._trackers
 
     @property
     def nbytes(self) -> int:
-        """What waits for readers."""
+        """Bytes of all replies that wait."""
         self._forget()
         return sum(nbytes for _, nbytes in self._trackers.values())
 
     @property
     def largest(self) -> int:
-        """The largest of them."""
+        """Bytes of the largest reply that waits."""
         self._forget()
         return max((nbytes for _, nbytes in self._trackers.values()), default=0)
 
@@ -61,7 +64,7 @@ class PendingReplies:
         self._trackers = {key: kept for key, kept in self._trackers.items() if not kept[0].done}
 
     def wrap(self, reader: bytes, frames: Sequence[zmq.Frame]) -> list[zmq.Frame]:
-        """The frames anew, so that it shows when the last has left."""
+        """Copies of the frames that share their memory, and show when the last frame has left."""
         *others, last = (frame.buffer for frame in frames)
         tracked = zmq.Frame(last, track=True, copy=False, copy_threshold=0)
         nbytes = sum(other.nbytes for other in others) + last.nbytes

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A server's figures for Prometheus, and its health checks.
 
-The gateway's thread writes (`observe`, `health`), a thread of its own answers HTTP; neither waits for the
-other.
+The gateway's thread writes (`observe`, `health`), another thread answers HTTP; neither waits for the other.
 """
 
 import platform
@@ -26,19 +25,15 @@ STAGES = (*LEDGER_STAGES, "total")
 BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)  # seconds
 FRESH = 10.0  # seconds; a gateway renews its snapshot every second
 _TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
-_MAX_MAPS = 256  # that have a label of their own; those beyond share `families.OTHERS`
-
-__all__ = ["BUCKETS", "FRESH", "STAGES", "Metrics"]
+_MAX_MAPS = 256  # with a label of their own; the others share `metrics_families.OTHERS`
 
 
 class Metrics(Collector):
     """The figures of one server.
 
     Args:
-        server: adds the limits and the room that is left in its state folder.
-
-    Attributes:
-        registry: every figure.
+        server: None = without the limits of the disk and what is free on it.
+        clock: seconds, monotonic.
     """
 
     def __init__(
@@ -49,18 +44,18 @@ class Metrics(Collector):
         self._seen: tuple[Health, float] | None = None
         self._maps: set[str] = set()
         self._page: MetricsPage | None = None
-        self.registry = CollectorRegistry()
+        self._registry = CollectorRegistry()
         self._delay = Histogram(
             "tsfusion_keyframe_delay_seconds",
             "How long a keyframe took from one stamp to the next; total = captured to fused.",
             ("map", "stage"),
             buckets=BUCKETS,
-            registry=self.registry,
+            registry=self._registry,
         )
-        self.registry.register(self)
+        self._registry.register(self)
 
     def observe(self, map_name: str, stage: str, seconds: float) -> None:
-        """A keyframe took so long for a stage of `STAGES`."""
+        """Count the seconds that a keyframe took for a stage of `STAGES`."""
         if map_name not in self._maps:
             if len(self._maps) >= _MAX_MAPS:
                 map_name = metrics_families.OTHERS
@@ -90,7 +85,7 @@ class Metrics(Collector):
         return self._page.address
 
     def close(self) -> None:
-        """HttpResponse no more."""
+        """Stop answering HTTP."""
         if self._page is not None:
             self._page.close()
             self._page = None
@@ -98,7 +93,7 @@ class Metrics(Collector):
     # --- pages ---
 
     def _figures(self) -> HttpResponse:
-        return HttpResponse(200, generate_latest(self.registry), _TEXT_FORMAT)
+        return HttpResponse(200, generate_latest(self._registry), _TEXT_FORMAT)
 
     def _alive(self) -> HttpResponse:
         _, silence = self._fresh()
@@ -124,11 +119,11 @@ class Metrics(Collector):
     # --- figures ---
 
     def describe(self) -> list[Metric]:
-        """Nothing: what there is depends on the snapshot."""
+        """An empty list: the figures depend on the snapshot."""
         return []
 
     def collect(self) -> Iterator[Metric]:
-        """Everything but the delays, of the last snapshot."""
+        """The figures of the last snapshot: all but the delays."""
         build = GaugeMetricFamily("tsfusion_build_info", "Versions.", labels=("version", "python"))
         build.add_metric((version("tsfusion"), platform.python_version()), 1)
         yield build

@@ -2,8 +2,8 @@
 """A health snapshot as Prometheus figures.
 
 A figure that can fall (a fuser that restarts goes back to its checkpoint, a session is forgotten) is a
-gauge. Labels are names that somebody here chose or reasons out of our own lists, never a random session or a
-word of a peer's: their number is bounded.
+gauge. Labels are names of maps and clients, or reasons from the server's own lists, never a random session or
+a word that a peer chose: their number is bounded.
 """
 
 import os
@@ -18,10 +18,10 @@ from tsfusion.core.config import ServerConfig
 from tsfusion.wire.health import ClientHealth, Health, MapHealth, MapState
 
 NAMELESS = "-"  # clients without keys; no name looks like this
-OTHERS = "+"  # all that are beyond a limit
+OTHERS = "+"  # the label that all names beyond a limit share
 MAX_CLIENTS = 100
-HEARD = 30.0  # seconds; what a session said before that is no news: its client may be gone
-# Why a client leaves keyframes out; it may say anything.
+RECENT = 30.0  # seconds; older figures of a session do not count: its client may have ended
+# Why clients leave keyframes out; other reasons, which a client may invent, are counted as "other".
 SKIPPED = frozenset({"thinned", "dropped", "spool", "disk"})
 
 Rows: TypeAlias = Iterable[tuple[tuple[str, ...], float]]
@@ -40,42 +40,42 @@ _OF_MAPS: tuple[tuple[str, str, Callable[[MapHealth], float]], ...] = (
     ("delay_bound_seconds", "The total delays are right to within ±.", lambda one: one.delay_bound_ms / 1e3),
 )
 _OF_CLIENTS: tuple[tuple[str, str, Callable[[list[ClientHealth]], float]], ...] = (
-    ("sessions", "Sessions heard since the start.", len),
+    ("sessions", "Sessions that were connected since the start.", len),
     (
         "waiting_keyframes",
-        "In its spools, as it said lately.",
-        lambda own: sum(s.waiting for s in _lately(own)),
+        "Keyframes in the client's spools, as last reported.",
+        lambda own: sum(s.waiting for s in _recent(own)),
     ),
-    ("received_bytes", "Bytes of keyframes that came.", lambda own: sum(s.received_bytes for s in own)),
+    ("received_bytes", "Bytes of keyframes received.", lambda own: sum(s.received_bytes for s in own)),
     (
         "held_sessions",
-        "Sessions nothing is taken from now.",
-        lambda own: sum(bool(s.held) for s in _lately(own)),
+        "Sessions whose keyframes are turned away now.",
+        lambda own: sum(bool(s.held) for s in _recent(own)),
     ),
 )
 
 
 def of_health(health: Health, age: float) -> Iterator[Metric]:
-    """Everything in a snapshot that is `age` seconds old."""
-    yield _gauge("snapshot_age_seconds", "Since these figures were taken.", (), [((), age)])
-    yield _gauge("uptime_seconds", "Since the server began.", (), [((), health.uptime_s + age)])
-    yield _gauge("problems", "What needs a person.", (), [((), len(health.problems))])
+    """The figures of a snapshot that is `age` seconds old."""
+    yield _gauge("snapshot_age_seconds", "Seconds since these figures were taken.", (), [((), age)])
+    yield _gauge("uptime_seconds", "Seconds since the server started.", (), [((), health.uptime_s + age)])
+    yield _gauge("problems", "Problems that need a person.", (), [((), len(health.problems))])
     yield _gauge("gateway_resident_bytes", "Memory of the gateway.", (), [((), health.rss_bytes)])
     yield _counter("messages_refused", "Messages never journaled.", ("reason",), _counts(health.refused))
-    yield _counter("duplicates", "Keyframes that came again.", (), [((), health.duplicates)])
+    yield _counter("duplicates", "Keyframes that were received again.", (), [((), health.duplicates)])
     yield from _of_maps(health.maps, age)
     yield from _of_clients(health.clients, age)
 
 
 def of_disk(state: Path, server: ServerConfig) -> Iterator[Metric]:
-    """The limits of a server's disk, and what is left of it."""
+    """The limits of a server's disk, and what is free on it."""
     if server.journal_bytes is not None:
         limit = [((), server.journal_bytes)]
         yield _gauge("journal_limit_bytes", "A journal with more loses its oldest segments.", (), limit)
     yield _gauge("disk_reserve_bytes", "With less free, keyframes wait.", (), [((), server.min_free_bytes)])
     try:
         found = os.statvfs(state)
-    except OSError:  # no folder yet, or no more: its figure is missing
+    except OSError:  # the folder is not there: its figure is left out
         return
     yield _gauge("disk_free_bytes", "Free for the state folder.", (), [((), found.f_bavail * found.f_frsize)])
 
@@ -93,7 +93,7 @@ def _of_maps(maps: dict[str, MapHealth], age: float) -> Iterator[Metric]:
     ages = (
         ((name,), one.last_keyframe_s + age) for name, one in maps.items() if one.last_keyframe_s is not None
     )
-    yield _gauge("last_keyframe_age_seconds", "Since a keyframe was journaled.", ("map",), ages)
+    yield _gauge("last_keyframe_age_seconds", "Seconds since a keyframe was journaled.", ("map",), ages)
     states = (
         ((name, state), one.state == state) for name, one in maps.items() for state in get_args(MapState)
     )
@@ -106,15 +106,15 @@ def _of_clients(clients: Iterable[ClientHealth], age: float) -> Iterator[Metric]
         rows = (((client,), value(own)) for client, own in by_name.items())
         yield _gauge(f"client_{name}", help_, ("client",), rows)
     heard = (((client,), min(s.heard_s for s in own) + age) for client, own in by_name.items())
-    yield _gauge("client_silence_seconds", "Since it was last heard.", ("client",), heard)
+    yield _gauge("client_silence_seconds", "Seconds since its last message.", ("client",), heard)
     skipped = (
         ((client, reason), n) for client, own in by_name.items() for reason, n in _skipped(own).items()
     )
-    yield _gauge("client_skipped_keyframes", "Never sent, as it said.", ("client", "reason"), skipped)
+    yield _gauge("client_skipped_keyframes", "Never sent, as reported.", ("client", "reason"), skipped)
 
 
 def _grouped(clients: Iterable[ClientHealth]) -> dict[str, list[ClientHealth]]:
-    """Sessions by client; those without keys are one client, and so are those beyond the limit."""
+    """Sessions by client; clients without keys share one label, and so do those beyond the limit."""
     found: dict[str, list[ClientHealth]] = {}
     for session in sorted(clients, key=lambda one: one.client):
         name = session.client or NAMELESS
@@ -124,8 +124,8 @@ def _grouped(clients: Iterable[ClientHealth]) -> dict[str, list[ClientHealth]]:
     return found
 
 
-def _lately(sessions: Iterable[ClientHealth]) -> list[ClientHealth]:
-    return [one for one in sessions if one.heard_s <= HEARD]
+def _recent(sessions: Iterable[ClientHealth]) -> list[ClientHealth]:
+    return [one for one in sessions if one.heard_s <= RECENT]
 
 
 def _skipped(sessions: Iterable[ClientHealth]) -> Counter[str]:

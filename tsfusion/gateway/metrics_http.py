@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """A few pages over HTTP for programs on this machine, from one thread.
 
-A browser that shows somebody else's page can be led here, too: requests must name this machine as their
-host, and nothing here changes anything. One that is slow, idle or too long is cut off.
+A foreign page can make a browser on this machine send requests here: so they must name this machine as their
+host, and no page changes anything. A connection that is slow or idle, or sends too much, is cut off.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 class HttpResponse(Struct, frozen=True):
-    """What a page shows. Text ends with a line break."""
+    """The answer to a request. Text gets a line break at its end."""
 
     status: int
     body: str | bytes
@@ -38,14 +38,14 @@ class HttpResponse(Struct, frozen=True):
 
 
 class MetricsPage:
-    """Answers GET and HEAD for the paths it is given, and 404 for all others, until `close`.
+    """An HTTP server in a thread, for GET and HEAD of a few pages, until `close`.
 
     Args:
         address: HOST:PORT on this machine; port 0 = a random one.
-        pages: path → what makes its answer, called in the page's thread.
+        pages: path → function that makes its answer, called in the thread.
 
     Attributes:
-        address: with the real port.
+        address: HOST:PORT with the real port.
 
     Raises:
         InvalidConfig: when others than this machine could reach it.
@@ -92,7 +92,7 @@ class MetricsPage:
         try:
             await asyncio.wait_for(self._exchange(reader, writer), DEADLINE)
         except (OSError, EOFError, asyncio.TimeoutError, asyncio.LimitOverrunError):
-            pass  # a peer's own doing: nobody is left to be told
+            pass  # the peer's own fault, and it does not read any more
         finally:
             with suppress(ValueError):
                 self._open.remove(task)

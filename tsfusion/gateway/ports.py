@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: MIT
-"""The server's three sockets, and how the gateway reads and writes them without ever waiting."""
+"""The server's three sockets, read and written without ever waiting, and what viewers subscribed to."""
 
 import logging
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeAlias
 
 import zmq
 
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import TransportError
-from tsfusion.wire import sockets
+from tsfusion.wire import messages, sockets
 from tsfusion.wire.curve import ServerKeys
 from tsfusion.wire.sockets import Addresses
 
@@ -22,10 +22,10 @@ Handler: TypeAlias = Callable[[list[zmq.Frame]], None]
 
 
 class Ports:
-    """Keyframes in, control both ways, mesh updates out.
+    """The sockets: keyframes in, control both ways, mesh updates out.
 
     Attributes:
-        problem: why nobody can connect; empty = they can.
+        problem: why nobody can connect; empty = clients can.
     """
 
     def __init__(
@@ -35,24 +35,32 @@ class Ports:
         self._server = server
         self._keys = keys
         self._addresses: Addresses | None = None
-        self._again = 0.0  # when it is tried again to listen
+        self._next_bind = 0.0
         self.problem = ""
         self._open()
 
     def _open(self) -> None:
         self.keyframes = sockets.pull(self._context, self._server.max_frame_bytes, keys=self._keys)
         self.control = sockets.router(self._context, keys=self._keys)
-        self.publish = sockets.publisher(self._context, keys=self._keys)
+        self.viewers = sockets.publisher(self._context, keys=self._keys)
 
     def bind(self) -> Addresses:
-        """Open them to clients.
+        """Bind the sockets, so that clients can connect.
 
         Raises:
             TransportError: when a port is taken.
         """
         listen, control = self._server.listen, self._server.control
-        self._addresses = sockets.bind(self.keyframes, self.control, self.publish, listen, control)
+        self._addresses = sockets.bind(self.keyframes, self.control, self.viewers, listen, control)
         return self._addresses
+
+    def reply(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
+        """Send a message to a connection of the control socket, or drop it."""
+        send_now(self.control, [identity, messages.encode(message), *frames])
+
+    def publish(self, topic: bytes, message: bytes, frames: Sequence[zmq.Frame]) -> None:
+        """Send a mesh update to the viewers that subscribed to its topic, or drop it."""
+        send_now(self.viewers, [topic, message, *frames])
 
     def renew(self) -> None:
         """Drop every connection, with all that it holds in memory; `step` listens at the same ports again."""
@@ -63,15 +71,15 @@ class Ports:
     def step(self) -> None:
         """Listen again, as soon as ZeroMQ's threads have given the ports back. Never waits."""
         now = time.monotonic()
-        if not self.problem or now < self._again:
+        if not self.problem or now < self._next_bind:
             return
-        self._again = now + _REBIND_INTERVAL
+        self._next_bind = now + _REBIND_INTERVAL
         try:
             if self.control.closed:
                 self._open()
             if self._addresses is not None:
                 addresses = self._addresses
-                sockets.bind(self.keyframes, self.control, self.publish, addresses.data, addresses.control)
+                sockets.bind(self.keyframes, self.control, self.viewers, addresses.data, addresses.control)
         except (TransportError, zmq.ZMQError) as error:
             if self.control.closed:
                 self.close()  # no room for all three
@@ -80,13 +88,13 @@ class Ports:
             self.problem = ""
 
     def close(self) -> None:
-        """Close them; nothing lingers."""
-        for socket in (self.keyframes, self.control, self.publish):
+        """Close the sockets at once, with whatever they have not sent."""
+        for socket in (self.keyframes, self.control, self.viewers):
             socket.close()
 
 
-def each(socket: sockets.AnySocket, handle: Handler) -> None:
-    """Handle what a socket holds, up to a limit: then the others get their turn."""
+def receive_some(socket: sockets.AnySocket, handle: Handler) -> None:
+    """Handle the messages that a socket holds, up to a limit: then the other sockets get their turn."""
     for _ in range(_MESSAGES_A_STEP):
         try:
             frames = socket.recv_multipart(zmq.NOBLOCK, copy=False)
@@ -96,7 +104,7 @@ def each(socket: sockets.AnySocket, handle: Handler) -> None:
 
 
 def send_now(socket: sockets.AnySocket, frames: list[Any]) -> None:
-    """Send, or drop what cannot leave at once: the asker will ask again."""
+    """Send a message, or drop it when it cannot leave at once: whoever needs it will ask again."""
     try:
         socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
     except zmq.ZMQError as error:  # zmq.Again: it is full; or it is being made anew
@@ -107,7 +115,7 @@ _MAX_TOPICS = 256  # of maps that are not open
 
 
 class Subscriptions:
-    """Topics that somebody subscribed to, as far as they can be a map's."""
+    """The topics that viewers subscribed to, as far as they can be a map's."""
 
     def __init__(self) -> None:
         self._topics: set[bytes] = set()
@@ -116,10 +124,10 @@ class Subscriptions:
         return len(self._topics)
 
     def add(self, topic: bytes, maps: Iterable[str]) -> bool:
-        """Somebody subscribed; False when that leads to nothing. The topics of open maps always have room.
+        """Note a subscription; False when it can match no map. Topics of open maps are never too many.
 
         Args:
-            maps: those that are open.
+            maps: the names of the open maps.
         """
         wanted = any(sockets.mesh_topic(name).startswith(topic) for name in maps)
         if not wanted and (len(self._topics) >= _MAX_TOPICS or not sockets.is_mesh_topic(topic)):
@@ -128,14 +136,14 @@ class Subscriptions:
         return True
 
     def discard(self, topic: bytes) -> None:
-        """Nobody does any more."""
+        """Note that the last subscription to a topic ended."""
         self._topics.discard(topic)
 
     def clear(self) -> None:
-        """All connections are gone."""
+        """Forget all subscriptions: every connection was dropped."""
         self._topics.clear()
 
     def watched(self, map_name: str) -> bool:
-        """Whether anybody gets a map's updates."""
+        """Whether any viewer gets a map's updates."""
         topic = sockets.mesh_topic(map_name)
         return any(topic.startswith(wanted) for wanted in self._topics)

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What one client may send: bytes and keyframes a second (what is over it waits), points and place of a
-keyframe (what is over it is refused)."""
+"""The quotas of a client: keyframes and bytes a second, points of a keyframe, distance from the origin."""
 
 import math
 from collections import OrderedDict
@@ -24,13 +23,13 @@ class Bucket:
         self._then = now
 
     def wait(self, amount: float, now: float) -> float:
-        """Seconds until `amount` may pass; more than the bucket holds passes when it is full."""
+        """Seconds until an amount may pass; one that is larger than the bucket passes when that is full."""
         self._level = min(self._level + (now - self._then) * self._rate, self._most)
         self._then = now
         return max(min(amount, self._most) - self._level, 0.0) / self._rate
 
-    def take(self, amount: float) -> None:
-        """It passed."""
+    def spend(self, amount: float) -> None:
+        """Count an amount that passes now."""
         self._level -= amount
 
 
@@ -42,9 +41,11 @@ class Quotas:
         self._clients: OrderedDict[str, tuple[Bucket, Bucket]] = OrderedDict()
 
     def wait(self, owner: str, nbytes: int, now: float) -> float:
-        """Seconds that a client has to wait before a message of so many bytes; 0 = it passes, and counts.
+        """Seconds that a client has to wait before it may send a message; 0 = it passes, and is counted.
 
-        `owner`: its name. Without keys all are one: sessions cost nothing, and would evade it.
+        Args:
+            owner: the client's name. Without keys all clients are one: new sessions cost nothing.
+            now: `time.monotonic()`.
         """
         buckets = self._clients.get(owner)
         if buckets is None:
@@ -59,12 +60,12 @@ class Quotas:
         keyframes, data = buckets
         seconds = max(keyframes.wait(1.0, now), data.wait(nbytes, now))
         if not seconds:
-            keyframes.take(1.0)
-            data.take(nbytes)
+            keyframes.spend(1.0)
+            data.spend(nbytes)
         return seconds
 
     def check(self, header: KeyframeHeader) -> None:
-        """Raise Refused (`quota`) for a keyframe of too many points, or taken too far away."""
+        """Raise Refused (`quota`) for a keyframe with too many points, or from too far away."""
         server = self._server
         shape = next(buffer.shape for buffer in header.buffers if buffer.name == measurement(header))
         points = shape[0] if len(shape) == 2 and measurement(header) == "points" else int(np.prod(shape))

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""What the gateway knows of sessions and keyframes: policy and bookkeeping, no sockets."""
+"""The sessions of a map, and how far each is."""
 
 from array import array
-from collections import OrderedDict, deque
 from collections.abc import Iterator
 from typing import Literal
 
@@ -16,11 +15,12 @@ class Session(Struct, eq=False):
     """One client's stream of keyframes.
 
     Attributes:
-        number: its place in `Sessions`.
-        client: whose it is: the name that its key is allowed under; empty = it came without keys.
+        key: 16 bytes that the client drew.
+        number: position in `Sessions`.
+        client: the name that the owner's key is allowed under; empty = it came without keys.
         durable: the highest seq that is journaled.
-        fused: the highest that the map has taken or refused.
-        in_map: the same of the fuser that lives: after a death it begins at the checkpoint again.
+        fused: the highest seq that the map has taken or rejected.
+        in_map: the same for the present fuser: one that takes over begins at the checkpoint again.
         entries: the indices of its keyframes that are not forgotten.
         handed: how many of these the fuser was given.
     """
@@ -36,22 +36,12 @@ class Session(Struct, eq=False):
 
     @property
     def owner(self) -> str:
-        """Whom to be fair to: the client, or where there are no keys the session."""
+        """The name that gets a turn in the fair queue: the client, or where there are no keys the session."""
         return self.client or self.key.hex()
 
     def belongs_to(self, client: str) -> bool:
-        """Whether this client may go on with it. What came without keys is anyone's."""
+        """Whether a client may go on with the session. One that came without keys is anyone's."""
         return not self.client or not client or self.client == client
-
-    def admit(self, seq: int, previous: int) -> Verdict:
-        """What to do with keyframe `seq` of a client that offers none between `previous` and it.
-
-        Taking them only in order makes one number a session enough to know every keyframe that ever came:
-        exact de-duplication in constant memory.
-        """
-        if seq <= self.durable:
-            return "duplicate"
-        return "next" if previous <= self.durable else "gap"
 
 
 class Sessions:
@@ -68,11 +58,11 @@ class Sessions:
         return len(self._all)
 
     def get(self, key: bytes) -> Session | None:
-        """A session that has something in the journal, or None."""
+        """The session of a key, or None when it has no keyframe in the journal."""
         return self._by_key.get(key)
 
     def room_for(self, key: bytes) -> bool:
-        """Whether it is one of them, or may become one."""
+        """Whether a key has a session, or may still get one."""
         return key in self._by_key or len(self) < _MAX_SESSIONS
 
     def open(self, key: bytes, client: str = "") -> Session:
@@ -84,8 +74,15 @@ class Sessions:
         return session
 
     def admit(self, key: bytes, seq: int, previous: int) -> Verdict:
-        """As `Session.admit`, for a session that may not exist yet."""
-        return (self._by_key.get(key) or Session(key, -1)).admit(seq, previous)
+        """Whether keyframe `seq` may be journaled, when the client has none between `previous` and it.
+
+        Keyframes are taken in order only, so one number a session is enough to know every keyframe that ever
+        came: exact de-duplication in constant memory.
+        """
+        durable, _ = self.progress(key)
+        if seq <= durable:
+            return "duplicate"
+        return "next" if previous <= durable else "gap"
 
     def progress(self, key: bytes) -> tuple[int, int]:
         """The highest seq of a session that is durable, and that is fused."""
@@ -95,35 +92,3 @@ class Sessions:
     def numbered(self, number: int) -> Session:
         """A session by its number."""
         return self._all[number]
-
-
-class FairQueue:
-    """Whose keyframe the fuser gets next: one of each client in turn, and of its sessions in turn."""
-
-    def __init__(self) -> None:
-        self._owners: OrderedDict[str, deque[Session]] = OrderedDict()
-
-    def add(self, session: Session) -> None:
-        """It has something to hand out (again)."""
-        queue = self._owners.setdefault(session.owner, deque())
-        if session not in queue:
-            queue.append(session)
-
-    def next(self) -> Session | None:
-        """The one whose turn it is; it stays so until `served`."""
-        for queue in self._owners.values():
-            return queue[0]
-        return None
-
-    def served(self) -> None:
-        """The next one got its turn; if it has more, it gets another when the others had theirs."""
-        owner, queue = self._owners.popitem(last=False)
-        session = queue.popleft()
-        if session.handed < len(session.entries):
-            queue.append(session)
-        if queue:
-            self._owners[owner] = queue
-
-    def clear(self) -> None:
-        """Nothing is to be handed out."""
-        self._owners.clear()

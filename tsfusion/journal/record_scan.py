@@ -62,7 +62,7 @@ def segment_number(path: Path) -> int:
 
 def journal_error(verb: str, path: Path, error: OSError) -> JournalError:
     """The JournalError for what the disk refused: `cannot read FILE: reason`."""
-    return JournalError(f"cannot {verb} {path}: {error.strerror or error}")
+    return JournalError(f"cannot {verb} {path}: {error.strerror or error}", error.errno or errno.EIO)
 
 
 def _was_index(raw: bytes) -> bool:

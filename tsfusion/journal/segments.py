@@ -64,7 +64,7 @@ def read_at(path: Path, offset: int) -> Record:
     """One record of a segment file.
 
     Raises:
-        JournalError: when it is not there or its CRC differs; from an OSError when the system refuses.
+        JournalError: when it is not there or its CRC differs, or with an `errno` when the system refuses.
     """
     try:
         with SegmentFile(path) as source:

@@ -303,7 +303,7 @@ class FreeSpace:
             return durable_files.free_bytes(self._folder)
         except OSError as error:
             raise JournalError(
-                f"cannot tell how full the disk of {self._folder} is: {error.strerror}"
+                f"cannot tell how full the disk of {self._folder} is: {error.strerror}", error.errno
             ) from error
 
 

@@ -85,7 +85,8 @@ def read(path: Path) -> tuple[CheckpointHeader, NDArray[np.int64], dict[str, NDA
                     part[...] = np.frombuffer(chunk, part.dtype, part.size, at).reshape(part.shape)
                     at += part.nbytes
     except OSError as error:
-        raise CheckpointError(f"cannot read the map {path}: {error.strerror}") from error
+        missing = isinstance(error, FileNotFoundError)
+        raise CheckpointError(f"cannot read the map {path}: {error.strerror}", missing=missing) from error
     except MemoryError as error:
         raise CheckpointError(f"the map {path} does not fit into this machine's memory") from error
     return header, keys, layers

@@ -147,9 +147,6 @@ class Pong(Struct, frozen=True, tag="pong"):
     fused: Seq = 0
 
 
-ASK_AGAIN = "ask again"  # so ends the error of a Reply when the same question may be answered soon
-
-
 class Command(Struct, frozen=True, tag="command", kw_only=True):
     """A request of a person or program; answered by one Reply."""
 
@@ -159,10 +156,16 @@ class Command(Struct, frozen=True, tag="command", kw_only=True):
 
 
 class Reply(Struct, frozen=True, tag="reply", kw_only=True):
-    """The answer to a Command; arrays of a mesh follow as raw frames."""
+    """The answer to a Command; arrays of a mesh follow as raw frames.
+
+    Attributes:
+        error: why there is no answer, for a person.
+        retry: whether the same command may be answered soon, though it is not now.
+    """
 
     name: str
     error: str | None = None
+    retry: bool = False
     health: "Health | None" = None
     status: "Status | None" = None
     mesh: "MeshLayout | None" = None

@@ -16,11 +16,25 @@ from tsfusion.wire import messages, sockets
 from tsfusion.wire.connection_monitor import ConnectionMonitor
 from tsfusion.wire.curve import ClientKeys
 from tsfusion.wire.health import Health, MeshLayout, Status
-from tsfusion.wire.messages import ASK_AGAIN, Command, Reply
+from tsfusion.wire.messages import Command, Reply
 from tsfusion.wire.sockets import control_address
 
 _AGAIN_INTERVAL = 0.25  # seconds
 _PING_TIMEOUT = 5.0  # seconds; the gateway is never busy: without an answer for so long there is none
+
+
+class CommandRefused(TransportError):
+    """The server answered that it cannot do what a command asks.
+
+    Attributes:
+        reason: the server's words, without its address.
+        retry: whether the same command may succeed soon.
+    """
+
+    def __init__(self, address: str, reason: str, *, retry: bool = False) -> None:
+        super().__init__(f"the server at {address}: {reason}")
+        self.reason = reason
+        self.retry = retry
 
 
 def fetch_health(
@@ -85,8 +99,8 @@ def fetch_mesh(
             left = max(deadline - time.monotonic(), 0.0)
             reply, frames = _request_if_present(address, control, command, left, keys)
             break
-        except TransportError as error:
-            if not str(error).endswith(ASK_AGAIN) or time.monotonic() + 2 * _AGAIN_INTERVAL > deadline:
+        except CommandRefused as error:
+            if not error.retry or time.monotonic() + 2 * _AGAIN_INTERVAL > deadline:
                 raise
         time.sleep(_AGAIN_INTERVAL)
     if reply.mesh is None:
@@ -140,7 +154,8 @@ def request(
         InvalidConfig: for a malformed address.
         NotAllowed: as soon as the server turns the connection away.
         ServerUnreachable: when nobody answered within `timeout` seconds.
-        TransportError: when the server answered that it cannot.
+        CommandRefused: when the server answered that it cannot.
+        TransportError: when what answers is no tsfusion server.
     """
     address, timeout = sockets.connect_address(address), min(timeout, _MAX_TIMEOUT_S)
     context: zmq.Context[Any] = zmq.Context()
@@ -159,7 +174,7 @@ def request(
     if not isinstance(reply, messages.Reply):
         raise TransportError(f"the server at {address} answered a command with a {type(reply).__name__}")
     if reply.error is not None:
-        raise TransportError(f"the server at {address}: {reply.error}")
+        raise CommandRefused(address, reply.error, retry=reply.retry)
     return reply, [frame.buffer for frame in frames]
 
 

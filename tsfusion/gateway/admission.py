@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: MIT
+"""Admission of messages: who sent them, whose session they belong to, and how many were refused."""
+
+from collections import Counter
+
+import zmq
+
+from tsfusion.gateway.access_control import AccessControl
+from tsfusion.gateway.client_routes import ClientRoutes
+from tsfusion.gateway.sessions import Sessions
+
+
+class Admission:
+    """The checks that every socket of a server makes, and their counter.
+
+    Attributes:
+        refused: messages that were not taken, by reason.
+    """
+
+    def __init__(self, access: AccessControl, routes: ClientRoutes) -> None:
+        self.refused: Counter[str] = Counter()
+        self._access = access
+        self._routes = routes
+
+    def client_of(self, frame: zmq.Frame) -> str | None:
+        """The client that sent a frame, empty without keys; None when it has no access, which is counted."""
+        client = self._access.client_of(frame)
+        if client is None:
+            self.refused["key"] += 1
+        return client
+
+    def owns(self, sessions: Sessions, key: bytes, client: str) -> bool:
+        """Whether a client may go on with a session: no other client has journaled it, or is connected."""
+        session, route = sessions.get(key), self._routes.get(key)
+        return (session is None or session.belongs_to(client)) and (route is None or route.open_to(client))

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: MIT
+"""The journaled keyframes that a map's fuser has not answered, and the fair order in which it gets them."""
+
+from collections import OrderedDict, deque
+from collections.abc import Mapping
+
+from tsfusion.fuser.messages import Fuse, SessionProgress
+from tsfusion.gateway.fuser_supervisor import FuserSupervisor
+from tsfusion.gateway.keyframe_index import KeyframeIndex
+from tsfusion.gateway.sessions import Session, Sessions
+
+
+class FuserBacklog:
+    """Hands out keyframes of each client in turn, and of each session of a client in turn.
+
+    Attributes:
+        waiting: keyframes that are not answered.
+    """
+
+    def __init__(self, index: KeyframeIndex, sessions: Sessions) -> None:
+        self.waiting = len(index)
+        self._index = index
+        self._sessions = sessions
+        self._queues: OrderedDict[str, deque[Session]] = OrderedDict()  # by owner, the next one first
+
+    def add(self, session: Session) -> None:
+        """Add the keyframe of a session that was journaled just now."""
+        self.waiting += 1
+        self._enqueue(session)
+
+    def _enqueue(self, session: Session) -> None:
+        if session.handed < len(session.entries):
+            queue = self._queues.setdefault(session.owner, deque())
+            if session not in queue:
+                queue.append(session)
+
+    def restart(self, done: Mapping[bytes, SessionProgress]) -> None:
+        """Begin where a new fuser begins, with `done` of each session: hand out all the rest again."""
+        self._queues.clear()
+        self.waiting = 0
+        for session in self._sessions:
+            progress = done.get(session.key)
+            session.in_map = progress.seq if progress else 0
+            session.handed = self._index.after(session, progress.seq) if progress else 0
+            self.waiting += len(session.entries) - session.handed
+            self._enqueue(session)
+
+    def hand_out(self, fuser: FuserSupervisor) -> None:
+        """Hand out as many keyframes as the fuser wants."""
+        while self._queues and fuser.wants_work:
+            owner, queue = next(iter(self._queues.items()))
+            session = queue[0]
+            entry = self._index[session.entries[session.handed]]
+            order = Fuse(entry.index, entry.position, session.key, entry.stamps.seq, session.client)
+            if not fuser.fuse(order):
+                return
+            session.handed += 1
+            queue.popleft()
+            if session.handed < len(session.entries):
+                queue.append(session)
+            self._queues.move_to_end(owner)
+            if not queue:
+                del self._queues[owner]
