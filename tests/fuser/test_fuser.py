@@ -16,9 +16,15 @@ from keyframes_and_servers import alive, serving, until, wall
 
 import tsfusion
 from tsfusion import VolumeConfig
-from tsfusion.core.errors import CheckpointError, InvalidConfig
-from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, JournalError, MapError, MapFull, TsfusionError
-from tsfusion.core.folder_lock import hold
+from tsfusion.core.errors import (
+    CheckpointError,
+    DamagedCheckpoint,
+    InvalidConfig,
+    JournalError,
+    MapError,
+    MapFull,
+    TsfusionError,
+)
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.fuser import Fuser
 from tsfusion.fuser.map_checkpoints import MapCheckpoints

@@ -2,8 +2,6 @@
 """Addresses, control messages, clocks, and the gateway's bookkeeping."""
 
 import socket
-from typing import Any
-from pathlib import Path
 from typing import Any, cast
 
 import msgspec
@@ -16,13 +14,9 @@ from tsfusion.delivery.timing import ClockOffset
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.keyframe_outcomes import DelayStatistics
-from tsfusion.gateway.ports import Subscriptions
-from tsfusion.gateway.sessions import FairQueue, Session, Sessions
-from tsfusion.journal import Position, RecordEntry
 from tsfusion.gateway.ports import Ports, Subscriptions
 from tsfusion.gateway.sessions import Sessions
-from tsfusion.journal import Position, Scan, quarantine
-from tsfusion.journal.quarantine import Quarantine
+from tsfusion.journal import Position, RecordEntry
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.keyframe_times import Stamps
 from tsfusion.wire.messages import Ack, Command, Denied, Hello, Hold, Nack, Ping, Pong, Welcome
