@@ -40,13 +40,10 @@ WITHOUT_KEYS = (
 )  # what gets as far as that
 
 
+@pytest.mark.parametrize("seconds", [0.3, pytest.param(3.0, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize(
     ("attacks", "keys"), [(tuple(ATTACKS), False), (WITHOUT_KEYS, True)], ids=["open", "keys"]
 )
-def test_attacks_harm_nobody(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], attacks: tuple[str, ...], keys: bool
-) -> None:
-    outcome = run(tmp_path, 1.0, attacks, keys=keys)
-    with capsys.disabled():
-        print(f"\n{table(outcome)}")
-    assert not outcome.problems, outcome
+def test_attacks_harm_nobody(tmp_path: Path, attacks: tuple[str, ...], keys: bool, seconds: float) -> None:
+    outcome = run(tmp_path, seconds, attacks, keys=keys)
+    assert not outcome.problems, f"{outcome.problems}\n{table(outcome)}"

@@ -18,7 +18,11 @@ from tsfusion.core.errors import InvalidConfig, SourceError
 from tsfusion.scanner.sources.realsense import RealSense
 from tsfusion.scanner.sources.source import Source
 
-rs = pytest.importorskip("pyrealsense2", reason="no pyrealsense2: pip install 'tsfusion[realsense]'")
+rs = pytest.importorskip(
+    "pyrealsense2",
+    exc_type=ImportError,
+    reason="pyrealsense2 does not load: pip install 'tsfusion[realsense]', and libusb-1.0-0 of the system",
+)
 
 H, W, FX, BASELINE = 60, 80, 70.0, 0.05
 START_MS, STEP_MS = 1_700_000_000_000.0, 33.25
