@@ -23,7 +23,7 @@ from supervisors import SCANNER
 from tsfusion import Client, Volume, journal
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, ServerUnreachable, TransportError
-from tsfusion.delivery import spool
+from tsfusion.delivery import control_session, spool
 from tsfusion.wire import codec, messages, sockets
 from tsfusion.wire.keyframe_header import VERSION
 from tsfusion.wire.queries import fetch_status
@@ -231,7 +231,7 @@ def test_another_version_is_named(shared: Server) -> None:
 
 
 def test_a_client_of_another_version_says_so(shared: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(codec, "VERSION", VERSION + 1)
+    monkeypatch.setattr(control_session, "VERSION", VERSION + 1)
     with (
         Client(shared.address) as client,
         pytest.raises(ServerUnreachable, match=r"version 1 of the wire format, this client 2"),
