@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Everything is killed, the link is spoiled, no keyframe is lost. The long form: `scripts/chaos.py`."""
+"""No keyframe is lost when processes are killed and the network is bad. The long form: `scripts/chaos.py`."""
 
 from pathlib import Path
 

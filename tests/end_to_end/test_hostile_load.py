@@ -11,15 +11,15 @@ from tsfusion.core import process
 from tsfusion.gateway.memory_guard import MemoryGuard
 
 
-def test_memory_that_does_not_come_back_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Else every connection would be dropped for ever."""
+def test_memory_that_does_not_come_back_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reported again, it would drop every connection for ever."""
     held = 0
     monkeypatch.setattr(process, "rss_bytes", lambda: held)
     bound = MemoryGuard(800)
-    told = []
+    reported = []
     for held in (700, 800, 850, 900, 950, 960, 980, 1080, 1090, 400, 790, 810):  # noqa: B007
-        told.append(bound.excess(elsewhere=0))
-    assert told == [0, 0, 850, 0, 0, 960, 0, 1080, 0, 0, 0, 810]
+        reported.append(bound.excess(elsewhere=0))
+    assert reported == [0, 0, 850, 0, 0, 960, 0, 1080, 0, 0, 0, 810]
     assert bound.excess(elsewhere=100) == 0
 
 

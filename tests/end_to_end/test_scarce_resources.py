@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a server and a client lack: file descriptors, room on the disk, files that were there before."""
+"""Servers and clients without file descriptors, without room on the disk, without files they had."""
 
 import errno
 import os
@@ -62,7 +62,7 @@ def seqs(folder: Path) -> list[int]:
 
 
 def test_a_keyframe_the_disk_refused_does_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its number is used again: found by a later scan, it would stand in the other's place."""
+    """The number is used again; a later scan that found the first keyframe would take it for the second."""
     writer = Journal(tmp_path, 1 << 20)
     writer.append([b"head", b"body"], session=bytes(16), seq=1)
 

@@ -241,7 +241,7 @@ def test_a_full_disk_with_room_again(small_disk: Callable[[int], Path]) -> None:
 
 
 def test_a_journal_keeps_to_its_limit(tmp_path: Path) -> None:
-    """What two checkpoints hold goes; a restart knows all the same what was fused."""
+    """Segments that two checkpoints cover are deleted; a restart still knows what was fused."""
     limit = 1 << 20
     settings = {"journal_bytes": limit, "segment_bytes": 1 << 16, "checkpoint_every": 40}
     with serving(tmp_path, **settings) as server:
