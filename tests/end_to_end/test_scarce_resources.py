@@ -143,24 +143,24 @@ def test_a_client_survives_the_loss_of_its_spool_files(shared: Server, tmp_path:
 @pytest.mark.slow
 def test_a_map_that_outgrows_its_memory_refuses_keyframes_and_lives(tmp_path: Path) -> None:
     """The map has what fitted, exactly; the rest is kept aside, and the fuser does not die of it."""
-    room = Synthetic("room", sensor="kinect", count=12, seed=0)
+    room = Synthetic("room", sensor="kinect", count=8, seed=0)
     fine = VolumeConfig(voxel_size=0.004, threads=1)
     with (
         serving(tmp_path, fine, fuser_memory_bytes=1 << 28) as server,
         Client(server.address, policy="spool_all") as client,
     ):
-        for i in range(12):
+        for i in range(8):
             client.send(room[i])
         client.flush(timeout=DEADLINE)
         client.wait_fused(timeout=DEADLINE)
         health = fetch_health(server.address).maps["default"]
-        assert 0 < client.stats.rejected["memory"] == health.rejected["memory"] == health.quarantined < 12
+        assert 0 < client.stats.rejected["memory"] == health.rejected["memory"] == health.quarantined < 8
         assert health.fuser_restarts == 0
         assert server.terminate() == 0
     saved = Volume.load(tmp_path / "maps/default/map.tsf")
     kept = {int(path.name.split("-")[1]) for path in (tmp_path / "maps/default/quarantine").iterdir()}
     volume = Volume(fine)
-    for i in set(range(12)) - {seq - 1 for seq in kept}:
+    for i in set(range(8)) - {seq - 1 for seq in kept}:
         volume.integrate(room[i])
     assert volume.map_hash() == saved.map_hash()
 

@@ -33,6 +33,7 @@ from tsfusion.wire.keyframe_header import Refused
 
 _SET_ASIDE = 2 << 30  # bytes that Taichi asks for and hardly uses
 _KEPT_FREE = 256 << 20  # bytes that keyframes leave to meshes and checkpoints
+_FOR_A_CHECKPOINT = 64 << 20  # bytes beyond the limit: meshes may have taken what was kept free
 _REFINED_AT_ONCE = 256  # blocks: about 50 ms
 _FUSING_SHARE = 3  # a busy fuser meshes for at most a quarter of its time
 
@@ -176,7 +177,9 @@ class Fuser:
     def _checkpoint(self) -> bool:
         written = False
         if self._since_checkpoint:
+            process.limit_memory(self._most + _FOR_A_CHECKPOINT)
             written = self._map.save()
+            process.limit_memory(self._most)
             self._since_checkpoint = 0 if written else 1
         self._send(fuser_messages.Saved(written))
         return not self._since_checkpoint
