@@ -57,7 +57,7 @@ def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> 
 
 @pytest.fixture(autouse=True)
 def logging_as_it_was() -> Iterator[None]:
-    """A command that runs in this process logs to a stderr that is gone afterwards."""
+    """Undo the logging of a command that ran in this process; the stderr it wrote to is closed."""
     level, hook = logging.getLogger("tsfusion").level, sys.excepthook
     yield
     for handler in logging.root.handlers[:]:
@@ -83,7 +83,7 @@ def data() -> Callable[[str], Path]:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
-    """Mounts a file system of so many MiB; its folder."""
+    """`small_disk(24)`: mount a file system of 24 MiB, and give its folder."""
     folder = tmp_path / "disk"
     folder.mkdir()
 

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zmq
-from keyframes_and_servers import DEADLINE, Server, alive, pose, serving, until, wall
+from command_processes import alive
+from keyframes_and_servers import DEADLINE, Server, pose, serving, until, wall
 
 import tsfusion
 from tsfusion import Client, Keyframe

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 import zmq
-from keyframes_and_servers import DEADLINE, Server, alive, connected, serving, until, wall
+from command_processes import alive
+from keyframes_and_servers import DEADLINE, Server, connected, serving, until, wall
 
 from tsfusion import Client, Volume, VolumeConfig, journal
 from tsfusion.core.config import ClientConfig

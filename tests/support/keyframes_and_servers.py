@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Keyframes and server processes for the tests of the wire."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -172,15 +171,6 @@ def serving(state: Path, volume: VolumeConfig | None = None, **settings: Any) ->
         yield server
     finally:
         server.close()
-
-
-def alive(pid: int) -> bool:
-    """Tell whether a process runs (a zombie does not)."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return Path(f"/proc/{pid}/stat").read_text().split(")")[1].split()[0] != "Z"
 
 
 @contextmanager
