@@ -8,7 +8,7 @@ check:  ## style and types
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m mypy
 
-test:  ## everything; `make test ARGS="-m 'not slow'"` leaves out the long ones
+test:  ## the default suite; `make test ARGS="-m 'not slow'"` leaves out real data and long runs
 	$(PYTHON) -m pytest $(ARGS)
 
 bench:  ## one JSON line a case
@@ -18,6 +18,7 @@ accuracy:  ## every row, then the tables and plots of docs/accuracy.md
 	$(PYTHON) scripts/accuracy.py --output out/accuracy --write-docs $(ARGS)
 
 nightly:  ## the long forms of what the tests try: about an hour; a JSON line each
+	$(PYTHON) -m pytest --nightly -m nightly
 	$(PYTHON) scripts/chaos.py --seeds 20
 	$(PYTHON) scripts/hostile.py --seconds 10
 	$(PYTHON) scripts/hostile.py --seconds 10 --keys

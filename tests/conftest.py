@@ -1,24 +1,63 @@
 # SPDX-License-Identifier: MIT
-"""Fixtures shared by all tests."""
+"""Fixtures of all tests; which tests are collected, and how they start."""
 
 import logging
 import os
+import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import pytest
 
 from tsfusion.core import logs
+from tsfusion.core.errors import MissingDependency
 
 os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # programs that tests start find what tests find
 DATA = Path(os.environ.get("TSFUSION_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--nightly", action="store_true", help="also run the tests marked nightly (long)")
+
+
+def pytest_configure() -> None:
+    """Let Ctrl-C reach the tests and the commands they start.
+
+    A shell starts its background jobs with SIGINT ignored, and their children inherit that.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--nightly"):
+        return
+    nightly = [item for item in items if item.get_closest_marker("nightly")]
+    if nightly:
+        config.hook.pytest_deselected(items=nightly)
+        items[:] = [item for item in items if item not in nightly]
+
+
+class SkippableModule(pytest.Module):
+    """A test module that is skipped where Taichi does not load."""
+
+    def collect(self) -> Iterable[pytest.Item | pytest.Collector]:
+        try:
+            return super().collect()
+        except MissingDependency as error:
+            pytest.skip(str(error), allow_module_level=True)
+
+
+def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> pytest.Module:
+    module: pytest.Module = SkippableModule.from_parent(parent, path=module_path)
+    return module
+
+
 @pytest.fixture(autouse=True)
 def logging_as_it_was() -> Iterator[None]:
-    """A command that runs in this process logs to a stderr that is gone afterwards."""
+    """Undo the logging of a command that ran in this process; the stderr it wrote to is closed."""
     level, hook = logging.getLogger("tsfusion").level, sys.excepthook
     yield
     for handler in logging.root.handlers[:]:
@@ -44,7 +83,7 @@ def data() -> Callable[[str], Path]:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
-    """Mounts a file system of so many MiB; its folder."""
+    """`small_disk(24)`: mount a file system of 24 MiB, and give its folder."""
     folder = tmp_path / "disk"
     folder.mkdir()
 

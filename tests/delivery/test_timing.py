@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: MIT
 """The client's stamps: one row a keyframe, memory of one size, whatever a server says."""
 
-from tsfusion.delivery.timing import CAPACITY, KeyframeTimesTable
+import numpy as np
+import pytest
+
+from tsfusion.delivery.timing import CAPACITY, ClockOffset, KeyframeTimesTable
 from tsfusion.wire.keyframe_times import KeyframeTimes, Stamps
 
 
@@ -45,3 +48,20 @@ def test_impossible_stamps_do_no_harm() -> None:
     times.stamp(Stamps(1, 1 << 64, -(1 << 63), 5, 1 << 63), 1 << 62, 1 << 70)
     (row,) = times.copy()
     assert row.fuse_start_ns == 5 - (1 << 62)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_clock_estimate_stays_within_its_bound(seed: int) -> None:
+    """Asymmetric jitter, as on Wi-Fi: the truth lies within half the best round trip."""
+    rng = np.random.default_rng(seed)
+    true_offset, clock = 3_217_000_000, ClockOffset()
+    assert (clock.offset_ns, clock.bound_ns, clock.count) == (None, 0, 0)
+    for i in range(40):
+        there, work, back = (int(1e6 * value) for value in rng.exponential((2.0, 0.1, 0.5)) + 0.05)
+        sent = i * 10**8
+        clock.add(
+            sent, sent + there + true_offset, sent + there + work + true_offset, sent + there + work + back
+        )
+        assert clock.offset_ns is not None
+        assert abs(clock.offset_ns - true_offset) <= clock.bound_ns
+    assert clock.count == 16

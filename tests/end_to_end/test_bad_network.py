@@ -71,12 +71,12 @@ def connected(proxy: Proxy, port: int = 0) -> Iterator[socket.socket]:
         yield made
 
 
-def said(link: socket.socket, content: bytes) -> bytes:
+def echoed(link: socket.socket, content: bytes) -> bytes:
     link.sendall(content)
-    return heard(link, len(content))
+    return received(link, len(content))
 
 
-def heard(link: socket.socket, size: int) -> bytes:
+def received(link: socket.socket, size: int) -> bytes:
     got = b""
     while len(got) < size and (more := link.recv(1 << 16)):
         got += more
@@ -87,30 +87,30 @@ def test_it_carries_both_ports_both_ways(proxy: Proxy) -> None:
     for port in (0, 1):
         with connected(proxy, port) as link:
             content = bytes(range(256)) * 1000
-            assert said(link, content) == content
+            assert echoed(link, content) == content
     assert proxy.carried >= 2 * 2 * 256_000
 
 
 def test_a_cut_ends_what_is_connected_and_nothing_else(proxy: Proxy) -> None:
     with connected(proxy) as link, connected(proxy) as other:
-        assert said(link, b"a") == said(other, b"a") == b"a"
+        assert echoed(link, b"a") == echoed(other, b"a") == b"a"
         proxy.cut()
         with pytest.raises(ConnectionError):
             assert link.recv(1) == b"never"
     with connected(proxy) as link:
-        assert said(link, b"b") == b"b"
+        assert echoed(link, b"b") == b"b"
 
 
 def test_it_refuses_until_it_does_not(proxy: Proxy) -> None:
     with connected(proxy) as before:
-        assert said(before, b"a") == b"a"
+        assert echoed(before, b"a") == b"a"
         proxy.refuse(True)
         with pytest.raises(ConnectionRefusedError), connected(proxy):
             pass
-        assert said(before, b"still here") == b"still here"
+        assert echoed(before, b"still here") == b"still here"
     proxy.heal()
     with connected(proxy) as link:
-        assert said(link, b"a") == b"a"
+        assert echoed(link, b"a") == b"a"
 
 
 def test_nobody_behind_it(proxy: Proxy) -> None:
@@ -123,18 +123,18 @@ def test_it_is_as_slow_as_told(proxy: Proxy) -> None:
     proxy.throttle(100_000)
     with connected(proxy) as link:
         started = time.monotonic()
-        assert said(link, bytes(20_000)) == bytes(20_000)  # twice 20 kB
+        assert echoed(link, bytes(20_000)) == bytes(20_000)  # twice 20 kB
         assert time.monotonic() - started > 0.3
         proxy.throttle(None)
         proxy.delay(0.05)
         started = time.monotonic()
-        assert said(link, b"a") == b"a"
+        assert echoed(link, b"a") == b"a"
         assert time.monotonic() - started >= 0.1
 
 
 def test_a_frozen_link_loses_nothing(proxy: Proxy) -> None:
     with connected(proxy) as link:
-        assert said(link, b"a") == b"a"
+        assert echoed(link, b"a") == b"a"
         proxy.freeze(True)
         link.sendall(b"later")
         link.settimeout(0.2)
@@ -142,12 +142,12 @@ def test_a_frozen_link_loses_nothing(proxy: Proxy) -> None:
             link.recv(1)
         proxy.freeze(False)
         link.settimeout(PATIENCE)
-        assert heard(link, 5) == b"later"
+        assert received(link, 5) == b"later"
 
 
 def test_a_muted_server_is_heard_later(proxy: Proxy) -> None:
     with connected(proxy) as link:
-        assert said(link, b"a") == b"a"
+        assert echoed(link, b"a") == b"a"
         proxy.mute(True)
         before = proxy.carried
         link.sendall(b"late")
@@ -159,18 +159,18 @@ def test_a_muted_server_is_heard_later(proxy: Proxy) -> None:
             link.recv(1)
         proxy.heal()
         link.settimeout(PATIENCE)
-        assert heard(link, 4) == b"late"
+        assert received(link, 4) == b"late"
 
 
 def test_what_is_jammed_comes_after_what_came_later(proxy: Proxy) -> None:
     with connected(proxy) as link:
-        assert said(link, b"a") == b"a"
+        assert echoed(link, b"a") == b"a"
         proxy.jam(True)
         link.sendall(b"late")
         with connected(proxy) as other:
-            assert said(other, b"sooner") == b"sooner"
+            assert echoed(other, b"sooner") == b"sooner"
         proxy.heal()
-        assert heard(link, 4) == b"late"
+        assert received(link, 4) == b"late"
 
 
 def test_what_is_swallowed_never_comes(proxy: Proxy) -> None:
@@ -185,16 +185,16 @@ def test_what_is_swallowed_never_comes(proxy: Proxy) -> None:
         with pytest.raises(ConnectionError):
             assert link.recv(1)
     with connected(proxy) as link:
-        assert said(link, b"a") == b"a"
+        assert echoed(link, b"a") == b"a"
 
 
 def test_half_closed(proxy: Proxy) -> None:
     with connected(proxy) as link:
-        assert said(link, b"a") == b"a"
+        assert echoed(link, b"a") == b"a"
         before = proxy.carried
         proxy.half_close()
         assert link.recv(1) == b""
-        link.sendall(b"still heard")
+        link.sendall(b"still there")
         end = time.monotonic() + PATIENCE
-        while proxy.carried < before + len(b"still heard"):
+        while proxy.carried < before + len(b"still there"):
             assert time.monotonic() < end

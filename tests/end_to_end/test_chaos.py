@@ -1,12 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Everything is killed, the link is spoiled, no keyframe is lost. The long form: `scripts/chaos.py`."""
+"""No keyframe is lost when processes are killed and the network is bad. The long form: `scripts/chaos.py`."""
 
 from pathlib import Path
 
+import pytest
 from chaos_run import run
 
 
-def test_killed_again_and_again_nothing_is_lost(tmp_path: Path) -> None:
-    result = run(2, tmp_path, keyframes=100, kills=6)
+@pytest.mark.parametrize(
+    ("seed", "keyframes", "kills"),
+    [(2, 60, 4), *(pytest.param(seed, 150, 8, marks=pytest.mark.nightly) for seed in range(4))],
+)
+def test_killed_again_and_again_nothing_is_lost(
+    tmp_path: Path, seed: int, keyframes: int, kills: int
+) -> None:
+    result = run(seed, tmp_path, keyframes=keyframes, kills=kills)
     assert not result.problems, result
-    assert sum(result.kills.values()) >= 4, result
+    assert sum(result.kills.values()) >= kills - 2, result

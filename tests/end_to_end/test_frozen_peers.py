@@ -23,7 +23,7 @@ from supervisors import SCANNER
 from tsfusion import Client, Volume, journal
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, ServerUnreachable, TransportError
-from tsfusion.delivery import spool
+from tsfusion.delivery import control_session, spool
 from tsfusion.wire import codec, messages, sockets
 from tsfusion.wire.keyframe_header import VERSION
 from tsfusion.wire.queries import fetch_status
@@ -64,7 +64,7 @@ def stream(client: Client, numbers: range, seconds: float) -> threading.Thread:
 
 
 def outcome(server: Server, keyframes: int, state: Path) -> list[str]:
-    """What is wrong after it has stopped."""
+    """Wait until all are fused, stop the server, and list what is wrong with the journal and the map."""
     until(lambda: fetch_status(server.address).keyframes_fused >= keyframes)
     status = fetch_status(server.address)
     assert server.terminate() == 0
@@ -112,8 +112,8 @@ def test_a_frozen_scanner_holds_nobody_up(tmp_path: Path) -> None:
                 if time.monotonic() > ends:
                     break
         assert scanner.wait(DEADLINE) == 0
-        told = msgspec.json.decode(report.read_bytes(), type=Report)
-        assert (told.fused, told.refused, told.rejected) == (60, {}, {})
+        result = msgspec.json.decode(report.read_bytes(), type=Report)
+        assert (result.fused, result.refused, result.rejected) == (60, {}, {})
         assert outcome(server, i + 1, state) == []
 
 
@@ -151,7 +151,7 @@ def test_a_fuser_that_stands_still_is_replaced(tmp_path: Path) -> None:
 
 
 def test_a_copied_spool_is_one_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its keyframes count once, and who comes with lower numbers is told why they are not taken."""
+    """The keyframes count once; a client with lower numbers learns why they are not taken."""
     monkeypatch.setattr(spool, "_RESTART_SPREAD", 1)  # here: who comes second
     state, spools = tmp_path / "state", [tmp_path / name for name in ("spool", "copy")]
     with Client("tcp://127.0.0.1:1", spool=spools[0]) as client:
@@ -175,7 +175,7 @@ def test_a_copied_spool_is_one_session(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_two_that_share_a_session_at_once_spoil_nothing(tmp_path: Path) -> None:
-    """They go on with numbers of their own; the lower ones are not taken, which is told: nothing is lost."""
+    """Both go on with numbers of their own; lower ones are not taken, which is reported: nothing is lost."""
     state, spools = tmp_path / "state", [tmp_path / name for name in ("spool", "copy")]
     with Client("tcp://127.0.0.1:1", spool=spools[0]) as client:
         client.send(wall(0))
@@ -190,18 +190,18 @@ def test_two_that_share_a_session_at_once_spoil_nothing(tmp_path: Path) -> None:
                 scanner.flush(timeout=2.0)
             scanner.close()
         until(lambda: (status := fetch_status(server.address)).keyframes_fused == status.keyframes_durable)
-        told = fetch_status(server.address)
+        status = fetch_status(server.address)
         assert server.terminate() == 0
     (folder,) = journals(state)
     found = numbers(folder)
     assert found[0] == 0
-    assert len(found) == len(set(found)) == told.keyframes_fused
+    assert len(found) == len(set(found)) == status.keyframes_fused
     kept = {number for folder in spools if journal.segments(folder) for number in numbers(folder)}
     assert {*found, *kept} == set(range(41))
     volume = Volume(voxel_size=VOXEL_SIZE, threads=1)
     for i in found:
         volume.integrate(wall(i))
-    assert volume.map_hash() == told.map_hash
+    assert volume.map_hash() == status.map_hash
 
 
 # --- another version ---
@@ -231,7 +231,7 @@ def test_another_version_is_named(shared: Server) -> None:
 
 
 def test_a_client_of_another_version_says_so(shared: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(codec, "VERSION", VERSION + 1)
+    monkeypatch.setattr(control_session, "VERSION", VERSION + 1)
     with (
         Client(shared.address) as client,
         pytest.raises(ServerUnreachable, match=r"version 1 of the wire format, this client 2"),

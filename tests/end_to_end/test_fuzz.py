@@ -13,14 +13,16 @@ from fuzz_targets import TARGETS
 from tsfusion.wire import codec
 from tsfusion.wire.keyframe_header import Refused
 
-CASES = {"message": 6000, "control": 20_000, "corrections": 3000, "journal": 2000, "checkpoint": 1000}
+CASES = {"message": 3000, "control": 10_000, "corrections": 1500, "journal": 1000, "checkpoint": 500}
+NIGHTLY = 20  # times as many
 _CHECK_BYTES = 1 << 20  # besides the message itself
 
 
+@pytest.mark.parametrize("times", [1, pytest.param(NIGHTLY, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("name", TARGETS)
-def test_only_named_errors_come_out(name: str) -> None:
-    found = fuzz(name, CASES[name], seed=1)
-    assert found.cases == CASES[name]
+def test_only_named_errors_come_out(name: str, times: int) -> None:
+    found = fuzz(name, CASES[name] * times, seed=times)
+    assert found.cases == CASES[name] * times
     assert len(found.outcomes) > 10, found
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a server and a client lack: file descriptors, room on the disk, files that were there before."""
+"""Servers and clients without file descriptors, without room on the disk, without files they had."""
 
 import errno
 import os
@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 import zmq
-from keyframes_and_servers import DEADLINE, Server, alive, connected, serving, until, wall
+from command_processes import alive
+from keyframes_and_servers import DEADLINE, Server, connected, serving, until, wall
 
 from tsfusion import Client, Volume, VolumeConfig, journal
 from tsfusion.core.config import ClientConfig
@@ -62,7 +63,7 @@ def seqs(folder: Path) -> list[int]:
 
 
 def test_a_keyframe_the_disk_refused_does_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its number is used again: found by a later scan, it would stand in the other's place."""
+    """The number is used again; a later scan that found the first keyframe would take it for the second."""
     writer = Journal(tmp_path, 1 << 20)
     writer.append([b"head", b"body"], session=bytes(16), seq=1)
 
@@ -143,24 +144,24 @@ def test_a_client_survives_the_loss_of_its_spool_files(shared: Server, tmp_path:
 @pytest.mark.slow
 def test_a_map_that_outgrows_its_memory_refuses_keyframes_and_lives(tmp_path: Path) -> None:
     """The map has what fitted, exactly; the rest is kept aside, and the fuser does not die of it."""
-    room = Synthetic("room", sensor="kinect", count=12, seed=0)
+    room = Synthetic("room", sensor="kinect", count=8, seed=0)
     fine = VolumeConfig(voxel_size=0.004, threads=1)
     with (
         serving(tmp_path, fine, fuser_memory_bytes=1 << 28) as server,
         Client(server.address, policy="spool_all") as client,
     ):
-        for i in range(12):
+        for i in range(8):
             client.send(room[i])
         client.flush(timeout=DEADLINE)
         client.wait_fused(timeout=DEADLINE)
         health = fetch_health(server.address).maps["default"]
-        assert 0 < client.stats.rejected["memory"] == health.rejected["memory"] == health.quarantined < 12
+        assert 0 < client.stats.rejected["memory"] == health.rejected["memory"] == health.quarantined < 8
         assert health.fuser_restarts == 0
         assert server.terminate() == 0
     saved = Volume.load(tmp_path / "maps/default/map.tsf")
     kept = {int(path.name.split("-")[1]) for path in (tmp_path / "maps/default/quarantine").iterdir()}
     volume = Volume(fine)
-    for i in set(range(12)) - {seq - 1 for seq in kept}:
+    for i in set(range(8)) - {seq - 1 for seq in kept}:
         volume.integrate(room[i])
     assert volume.map_hash() == saved.map_hash()
 

@@ -3,9 +3,11 @@
 
 from pathlib import Path
 
+import pytest
 from soak_run import run
 
 
-def test_files_and_threads_stay_and_memory_is_flat(tmp_path: Path) -> None:
-    outcome = run(tmp_path, keyframes=600)
+@pytest.mark.parametrize("keyframes", [400, pytest.param(3000, marks=pytest.mark.nightly)])
+def test_files_and_threads_stay_and_memory_is_flat(tmp_path: Path, keyframes: int) -> None:
+    outcome = run(tmp_path, keyframes=keyframes)
     assert not outcome.problems, outcome

@@ -106,8 +106,8 @@ FOLDERS = {
 WHOLE = (
     "7scenes",
     "hololens",
-    pytest.param("redwood", marks=pytest.mark.slow),
-    pytest.param("open3d", marks=pytest.mark.slow),
+    pytest.param("redwood", marks=pytest.mark.nightly),
+    pytest.param("open3d", marks=pytest.mark.nightly),
 )
 
 

@@ -95,7 +95,7 @@ def test_a_jpeg_of_a_million_segments_does_not_hold_the_gateway_up() -> None:
     started = time.process_time()
     with pytest.raises(Refused, match="without a frame header"):
         codec.check([head, good[1], evil])
-    assert time.process_time() - started < 0.1
+    assert time.process_time() - started < 0.5  # a millisecond; a loop over the segments takes seconds
 
 
 def test_who_does_not_fetch_a_mesh_gets_no_second_one(shared: Server) -> None:

@@ -99,7 +99,7 @@ def test_any_flipped_bit_in_the_head_of_a_record_costs_at_most_that_record(segme
                 check_flip(segment, at, bit)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_any_flipped_bit_costs_at_most_the_record_it_hit(segment: Segment) -> None:
     for at in range(len(segment.whole)):
         for bit in range(8):

@@ -46,12 +46,12 @@ def settings(section: str) -> dict[str, list[str]]:
 
 @cache
 def help_of(*verb: str) -> str:
-    """What a verb says of itself, wide enough that nothing is cut."""
-    said, handler = io.StringIO(), signal.getsignal(signal.SIGTERM)
-    with patch.dict(os.environ, {"COLUMNS": "400"}), redirect_stdout(said), pytest.raises(SystemExit):
+    """The help of a verb, wide enough that nothing is cut."""
+    text, handler = io.StringIO(), signal.getsignal(signal.SIGTERM)
+    with patch.dict(os.environ, {"COLUMNS": "400"}), redirect_stdout(text), pytest.raises(SystemExit):
         main([*verb, "--help"])
     signal.signal(signal.SIGTERM, handler)
-    return said.getvalue()
+    return text.getvalue()
 
 
 def check_command(words: list[str]) -> None:
@@ -173,7 +173,7 @@ def test_prometheus_understands_its_files(folder: Path, arguments: list[str]) ->
 
 
 def free_port() -> int:
-    """One that nobody listens at."""
+    """A port that nobody listens at."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -205,15 +205,15 @@ def test_a_server_lives_as_its_unit_expects(tmp_path: Path) -> None:
         assert tsfusion("status", "--connect", address).returncode == 0
         fused = 'tsfusion_keyframe_delay_seconds_count{map="default",stage="fuse"} 1.0'
         assert eventually(lambda: fused in get(page, "/metrics")[1])
-        heard = [manager.recv(4096) for _ in range(3)]
-        assert b"WATCHDOG=1" in heard
+        notices = [manager.recv(4096) for _ in range(3)]
+        assert b"WATCHDOG=1" in notices
         process.send_signal(signal.SIGSTOP)
         assert tsfusion("status", "--connect", address, "--timeout", 0.5).returncode == 1
         process.send_signal(signal.SIGCONT)
         assert eventually(lambda: tsfusion("status", "--connect", address).returncode == 0)
         assert end(process) == 0
-        while not (said := manager.recv(4096)).startswith(b"STOPPING=1"):
-            assert said == b"WATCHDOG=1" or said.startswith(b"STATUS="), said
+        while not (notice := manager.recv(4096)).startswith(b"STOPPING=1"):
+            assert notice == b"WATCHDOG=1" or notice.startswith(b"STATUS="), notice
     finally:
         if process.poll() is None:
             os.kill(process.pid, signal.SIGCONT)

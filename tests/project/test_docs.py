@@ -2,6 +2,7 @@
 """The documents name only what exists."""
 
 import re
+import shlex
 from pathlib import Path
 
 import msgspec
@@ -10,7 +11,8 @@ from repository import ROOT
 
 from tsfusion.core.config import ClientConfig, ServerConfig
 
-DOCUMENTS = [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *sorted((ROOT / "docs").rglob("*.md"))]
+ROOT_DOCUMENTS = ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md")
+DOCUMENTS = [*(ROOT / name for name in ROOT_DOCUMENTS), *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
@@ -31,3 +33,19 @@ def test_the_limits_that_are_named_are_settings() -> None:
     named = set(re.findall(r"`(\w+_\w+)`", section))
     assert named
     assert named <= settings
+
+
+def test_the_commands_for_contributors_exist() -> None:
+    names = ("CONTRIBUTING.md", "Makefile", "pyproject.toml")
+    text, makefile, pyproject = ((ROOT / name).read_text(encoding="utf-8") for name in names)
+    targets = re.findall(r"^(\w+):", makefile, re.MULTILINE)
+    markers = re.findall(r'^    "(\w+): ', pyproject, re.MULTILINE)
+    assert set(re.findall(r"make (\w+)", text)) <= set(targets)
+    assert set(re.findall(r"marked `(\w+)`", text)) == set(markers) == {"slow", "nightly"}
+    for path in re.findall(r"`([\w.]*/[\w./]+)`|\]\(([\w./]+)\)", text):
+        assert (ROOT / "".join(path)).exists() or path[0] == "dist/", path
+    blocks = re.findall(r"^```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    commands = [shlex.split(line, comments=True) for line in "".join(blocks).splitlines()]
+    assert len(commands) >= 8
+    for word in (word for command in commands for word in command if word.startswith(("tests/", "scripts/"))):
+        assert (ROOT / word).exists(), word

@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from repository import ROOT
+from repository import ROOT, TESTS
 
 PACKAGE = ROOT / "tsfusion"
 
@@ -113,6 +113,14 @@ def test_architecture_shows_every_wing() -> None:
     text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
     shown = set(re.findall(r"^  (\w+)(?:/|\.py) ", text, re.MULTILINE))
     assert shown >= {one for wings in ROWS for one in wings} - {"__main__"}
+
+
+def test_tests_lie_where_their_wing_says() -> None:
+    folders = {path.parent for path in TESTS.rglob("test_*.py")}
+    others = {TESTS / name for name in ("end_to_end", "project")}
+    assert others <= folders
+    for folder in folders - others:
+        assert (PACKAGE / folder.relative_to(TESTS)).is_dir(), f"{folder} is the folder of no wing"
 
 
 @pytest.mark.parametrize("name", INSIDE)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What `import tsfusion` offers."""
+"""The names that `import tsfusion` offers."""
 
 import inspect
 import subprocess

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the README shows is run: its Python as it stands, its commands as far as they need no data."""
+"""The README's Python is run as it stands, its commands as far as they need no data."""
 
 import re
 import shlex

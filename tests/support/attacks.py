@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What strangers might do to a server, for some seconds, in a process of its own; bounded, loopback only.
+"""Attacks of strangers on a server, each some seconds long in a process of its own; bounded, loopback only.
 
 python tests/support/attacks.py NAME DATA CONTROL PUBLISH SERVER_KEY SECONDS
 
@@ -39,7 +39,7 @@ _PAUSE = 0.002  # between hostile messages: they shall be checked, not only queu
 
 
 class Target(msgspec.Struct, frozen=True):
-    """Where, and until when."""
+    """The server under attack, and when to stop."""
 
     data: str
     control: str
@@ -116,10 +116,10 @@ def wrong_corrections(target: Target) -> int:
         if push.poll(1000, zmq.POLLOUT):
             push.send_multipart(keyframe)
         for revision in itertools.count(1):
-            said = hostile_corrections(session, revision)
+            attacks = hostile_corrections(session, revision)
             content = huge if revision % 10 == 0 else huge.up_to(20)
-            said.append(("good", "", corrections.pack(dataclasses.replace(content, revision=revision))))
-            for _, _, frames in said:
+            attacks.append(("good", "", corrections.pack(dataclasses.replace(content, revision=revision))))
+            for _, _, frames in attacks:
                 if target.over or not link.poll(1000, zmq.POLLOUT):
                     return sent
                 link.send_multipart(frames)
@@ -177,7 +177,7 @@ def mesh_flood(target: Target) -> int:
 
 
 def tiny(target: Target) -> int:
-    """As many small messages as go through, on both ports."""
+    """Small messages on both ports, as many as go through."""
     sent = 0
     with connected(sockets.push, target.data) as push, connected(sockets.dealer, target.control) as link:
         while not target.over and sent < 2_000_000:
@@ -307,7 +307,7 @@ def half_open(target: Target) -> int:
 
 def slow_loris(target: Target) -> int:
     """A byte now and then, for ever."""
-    said = 0
+    sent = 0
     with ExitStack() as stack:
         links = []
         for address in (target.data, target.control, target.publish):
@@ -320,9 +320,9 @@ def slow_loris(target: Target) -> int:
             for link in links:
                 with contextlib.suppress(OSError):
                     link.send(bytes([byte]))
-                    said += 1
+                    sent += 1
             time.sleep(min(1.0, max(target.end - time.monotonic(), 0)))
-    return said
+    return sent
 
 
 ATTACKS: dict[str, Callable[[Target], int]] = {

@@ -52,7 +52,7 @@ class Proxy:
         self._run(self._listen())
 
     def target(self, data: str | None, control: str | None = None) -> None:
-        """Where the server is from now on; None = nowhere: connections are closed at once."""
+        """Lead to this server from now on; None: close connections at once."""
         ports = [None if one is None else int(one.rpartition(":")[2]) for one in (data, control)]
         self._upstream = dict(zip(self._ports, ports, strict=True))
 
@@ -206,7 +206,7 @@ class Proxy:
     async def _pump(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *ways: asyncio.Event
     ) -> None:
-        """One way of one connection, to its end."""
+        """Carry one direction of a connection until it ends."""
         while chunk := await reader.read(_CHUNK):
             await asyncio.sleep(self._wait(len(chunk)))
             for way in ways:

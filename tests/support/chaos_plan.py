@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What goes wrong in a chaos run, and when: drawn from its seed."""
+"""The plan of a chaos run, drawn from its seed: which process is killed when, and what the network does."""
 
 import random
 from typing import Literal
@@ -37,13 +37,13 @@ class Fault(Struct, frozen=True):
 
 
 def on_scanners(rng: random.Random, keyframes: int, kills: int) -> list[Attack]:
-    """While they send, whatever becomes of the server meanwhile."""
+    """Attacks on scanners while they send, whatever becomes of the server meanwhile."""
     moments = sorted(rng.randrange(keyframes) for _ in range(kills))
     return [Attack("scanner", at, False, rng.uniform(0.0, 0.3)) for at in moments]
 
 
 def on_server(rng: random.Random, keyframes: int, kills: int) -> list[Attack]:
-    """Gateway and fuser: mostly in full flow, sometimes while what was killed before is on its way up."""
+    """Attacks on gateway and fuser: mostly in full flow, sometimes while a killed one starts again."""
     kinds: list[Kind] = ["server" if i % 2 else "fuser" for i in range(kills)]
     rng.shuffle(kinds)
     moments = sorted(rng.randrange(keyframes) for _ in kinds)
@@ -58,7 +58,7 @@ def on_server(rng: random.Random, keyframes: int, kills: int) -> list[Attack]:
 
 
 def fault(rng: random.Random) -> Fault:
-    """Something that networks do."""
+    """A fault that networks have."""
     what = rng.choice(
         ["cut", "half_close", "refuse", "throttle", "delay", "freeze", "swallow", "mute", *3 * ["jam"]]
     )

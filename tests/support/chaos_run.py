@@ -43,7 +43,7 @@ class Kill(Struct, frozen=True):
 
 
 class Result(Struct, kw_only=True):
-    """One seed's outcome. `problems` is empty when every promise was kept."""
+    """Result of one seed. `problems` is empty when every promise was kept."""
 
     seed: int
     keys: bool
@@ -65,7 +65,7 @@ class Result(Struct, kw_only=True):
 
 
 class Weather:
-    """One fault after the other, in a thread of its own."""
+    """Faults of the network, one after the other, in a thread."""
 
     def __init__(self, rng: random.Random, proxy: Proxy) -> None:
         self.faults: list[str] = []
@@ -85,7 +85,7 @@ class Weather:
             self._over.wait(one.pause)
 
     def end(self) -> None:
-        """A good network from here on."""
+        """Stop the faults; the network is good from here on."""
         self._over.set()
         self._thread.join()
 
@@ -110,25 +110,25 @@ class Watch:
 
     @property
     def duplicates(self) -> int:
-        """Of all servers so far."""
+        """Keyframes that all servers so far knew already."""
         return sum(duplicates for duplicates, _ in self._seen.values())
 
     @property
     def refused(self) -> dict[str, int]:
-        """Of all servers so far, by reason."""
+        """Messages that all servers so far refused, by reason."""
         found = Counter[str]()
         for _, refused in self._seen.values():
             found.update(refused)
         return dict(found)
 
     def end(self) -> None:
-        """What it has seen stays."""
+        """Stop asking; the counts stay."""
         self._over.set()
         self._thread.join()
 
 
 class Killer:
-    """Works through attacks, and notes what it did. Call `work` in any thread."""
+    """Carries out attacks and notes them. Call `work` in any thread."""
 
     def __init__(self, daemon: Daemon, scanners: list[Scanner], proxy: Proxy, started: float) -> None:
         self.kills: list[Kill] = []
@@ -138,7 +138,7 @@ class Killer:
         self._started = started
 
     def work(self, attacks: list[Attack]) -> None:
-        """One after the other."""
+        """Carry out the attacks one after the other."""
         for number, attack in enumerate(attacks):
             scanner = self._scanners[number % len(self._scanners)]
             until(lambda attack=attack, scanner=scanner: self._is_time(attack, scanner), PATIENCE)
@@ -160,7 +160,7 @@ class Killer:
         return journaled(self._daemon.state) >= attack.keyframes and (self._daemon.ready or not attack.ready)
 
     def _kill(self, kind: Kind, scanner: Scanner) -> bool:
-        """Whether there was somebody to kill."""
+        """Kill a process; False when it has ended before."""
         if kind == "server":
             self._daemon.kill()
         elif kind == "fuser":
@@ -209,7 +209,7 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
         status = _status(daemon, keys)
         problems += [] if status else ["the server says nothing of itself"]
         if not problems and (code := daemon.stop()):
-            problems.append(f"the server ended with status {code} when told to")
+            problems.append(f"the server ended with status {code} after SIGTERM")
     seconds = time.monotonic() - started
     if len(killer.kills) < kills - 2:  # a scanner that has finished cannot be killed
         problems.append(f"only {len(killer.kills)} of {kills} were killed")
@@ -252,7 +252,7 @@ def _bytes(state: Path) -> int:
 
 
 def journaled(state: Path) -> int:
-    """About how many keyframes the journal has: looked at often, so by its size."""
+    """Number of keyframes in the journal, estimated from its size because it is asked often."""
     with contextlib.suppress(OSError):
         return _bytes(state) // _keyframe_bytes()
     return 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Clients without a server, and spools they fill."""
+"""Clients of a scripted server or of none, and keyframes for them."""
 
 from keyframes_and_servers import wall
 from scripted_server import ScriptedServer
@@ -16,5 +16,5 @@ def joined(server: ScriptedServer, **settings: object) -> Client:
 
 
 def send_all(client: Client, numbers: range) -> list[int]:
-    """Which of them were taken."""
+    """Send these walls; the numbers of those that the client took."""
     return [i for i in numbers if client.send(wall(i)) is not None]

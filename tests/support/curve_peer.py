@@ -88,13 +88,13 @@ class Peer:
 
     @property
     def taken(self) -> bool:
-        """Whether the server said READY."""
+        """Finish the handshake; False unless the server answers READY."""
         if not self.answered:
             return False
         return self._receive(self.answered[1])[1:6] == b"READY"
 
     def send(self, text: bytes) -> None:
-        """One message of one frame."""
+        """Send a message of one frame."""
         number = self._next()
         box = _shut(b"\0" + text, b"CurveZMQMESSAGEC" + number, self._server_once, self._secret_once)
         self._socket.sendall(b"\x00" + bytes([16 + len(box)]) + b"\x07MESSAGE" + number + box)

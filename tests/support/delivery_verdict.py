@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What must be true of journal, map and counts in the end: `wire.wall`s 0 to n - 1, each once."""
+"""Check journal, map and counts after a run: walls 0 to n - 1, each once."""
 
 import functools
 from pathlib import Path
@@ -32,7 +32,7 @@ def client_problems(report: Report) -> list[str]:
 
 
 def verify(state: Path, keyframes: int, map_hash: str) -> list[str]:
-    """What is wrong with the files and the map that a stopped server left; empty = nothing."""
+    """List what is wrong with the files and the map that a stopped server left."""
     problems = []
     last: dict[bytes, tuple[int, int]] = {}
     found = []
@@ -70,7 +70,7 @@ def _map_problems(state: Path, keyframes: int, map_hash: str) -> list[str]:
 
 @functools.cache
 def undisturbed_hash(keyframes: int) -> str:
-    """Of the map that nothing happened to."""
+    """Hash of the map of an undisturbed run."""
     from tsfusion import Volume
 
     volume = Volume(voxel_size=VOXEL_SIZE, threads=1)

@@ -17,7 +17,7 @@ Answer = Callable[[Command], Reply | None]
 
 
 def status(**fields: Any) -> Status:
-    """What a fuser says of a map that is well."""
+    """The report of a fuser whose map is well."""
     return Status(**{
         "epoch": "abc", "map": "default", "state": "state/maps/default", "fuser": "idle", "uptime_s": 3.0,
         "keyframes_durable": 6, "keyframes_fused": 5, "keyframes_rejected": {}, "messages_refused": {},

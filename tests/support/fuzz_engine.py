@@ -16,7 +16,7 @@ _MAX_CORPUS = 4096
 
 
 class Found(Struct, kw_only=True):
-    """What a run of our own engine came to."""
+    """Result of a run of our own engine."""
 
     cases: int
     seconds: float

@@ -79,7 +79,7 @@ def value(old: Any, rng: random.Random) -> Any:
 
 
 def tree(content: Any, rng: random.Random) -> Any:
-    """One change somewhere in a tree of lists and dicts."""
+    """Change one place in a tree of lists and dicts."""
     if isinstance(content, dict) and content:
         return _dict(dict(content), rng)
     if isinstance(content, list) and content:
@@ -127,7 +127,7 @@ def msgpack(content: bytes, rng: random.Random, corpus: Sequence[bytes]) -> byte
 
 
 def join(frames: Sequence[bytes]) -> bytes:
-    """One string of a message's frames."""
+    """Join the frames of a message into one string of bytes."""
     return b"".join(struct.pack("<I", len(frame)) + frame for frame in frames)
 
 
@@ -176,7 +176,7 @@ def _shuffled(frames: list[bytes], rng: random.Random) -> list[bytes]:
 
 
 def repaired(frames: list[bytes]) -> list[bytes]:
-    """With lengths and CRCs in the header that are true, so that what is behind them gets looked at."""
+    """Correct the lengths and CRCs in the header, so that the checks behind them are reached."""
     try:
         header = msgspec.msgpack.decode(frames[0][4:])
         for buffer, frame in zip(header["buffers"], frames[1:], strict=False):

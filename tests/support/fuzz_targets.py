@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What strangers' bytes and damaged files reach, as functions of bytes: only the named errors may come out.
+"""Code that strangers' bytes and damaged files reach, as functions of bytes; only named errors come out.
 
 A case that is wrong in another way raises `Broken`.
 """
@@ -289,7 +289,7 @@ def run_corrections(content: bytes) -> str:
     head, *frames = corrections.pack(one)
     again = messages.decode_to_server(head)
     if not isinstance(again, Corrections) or corrections.unpack(again, frames).without(one):
-        raise Broken("it is not said again as it was")
+        raise Broken("it does not encode to the same bytes again")
     return f"good {min(len(one), 3)} {one.T_map_odometry is None}"
 
 

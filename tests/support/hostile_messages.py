@@ -115,7 +115,7 @@ def hostile_corrections(session: bytes, revision: int = 1) -> list[tuple[str, st
     fields, body = msgspec.msgpack.decode(good[0]), good[1]
 
     def changed(content: bytes = body, **changes: Any) -> Frames:
-        """With a true checksum."""
+        """Encode a message whose checksum is right."""
         said = {**fields, "crc32": zlib.crc32(content), **changes}
         return [msgspec.msgpack.encode(said), *([content] if content else [])]
 

@@ -32,7 +32,7 @@ _MORE_FILES = 30  # of maps that were opened meanwhile
 
 
 class Phase(Struct, kw_only=True):
-    """An attack (or none) and what it did to the others."""
+    """An attack (or none) and its effect on the others."""
 
     attack: str
     hostile: int  # messages, connections or bytes of it
@@ -71,7 +71,7 @@ class Rss:
                     self._highest[at] = max(self._highest[at], *map(rss_bytes, pids), 0)
 
     def highest(self) -> list[int]:
-        """Of gateway and fuser, bytes."""
+        """Highest RSS of gateway and fuser since the last call, bytes."""
         found, self._highest = self._highest, [0, 0]
         return found
 
@@ -81,7 +81,7 @@ class Rss:
 
 
 def rss_bytes(pid: int) -> int:
-    """What a process holds now; 0 when it is gone."""
+    """RSS of a process; 0 when it has ended."""
     with contextlib.suppress(OSError):
         for line in Path(f"/proc/{pid}/status").read_text().splitlines():
             if line.startswith("VmRSS:"):
@@ -116,7 +116,7 @@ def run(
         if scanner.wait(PATIENCE):
             problems.append("the well-behaved scanner did not see everything fused")
         if server.process.poll() is not None:
-            problems.append(f"the server died: {server.said()[-1000:]}")
+            problems.append(f"the server died: {server.stderr_text()[-1000:]}")
             return Outcome(problems=problems, phases=[], keyframes=0, refused={}, rejected={})
         with contextlib.suppress(AssertionError):  # who never greets is cut off after five seconds
             until(lambda: _files(server) <= files + _MORE_FILES, 15.0)
@@ -218,7 +218,7 @@ def _phase(span: _Span, times: list[KeyframeTimes]) -> Phase:
 
 
 def table(outcome: Outcome) -> str:
-    """For a person: one line an attack."""
+    """Table for people, one line an attack."""
     head = ("attack", "hostile", "durable p50", "p95 ms", "fused p50", "p95 ms", "gateway MB", "fuser MB")
     rows = [head]
     for one in outcome.phases:

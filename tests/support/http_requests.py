@@ -23,7 +23,7 @@ def get(
 
 
 def raw(address: str, sent: bytes) -> bytes:
-    """Everything that comes back until the other end closes."""
+    """Read until the other end closes."""
     host, _, port = address.rpartition(":")
     with socket.create_connection((host, int(port)), timeout=DEADLINE) as link:
         link.sendall(sent)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Keyframes and server processes for the tests of the wire."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -64,14 +63,14 @@ def until(reached: Callable[[], bool], deadline: float = DEADLINE) -> None:
 
 
 class Secured(NamedTuple):
-    """What makes a server ask for keys, and a client show them."""
+    """Settings with which a server asks for keys and a client has them."""
 
     server: dict[str, str]  # settings
     client: dict[str, str]
 
     @property
     def keys(self) -> ClientKeys | None:
-        """For who asks questions."""
+        """Keys of whoever asks the server questions."""
         return client_keys(self.client.get("key"), self.client.get("server_key"))
 
 
@@ -121,7 +120,7 @@ class Server:
             self.wait_ready()
 
     def wait_ready(self) -> bool:
-        """Wait until it has said where it listens; False when it ended instead."""
+        """Wait until it prints where it listens; False when it ended instead."""
         assert self.process.stdout is not None
         self.address, self.control, self.publish = (self.process.stdout.readline().split() or [""] * 3)[:3]
         return bool(self.address)
@@ -136,14 +135,14 @@ class Server:
         self.process.kill()
         self.process.wait(DEADLINE)
 
-    def said(self) -> str:
-        """Its last words, once it has ended."""
+    def stderr_text(self) -> str:
+        """Text of its stderr, once it has ended."""
         self.process.wait(DEADLINE)
         self._words.seek(0)
         return self._words.read().strip()
 
     def close(self) -> None:
-        """End it, if need be, and let go of its files."""
+        """End it, if need be, and close its files."""
         if self.process.poll() is None:
             self.kill()
         assert self.process.stdout is not None
@@ -164,28 +163,19 @@ class Server:
 
 @contextmanager
 def serving(state: Path, volume: VolumeConfig | None = None, **settings: Any) -> Iterator[Server]:
-    """A ready server, gone afterwards whatever happens."""
+    """Start a server, and end it afterwards whatever happens."""
     server = Server(state, volume, **settings)
     try:
         if not server.address:
-            raise RuntimeError(server.said())
+            raise RuntimeError(server.stderr_text())
         yield server
     finally:
         server.close()
 
 
-def alive(pid: int) -> bool:
-    """Whether a process runs (a zombie does not)."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return Path(f"/proc/{pid}/stat").read_text().split(")")[1].split()[0] != "Z"
-
-
 @contextmanager
 def connected(kind: Callable[..., sockets.AnySocket], address: str) -> Iterator[sockets.AnySocket]:
-    """A socket of this kind at an address, gone afterwards."""
+    """Connect a socket of this kind, and close it afterwards."""
     context: zmq.Context[Any] = zmq.Context()
     made = kind(context)
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where things lie in a checkout."""
+"""Folders of a checkout."""
 
 from pathlib import Path
 

@@ -136,7 +136,7 @@ def kitti_raw(root: Path, *, count: int = 3, cameras: tuple[str, ...] = ("00", "
 
 
 def scans(poses: list[NDArray[np.float64]]) -> list[NDArray[np.float32]]:
-    """What a spinning LiDAR without noise would see of the room from some poses."""
+    """Scans of the room as a spinning LiDAR without noise sees it from some poses."""
     axes = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])  # of camera and LiDAR
     world = dataclasses.replace(worlds.room(), paths={"given": lambda index, _: poses[index] @ inverse(axes)})
     made = Synthetic(world, "lidar", count=len(poses), noise=False, color=False)

@@ -27,7 +27,7 @@ LOST = 3  # exit status
 
 
 class Plan(Struct, kw_only=True):
-    """What a scanner is to do.
+    """Orders for a scanner process.
 
     Attributes:
         address, control: of the server.
@@ -60,7 +60,7 @@ class Plan(Struct, kw_only=True):
 
 
 class Report(Struct, kw_only=True):
-    """How it went, in the life that saw the end."""
+    """Counts of the process that saw everything fused."""
 
     sent: int
     durable: int
@@ -133,9 +133,9 @@ def unsent(plan: Plan) -> range:
     for folder in journals(Path(plan.state)):
         taken.update(numbers(folder))
     taken &= set(own)
-    said = {int(line) for line in _lines(plan.log)}
-    if said - taken or taken != set(own[: len(taken)]):
-        sys.stderr.write(f"taken {sorted(taken)}, but said {sorted(said)}\n")
+    logged = {int(line) for line in _lines(plan.log)}
+    if logged - taken or taken != set(own[: len(taken)]):
+        sys.stderr.write(f"taken {sorted(taken)}, but logged {sorted(logged)}\n")
         sys.exit(LOST)
     return own[len(taken) :]
 

@@ -24,7 +24,7 @@ def number(header: KeyframeHeader) -> int:
 
 @dataclass
 class Session:
-    """How far one client's stream is."""
+    """Progress of one client's stream."""
 
     key: bytes
     durable: int = 0

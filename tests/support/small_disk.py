@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A program with a small disk of its own, which really fills up."""
+"""Python with a small disk of its own, which really fills up."""
 
 import subprocess
 import sys
@@ -11,9 +11,9 @@ _MOUNT = 'mount -t tmpfs -o "size=$1" none "$2" && shift 2 && exec "$@"'
 
 
 def run(folder: Path, size: str, code: str) -> str:
-    """What Python prints that has a file system of `size` at `folder` (its only argument) to itself.
+    """Run `code` where a file system of `size` is mounted at `folder`, its only argument; what it prints.
 
-    Skips the test where that is not allowed.
+    Skip the test where that is not allowed.
     """
     folder.mkdir(exist_ok=True)
     shell = ["unshare", "--mount", "sh", "-c", _MOUNT, "sh", size, str(folder)]

@@ -31,7 +31,7 @@ TOLERANCE_MB = 16.0  # of RSS, from a third of the way to the end
 
 
 class Process(Struct, frozen=True):
-    """One process at one moment."""
+    """Memory, files and threads of a process at one moment."""
 
     rss_mb: float
     files: int
@@ -58,7 +58,7 @@ class Outcome(Struct, kw_only=True):
 
 
 def run(folder: Path, keyframes: int, *, tolerance_mb: float = TOLERANCE_MB) -> Outcome:
-    """As fast as the map takes them, with a viewer, and somebody who asks how it goes."""
+    """Send keyframes as fast as the map takes them, beside a viewer and somebody who asks for the status."""
     room = folder / "room.npz"
     save_room(room, VIEWS, WIDTH)
     settings = {"checkpoint_every": 200, "segment_bytes": 4 << 20, "quota_keyframes": 1e6}
@@ -174,7 +174,7 @@ def _problems(samples: list[Sample], keyframes: int, tolerance_mb: float) -> lis
 
 
 def table(outcome: Outcome, rows: int = 12) -> str:
-    """For a person: every so many samples."""
+    """Table for people: every so many samples."""
     lines = [
         f"{'s':>7}{'fused':>8}{'blocks':>8}"
         + "".join(f"{name:>10} MB  fd thr" for name in ("gateway", "fuser", "client"))

@@ -46,7 +46,7 @@ class Daemon:
             if self._ended:
                 return
             if not self._killed:
-                self.exits.append(self.server.said()[-500:])
+                self.exits.append(self.server.stderr_text()[-500:])
             self._killed = False
             self.server.close()
             self.server = self._start()
@@ -120,23 +120,23 @@ class Scanner:
 
     @property
     def taken(self) -> int:
-        """How many keyframes it said it took, in all its lives."""
+        """Number of keyframes that all its processes logged as taken."""
         assert self.plan.log is not None
         log = Path(self.plan.log)
         return len(log.read_bytes().split()) if log.exists() else 0
 
     @property
     def finished(self) -> bool:
-        """Whether there will be no more of it."""
+        """True once it will not be started again."""
         return self._done.is_set()
 
     def wait(self) -> None:
-        """Until everything is fused, or something is wrong."""
+        """Wait until everything is fused or something is wrong."""
         if not self._done.wait(PATIENCE):
             self.problem = f"not everything was fused in {PATIENCE:.0f} s"
 
     def report(self) -> Report:
-        """Of the life that saw the end."""
+        """Report of the process that saw everything fused."""
         assert self.plan.report is not None
         return msgspec.json.decode(Path(self.plan.report).read_bytes(), type=Report)
 

@@ -22,7 +22,7 @@ STEPS = 40  # keyframes of the circle that the views are the first of
 
 
 def at(poses: list[NDArray[np.float64]], *, width: int = 160) -> list[Keyframe]:
-    """What a Kinect without noise would see of the room from some poses."""
+    """Images of the room as a Kinect without noise sees it from some poses."""
     world = dataclasses.replace(worlds.room(), paths={"given": lambda index, _: poses[index]})
     return list(Synthetic(world, "kinect", count=len(poses), noise=False, width=width))
 
@@ -137,7 +137,7 @@ def replica(root: Path, count: int = 4) -> Path:
 
 
 def through_lens(image: NDArray[np.generic], pinhole: Intrinsics, camera: Camera) -> NDArray[np.generic]:
-    """What a camera with a distorted lens sees in the pinhole camera's place; 0 beyond its image."""
+    """Image of a camera with a distorted lens in the pinhole camera's place; 0 beyond its edge."""
     v, u = np.mgrid[: camera.size[0], : camera.size[1]]
     rays = camera.rays(np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64))
     columns, rows = (

@@ -33,6 +33,7 @@ from tsfusion.wire.keyframe_header import Refused
 
 _TAICHI_RESERVES = 2 << 30  # bytes that Taichi asks for and hardly uses
 _KEPT_FREE = 256 << 20  # bytes that keyframes leave to meshes and checkpoints
+_FOR_A_CHECKPOINT = 64 << 20  # bytes beyond the limit: meshes may have taken what was kept free
 _REFINED_AT_ONCE = 256  # blocks: about 50 ms
 _REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
 
@@ -182,7 +183,9 @@ class Fuser:
     def _checkpoint(self) -> bool:
         written = False
         if self._since_checkpoint:
+            process.limit_memory(self._most + _FOR_A_CHECKPOINT)
             written = self._map.save()
+            process.limit_memory(self._most)
             self._since_checkpoint = 0 if written else 1
         self._send(fuser_messages.Saved(written))
         return not self._since_checkpoint

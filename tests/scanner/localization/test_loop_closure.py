@@ -110,7 +110,7 @@ def test_rooms_all_alike_are_not_one_room():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("identical", [True, False])
+@pytest.mark.parametrize("identical", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_the_way_back_closes_each_room_with_itself(identical):
     dataset = Synthetic(loop_worlds.rooms(identical=identical), count=150, path="return")
     run = Run([dataset.frame(index) for index in range(150)])
@@ -120,7 +120,7 @@ def test_the_way_back_closes_each_room_with_itself(identical):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.nightly)])
 def test_a_real_kitchen_gives_no_wrong_loop(data, seed):
     dataset = open_dataset(data("7scenes/redkitchen"))
     run = Run([frame_of(dataset, index) for index in range(len(dataset))], seed)

@@ -128,7 +128,7 @@ WRITER = """
 def test_a_slow_untidy_writer(tmp_path: Path) -> None:
     command = [sys.executable, "-c", textwrap.dedent(WRITER), str(tmp_path)]
     begun = time.monotonic_ns()
-    source: Source = open_source(f"folder:{tmp_path}", deadline=1.0)
+    source: Source = open_source(f"folder:{tmp_path}", deadline=1.0, idle=60.0)
     frames = []
     with subprocess.Popen(command, cwd=Path(__file__).parent) as writer, source:
         for frame in source:

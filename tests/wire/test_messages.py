@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: MIT
+"""Control messages keep their bytes, and wrong ones raise one error."""
+
+import msgspec
+import pytest
+
+from tsfusion.core.errors import DecodeError
+from tsfusion.wire import messages
+from tsfusion.wire.keyframe_times import Stamps
+from tsfusion.wire.messages import Ack, Denied, Hello, Hold, Nack, Ping, Pong, Welcome
+
+SESSION = bytes(range(16))
+
+
+def test_control_messages_keep_their_bytes() -> None:
+    """As others implement them: a change here is a new wire version."""
+    key = "000102030405060708090a0b0c0d0e0f"
+    golden = (
+        (Hello(SESSION, 1), f"83a474797065a568656c6c6fa773657373696f6ec410{key}a776657273696f6e01"),
+        (
+            Hello(SESSION, 1, map="yard"),
+            f"84a474797065a568656c6c6fa773657373696f6ec410{key}a776657273696f6e01a36d6170a479617264",
+        ),
+        (Ping(b"", 5), "83a474797065a470696e67a773657373696f6ec400a773656e745f6e7305"),
+    )
+    for message, stored in golden:
+        assert messages.encode(message).hex() == stored
+        assert messages.decode_to_server(bytes.fromhex(stored)) == message
+    for answer in (
+        Welcome("e", 1, 3, 2, 8, 1, 1),
+        Ack(SESSION, 3, 2, (Stamps(3, 1, 2, 3, 4, 5),), resend=True),
+        Denied(SESSION, "map", "no room"),
+        Hold(SESSION, 1.5, "disk", "full"),
+        Nack(SESSION, 3, "door", "crc", "damaged"),
+        Pong("e", 1, 2, 3),
+    ):
+        assert messages.decode_to_client(messages.encode(answer)) == answer
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        *(b"", b"\xc1", b"\x80", b"hello", b"\x91" * 500, b"\xa5\xff\xff\xff\xff\xff"),
+        msgspec.msgpack.encode({"type": "hello", "session": b"short", "version": 1}),
+        msgspec.msgpack.encode({"type": "shutdown"}),
+    ],
+)
+def test_bad_control_messages_raise_one_error(frame: bytes) -> None:
+    with pytest.raises(DecodeError):
+        messages.decode_to_server(frame)
+    with pytest.raises(DecodeError):
+        messages.decode_to_client(frame)
