@@ -12,9 +12,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from keyframes_and_servers import alive, serving, until, wall
 from command_processes import alive
-from keyframes_and_servers import DEADLINE, serving, until, wall
+from keyframes_and_servers import alive, serving, until, wall
 
 import tsfusion
 from tsfusion import VolumeConfig
