@@ -186,7 +186,9 @@ folder = Path(sys.argv[1])
 def save(blocks):
     keys = np.arange(blocks, dtype=np.int64)
     sums = np.random.default_rng(0).integers(0, 1 << 40, (blocks, 512))
-    header = checkpoint.Header(config=VolumeConfig(), keyframes=blocks, map_hash="", layers=["sums"], meta={})
+    header = checkpoint.CheckpointHeader(
+        config=VolumeConfig(), keyframes=blocks, map_hash="", layers=["sums"], meta={}
+    )
     checkpoint.write(folder / "map.tsf", header, keys, keys, {"sums": sums})
 save(100)
 before = (folder / "map.tsf").read_bytes()

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Laws of the map: it is a sum, whatever the order, the threads or the history."""
 
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,7 +12,6 @@ import kernel_twins
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from repository import SUPPORT
 
 from tsfusion import Keyframe, Volume
 from tsfusion.core.errors import InvalidConfig, MapError, MapFull, WeightOverflow
@@ -58,19 +58,18 @@ def test_any_order_gives_the_same_hash(regularizer: str) -> None:
 
 
 def test_one_thread_gives_the_hash_of_two() -> None:
-    here = SUPPORT
     script = (
-        "import scenes; from tsfusion import Volume\n"
+        "import formula_scenes; from tsfusion import Volume\n"
         "for regularizer in ('off', 'ray'):\n"
         "    v = Volume(voxel_size=0.02, threads={}, regularizer=regularizer)\n"
-        "    [v.integrate(k) for k in scenes.sphere_views(0.4, 4)]\n"
+        "    [v.integrate(k) for k in formula_scenes.sphere_views(0.4, 4)]\n"
         "    layers = v._store.layers().values()\n"
         "    print(v.map_hash(), v.color_hash(), [hash(layer.tobytes()) for layer in layers])\n"
     )
     found = {
         subprocess.run(
             [sys.executable, "-c", script.format(threads)],
-            cwd=here, env={"PYTHONPATH": str(here), "PYTHONHASHSEED": "0"},
+            env={"PYTHONPATH": os.pathsep.join(sys.path), "PYTHONHASHSEED": "0"},
             capture_output=True, text=True, check=True, timeout=120,
         ).stdout
         for threads in (1, 2)
@@ -377,23 +376,22 @@ def test_memory_grows_without_losing_a_bit() -> None:
 def test_kernels_stay_in_bounds(tmp_path: Path) -> None:
     """Taichi's debug mode checks every array access; it needs a process of its own."""
     script = (
-        "import numpy as np, scenes\n"
+        "import numpy as np, formula_scenes\n"
         "from tsfusion.kernels import runtime\n"
         "from tsfusion import Volume, Keyframe\n"
         "import taichi as ti\n"
         "ti.init(arch=ti.cpu, debug=True, offline_cache=False, log_level=ti.ERROR)\n"
         "runtime._started_threads = 2\n"
         "v = Volume(voxel_size=0.04, regularizer='ray')\n"
-        "for k in scenes.sphere_views(0.4, 2): v.integrate(k)\n"
+        "for k in formula_scenes.sphere_views(0.4, 2): v.integrate(k)\n"
         "r = np.random.default_rng(0).uniform(-3, 3, (700, 3)).astype(np.float32)\n"
         "v.integrate(Keyframe(points=r, T_world_camera=np.eye(4)))\n"
         "v.retract(Keyframe(points=r, T_world_camera=np.eye(4)))\n"
         "assert len(v.extract_mesh(min_weight=0).faces)\n"
         "assert len(v.extract_mesh(min_weight=0, blocks=v.take_dirty()[::3]).faces)\n"
     )
-    here = SUPPORT
     done = subprocess.run(
-        [sys.executable, "-c", script], cwd=here, env={"PYTHONPATH": str(here)},
+        [sys.executable, "-c", script], env={"PYTHONPATH": os.pathsep.join(sys.path)},
         capture_output=True, text=True, timeout=240, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
