@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from command_processes import alive
+
 from keyframes_and_servers import alive, serving, until, wall
 
 import tsfusion

@@ -25,22 +25,16 @@ from tsfusion.kernels.integrate import (
 )
 from tsfusion.kernels.voxel_traversal import (
     COUNT,
-    CROSSING,
-    DISTANCE,
-    END,
-    INTERVAL,
     LENGTH,
-    LOSS,
     MAX_CROSSED,
     RUN,
     START,
-    VOXEL,
+    advance,
+    begin_walk,
     block_key,
     next_step,
     offset_in_block,
-    ray_vector,
     ray_weight,
-    steps,
     vec3i,
 )
 
@@ -85,6 +79,31 @@ def solve_signal(signal: ti.template(), band, n, smoothness):
         x2, x1 = x1, x
 
 
+@ti.func
+def read_signal(
+    signal: ti.template(),
+    band,
+    i,
+    distance,
+    slot,
+    o,
+    feedback,
+    sums: ti.template(),
+    correction: ti.template(),
+):
+    """Read t, y − t and W of a crossed voxel, element i of a ray's signal. Returns W."""
+    packed = sums[slot, o]
+    w = ti.cast(lane_weight(packed), ti.f32)
+    s = ti.cast(lane_distance(packed), ti.f32)
+    if feedback == 1:
+        s += correction[slot, o]
+    t = ti.cast(distance, ti.f32) * (QUANTA_PER_VOXEL / 65536.0)
+    signal[band, i, 0] = t
+    signal[band, i, 1] = s / w - t
+    signal[band, i, 2] = w
+    return w
+
+
 @ti.kernel
 def smooth_rays(
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
@@ -103,48 +122,33 @@ def smooth_rays(
 ):
     """Gather y along each ray, solve, and add x̂ to `votes` as (Σ x̂ · 16) · 2²⁴ + n."""
     hash_mask = hash_keys.shape[0] - 1
-    for run in range(bands.shape[0] * RUN):
+    for run in range(bands.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN
             last = vec3i(2147483647)
             slot = -1
             for r in range(bands[band, START], bands[band, START] + bands[band, COUNT]):
                 if ray_weight(rays, r) > 0:
-                    voxel = ray_vector(rays, r, VOXEL)
-                    crossing = ray_vector(rays, r, CROSSING)
-                    interval = ray_vector(rays, r, INTERVAL)
-                    loss = ray_vector(rays, r, LOSS)
-                    towards = steps(rays[r, END])
-                    distance = rays[r, DISTANCE]
-                    length = rays[r, LENGTH]
+                    walk = begin_walk(rays, r)
                     n = 0
                     total = ti.f32(0.0)
                     inside = 1
                     while inside == 1 and n < MAX_CROSSED:
-                        block = voxel >> 3
+                        block = walk.voxel >> 3
                         if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
                             last = block
-                            slot = map_find(hash_keys, hash_slots, hash_mask, block_key(voxel))
-                        o = offset_in_block(voxel)
-                        packed = sums[slot, o]
-                        w = ti.cast(lane_weight(packed), ti.f32)
-                        s = ti.cast(lane_distance(packed), ti.f32)
-                        if feedback == 1:
-                            s += correction[slot, o]
-                        t = ti.cast(distance, ti.f32) * (QUANTA_PER_VOXEL / 65536.0)
-                        signal[band, n, 0] = t
-                        signal[band, n, 1] = s / w - t
-                        signal[band, n, 2] = w
+                            slot = map_find(hash_keys, hash_slots, hash_mask, block_key(walk.voxel))
+                        o = offset_in_block(walk.voxel)
+                        total += read_signal(
+                            signal, band, n, walk.distance, slot, o, feedback, sums, correction
+                        )
                         crossed[band, n, 0] = places[slot]
                         crossed[band, n, 1] = o
-                        total += w
                         n += 1
-                        step, next_crossing = next_step(crossing)
-                        if next_crossing >= length:
+                        step, next_crossing = next_step(walk.crossing)
+                        if next_crossing >= rays[r, LENGTH]:
                             inside = 0
-                        crossing += interval & step
-                        voxel += towards & step
-                        distance -= (loss & step).sum()
+                        advance(walk, step)
                     for i in range(n):
                         signal[band, i, 2] = ti.select(weighted == 1, signal[band, i, 2] * n / total, 1.0)
                     if n >= 3:
@@ -166,7 +170,7 @@ def commit_votes(
 ):
     """A voxel's value (Σ w·m + correction) / Σ w becomes the mean that its rays propose; clears `votes`."""
     count = touched[TOUCHED_COUNT]
-    for run in range(count * RUN):
+    for run in range(count * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             i = run // RUN
             slot = touched[TOUCHED_HEADER + i]

@@ -2,15 +2,14 @@
 """Taichi is started once, here, on the thread that will launch kernels."""
 
 import os
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from io import StringIO
-from types import ModuleType
 
 _started_threads: int | None = None
 
 
-def start(threads: int | None = None) -> ModuleType:
-    """Start Taichi's CPU backend (once a process) and return the `taichi` module.
+def start(threads: int | None = None) -> None:
+    """Start Taichi's CPU backend, once a process.
 
     The thread count of the first call stands: a second `ti.init` would tear kernels down. Results never
     depend on it.
@@ -32,15 +31,15 @@ def start(threads: int | None = None) -> ModuleType:
                 offline_cache=True,
                 log_level=ti.ERROR,
             )
-    module: ModuleType = ti
-    return module
 
 
 def _leave_out_source_lines() -> None:
-    """Spare Taichi wrapping the source line of every statement of every kernel, for errors that cannot come.
+    """Keep Taichi from formatting the source position of every statement of every kernel.
 
-    It was a third of the time that the kernels took to load from the cache.
+    Only compile errors show these positions. Formatting them took a third of the time in which kernels load
+    from the cache.
     """
-    from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+    with suppress(ImportError):  # another version of Taichi: its kernels load as slowly as before
+        from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
-    ASTTransformerContext.get_pos_info = lambda _context, _node: ""
+        ASTTransformerContext.get_pos_info = lambda _context, _node: ""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Memory for one keyframe at a time: its rays and what they touch. Reused, never per call."""
+"""Memory for one keyframe at a time: its rays and the blocks they touch. Every keyframe uses it again."""
 
 from typing import Any
 
@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import SensorModel, VolumeConfig
-from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.kernels import ray_smoothing, rays_from_images, rays_from_points
+from tsfusion.geometry.keyframe import Intrinsics, Keyframe
+from tsfusion.kernels import ray_smoothing, rays_from_images, rays_from_points, sensor_noise
 from tsfusion.kernels.integrate import CUBE, TOUCHED_COUNT, TOUCHED_HEADER, TOUCHED_OVERFLOW
 from tsfusion.kernels.voxel_traversal import BAND_FIELDS, MAX_CROSSED, RAY_FIELDS, SAMPLES
 from tsfusion.tsdf.growing_array import GrowingArray
@@ -48,6 +48,7 @@ class RayBuffers:
 
     @property
     def touched_slots(self) -> NDArray[np.int32]:
+        """Slots of the blocks that the current keyframe touches."""
         return self.touched[TOUCHED_HEADER : TOUCHED_HEADER + self.touched[TOUCHED_COUNT]]
 
     def reserve_touched(self, blocks: int) -> None:
@@ -89,17 +90,18 @@ class RayBuffers:
         return int(self.bands[:, SAMPLES].sum())
 
     def take_missing(self) -> NDArray[np.int64]:
-        """Keys of the missing blocks, in an order that only the set decides; it is empty after."""
+        """Keys of the missing blocks, in an order that only the set of them decides. Empties `missing`."""
         keys: NDArray[np.int64] = self.missing[self.missing != 0]
         self.missing[:] = 0
         return keys
 
     def grow_missing(self) -> None:
-        """Double the set after an overflow; it is empty after."""
+        """Double the size of `missing` after an overflow, and empty it."""
         self.missing = np.zeros(2 * len(self.missing), np.int64)
         self.touched[TOUCHED_OVERFLOW] = 0
 
     def reserve_votes(self) -> None:
+        """Make room for the votes of all touched blocks."""
         self._votes.reserve(int(self.touched[TOUCHED_COUNT]))
 
     @property
@@ -121,17 +123,24 @@ def model_parameters(
     outlier_filter: bool = True,
     space_carving: bool = False,
 ) -> NDArray[np.float64]:
-    """The kernel's `model` argument (12 float64, see kernels/rays.py)."""
+    """The sensor model as the kernels read it: (12,) float64, indices in kernels/sensor_noise.py."""
     slope, z0 = model.sigma_slope, model.sigma_z0
     if baseline_fx is not None and model.disparity_sigma > 0:
         slope, z0 = model.disparity_sigma / baseline_fx, 0.0
-    return np.array(
-        [
-            model.sigma_floor, slope, z0, model.min_support, model.max_support, voxel_size,
-            FULL_WEIGHT_SIGMA * voxel_size, model.min_range, model.max_range, outlier_filter,
-            3 * 256 / voxel_size, space_carving,
-        ]
-    )  # fmt: skip
+    parameters = np.empty(sensor_noise.MODEL_FIELDS)
+    parameters[sensor_noise.SIGMA_FLOOR] = model.sigma_floor
+    parameters[sensor_noise.SIGMA_SLOPE] = slope
+    parameters[sensor_noise.SIGMA_Z0] = z0
+    parameters[sensor_noise.LEAST_SUPPORT] = model.min_support
+    parameters[sensor_noise.MOST_SUPPORT] = model.max_support
+    parameters[sensor_noise.VOXEL_SIZE] = voxel_size
+    parameters[sensor_noise.FULL_WEIGHT_SIGMA] = FULL_WEIGHT_SIGMA * voxel_size
+    parameters[sensor_noise.MIN_RANGE] = model.min_range
+    parameters[sensor_noise.MAX_RANGE] = model.max_range
+    parameters[sensor_noise.DROPS_LONE_SAMPLES] = outlier_filter
+    parameters[sensor_noise.SUPPORT_PER_SIGMA] = 3 * 256 / voxel_size
+    parameters[sensor_noise.CARVES_SPACE] = space_carving
+    return parameters
 
 
 def _depth_scale(keyframe: Keyframe) -> float:
@@ -143,7 +152,7 @@ def _depth_scale(keyframe: Keyframe) -> float:
 
 
 def _camera(keyframe: Keyframe, voxel_size: float) -> NDArray[np.float64]:
-    """(4, 3) float64: what a pixel's step right, its step down, pixel (0, 0) and the centre are in voxels."""
+    """(4, 3) float64, voxels: a pixel's step right, its step down, pixel (0, 0), and the camera's centre."""
     K, T = keyframe.intrinsics, keyframe.T_world_camera
     assert K is not None  # checked by Keyframe
     R = T[:3, :3] / voxel_size
@@ -152,4 +161,25 @@ def _camera(keyframe: Keyframe, voxel_size: float) -> NDArray[np.float64]:
 
 
 def _optional(array: NDArray[np.uint8] | None, dims: int) -> tuple[NDArray[Any], int]:
+    """An array that a kernel can be handed, and whether it holds anything."""
     return (_NOTHING[dims], 0) if array is None else (array, 1)
+
+
+def keyframes_of_every_kind(model: SensorModel, voxel_size: float) -> list[Keyframe]:
+    """Keyframes of 16×16 samples within the sensor's range, one for each way through `make_rays`."""
+    near = max(model.min_range * 1.5, 4 * voxel_size)
+    pose, camera = np.eye(4), Intrinsics(20.0, 20.0, 8.0, 8.0)
+    color = np.zeros((16, 16, 3), np.uint8)
+    metres = np.full((16, 16), near, np.float32)
+    units = np.full((16, 16), 1000, np.uint16)
+    rays = np.dstack(
+        [*np.meshgrid(np.linspace(-0.4, 0.4, 16), np.linspace(-0.4, 0.4, 16)), np.ones((16, 16))]
+    )
+    points = (rays * near).reshape(-1, 3).astype(np.float32)
+    return [
+        Keyframe(depth=metres, intrinsics=camera, T_world_camera=pose, color=color),
+        Keyframe(depth=units, depth_scale=near / 1000, intrinsics=camera, T_world_camera=pose),
+        Keyframe(disparity=units, disparity_scale=1 / 16, baseline_fx=near * 1000 / 16,
+                 intrinsics=camera, T_world_camera=pose),
+        Keyframe(points=points, T_world_camera=pose, color=color.reshape(-1, 3)),
+    ]  # fmt: skip
