@@ -12,7 +12,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-
 from keyframes_and_servers import alive, serving, until, wall
 
 import tsfusion
