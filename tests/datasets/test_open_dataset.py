@@ -114,7 +114,7 @@ def test_several_datasets_in_a_folder_are_named(tmp_path):
 
 
 def test_an_option_of_another_layout_is_refused(tmp_path):
-    with pytest.raises(DatasetError, match=r"^a 7-Scenes dataset takes no `sequence`$"):
+    with pytest.raises(DatasetError, match=r"^a 7-Scenes dataset takes no `sequence`; it takes .*posed"):
         open_dataset(seven_scenes(tmp_path), sequence="06")
 
 

@@ -5,12 +5,14 @@ Another package adds one by an entry point in the group `tsfusion.datasets` that
 before those here.
 """
 
-import inspect
 import logging
 from collections.abc import Callable, Iterable
+from functools import partial
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
+from tsfusion.core import plugins
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import Dataset
 from tsfusion.datasets.download import archives
@@ -27,16 +29,11 @@ from tsfusion.datasets.formats import (
     tum,
 )
 from tsfusion.datasets.rosbag import dataset as rosbag_dataset
-from tsfusion.geometry.keyframe import Intrinsics
 
 GROUP = "tsfusion.datasets"
 
 _log = logging.getLogger(__name__)
 _MAC = "__MACOSX"  # what macOS puts into archives beside the recording
-_TYPES = {
-    bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path",
-    Intrinsics: "four numbers, [fx, fy, cx, cy]",
-}  # fmt: skip
 _INDEX = (".txt", ".json", ".yaml", ".csv", ".freiburg")  # a file of these is taken for its folder
 
 
@@ -74,7 +71,7 @@ class Found(NamedTuple):
         Raises:
             DatasetError: naming what was found wrong, or an option that the layout does not have.
         """
-        return opened(self.layout.name, self.layout.open, (self.path,), options)
+        return open_as(self.layout.name, partial(self.layout.open, self.path), options)
 
 
 # The first that fits is taken: the more specific stand first.
@@ -144,44 +141,18 @@ def find(path: str | Path, *, unpack: bool = False) -> Found:
     return found[0]
 
 
-def opened(
-    name: str, opener: Callable[..., Dataset], places: tuple[Path, ...], options: dict[str, Any]
-) -> Dataset:
-    """Call an opener with the options it has: `posed` is dropped where it has none, `poses` may be its
-    `trajectory`; another it does not have is a DatasetError, and one that is None is left out."""
-    options = {key: value for key, value in options.items() if value is not None}
-    known = list(inspect.signature(opener).parameters)[len(places) :]
-    if "posed" not in known:
-        options.pop("posed", None)
-    if "poses" not in known and "trajectory" in known and "poses" in options:
-        options["trajectory"] = options.pop("poses")
-    unknown = sorted(set(options) - set(known))
-    if unknown:
-        raise DatasetError(f"a {name} dataset takes no `{unknown[0]}`")
-    parameters = inspect.signature(opener).parameters
-    given = {key: _typed(key, value, parameters[key].annotation) for key, value in options.items()}
-    return opener(*places, **given)
-
-
-def _typed(key: str, value: Any, annotation: Any) -> Any:
-    """An option as its parameter wants it: a number may be a name, four numbers may be intrinsics.
+def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) -> Dataset:
+    """Call a layout's opener; where it takes no `posed` all have poses, and `poses` may be its `trajectory`.
 
     Raises:
-        DatasetError: it cannot be that; a parameter whose type is none of `_TYPES` takes anything.
+        DatasetError: an option that it does not take, or of the wrong type.
     """
-    wanted = [kind for kind in get_args(annotation) or (annotation,) if kind is not type(None)]
-    if not all(kind in _TYPES for kind in wanted):
-        return value
-    if isinstance(value, tuple(wanted)) and isinstance(value, bool) == (bool in wanted):
-        return value
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        if float in wanted:
-            return float(value)
-        if str in wanted:
-            return str(value)
-    if Intrinsics in wanted and isinstance(value, list | tuple) and len(value) == 4:
-        return Intrinsics(*value)
-    raise DatasetError(f"`{key}` must be {_TYPES[wanted[0]]}, got {value!r}")
+    options = dict(options)
+    if not plugins.takes(opener, "posed"):
+        options.pop("posed", None)
+    if not plugins.takes(opener, "poses") and plugins.takes(opener, "trajectory") and "poses" in options:
+        options["trajectory"] = options.pop("poses")
+    return plugins.call(opener, options, name=f"a {name} dataset", error=DatasetError)
 
 
 def describe(dataset: Dataset) -> str:
@@ -237,16 +208,12 @@ def _recognises(layout: Layout, place: Path) -> bool:
 
 
 def _plugins() -> list[Layout]:
-    from importlib.metadata import entry_points
-
     found = []
     for point in entry_points(group=GROUP):
         try:
-            name, description, recognises, opener = point.load()
-        except Exception as error:  # noqa: BLE001 - another package's code
-            _log.warning("the dataset layout %s = %s cannot be used: %r", point.name, point.value, error)
-        else:
-            found.append(Layout(name, description, recognises, opener))
+            found.append(Layout(*plugins.load(point, DatasetError)))
+        except (DatasetError, TypeError) as error:
+            _log.warning("the dataset layout %s is left out: %s", point.name, error)
     return found
 
 
