@@ -22,7 +22,7 @@ from tsfusion.cli import replay
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.rosbag.dataset import Bag, recognises
-from tsfusion.datasets.rosbag.transforms import Samples
+from tsfusion.datasets.rosbag.transforms import PoseSamples
 from tsfusion.geometry import se3
 from tsfusion.geometry.calibration import Camera, Rectifier, StereoRig, Undistorter
 from tsfusion.geometry.depth_registration import Registration
@@ -595,7 +595,7 @@ def test_a_pose_topic_that_was_named_goes_before_the_transforms(tmp_path: Path) 
         for i in range(12):
             bag.transform(pose(i), WORLD, OPTICAL, T0 + i * 100_000_000)
     check_turning(Bag(path, pose_topic="/odom", body_frame=OPTICAL), after=np.eye(4))
-    with pytest.raises(DatasetError, match="tells poses of 'base_link', and no transforms lead from there"):
+    with pytest.raises(DatasetError, match="holds poses of 'base_link', and no transforms lead from there"):
         Bag(path, pose_topic="/odom")
     with pytest.raises(DatasetError, match=r"no topic of poses.*nav_msgs/Odometry, 12"):
         Bag(path, pose_topic="/nowhere")
@@ -604,7 +604,7 @@ def test_a_pose_topic_that_was_named_goes_before_the_transforms(tmp_path: Path) 
 def test_poses_that_cannot_be_told_are_one_clear_error(tmp_path: Path) -> None:
     with writing(tmp_path, "mcap") as (bag, path):
         moments(bag)
-    with pytest.raises(DatasetError, match="tells no poses of 'camera_color_optical_frame'"):
+    with pytest.raises(DatasetError, match="has no poses of 'camera_color_optical_frame'"):
         Bag(path)
     assert len(Bag(path, posed=False)) == 10
     with writing(tmp_path / "two", "ros1") as (bag, path):
@@ -612,7 +612,7 @@ def test_poses_that_cannot_be_told_are_one_clear_error(tmp_path: Path) -> None:
         for topic in ("/one", "/two"):
             odometry(bag, topic)
         bag.transform(T_BODY_OPTICAL, BODY, OPTICAL, T0, static=True)
-    with pytest.raises(DatasetError, match=r"several topics tell poses \(/one, /two\)"):
+    with pytest.raises(DatasetError, match=r"several topics hold poses \(/one, /two\)"):
         Bag(path)
 
 
@@ -842,7 +842,7 @@ def test_without_rosbags_the_error_names_the_command(tmp_path: Path, monkeypatch
 def test_poses_of_a_long_recording_stay_small() -> None:
     """A robot with thirty joints tells millions of transforms an hour."""
     q, t = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0), SimpleNamespace(x=1.0, y=2.0, z=3.0)
-    samples = Samples()
+    samples = PoseSamples()
     tracemalloc.start()
     try:
         for stamp in range(10_000):

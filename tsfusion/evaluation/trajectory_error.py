@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, pose_of
+from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, nearest_in_time, pose_of
 from tsfusion.datasets.readers import read_lines
 from tsfusion.datasets.trajectory_files import read_kitti, read_log, read_tum
 from tsfusion.geometry.trajectory import rigid
@@ -111,10 +111,7 @@ def associate(
     """
     swapped = len(first_ns) > len(second_ns)
     few, many = (second_ns, first_ns) if swapped else (first_ns, second_ns)
-    right = np.clip(np.searchsorted(many, few), 1, max(len(many) - 1, 1))
-    right = np.minimum(right, len(many) - 1)
-    left = np.maximum(right - 1, 0)
-    nearest = np.where(np.abs(many[left] - few) <= np.abs(many[right] - few), left, right)
+    nearest = nearest_in_time(many, few)
     kept = np.flatnonzero(np.abs(many[nearest] - few) <= max_difference_ns)
     if not len(kept):
         raise DatasetError(

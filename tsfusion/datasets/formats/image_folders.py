@@ -75,7 +75,7 @@ class DepthImages(Frames):
         return read_color(color, depth.shape)
 
 
-def seen_by(
+def resample_for_camera(
     color: NDArray[np.uint8], own: Intrinsics, other: Intrinsics, shape: tuple[int, ...]
 ) -> NDArray[np.uint8]:
     """An image resampled for another camera in the same place: (h, w, 3) uint8 → (*shape, 3).
@@ -124,7 +124,7 @@ def read_open3d_camera(path: Path) -> Intrinsics:
         ) from error
 
 
-def matched(depth: list[Path], where: Path, expected: str) -> list[Path]:
+def color_images(depth: list[Path], where: Path, expected: str) -> list[Path]:
     """The colour image of each depth image, by file name."""
     by_stem = {path.stem: path for path in images(where, expected)}
     for image in depth:
@@ -135,7 +135,7 @@ def matched(depth: list[Path], where: Path, expected: str) -> list[Path]:
     return [by_stem[image.stem] for image in depth]
 
 
-def by_number(files: list[Path], poses: list[tuple[int, Pose]], source: Path) -> list[Pose | None]:
+def poses_by_number(files: list[Path], poses: list[tuple[int, Pose]], source: Path) -> list[Pose | None]:
     """Each image's pose: the k-th one's where there are as many, else by the number that is its name."""
     if len(files) == len(poses):
         return [pose for _, pose in poses]

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
-from tsfusion.datasets.dataset import Frames, kept, require_frames
-from tsfusion.datasets.formats.image_folders import seen_by
+from tsfusion.datasets.dataset import Frames, keep_posed, require_frames
+from tsfusion.datasets.formats.image_folders import resample_for_camera
 from tsfusion.datasets.readers import read_color, read_image
 from tsfusion.geometry.calibration import Camera, Undistorter
 from tsfusion.geometry.frame import Frame
@@ -94,7 +94,7 @@ class Nerfstudio(Frames):
             )
         if len(views) < len(capture["frames"]):
             self.skipped["without depth"] = len(capture["frames"]) - len(views)
-        self._views, self._poses = kept(views, poses, posed=posed, skipped=self.skipped)
+        self._views, self._poses = keep_posed(views, poses, posed=posed, skipped=self.skipped)
         require_frames(len(self._views), file, EXPECTED, self.skipped)
         self._undistorters: dict[Camera, Undistorter] = {}
 
@@ -110,7 +110,7 @@ class Nerfstudio(Frames):
         fitted = _resized(camera, depth.shape[:2], view.where)
         if color is not None and color.shape != (*depth.shape, 3):
             own = _resized(camera, color.shape[:2], view.where)
-            color = seen_by(color, own.intrinsics, fitted.intrinsics, depth.shape)
+            color = resample_for_camera(color, own.intrinsics, fitted.intrinsics, depth.shape)
         intrinsics = fitted.intrinsics
         if fitted.model != "pinhole":
             undistorter = self._undistorter(fitted)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import SCAN, folder, kept, require_frames
+from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
 from tsfusion.datasets.formats.image_folders import DepthImages
 from tsfusion.datasets.formats.tum_lists import ASSOCIATIONS, read_recording
 from tsfusion.datasets.readers import checked_intrinsics, read_depth, read_intrinsics
@@ -95,7 +95,7 @@ class TUM(DepthImages):
         color: bool = True,
         posed: bool = True,
     ) -> None:
-        root = folder(path, "TUM RGB-D")
+        root = require_folder(path, "TUM RGB-D")
         listed = read_recording(root, max_difference_ns=round(max_difference_s * 1e9))
         camera = _camera(root, listed.windows)
         skipped: dict[str, int] = {}
@@ -105,7 +105,7 @@ class TUM(DepthImages):
             max_gap_ns=round(max_gap_s * 1e9),
             offset_ns=round(time_offset_s * 1e9),
         )
-        chosen, poses = kept(
+        chosen, poses = keep_posed(
             range(len(poses)), poses, posed=posed, skipped=skipped, reason="without a pose in time"
         )
         require_frames(len(chosen), root, EXPECTED, skipped)
