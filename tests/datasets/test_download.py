@@ -27,7 +27,7 @@ from tsfusion.datasets import open_dataset
 from tsfusion.datasets.download import archives
 from tsfusion.datasets.download import http as download_http
 from tsfusion.datasets.download.catalogue import CATALOGUE, File, PublicRecording, entry
-from tsfusion.datasets.download.download import Fetched, check, fetch
+from tsfusion.datasets.download.download import FetchedRecording, check, fetch
 
 pytest.importorskip("pooch")
 
@@ -169,7 +169,7 @@ def test_what_is_there_is_not_fetched_again(server: Server, tmp_path: Path) -> N
     (second,) = fetch(recording, tmp_path, silent).files
     assert (second.known, second.fetched, second.sha256) == (True, False, sha256())
     (tmp_path / "file.bin").unlink()  # the unpacked one is enough
-    assert fetch(recording, tmp_path, silent) == Fetched(tmp_path / "one", [])
+    assert fetch(recording, tmp_path, silent) == FetchedRecording(tmp_path / "one", [])
     assert len(server.asked) == 1
 
 

@@ -256,7 +256,7 @@ def test_other_packages_bring_layouts(tmp_path, caplog):
 def test_another_packages_fault_is_not_ours(tmp_path, caplog):
     seven_scenes(tmp_path / "cursed")
     assert open_dataset(tmp_path / "cursed").name == "7-Scenes cursed"
-    assert "the layout Theirs failed to look at" in caplog.text
+    assert "the layout Theirs failed on" in caplog.text
 
 
 def test_no_layout_fails_on_any_file_or_folder(tmp_path):

@@ -9,7 +9,7 @@ from tsfusion import Intrinsics, Keyframe, Mesh
 from tsfusion.datasets import Synthetic
 from tsfusion.datasets.synthetic import benchmark_worlds, worlds
 from tsfusion.evaluation import surface_error
-from tsfusion.evaluation.known_surfaces import ReferenceSurface, Solid, edges_of, measure
+from tsfusion.evaluation.known_surfaces import ReferenceSurface, WorldSurface, edges_of, measure
 from tsfusion.evaluation.view_prediction import compare_views, depth_metres, points_world, predicted_depth
 
 VOXEL = 0.02
@@ -87,7 +87,7 @@ def test_one_point_a_cell_whatever_the_sign() -> None:
 @pytest.mark.parametrize("offset", [0.004, -0.004])
 def test_a_sphere_too_large_or_too_small_is_off_by_just_that(offset: float) -> None:
     shape = trimesh.creation.icosphere(5, 0.5 + offset)
-    truth = Solid(ball(0.5), trimesh.creation.icosphere(5, 0.5).vertices)
+    truth = WorldSurface(ball(0.5), trimesh.creation.icosphere(5, 0.5).vertices)
     found = measure(as_mesh(shape), truth, VOXEL)
     assert found["accuracy_mm"] == pytest.approx({"mean": 4, "rmse": 4, "p95": 4}, abs=1e-3)
     assert (found["precision"], found["completeness"], found["f_score"]) == (100, 100, 100)
@@ -97,7 +97,7 @@ def test_a_sphere_too_large_or_too_small_is_off_by_just_that(offset: float) -> N
 
 def test_half_a_surface_is_half_complete_and_fully_precise() -> None:
     shape = trimesh.creation.icosphere(6, 0.5)
-    truth = Solid(ball(0.5), shape.vertices)
+    truth = WorldSurface(ball(0.5), shape.vertices)
     shape.update_vertices(shape.vertices[:, 2] >= 0)
     found = measure(as_mesh(shape), truth, VOXEL)
     assert found["precision"] == 100
@@ -111,7 +111,7 @@ def test_a_normal_tilted_by_ten_degrees_is_ten_degrees_off() -> None:
     points = np.random.default_rng(0).uniform(-1, 1, (50, 3)) * (1, 1, 0)
     tilted = np.tile((np.sin(np.radians(10)), 0, np.cos(np.radians(10))), (50, 1))
     mesh = Mesh(points.astype(np.float32), np.zeros((0, 3), np.int32), tilted.astype(np.float32))
-    assert measure(mesh, Solid(world, points), VOXEL)["normal_deg"] == pytest.approx(
+    assert measure(mesh, WorldSurface(world, points), VOXEL)["normal_deg"] == pytest.approx(
         {"median": 10, "mean": 10}, abs=1e-3
     )
 
@@ -128,7 +128,7 @@ def test_edge_error_counts_what_is_near_an_edge() -> None:
     corner = edges[0, 0] + np.sign(edges[0, 0] - (1, 2, 3)) * (0, 0, 0.006)  # 6 mm above or below it
     points = np.vstack([top, corner]).astype(np.float32)
     mesh = Mesh(points, np.zeros((0, 3), np.int32), np.tile(np.float32((0, 0, 1)), (3, 1)))
-    assert measure(mesh, Solid(world, top), VOXEL)["edge_mm"] == pytest.approx(6, abs=0.01)
+    assert measure(mesh, WorldSurface(world, top), VOXEL)["edge_mm"] == pytest.approx(6, abs=0.01)
 
 
 def test_edges_inside_another_solid_are_none() -> None:
@@ -144,7 +144,7 @@ def test_edges_inside_another_solid_are_none() -> None:
 
 def test_an_empty_mesh_is_measured_too() -> None:
     nothing = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
-    found = measure(nothing, Solid(ball(0.5), trimesh.creation.icosphere(3, 0.5).vertices), VOXEL)
+    found = measure(nothing, WorldSurface(ball(0.5), trimesh.creation.icosphere(3, 0.5).vertices), VOXEL)
     assert found["vertices"] == found["completeness"] == 0
     assert found["accuracy_mm"]["mean"] is None
     assert found["f_score"] is None
@@ -165,13 +165,13 @@ def test_a_reference_mesh_measures_to_its_triangles() -> None:
 )
 def test_column_by_column_is_as_all_at_once(world: worlds.World) -> None:
     points = np.random.default_rng(1).uniform((-8, -8, -0.5), (25, 8, 6), (4000, 3))
-    truth = Solid(world, points[:1], edges=False)
+    truth = WorldSurface(world, points[:1], edges=False)
     assert (truth.distance(points) == world.distance(points)).all()
 
 
 def test_seen_points_are_moved_onto_the_surface() -> None:
     rough = trimesh.creation.icosphere(3, 0.512).vertices
-    assert np.linalg.norm(Solid(ball(0.5), rough).seen, axis=1) == pytest.approx(0.5, abs=1e-6)
+    assert np.linalg.norm(WorldSurface(ball(0.5), rough).seen, axis=1) == pytest.approx(0.5, abs=1e-6)
 
 
 @pytest.mark.parametrize(("world", "path"), [

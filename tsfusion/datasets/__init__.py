@@ -52,7 +52,7 @@ _SYNTHETIC = "synthetic:"
 
 
 def open_dataset(path: str | Path, /, *, unpack: bool = False, **options: Any) -> Dataset:
-    """Find out what a path is and open it.
+    """Open a recording of any layout, or a synthetic world.
 
     Args:
         path: a folder in one of `layouts()`, one that holds exactly one such, a file that stands for a
@@ -63,7 +63,7 @@ def open_dataset(path: str | Path, /, *, unpack: bool = False, **options: Any) -
             …); those that are None are left out.
 
     Raises:
-        DatasetError: naming what was found wrong or, for an unknown layout, what would have been recognised.
+        DatasetError: the files are wrong, or the layout is unknown; the message says what was expected.
     """
     if not str(path).startswith(_SYNTHETIC):
         return find(path, unpack=unpack).open(**options)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Which layouts there are, and which one a path is in.
+"""The known layouts of recordings, and the one that a path is in.
 
-Another package adds one by an entry point in the group `tsfusion.datasets` that names a `Layout`; it is asked
-before those here.
+Another package adds a layout by an entry point in the group `tsfusion.datasets` that names a `Layout`; it is
+tried before the built-in ones.
 """
 
 import logging
@@ -38,12 +38,12 @@ _INDEX = (".txt", ".json", ".yaml", ".csv", ".freiburg")  # a file of these is t
 
 
 class Layout(NamedTuple):
-    """A way recordings lie on disk.
+    """A way in which recordings are stored on the disk.
 
     Attributes:
-        name: as reports call it.
-        description: what is expected, one line.
-        recognises: whether a folder or a file is in this layout; quick, reads no images, raises nothing.
+        name: for reports.
+        description: the expected files, in one line.
+        recognises: True if a folder or file is in this layout; quick, reads no images, raises nothing.
         open: `open(path, **options)` → a dataset; takes `posed` where frames may lack a pose.
     """
 
@@ -54,10 +54,10 @@ class Layout(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What `find` made of a path.
+    """Result of `find`.
 
     Attributes:
-        path: the folder or file to open: the one given, or the only dataset in it.
+        path: the folder or file to open: the given one, or the only dataset in it.
         also: names of less specific layouts that fit too.
     """
 
@@ -66,15 +66,15 @@ class Found(NamedTuple):
     also: tuple[str, ...]
 
     def open(self, **options: Any) -> Dataset:
-        """The dataset; options that are None are left out.
+        """Open the dataset; options that are None are left out.
 
         Raises:
-            DatasetError: naming what was found wrong, or an option that the layout does not have.
+            DatasetError: the files are wrong, or an option that the layout does not have.
         """
         return open_as(self.layout.name, partial(self.layout.open, self.path), options)
 
 
-# The first that fits is taken: the more specific stand first.
+# In the order in which they are tried: specific layouts first.
 BUILT_IN = (
     Layout("EuRoC", euroc.EXPECTED, euroc.recognises, euroc.EuRoC),
     Layout("KITTI odometry", kitti.EXPECTED, kitti.recognises, kitti.open_kitti),
@@ -91,7 +91,7 @@ BUILT_IN = (
            redwood_hololens.Redwood),
     Layout("ROS bag", rosbag_dataset.EXPECTED, rosbag_dataset.recognises, rosbag_dataset.Bag),
 )  # fmt: skip
-# Asked where none of those fits.
+# Tried where no other layout fits.
 PLAIN = (
     Layout(
         "RGB-D folders",
@@ -108,18 +108,18 @@ SYNTHETIC = (
 
 
 def layouts() -> list[Layout]:
-    """Every layout there is, in the order in which they are asked."""
+    """Every layout, in the order in which they are tried."""
     return [*_plugins(), *BUILT_IN, *PLAIN]
 
 
 def find(path: str | Path, *, unpack: bool = False) -> Found:
-    """What a path is: a dataset's folder, a folder that holds exactly one, or a file that stands for one.
+    """Find the dataset at a path: its folder, a folder that holds exactly one, or a file that stands for it.
 
     Args:
-        unpack: an archive is unpacked beside itself; else that is refused, with the command to type.
+        unpack: unpack an archive beside itself; otherwise the error names the command that does.
 
     Raises:
-        DatasetError: naming the path and what would have been recognised.
+        DatasetError: nothing or more than one dataset found; the message says what was expected.
     """
     root = Path(path).expanduser()
     if not root.exists():
@@ -142,7 +142,7 @@ def find(path: str | Path, *, unpack: bool = False) -> Found:
 
 
 def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) -> Dataset:
-    """Call a layout's opener; where it takes no `posed` all have poses, and `poses` may be its `trajectory`.
+    """Call a layout's opener; it may lack the option `posed`, and call the option `poses` `trajectory`.
 
     Raises:
         DatasetError: an option that it does not take, or of the wrong type.
@@ -156,7 +156,7 @@ def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) 
 
 
 def describe(dataset: Dataset) -> str:
-    """One line: how many frames of what, their size, rate, and how many have a pose; reads one frame."""
+    """One line: number and kind of frames, size, rate, how many have a pose. Reads one frame."""
     from tsfusion.datasets.dataset import frame_of, pose_of
 
     first = frame_of(dataset, 0)
@@ -203,7 +203,7 @@ def _recognises(layout: Layout, place: Path) -> bool:
     try:
         return layout.recognises(place)
     except Exception as error:  # noqa: BLE001 - another package's code
-        _log.warning("the layout %s failed to look at %s: %r", layout.name, place, error)
+        _log.warning("the layout %s failed on %s: %r", layout.name, place, error)
         return False
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Recordings as they are downloaded: archives, unpacked beside themselves."""
+"""Unpack archives of recordings beside themselves, safely."""
 
 import errno
 import lzma
@@ -31,7 +31,7 @@ def destination(path: Path) -> Path:
 
 
 def command(path: Path) -> str:
-    """What to type to unpack it there."""
+    """The shell command that unpacks an archive to `destination`."""
     into = destination(path)
     if path.suffix.lower() == ".zip":
         return f"unzip -q '{path}' -d '{into}'"
@@ -59,10 +59,10 @@ def unpack(path: Path) -> Path:
 
 
 def extract(path: Path, into: Path, *, nested: bool = False) -> None:
-    """Unpack into a folder, which should be an empty one: what was unpacked stays when the rest fails.
+    """Unpack into an empty folder. What was unpacked stays there when the rest fails.
 
     Args:
-        nested: zip files that come out are unpacked where they are, and removed.
+        nested: unpack zip files inside too, and remove them.
 
     Raises:
         DatasetError: when it is broken, or a member is a link or leads out of the folder.
@@ -109,7 +109,7 @@ def _extract_zip(path: Path, into: Path) -> None:
 
 
 def _require_room(nbytes: int, into: Path) -> None:
-    """Raise OSError where what is to be unpacked, as the archive says, would fill the disk."""
+    """Raise OSError if `nbytes` more would fill the disk."""
     free = durable_files.free_bytes(into)
     if nbytes + _RESERVE_BYTES > free:
         raise OSError(

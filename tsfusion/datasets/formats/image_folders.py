@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Depth images in one folder, colour images of the same names in another: common to many layouts."""
+"""Base of layouts with depth images in one folder and colour images in another."""
 
 import json
 from collections.abc import Sequence
@@ -21,12 +21,12 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 class DepthImages(Frames):
-    """A depth image a frame, with colour and a pose where there are any.
+    """Frames of one depth image each, with colour and a pose where they are recorded.
 
     Args:
         depth: files of 16-bit depth.
-        color: as many, None where there is no colour; or an empty list.
-        poses: as many.
+        color: as many files, None where there is no colour; or an empty list.
+        poses: as many (4, 4), None where there is no pose.
         depth_scale: metres per unit.
     """
 
@@ -78,9 +78,9 @@ class DepthImages(Frames):
 def resample_for_camera(
     color: NDArray[np.uint8], own: Intrinsics, other: Intrinsics, shape: tuple[int, ...]
 ) -> NDArray[np.uint8]:
-    """An image resampled for another camera in the same place: (h, w, 3) uint8 → (*shape, 3).
+    """Resample an image for another camera in the same place: (h, w, 3) uint8 → (*shape, 3).
 
-    Shrinking averages; beyond the image its border is repeated.
+    Averages pixels where it shrinks; repeats the border beyond the image.
     """
     factor = other.fx / own.fx
     if factor < 1:
@@ -106,7 +106,7 @@ def resample_for_camera(
 
 
 def images(where: Path, expected: str, pattern: str = "[!.]*") -> list[Path]:
-    """The images in a folder: by number where all names are numbers, else by name; no hidden ones (macOS)."""
+    """The images in a folder, sorted by number if all names are numbers, else by name; no hidden files."""
     if not where.is_dir():
         raise DatasetError(f"{where} is missing; expected {expected}")
     found = sorted(path for path in where.glob(pattern) if path.suffix.lower() in SUFFIXES)
@@ -136,7 +136,7 @@ def color_images(depth: list[Path], where: Path, expected: str) -> list[Path]:
 
 
 def poses_by_number(files: list[Path], poses: list[tuple[int, Pose]], source: Path) -> list[Pose | None]:
-    """Each image's pose: the k-th one's where there are as many, else by the number that is its name."""
+    """The pose of each image: the k-th pose if the numbers are equal, else the one numbered as the file."""
     if len(files) == len(poses):
         return [pose for _, pose in poses]
     if not _numbered(files):

@@ -50,7 +50,7 @@ def open_kitti(
 
 
 class KITTIFrames(Frames):
-    """Stereo pairs or Velodyne scans of the KITTI car, by frame number."""
+    """Base of both KITTI layouts: stereo pairs or Velodyne scans by frame number."""
 
     intrinsics: Intrinsics | None
     baseline_fx: float | None
@@ -83,7 +83,7 @@ class KITTIFrames(Frames):
         )
 
     def _color(self, number: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W, 3) uint8 BGR of the left camera: here the grey image."""
+        """(H, W, 3) uint8 BGR of the left camera: the grey image, three times."""
         return np.repeat(left[:, :, None], 3, axis=2)
 
 
@@ -209,9 +209,8 @@ def read_calibration(path: Path, wanted: dict[str, int]) -> Mapping[str, NDArray
     for name, count in wanted.items():
         values = found.get(name)
         if values is None or len(values) != count or not np.isfinite(values).all():
-            state = "no" if values is None else f"no usable ({len(values)} numbers)"
             raise DatasetError(
-                f"{path} has {state} line {name}; expected `{name}:` and {count} finite numbers"
+                f"{path} has no usable line {name}; expected `{name}:` and {count} finite numbers"
             )
     return found
 

@@ -25,7 +25,7 @@ CALIBRATED_SIZE = (480, 640)  # height, width of the cameras below
 
 @dataclass(frozen=True)
 class _Camera:
-    """Cameras of published recordings, told by the folder's name."""
+    """Camera of a published recording, found by the folder's name."""
 
     name: str
     folder: str  # regular expression, searched in the last two folder names

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Lists of time-stamped images in text files, as TUM's tools write them, and matching them by time."""
+"""Text lists of time-stamped images, as TUM's tools write them, matched by time."""
 
 from pathlib import Path, PureWindowsPath
 from typing import NamedTuple
@@ -19,9 +19,9 @@ class ImageList(NamedTuple):
     """Images of a recording in time order.
 
     Attributes:
-        timestamps_ns: of the depth images.
-        depth: their files.
-        color: as many, None where there is none near in time; empty where the recording has no colour.
+        timestamps_ns: nanoseconds of each depth image.
+        depth: files of the depth images.
+        color: as many files, None where none is near in time; empty where the recording has no colour.
         windows: whether the paths were Windows paths.
     """
 
