@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a path is: found out and said; archives, files, other packages' layouts, frames without poses."""
+"""The layout of a path: found and reported; files, other packages' layouts, frames without poses."""
 
 import json
 import logging
@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 import written_recordings
-from small_recordings import corbs, hololens, kitti, redwood, seven_scenes
+from small_recordings import hololens, kitti, redwood, seven_scenes
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import Dataset, Selection, describe, find, layouts, open_dataset, select
@@ -112,70 +112,6 @@ def test_kitti_poses_may_end_early(tmp_path):
 
 def test_worlds_have_all_poses(tmp_path):
     assert open_dataset("synthetic:room", posed=False, count=2).pose(1) is not None
-
-
-def corbs_zip(root: Path) -> Path:
-    """The archive as its authors' Windows packs it: backslashes inside, the trajectory in one of its own."""
-    place = corbs(root / "unpacked")
-    archive = root / "D1_pre_registereddata.zip"
-    with zipfile.ZipFile(archive, "w") as packed:
-        for path in sorted(place.rglob("*")):
-            if path.is_file():
-                packed.write(
-                    path, "D1_pre_registereddata\\" + str(path.relative_to(place)).replace("/", "\\")
-                )
-    shutil.move(root / "unpacked" / "D1_Trajectory", root / "D1_Trajectory")
-    shutil.rmtree(root / "unpacked")
-    return archive
-
-
-def test_a_corbs_archive_is_unpacked_when_asked_to(tmp_path):
-    archive = corbs_zip(tmp_path)
-    with pytest.raises(
-        DatasetError, match=r"\.zip is an archive; unpack it with: unzip -q '.*\.zip' -d '.*'"
-    ):
-        open_dataset(archive)
-    dataset = open_dataset(archive, unpack=True)
-    assert dataset.name == "CoRBS D1_pre_registereddata"
-    assert (len(dataset), dataset.skipped, dataset.uncolored) == (4, {"without a pose in time": 1}, 1)
-    assert describe(dataset).endswith("all with poses, 1 without colour in time")
-    assert float(dataset[1].depth[0, 0] * dataset[1].depth_scale) == pytest.approx(2)
-    assert dataset[1].T_world_camera[0, 3] == pytest.approx(1.8)
-    assert len(open_dataset(archive)) == 4  # its folder is there now
-    assert not list(tmp_path.glob(".unpacking-*"))
-
-
-@pytest.mark.parametrize("suffix", [".tar.gz", ".tgz", ".tar"])
-def test_other_archives_are_unpacked_too(tmp_path, suffix):
-    seven_scenes(tmp_path / "in" / "chess")
-    kind = {".tar.gz": "gztar", ".tgz": "gztar", ".tar": "tar"}[suffix]
-    made = Path(shutil.make_archive(str(tmp_path / "chess-made"), kind, tmp_path / "in"))
-    archive = made.rename(tmp_path / f"chess{suffix}")
-    with pytest.raises(
-        DatasetError, match=r"unpack it with: mkdir '.*chess' && tar -xf '.*' -C '.*chess', then"
-    ):
-        find(archive)
-    assert find(archive, unpack=True).path == tmp_path / "chess" / "chess"
-
-
-def test_a_broken_archive_leaves_nothing_behind(tmp_path):
-    (tmp_path / "a.zip").write_bytes(b"PK\x03\x04 and no more")
-    (tmp_path / "b.tgz").write_bytes(b"nothing")
-    for name in ("a.zip", "b.tgz"):
-        with pytest.raises(DatasetError, match=rf"cannot unpack .*{name}: ") as caught:
-            open_dataset(tmp_path / name, unpack=True)
-        assert "\n" not in str(caught.value)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zip", "b.tgz"]
-
-
-@pytest.mark.parametrize("name", ["..\\..\\out.txt", "/etc/out.txt", "C:\\out.txt"])
-def test_an_archive_cannot_write_beside_its_folder(tmp_path, name):
-    with zipfile.ZipFile(tmp_path / "a.zip", "w") as packed:
-        packed.writestr("in.txt", "x")
-        packed.writestr(name, "x")
-    with pytest.raises(DatasetError, match=r"cannot unpack .*a\.zip: .*leads out of the archive's folder"):
-        open_dataset(tmp_path / "a.zip", unpack=True)
-    assert [path.name for path in tmp_path.rglob("*")] == ["a.zip"]
 
 
 def test_a_file_stands_for_its_folder(tmp_path):
