@@ -3,7 +3,6 @@
 
 import json
 import logging
-import re
 import shutil
 import struct
 import subprocess
@@ -16,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import written_recordings
-from small_recordings import hololens, kitti, redwood, seven_scenes
+from small_recordings import hololens, kitti, one_line, redwood, seven_scenes
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import Dataset, Selection, describe, find, layouts, open_dataset, select
@@ -70,10 +69,7 @@ def test_a_recording_without_poses_is_there_for_a_scan(tmp_path, layout):
     assert describe(dataset).endswith(", no poses")
     with pytest.raises(DatasetError, match=r"frame 2 of .* has no pose; `tsfusion scan --source PATH` finds"):
         dataset[2]
-    with pytest.raises(DatasetError) as caught:
-        open_dataset(root)
-    assert "\n" not in str(caught.value)
-    assert re.search(r"pose|trajectory|groundtruth", str(caught.value))
+    one_line(lambda: open_dataset(root), "pose|trajectory|groundtruth")
 
 
 def test_some_poses_are_given_where_they_are_known(tmp_path):
@@ -203,9 +199,7 @@ def test_no_layout_fails_on_any_file_or_folder(tmp_path):
     for path in [*tmp_path.rglob("*"), tmp_path]:
         for layout in layouts():
             assert layout.recognises(path) in (True, False)
-        with pytest.raises(DatasetError) as caught:
-            open_dataset(path)
-        assert "\n" not in str(caught.value)
+        one_line(lambda path=path: open_dataset(path))
 
 
 def test_a_depth_image_of_the_wrong_kind_is_named(tmp_path):
@@ -286,23 +280,6 @@ def test_replay_says_what_it_found(tmp_path):
     assert (tmp_path / "scan" / "scene0000_00").is_dir()
 
 
-@pytest.mark.parametrize(
-    ("option", "expected"),
-    [
-        ({"depth_scale": "x"}, "`depth_scale` must be a number, got 'x'"),
-        ({"depth_scale": True}, "`depth_scale` must be a number, got True"),
-        ({"color": "False"}, "`color` must be true or false, got 'False'"),
-        ({"trajectory": ["a"]}, "`trajectory` must be text, got "),
-        ({"intrinsics": [1, 2]}, r"`intrinsics` must be numbers \[fx, fy, cx, cy\], got "),
-        ({"intrinsics": ["a", 2, 3, 4]}, r"`intrinsics` must be numbers \[fx, fy, cx, cy\], got "),
-    ],
-)
-def test_an_option_of_the_wrong_type_is_one_clear_line(tmp_path, option, expected):
-    with pytest.raises(DatasetError, match=expected) as caught:
-        open_dataset(redwood(tmp_path, [0], [0]), **option)
-    assert "\n" not in str(caught.value)
-
-
 def test_options_are_taken_as_they_were_meant(tmp_path):
     redwood(tmp_path / "5", [0], [0])
     dataset = open_dataset(tmp_path / "5", intrinsics=[500, 500, 3.5, 2.5], depth_scale=1)
@@ -310,6 +287,9 @@ def test_options_are_taken_as_they_were_meant(tmp_path):
     assert dataset[0].depth_scale == 1.0
     with pytest.raises(DatasetError, match=r"5/17 is missing"):
         open_dataset(tmp_path / "5", trajectory=17)
+    one_line(
+        lambda: open_dataset(tmp_path / "5", color="False"), "`color` must be true or false, got 'False'"
+    )
 
 
 @pytest.mark.parametrize(
@@ -324,6 +304,4 @@ def test_a_broken_camera_file_is_one_clear_line(tmp_path, content):
     written_recordings.replica(tmp_path / "replica")
     (tmp_path / "replica" / "cam_params.json").write_text(content)
     for place in ("redwood", "replica"):
-        with pytest.raises(DatasetError, match=r"\.json must ") as caught:
-            open_dataset(tmp_path / place)
-        assert "\n" not in str(caught.value)
+        one_line(lambda place=place: open_dataset(tmp_path / place), r"\.json must ")

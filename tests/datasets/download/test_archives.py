@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from download_server import Server, one, silent, tarred
-from small_recordings import corbs, seven_scenes
+from small_recordings import corbs, one_line, seven_scenes
 
 from tsfusion.core.errors import DatasetError, OutputError
 from tsfusion.datasets import describe, find, open_dataset
@@ -150,9 +150,7 @@ def test_a_broken_archive_leaves_nothing_behind(tmp_path):
     (tmp_path / "a.zip").write_bytes(b"PK\x03\x04 and no more")
     (tmp_path / "b.tgz").write_bytes(b"nothing")
     for name in ("a.zip", "b.tgz"):
-        with pytest.raises(DatasetError, match=rf"cannot unpack .*{name}: ") as caught:
-            open_dataset(tmp_path / name, unpack=True)
-        assert "\n" not in str(caught.value)
+        one_line(lambda name=name: open_dataset(tmp_path / name, unpack=True), rf"cannot unpack .*{name}: ")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zip", "b.tgz"]
 
 
