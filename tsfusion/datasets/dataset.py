@@ -4,7 +4,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +85,11 @@ class Frames(ABC):
         if not -count <= index < count:
             raise IndexError(f"{self.name} has {count} keyframes, got index {index}")
         return index % count
+
+    def _posed_frame(self, index: int, **measurement: Any) -> Frame:
+        """A frame with the recorded pose, sensor and time of an index."""
+        T, stamp = self._poses[index], self._stamp(index)
+        return Frame(T_world_camera=T, sensor=self.sensor, timestamp_ns=stamp, **measurement)
 
     def _stamp(self, index: int) -> int:
         return 0 if self.timestamps_ns is None else int(self.timestamps_ns[index])

@@ -269,10 +269,12 @@ def _time_shift(dataset: Dataset, pairs: list[_Pair], best: NDArray[np.float64])
 
     def fits(late: int) -> NDArray[np.float64]:
         moved = [(pose(pair.first + late), pose(pair.second + late)) for pair in chosen]
-        return np.array([
-            np.nan if first is None or second is None else pair.fit(np.linalg.inv(second) @ first)
-            for pair, (first, second) in zip(chosen, moved, strict=True)
-        ])  # fmt: skip
+        return np.array(
+            [
+                np.nan if first is None or second is None else pair.fit(np.linalg.inv(second) @ first)
+                for pair, (first, second) in zip(chosen, moved, strict=True)
+            ]
+        )
 
     given, found = fits(0), (0.0, 0)
     for late in sorted(range(-MAX_SHIFT, MAX_SHIFT + 1), key=abs):

@@ -83,15 +83,13 @@ class EuRoC(Frames):
             left, right = self._rectifier.pair(_grey(left_file), _grey(right_file))
         except InvalidConfig as error:
             raise DatasetError(f"{left_file} or its right image: {error}") from error
-        return Frame(
+        return self._posed_frame(
+            index,
             left=left,
             right=right,
             baseline_fx=self.baseline_fx,
             intrinsics=self.intrinsics,
             color=np.repeat(left[:, :, None], 3, axis=2) if self._with_color else None,
-            T_world_camera=self._poses[index],
-            sensor=self.sensor,
-            timestamp_ns=self._stamp(index),
         )
 
 

@@ -49,9 +49,7 @@ class LidarDump(Frames):
         return len(self._files)
 
     def _frame(self, index: int) -> Frame:
-        return Frame(
-            points=_read_points(self._files[index]), T_world_camera=self._poses[index], sensor=self.sensor
-        )
+        return self._posed_frame(index, points=_read_points(self._files[index]))
 
 
 def _read_graph(path: Path, *, required: bool) -> dict[int, Pose]:

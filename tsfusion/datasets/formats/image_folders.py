@@ -60,14 +60,12 @@ class DepthImages(Frames):
                 f"{self._size[1]}×{self._size[0]}; expected one size, as there is one camera"
             )
         color = self._color[index] if self._color else None
-        return Frame(
+        return self._posed_frame(
+            index,
             depth=depth,
             depth_scale=self.depth_scale,
             color=None if color is None else self._registered(color, depth),
             intrinsics=self.intrinsics,
-            T_world_camera=self._poses[index],
-            sensor=self.sensor,
-            timestamp_ns=self._stamp(index),
         )
 
     def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:

@@ -8,7 +8,6 @@ pose and time are the lines of that number.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,21 +64,16 @@ class KITTIFrames(Frames):
 
     def _frame(self, index: int) -> Frame:
         number = self._frames[index]
-        common: dict[str, Any] = {
-            "T_world_camera": self._poses[index],
-            "sensor": self.sensor,
-            "timestamp_ns": self._stamp(index),
-        }
         if self.sensor == "lidar":
-            return Frame(points=read_scan(self._left[number]), **common)
+            return self._posed_frame(index, points=read_scan(self._left[number]))
         left, right = read_pair(self._left[number], self._right[number])
-        return Frame(
+        return self._posed_frame(
+            index,
             left=left,
             right=right,
             baseline_fx=self.baseline_fx,
             intrinsics=self.intrinsics,
             color=self._color(number, left) if self._with_color else None,
-            **common,
         )
 
     def _color(self, number: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -116,13 +116,12 @@ class Nerfstudio(Frames):
             undistorter = self._undistorter(fitted)
             intrinsics, depth = undistorter.intrinsics, undistorter.depth(depth)
             color = None if color is None else undistorter.image(color)
-        return Frame(
+        return self._posed_frame(
+            index,
             depth=depth,
             depth_scale=scale,
             color=color,
             intrinsics=intrinsics,
-            T_world_camera=self._poses[index],
-            sensor=self.sensor,
         )
 
     def _undistorter(self, camera: Camera) -> Undistorter:

@@ -89,13 +89,12 @@ class SevenScenes(Frames):
         if color is not None and self._register:
             registration = _registration(self.intrinsics, depth.shape)
             color = registration.color_of_depth(color, depth * np.float32(0.001))
-        return Frame(
+        return self._posed_frame(
+            index,
             depth=depth,
             depth_scale=0.001,
             color=color,
             intrinsics=self.intrinsics,
-            T_world_camera=self._poses[index],
-            sensor=self.sensor,
         )
 
 

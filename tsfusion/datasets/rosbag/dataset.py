@@ -108,9 +108,13 @@ class Bag(Frames):
             )
         self._recording = BagRecording(path)
         topics = {
-            "depth_topic": depth_topic, "color_topic": color_topic, "info_topic": info_topic,
-            "points_topic": points_topic, "left_topic": left_topic, "right_topic": right_topic,
-        }  # fmt: skip
+            "depth_topic": depth_topic,
+            "color_topic": color_topic,
+            "info_topic": info_topic,
+            "points_topic": points_topic,
+            "left_topic": left_topic,
+            "right_topic": right_topic,
+        }
         chosen = TopicChooser(self._recording, topics, intrinsics=intrinsics, rectified=rectified).choose(
             modality
         )
@@ -120,10 +124,14 @@ class Bag(Frames):
         self.depth_scale = depth_scale or recorded_scale(self._recording, chosen.main) or MILLIMETRES
         self.uncolored = 0
         poses = PoseFinder(
-            path, chosen.frame, pose_streams(self._recording, pose_topic),
-            topic_named=pose_topic is not None, world_frame=world_frame, body_frame=body_frame,
+            path,
+            chosen.frame,
+            pose_streams(self._recording, pose_topic),
+            topic_named=pose_topic is not None,
+            world_frame=world_frame,
+            body_frame=body_frame,
             max_gap_s=max_gap_s,
-        )  # fmt: skip
+        )
         mains, others = self._index(poses)
         difference_s = _DIFFERENCE_S[chosen.modality] if max_difference_s is None else max_difference_s
         self._pair(mains, others, round(difference_s * 1e9))
@@ -213,39 +221,43 @@ class Bag(Frames):
         if T_color_depth is None:
             log.warning(
                 "%s: no transforms lead from %r to %r, so that colour cannot be registered and is left out",
-                self._recording.path, chosen.frame, chosen.color_camera.frame,
-            )  # fmt: skip
+                self._recording.path,
+                chosen.frame,
+                chosen.color_camera.frame,
+            )
             self._others = [None] * len(self)
             return None
         return Registration(
-            chosen.view.intrinsics, chosen.color_camera.view.intrinsics, T_color_depth, chosen.size,
+            chosen.view.intrinsics,
+            chosen.color_camera.view.intrinsics,
+            T_color_depth,
+            chosen.size,
             color_size=chosen.color_camera.size,
-        )  # fmt: skip
+        )
 
     def _frame(self, index: int) -> Frame:
         chosen, location = self._chosen, self._mains[index]
-        common: dict[str, Any] = {
-            "sensor": self.sensor, "timestamp_ns": self._stamp(index), "T_world_camera": self._poses[index],
-        }  # fmt: skip
         content = self._recording.read(location)
         try:
             if chosen.modality == "lidar":
                 found = messages.cloud(content, self._stamp(index))
-                return Frame(
-                    points=found.points, point_times_s=found.times_s,
-                    color=found.color if self._with_color else None, **common,
-                )  # fmt: skip
+                return self._posed_frame(
+                    index,
+                    points=found.points,
+                    point_times_s=found.times_s,
+                    color=found.color if self._with_color else None,
+                )
             other = self._others[index]
             beside = None if other is None else self._recording.read(other)
             if chosen.modality == "stereo":
-                return self._pair_frame(content, beside, common)
-            return self._depth_frame(content, beside, common)
+                return self._pair_frame(index, content, beside)
+            return self._depth_frame(index, content, beside)
         except DatasetError as error:
             raise DatasetError(
                 f"{self._recording.path}: message {index} of {chosen.main.topic} {error}"
             ) from error
 
-    def _depth_frame(self, content: Any, beside: Any, common: dict[str, Any]) -> Frame:
+    def _depth_frame(self, index: int, content: Any, beside: Any) -> Frame:
         view = self._chosen.view
         assert view is not None
         depth = messages.depth(content)
@@ -259,11 +271,11 @@ class Bag(Frames):
         if color is not None and self._registration is not None:
             metres = np.nan_to_num(depth * (1.0 if depth.dtype == np.float32 else self.depth_scale))
             color = self._registration.color_of_depth(color, metres.astype(np.float32))
-        return Frame(
-            depth=depth, depth_scale=self.depth_scale, color=color, intrinsics=view.intrinsics, **common
-        )  # fmt: skip
+        return self._posed_frame(
+            index, depth=depth, depth_scale=self.depth_scale, color=color, intrinsics=view.intrinsics
+        )
 
-    def _pair_frame(self, left: Any, right: Any, common: dict[str, Any]) -> Frame:
+    def _pair_frame(self, index: int, left: Any, right: Any) -> Frame:
         rig = self._chosen.rig
         assert rig is not None
         pair = messages.gray(left), messages.gray(right)
@@ -272,10 +284,14 @@ class Bag(Frames):
             if color is not None:
                 color = rig.rectifier.pair(color, color)[0]
             pair = rig.rectifier.pair(*pair)
-        return Frame(
-            left=pair[0], right=pair[1], color=color,
-            intrinsics=rig.intrinsics, baseline_fx=rig.baseline_fx, **common,
-        )  # fmt: skip
+        return self._posed_frame(
+            index,
+            left=pair[0],
+            right=pair[1],
+            color=color,
+            intrinsics=rig.intrinsics,
+            baseline_fx=rig.baseline_fx,
+        )
 
 
 _CHECKS: dict[str, Callable[[Any], None]] = {
