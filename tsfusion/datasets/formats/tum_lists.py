@@ -5,7 +5,6 @@ from pathlib import Path, PureWindowsPath
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import nearest_in_time
@@ -44,17 +43,17 @@ def read_recording(root: Path, *, max_difference_ns: int) -> ImageList:
     stamps, files = [stamp for stamp, _ in depth], [path for _, path in depth]
     if not (root / "rgb.txt").exists():
         return ImageList(stamps, files, [], windows)
-    color = _nearest(_read_list(root / "rgb.txt")[0], np.array(stamps, dtype=np.int64), max_difference_ns)
+    color = _nearest_images(_read_list(root / "rgb.txt")[0], stamps, max_difference_ns)
     return ImageList(stamps, files, color, windows)
 
 
-def _nearest(
-    listed: list[tuple[int, Path]], stamps_ns: NDArray[np.int64], max_difference_ns: int
+def _nearest_images(
+    listed: list[tuple[int, Path]], stamps_ns: list[int], max_difference_ns: int
 ) -> list[Path | None]:
     """The image nearest to each stamp, None where it is too far in time."""
-    own = np.array([stamp for stamp, _ in listed], dtype=np.int64)
-    nearest = nearest_in_time(own, stamps_ns)
-    near = np.abs(own[nearest] - stamps_ns) <= max_difference_ns
+    own, wanted = np.array([stamp for stamp, _ in listed], np.int64), np.array(stamps_ns, np.int64)
+    nearest = nearest_in_time(own, wanted)
+    near = np.abs(own[nearest] - wanted) <= max_difference_ns
     return [listed[i][1] if ok else None for i, ok in zip(nearest, near, strict=True)]
 
 
