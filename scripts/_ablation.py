@@ -18,9 +18,9 @@ from tsfusion.datasets.synthetic import benchmark_worlds
 from tsfusion.evaluation import surface_error
 from tsfusion.evaluation.known_surfaces import (
     COMPLETE_WITHIN,
+    KnownSurface,
     ReferenceSurface,
-    Solid,
-    Truth,
+    WorldSurface,
     measure,
     rounded,
 )
@@ -128,7 +128,7 @@ class Material:
 
     fused: list[Keyframe]
     sensor: str
-    truth: Truth | None = None
+    truth: KnownSurface | None = None
     held_out: list[Keyframe] = field(default_factory=list)
     max_range: float | None = None  # metres; None = the sensor preset's
 
@@ -219,7 +219,7 @@ def _synthetic(setup: Setup) -> Material:
     reach = MAX_RANGE.get(setup.scene)
     step = setup.keyframes if setup.path == "still" else 1 + setup.keyframes // MOST_SHOWN
     shown = (clean[i] for i in range(0, setup.keyframes, step))
-    truth = Solid(views.world, _seen(shown, setup, reach), edges=setup.scene != "street")
+    truth = WorldSurface(views.world, _seen(shown, setup, reach), edges=setup.scene != "street")
     return Material(list(views), sensor, truth, max_range=reach)
 
 
@@ -243,7 +243,7 @@ def _shared_room(setup: Setup) -> Material:
 
     clean = read("clean")
     fused = clean if setup.noise == "none" else read(setup.noise)
-    return Material(fused, sensor, Solid(benchmark_worlds.room(), _seen(clean, setup)))
+    return Material(fused, sensor, WorldSurface(benchmark_worlds.room(), _seen(clean, setup)))
 
 
 def _bunny(setup: Setup) -> Material:

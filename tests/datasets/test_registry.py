@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""What a path is: found out and said; archives, files, other packages' layouts, frames without poses."""
+"""The layout of a path: found and reported; files, other packages' layouts, frames without poses."""
 
 import json
 import logging
-import re
 import shutil
 import struct
 import subprocess
@@ -16,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import written_recordings
-from small_recordings import corbs, hololens, kitti, redwood, seven_scenes
+from small_recordings import hololens, kitti, one_line, redwood, seven_scenes
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import Dataset, Selection, describe, find, layouts, open_dataset, select
@@ -70,10 +69,7 @@ def test_a_recording_without_poses_is_there_for_a_scan(tmp_path, layout):
     assert describe(dataset).endswith(", no poses")
     with pytest.raises(DatasetError, match=r"frame 2 of .* has no pose; `tsfusion scan --source PATH` finds"):
         dataset[2]
-    with pytest.raises(DatasetError) as caught:
-        open_dataset(root)
-    assert "\n" not in str(caught.value)
-    assert re.search(r"pose|trajectory|groundtruth", str(caught.value))
+    one_line(lambda: open_dataset(root), "pose|trajectory|groundtruth")
 
 
 def test_some_poses_are_given_where_they_are_known(tmp_path):
@@ -112,70 +108,6 @@ def test_kitti_poses_may_end_early(tmp_path):
 
 def test_worlds_have_all_poses(tmp_path):
     assert open_dataset("synthetic:room", posed=False, count=2).pose(1) is not None
-
-
-def corbs_zip(root: Path) -> Path:
-    """The archive as its authors' Windows packs it: backslashes inside, the trajectory in one of its own."""
-    place = corbs(root / "unpacked")
-    archive = root / "D1_pre_registereddata.zip"
-    with zipfile.ZipFile(archive, "w") as packed:
-        for path in sorted(place.rglob("*")):
-            if path.is_file():
-                packed.write(
-                    path, "D1_pre_registereddata\\" + str(path.relative_to(place)).replace("/", "\\")
-                )
-    shutil.move(root / "unpacked" / "D1_Trajectory", root / "D1_Trajectory")
-    shutil.rmtree(root / "unpacked")
-    return archive
-
-
-def test_a_corbs_archive_is_unpacked_when_asked_to(tmp_path):
-    archive = corbs_zip(tmp_path)
-    with pytest.raises(
-        DatasetError, match=r"\.zip is an archive; unpack it with: unzip -q '.*\.zip' -d '.*'"
-    ):
-        open_dataset(archive)
-    dataset = open_dataset(archive, unpack=True)
-    assert dataset.name == "CoRBS D1_pre_registereddata"
-    assert (len(dataset), dataset.skipped, dataset.uncolored) == (4, {"without a pose in time": 1}, 1)
-    assert describe(dataset).endswith("all with poses, 1 without colour in time")
-    assert float(dataset[1].depth[0, 0] * dataset[1].depth_scale) == pytest.approx(2)
-    assert dataset[1].T_world_camera[0, 3] == pytest.approx(1.8)
-    assert len(open_dataset(archive)) == 4  # its folder is there now
-    assert not list(tmp_path.glob(".unpacking-*"))
-
-
-@pytest.mark.parametrize("suffix", [".tar.gz", ".tgz", ".tar"])
-def test_other_archives_are_unpacked_too(tmp_path, suffix):
-    seven_scenes(tmp_path / "in" / "chess")
-    kind = {".tar.gz": "gztar", ".tgz": "gztar", ".tar": "tar"}[suffix]
-    made = Path(shutil.make_archive(str(tmp_path / "chess-made"), kind, tmp_path / "in"))
-    archive = made.rename(tmp_path / f"chess{suffix}")
-    with pytest.raises(
-        DatasetError, match=r"unpack it with: mkdir '.*chess' && tar -xf '.*' -C '.*chess', then"
-    ):
-        find(archive)
-    assert find(archive, unpack=True).path == tmp_path / "chess" / "chess"
-
-
-def test_a_broken_archive_leaves_nothing_behind(tmp_path):
-    (tmp_path / "a.zip").write_bytes(b"PK\x03\x04 and no more")
-    (tmp_path / "b.tgz").write_bytes(b"nothing")
-    for name in ("a.zip", "b.tgz"):
-        with pytest.raises(DatasetError, match=rf"cannot unpack .*{name}: ") as caught:
-            open_dataset(tmp_path / name, unpack=True)
-        assert "\n" not in str(caught.value)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zip", "b.tgz"]
-
-
-@pytest.mark.parametrize("name", ["..\\..\\out.txt", "/etc/out.txt", "C:\\out.txt"])
-def test_an_archive_cannot_write_beside_its_folder(tmp_path, name):
-    with zipfile.ZipFile(tmp_path / "a.zip", "w") as packed:
-        packed.writestr("in.txt", "x")
-        packed.writestr(name, "x")
-    with pytest.raises(DatasetError, match=r"cannot unpack .*a\.zip: .*leads out of the archive's folder"):
-        open_dataset(tmp_path / "a.zip", unpack=True)
-    assert [path.name for path in tmp_path.rglob("*")] == ["a.zip"]
 
 
 def test_a_file_stands_for_its_folder(tmp_path):
@@ -247,8 +179,8 @@ def test_other_packages_bring_layouts(tmp_path, caplog):
     assert (len(dataset), dataset[0].shape) == (2, (48, 64))
     assert find(root).layout.name == "Theirs"
     assert "Theirs" in [layout.name for layout in layouts()]
-    assert "the dataset layout broken = theirs_layout:gone cannot be used" in caplog.text
-    with pytest.raises(DatasetError, match=r"^a Theirs dataset takes no `sequence`$"):
+    assert "the dataset layout broken is left out: broken (theirs_layout:gone), an entry" in caplog.text
+    with pytest.raises(DatasetError, match=r"^a Theirs dataset takes no `sequence`; it takes width$"):
         open_dataset(root, sequence="06")
 
 
@@ -256,7 +188,7 @@ def test_other_packages_bring_layouts(tmp_path, caplog):
 def test_another_packages_fault_is_not_ours(tmp_path, caplog):
     seven_scenes(tmp_path / "cursed")
     assert open_dataset(tmp_path / "cursed").name == "7-Scenes cursed"
-    assert "the layout Theirs failed to look at" in caplog.text
+    assert "the layout Theirs failed on" in caplog.text
 
 
 def test_no_layout_fails_on_any_file_or_folder(tmp_path):
@@ -267,9 +199,7 @@ def test_no_layout_fails_on_any_file_or_folder(tmp_path):
     for path in [*tmp_path.rglob("*"), tmp_path]:
         for layout in layouts():
             assert layout.recognises(path) in (True, False)
-        with pytest.raises(DatasetError) as caught:
-            open_dataset(path)
-        assert "\n" not in str(caught.value)
+        one_line(lambda path=path: open_dataset(path))
 
 
 def test_a_depth_image_of_the_wrong_kind_is_named(tmp_path):
@@ -350,23 +280,6 @@ def test_replay_says_what_it_found(tmp_path):
     assert (tmp_path / "scan" / "scene0000_00").is_dir()
 
 
-@pytest.mark.parametrize(
-    ("option", "expected"),
-    [
-        ({"depth_scale": "x"}, "`depth_scale` must be a number, got 'x'"),
-        ({"depth_scale": True}, "`depth_scale` must be a number, got True"),
-        ({"color": "False"}, "`color` must be true or false, got 'False'"),
-        ({"trajectory": ["a"]}, "`trajectory` must be text, got "),
-        ({"intrinsics": [1, 2]}, r"`intrinsics` must be four numbers, \[fx, fy, cx, cy\], got "),
-        ({"intrinsics": ["a", 2, 3, 4]}, "intrinsics must be four numbers"),
-    ],
-)
-def test_an_option_of_the_wrong_type_is_one_clear_line(tmp_path, option, expected):
-    with pytest.raises(DatasetError, match=expected) as caught:
-        open_dataset(redwood(tmp_path, [0], [0]), **option)
-    assert "\n" not in str(caught.value)
-
-
 def test_options_are_taken_as_they_were_meant(tmp_path):
     redwood(tmp_path / "5", [0], [0])
     dataset = open_dataset(tmp_path / "5", intrinsics=[500, 500, 3.5, 2.5], depth_scale=1)
@@ -374,6 +287,9 @@ def test_options_are_taken_as_they_were_meant(tmp_path):
     assert dataset[0].depth_scale == 1.0
     with pytest.raises(DatasetError, match=r"5/17 is missing"):
         open_dataset(tmp_path / "5", trajectory=17)
+    one_line(
+        lambda: open_dataset(tmp_path / "5", color="False"), "`color` must be true or false, got 'False'"
+    )
 
 
 @pytest.mark.parametrize(
@@ -388,6 +304,4 @@ def test_a_broken_camera_file_is_one_clear_line(tmp_path, content):
     written_recordings.replica(tmp_path / "replica")
     (tmp_path / "replica" / "cam_params.json").write_text(content)
     for place in ("redwood", "replica"):
-        with pytest.raises(DatasetError, match=r"\.json must ") as caught:
-            open_dataset(tmp_path / place)
-        assert "\n" not in str(caught.value)
+        one_line(lambda place=place: open_dataset(tmp_path / place), r"\.json must ")

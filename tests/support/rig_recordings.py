@@ -83,7 +83,7 @@ def _body_truth(place: Path, T_world_left: list[NDArray[np.float64]]) -> None:
     ]
     bodies = [T @ inverse(T_BODY_LEFT) for T in T_world_left]
     for number in range(5 * (len(bodies) - 1) + 1):  # between two images the body turns evenly
-        before, share = min(number // 5, len(bodies) - 2), 0.0
+        before = min(number // 5, len(bodies) - 2)
         share = number / 5 - before
         A, B = bodies[before], bodies[before + 1]
         R = Rotation.from_matrix(A[:3, :3]) * Rotation.from_rotvec(
@@ -136,7 +136,7 @@ def kitti_raw(root: Path, *, count: int = 3, cameras: tuple[str, ...] = ("00", "
 
 
 def scans(poses: list[NDArray[np.float64]]) -> list[NDArray[np.float32]]:
-    """Scans of the room as a spinning LiDAR without noise sees it from some poses."""
+    """Points (n, 3) of a spinning LiDAR without noise in the room, at some poses."""
     axes = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])  # of camera and LiDAR
     world = dataclasses.replace(worlds.room(), paths={"given": lambda index, _: poses[index] @ inverse(axes)})
     made = Synthetic(world, "lidar", count=len(poses), noise=False, color=False)

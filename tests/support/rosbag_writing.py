@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Genuine ROS 1 and ROS 2 recordings, written by rosbags."""
+"""Write genuine ROS 1 and ROS 2 recordings with rosbags."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,7 +18,7 @@ CAMERA_INFO, TF = "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
 
 
 class BagWriter:
-    """Makes messages of one ROS version and writes them; the recorder's clock is the header's unless told."""
+    """Messages of one ROS version, made and written; the recorder's clock is the header's, or `log_ns`."""
 
     def __init__(self, writer: Any, store: Any, *, is2: bool) -> None:
         self._writer, self._store, self._is2 = writer, store, is2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Folders of real recordings, and small copies of their layouts."""
+"""Tiny recordings in the layouts of datasets, and changes that break them."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -13,24 +13,24 @@ from tsfusion.core.errors import DatasetError
 P0 = "700 0 40 0 0 700 24 0 0 0 1 0"
 P1 = "700 0 40 -350 0 700 24 0 0 0 1 0"
 TR = "0 -1 0 0.1 0 0 -1 0.2 1 0 0 0.3"
-Change = Callable[[Path], object]
 POSE = "1 0 0 0.5\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
 ROW = POSE.replace("\n", " ")
+Change = Callable[[Path], object]  # of a recording in a folder
 
 
 def seven_scenes(root: Path, count: int = 3, shape: tuple[int, int] = (6, 8)) -> Path:
-    """A tiny genuine layout: depth of (100 + frame) mm."""
+    """7-Scenes: depth of (100 + frame) mm."""
     root.mkdir(parents=True, exist_ok=True)
     for frame in range(count):
         stem = root / f"frame-{frame:06d}"
         cv2.imwrite(f"{stem}.depth.png", np.full(shape, 100 + frame, np.uint16))
         cv2.imwrite(f"{stem}.color.png", np.full((*shape, 3), 10 * frame, np.uint8))
-        Path(f"{stem}.pose.txt").write_text("1 0 0 0.5\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+        Path(f"{stem}.pose.txt").write_text(POSE)
     return root
 
 
 def kitti(root: Path, count: int = 4) -> Path:
-    """A tiny genuine layout: random texture, 8 px of disparity; the car drives 1 m a frame."""
+    """KITTI odometry: random texture, 8 px of disparity; the car drives 1 m a frame."""
     place = root / "sequences" / "06"
     for name in ("image_0", "image_1", "velodyne"):
         (place / name).mkdir(parents=True)
@@ -49,6 +49,7 @@ def kitti(root: Path, count: int = 4) -> Path:
 
 
 def hololens(root: Path, count: int = 3) -> Path:
+    """Depth of (7 + frame) mm, all with one pose."""
     for name in ("depth", "images"):
         (root / name).mkdir(parents=True)
         for frame in range(count):
@@ -62,6 +63,7 @@ def hololens(root: Path, count: int = 3) -> Path:
 
 
 def redwood(root: Path, stems: list[int], poses: list[int]) -> Path:
+    """Images named by `stems`, and a log of poses with the numbers `poses`."""
     for name, pixels in (("depth", np.ones((6, 8), np.uint16)), ("color", np.zeros((6, 8, 3), np.uint8))):
         (root / name).mkdir(parents=True)
         for stem in stems:
@@ -97,17 +99,34 @@ def corbs(root: Path, *, shape: tuple[int, int] = (480, 640)) -> Path:
     return place
 
 
-def put(name: str, text: str) -> Change:
-    return lambda root: (root / name).write_text(text)
+def put(name: str, content: str | bytes | None) -> Change:
+    """Write a file of a recording; None: delete it."""
+
+    def change(root: Path) -> None:
+        if content is None:
+            (root / name).unlink()
+        else:
+            (root / name).write_bytes(content.encode() if isinstance(content, str) else content)
+
+    return change
 
 
-def one_line(opened: Callable[[], object], match: str) -> None:
+def replace(name: str, old: str, new: str) -> Change:
+    """Replace a text in a file of a recording."""
+    return lambda root: (root / name).write_bytes(
+        (root / name).read_bytes().replace(old.encode(), new.encode())
+    )
+
+
+def one_line(open_: Callable[[], object], match: str = "") -> None:
+    """Opening must raise a DatasetError of one line that matches."""
     with pytest.raises(DatasetError, match=match) as caught:
-        opened()
+        open_()
     assert "\n" not in str(caught.value)
 
 
 def textured_pair(rng: np.random.Generator, shape: tuple[int, int], disparity: int):
+    """(left, right) random texture, equal but for the disparity."""
     wide = rng.integers(0, 256, (shape[0], shape[1] + disparity)).astype(np.uint8)
     wide = cv2.GaussianBlur(wide, (0, 0), 0.8)
     left, right = wide[:, : shape[1]], wide[:, disparity:]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Recordings of the synthetic room written in other people's layouts, so that what is read back is known."""
+"""Recordings of the synthetic room, written in the layouts of public datasets, and checks of what is read."""
 
 import dataclasses
 import json
@@ -18,18 +18,18 @@ from tsfusion.geometry.calibration import Camera
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.geometry.se3 import inverse
 
-STEPS = 40  # keyframes of the circle that the views are the first of
+STEPS = 40  # keyframes of the whole circle
 
 
 def at(poses: list[NDArray[np.float64]], *, width: int = 160) -> list[Keyframe]:
-    """Images of the room as a Kinect without noise sees it from some poses."""
+    """Keyframes of the room by a Kinect without noise, at some poses."""
     world = dataclasses.replace(worlds.room(), paths={"given": lambda index, _: poses[index]})
     return list(Synthetic(world, "kinect", count=len(poses), noise=False, width=width))
 
 
 @cache
 def views(count: int = 4, *, width: int = 160) -> tuple[Keyframe, ...]:
-    """The first of a circle's views, 9° apart."""
+    """The first keyframes of a circle, 9° apart."""
     room = Synthetic("room", "kinect", count=STEPS, noise=False, width=width)
     return tuple(room[index] for index in range(count))
 
@@ -76,18 +76,18 @@ def fits_together(a: Keyframe, b: Keyframe, *, bound: float = 0.006) -> None:
 
 
 def millimetres(view: Keyframe) -> NDArray[np.uint16]:
-    """(H, W) uint16."""
+    """Depth as (H, W) uint16 millimetres."""
     return np.rint(depth_metres(view) * 1000).astype(np.uint16)
 
 
 def write(path: Path, image: NDArray[np.generic]) -> None:
-    """An image, its folder made."""
+    """Write an image, and make its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, 98] if path.suffix == ".jpg" else [])
 
 
 def matrix(T: NDArray[np.float64]) -> str:
-    """Rows of numbers."""
+    """The text of a matrix: rows of numbers."""
     return "\n".join(" ".join(f"{value:.9f}" for value in row) for row in T) + "\n"
 
 
@@ -137,7 +137,7 @@ def replica(root: Path, count: int = 4) -> Path:
 
 
 def through_lens(image: NDArray[np.generic], pinhole: Intrinsics, camera: Camera) -> NDArray[np.generic]:
-    """Image of a camera with a distorted lens in the pinhole camera's place; 0 beyond its edge."""
+    """The image of a camera with a distorting lens in the place of a pinhole camera; 0 beyond its image."""
     v, u = np.mgrid[: camera.size[0], : camera.size[1]]
     rays = camera.rays(np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64))
     columns, rows = (

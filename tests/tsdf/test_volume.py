@@ -12,6 +12,7 @@ import kernel_twins
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from repository import SUPPORT
 
 from tsfusion import Keyframe, Volume
 from tsfusion.core.errors import InvalidConfig, MapError, MapFull, WeightOverflow

@@ -10,7 +10,7 @@ from tsfusion.cli import options
 
 if TYPE_CHECKING:
     from tsfusion.datasets.download.catalogue import PublicRecording
-    from tsfusion.datasets.download.download import Checked
+    from tsfusion.datasets.download.download import CheckedFile
 
 
 def download(
@@ -90,10 +90,10 @@ def _check(recordings: "list[PublicRecording]", to: Path, *, json: bool) -> None
         typer.echo(f"no archives of these recordings in {to}", err=True)
 
 
-def _row(one: "Checked") -> dict[str, object]:
+def _row(one: "CheckedFile") -> dict[str, object]:
     return {**one._asdict(), "path": str(one.path)}
 
 
-def _say(one: "Checked") -> None:
+def _say(one: "CheckedFile") -> None:
     verdict = "as expected" if one.known else "unverified: no checksum is published; recorded for later"
     typer.echo(f"{one.path}  sha256 {one.sha256}  {verdict}", err=True)

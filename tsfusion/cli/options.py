@@ -16,18 +16,14 @@ import typer
 if TYPE_CHECKING:
     from tsfusion.core.config import ClientConfig, Config
 
-ConfigFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--config", metavar="FILE", envvar="TSFUSION_CONFIG", help="TOML; `tsfusion config dump` writes one."
-    ),
-]
 
-
-def _map_option(flag: str, metavar: str | None, help_: str) -> Any:
+def _option(flag: str, metavar: str | None, help_: str, *, panel: str | None = None) -> Any:
+    """A flag that the environment variable `TSFUSION_FLAG` sets too."""
     variable = "TSFUSION_" + flag.partition("/")[0].strip("-").replace("-", "_").upper()
-    return typer.Option(flag, metavar=metavar, envvar=variable, rich_help_panel="Map", help=help_)
+    return typer.Option(flag, metavar=metavar, envvar=variable, rich_help_panel=panel, help=help_)
 
+
+_map_option = functools.partial(_option, panel="Map")
 
 # By name: a setting of the `volume` table, or one that `configuration` turns into some.
 MAP_OPTIONS: dict[str, Any] = {
@@ -57,58 +53,32 @@ VIEW_OPTIONS = ("min_weight", "surface", "lambda_", "threads")  # these change n
 
 
 def takes_map_settings(verb: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a verb whose last parameter is `**settings` every one of `MAP_OPTIONS`."""
+    """Let Typer see every one of `MAP_OPTIONS` as a flag of a verb whose last parameter is `**settings`."""
     signature = inspect.signature(verb)
     own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
     shared = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=option)
         for name, option in MAP_OPTIONS.items()
     ]
-
-    @functools.wraps(verb)
-    def with_settings(*arguments: Any, **settings: Any) -> Any:
-        return verb(*arguments, **settings)
-
-    parameters = [*own, *shared]
-    del with_settings.__wrapped__
-    with_settings.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
-    with_settings.__annotations__ = {p.name: p.annotation for p in parameters}
-    return with_settings
+    verb.__signature__ = signature.replace(parameters=[*own, *shared])  # type: ignore[attr-defined]
+    verb.__annotations__ |= MAP_OPTIONS
+    return verb
 
 
-Connect = Annotated[
-    str | None,
-    typer.Option(
-        "--connect", metavar="ADDRESS", envvar="TSFUSION_CONNECT", help="A running server's address."
-    ),
-]
+ConfigFile = Annotated[Path | None, _option("--config", "FILE", "TOML; `tsfusion config dump` writes one.")]
+Connect = Annotated[str | None, _option("--connect", "ADDRESS", "A running server's address.")]
 Control = Annotated[
-    str | None,
-    typer.Option(
-        "--control", metavar="ADDRESS", envvar="TSFUSION_CONTROL",
-        help="Its control address; else the port after the other.",
-    ),
-]  # fmt: skip
-Map = Annotated[
-    str | None,
-    typer.Option(
-        "--map", metavar="NAME", envvar="TSFUSION_MAP", help="Which of a server's maps; else default."
-    ),
+    str | None, _option("--control", "ADDRESS", "Its control address; else the port after the other.")
 ]
+Map = Annotated[str | None, _option("--map", "NAME", "Which of a server's maps; else default.")]
 Key = Annotated[
     str | None,
-    typer.Option(
-        "--key", metavar="FILE", envvar="TSFUSION_KEY",
-        help="This client's secret key, of `tsfusion keys new`, for a server with keys.",
-    ),
-]  # fmt: skip
+    _option("--key", "FILE", "This client's secret key, of `tsfusion keys new`, for a server with keys."),
+]
 ServerKey = Annotated[
     str | None,
-    typer.Option(
-        "--server-key", metavar="FILE|KEY", envvar="TSFUSION_SERVER_KEY",
-        help="That server's public key: a file, or the 40 characters.",
-    ),
-]  # fmt: skip
+    _option("--server-key", "FILE|KEY", "That server's public key: a file, or the 40 characters."),
+]
 DatasetOptions = Annotated[
     list[str] | None,
     typer.Option(

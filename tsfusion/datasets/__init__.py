@@ -19,7 +19,7 @@ from tsfusion.datasets.formats.replica import Replica
 from tsfusion.datasets.formats.scannet import ScanNet
 from tsfusion.datasets.formats.sevenscenes import SevenScenes
 from tsfusion.datasets.formats.tum import TUM
-from tsfusion.datasets.registry import SYNTHETIC, Found, Layout, describe, find, layouts, opened
+from tsfusion.datasets.registry import SYNTHETIC, Found, Layout, describe, find, layouts, open_as
 from tsfusion.datasets.rosbag.dataset import Bag
 from tsfusion.datasets.synthetic.dataset import Synthetic
 
@@ -52,7 +52,7 @@ _SYNTHETIC = "synthetic:"
 
 
 def open_dataset(path: str | Path, /, *, unpack: bool = False, **options: Any) -> Dataset:
-    """Find out what a path is and open it.
+    """Open a recording of any layout, or a synthetic world.
 
     Args:
         path: a folder in one of `layouts()`, one that holds exactly one such, a file that stands for a
@@ -63,7 +63,7 @@ def open_dataset(path: str | Path, /, *, unpack: bool = False, **options: Any) -
             …); those that are None are left out.
 
     Raises:
-        DatasetError: naming what was found wrong or, for an unknown layout, what would have been recognised.
+        DatasetError: the files are wrong, or the layout is unknown; the message says what was expected.
     """
     if not str(path).startswith(_SYNTHETIC):
         return find(path, unpack=unpack).open(**options)
@@ -71,4 +71,4 @@ def open_dataset(path: str | Path, /, *, unpack: bool = False, **options: Any) -
     if len(words) > 2:
         raise DatasetError(f"{path!s}: expected synthetic:WORLD or synthetic:WORLD:SENSOR")
     given = dict(zip(("world", "sensor"), filter(None, words), strict=False))
-    return opened(SYNTHETIC[0], Synthetic, (), {**given, **options})
+    return open_as(SYNTHETIC[0], Synthetic, {**given, **options})

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""What a dataset is, and how its files are read with one clear error each."""
+"""The `Dataset` protocol, its base for recordings, and choosing some of a dataset's frames."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,18 +13,19 @@ from tsfusion.core.errors import DatasetError, InvalidKeyframe
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Keyframe
 
+NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a second
 SCAN = "`tsfusion scan --source PATH` finds poses by itself"
 _T = TypeVar("_T")
 
 
 @runtime_checkable
 class Dataset(Protocol):
-    """Keyframes by index: what `replay` needs, and all it needs.
+    """Keyframes by index: all that `replay` needs.
 
     One that a localizer can follow has `frame(index)` too, as `Frames` gives it.
 
     Attributes:
-        name: what to call it in a report.
+        name: for reports.
         sensor: name of the sensor model (`kinect`, `tof`, `stereo`, `lidar`).
         timestamps_ns: (n,) int64 nanoseconds of the sensor's clock; None where none were recorded.
         skipped: frames left out at opening, by reason.
@@ -43,7 +44,7 @@ class Dataset(Protocol):
 
 
 class Frames(ABC):
-    """Indexing and iteration over `_frame(index)`; files are opened there, not before."""
+    """Base of recordings: indexing and iteration over `_frame(index)`, which alone opens a frame's files."""
 
     name: str
     sensor: str
@@ -85,12 +86,17 @@ class Frames(ABC):
             raise IndexError(f"{self.name} has {count} keyframes, got index {index}")
         return index % count
 
+    def _posed_frame(self, index: int, **measurement: Any) -> Frame:
+        """A frame with the recorded pose, sensor and time of an index."""
+        T, stamp = self._poses[index], self._stamp(index)
+        return Frame(T_world_camera=T, sensor=self.sensor, timestamp_ns=stamp, **measurement)
+
     def _stamp(self, index: int) -> int:
         return 0 if self.timestamps_ns is None else int(self.timestamps_ns[index])
 
 
 class Selection(Frames):
-    """Some keyframes of another dataset, in the order given; `select` makes one.
+    """Some keyframes of another dataset; `select` makes one.
 
     Has the other's `distance` where it has one: the measure of a world whose surface is known.
     """
@@ -130,7 +136,7 @@ def pose_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:
     return own(index) if own is not None else dataset[index].T_world_camera
 
 
-def kept(
+def keep_posed(
     files: Sequence[_T],
     poses: Sequence[NDArray[np.float64] | None],
     *,
@@ -138,7 +144,7 @@ def kept(
     skipped: dict[str, int],
     reason: str = "without a pose",
 ) -> tuple[list[_T], list[NDArray[np.float64] | None]]:
-    """The frames to offer: with `posed` only those with a pose; the others are counted in `skipped`."""
+    """Leave out frames without a pose if `posed`, and count them in `skipped`: (files, poses) that remain."""
     pairs = [pair for pair in zip(files, poses, strict=True) if pair[1] is not None or not posed]
     if len(pairs) < len(files):
         skipped[reason] = skipped.get(reason, 0) + len(files) - len(pairs)
@@ -164,8 +170,16 @@ def select(
     return Selection(dataset, indices)
 
 
-def folder(path: str | Path, layout: str) -> Path:
-    """`path` as an existing folder."""
+def nearest_in_time(sorted_ns: NDArray[np.int64], stamps_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Index in `sorted_ns` (not empty) of the time nearest to each of `stamps_ns`; of equals the first."""
+    right = np.minimum(np.searchsorted(sorted_ns, stamps_ns), len(sorted_ns) - 1)
+    left = np.maximum(right - 1, 0)
+    nearer = np.abs(sorted_ns[left] - stamps_ns) <= np.abs(sorted_ns[right] - stamps_ns)
+    return np.searchsorted(sorted_ns, sorted_ns[np.where(nearer, left, right)])
+
+
+def require_folder(path: str | Path, layout: str) -> Path:
+    """`path` as an existing folder; raises DatasetError for another."""
     path = Path(path).expanduser()
     if not path.exists():
         raise DatasetError(f"{path} does not exist; expected a folder in the {layout} layout")
@@ -175,13 +189,10 @@ def folder(path: str | Path, layout: str) -> Path:
 
 
 def require_frames(count: int, path: Path, expected: str, skipped: dict[str, int]) -> None:
-    """Raise unless at least one frame is left."""
+    """Raise DatasetError unless at least one frame is left."""
     if count:
         return
     reasons = "; ".join(f"{number} {reason}" for reason, number in skipped.items() if number)
     raise DatasetError(
         f"{path} holds no usable frames; expected {expected}" + (f" ({reasons})" if reasons else "")
     )
-
-
-NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a second

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Todo."""
+"""Text tables, images and camera matrices from files; each error is one DatasetError that names the file."""
 
 import struct
 from pathlib import Path
@@ -57,7 +57,7 @@ def read_image(path: Path, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDAr
     if not path.is_file():
         raise DatasetError(f"{path} is missing; expected {what}")
     try:
-        image = decoded(np.fromfile(path, np.uint8), flags)
+        image = decode_image(np.fromfile(path, np.uint8), flags)
     except OSError as error:
         raise DatasetError(f"cannot read {path}: {error.strerror}") from error
     if image is None:
@@ -65,8 +65,8 @@ def read_image(path: Path, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDAr
     return image
 
 
-def decoded(content: NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
-    """An image file's bytes as OpenCV's `flags` say; None where they are none, or one that is far too large.
+def decode_image(content: NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
+    """Decode an image file's bytes as OpenCV's `flags` say; None where that fails, or it is far too large.
 
     OpenCV believes a PNG of a few bytes that claims gigabytes of pixels, and raises beyond that.
     """
@@ -111,7 +111,12 @@ def read_intrinsics(path: Path) -> Intrinsics:
     K = read_numbers(path, "a 3×3 camera matrix", columns=3)
     if K.shape != (3, 3) or K[1, 0] or abs(K[2] - (0, 0, 1)).max() > 1e-9:
         raise DatasetError(f"{path} must hold a 3×3 camera matrix ending in 0 0 1, got {K.tolist()}")
-    return checked_intrinsics(Intrinsics(*map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))), path)
+    return intrinsics_of(K, path)
+
+
+def intrinsics_of(K: NDArray[np.float64], source: object) -> Intrinsics:
+    """The intrinsics in a camera or projection matrix, checked; an error names where it came from."""
+    return checked_intrinsics(Intrinsics(*map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))), source)
 
 
 def checked_intrinsics(intrinsics: Intrinsics, source: object) -> Intrinsics:

@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Which layouts there are, and which one a path is in.
+"""The known layouts of recordings, and the one that a path is in.
 
-Another package adds one by an entry point in the group `tsfusion.datasets` that names a `Layout`; it is asked
-before those here.
+Another package adds a layout by an entry point in the group `tsfusion.datasets` that names a `Layout`; it is
+tried before the built-in ones.
 """
 
-import inspect
 import logging
 from collections.abc import Callable, Iterable
+from functools import partial
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
+from tsfusion.core import plugins
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import Dataset
 from tsfusion.datasets.download import archives
@@ -27,26 +29,21 @@ from tsfusion.datasets.formats import (
     tum,
 )
 from tsfusion.datasets.rosbag import dataset as rosbag_dataset
-from tsfusion.geometry.keyframe import Intrinsics
 
 GROUP = "tsfusion.datasets"
 
 _log = logging.getLogger(__name__)
 _MAC = "__MACOSX"  # what macOS puts into archives beside the recording
-_TYPES = {
-    bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path",
-    Intrinsics: "four numbers, [fx, fy, cx, cy]",
-}  # fmt: skip
 _INDEX = (".txt", ".json", ".yaml", ".csv", ".freiburg")  # a file of these is taken for its folder
 
 
 class Layout(NamedTuple):
-    """A way recordings lie on disk.
+    """A way in which recordings are stored on the disk.
 
     Attributes:
-        name: as reports call it.
-        description: what is expected, one line.
-        recognises: whether a folder or a file is in this layout; quick, reads no images, raises nothing.
+        name: for reports.
+        description: the expected files, in one line.
+        recognises: True if a folder or file is in this layout; quick, reads no images, raises nothing.
         open: `open(path, **options)` → a dataset; takes `posed` where frames may lack a pose.
     """
 
@@ -57,10 +54,10 @@ class Layout(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What `find` made of a path.
+    """Result of `find`.
 
     Attributes:
-        path: the folder or file to open: the one given, or the only dataset in it.
+        path: the folder or file to open: the given one, or the only dataset in it.
         also: names of less specific layouts that fit too.
     """
 
@@ -69,15 +66,15 @@ class Found(NamedTuple):
     also: tuple[str, ...]
 
     def open(self, **options: Any) -> Dataset:
-        """The dataset; options that are None are left out.
+        """Open the dataset; options that are None are left out.
 
         Raises:
-            DatasetError: naming what was found wrong, or an option that the layout does not have.
+            DatasetError: the files are wrong, or an option that the layout does not have.
         """
-        return opened(self.layout.name, self.layout.open, (self.path,), options)
+        return open_as(self.layout.name, partial(self.layout.open, self.path), options)
 
 
-# The first that fits is taken: the more specific stand first.
+# In the order in which they are tried: specific layouts first.
 BUILT_IN = (
     Layout("EuRoC", euroc.EXPECTED, euroc.recognises, euroc.EuRoC),
     Layout("KITTI odometry", kitti.EXPECTED, kitti.recognises, kitti.open_kitti),
@@ -94,7 +91,7 @@ BUILT_IN = (
            redwood_hololens.Redwood),
     Layout("ROS bag", rosbag_dataset.EXPECTED, rosbag_dataset.recognises, rosbag_dataset.Bag),
 )  # fmt: skip
-# Asked where none of those fits.
+# Tried where no other layout fits.
 PLAIN = (
     Layout(
         "RGB-D folders",
@@ -111,18 +108,18 @@ SYNTHETIC = (
 
 
 def layouts() -> list[Layout]:
-    """Every layout there is, in the order in which they are asked."""
+    """Every layout, in the order in which they are tried."""
     return [*_plugins(), *BUILT_IN, *PLAIN]
 
 
 def find(path: str | Path, *, unpack: bool = False) -> Found:
-    """What a path is: a dataset's folder, a folder that holds exactly one, or a file that stands for one.
+    """Find the dataset at a path: its folder, a folder that holds exactly one, or a file that stands for it.
 
     Args:
-        unpack: an archive is unpacked beside itself; else that is refused, with the command to type.
+        unpack: unpack an archive beside itself; otherwise the error names the command that does.
 
     Raises:
-        DatasetError: naming the path and what would have been recognised.
+        DatasetError: nothing or more than one dataset found; the message says what was expected.
     """
     root = Path(path).expanduser()
     if not root.exists():
@@ -144,48 +141,22 @@ def find(path: str | Path, *, unpack: bool = False) -> Found:
     return found[0]
 
 
-def opened(
-    name: str, opener: Callable[..., Dataset], places: tuple[Path, ...], options: dict[str, Any]
-) -> Dataset:
-    """Call an opener with the options it has: `posed` is dropped where it has none, `poses` may be its
-    `trajectory`; another it does not have is a DatasetError, and one that is None is left out."""
-    options = {key: value for key, value in options.items() if value is not None}
-    known = list(inspect.signature(opener).parameters)[len(places) :]
-    if "posed" not in known:
-        options.pop("posed", None)
-    if "poses" not in known and "trajectory" in known and "poses" in options:
-        options["trajectory"] = options.pop("poses")
-    unknown = sorted(set(options) - set(known))
-    if unknown:
-        raise DatasetError(f"a {name} dataset takes no `{unknown[0]}`")
-    parameters = inspect.signature(opener).parameters
-    given = {key: _typed(key, value, parameters[key].annotation) for key, value in options.items()}
-    return opener(*places, **given)
-
-
-def _typed(key: str, value: Any, annotation: Any) -> Any:
-    """An option as its parameter wants it: a number may be a name, four numbers may be intrinsics.
+def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) -> Dataset:
+    """Call a layout's opener; it may lack the option `posed`, and call the option `poses` `trajectory`.
 
     Raises:
-        DatasetError: it cannot be that; a parameter whose type is none of `_TYPES` takes anything.
+        DatasetError: an option that it does not take, or of the wrong type.
     """
-    wanted = [kind for kind in get_args(annotation) or (annotation,) if kind is not type(None)]
-    if not all(kind in _TYPES for kind in wanted):
-        return value
-    if isinstance(value, tuple(wanted)) and isinstance(value, bool) == (bool in wanted):
-        return value
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        if float in wanted:
-            return float(value)
-        if str in wanted:
-            return str(value)
-    if Intrinsics in wanted and isinstance(value, list | tuple) and len(value) == 4:
-        return Intrinsics(*value)
-    raise DatasetError(f"`{key}` must be {_TYPES[wanted[0]]}, got {value!r}")
+    options = dict(options)
+    if not plugins.takes(opener, "posed"):
+        options.pop("posed", None)
+    if not plugins.takes(opener, "poses") and plugins.takes(opener, "trajectory") and "poses" in options:
+        options["trajectory"] = options.pop("poses")
+    return plugins.call(opener, options, name=f"a {name} dataset", error=DatasetError)
 
 
 def describe(dataset: Dataset) -> str:
-    """One line: how many frames of what, their size, rate, and how many have a pose; reads one frame."""
+    """One line: number and kind of frames, size, rate, how many have a pose. Reads one frame."""
     from tsfusion.datasets.dataset import frame_of, pose_of
 
     first = frame_of(dataset, 0)
@@ -232,21 +203,17 @@ def _recognises(layout: Layout, place: Path) -> bool:
     try:
         return layout.recognises(place)
     except Exception as error:  # noqa: BLE001 - another package's code
-        _log.warning("the layout %s failed to look at %s: %r", layout.name, place, error)
+        _log.warning("the layout %s failed on %s: %r", layout.name, place, error)
         return False
 
 
 def _plugins() -> list[Layout]:
-    from importlib.metadata import entry_points
-
     found = []
     for point in entry_points(group=GROUP):
         try:
-            name, description, recognises, opener = point.load()
-        except Exception as error:  # noqa: BLE001 - another package's code
-            _log.warning("the dataset layout %s = %s cannot be used: %r", point.name, point.value, error)
-        else:
-            found.append(Layout(name, description, recognises, opener))
+            found.append(Layout(*plugins.load(point, DatasetError)))
+        except (DatasetError, TypeError) as error:
+            _log.warning("the dataset layout %s is left out: %s", point.name, error)
     return found
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Trajectories: the text formats of the field, and the pose at a time between two of them."""
+"""Trajectory files: the text formats of the field, read and written."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -86,7 +86,7 @@ def _in_order(stamps: list[int], rows: list[list[float]], path: Path, content: s
 def read_kitti(path: Path) -> list[Transform]:
     """3×4 row-major matrices, one a line; the line number is the frame number."""
     table = read_numbers(path, "12 numbers a line, a 3×4 row-major camera-to-world matrix", columns=12)
-    return [_pose(row.reshape(3, 4), f"{path}, pose {index}") for index, row in enumerate(table)]
+    return [checked_pose(row.reshape(3, 4), f"{path}, pose {index}") for index, row in enumerate(table)]
 
 
 def read_matrix(path: Path) -> Transform:
@@ -94,13 +94,13 @@ def read_matrix(path: Path) -> Transform:
     table = read_numbers(path, "a 4×4 camera-to-world matrix", columns=4)
     if table.shape != (4, 4):
         raise DatasetError(f"{path} must hold 4 rows of 4 numbers, got {len(table)} rows")
-    return _pose(table, str(path))
+    return checked_pose(table, path)
 
 
 def read_matrix_rows(path: Path) -> list[Transform]:
     """4×4 matrices, one a line of 16 numbers (HoloLens folders)."""
     table = read_numbers(path, "16 numbers a line, a 4×4 row-major camera-to-world matrix", columns=16)
-    return [_pose(row.reshape(4, 4), f"{path}, pose {index}") for index, row in enumerate(table)]
+    return [checked_pose(row.reshape(4, 4), f"{path}, pose {index}") for index, row in enumerate(table)]
 
 
 def read_log(path: Path) -> list[tuple[int, Transform]]:
@@ -117,14 +117,15 @@ def read_log(path: Path) -> list[tuple[int, Transform]]:
         if len(words) != 3 or not words[0].isdigit():
             raise DatasetError(f"{path}:{number}: three integers expected before each matrix, got {head!r}")
         rows = [numbers(path, n, line.split(), 4, "a 4×4 matrix") for n, line in lines[start + 1 : start + 5]]
-        poses.append((int(words[0]), _pose(np.array(rows), f"{path}:{number}")))
+        poses.append((int(words[0]), checked_pose(np.array(rows), f"{path}:{number}")))
     return poses
 
 
-def _pose(matrix: NDArray[np.float64], where: str) -> Transform:
+def checked_pose(matrix: NDArray[np.float64], source: object) -> Transform:
+    """(3, 4) or (4, 4) as a rigid (4, 4), or an error that names where it came from."""
     T = np.eye(4)
     T[: len(matrix)] = matrix
     try:
         return check_pose(T)
     except InvalidKeyframe as error:
-        raise DatasetError(f"{where}: {error}") from error
+        raise DatasetError(f"{source}: {error}") from error

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Measured surfaces that others can be compared with: how far do moved points lie from what a frame saw?"""
+"""The surface that one frame measured, and the deviation of other frames' points from it."""
 
 from typing import Any, Protocol
 
@@ -11,64 +11,65 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.stereo_matching import Matcher
 
-_POINTS = 800  # of a frame that are moved
-_TOLERANCE = 0.02  # of the depth
-_FLOOR = 0.004  # metres, and
-_DISPARITY = 1.0  # pixels: what two good measurements may differ by
-_JUMP = 0.05  # between neighbouring pixels, of the depth: an edge, which neither camera sees alike
-_HALF = 0.5
-_STEREO_WIDTH = 500  # above it a pair is halved before it is matched
-_LIDAR_FLOOR = 0.04  # metres
-_CELL = 0.01  # of the range: points of a scan closer than that count as one
-_GROUND = 0.03  # of the range: thickness of the slice that holds the ground
-_FLAT = 0.25  # share of the points in one such slice that makes it the ground
-_FARTHEST = 1e6  # metres: beyond it no LiDAR measures
-_TREE = 20_000  # points of a scan that others are compared with
-_EXACT_TREE = 4  # FLANN_INDEX_KDTREE_SINGLE
+MAX_POINTS = 800  # of a frame that are compared with another
+# Two good measurements may differ by the sum of these three.
+MIN_TOLERANCE = 0.004  # metres
+DEPTH_TOLERANCE = 0.02  # of the depth
+DISPARITY_TOLERANCE = 1.0  # pixels
+EDGE_JUMP = 0.05  # of the depth, between neighbouring pixels: an edge, which no two cameras see alike
+MAX_STEREO_WIDTH = 500  # pixels; a wider pair is scaled before it is matched
+STEREO_SCALE = 0.5
+LIDAR_TOLERANCE = 0.04  # metres
+SCAN_CELL = 0.01  # of the range: side of the cells in which one point of a scan is kept
+GROUND_SLICE = 0.03  # of the range: thickness of the slice that holds the ground
+MIN_GROUND_SHARE = 0.25  # share of the points in one such slice that makes it the ground
+MAX_DISTANCE = 1e6  # metres; points beyond it are invalid
+MAX_TREE_POINTS = 20_000  # of a scan that others are compared with
+EXACT_KD_TREE = 4  # FLANN_INDEX_KDTREE_SINGLE
 
 
 class DepthView(Protocol):
-    """A frame's measurement.
+    """The surface that a frame measured.
 
     Attributes:
-        points: (n, 3) float64, some of what was measured, in the sensor's axes, metres.
+        points: (n, 3) float64, a part of the measured points, in the sensor's axes, metres.
         range_m: their median distance along the axis (of a scan: from the sensor).
     """
 
     points: NDArray[np.float64]
     range_m: float
 
-    def off(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How far (n, 3) points lie from the measured surface, in what sensors may differ by.
+    def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n,) distance of (n, 3) points from the measured surface, in units of the tolerance.
 
-        Infinite where the frame did not look or saw nothing.
+        Infinite where a point is out of view, or nothing was measured.
         """
         ...
 
 
-def view_of(frame: Frame) -> DepthView | None:
-    """The frame's measurement, None when too little was measured."""
+def depth_view(frame: Frame) -> DepthView | None:
+    """The view of a frame; None when too little was measured."""
     made: DepthView
     if frame.points is not None:
-        made = _Scan(frame.points)
+        made = _ScanView(frame.points)
     elif frame.kind == "pair":
-        made = _matched(frame)
+        made = _stereo_view(frame)
     else:
         assert frame.depth_m is not None
         assert frame.intrinsics is not None
         baseline = frame.baseline_fx if frame.kind == "disparity" else None
-        made = _Image(frame.depth_m, frame.intrinsics, baseline)
-    return made if len(made.points) >= _POINTS // 8 else None
+        made = _ImageView(frame.depth_m, frame.intrinsics, baseline)
+    return made if len(made.points) >= MAX_POINTS // 8 else None
 
 
-def _matched(frame: Frame) -> "_Image":
+def _stereo_view(frame: Frame) -> "_ImageView":
     assert frame.left is not None
     assert frame.right is not None
     assert frame.intrinsics is not None
     assert frame.baseline_fx is not None
     left, right, scale = frame.left, frame.right, 1.0
-    if left.shape[1] > _STEREO_WIDTH:
-        scale = _HALF
+    if left.shape[1] > MAX_STEREO_WIDTH:
+        scale = STEREO_SCALE
         left, right = (
             np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
             for image in (left, right)
@@ -77,23 +78,23 @@ def _matched(frame: Frame) -> "_Image":
     baseline_fx = frame.baseline_fx * scale
     depth = np.zeros(disparity.shape, np.float32)
     np.divide(np.float32(baseline_fx), disparity, out=depth, where=disparity > 1)
-    return _Image(depth, frame.intrinsics.scaled(scale), baseline_fx)
+    return _ImageView(depth, frame.intrinsics.scaled(scale), baseline_fx)
 
 
-class _Image:
+class _ImageView:
     """Depth of a pinhole camera."""
 
     def __init__(self, depth_m: NDArray[np.float32], K: Intrinsics, baseline_fx: float | None) -> None:
         self._depth, self._K = depth_m, K
-        self._disparity = 0.0 if baseline_fx is None else _DISPARITY / baseline_fx
-        rows, columns = np.nonzero(_smooth(depth_m))
-        chosen = np.linspace(0, len(rows) - 1, min(_POINTS, len(rows))).astype(np.intp)
+        self._disparity = 0.0 if baseline_fx is None else DISPARITY_TOLERANCE / baseline_fx
+        rows, columns = np.nonzero(_without_edges(depth_m))
+        chosen = np.linspace(0, len(rows) - 1, min(MAX_POINTS, len(rows))).astype(np.intp)
         rows, columns = rows[chosen], columns[chosen]
         z = depth_m[rows, columns].astype(np.float64)
         self.points = np.stack([(columns - K.cx) / K.fx * z, (rows - K.cy) / K.fy * z, z], axis=1)
         self.range_m = float(np.median(z)) if len(z) else 0.0
 
-    def off(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         K, (height, width) = self._K, self._depth.shape
         z = points[:, 2]
         front = z > 1e-6
@@ -103,62 +104,62 @@ class _Image:
         seen = front & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         result = np.full(len(points), np.inf)
         measured = self._depth[row[seen], column[seen]].astype(np.float64)
-        tolerance = _FLOOR + _TOLERANCE * measured + self._disparity * measured**2
+        tolerance = MIN_TOLERANCE + DEPTH_TOLERANCE * measured + self._disparity * measured**2
         result[seen] = np.where(measured > 0, np.abs(z[seen] - measured) / tolerance, np.inf)
         return result
 
 
-def _smooth(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _without_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Pixels with depth whose neighbours have about the same."""
     least, most = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
-    smooth: NDArray[np.bool_] = (least > 0) & (most - least < _JUMP * depth)
+    smooth: NDArray[np.bool_] = (least > 0) & (most - least < EDGE_JUMP * depth)
     smooth[[0, -1]] = smooth[:, [0, -1]] = False
     return smooth
 
 
-class _Scan:
-    """Points without order, as of a LiDAR; the ground, which fits itself however it is moved, is left out."""
+class _ScanView:
+    """Points of a LiDAR without the ground, which would fit itself under many wrong motions."""
 
     def __init__(self, points: NDArray[np.float32]) -> None:
         finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
         distance = np.linalg.norm(finite, axis=1)
-        finite = finite[(distance > 1e-6) & (distance < _FARTHEST)]
+        finite = finite[(distance > 1e-6) & (distance < MAX_DISTANCE)]
         self.range_m = float(np.median(np.linalg.norm(finite, axis=1))) if len(finite) else 0.0
-        kept = _thinned(_above_ground(finite, self.range_m), max(_CELL * self.range_m, 1e-6))
-        kept = _spread(kept, _TREE)
-        self._tree = _tree(kept) if len(kept) else None
+        kept = _one_per_cell(_above_ground(finite, self.range_m), max(SCAN_CELL * self.range_m, 1e-6))
+        kept = _evenly_chosen(kept, MAX_TREE_POINTS)
+        self._tree = _kd_tree(kept) if len(kept) else None
         self._box = (kept.min(axis=0), kept.max(axis=0)) if len(kept) else (np.zeros(3), np.zeros(3))
-        self.points = _spread(kept, _POINTS // 2)
+        self.points = _evenly_chosen(kept, MAX_POINTS // 2)
 
-    def off(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         assert self._tree is not None
         near = ((points >= self._box[0]) & (points <= self._box[1])).all(axis=1)
-        off = np.full(len(points), np.inf)
+        deviation = np.full(len(points), np.inf)
         if near.any():
             _, squared = self._tree.knnSearch(points[near].astype(np.float32), 1, params={})
-            tolerance = _LIDAR_FLOOR + 0.005 * self.range_m + 0.01 * np.linalg.norm(points[near], axis=1)
-            off[near] = np.sqrt(squared[:, 0]) / tolerance
-        return off
+            tolerance = LIDAR_TOLERANCE + 0.005 * self.range_m + 0.01 * np.linalg.norm(points[near], axis=1)
+            deviation[near] = np.sqrt(squared[:, 0]) / tolerance
+        return deviation
 
 
-def _spread(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+def _evenly_chosen(points: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     return np.asarray(points[np.linspace(0, len(points) - 1, min(count, len(points))).astype(np.intp)])
 
 
-def _tree(points: NDArray[np.float64]) -> Any:
+def _kd_tree(points: NDArray[np.float64]) -> Any:
     index: Any = cv2.flann_Index  # type: ignore[attr-defined]
-    return index(points.astype(np.float32), {"algorithm": _EXACT_TREE})
+    return index(points.astype(np.float32), {"algorithm": EXACT_KD_TREE})
 
 
 def _above_ground(points: NDArray[np.float64], range_m: float) -> NDArray[np.float64]:
     for axis in (2, 1):  # LiDARs have z up, what was moved to a camera's axes y down
-        heights = np.round(points[:, axis] / max(_GROUND * range_m, 1e-9)).astype(np.int64)
+        heights = np.round(points[:, axis] / max(GROUND_SLICE * range_m, 1e-9)).astype(np.int64)
         values, counts = np.unique(heights, return_counts=True)
-        if len(values) and counts.max() > _FLAT * len(points):
+        if len(values) and counts.max() > MIN_GROUND_SHARE * len(points):
             return np.asarray(points[np.abs(heights - values[np.argmax(counts)]) > 1])
     return points
 
 
-def _thinned(points: NDArray[np.float64], cell: float) -> NDArray[np.float64]:
+def _one_per_cell(points: NDArray[np.float64], cell: float) -> NDArray[np.float64]:
     _, first = np.unique(np.round(points / cell).astype(np.int64), axis=0, return_index=True)
     return np.asarray(points[np.sort(first)])

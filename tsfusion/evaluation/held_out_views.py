@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the mesh of a scan says of frames that were not fused, each at the pose its own scan gave it."""
+"""How well the mesh of a scan predicts frames that were not fused, at the poses of the same scan."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,14 +16,14 @@ from tsfusion.evaluation.view_prediction import compare_views
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.trajectory import rigid
 
-_STEP = 3  # every third of the frames that can be looked at
+_STEP = 3  # every third of the frames that can be compared
 
 
 def compare_scans(dataset: Dataset, folders: Sequence[Path], *, voxel_size: float) -> list[dict[str, Any]]:
     """Result folders of `tsfusion scan` of one dataset, such as with poses of its own and with the true ones.
 
-    The frames looked at have a pose in all of them and were fused in none. Each mesh is in the world of its
-    own trajectory: what is compared is how well mesh and trajectory explain the depth together.
+    The frames compared have a pose in every folder and were fused in none. Each mesh is in the world of its
+    own trajectory: the figures show how well mesh and trajectory explain the depth together.
 
     Returns:
         `compare_views` of each folder.

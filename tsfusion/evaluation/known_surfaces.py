@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Surfaces that are known: worlds of solids, and reference meshes; and a mesh measured against one."""
+"""Known surfaces (worlds of solids, reference meshes), and the error of a mesh against one."""
 
 from collections.abc import Iterable
 from typing import Any, Protocol
@@ -18,16 +18,16 @@ MOST_NORMALS = 50_000  # of evenly chosen vertices
 EDGE_REACH = 2.0  # voxels: what counts as near an edge
 _CIRCLE = 24  # segments of a cylinder's rim
 _STEP = 1e-5  # metres, of the distance's gradient
-_ON_SURFACE = 1e-3  # metres: nearer is on it
+_ON_SURFACE = 1e-3  # metres: nearer points count as on the surface
 _COLUMN = 4.0  # metres: the side of the columns of points that are measured together
 
 
-class Truth(Protocol):
-    """A surface and what was seen of it.
+class KnownSurface(Protocol):
+    """A surface whose place is known, and the part of it that cameras saw.
 
     Attributes:
-        seen: (n, 3) float64 points of it, metres, that fused views show without noise, evenly spread.
-        edges: (m, 2, 3) float64 segments where it bends sharply; none where they are not known.
+        seen: (n, 3) float64 metres, evenly spread points of the part that was seen.
+        edges: (m, 2, 3) float64 metres, segments where it bends sharply; empty where they are not known.
     """
 
     seen: NDArray[np.float64]
@@ -42,12 +42,12 @@ class Truth(Protocol):
         ...
 
 
-class Solid:
-    """A world of solids.
+class WorldSurface:
+    """Surface of a synthetic world.
 
     Args:
-        seen: (n, 3) points near its surface; they are moved onto it where they are off it.
-        edges: tell the edges apart; False where there are too many of them to search.
+        seen: (n, 3) metres, points near the surface; they are moved onto it.
+        edges: measure edges too; False where there are too many of them.
     """
 
     def __init__(self, world: World, seen: NDArray[np.float64], *, edges: bool = True) -> None:
@@ -58,7 +58,7 @@ class Solid:
         self.seen[off] -= away[off, None] * self.normals(seen[off])
 
     def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """As the world's own, which asks every solid; here, those that can be nearest, column by column."""
+        """The world's distance, but of each column of points only to the solids that can be nearest."""
         result = np.empty(len(points))
         column = np.floor(points[:, :2] / _COLUMN).astype(np.int64) @ (1 << 20, 1)
         order = np.argsort(column, kind="stable")
@@ -74,11 +74,11 @@ class Solid:
 
 
 class ReferenceSurface:
-    """A reference mesh, sampled: the distance is that from the triangle of the nearest sample.
+    """A reference mesh; a distance is measured to the triangle of the nearest of many samples.
 
     Args:
-        measured: (n, 3) points measured on it. Seen is what lies within `reach` metres of one, a point a
-            cube of that size.
+        measured: (n, 3) metres, points measured on it. What lies within `reach` metres of one was seen, by
+            one point a cube of that size.
 
     Raises:
         MissingDependency: without scipy.
@@ -119,12 +119,12 @@ class ReferenceSurface:
         return face
 
 
-def measure(mesh: Mesh, truth: Truth, voxel_size: float) -> dict[str, Any]:
-    """Every figure of a mesh against the truth: millimetres, percent, degrees; JSON-like, NaN → None.
+def measure(mesh: Mesh, truth: KnownSurface, voxel_size: float) -> dict[str, Any]:
+    """Every figure of a mesh against a known surface: millimetres, percent, degrees; None for NaN.
 
-    - `accuracy_mm`: |distance| of the vertices from the truth; `precision`: within 1 voxel of it.
+    - `accuracy_mm`: |distance| of the vertices from the surface; `precision`: within 1 voxel of it.
     - `completeness`: of the surface seen, what has a vertex within 1.5 voxels; `f_score` of the two.
-    - `normal_deg`: angle between the vertices' normals and the truth's.
+    - `normal_deg`: angle between the normals of the vertices and of the surface.
     - `edge_mm`: mean |distance| of the vertices within 2 voxels of an edge, `edge_completeness` likewise.
 
     Completeness is None without scipy.
@@ -164,7 +164,7 @@ def edges_of(world: World) -> NDArray[np.float64]:
 
 
 def rounded(figures: dict[str, Any]) -> dict[str, Any]:
-    """Three decimals; None for NaN, which JSON has not."""
+    """Figures with three decimals; None for NaN, which JSON lacks."""
     result: dict[str, Any] = {}
     for key, value in figures.items():
         if isinstance(value, dict):
@@ -177,7 +177,7 @@ def rounded(figures: dict[str, Any]) -> dict[str, Any]:
 
 
 def _candidates(solids: Solids, points: NDArray[np.float64]) -> Solids:
-    """The solids that can be nearest to some of the points: no other is surely nearer to all of them."""
+    """The solids that can be nearest to some point: no other solid is nearer to all points."""
     low, high = points.min(axis=0), points.max(axis=0)
     radius = np.linalg.norm(solids[:, 4:7], axis=1)
     gap = np.linalg.norm(np.maximum(np.maximum(low - solids[:, 1:4], solids[:, 1:4] - high), 0), axis=1)

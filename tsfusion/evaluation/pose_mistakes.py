@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is usually wrong with poses, as the pose that was meant: each is tried against the depth."""
+"""The usual mistakes in poses, each with its correction, which `pose_check` tries against the depth."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,26 +22,26 @@ class Mistake:
     Attributes:
         name: short, for programs.
         text: what it is and what to do.
-        meant: the pose meant by a given one, up to the choice of the world's axes; may be a reflection, of
-            which only `inv(meant_j) @ meant_i`, a rigid motion, is used.
+        intended: the intended pose of a given one, up to the choice of the world's axes; may be a reflection:
+            only `inv(intended_j) @ intended_i`, a rigid motion, is used.
     """
 
     name: str
     text: str
-    meant: Callable[[Transform], NDArray[np.float64]]
+    intended: Callable[[Transform], NDArray[np.float64]]
 
 
-def _turned(order: list[int]) -> Callable[[Transform], Transform]:
-    def meant(T: Transform) -> Transform:
+def _reordered_quaternion(order: list[int]) -> Callable[[Transform], Transform]:
+    def intended(T: Transform) -> Transform:
         return rigid(quaternion(T[:3, :3])[order], T[:3, 3])
 
-    return meant
+    return intended
 
 
 def _conjugated(T: Transform) -> Transform:
-    meant: Transform = np.array(T)
-    meant[:3, :3] = T[:3, :3].T
-    return meant
+    intended: Transform = np.array(T)
+    intended[:3, :3] = T[:3, :3].T
+    return intended
 
 
 def _inverse(T: Transform) -> NDArray[np.float64]:
@@ -93,12 +93,12 @@ MISTAKES: tuple[Mistake, ...] = (
     Mistake(
         "quaternion wxyz",
         "the quaternions are in the order w x y z and were read as x y z w: reorder them",
-        _turned([1, 2, 3, 0]),
+        _reordered_quaternion([1, 2, 3, 0]),
     ),
     Mistake(
         "quaternion xyzw",
         "the quaternions are in the order x y z w and were read as w x y z: reorder them",
-        _turned([3, 0, 1, 2]),
+        _reordered_quaternion([3, 0, 1, 2]),
     ),
     Mistake(
         "conjugate",
@@ -107,7 +107,7 @@ MISTAKES: tuple[Mistake, ...] = (
     ),
 )  # fmt: skip
 
-# By what the translations must be multiplied; a depth that much smaller would do as well.
+# Factors that correct the translations; dividing the depth by them would do as well.
 SCALES: tuple[tuple[float, str], ...] = (
     (0.001, "the translations are in millimetres, metres are expected: divide them by 1000"),
     (0.01, "the translations are in centimetres, metres are expected: divide them by 100"),
@@ -123,7 +123,7 @@ SCALES: tuple[tuple[float, str], ...] = (
 
 
 def scale_text(factor: float) -> str:
-    """What a factor on the translations says, and what to do."""
+    """What is wrong where translations must be multiplied by a factor, and what to do."""
     known = dict(SCALES)
     if factor in known:
         return f"poses and depth disagree: {known[factor]}"
@@ -134,13 +134,13 @@ def scale_text(factor: float) -> str:
     )
 
 
-def or_text(alternatives: tuple[str, ...]) -> str:
-    """The other mistakes that a disagreement may come from; empty without any."""
+def alternatives_text(alternatives: tuple[str, ...]) -> str:
+    """Ending of a disagreement: the other mistakes that it may come from; empty without any."""
     return f" (these would fit as well: {', '.join(alternatives)})" if alternatives else ""
 
 
-def untold_text(alternatives: tuple[str, ...]) -> str:
-    """The mistakes that an agreement does not rule out; empty without any."""
+def not_ruled_out_text(alternatives: tuple[str, ...]) -> str:
+    """Ending of an agreement: the mistakes that it does not rule out; empty without any."""
     if not alternatives:
         return ""
     return (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Measures of a surface, given its distances from the truth. Arrays in, numbers out."""
+"""Figures of surface error from arrays of distances and directions."""
 
 import msgspec
 import numpy as np
@@ -11,7 +11,7 @@ _CHUNK = 1 << 21  # point-segment pairs measured at once
 
 
 class DistanceSpread(msgspec.Struct, frozen=True):
-    """A set of errors in three figures, millimetres; NaN of none."""
+    """Mean, root mean square and 95th percentile of errors, millimetres; NaN without errors."""
 
     mean: float
     rmse: float
@@ -29,12 +29,12 @@ def spread_mm(error: NDArray[np.floating]) -> DistanceSpread:
 
 
 def percent_within(error: NDArray[np.floating], tolerance: float) -> float:
-    """The share of |error| up to `tolerance`, percent; NaN of none."""
+    """Percent of the errors with |error| <= `tolerance`; NaN without errors."""
     return 100.0 * float((np.abs(error) <= tolerance).mean()) if len(error) else np.nan
 
 
 def f_score(precision: float, completeness: float) -> float:
-    """The harmonic mean of the two; 0 when both are."""
+    """Harmonic mean of precision and completeness; 0 when both are 0."""
     total = precision + completeness
     return 2 * precision * completeness / total if total else 0.0
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, pose_of
+from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, nearest_in_time, pose_of
 from tsfusion.datasets.readers import read_lines
 from tsfusion.datasets.trajectory_files import read_kitti, read_log, read_tum
 from tsfusion.geometry.trajectory import rigid
@@ -17,12 +17,12 @@ Poses = NDArray[np.float64]  # (n, 4, 4) T_world_camera
 
 
 class TrajectoryError(msgspec.Struct, frozen=True, kw_only=True):
-    """Absolute trajectory error, metres, over `count` poses; and how it grows with the way.
+    """Absolute trajectory error, metres, over `count` poses, and drift.
 
     Attributes:
-        length: of the reference's path.
-        drift_percent: distance between the ends of both paths when their beginnings lie upon each other, in
-            percent of `length`; 0 where there is no path.
+        length: metres of the reference's path.
+        drift_percent: distance between the ends of both paths after their first poses were made equal, in
+            percent of `length`; 0 where `length` is 0.
         rotation_deg: mean angle between the two orientations after the same alignment.
     """
 
@@ -45,7 +45,6 @@ def umeyama(
 
     Returns:
         (4, 4) rotation and translation, and the scale (1 without `with_scale`): target ≈ scale·R·source + t.
-
     """
     mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
     centered = source - mean_source
@@ -89,14 +88,14 @@ def absolute_error(estimate: Poses, reference: Poses, *, align: bool = True) -> 
 
 
 def aligned_to(estimate: Poses, reference: Poses) -> Poses:
-    """The estimate, moved so that its positions lie nearest to the reference's."""
+    """The estimate after the rigid motion that brings its positions nearest to the reference's."""
     T, _ = umeyama(estimate[:, :3, 3], reference[:, :3, 3])
     moved: Poses = T @ estimate
     return moved
 
 
 def _end_error(estimate: Poses, reference: Poses) -> float:
-    """Metres between the last positions, seen from the first poses."""
+    """Metres between the last positions, each in the axes of its first pose."""
     ends = [np.linalg.solve(poses[0], poses[-1]) for poses in (estimate, reference)]
     return float(np.linalg.norm(ends[0][:3, 3] - ends[1][:3, 3]))
 
@@ -111,10 +110,7 @@ def associate(
     """
     swapped = len(first_ns) > len(second_ns)
     few, many = (second_ns, first_ns) if swapped else (first_ns, second_ns)
-    right = np.clip(np.searchsorted(many, few), 1, max(len(many) - 1, 1))
-    right = np.minimum(right, len(many) - 1)
-    left = np.maximum(right - 1, 0)
-    nearest = np.where(np.abs(many[left] - few) <= np.abs(many[right] - few), left, right)
+    nearest = nearest_in_time(many, few)
     kept = np.flatnonzero(np.abs(many[nearest] - few) <= max_difference_ns)
     if not len(kept):
         raise DatasetError(
@@ -129,7 +125,7 @@ def _span(stamps_ns: NDArray[np.int64]) -> str:
 
 
 def read(path: Path) -> tuple[NDArray[np.int64] | None, Poses]:
-    """A trajectory file by its looks: TUM (8 numbers a line), KITTI (12) or Redwood's `.log`.
+    """Read a trajectory file: TUM (8 numbers in the first line), KITTI (12) or Redwood's `.log` (3).
 
     Returns:
         (n,) timestamps in nanoseconds, None where the format has none; (n, 4, 4) poses.
@@ -153,8 +149,8 @@ def read(path: Path) -> tuple[NDArray[np.int64] | None, Poses]:
     )
 
 
-def of_dataset(dataset: Dataset) -> tuple[NDArray[np.int64], Poses]:
-    """The poses a recording has; its times, or where it has none those that `tsfusion scan` counts.
+def dataset_trajectory(dataset: Dataset) -> tuple[NDArray[np.int64], Poses]:
+    """The poses of a recording; without times in it, the times that `tsfusion scan` would give.
 
     Returns:
         (n,) timestamps in nanoseconds and (n, 4, 4) poses, of the frames that have one.
@@ -179,7 +175,8 @@ def paired(
         DatasetError: when nothing can be paired, or without times for unequal numbers.
     """
     stamps, poses = read(estimate)
-    reference_stamps, references = read(reference) if isinstance(reference, Path) else of_dataset(reference)
+    of_reference = read(reference) if isinstance(reference, Path) else dataset_trajectory(reference)
+    reference_stamps, references = of_reference
     if stamps is not None and reference_stamps is not None:
         a, b = associate(stamps, reference_stamps, round(max_difference_s * 1e9))
         return poses[a], references[b]
@@ -201,7 +198,7 @@ _NARROWEST = 0.4  # of the view's longer side
 def draw(estimate: Poses, reference: Poses, path: Path, *, align: bool = True) -> None:
     """Write a .png, .pdf or .svg of (n, 4, 4) poses in pairs.
 
-    It is looked at along the direction in which the reference moves least.
+    The view is along the direction in which the reference moves least.
     """
     from matplotlib.figure import Figure
 

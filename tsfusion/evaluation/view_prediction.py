@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a mesh says that a camera sees, and how far from what it saw."""
+"""Depth that a mesh predicts for a camera, and its difference from the measured depth."""
 
 from typing import Any
 

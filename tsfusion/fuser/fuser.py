@@ -183,9 +183,9 @@ class Fuser:
     def _checkpoint(self) -> bool:
         written = False
         if self._since_checkpoint:
-            process.limit_memory(self._most + _FOR_A_CHECKPOINT)
+            process.limit_memory(self._memory_limit + _FOR_A_CHECKPOINT)
             written = self._map.save()
-            process.limit_memory(self._most)
+            process.limit_memory(self._memory_limit)
             self._since_checkpoint = 0 if written else 1
         self._send(fuser_messages.Saved(written))
         return not self._since_checkpoint

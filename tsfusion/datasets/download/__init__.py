@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Public recordings: where they are, fetched and checked."""
+"""Download public recordings, check and unpack them."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Recordings as they are downloaded: archives, unpacked beside themselves."""
+"""Unpack archives of recordings beside themselves, safely."""
 
 import lzma
 import shutil
@@ -29,7 +29,7 @@ def destination(path: Path) -> Path:
 
 
 def command(path: Path) -> str:
-    """What to type to unpack it there."""
+    """The shell command that unpacks an archive to `destination`."""
     into = destination(path)
     if path.suffix.lower() == ".zip":
         return f"unzip -q '{path}' -d '{into}'"
@@ -57,10 +57,10 @@ def unpack(path: Path) -> Path:
 
 
 def extract(path: Path, into: Path, *, nested: bool = False) -> None:
-    """Unpack into a folder, which should be an empty one: what was unpacked stays when the rest fails.
+    """Unpack into an empty folder. What was unpacked stays there when the rest fails.
 
     Args:
-        nested: zip files that come out are unpacked where they are, and removed.
+        nested: unpack zip files inside too, and remove them.
 
     Raises:
         DatasetError: when it is broken, or a member is a link or leads out of the folder.

@@ -2,7 +2,7 @@
 """Public recordings that `tsfusion download` knows: where they are, how large, under which licence.
 
 A checksum is the publisher's where one is published, else one that independent users of the same archive
-have put down in public; None = neither is known, and the first download records what it saw.
+have published; None = neither is known, and the first download writes down its own.
 """
 
 from typing import NamedTuple
@@ -22,10 +22,10 @@ _CORBS = "http://corbs.dfki.uni-kl.de/suppfiles/ElectricalCabinet/E1"
 
 
 class File(NamedTuple):
-    """One file to fetch.
+    """A file to download.
 
     Attributes:
-        name: under which it is kept, and asked for at a mirror.
+        name: of the file on this disk and at a mirror.
         checksum: `sha256:…` or `md5:…`; None = unknown.
         into: subfolder that an archive is unpacked to.
     """
@@ -37,12 +37,12 @@ class File(NamedTuple):
 
 
 class PublicRecording(NamedTuple):
-    """One entry.
+    """An entry of the catalogue.
 
     Attributes:
-        files: empty = it has to be fetched by hand, `note` says why.
+        files: empty = fetch it by hand; `note` says why.
         nbytes: of all files; None = unknown.
-        opens: what to open, below the folder it is unpacked to.
+        opens: path to open, below the folder it is unpacked to.
     """
 
     name: str
@@ -154,10 +154,10 @@ CATALOGUE: tuple[PublicRecording, ...] = (
 
 
 def entry(name: str) -> PublicRecording:
-    """The entry of that name.
+    """The recording of a name.
 
     Raises:
-        DatasetError: naming those there are.
+        DatasetError: no such name; lists the known ones.
     """
     for one in CATALOGUE:
         if one.name == name:

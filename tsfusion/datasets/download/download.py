@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Fetching a recording of the catalogue: checked, resumable, unpacked whole or not at all.
+"""Fetch a recording of the catalogue: checked, resumable, unpacked completely or not at all.
 
-pooch checks what has come; the bytes come by `fetching`, which goes on where it was interrupted.
+pooch compares checksums; `http` downloads, and goes on where it was interrupted.
 """
 
 import logging
@@ -19,13 +19,13 @@ _INSTALL = "downloads need pooch; install it with: pip install 'tsfusion[downloa
 ENDING = ".sha256"
 
 
-class Checked(NamedTuple):
-    """One file of a recording.
+class CheckedFile(NamedTuple):
+    """A downloaded file of a recording.
 
     Attributes:
-        sha256: of what is there.
-        known: whether a checksum was known before; otherwise this one has been recorded beside it.
-        fetched: whether it came just now.
+        sha256: of the file on the disk.
+        known: whether a checksum was known to compare with; otherwise this one was written beside the file.
+        fetched: whether it was downloaded by this call.
     """
 
     path: Path
@@ -34,22 +34,24 @@ class Checked(NamedTuple):
     fetched: bool
 
 
-class Fetched(NamedTuple):
-    """A recording on the disk; `path` is what to open. Archives that were removed are not in `files`."""
+class FetchedRecording(NamedTuple):
+    """A recording on the disk; `path` is to be opened, `files` lacks archives that the user has removed."""
 
     path: Path
-    files: list[Checked]
+    files: list[CheckedFile]
 
 
-def fetch(recording: PublicRecording, to: Path, watch: Watcher, *, base: str | None = None) -> Fetched:
-    """Have a recording in `to`: its archives, and the folder `to/NAME` they are unpacked to.
+def fetch(
+    recording: PublicRecording, to: Path, watch: Watcher, *, base: str | None = None
+) -> FetchedRecording:
+    """Bring a recording into `to`: its archives, and the folder `to/NAME` with what they hold.
 
     Args:
-        base: of a mirror, that has the files by their names.
+        base: address of a mirror that has the files under their names.
 
     Raises:
         MissingDependency: without pooch.
-        DatasetError: it has to be fetched by hand, cannot be fetched, or is not what it should be.
+        DatasetError: it has to be fetched by hand, cannot be fetched, or has another checksum.
         OutputError: it cannot be written.
     """
     if not recording.files:
@@ -59,32 +61,32 @@ def fetch(recording: PublicRecording, to: Path, watch: Watcher, *, base: str | N
     for file in recording.files:
         path = to / file.name
         if path.exists() or not folder.exists():
-            files.append(_have(file, path, watch, base))
+            files.append(_fetched_or_there(file, path, watch, base))
     if not folder.exists():
         _unpack(recording, to, folder)
-    return Fetched(folder / recording.opens if recording.opens else folder, files)
+    return FetchedRecording(folder / recording.opens if recording.opens else folder, files)
 
 
-def check(recording: PublicRecording, to: Path) -> list[Checked]:
-    """The files of a recording that are in `to`, each compared with the checksum known of it.
+def check(recording: PublicRecording, to: Path) -> list[CheckedFile]:
+    """Compare the files of a recording that are in `to` with their checksums.
 
     Raises:
-        DatasetError: one is not what it was.
+        DatasetError: a file has another checksum.
     """
     paths = [(file, to / file.name) for file in recording.files]
     return [_verified(file, path) for file, path in paths if path.exists()]
 
 
-def _have(file: File, path: Path, watch: Watcher, base: str | None) -> Checked:
+def _fetched_or_there(file: File, path: Path, watch: Watcher, base: str | None) -> CheckedFile:
     if path.exists():
         return _verified(file, path)
     url = f"{base.rstrip('/')}/{file.name}" if base else file.url
-    known = _known(file, path)
-    _retrieve(url, path, known, watch)
-    return _recorded(path, known=known is not None, fetched=True)
+    known = _known_checksum(file, path)
+    _download(url, path, known, watch)
+    return _with_checksum_file(path, known=known is not None, fetched=True)
 
 
-def _retrieve(url: str, path: Path, known: str | None, watch: Watcher) -> None:
+def _download(url: str, path: Path, known: str | None, watch: Watcher) -> None:
     pooch = _pooch()
     part = path.with_name(f"{path.name}.part")
 
@@ -112,8 +114,8 @@ def _pooch() -> Any:
     return pooch
 
 
-def _known(file: File, path: Path) -> str | None:
-    """The checksum of the catalogue, or the one recorded when it was first seen."""
+def _known_checksum(file: File, path: Path) -> str | None:
+    """The checksum of the catalogue, or the one written at the first download."""
     if file.checksum is not None:
         return file.checksum
     try:
@@ -123,32 +125,32 @@ def _known(file: File, path: Path) -> str | None:
     return f"sha256:{words[0]}" if words else None
 
 
-def _verified(file: File, path: Path) -> Checked:
-    known = _known(file, path)
+def _verified(file: File, path: Path) -> CheckedFile:
+    known = _known_checksum(file, path)
     if known is not None:
         kind, _, expected = known.partition(":")
-        found = _hash(path, kind)
+        found = _file_hash(path, kind)
         if found != expected.lower():
             raise DatasetError(
                 f"{path} is not what it should be: {kind} {found}, expected {expected}; remove it (and "
                 f"{path.name}{ENDING} if it was meant to change) to fetch it again"
             )
-    return _recorded(path, known=known is not None, fetched=False)
+    return _with_checksum_file(path, known=known is not None, fetched=False)
 
 
-def _recorded(path: Path, *, known: bool, fetched: bool) -> Checked:
-    """The file with its checksum, which is put down beside it as `sha256sum --check` reads it."""
-    sha256 = _hash(path, "sha256")
+def _with_checksum_file(path: Path, *, known: bool, fetched: bool) -> CheckedFile:
+    """The file and its checksum, which is written beside it as `sha256sum --check` reads it."""
+    sha256 = _file_hash(path, "sha256")
     beside = path.with_name(path.name + ENDING)
     try:
         if not beside.exists():
             beside.write_text(f"{sha256}  {path.name}\n", encoding="ascii")
     except OSError as error:
         raise OutputError(f"cannot write {beside}: {error.strerror}") from error
-    return Checked(path, sha256, known, fetched)
+    return CheckedFile(path, sha256, known, fetched)
 
 
-def _hash(path: Path, kind: str) -> str:
+def _file_hash(path: Path, kind: str) -> str:
     try:
         return str(_pooch().file_hash(str(path), alg=kind)).lower()
     except OSError as error:

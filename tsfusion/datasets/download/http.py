@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""One file over HTTP, in as many goes as it takes: what has come stays in a `.part`.
+"""Download one file over HTTP in as many requests as needed; received bytes stay in a `.part` file.
 
-A part goes on only where the server says that it still has the same file (RFC 9110: Range and If-Range).
+A part is continued only if the server still has the same file (RFC 9110: Range and If-Range).
 """
 
 import errno
@@ -23,12 +23,12 @@ Watcher = Callable[[int, int], None]  # bytes there, bytes of all (0 = unknown)
 
 _CHUNK_BYTES = 1 << 20
 _TIMEOUT_S = 30.0
-_GIVE_UP_AFTER = 4  # attempts in a row that brought nothing
+_GIVE_UP_AFTER = 4  # requests in a row without a new byte
 _PAUSE_S = 1.0
 
 
 def download(url: str, part: Path, watch: Watcher) -> None:
-    """Complete `part`; another call goes on where one was interrupted, a server without ranges starts again.
+    """Complete `part`, from where an earlier call stopped; without ranges at the server, from the start.
 
     Raises:
         DatasetError: the server refuses, sends a web page, or cannot be reached.
@@ -36,68 +36,68 @@ def download(url: str, part: Path, watch: Watcher) -> None:
     """
     if not url.startswith(("https://", "http://")):
         raise DatasetError(f"cannot download {url}: only https and http are fetched")
-    in_vain, said, most = 0, "the connection was cut", _nbytes(part)
-    while in_vain < _GIVE_UP_AFTER:
+    fruitless, cause, most = 0, "the connection was cut", _nbytes(part)
+    while fruitless < _GIVE_UP_AFTER:
         try:
-            if _attempt(url, part, watch):
+            if _request(url, part, watch):
                 _validator_file(part).unlink(missing_ok=True)
                 return
-            said = "the connection was cut"
+            cause = "the connection was cut"
         except urllib.error.HTTPError as error:
             error.close()
-            said = f"HTTP {error.code} {error.reason}"
+            cause = f"HTTP {error.code} {error.reason}"
             if error.code < 500 and error.code != http.client.TOO_MANY_REQUESTS:
-                raise DatasetError(f"cannot download {url}: {said}") from error
+                raise DatasetError(f"cannot download {url}: {cause}") from error
         except UnicodeError as error:
             raise DatasetError(f"cannot download {url}: no host can have that name") from error
         except (OSError, http.client.HTTPException) as error:
-            said = str(getattr(error, "reason", error)) or type(error).__name__
-        in_vain = 0 if _nbytes(part) > most else in_vain + 1  # a part that was begun again is no progress
+            cause = str(getattr(error, "reason", error)) or type(error).__name__
+        fruitless = 0 if _nbytes(part) > most else fruitless + 1  # a part that began again is no progress
         most = max(most, _nbytes(part))
-        if in_vain < _GIVE_UP_AFTER:
-            time.sleep(_PAUSE_S * in_vain)
+        if fruitless < _GIVE_UP_AFTER:
+            time.sleep(_PAUSE_S * fruitless)
     raise DatasetError(
-        f"cannot download {url}: {said} ({_nbytes(part)} bytes stay in {part}; the same command goes on)"
+        f"cannot download {url}: {cause} ({_nbytes(part)} bytes stay in {part}; the same command goes on)"
     )
 
 
-def _attempt(url: str, part: Path, watch: Watcher) -> bool:
-    """One request; whether the file is whole then."""
+def _request(url: str, part: Path, watch: Watcher) -> bool:
+    """Send one request; True if the file is complete then."""
     start, validator = _nbytes(part), _validator(part)
     headers = {"User-Agent": f"tsfusion/{version('tsfusion')}", "Accept-Encoding": "identity"}
     if start and validator:
         headers |= {"Range": f"bytes={start}-", "If-Range": validator}
     try:
-        answer = _opener().open(urllib.request.Request(url, headers=headers), timeout=_TIMEOUT_S)
+        response = _opener().open(urllib.request.Request(url, headers=headers), timeout=_TIMEOUT_S)
     except urllib.error.HTTPError as error:
         if error.code != http.client.REQUESTED_RANGE_NOT_SATISFIABLE:
             raise
         error.close()
         if error.headers.get("Content-Range") == f"bytes */{start}":
             return True
-        _forget(part)
+        _remove_part(part)
         return False
-    with answer:
-        if answer.headers.get_content_type() == "text/html":
+    with response:
+        if response.headers.get_content_type() == "text/html":
             raise DatasetError(f"cannot download {url}: it answers with a web page; open it in a browser")
-        at = _first_byte(answer)
-        if at and (at != start or _validator_of(answer) != validator):
-            _forget(part)
+        at = _first_byte(response)
+        if at and (at != start or _validator_of(response) != validator):
+            _remove_part(part)
             return False
-        length = answer.headers.get("Content-Length", "")
+        length = response.headers.get("Content-Length", "")
         total = at + int(length) if length.isdigit() else 0
         _require_room(part, total - at)
-        _copy(answer, part, at, total, watch)
+        _copy(response, part, at, total, watch)
     return not total or _nbytes(part) == total
 
 
-def _copy(answer: Any, part: Path, at: int, total: int, watch: Watcher) -> None:
+def _copy(response: Any, part: Path, at: int, total: int, watch: Watcher) -> None:
     with _locked(part) as file:
         if not at:
-            _remember(part, _validator_of(answer))
+            _write_validator(part, _validator_of(response))
         file.seek(at)
         file.truncate()
-        while chunk := answer.read(_CHUNK_BYTES):
+        while chunk := response.read(_CHUNK_BYTES):
             _require_room(part, max(len(chunk), total - at))
             try:
                 file.write(chunk)
@@ -110,7 +110,7 @@ def _copy(answer: Any, part: Path, at: int, total: int, watch: Watcher) -> None:
 
 @contextmanager
 def _locked(part: Path) -> Iterator[IO[bytes]]:
-    """The part, open for nobody else."""
+    """The part, opened and locked."""
     try:
         with folder_lock.hold(part.parent, part.name), part.open("r+b") as file:
             yield file
@@ -120,18 +120,18 @@ def _locked(part: Path) -> Iterator[IO[bytes]]:
         raise _not_written(part, error) from error
 
 
-def _first_byte(answer: Any) -> int:
-    """Where in the file the answer begins."""
-    if answer.status != http.client.PARTIAL_CONTENT:
+def _first_byte(response: Any) -> int:
+    """Position in the file of the response's first byte."""
+    if response.status != http.client.PARTIAL_CONTENT:
         return 0
-    found = re.match(r"bytes (\d+)-", answer.headers.get("Content-Range", ""))
+    found = re.match(r"bytes (\d+)-", response.headers.get("Content-Range", ""))
     return int(found[1]) if found else 0
 
 
-def _validator_of(answer: Any) -> str:
-    """What tells this version of the file from another: a strong ETag, or its date."""
-    tag = str(answer.headers.get("ETag") or "")
-    return tag if tag.startswith('"') else str(answer.headers.get("Last-Modified") or "")
+def _validator_of(response: Any) -> str:
+    """Identifier of this version of the file: a strong ETag, or its date; empty without either."""
+    tag = str(response.headers.get("ETag") or "")
+    return tag if tag.startswith('"') else str(response.headers.get("Last-Modified") or "")
 
 
 def _validator_file(part: Path) -> Path:
@@ -145,14 +145,14 @@ def _validator(part: Path) -> str:
         return ""
 
 
-def _remember(part: Path, validator: str) -> None:
+def _write_validator(part: Path, validator: str) -> None:
     try:
         _validator_file(part).write_text(validator, encoding="latin-1")
     except OSError as error:
         raise _not_written(part, error) from error
 
 
-def _forget(part: Path) -> None:
+def _remove_part(part: Path) -> None:
     for path in (part, _validator_file(part)):
         with suppress(OSError):
             path.unlink(missing_ok=True)
@@ -180,15 +180,15 @@ def _not_written(part: Path, error: OSError) -> OutputError:
 class _NoDowngrade(urllib.request.HTTPRedirectHandler):
     """Follows redirects to http and https, but never from https to http."""
 
-    def redirect_request(self, req: Any, *answer: Any) -> Any:
-        newurl = str(answer[-1])
+    def redirect_request(self, req: Any, *response: Any) -> Any:
+        newurl = str(response[-1])
         if not newurl.startswith("https://" if req.full_url.startswith("https://") else "http"):
             raise DatasetError(f"cannot download {req.full_url}: it redirects to {newurl}")
-        return super().redirect_request(req, *answer)
+        return super().redirect_request(req, *response)
 
 
 def _opener() -> urllib.request.OpenerDirector:
-    """One for http and https alone."""
+    """An opener for http and https alone."""
     opener = urllib.request.OpenerDirector()
     for handler in (
         urllib.request.ProxyHandler,

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""One file a recording layout."""
+"""Readers of recording layouts, one file each."""

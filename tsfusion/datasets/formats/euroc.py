@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
-from tsfusion.datasets.dataset import SCAN, Frames, folder, kept, require_frames
+from tsfusion.datasets.dataset import SCAN, Frames, keep_posed, require_folder, require_frames
 from tsfusion.datasets.readers import read_image, read_lines
 from tsfusion.datasets.trajectory_files import read_euroc
 from tsfusion.geometry.calibration import Rectifier
@@ -58,7 +58,7 @@ class EuRoC(Frames):
         color: bool = True,
         posed: bool = True,
     ) -> None:
-        root = folder(path, "EuRoC")
+        root = require_folder(path, "EuRoC")
         place = root / "mav0" if (root / "mav0").is_dir() else root
         self.name, self.sensor, self.skipped = f"EuRoC {place.absolute().parent.name}", sensor, {}
         pairs = _pairs(place, round(max_difference_s * 1e9), self.skipped)
@@ -67,7 +67,7 @@ class EuRoC(Frames):
         trajectory = _trajectory(place, required=posed)
         gap, offset = round(max_gap_s * 1e9), round(time_offset_s * 1e9)
         poses = [_pose(trajectory, stamp + offset, gap, T_body_camera) for stamp, _, _ in pairs]
-        self._pairs, self._poses = kept(
+        self._pairs, self._poses = keep_posed(
             pairs, poses, posed=posed, skipped=self.skipped, reason="without a pose in time"
         )
         require_frames(len(self._pairs), place, EXPECTED, self.skipped)
@@ -84,15 +84,13 @@ class EuRoC(Frames):
             left, right = self._rectifier.pair(_grey(left_file), _grey(right_file))
         except InvalidConfig as error:
             raise DatasetError(f"{left_file} or its right image: {error}") from error
-        return Frame(
+        return self._posed_frame(
+            index,
             left=left,
             right=right,
             baseline_fx=self.baseline_fx,
             intrinsics=self.intrinsics,
             color=np.repeat(left[:, :, None], 3, axis=2) if self._with_color else None,
-            T_world_camera=self._poses[index],
-            sensor=self.sensor,
-            timestamp_ns=self._stamp(index),
         )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import SCAN, Frames, folder, kept, require_frames
+from tsfusion.datasets.dataset import SCAN, Frames, keep_posed, require_folder, require_frames
 from tsfusion.datasets.readers import numbers, read_lines
 from tsfusion.datasets.trajectory_files import check_quaternion
 from tsfusion.geometry.frame import Frame
@@ -37,11 +37,11 @@ class LidarDump(Frames):
     """
 
     def __init__(self, path: str | Path, *, sensor: str = "lidar", posed: bool = True) -> None:
-        root = folder(path, "LiDAR keyframes")
+        root = require_folder(path, "LiDAR keyframes")
         self.name, self.sensor, self.skipped = f"LiDAR keyframes {root.name}", sensor, {}
         files = [file for file in sorted(root.glob("*/points.bin")) if file.parent.name.isdecimal()]
         graph = _read_graph(root / "graph.txt", required=posed)
-        self._files, self._poses = kept(
+        self._files, self._poses = keep_posed(
             files, [graph.get(int(file.parent.name)) for file in files], posed=posed, skipped=self.skipped
         )
         require_frames(len(self._files), root, EXPECTED, self.skipped)
@@ -50,9 +50,7 @@ class LidarDump(Frames):
         return len(self._files)
 
     def _frame(self, index: int) -> Frame:
-        return Frame(
-            points=_read_points(self._files[index]), T_world_camera=self._poses[index], sensor=self.sensor
-        )
+        return self._posed_frame(index, points=_read_points(self._files[index]))
 
 
 def _read_graph(path: Path, *, required: bool) -> dict[int, Transform]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Depth images in one folder, colour images of the same names in another: common to many layouts."""
+"""Base of layouts with depth images in one folder and colour images in another."""
 
 import json
 from collections.abc import Sequence
@@ -21,12 +21,12 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 class DepthImages(Frames):
-    """A depth image a frame, with colour and a pose where there are any.
+    """Frames of one depth image each, with colour and a pose where they are recorded.
 
     Args:
         depth: files of 16-bit depth.
-        color: as many, None where there is no colour; or an empty list.
-        poses: as many.
+        color: as many files, None where there is no colour; or an empty list.
+        poses: as many (4, 4), None where there is no pose.
         depth_scale: metres per unit.
     """
 
@@ -60,14 +60,12 @@ class DepthImages(Frames):
                 f"{self._size[1]}×{self._size[0]}; expected one size, as there is one camera"
             )
         color = self._color[index] if self._color else None
-        return Frame(
+        return self._posed_frame(
+            index,
             depth=depth,
             depth_scale=self.depth_scale,
             color=None if color is None else self._registered(color, depth),
             intrinsics=self.intrinsics,
-            T_world_camera=self._poses[index],
-            sensor=self.sensor,
-            timestamp_ns=self._stamp(index),
         )
 
     def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
@@ -75,12 +73,12 @@ class DepthImages(Frames):
         return read_color(color, depth.shape)
 
 
-def seen_by(
+def resample_for_camera(
     color: NDArray[np.uint8], own: Intrinsics, other: Intrinsics, shape: tuple[int, ...]
 ) -> NDArray[np.uint8]:
-    """An image resampled for another camera in the same place: (h, w, 3) uint8 → (*shape, 3).
+    """Resample an image for another camera in the same place: (h, w, 3) uint8 → (*shape, 3).
 
-    Shrinking averages; beyond the image its border is repeated.
+    Averages pixels where it shrinks; repeats the border beyond the image.
     """
     factor = other.fx / own.fx
     if factor < 1:
@@ -106,7 +104,7 @@ def seen_by(
 
 
 def images(where: Path, expected: str, pattern: str = "[!.]*") -> list[Path]:
-    """The images in a folder: by number where all names are numbers, else by name; no hidden ones (macOS)."""
+    """The images in a folder, sorted by number if all names are numbers, else by name; no hidden files."""
     if not where.is_dir():
         raise DatasetError(f"{where} is missing; expected {expected}")
     found = sorted(path for path in where.glob(pattern) if path.suffix.lower() in SUFFIXES)
@@ -124,7 +122,7 @@ def read_open3d_camera(path: Path) -> Intrinsics:
         ) from error
 
 
-def matched(depth: list[Path], where: Path, expected: str) -> list[Path]:
+def color_images(depth: list[Path], where: Path, expected: str) -> list[Path]:
     """The colour image of each depth image, by file name."""
     by_stem = {path.stem: path for path in images(where, expected)}
     for image in depth:
@@ -135,8 +133,10 @@ def matched(depth: list[Path], where: Path, expected: str) -> list[Path]:
     return [by_stem[image.stem] for image in depth]
 
 
-def by_number(files: list[Path], poses: list[tuple[int, Transform]], source: Path) -> list[Transform | None]:
-    """Each image's pose: the k-th one's where there are as many, else by the number that is its name."""
+def poses_by_number(
+    files: list[Path], poses: list[tuple[int, Transform]], source: Path
+) -> list[Transform | None]:
+    """The pose of each image: the k-th pose if the numbers are equal, else the one numbered as the file."""
     if len(files) == len(poses):
         return [pose for _, pose in poses]
     if not _numbered(files):

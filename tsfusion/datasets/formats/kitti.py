@@ -8,21 +8,19 @@ pose and time are the lines of that number.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import DatasetError, InvalidKeyframe
-from tsfusion.datasets.dataset import Frames, folder, kept, require_frames
-from tsfusion.datasets.readers import checked_intrinsics, read_lines
-from tsfusion.datasets.trajectory_files import nanoseconds, read_kitti
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import Frames, keep_posed, require_folder, require_frames
+from tsfusion.datasets.readers import intrinsics_of, read_lines
+from tsfusion.datasets.trajectory_files import checked_pose, nanoseconds, read_kitti
 from tsfusion.geometry.frame import Frame
-from tsfusion.geometry.keyframe import Intrinsics, check_pose
+from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
 EXPECTED = "sequences/NN/{calib.txt,times.txt,image_0,image_1,velodyne} and poses/NN.txt"
-_COLUMNS = 12  # numbers of a 3×4 matrix
 
 
 def recognises(path: Path) -> bool:
@@ -50,8 +48,8 @@ def open_kitti(
     return KITTI(root, sequence, modality=modality, poses=poses, color=color, posed=posed)
 
 
-class Drive(Frames):
-    """Stereo pairs or Velodyne scans of the KITTI car, by frame number."""
+class KITTIFrames(Frames):
+    """Base of both KITTI layouts: stereo pairs or Velodyne scans by frame number."""
 
     intrinsics: Intrinsics | None
     baseline_fx: float | None
@@ -66,29 +64,24 @@ class Drive(Frames):
 
     def _frame(self, index: int) -> Frame:
         number = self._frames[index]
-        common: dict[str, Any] = {
-            "T_world_camera": self._poses[index],
-            "sensor": self.sensor,
-            "timestamp_ns": self._stamp(index),
-        }
         if self.sensor == "lidar":
-            return Frame(points=read_scan(self._left[number]), **common)
+            return self._posed_frame(index, points=read_scan(self._left[number]))
         left, right = read_pair(self._left[number], self._right[number])
-        return Frame(
+        return self._posed_frame(
+            index,
             left=left,
             right=right,
             baseline_fx=self.baseline_fx,
             intrinsics=self.intrinsics,
             color=self._color(number, left) if self._with_color else None,
-            **common,
         )
 
     def _color(self, number: int, left: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W, 3) uint8 BGR of the left camera: here the grey image."""
+        """(H, W, 3) uint8 BGR of the left camera: the grey image, three times."""
         return np.repeat(left[:, :, None], 3, axis=2)
 
 
-class KITTI(Drive):
+class KITTI(KITTIFrames):
     """One sequence as stereo disparity (`modality="stereo"`) or as Velodyne scans (`"lidar"`).
 
     Stereo: the left camera's frame, disparity in 1/16 px by semi-global matching at each access; colour is
@@ -117,15 +110,15 @@ class KITTI(Drive):
     ) -> None:
         if modality not in ("stereo", "lidar"):
             raise DatasetError(f"modality of KITTI must be stereo or lidar, got {modality!r}")
-        root = folder(root, "KITTI odometry")
-        place = folder(root / "sequences" / sequence, "KITTI odometry (sequences/NN)")
+        root = require_folder(root, "KITTI odometry")
+        place = require_folder(root / "sequences" / sequence, "KITTI odometry (sequences/NN)")
         self.name, self.sensor, self.skipped = f"KITTI {sequence} {modality}", modality, {}
         self._left, self._right = _stereo_files(place) if modality == "stereo" else (_scan_files(place), {})
-        calibration = _read_calibration(
-            place / "calib.txt", ("P0", "P1") if modality == "stereo" else ("Tr",)
+        calibration = read_calibration(
+            place / "calib.txt", dict.fromkeys(("P0", "P1") if modality == "stereo" else ("Tr",), 12)
         )
         trajectory = _trajectory(root, sequence, poses, posed=posed)
-        self._frames, found = kept(
+        self._frames, found = keep_posed(
             list(self._left), [trajectory.get(n) for n in self._left], posed=posed, skipped=self.skipped
         )
         require_frames(len(self._frames), place, EXPECTED, self.skipped)
@@ -134,7 +127,7 @@ class KITTI(Drive):
         if modality == "stereo":
             self.intrinsics, self.baseline_fx = _stereo_camera(calibration, place / "calib.txt")
         else:
-            T_cam0_velo = _transform(calibration["Tr"], place / "calib.txt")
+            T_cam0_velo = checked_pose(calibration["Tr"].reshape(3, 4), f"{place / 'calib.txt'}: Tr")
             T_velo_cam0 = np.linalg.inv(T_cam0_velo)
             found = [None if T is None else T_velo_cam0 @ T @ T_cam0_velo for T in found]
         self._poses = found
@@ -155,7 +148,7 @@ def _only_sequence(root: Path) -> str:
     return found[0]
 
 
-def numbered(place: Path, suffix: str) -> dict[int, Path]:
+def files_by_frame(place: Path, suffix: str) -> dict[int, Path]:
     """Frame number → file, in order."""
     files = sorted(place.glob(f"*{suffix}"))
     for path in files:
@@ -165,7 +158,7 @@ def numbered(place: Path, suffix: str) -> dict[int, Path]:
 
 
 def _stereo_files(place: Path) -> tuple[dict[int, Path], dict[int, Path]]:
-    left, right = numbered(place / "image_0", ".png"), numbered(place / "image_1", ".png")
+    left, right = files_by_frame(place / "image_0", ".png"), files_by_frame(place / "image_1", ".png")
     if not left or not right:
         raise DatasetError(f"{place} has {len(left)} left and {len(right)} right images; expected {EXPECTED}")
     alone = sorted(left.keys() ^ right.keys())
@@ -180,7 +173,7 @@ def _stereo_files(place: Path) -> tuple[dict[int, Path], dict[int, Path]]:
 
 
 def _scan_files(place: Path) -> dict[int, Path]:
-    scans = numbered(place / "velodyne", ".bin")
+    scans = files_by_frame(place / "velodyne", ".bin")
     if not scans:
         raise DatasetError(f"{place / 'velodyne'} has no scans (*.bin); expected {EXPECTED}")
     return scans
@@ -196,22 +189,23 @@ def _trajectory(root: Path, sequence: str, poses: str | Path | None, *, posed: b
     return dict(enumerate(read_kitti(path)))
 
 
-def _read_calibration(path: Path, wanted: tuple[str, ...]) -> Mapping[str, NDArray[np.float64]]:
+def read_calibration(path: Path, wanted: dict[str, int]) -> Mapping[str, NDArray[np.float64]]:
+    """`name: numbers` a line; each wanted name must be there with so many finite numbers."""
     import pykitti.utils  # a second to import: pandas and matplotlib come with it
 
-    lines = read_lines(path, f"KITTI's calibration with the lines {', '.join(wanted)}")
-    for number, line in lines:
+    for number, line in read_lines(path, f"KITTI's calibration with the lines {', '.join(wanted)}"):
         if ":" not in line:
-            raise DatasetError(f"{path}:{number}: {line!r}; expected `name: 12 numbers`")
+            raise DatasetError(f"{path}:{number}: {line!r}; expected `name: numbers`")
     try:
         found: dict[str, NDArray[np.float64]] = pykitti.utils.read_calib_file(path)
     except ValueError as error:
-        raise DatasetError(f"{path}: {error}; expected `name: 12 numbers` a line") from error
-    for name in wanted:
+        raise DatasetError(f"{path}: {error}; expected `name: numbers` a line") from error
+    for name, count in wanted.items():
         values = found.get(name)
-        if values is None or len(values) != _COLUMNS or not np.isfinite(values).all():
-            state = "no" if values is None else f"no usable ({len(values)} numbers)"
-            raise DatasetError(f"{path} has {state} line {name}; expected `{name}:` and 12 finite numbers")
+        if values is None or len(values) != count or not np.isfinite(values).all():
+            raise DatasetError(
+                f"{path} has no usable line {name}; expected `{name}:` and {count} finite numbers"
+            )
     return found
 
 
@@ -222,15 +216,7 @@ def _stereo_camera(calibration: Mapping[str, NDArray[np.float64]], path: Path) -
         raise DatasetError(
             f"{path}: P1 must lie to the right of P0 (P1[0,3] < P0[0,3]), got {-baseline_fx} px·m"
         )
-    camera = Intrinsics(float(P0[0, 0]), float(P0[1, 1]), float(P0[0, 2]), float(P0[1, 2]))
-    return checked_intrinsics(camera, path), baseline_fx
-
-
-def _transform(row: NDArray[np.float64], path: Path) -> Transform:
-    try:
-        return check_pose(np.vstack([row.reshape(3, 4), (0, 0, 0, 1)]))
-    except InvalidKeyframe as error:
-        raise DatasetError(f"{path}: Tr: {error}") from error
+    return intrinsics_of(P0, path), baseline_fx
 
 
 def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:

@@ -5,18 +5,18 @@ Calibration and GPS packets are read by pykitti's functions; files are chosen he
 their names: `pykitti.raw` goes by their place in a sorted list, and several drives lack some scans.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import DatasetError, InvalidKeyframe
-from tsfusion.datasets.dataset import folder, kept, require_frames
-from tsfusion.datasets.formats.kitti import Drive, numbered
-from tsfusion.datasets.readers import checked_intrinsics, read_color, read_lines, read_numbers
-from tsfusion.geometry.keyframe import Intrinsics, check_pose
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import keep_posed, require_folder, require_frames
+from tsfusion.datasets.formats.kitti import KITTIFrames, files_by_frame, read_calibration
+from tsfusion.datasets.readers import intrinsics_of, read_color, read_numbers
+from tsfusion.datasets.trajectory_files import checked_pose
+from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform, inverse
 
 EXPECTED = "DATE/DATE_drive_NNNN_sync/{image_00..03,velodyne_points,oxts}/data and DATE/calib_*.txt"
@@ -29,7 +29,7 @@ def recognises(path: Path) -> bool:
     return _is_drive(path) or bool(_drives(path))
 
 
-class KITTIRaw(Drive):
+class KITTIRaw(KITTIFrames):
     """One synchronised and rectified drive (`…_sync`) as stereo disparity or as Velodyne scans.
 
     https://www.cvlibs.net/datasets/kitti/raw_data.php. A frame's pose comes from the GPS/IMU packet of its
@@ -60,7 +60,7 @@ class KITTIRaw(Drive):
                 "modality of KITTI raw must be stereo or lidar, cameras grey or color, "
                 f"got {modality!r} and {cameras!r}"
             )
-        drive = _only_drive(folder(path, "KITTI raw"))
+        drive = _only_drive(require_folder(path, "KITTI raw"))
         chosen = _cameras(drive, cameras)
         if modality is None:
             modality = "stereo" if (drive / f"image_{chosen[0]}").is_dir() else "lidar"
@@ -68,12 +68,14 @@ class KITTIRaw(Drive):
         left, self._right = _files(drive, modality, chosen, self.skipped)
         require_frames(len(left), drive, EXPECTED, self.skipped)
         body = _imu_poses(drive / "oxts" / "data", required=posed)
-        rig = _rig(drive.parent, None if modality == "lidar" else chosen, imu=bool(body))
-        poses = [body[n] @ rig.T_imu_sensor if n in body else None for n in left]
-        self._frames, self._poses = kept(list(left), poses, posed=posed, skipped=self.skipped)
+        calibration = _sensor_calibration(
+            drive.parent, None if modality == "lidar" else chosen, imu=bool(body)
+        )
+        poses = [body[n] @ calibration.T_imu_sensor if n in body else None for n in left]
+        self._frames, self._poses = keep_posed(list(left), poses, posed=posed, skipped=self.skipped)
         require_frames(len(self._frames), drive, EXPECTED, self.skipped)
         self._left, self._colored, self._with_color = left, chosen[0] == "02", color
-        self.intrinsics, self.baseline_fx = rig.intrinsics, rig.baseline_fx
+        self.intrinsics, self.baseline_fx = calibration.intrinsics, calibration.baseline_fx
         times = (
             drive / (f"image_{chosen[0]}" if modality == "stereo" else "velodyne_points") / "timestamps.txt"
         )
@@ -83,34 +85,33 @@ class KITTIRaw(Drive):
         return read_color(self._left[number], left.shape) if self._colored else super()._color(number, left)
 
 
-class _Rig(NamedTuple):
+class _SensorCalibration(NamedTuple):
     T_imu_sensor: Transform
     intrinsics: Intrinsics | None = None
     baseline_fx: float | None = None
 
 
-def _rig(day: Path, cameras: tuple[str, str] | None, *, imu: bool) -> _Rig:
-    """The pinhole model of a pair, and where its left camera (without `cameras`, the Velodyne) sits.
+def _sensor_calibration(day: Path, cameras: tuple[str, str] | None, *, imu: bool) -> _SensorCalibration:
+    """The pinhole model of a pair, and the place of its left camera (without `cameras`, of the Velodyne).
 
     Args:
-        imu: without it nobody asks where; then the calibration of the GPS/IMU unit may be missing.
+        imu: whether that place is needed; without, the calibration of the GPS/IMU unit may be missing.
     """
     T_velo_imu = _rigid(day / "calib_imu_to_velo.txt") if imu else np.eye(4)
     if cameras is None:
-        return _Rig(inverse(T_velo_imu))
+        return _SensorCalibration(inverse(T_velo_imu))
     T_cam0_velo = _rigid(day / "calib_velo_to_cam.txt") if imu else np.eye(4)
     path = day / "calib_cam_to_cam.txt"
-    found = _read_calibration(path, {"R_rect_00": 9, **{f"P_rect_{camera}": 12 for camera in cameras}})
+    found = read_calibration(path, {"R_rect_00": 9, **{f"P_rect_{camera}": 12 for camera in cameras}})
     left, right = (found[f"P_rect_{camera}"].reshape(3, 4) for camera in cameras)
     rectified, shift = np.eye(4), np.eye(4)
     rectified[:3, :3] = found["R_rect_00"].reshape(3, 3)
     shift[0, 3] = left[0, 3] / left[0, 0]  # the camera's place beside camera 0
-    T_imu_camera = inverse(_checked(shift @ rectified @ T_cam0_velo @ T_velo_imu, path))
-    K = Intrinsics(*map(float, (left[0, 0], left[1, 1], left[0, 2], left[1, 2])))
+    T_imu_camera = inverse(checked_pose(shift @ rectified @ T_cam0_velo @ T_velo_imu, path))
     baseline_fx = float(left[0, 3] - right[0, 3])
     if baseline_fx <= 0:
         raise DatasetError(f"{path}: P_rect_{cameras[1]} must lie to the right of P_rect_{cameras[0]}")
-    return _Rig(T_imu_camera, checked_intrinsics(K, path), baseline_fx)
+    return _SensorCalibration(T_imu_camera, intrinsics_of(left, path), baseline_fx)
 
 
 def _is_drive(path: Path) -> bool:
@@ -147,8 +148,8 @@ def _files(
 ) -> tuple[dict[int, Path], dict[int, Path]]:
     """Frame number → left image or scan, and → right image; pairs alone are left out and counted."""
     if modality == "lidar":
-        return numbered(drive / "velodyne_points" / "data", ".bin"), {}
-    left, right = (numbered(drive / f"image_{camera}" / "data", ".png") for camera in cameras)
+        return files_by_frame(drive / "velodyne_points" / "data", ".bin"), {}
+    left, right = (files_by_frame(drive / f"image_{camera}" / "data", ".png") for camera in cameras)
     alone = left.keys() ^ right.keys()
     if alone:
         skipped["without their other half"] = len(alone)
@@ -160,7 +161,7 @@ def _imu_poses(place: Path, *, required: bool) -> dict[int, Transform]:
     """Frame number → T_world_imu, by pykitti's Mercator projection; the first packet is the origin."""
     from pykitti.utils import OxtsPacket, pose_from_oxts_packet
 
-    files = numbered(place, ".txt")
+    files = files_by_frame(place, ".txt")
     if required and not files:
         raise DatasetError(f"{place} has no packets (*.txt); expected {EXPECTED}")
     poses: dict[int, Transform] = {}
@@ -177,33 +178,10 @@ def _imu_poses(place: Path, *, required: bool) -> dict[int, Transform]:
 
 
 def _rigid(path: Path) -> Transform:
-    found = _read_calibration(path, {"R": 9, "T": 3})
+    found = read_calibration(path, {"R": 9, "T": 3})
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = found["R"].reshape(3, 3), found["T"]
-    return _checked(T, path)
-
-
-def _checked(T: Transform, path: Path) -> Transform:
-    try:
-        return check_pose(T)
-    except InvalidKeyframe as error:
-        raise DatasetError(f"{path}: {error}") from error
-
-
-def _read_calibration(path: Path, wanted: dict[str, int]) -> Mapping[str, NDArray[np.float64]]:
-    from pykitti.utils import read_calib_file
-
-    for number, line in read_lines(path, f"KITTI's calibration with the lines {', '.join(wanted)}"):
-        if ":" not in line:
-            raise DatasetError(f"{path}:{number}: {line!r}; expected `name: numbers`")
-    found: dict[str, NDArray[np.float64]] = read_calib_file(path)
-    for name, count in wanted.items():
-        values = found.get(name)
-        if values is None or len(values) != count or not np.isfinite(values).all():
-            raise DatasetError(
-                f"{path} has no usable line {name}; expected `{name}:` and {count} finite numbers"
-            )
-    return found
+    return checked_pose(T, path)
 
 
 def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
-from tsfusion.datasets.dataset import Frames, kept, require_frames
-from tsfusion.datasets.formats.image_folders import seen_by
+from tsfusion.datasets.dataset import Frames, keep_posed, require_frames
+from tsfusion.datasets.formats.image_folders import resample_for_camera
 from tsfusion.datasets.readers import read_color, read_image
 from tsfusion.geometry.calibration import Camera, Undistorter
 from tsfusion.geometry.frame import Frame
@@ -31,7 +31,9 @@ _MODELS = {
 
 
 @dataclass(frozen=True)
-class _View:
+class _ListedFrame:
+    """A frame of the capture that has depth."""
+
     depth: Path
     color: Path | None
     size: tuple[int, int] | None  # (height, width) that the camera is given for; None = the images' own
@@ -80,49 +82,48 @@ class Nerfstudio(Frames):
         self.name, self.sensor, self.skipped = f"nerfstudio {file.absolute().parent.name}", sensor, {}
         self.depth_scale = _depth_scale(capture, file) if depth_scale is None else depth_scale
         applied = _scale(capture, "applied_scale", file) if "applied_scale" in capture else 1.0
-        views, poses = [], []
+        listed, poses = [], []
         for number, frame in enumerate(capture["frames"]):
             where = f"{file}, frame {number}"
-            view = _view(file.parent, capture, frame, where, color=color)
-            if view is not None:
-                views.append(view)
+            entry = _listed_frame(file.parent, capture, frame, where, color=color)
+            if entry is not None:
+                listed.append(entry)
                 poses.append(_pose(frame, applied, where))
-        if not views:
+        if not listed:
             raise DatasetError(
                 f"{file} has {len(capture['frames'])} frames, none with depth_file_path or depth_path; "
                 "expected depth images: colour alone cannot be fused"
             )
-        if len(views) < len(capture["frames"]):
-            self.skipped["without depth"] = len(capture["frames"]) - len(views)
-        self._views, self._poses = kept(views, poses, posed=posed, skipped=self.skipped)
-        require_frames(len(self._views), file, EXPECTED, self.skipped)
+        if len(listed) < len(capture["frames"]):
+            self.skipped["without depth"] = len(capture["frames"]) - len(listed)
+        self._listed, self._poses = keep_posed(listed, poses, posed=posed, skipped=self.skipped)
+        require_frames(len(self._listed), file, EXPECTED, self.skipped)
         self._undistorters: dict[Camera, Undistorter] = {}
 
     def __len__(self) -> int:
-        return len(self._views)
+        return len(self._listed)
 
     def _frame(self, index: int) -> Frame:
-        view = self._views[index]
-        depth, scale = _read_depth(view.depth, self.depth_scale)
-        color = None if view.color is None else read_color(view.color, None)
-        size = view.size or (depth if color is None else color).shape[:2]
-        camera = _camera(view, size)
-        fitted = _resized(camera, depth.shape[:2], view.where)
+        entry = self._listed[index]
+        depth, scale = _read_depth(entry.depth, self.depth_scale)
+        color = None if entry.color is None else read_color(entry.color, None)
+        size = entry.size or (depth if color is None else color).shape[:2]
+        camera = _camera(entry, size)
+        fitted = _resized(camera, depth.shape[:2], entry.where)
         if color is not None and color.shape != (*depth.shape, 3):
-            own = _resized(camera, color.shape[:2], view.where)
-            color = seen_by(color, own.intrinsics, fitted.intrinsics, depth.shape)
+            own = _resized(camera, color.shape[:2], entry.where)
+            color = resample_for_camera(color, own.intrinsics, fitted.intrinsics, depth.shape)
         intrinsics = fitted.intrinsics
         if fitted.model != "pinhole":
             undistorter = self._undistorter(fitted)
             intrinsics, depth = undistorter.intrinsics, undistorter.depth(depth)
             color = None if color is None else undistorter.image(color)
-        return Frame(
+        return self._posed_frame(
+            index,
             depth=depth,
             depth_scale=scale,
             color=color,
             intrinsics=intrinsics,
-            T_world_camera=self._poses[index],
-            sensor=self.sensor,
         )
 
     def _undistorter(self, camera: Camera) -> Undistorter:
@@ -146,9 +147,9 @@ def _read(path: Path) -> dict[str, Any]:
     return found
 
 
-def _view(
+def _listed_frame(
     root: Path, capture: dict[str, Any], frame: dict[str, Any], where: str, *, color: bool
-) -> _View | None:
+) -> _ListedFrame | None:
     camera = {**capture, **frame}
     depth = frame.get("depth_file_path") or frame.get("depth_path")
     if not depth:
@@ -156,8 +157,8 @@ def _view(
     size = None
     if "w" in camera and "h" in camera:
         size = (int(_number(camera, "h", where)), int(_number(camera, "w", where)))
-    listed = frame.get("file_path") if color else None
-    return _View(root / str(depth), _image(root / str(listed)) if listed else None, size, camera, where)
+    file = frame.get("file_path") if color else None
+    return _ListedFrame(root / str(depth), _image(root / str(file)) if file else None, size, camera, where)
 
 
 def _image(path: Path) -> Path:
@@ -178,9 +179,9 @@ def _pose(frame: dict[str, Any], applied_scale: float, where: str) -> Transform 
         raise DatasetError(f"{where}: transform_matrix: {error}") from error
 
 
-def _camera(view: _View, size: tuple[int, ...]) -> Camera:
+def _camera(entry: _ListedFrame, size: tuple[int, ...]) -> Camera:
     """The camera that a frame's keys give for images of (height, width) `size`."""
-    given, where = view.camera, view.where
+    given, where = entry.camera, entry.where
     model = str(given.get("camera_model", "OPENCV"))
     if model not in _MODELS:
         raise DatasetError(f"{where}: camera_model must be one of {', '.join(_MODELS)}, got {model!r}")

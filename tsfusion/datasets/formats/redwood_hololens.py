@@ -4,12 +4,12 @@
 from pathlib import Path
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import SCAN, folder, kept, require_frames
+from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
 from tsfusion.datasets.formats.image_folders import (
     DepthImages,
-    by_number,
+    color_images,
     images,
-    matched,
+    poses_by_number,
     read_open3d_camera,
 )
 from tsfusion.datasets.readers import checked_intrinsics, read_intrinsics
@@ -61,7 +61,7 @@ class HoloLens(DepthImages):
     def __init__(
         self, path: str | Path, *, sensor: str = "tof", color: bool = True, posed: bool = True
     ) -> None:
-        root = folder(path, "HoloLens")
+        root = require_folder(path, "HoloLens")
         depth = images(root / "depth", HOLOLENS_EXPECTED)
         require_frames(len(depth), root / "depth", HOLOLENS_EXPECTED, {})
         poses: list[Transform | None] = [None] * len(depth)
@@ -76,7 +76,7 @@ class HoloLens(DepthImages):
             f"HoloLens {root.name}",
             sensor=sensor,
             depth=depth,
-            color=matched(depth, root / "images", HOLOLENS_EXPECTED) if color else [],
+            color=color_images(depth, root / "images", HOLOLENS_EXPECTED) if color else [],
             poses=poses,
             intrinsics=read_intrinsics(root / "K.txt"),
             skipped={},
@@ -118,21 +118,21 @@ class Redwood(DepthImages):
         path = Path(path).expanduser()
         if path.is_file():
             path, trajectory = _root_of(path) or path.parent, trajectory or path.absolute()
-        root = folder(path, "Redwood")
+        root = require_folder(path, "Redwood")
         files = images(_depth_folder(root), REDWOOD_EXPECTED)
-        log = _log(root) if trajectory is None else _given(root, trajectory)
+        log = _log(root) if trajectory is None else _trajectory_file(root, trajectory)
         if log is None and posed:
             raise DatasetError(f"{root} has no trajectory; expected {REDWOOD_EXPECTED}; {SCAN}")
         skipped: dict[str, int] = {}
-        found = [None] * len(files) if log is None else by_number(files, read_log(log), log)
-        depth, poses = kept(files, found, posed=posed, skipped=skipped)
+        found = [None] * len(files) if log is None else poses_by_number(files, read_log(log), log)
+        depth, poses = keep_posed(files, found, posed=posed, skipped=skipped)
         require_frames(len(depth), root, REDWOOD_EXPECTED, skipped)
         where = _color_folder(root)
         super().__init__(
             f"Redwood {root.name}",
             sensor=sensor,
             depth=depth,
-            color=matched(depth, where, REDWOOD_EXPECTED) if color and where else [],
+            color=color_images(depth, where, REDWOOD_EXPECTED) if color and where else [],
             poses=poses,
             intrinsics=checked_intrinsics(intrinsics or _open3d_intrinsics(root), "intrinsics"),
             skipped=skipped,
@@ -171,7 +171,7 @@ def _log(root: Path) -> Path | None:
     return next((path for path in [*known, *named] if not path.name.startswith(".")), None)
 
 
-def _given(root: Path, trajectory: str | Path) -> Path:
+def _trajectory_file(root: Path, trajectory: str | Path) -> Path:
     return Path(trajectory) if Path(trajectory).is_file() else root / trajectory
 
 

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import SCAN, folder, kept, require_frames
+from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
 from tsfusion.datasets.formats.image_folders import DepthImages, images
 from tsfusion.datasets.readers import checked_intrinsics, numbers, read_depth
 from tsfusion.datasets.trajectory_files import read_matrix_rows
@@ -40,10 +40,10 @@ class Replica(DepthImages):
     def __init__(
         self, path: str | Path, *, sensor: str = "kinect", color: bool = True, posed: bool = True
     ) -> None:
-        root = folder(path, "Replica")
+        root = require_folder(path, "Replica")
         skipped: dict[str, int] = {}
         files = images(root / "results", EXPECTED, "depth*")
-        depth, poses = kept(files, _poses(root, files, posed=posed), posed=posed, skipped=skipped)
+        depth, poses = keep_posed(files, _poses(root, files, posed=posed), posed=posed, skipped=skipped)
         require_frames(len(depth), root / "results", EXPECTED, skipped)
         intrinsics, size, scale = _camera(root)
         super().__init__(
@@ -52,7 +52,7 @@ class Replica(DepthImages):
             depth=depth,
             color=_frames(root, depth) if color else [],
             poses=poses,
-            intrinsics=_at_size(intrinsics, size, depth[0]),
+            intrinsics=_scaled_to_depth(intrinsics, size, depth[0]),
             skipped=skipped,
             depth_scale=scale,
         )
@@ -108,7 +108,7 @@ def _camera(root: Path) -> tuple[Intrinsics, tuple[int, int], float]:
     return checked_intrinsics(intrinsics, path), size, scale
 
 
-def _at_size(intrinsics: Intrinsics, size: tuple[int, int], depth: Path) -> Intrinsics:
+def _scaled_to_depth(intrinsics: Intrinsics, size: tuple[int, int], depth: Path) -> Intrinsics:
     shape = read_depth(depth).shape
     if shape[0] * size[1] != shape[1] * size[0]:
         raise DatasetError(

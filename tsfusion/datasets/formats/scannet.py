@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import folder, kept, require_frames
-from tsfusion.datasets.formats.image_folders import DepthImages, images, matched, seen_by
-from tsfusion.datasets.readers import checked_intrinsics, read_color, read_lines, read_numbers
+from tsfusion.datasets.dataset import keep_posed, require_folder, require_frames
+from tsfusion.datasets.formats.image_folders import DepthImages, color_images, images, resample_for_camera
+from tsfusion.datasets.readers import intrinsics_of, read_color, read_lines, read_numbers
 from tsfusion.datasets.trajectory_files import read_matrix
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
@@ -42,10 +42,10 @@ class ScanNet(DepthImages):
     def __init__(
         self, path: str | Path, *, sensor: str = "kinect", color: bool = True, posed: bool = True
     ) -> None:
-        root = folder(path, "ScanNet")
+        root = require_folder(path, "ScanNet")
         skipped: dict[str, int] = {}
         files = images(root / "depth", EXPECTED)
-        depth, poses = kept(
+        depth, poses = keep_posed(
             files, [_pose(root / "pose" / f"{file.stem}.txt") for file in files], posed=posed, skipped=skipped
         )
         require_frames(len(depth), root, EXPECTED, skipped)
@@ -54,7 +54,7 @@ class ScanNet(DepthImages):
             f"ScanNet {root.name}",
             sensor=sensor,
             depth=depth,
-            color=matched(depth, root / "color", EXPECTED) if color else [],
+            color=color_images(depth, root / "color", EXPECTED) if color else [],
             poses=poses,
             intrinsics=_required(root),
             skipped=skipped,
@@ -63,7 +63,9 @@ class ScanNet(DepthImages):
     def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
         if self.color_intrinsics is None:
             return read_color(color, depth.shape)
-        return seen_by(read_color(color, None), self.color_intrinsics, self.intrinsics, depth.shape)
+        return resample_for_camera(
+            read_color(color, None), self.color_intrinsics, self.intrinsics, depth.shape
+        )
 
 
 def _camera_file(root: Path, camera: str) -> Path | None:
@@ -77,7 +79,7 @@ def _intrinsics(root: Path, camera: str) -> Intrinsics | None:
     K = read_numbers(path, "a 4×4 or 3×3 camera matrix")
     if K.shape not in ((4, 4), (3, 3)):
         raise DatasetError(f"{path} must hold a 4×4 or 3×3 camera matrix, got {K.shape[0]}×{K.shape[1]}")
-    return checked_intrinsics(Intrinsics(*map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))), path)
+    return intrinsics_of(K, path)
 
 
 def _required(root: Path) -> Intrinsics:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import Frames, folder, kept, require_frames
+from tsfusion.datasets.dataset import Frames, keep_posed, require_folder, require_frames
 from tsfusion.datasets.readers import checked_intrinsics, read_color, read_depth, read_intrinsics
 from tsfusion.datasets.trajectory_files import read_matrix
 from tsfusion.geometry.depth_registration import Registration
@@ -58,7 +58,7 @@ class SevenScenes(Frames):
         register: bool | None = None,
         posed: bool = True,
     ) -> None:
-        root = folder(path, "7-Scenes")
+        root = require_folder(path, "7-Scenes")
         self.name, self.sensor, self.skipped = f"7-Scenes {root.name}", sensor, {}
         stems: list[Path] = []
         for sequence in _sequences(root):
@@ -70,7 +70,9 @@ class SevenScenes(Frames):
                     f"expected {EXPECTED}"
                 )
             stems += [sequence / stem for stem in sorted(depth)]
-        self._stems, self._poses = kept(stems, [_pose(s) for s in stems], posed=posed, skipped=self.skipped)
+        self._stems, self._poses = keep_posed(
+            stems, [_pose(s) for s in stems], posed=posed, skipped=self.skipped
+        )
         require_frames(len(self._stems), root, EXPECTED, self.skipped)
         self._suffix = _color_suffix(self._stems[0]) if color else None
         self.intrinsics = _intrinsics(root, self._stems[0].parent) if intrinsics is None else intrinsics
@@ -87,13 +89,12 @@ class SevenScenes(Frames):
         if color is not None and self._register:
             registration = _registration(self.intrinsics, depth.shape)
             color = registration.color_of_depth(color, depth * np.float32(0.001))
-        return Frame(
+        return self._posed_frame(
+            index,
             depth=depth,
             depth_scale=0.001,
             color=color,
             intrinsics=self.intrinsics,
-            T_world_camera=self._poses[index],
-            sensor=self.sensor,
         )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.trajectory import rigid
 
 LENS_Y, LENS_Z = 0.179, 1.32  # metres, scan frame: where the rays of one column meet
 
@@ -47,32 +48,10 @@ def read_points(path: Path) -> NDArray[np.float32]:
     return np.array([row.split()[:3] for row in rows], dtype=np.float64).astype(np.float32)
 
 
-def read_rows(path: Path) -> NDArray[np.int64]:
-    """(N,) the range grid's row of every vertex."""
-    head, body = path.read_bytes().replace(b"\r\n", b"\n").split(b"end_header\n", 1)
-    sizes = dict(
-        line.split()[1:3] for line in head.splitlines() if line.startswith((b"element", b"obj_info num"))
-    )
-    cells = body.splitlines()[int(sizes[b"vertex"]) :]
-    rows = np.full(int(sizes[b"vertex"]), -1)
-    for index, cell in enumerate(cells):
-        if cell[:1] == b"1":
-            rows[int(cell.split()[1])] = index // int(sizes[b"num_cols"])
-    return rows
-
-
 def pose(translation_quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     """`tx ty tz qx qy qz qw` of bun.conf → (4, 4) T_world_scan; its quaternion is the conjugate of ours."""
     q = translation_quaternion[3:] / np.linalg.norm(translation_quaternion[3:])
-    x, y, z, w = -q[0], -q[1], -q[2], q[3]
-    T = np.eye(4)
-    T[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    T[:3, 3] = translation_quaternion[:3]
-    return T
+    return rigid(q * (-1, -1, -1, 1), translation_quaternion[:3])
 
 
 def reference(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import SCAN, folder, kept, require_frames
+from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
 from tsfusion.datasets.formats.image_folders import DepthImages
 from tsfusion.datasets.formats.tum_lists import ASSOCIATIONS, read_recording
 from tsfusion.datasets.readers import checked_intrinsics, read_depth, read_intrinsics
@@ -24,8 +24,8 @@ CALIBRATED_SIZE = (480, 640)  # height, width of the cameras below
 
 
 @dataclass(frozen=True)
-class _Camera:
-    """Cameras of published recordings, told by the folder's name."""
+class _PublishedCamera:
+    """Camera of a published recording, found by the folder's name."""
 
     name: str
     folder: str  # regular expression, searched in the last two folder names
@@ -33,10 +33,10 @@ class _Camera:
     sensor: str = "kinect"
 
 
-_CORBS = _Camera(
+_CORBS = _PublishedCamera(
     "CoRBS", r"corbs|pre[-_]?registered", Intrinsics(468.60, 468.61, 318.27, 243.99), sensor="tof"
 )
-_ICL = _Camera(
+_ICL = _PublishedCamera(
     "ICL-NUIM",
     r"icl[-_]?nuim|(living|office)_room_traj|traj\d\w?_(frei|loop)",
     Intrinsics(481.2, -480.0, 319.5, 239.5),
@@ -44,11 +44,11 @@ _ICL = _Camera(
 _CAMERAS = (
     _CORBS,
     _ICL,
-    _Camera("TUM", r"freiburg1", Intrinsics(517.3, 516.5, 318.6, 255.3)),
-    _Camera("TUM", r"freiburg2", Intrinsics(520.9, 521.0, 325.1, 249.7)),
-    _Camera("TUM", r"freiburg3", Intrinsics(535.4, 539.2, 320.1, 247.6)),
+    _PublishedCamera("TUM", r"freiburg1", Intrinsics(517.3, 516.5, 318.6, 255.3)),
+    _PublishedCamera("TUM", r"freiburg2", Intrinsics(520.9, 521.0, 325.1, 249.7)),
+    _PublishedCamera("TUM", r"freiburg3", Intrinsics(535.4, 539.2, 320.1, 247.6)),
 )
-_UNKNOWN = _Camera("TUM", "", Intrinsics(525.0, 525.0, 319.5, 239.5))  # the benchmark's ROS default
+_UNKNOWN = _PublishedCamera("TUM", "", Intrinsics(525.0, 525.0, 319.5, 239.5))  # the benchmark's ROS default
 
 
 def recognises(path: Path) -> bool:
@@ -95,9 +95,9 @@ class TUM(DepthImages):
         color: bool = True,
         posed: bool = True,
     ) -> None:
-        root = folder(path, "TUM RGB-D")
+        root = require_folder(path, "TUM RGB-D")
         listed = read_recording(root, max_difference_ns=round(max_difference_s * 1e9))
-        camera = _camera(root, listed.windows)
+        camera = _published_camera(root, listed.windows)
         skipped: dict[str, int] = {}
         poses = _poses_at(
             listed.timestamps_ns,
@@ -105,7 +105,7 @@ class TUM(DepthImages):
             max_gap_ns=round(max_gap_s * 1e9),
             offset_ns=round(time_offset_s * 1e9),
         )
-        chosen, poses = kept(
+        chosen, poses = keep_posed(
             range(len(poses)), poses, posed=posed, skipped=skipped, reason="without a pose in time"
         )
         require_frames(len(chosen), root, EXPECTED, skipped)
@@ -171,7 +171,7 @@ def _icl(root: Path) -> list[Path]:
     return [*sorted(root.glob("[!.]*.gt.freiburg")), root.parent / f"{room}{number[1]}.gt.freiburg"]
 
 
-def _camera(root: Path, windows: bool) -> _Camera:
+def _published_camera(root: Path, windows: bool) -> _PublishedCamera:
     names = "/".join(root.resolve().parts[-2:]).lower()
     for camera in _CAMERAS:
         if re.search(camera.folder, names):
@@ -181,7 +181,7 @@ def _camera(root: Path, windows: bool) -> _Camera:
     return _CORBS if windows else _UNKNOWN
 
 
-def _intrinsics(root: Path, camera: _Camera, shape: tuple[int, ...]) -> Intrinsics:
+def _intrinsics(root: Path, camera: _PublishedCamera, shape: tuple[int, ...]) -> Intrinsics:
     for name in ("camera-intrinsics.txt", "K.txt"):
         if (root / name).exists():
             return read_intrinsics(root / name)

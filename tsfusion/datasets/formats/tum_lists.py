@@ -1,26 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""Lists of time-stamped images in text files, as TUM's tools write them, and matching them by time."""
+"""Text lists of time-stamped images, as TUM's tools write them, matched by time."""
 
 from pathlib import Path, PureWindowsPath
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import nearest_in_time
 from tsfusion.datasets.readers import read_lines
 from tsfusion.datasets.trajectory_files import nanoseconds
 
 ASSOCIATIONS = ("associations.txt", "association.txt", "associated.txt")
 
 
-class Listed(NamedTuple):
+class ImageList(NamedTuple):
     """Images of a recording in time order.
 
     Attributes:
-        timestamps_ns: of the depth images.
-        depth: their files.
-        color: as many, None where there is none near in time; empty where the recording has no colour.
+        timestamps_ns: nanoseconds of each depth image.
+        depth: files of the depth images.
+        color: as many files, None where none is near in time; empty where the recording has no colour.
         windows: whether the paths were Windows paths.
     """
 
@@ -30,7 +30,7 @@ class Listed(NamedTuple):
     windows: bool
 
 
-def read_recording(root: Path, *, max_difference_ns: int) -> Listed:
+def read_recording(root: Path, *, max_difference_ns: int) -> ImageList:
     """`depth.txt` with `rgb.txt` where it exists, or a list of pairs in one of `ASSOCIATIONS` alone.
 
     Raises:
@@ -42,18 +42,18 @@ def read_recording(root: Path, *, max_difference_ns: int) -> Listed:
     depth, windows = _read_list(root / "depth.txt")
     stamps, files = [stamp for stamp, _ in depth], [path for _, path in depth]
     if not (root / "rgb.txt").exists():
-        return Listed(stamps, files, [], windows)
-    color = _nearest(_read_list(root / "rgb.txt")[0], np.array(stamps, dtype=np.int64), max_difference_ns)
-    return Listed(stamps, files, color, windows)
+        return ImageList(stamps, files, [], windows)
+    color = _nearest_images(_read_list(root / "rgb.txt")[0], stamps, max_difference_ns)
+    return ImageList(stamps, files, color, windows)
 
 
-def _nearest(
-    listed: list[tuple[int, Path]], stamps_ns: NDArray[np.int64], max_difference_ns: int
+def _nearest_images(
+    listed: list[tuple[int, Path]], stamps_ns: list[int], max_difference_ns: int
 ) -> list[Path | None]:
     """The image nearest to each stamp, None where it is too far in time."""
-    own = np.array([stamp for stamp, _ in listed], dtype=np.int64)
-    nearest = [int(np.abs(own - stamp).argmin()) for stamp in stamps_ns]
-    near = np.abs(own[nearest] - stamps_ns) <= max_difference_ns
+    own, wanted = np.array([stamp for stamp, _ in listed], np.int64), np.array(stamps_ns, np.int64)
+    nearest = nearest_in_time(own, wanted)
+    near = np.abs(own[nearest] - wanted) <= max_difference_ns
     return [listed[i][1] if ok else None for i, ok in zip(nearest, near, strict=True)]
 
 
@@ -72,7 +72,7 @@ def _read_list(path: Path) -> tuple[list[tuple[int, Path]], bool]:
     return sorted(images), windows
 
 
-def _read_pairs(path: Path) -> Listed:
+def _read_pairs(path: Path) -> ImageList:
     """`stamp path stamp path` (ICL-NUIM, TUM's `associate.py`); `depth` in a path tells which it is."""
     content = "`timestamp depth/… timestamp rgb/…` a line, in either order"
     rows: list[tuple[int, Path, Path]] = []
@@ -87,7 +87,7 @@ def _read_pairs(path: Path) -> Listed:
         rows.append((stamp, _beside(path, words[depth + 1]), _beside(path, words[color + 1])))
     _check(path, [file for row in rows for file in row[1:]], content)
     rows.sort()
-    return Listed([row[0] for row in rows], [row[1] for row in rows], [row[2] for row in rows], windows)
+    return ImageList([row[0] for row in rows], [row[1] for row in rows], [row[2] for row in rows], windows)
 
 
 def _beside(path: Path, listed: str) -> Path:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig
-from tsfusion.datasets.readers import checked_intrinsics
+from tsfusion.datasets.readers import checked_intrinsics, intrinsics_of
 from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.messages import CAMERA, CameraInfo
 from tsfusion.datasets.rosbag.reader import BagRecording, Message, Stream, frame_id
@@ -18,7 +18,7 @@ from tsfusion.geometry.calibration import Camera as Lens
 from tsfusion.geometry.calibration import Rectifier, StereoRig, Undistorter
 from tsfusion.geometry.keyframe import Intrinsics
 
-_TRIED = 20  # messages
+_MAX_TRIED = 20  # messages
 _TRANSPORT = re.compile(r"/(compressed|compressedDepth)$")
 RECTIFIED = re.compile(r"rect")
 _NO_COLOR = re.compile(r"infra|(^|[/_])ir([/_\d]|$)|fisheye|confidence", re.IGNORECASE)
@@ -26,7 +26,7 @@ _UNDISTORTED = 1e-6  # largest coefficient of a camera without distortion
 _NO_TURN = 1e-6
 
 
-class ImagePair(NamedTuple):
+class ImageTopic(NamedTuple):
     """A topic of images.
 
     Attributes:
@@ -48,7 +48,7 @@ class ImagePair(NamedTuple):
 
     @property
     def is_color(self) -> bool:
-        """Whether these are images of light that is seen."""
+        """Whether these are images of visible light, in colour or grey."""
         return not messages.is_depth(self.first) and not _NO_COLOR.search(self.base)
 
     @property
@@ -57,29 +57,29 @@ class ImagePair(NamedTuple):
         return messages.encoding(self.first) in ("mono8", "8UC1")
 
 
-def picture(recording: BagRecording, stream: Stream) -> ImagePair | None:
-    """A topic of images by the first one that can be decoded; None = none of the first few can."""
-    for message in islice(recording.messages([stream]), _TRIED):
+def image_topic(recording: BagRecording, stream: Stream) -> ImageTopic | None:
+    """Describe a topic by its first readable image; None = none of the first few can be decoded."""
+    for message in islice(recording.messages([stream]), _MAX_TRIED):
         if isinstance(message, Message):
             content = message.content
             with suppress(DatasetError):
                 is_depth = messages.is_depth(content)
                 height, width = (messages.depth(content) if is_depth else messages.gray(content)).shape
-                return ImagePair(
+                return ImageTopic(
                     stream, _TRANSPORT.sub("", stream.topic), content, (height, width), frame_id(content)
                 )
     return None
 
 
 class CameraView(NamedTuple):
-    """The pinhole camera that images are turned into; `undistorter` None = they are its already."""
+    """The pinhole camera that images are turned into; `undistorter` None = they have no distortion."""
 
     intrinsics: Intrinsics
     undistorter: Undistorter | None
 
 
 class CameraRig(NamedTuple):
-    """The two that pairs are turned into; `rectifier` None = they are theirs already."""
+    """The two pinhole cameras that pairs are turned into; `rectifier` None = the pairs are rectified."""
 
     intrinsics: Intrinsics
     baseline_fx: float
@@ -105,27 +105,27 @@ class Cameras:
         self._recording, self._info_topic = recording, info_topic
         self._intrinsics, self._rectified = intrinsics, rectified
 
-    def find(self, picture: ImagePair) -> CameraInfo | None:
-        """The camera of some images; None = there is no CameraInfo."""
-        stream = self._info_stream(picture)
+    def find(self, images: ImageTopic) -> CameraInfo | None:
+        """The camera of a topic of images; None = there is no CameraInfo."""
+        stream = self._info_stream(images)
         message = None if stream is None else self._recording.first(stream)
         return None if message is None else messages.camera(message)
 
-    def camera(self, picture: ImagePair) -> CameraInfo:
-        """The same; raises DatasetError where there is none."""
-        found = self.find(picture)
+    def camera(self, images: ImageTopic) -> CameraInfo:
+        """The camera of a topic of images; raises DatasetError where there is no CameraInfo."""
+        found = self.find(images)
         if found is None:
             raise DatasetError(
-                f"{self._recording.path}: no CameraInfo of {picture.stream.topic}: name one with info_topic; "
+                f"{self._recording.path}: no CameraInfo of {images.stream.topic}: name one with info_topic; "
                 f"{self._recording.listing()}"
             )
         return found
 
-    def _info_stream(self, picture: ImagePair) -> Stream | None:
+    def _info_stream(self, images: ImageTopic) -> Stream | None:
         found = {one.topic: one for one in self._recording.streams if one.kind == CAMERA}
         if self._info_topic is not None:
             return found.get(self._info_topic)
-        place = picture.base
+        place = images.base
         while place:
             for name in (f"{place}/camera_info", f"{place}/info/camera_info"):
                 if name in found:
@@ -133,7 +133,7 @@ class Cameras:
             place = place.rpartition("/")[0]
         return next(iter(found.values())) if len(found) == 1 else None
 
-    def view(self, picture: ImagePair) -> CameraView:
+    def view(self, images: ImageTopic) -> CameraView:
         """How some images become those of a pinhole camera.
 
         Raises:
@@ -141,22 +141,22 @@ class Cameras:
         """
         if self._intrinsics is not None:
             return CameraView(checked_intrinsics(self._intrinsics, "intrinsics"), None)
-        camera = self._checked(picture)
-        if self._is_rectified(picture):
-            return CameraView(self._pinhole(picture, camera.P if camera.P[0, 0] else camera.K), None)
+        camera = self._checked(images)
+        if self._is_rectified(images):
+            return CameraView(self._pinhole(images, camera.P if camera.P[0, 0] else camera.K), None)
         if np.abs(camera.D).max(initial=0) < _UNDISTORTED:
-            return CameraView(self._pinhole(picture, camera.K), None)
-        undistorter = Undistorter(self._lens(picture, camera))
+            return CameraView(self._pinhole(images, camera.K), None)
+        undistorter = Undistorter(self._lens(images, camera))
         return CameraView(undistorter.intrinsics, undistorter)
 
-    def own_view(self, picture: ImagePair) -> CameraView | None:
-        """The view of another camera than that of the depth; None where no CameraInfo of its own tells it."""
+    def own_view(self, images: ImageTopic) -> CameraView | None:
+        """The view of a camera that is not the depth's; None where it has no CameraInfo of its own."""
         if self._intrinsics is not None or self._info_topic is not None:
             return None
-        stream = self._info_stream(picture)
-        return None if stream is None or not _is_beside(stream.topic, picture.base) else self.view(picture)
+        stream = self._info_stream(images)
+        return None if stream is None or not _is_beside(stream.topic, images.base) else self.view(images)
 
-    def rig(self, left: ImagePair, right: ImagePair) -> CameraRig:
+    def rig(self, left: ImageTopic, right: ImageTopic) -> CameraRig:
         """How a pair's images become those of two equal cameras whose rows match; raises as `view` does."""
         cameras = [self._checked(one) for one in (left, right)]
         shift = cameras[0].P[0, 3] - cameras[1].P[0, 3]
@@ -171,31 +171,30 @@ class Cameras:
         rectifier = Rectifier(StereoRig(lenses[0], lenses[1], _right_of(*cameras)))
         return CameraRig(rectifier.intrinsics, rectifier.baseline_fx, rectifier)
 
-    def _is_rectified(self, picture: ImagePair) -> bool:
-        return bool(RECTIFIED.search(picture.base)) if self._rectified is None else self._rectified
+    def _is_rectified(self, images: ImageTopic) -> bool:
+        return bool(RECTIFIED.search(images.base)) if self._rectified is None else self._rectified
 
-    def _checked(self, picture: ImagePair) -> CameraInfo:
-        """The camera, once its size is that of the images."""
-        camera = self.camera(picture)
-        height, width = picture.size
+    def _checked(self, images: ImageTopic) -> CameraInfo:
+        """The camera, after its size was compared with that of the images."""
+        camera = self.camera(images)
+        height, width = images.size
         if camera.width and (camera.width, camera.height) != (width, height):
             raise DatasetError(
-                f"{self._recording.path}: {picture.stream.topic} is {width}×{height}, its CameraInfo says "
+                f"{self._recording.path}: {images.stream.topic} is {width}×{height}, its CameraInfo says "
                 f"{camera.width}×{camera.height}"
             )
         return camera
 
-    def _pinhole(self, picture: ImagePair, matrix: NDArray[np.float64]) -> Intrinsics:
-        given = Intrinsics(*map(float, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])))
-        return checked_intrinsics(given, f"{self._recording.path}: CameraInfo of {picture.stream.topic}")
+    def _pinhole(self, images: ImageTopic, matrix: NDArray[np.float64]) -> Intrinsics:
+        return intrinsics_of(matrix, f"{self._recording.path}: CameraInfo of {images.stream.topic}")
 
-    def _lens(self, picture: ImagePair, camera: CameraInfo) -> Lens:
-        self._pinhole(picture, camera.K)
+    def _lens(self, images: ImageTopic, camera: CameraInfo) -> Lens:
+        self._pinhole(images, camera.K)
         try:
-            return Lens.named(camera.K, picture.size, camera.model, camera.D)
+            return Lens.named(camera.K, images.size, camera.model, camera.D)
         except InvalidConfig as error:
             raise DatasetError(
-                f"{self._recording.path}: CameraInfo of {picture.stream.topic}: {error} (a rectified topic, "
+                f"{self._recording.path}: CameraInfo of {images.stream.topic}: {error} (a rectified topic, "
                 "as image_proc makes, needs no lens; rectified=True says that these images are)"
             ) from error
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """ROS 1 bags, ROS 2 bags (SQLite or MCAP) and MCAP files as datasets, without ROS.
 
-Topics and poses are found by type and name, or told; `Bag` says how.
+`Bag` finds topics and poses by type and name, or takes those that the user names.
 """
 
 import logging
@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.dataset import Frames, require_frames
+from tsfusion.datasets.dataset import Frames, keep_posed, nearest_in_time, require_frames
 from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.messages import MILLIMETRES
 from tsfusion.datasets.rosbag.poses import PoseFinder, pose_streams
@@ -22,7 +21,7 @@ from tsfusion.datasets.rosbag.reader import (
     ENDINGS,
     BagRecording,
     Message,
-    MessagePlace,
+    MessageLocation,
     recording,
 )
 from tsfusion.datasets.rosbag.topics import Modality, TopicChooser, recorded_scale
@@ -63,7 +62,7 @@ class Bag(Frames):
         info_topic: CameraInfo of the images; default the one beside or above their topic.
         pose_topic: default by type, as above.
         world_frame: default the root of the sensor's tree, or the frame of the pose topic.
-        body_frame: the frame whose poses the pose topic tells; default its `child_frame_id`, or the sensor's.
+        body_frame: the frame whose poses the pose topic holds; default its `child_frame_id`, or the sensor's.
         intrinsics: instead of a CameraInfo's.
         depth_scale: metres per unit of 16-bit depth; default 0.001 (REP 118), or as a RealSense recorded it.
         rectified: whether the images are rectified, so that `P` is theirs; default where the topic's name
@@ -102,44 +101,53 @@ class Bag(Frames):
         color: bool = True,
         posed: bool = True,
     ) -> None:
-        place = _place(Path(path).expanduser())
+        path = _recording_path(Path(path).expanduser())
         if modality not in (None, *_MODALITIES):
             raise DatasetError(
                 f"modality of a ROS recording must be {', '.join(_MODALITIES)}; got {modality!r}"
             )
-        self._recording = BagRecording(place)
+        self._recording = BagRecording(path)
         topics = {
-            "depth_topic": depth_topic, "color_topic": color_topic, "info_topic": info_topic,
-            "points_topic": points_topic, "left_topic": left_topic, "right_topic": right_topic,
-        }  # fmt: skip
+            "depth_topic": depth_topic,
+            "color_topic": color_topic,
+            "info_topic": info_topic,
+            "points_topic": points_topic,
+            "left_topic": left_topic,
+            "right_topic": right_topic,
+        }
         chosen = TopicChooser(self._recording, topics, intrinsics=intrinsics, rectified=rectified).choose(
             modality
         )
         self._chosen = chosen
-        self.name, self.sensor, self.skipped = f"ROS {place.name}", sensor or chosen.sensor, {}
+        self.name, self.sensor, self.skipped = f"ROS {path.name}", sensor or chosen.sensor, {}
         self._with_color = color
         self.depth_scale = depth_scale or recorded_scale(self._recording, chosen.main) or MILLIMETRES
         self.uncolored = 0
         poses = PoseFinder(
-            place, chosen.frame, pose_streams(self._recording, pose_topic),
-            told=pose_topic is not None, world_frame=world_frame, body_frame=body_frame, max_gap_s=max_gap_s,
-        )  # fmt: skip
+            path,
+            chosen.frame,
+            pose_streams(self._recording, pose_topic),
+            topic_named=pose_topic is not None,
+            world_frame=world_frame,
+            body_frame=body_frame,
+            max_gap_s=max_gap_s,
+        )
         mains, others = self._index(poses)
         difference_s = _DIFFERENCE_S[chosen.modality] if max_difference_s is None else max_difference_s
         self._pair(mains, others, round(difference_s * 1e9))
         self._pose(poses.finish(required=posed), round(time_offset_s * 1e9), posed)
         self._registration = self._register(poses)
-        require_frames(len(self._mains), place, EXPECTED, self.skipped)
+        require_frames(len(self._mains), path, EXPECTED, self.skipped)
 
     def __len__(self) -> int:
         return len(self._mains)
 
-    def _index(self, poses: PoseFinder) -> tuple[dict[int, MessagePlace], dict[int, MessagePlace]]:
-        """Places by time of the main and the other messages, from one pass over the recording."""
+    def _index(self, poses: PoseFinder) -> tuple[dict[int, MessageLocation], dict[int, MessageLocation]]:
+        """Locations by time of the main and the other messages, from one pass over the recording."""
         chosen = self._chosen
         used = [chosen.main] + ([chosen.other] if chosen.other and self._with_other else [])
         check = _CHECKS.get(chosen.main.kind)
-        places: dict[str, list[MessagePlace]] = {one.topic: [] for one in used}
+        locations: dict[str, list[MessageLocation]] = {one.topic: [] for one in used}
         broken: Counter[str] = Counter()
         for message in self._recording.messages([*used, *poses.streams]):
             if not isinstance(message, Message):
@@ -149,7 +157,7 @@ class Bag(Frames):
                     if check is not None and message.stream.kind == chosen.main.kind:
                         check(message.content)
                         chosen.check_size(message.stream, (message.content.height, message.content.width))
-                    places[message.stream.topic].append(message.place)
+                    locations[message.stream.topic].append(message.location)
                 except DatasetError as error:
                     broken[message.stream.topic] += 1
                     log.debug("%s: %s %s", self._recording.path, message.stream.topic, error)
@@ -158,8 +166,8 @@ class Bag(Frames):
         for topic, count in broken.items():
             if count:
                 self.skipped[f"of {topic} that are broken"] = count
-        found = [_by_time(places[one.topic]) for one in used]
-        if repeated := len(places[chosen.main.topic]) - len(found[0]):
+        found = [_by_time(locations[one.topic]) for one in used]
+        if repeated := len(locations[chosen.main.topic]) - len(found[0]):
             self.skipped[f"of {chosen.main.topic} with another's time"] = repeated
         return found[0], found[1] if len(found) > 1 else {}
 
@@ -168,12 +176,12 @@ class Bag(Frames):
         return self._with_color or self._chosen.modality == "stereo"
 
     def _pair(
-        self, mains: dict[int, MessagePlace], others: dict[int, MessagePlace], max_difference_ns: int
+        self, mains: dict[int, MessageLocation], others: dict[int, MessageLocation], max_difference_ns: int
     ) -> None:
         """Give each main message the nearest other one."""
         stamps = np.array(sorted(mains), dtype=np.int64)
         there = np.array(sorted(others), dtype=np.int64)
-        nearest = _nearest(there, stamps) if len(there) else np.zeros_like(stamps)
+        nearest = nearest_in_time(there, stamps) if len(there) else np.zeros_like(stamps)
         near = np.abs(there[nearest] - stamps) <= max_difference_ns if len(there) else stamps < 0
         if self._chosen.modality == "stereo":
             if not near.all():
@@ -193,62 +201,69 @@ class Bag(Frames):
         if rig is not None and rig.rectifier is not None:
             turned = rig.rectifier.T_left_rectified
             self._poses = [None if pose is None else pose @ turned for pose in self._poses]
-        kept = [i for i, pose in enumerate(self._poses) if pose is not None or not posed]
-        if len(kept) < len(self._poses):
-            self.skipped["without a pose in time"] = len(self._poses) - len(kept)
-            self.timestamps_ns = self.timestamps_ns[kept]
-            self._mains = [self._mains[i] for i in kept]
-            self._others = [self._others[i] for i in kept]
-            self._poses = [self._poses[i] for i in kept]
+        chosen, self._poses = keep_posed(
+            range(len(self._poses)),
+            self._poses,
+            posed=posed,
+            skipped=self.skipped,
+            reason="without a pose in time",
+        )
+        self.timestamps_ns = self.timestamps_ns[chosen]
+        self._mains = [self._mains[i] for i in chosen]
+        self._others = [self._others[i] for i in chosen]
 
     def _register(self, poses: PoseFinder) -> Registration | None:
         """What brings the colour of a camera of its own onto the depth; else such colour is left out."""
         chosen = self._chosen
-        if chosen.apart is None or chosen.view is None or not len(self):
+        if chosen.color_camera is None or chosen.view is None or not len(self):
             return None
-        T_color_depth = poses.between(chosen.apart.frame, chosen.frame, self._stamp(0))
+        T_color_depth = poses.between(chosen.color_camera.frame, chosen.frame, self._stamp(0))
         if T_color_depth is None:
             log.warning(
                 "%s: no transforms lead from %r to %r, so that colour cannot be registered and is left out",
-                self._recording.path, chosen.frame, chosen.apart.frame,
-            )  # fmt: skip
+                self._recording.path,
+                chosen.frame,
+                chosen.color_camera.frame,
+            )
             self._others = [None] * len(self)
             return None
         return Registration(
-            chosen.view.intrinsics, chosen.apart.view.intrinsics, T_color_depth, chosen.size,
-            color_size=chosen.apart.size,
-        )  # fmt: skip
+            chosen.view.intrinsics,
+            chosen.color_camera.view.intrinsics,
+            T_color_depth,
+            chosen.size,
+            color_size=chosen.color_camera.size,
+        )
 
     def _frame(self, index: int) -> Frame:
-        chosen, place = self._chosen, self._mains[index]
-        common: dict[str, Any] = {
-            "sensor": self.sensor, "timestamp_ns": self._stamp(index), "T_world_camera": self._poses[index],
-        }  # fmt: skip
-        content = self._recording.read(place)
+        chosen, location = self._chosen, self._mains[index]
+        content = self._recording.read(location)
         try:
             if chosen.modality == "lidar":
                 found = messages.cloud(content, self._stamp(index))
-                return Frame(
-                    points=found.points, point_times_s=found.times_s,
-                    color=found.color if self._with_color else None, **common,
-                )  # fmt: skip
+                return self._posed_frame(
+                    index,
+                    points=found.points,
+                    point_times_s=found.times_s,
+                    color=found.color if self._with_color else None,
+                )
             other = self._others[index]
             beside = None if other is None else self._recording.read(other)
             if chosen.modality == "stereo":
-                return self._pair_frame(content, beside, common)
-            return self._depth_frame(content, beside, common)
+                return self._pair_frame(index, content, beside)
+            return self._depth_frame(index, content, beside)
         except DatasetError as error:
             raise DatasetError(
                 f"{self._recording.path}: message {index} of {chosen.main.topic} {error}"
             ) from error
 
-    def _depth_frame(self, content: Any, beside: Any, common: dict[str, Any]) -> Frame:
+    def _depth_frame(self, index: int, content: Any, beside: Any) -> Frame:
         view = self._chosen.view
         assert view is not None
         depth = messages.depth(content)
         self._chosen.check_size(self._chosen.main, depth.shape)
         color = None if beside is None else messages.color(beside)
-        color_view = view if self._chosen.apart is None else self._chosen.apart.view
+        color_view = view if self._chosen.color_camera is None else self._chosen.color_camera.view
         if view.undistorter is not None:
             depth = view.undistorter.depth(depth)
         if color is not None and color_view.undistorter is not None:
@@ -256,11 +271,11 @@ class Bag(Frames):
         if color is not None and self._registration is not None:
             metres = np.nan_to_num(depth * (1.0 if depth.dtype == np.float32 else self.depth_scale))
             color = self._registration.color_of_depth(color, metres.astype(np.float32))
-        return Frame(
-            depth=depth, depth_scale=self.depth_scale, color=color, intrinsics=view.intrinsics, **common
-        )  # fmt: skip
+        return self._posed_frame(
+            index, depth=depth, depth_scale=self.depth_scale, color=color, intrinsics=view.intrinsics
+        )
 
-    def _pair_frame(self, left: Any, right: Any, common: dict[str, Any]) -> Frame:
+    def _pair_frame(self, index: int, left: Any, right: Any) -> Frame:
         rig = self._chosen.rig
         assert rig is not None
         pair = messages.gray(left), messages.gray(right)
@@ -269,10 +284,14 @@ class Bag(Frames):
             if color is not None:
                 color = rig.rectifier.pair(color, color)[0]
             pair = rig.rectifier.pair(*pair)
-        return Frame(
-            left=pair[0], right=pair[1], color=color,
-            intrinsics=rig.intrinsics, baseline_fx=rig.baseline_fx, **common,
-        )  # fmt: skip
+        return self._posed_frame(
+            index,
+            left=pair[0],
+            right=pair[1],
+            color=color,
+            intrinsics=rig.intrinsics,
+            baseline_fx=rig.baseline_fx,
+        )
 
 
 _CHECKS: dict[str, Callable[[Any], None]] = {
@@ -281,7 +300,7 @@ _CHECKS: dict[str, Callable[[Any], None]] = {
 }
 
 
-def _place(path: Path) -> Path:
+def _recording_path(path: Path) -> Path:
     found = recording(path)
     if found is not None:
         return found
@@ -295,14 +314,6 @@ def _place(path: Path) -> Path:
     raise DatasetError(f"{path} {holds}; expected {EXPECTED}")
 
 
-def _by_time(places: list[MessagePlace]) -> dict[int, MessagePlace]:
+def _by_time(locations: list[MessageLocation]) -> dict[int, MessageLocation]:
     """Messages by their header's stamp, or by the recorder's clock where a header says nothing."""
-    return {place.stamp_ns or place.log_ns: place for place in places}
-
-
-def _nearest(there: NDArray[np.int64], stamps: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Index in `there`, sorted, of the time nearest to each of `stamps`."""
-    right = np.clip(np.searchsorted(there, stamps), 1, max(1, len(there) - 1))
-    right = np.minimum(right, len(there) - 1)
-    left = np.maximum(right - 1, 0)
-    return np.where(np.abs(there[left] - stamps) <= np.abs(there[right] - stamps), left, right)
+    return {one.stamp_ns or one.log_ns: one for one in locations}

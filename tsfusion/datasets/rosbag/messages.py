@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """ROS messages as arrays: images, compressed images, point clouds and cameras.
 
-By the definitions of sensor_msgs, REP 118 (depth) and image_transport's plugins. A message that does not fit
-itself raises DatasetError; the caller says which one it was.
+By the definitions of sensor_msgs, REP 118 (depth) and image_transport's plugins. A message that contradicts
+itself raises DatasetError; the caller adds which message it was.
 """
 
 import struct
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.readers import decoded
+from tsfusion.datasets.readers import decode_image
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -153,7 +153,7 @@ def _stored(message: Any) -> NDArray[Any]:
 
 def _decoded(message: Any, flags: int, start: int = 0) -> NDArray[Any]:
     content = np.ascontiguousarray(message.data, np.uint8)[start:]
-    image = decoded(content, flags)
+    image = decode_image(content, flags)
     if image is None:
         raise DatasetError(f"of {len(message.data)} bytes cannot be decoded as {message.format!r}")
     return image

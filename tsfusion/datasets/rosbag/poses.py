@@ -9,15 +9,23 @@ import numpy as np
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import SCAN
 from tsfusion.datasets.rosbag.reader import BagRecording, Message, Stream
-from tsfusion.datasets.rosbag.transforms import OLD_TF, PATH, POSE_KINDS, TF, Told, Transforms, TransformTrack
+from tsfusion.datasets.rosbag.transforms import (
+    OLD_TF,
+    PATH,
+    POSE_KINDS,
+    TF,
+    PoseTopic,
+    Transforms,
+    TransformTrack,
+)
 from tsfusion.geometry.se3 import Transform
 
 
 def pose_streams(recording: BagRecording, pose_topic: str | None) -> list[Stream]:
-    """The transforms, and the topic of poses that was named or all of them.
+    """The streams of transforms, and the named topic of poses, or all such topics.
 
     Raises:
-        DatasetError: when the named one is none.
+        DatasetError: the named topic holds no poses.
     """
     transforms = [one for one in recording.streams if one.kind in (TF, OLD_TF)]
     poses = [one for one in recording.streams if one.kind in POSE_KINDS]
@@ -32,12 +40,12 @@ def pose_streams(recording: BagRecording, pose_topic: str | None) -> list[Stream
 
 
 class PoseFinder:
-    """Takes in the messages about poses, and then finds the sensor's.
+    """The sensor's pose at any time, by the pose messages of a recording.
 
     Args:
-        frame: of the sensor.
-        streams: of `pose_streams`.
-        told: the topic of poses was named, so that it goes before the transforms.
+        frame: name of the sensor's frame.
+        streams: those of `pose_streams`.
+        topic_named: the user named the topic of poses: it is preferred to the transforms.
     """
 
     def __init__(
@@ -46,50 +54,50 @@ class PoseFinder:
         frame: str,
         streams: list[Stream],
         *,
-        told: bool,
+        topic_named: bool,
         world_frame: str | None,
         body_frame: str | None,
         max_gap_s: float,
     ) -> None:
         self.streams = streams
-        self._path, self._frame, self._told = path, frame, told
+        self._path, self._frame, self._topic_named = path, frame, topic_named
         self._world, self._body = world_frame, body_frame
         self._max_gap_ns = round(max_gap_s * 1e9)
         self._transforms = Transforms(self._max_gap_ns)
-        self._told_by: dict[Stream, Told] = {}
+        self._pose_topics: dict[Stream, PoseTopic] = {}
 
     def add(self, message: Message) -> None:
-        """Take in one of `streams`."""
+        """Take a message of one of `streams` into account."""
         if message.stream.kind in (TF, OLD_TF):
             self._transforms.add(message.content, static=message.stream.topic.endswith("static"))
         else:
-            if message.stream.kind == PATH or message.stream not in self._told_by:
-                self._told_by[message.stream] = Told()  # each path holds all that were before
-            self._told_by[message.stream].add(message.content, message.stream.kind)
+            if message.stream.kind == PATH or message.stream not in self._pose_topics:
+                self._pose_topics[message.stream] = PoseTopic()  # each path holds all that were before
+            self._pose_topics[message.stream].add(message.content, message.stream.kind)
 
     def finish(self, *, required: bool) -> Callable[[int], Transform | None]:
-        """What gives `T_world_sensor` at a time, None where it is not known.
+        """A function from nanoseconds to `T_world_sensor`, None where the pose is not known.
 
         Raises:
-            DatasetError: `required`, and nothing tells poses; or frames that were named are not connected.
+            DatasetError: `required` and there are no poses; or no transforms connect the named frames.
         """
         self._transforms.finish()
-        if not self._told and self._transforms.moves(self._frame):
+        if not self._topic_named and self._transforms.moves(self._frame):
             return self._by_transforms()
         found = self._track()
         if found is not None:
             return self._by_track(found)
-        if self._transforms.told(self._frame):
+        if self._transforms.is_dynamic(self._frame):
             return self._by_transforms()
         if required:
             raise DatasetError(
-                f"{self._path} tells no poses of {self._frame!r}: no changing transform and no topic of "
+                f"{self._path} has no poses of {self._frame!r}: no changing transform and no topic of "
                 f"poses leads to it; {SCAN}"
             )
         return lambda _stamp: None
 
     def between(self, target: str, source: str, stamp: int) -> Transform | None:
-        """`T_target_source` at a time by the transforms, after `finish`; None where they do not tell it."""
+        """`T_target_source` at a time by the transforms, after `finish`; None where it is not known."""
         return self._transforms.at(target, source, stamp)
 
     def _by_transforms(self) -> Callable[[int], Transform | None]:
@@ -102,24 +110,24 @@ class PoseFinder:
         return lambda stamp: self._transforms.at(world, self._frame, stamp)
 
     def _track(self) -> TransformTrack | None:
-        """The poses of the most telling kind of topic."""
+        """The poses of the first kind in `POSE_KINDS` that leads to the sensor."""
         for kind in POSE_KINDS:
             tracks = {
                 stream.topic: found
-                for stream, told in self._told_by.items()
-                if stream.kind == kind and (found := told.track()) is not None
+                for stream, topic in self._pose_topics.items()
+                if stream.kind == kind and (found := topic.track()) is not None
             }
             fitting = {topic: one for topic, one in tracks.items() if self._leads(one)}
             if len(fitting) == 1:
                 return next(iter(fitting.values()))
             if fitting:
                 raise DatasetError(
-                    f"{self._path}: several topics tell poses ({', '.join(fitting)}); choose with pose_topic"
+                    f"{self._path}: several topics hold poses ({', '.join(fitting)}); choose with pose_topic"
                 )
-            if tracks and self._told:
+            if tracks and self._topic_named:
                 body = next(iter(tracks.values())).body
                 raise DatasetError(
-                    f"{self._path}: {next(iter(tracks))} tells poses of {body!r}, and no transforms lead "
+                    f"{self._path}: {next(iter(tracks))} holds poses of {body!r}, and no transforms lead "
                     f"from there to {self._frame!r}; body_frame={self._frame!r} takes them for the sensor's"
                 )
         return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""ROS 1 and ROS 2 recordings as messages that can be read again by their place, without ROS.
+"""Messages of ROS 1 and ROS 2 recordings, read one after the other or by their location; without ROS.
 
 A recording is a `.bag`, a ROS 2 folder (`metadata.yaml` beside `.db3` or `.mcap` files), or one such file.
 """
@@ -30,37 +30,37 @@ _HINTS = {
 
 
 class Stream(NamedTuple):
-    """One topic, of one type."""
+    """The messages of one type in one topic."""
 
     topic: str
     kind: str  # such as sensor_msgs/msg/Image, of ROS 1 too
     messages: int
 
 
-class MessagePlace(NamedTuple):
-    """Where a message is: enough to read it again."""
+class MessageLocation(NamedTuple):
+    """Position of a message in a recording: enough to read it again."""
 
     connection: int
     log_ns: int
-    stamp_ns: int  # as its header says; 0 = it says nothing
+    stamp_ns: int  # of its header; 0 = the header has none
 
 
 class Message(NamedTuple):
-    """One message that was read.
+    """A message that was read.
 
     Attributes:
         content: the fields, by ROS's names.
     """
 
     stream: Stream
-    place: MessagePlace
+    location: MessageLocation
     content: Any
 
 
 def recording(path: Path) -> Path | None:
-    """What is to be opened of a path: itself, or the one recording in a folder; None = there is none.
+    """The recording at a path: the path itself, or the only recording in a folder; None = there is none.
 
-    A file is told by its first bytes, an `.mcap` that is a journal's is none.
+    The first bytes decide what a file is; an `.mcap` of tsfusion's own journal does not count.
     """
     if path.is_file():
         return path if _is_bag(path) else None
@@ -90,7 +90,7 @@ def _opening(path: Path) -> bytes:
 
 
 class BagRecording:
-    """The messages of a recording. Its files stay open until it is no longer used.
+    """The messages of a recording. Its files stay open as long as this object lives.
 
     Raises:
         MissingDependency: without rosbags.
@@ -125,7 +125,7 @@ class BagRecording:
         return f"its topics: {shown}" if shown else "it holds no messages"
 
     def messages(self, streams: Collection[Stream]) -> Iterator[Message | Stream]:
-        """Every message of some streams in the order of recording; its stream alone where it is broken.
+        """Messages of some streams in the order of recording; of a broken message its stream alone.
 
         Raises:
             DatasetError: when the file ends or is damaged before the last one.
@@ -149,28 +149,30 @@ class BagRecording:
                 if content is None:
                     yield stream
                 else:
-                    yield Message(stream, MessagePlace(number, log_ns, stamp_ns(content)), content)
+                    yield Message(stream, MessageLocation(number, log_ns, stamp_ns(content)), content)
 
     def first(self, stream: Stream) -> Any:
-        """The first message of a stream that can be read; None = there is none."""
+        """The first readable message of a stream; None = there is none."""
         for message in self.messages([stream]):
             if isinstance(message, Message):
                 return message.content
         return None
 
-    def read(self, place: MessagePlace) -> Any:
-        """The message at a place.
+    def read(self, location: MessageLocation) -> Any:
+        """The message at a location.
 
         Raises:
-            DatasetError: when it is not there any more.
+            DatasetError: the recording has changed, and the message is no longer there.
         """
-        connection = self._connections[place.connection]
+        connection = self._connections[location.connection]
         with self._lock, self._errors():
-            for _, _, raw in self._reader.messages([connection], place.log_ns, place.log_ns + 1):
+            for _, _, raw in self._reader.messages([connection], location.log_ns, location.log_ns + 1):
                 content = self._content(raw, connection.msgtype)
-                if content is not None and stamp_ns(content) == place.stamp_ns:
+                if content is not None and stamp_ns(content) == location.stamp_ns:
                     return content
-        raise DatasetError(f"{self.path}: the message of {connection.topic} at {place.log_ns} ns is gone")
+        raise DatasetError(
+            f"{self.path}: the message of {connection.topic} at {location.log_ns} ns is no longer there"
+        )
 
     def _content(self, raw: bytes, kind: str) -> Any:
         """The message of some bytes, by the recording's own definition or else the usual one."""
@@ -196,21 +198,21 @@ class BagRecording:
 
     @contextmanager
     def _errors(self) -> Iterator[None]:
-        """rosbags lets through whatever its parts (SQLite, YAML, zstd, lz4, struct) raise."""
+        """Turn what rosbags lets through of its parts (SQLite, YAML, zstd, lz4, struct) into DatasetError."""
         try:
             yield
         except (DatasetError, MissingDependency):
             raise
         except Exception as error:
-            said = " ".join(str(error).split())[:300] or type(error).__name__
-            hint = next((hint for words, hint in _HINTS.items() if words in said), None)
+            cause = " ".join(str(error).split())[:300] or type(error).__name__
+            hint = next((hint for words, hint in _HINTS.items() if words in cause), None)
             raise DatasetError(
-                f"{self.path} cannot be read as a ROS recording: {said}" + (f" ({hint})" if hint else "")
+                f"{self.path} cannot be read as a ROS recording: {cause}" + (f" ({hint})" if hint else "")
             ) from error
 
 
 def stamp_ns(content: Any) -> int:
-    """Nanoseconds of a message's header; 0 = it has none, or says nothing."""
+    """Nanoseconds of a message's header; 0 = it has no header, or no time in it."""
     stamp = getattr(getattr(content, "header", None), "stamp", None)
     return 0 if stamp is None else max(0, stamp.sec * 10**9 + stamp.nanosec)
 

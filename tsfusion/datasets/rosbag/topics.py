@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which topics of a recording are a depth camera, a stereo pair or a LiDAR: as told, or by type and name."""
+"""The topics of a depth camera, a stereo pair or a LiDAR: as named, or found by type and name."""
 
 import logging
 import re
@@ -8,7 +8,14 @@ from typing import Any, Literal, NamedTuple
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.rosbag import messages
-from tsfusion.datasets.rosbag.cameras import RECTIFIED, CameraRig, Cameras, CameraView, ImagePair, picture
+from tsfusion.datasets.rosbag.cameras import (
+    RECTIFIED,
+    CameraRig,
+    Cameras,
+    CameraView,
+    ImageTopic,
+    image_topic,
+)
 from tsfusion.datasets.rosbag.messages import CAMERA, CLOUD, COMPRESSED, IMAGE
 from tsfusion.datasets.rosbag.reader import BagRecording, Stream, frame_id
 from tsfusion.geometry.keyframe import Intrinsics
@@ -31,7 +38,7 @@ _SENSORS = (
 )
 
 
-class Apart(NamedTuple):
+class ColorCamera(NamedTuple):
     """A colour camera that is not the depth camera."""
 
     frame: str
@@ -40,15 +47,15 @@ class Apart(NamedTuple):
 
 
 class ChosenTopics(NamedTuple):
-    """What to read.
+    """The topics of one sensor.
 
     Attributes:
         main: depth images, left images or point clouds.
         other: colour images of the depth, or right images; None = none.
-        frame: that `main` is in; empty = it does not say.
+        frame: of `main`; empty = its messages name none.
         size: height and width of an image of `main`.
         view, rig: the camera of depth images, or those of a pair.
-        apart: the camera of `other`, where these colour images are yet to be registered.
+        color_camera: the camera of `other`, where its images have to be registered to the depth.
     """
 
     modality: Modality
@@ -59,11 +66,12 @@ class ChosenTopics(NamedTuple):
     size: tuple[int, int]
     view: CameraView | None = None
     rig: CameraRig | None = None
-    apart: Apart | None = None
+    color_camera: ColorCamera | None = None
 
     def check_size(self, stream: Stream, size: tuple[int, ...]) -> None:
-        """Raise DatasetError for an image of a stream that has not the size its camera was found for."""
-        expected = self.apart.size if self.apart is not None and stream == self.other else self.size
+        """Raise DatasetError for an image of a stream whose size is not that of the stream's first one."""
+        camera = self.color_camera if stream == self.other else None
+        expected = self.size if camera is None else camera.size
         if self.modality != "lidar" and size != expected:
             raise DatasetError(f"is {size[1]}×{size[0]}, the first {expected[1]}×{expected[0]}")
 
@@ -72,7 +80,7 @@ class TopicChooser:
     """Chooses among the topics of one recording.
 
     Args:
-        given: topics by the names of `OPTIONS`, None where one is to be found.
+        given: topics by the names of `OPTIONS`; None = find it.
         intrinsics: of all images, instead of a CameraInfo's.
         rectified: whether images have been rectified already; None = by the topic's name.
     """
@@ -88,7 +96,7 @@ class TopicChooser:
         self._recording, self._given = recording, given
         info = self._named("info_topic", (CAMERA,))
         self._cameras = Cameras(recording, info and info.topic, intrinsics, rectified)
-        self._found: list[ImagePair] | None = None
+        self._found: list[ImageTopic] | None = None
 
     def choose(self, modality: Modality | None) -> ChosenTopics:
         """The sensor to read; of several kinds depth goes before stereo before LiDAR.
@@ -96,10 +104,10 @@ class TopicChooser:
         Raises:
             DatasetError: there is none, or no single one; lists the topics.
         """
-        told = [kind for kind, names in _OF_MODALITY.items() if any(self._given[name] for name in names)]
-        if len(told) > 1 or (modality and told and modality != told[0]):
-            raise DatasetError(f"{self._path}: topics of {' and '.join(told)} given; expected those of one")
-        wanted = modality or (told[0] if told else None)
+        named = [kind for kind, names in _OF_MODALITY.items() if any(self._given[name] for name in names)]
+        if len(named) > 1 or (modality and named and modality != named[0]):
+            raise DatasetError(f"{self._path}: topics of {' and '.join(named)} given; expected those of one")
+        wanted = modality or (named[0] if named else None)
         for kind, find in (("depth", self._depth), ("stereo", self._stereo), ("lidar", self._lidar)):
             if wanted in (None, kind) and (chosen := find()) is not None:
                 return chosen
@@ -113,7 +121,7 @@ class TopicChooser:
         return DatasetError(f"{self._path}: {what}; {self._recording.listing()}")
 
     def _named(self, option: str, kinds: tuple[str, ...]) -> Stream | None:
-        """The stream that an option names."""
+        """The stream that an option names; None where the option is not given."""
         topic = self._given[option]
         if topic is None:
             return None
@@ -123,42 +131,47 @@ class TopicChooser:
         wanted = " or ".join(kind.rpartition("/")[2] for kind in kinds)
         raise self._error(f"{option}={topic!r} is no topic of {wanted}")
 
-    def _pictures(self) -> list[ImagePair]:
+    def _image_topics(self) -> list[ImageTopic]:
         """Every topic of images that can be read."""
         if self._found is None:
             streams = [one for one in self._recording.streams if one.kind in (IMAGE, COMPRESSED)]
-            found = [picture(self._recording, one) for one in streams]
+            found = [image_topic(self._recording, one) for one in streams]
             self._found = [one for one in found if one is not None]
         return self._found
 
-    def _picture(self, option: str) -> ImagePair | None:
+    def _named_images(self, option: str) -> ImageTopic | None:
         stream = self._named(option, (IMAGE, COMPRESSED))
         if stream is None:
             return None
-        found = next((one for one in self._pictures() if one.stream == stream), None)
+        found = next((one for one in self._image_topics() if one.stream == stream), None)
         if found is None:
             raise self._error(f"the images of {stream.topic} cannot be decoded")
         return found
 
     def _depth(self) -> ChosenTopics | None:
-        main = self._picture("depth_topic") or self._only(
-            [one for one in self._pictures() if one.is_depth],
+        main = self._named_images("depth_topic") or self._only(
+            [one for one in self._image_topics() if one.is_depth],
             lambda one: (bool(_REGISTERED.search(one.base)), bool(RECTIFIED.search(one.base))),
             "depth_topic",
         )
         if main is None:
             return None
-        other, apart = self._color_of(main)
+        other, own_camera = self._color_of(main)
         sensor = next((name for pattern, name in _SENSORS if re.search(pattern, main.base)), "kinect")
         view = self._cameras.view(main)
-        return ChosenTopics("depth", main.stream, other, sensor, main.frame, main.size, view, apart=apart)
+        return ChosenTopics(
+            "depth", main.stream, other, sensor, main.frame, main.size, view, color_camera=own_camera
+        )
 
-    def _color_of(self, depth: ImagePair) -> tuple[Stream | None, Apart | None]:
+    def _color_of(self, depth: ImageTopic) -> tuple[Stream | None, ColorCamera | None]:
         """The colour images of a depth camera, and their own camera where they are not registered to it.
 
-        Registered are images told by a depth that says so in its name, or in the depth's frame, of its size.
+        Images count as registered when they have the depth's size, and its frame or a depth topic named so.
         """
-        given, found = self._picture("color_topic"), [one for one in self._pictures() if one.is_color]
+        given, found = (
+            self._named_images("color_topic"),
+            [one for one in self._image_topics() if one.is_color],
+        )
         best = given or max(found, key=lambda one: _closeness(one, depth), default=None)
         if best is None:
             return None, None
@@ -166,7 +179,7 @@ class TopicChooser:
         if fits and best.size == depth.size:
             return best.stream, None
         if (view := self._cameras.own_view(best)) is not None:
-            return best.stream, Apart(best.frame, view, best.size)
+            return best.stream, ColorCamera(best.frame, view, best.size)
         if given is not None and best.size == depth.size:
             return best.stream, None
         sizes = (
@@ -178,9 +191,9 @@ class TopicChooser:
         return None, None
 
     def _stereo(self) -> ChosenTopics | None:
-        left, right = self._picture("left_topic"), self._picture("right_topic")
+        left, right = self._named_images("left_topic"), self._named_images("right_topic")
         if left is None and right is None:
-            pairs = [pair for one in self._pictures() if (pair := self._pair(one)) is not None]
+            pairs = [pair for one in self._image_topics() if (pair := self._pair(one)) is not None]
             right = self._only(
                 [pair[1] for pair in pairs],
                 lambda one: (bool(RECTIFIED.search(one.base)), not one.is_color or one.is_gray),
@@ -201,7 +214,7 @@ class TopicChooser:
             rig=self._cameras.rig(left, right),
         )
 
-    def _pair(self, right: ImagePair) -> tuple[ImagePair, ImagePair] | None:
+    def _pair(self, right: ImageTopic) -> tuple[ImageTopic, ImageTopic] | None:
         """The left and the right images, if these are some of a right camera."""
         if messages.is_depth(right.first):
             return None
@@ -211,7 +224,7 @@ class TopicChooser:
         for word, other in _LEFT_OF:
             if word in right.stream.topic:
                 topic = other.join(right.stream.topic.rsplit(word, right.stream.topic.count(word)))
-                for left in self._pictures():
+                for left in self._image_topics():
                     if left.stream.topic == topic:
                         return left, right
         return None
@@ -230,7 +243,7 @@ class TopicChooser:
             raise self._error(f"no point cloud of {stream.topic} can be read")
         return ChosenTopics("lidar", stream, None, "lidar", frame_id(first), (0, 0))
 
-    def _only(self, found: list[ImagePair], rank: Any, option: str) -> ImagePair | None:
+    def _only(self, found: list[ImageTopic], rank: Any, option: str) -> ImageTopic | None:
         """The one that ranks highest; of the transports of one topic the fullest, then the raw one."""
         if not found:
             return None
@@ -254,7 +267,7 @@ def recorded_scale(recording: BagRecording, depth: Stream) -> float | None:
     return None
 
 
-def _closeness(color: ImagePair, depth: ImagePair) -> tuple[object, ...]:
+def _closeness(color: ImageTopic, depth: ImageTopic) -> tuple[object, ...]:
     """How likely colour images belong to the depth images: by frame, name and rectification."""
     return (
         color.frame == depth.frame,

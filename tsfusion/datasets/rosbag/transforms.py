@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where frames are: the tree of ROS transforms, and poses that other topics tell."""
+"""Poses of frames over time: the tree of ROS transforms, and topics of poses."""
 
 from array import array
 from collections import defaultdict
@@ -21,12 +21,12 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
-POSE_KINDS = (ODOMETRY, TRANSFORM, POSE, POSE_WITH_COVARIANCE, PATH)  # the most telling first
+POSE_KINDS = (ODOMETRY, TRANSFORM, POSE, POSE_WITH_COVARIANCE, PATH)  # the preferred first
 _SAME = 1e-9  # metres, and quaternion components: a transform that is sent again and again
 
 
-class Samples:
-    """Poses as they come in: 64 bytes each, for a robot may tell a thousand a second."""
+class PoseSamples:
+    """Poses with their times, 64 bytes each: a robot may send a thousand a second."""
 
     def __init__(self) -> None:
         self._stamps, self._values = array("q"), array("d")
@@ -44,7 +44,7 @@ class Samples:
             self._values.extend(values.tolist())
 
     def trajectory(self) -> Trajectory:
-        """All of them in time order, of equal times the first."""
+        """The poses in the order of time; of equal times the first."""
         stamps, order = np.unique(np.array(self._stamps, np.int64), return_index=True)
         table: NDArray[np.float64] = np.array(self._values).reshape(-1, 7)[order]
         return Trajectory(stamps, table[:, :3], table[:, 3:])
@@ -62,7 +62,7 @@ class _Edge(NamedTuple):
 
 
 class Transforms:
-    """The tree of frames that /tf and /tf_static tell, each transform over time.
+    """The tree of frames in /tf and /tf_static, each transform over time.
 
     A frame has one parent: of several, the one named most often.
 
@@ -72,12 +72,12 @@ class Transforms:
 
     def __init__(self, max_gap_ns: int) -> None:
         self._max_gap_ns = max_gap_ns
-        self._samples: dict[tuple[str, str], Samples] = defaultdict(Samples)
+        self._samples: dict[tuple[str, str], PoseSamples] = defaultdict(PoseSamples)
         self._dynamic: set[tuple[str, str]] = set()
         self._edges: dict[str, _Edge] = {}
 
     def add(self, message: Any, *, static: bool) -> None:
-        """Take in a TFMessage; transforms that are not finite are left out."""
+        """Add the transforms of a TFMessage; those that are not finite are left out."""
         for one in message.transforms:
             key = frame_id(one), str(one.child_frame_id).strip("/")
             if key[0] != key[1]:
@@ -86,7 +86,7 @@ class Transforms:
                     self._dynamic.add(key)
 
     def finish(self) -> None:
-        """Make the tree of what has been taken in."""
+        """Build the tree, after the last `add`."""
         for (parent, child), samples in sorted(self._samples.items(), key=lambda item: len(item[1])):
             if not samples:
                 continue
@@ -107,8 +107,8 @@ class Transforms:
         """Whether a transform between the frame and its root changes."""
         return any(not self._edges[one].is_constant for one in self.ancestors(frame)[:-1])
 
-    def told(self, frame: str) -> bool:
-        """Whether /tf itself, not only /tf_static, tells of the way between the frame and its root."""
+    def is_dynamic(self, frame: str) -> bool:
+        """Whether a transform between the frame and its root was sent on /tf, not only on /tf_static."""
         chain = self.ancestors(frame)
         return any((parent, child) in self._dynamic for child, parent in pairwise(chain))
 
@@ -117,7 +117,7 @@ class Transforms:
         return self.ancestors(one)[-1] == self.ancestors(other)[-1]
 
     def at(self, target: str, source: str, stamp: int) -> Transform | None:
-        """`T_target_source` at a time; None where it is not known then."""
+        """`T_target_source` at a time; None where it is not known."""
         if target == source:
             return np.eye(4)
         up_target, up_source = self.ancestors(target), self.ancestors(source)
@@ -142,10 +142,10 @@ class Transforms:
 
 
 class TransformTrack(NamedTuple):
-    """Poses of one frame in another, of a topic.
+    """Poses of one frame in another.
 
     Attributes:
-        body: the frame whose pose it is; empty = the topic does not say.
+        body: the frame whose pose it is; empty = the topic does not name it.
     """
 
     world: str
@@ -153,19 +153,19 @@ class TransformTrack(NamedTuple):
     trajectory: Trajectory
 
 
-class Told:
-    """What one topic tells, message by message.
+class PoseTopic:
+    """Poses of one topic, collected message by message.
 
     Attributes:
-        world, body: frames, of the first message; an empty body = the topic does not say.
+        world, body: frames that the first message names; an empty body = it names none.
     """
 
     def __init__(self) -> None:
         self.world, self.body = "", ""
-        self._samples, self._began = Samples(), False
+        self._samples, self._began = PoseSamples(), False
 
     def add(self, message: Any, kind: str) -> None:
-        """Take in a message of a kind of `POSE_KINDS`."""
+        """Add a message of one of `POSE_KINDS`."""
         for one in message.poses if kind == PATH else [message]:
             if not self._began:
                 self.world, self._began = frame_id(one), True
@@ -178,5 +178,5 @@ class Told:
             self._samples.add(stamp_ns(one), *where)
 
     def track(self) -> TransformTrack | None:
-        """The poses; None = there is none."""
+        """The poses so far; None = there is none."""
         return TransformTrack(self.world, self.body, self._samples.trajectory()) if self._samples else None

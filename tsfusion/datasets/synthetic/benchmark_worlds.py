@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Worlds made to measure: corners and edges, thin parts, a still camera, one more walk through the room."""
+"""Worlds for accuracy benchmarks: corners and edges, thin parts, two more paths in the room."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Recordings of worlds that exist only as formulas: every surface point is known exactly."""
+"""Rendered recordings of synthetic worlds, whose surfaces are known exactly."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.formats.image_folders import read_open3d_camera
-from tsfusion.datasets.readers import decoded, read_intrinsics, read_numbers
+from tsfusion.datasets.readers import decode_image, read_intrinsics, read_numbers
 from tsfusion.geometry.keyframe import Intrinsics
 
 Kind = Literal["depth", "pair", "points"]
@@ -87,7 +87,7 @@ def whole_image(path: Path, flags: int) -> NDArray[Any] | None:
     raw = path.read_bytes()
     if not raw.endswith(_PNG_END if path.suffix == ".png" else _JPEG_END):
         return None
-    return decoded(np.frombuffer(raw, np.uint8), flags)
+    return decode_image(np.frombuffer(raw, np.uint8), flags)
 
 
 def whole_scan(path: Path) -> NDArray[np.float32] | None:

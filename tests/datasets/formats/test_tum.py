@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: MIT
-"""TUM RGB-D, its relatives, and poses between poses."""
+"""TUM RGB-D recordings and their relatives CoRBS and ICL-NUIM."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from geometry_checks import move
-from small_recordings import corbs
+import written_recordings
+from geometry_checks import move, warp_residual
+from small_recordings import corbs, one_line, replace
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import TUM, open_dataset
 from tsfusion.datasets.trajectory_files import nanoseconds, read_tum
+from tsfusion.evaluation.view_prediction import points_camera
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.trajectory import Trajectory, rigid, slerp
 
 scipy_spatial = pytest.importorskip("scipy.spatial")
 
@@ -52,14 +54,6 @@ def test_a_gap_in_the_trajectory_is_not_bridged(tmp_path):
     assert TUM(place, max_gap_s=0.3).skipped == {"without a pose in time": 1}
 
 
-def _edit(name: str, old: str, new: str):
-    def change(place: Path) -> None:
-        path = place / name
-        path.write_bytes(path.read_bytes().replace(old.encode(), new.encode()))
-
-    return change
-
-
 @pytest.mark.parametrize(
     ("change", "match"),
     [
@@ -72,22 +66,25 @@ def _edit(name: str, old: str, new: str):
             r"3\.png is missing \(1 of 5 images that .*rgb\.txt lists\)",
         ),
         (
-            _edit("depth.txt", "1000.100000 depth", "1000.100000depth"),
+            replace("depth.txt", "1000.100000 depth", "1000.100000depth"),
             r"depth\.txt:4: .*expected `timestamp path`",
         ),
-        (_edit("depth.txt", "1000.100000", "then"), r"depth\.txt:4: timestamp must be seconds, got 'then'"),
+        (replace("depth.txt", "1000.100000", "then"), r"depth\.txt:4: timestamp must be seconds, got 'then'"),
         (lambda p: (p / "depth.txt").write_text("# nothing\n"), r"depth\.txt lists no images"),
-        (_edit("../D1_Trajectory/groundtruth.txt", " 2 0 0", " nan 0 0"), r"groundtruth\.txt:5: not finite"),
         (
-            _edit("../D1_Trajectory/groundtruth.txt", " 2 0 0", " 2 0"),
+            replace("../D1_Trajectory/groundtruth.txt", " 2 0 0", " nan 0 0"),
+            r"groundtruth\.txt:5: not finite",
+        ),
+        (
+            replace("../D1_Trajectory/groundtruth.txt", " 2 0 0", " 2 0"),
             r"groundtruth\.txt:5: 7 numbers, expected 8",
         ),
         (
-            _edit("../D1_Trajectory/groundtruth.txt", "2 0 0 0 0 0 1", "2 0 0 0 0 0 0"),
+            replace("../D1_Trajectory/groundtruth.txt", "2 0 0 0 0 0 1", "2 0 0 0 0 0 0"),
             r":5: quaternion must have",
         ),
         (
-            _edit("../D1_Trajectory/groundtruth.txt", "1000", "2000"),
+            replace("../D1_Trajectory/groundtruth.txt", "1000", "2000"),
             r"no usable frames.*\(5 without a pose in time\)",
         ),
         (
@@ -99,9 +96,7 @@ def _edit(name: str, old: str, new: str):
 def test_a_broken_recording_is_one_clear_line(tmp_path, change, match):
     place = corbs(tmp_path)
     change(place)
-    with pytest.raises(DatasetError, match=match) as caught:
-        TUM(place)
-    assert "\n" not in str(caught.value)
+    one_line(lambda: TUM(place), match)
 
 
 def test_freiburg_images_are_associated_by_time(data, tmp_path):
@@ -147,41 +142,76 @@ def _read_pcd(path: Path) -> np.ndarray:
     return points[np.isfinite(points).all(axis=1)]
 
 
-def test_slerp_takes_the_short_way_at_even_speed():
-    def turn(degrees: float) -> np.ndarray:
-        half = np.radians(degrees) / 2
-        return np.array([0, 0, np.sin(half), np.cos(half)])
-
-    rotations = scipy_spatial.transform.Rotation
-    for share in (0.0, 0.25, 0.5, 1.0):
-        for sign in (1, -1):
-            mixed = slerp(turn(10), sign * turn(130), share)
-            np.testing.assert_allclose(
-                rigid(mixed, np.zeros(3)), rigid(turn(10 + 120 * share), np.zeros(3)), atol=1e-12
-            )
-    np.testing.assert_allclose(
-        rigid(turn(33), np.zeros(3))[:3, :3], rotations.from_quat(turn(33)).as_matrix(), atol=1e-12
-    )
-    np.testing.assert_allclose(slerp(turn(5), turn(5), 0.3), turn(5))
+def test_icl_nuim_has_a_negative_fy_and_5000_units_a_metre(data):
+    dataset = TUM(data("icl_nuim_tum"))
+    a, b = dataset[0], dataset[2]
+    assert dataset.intrinsics == Intrinsics(481.2, -480.0, 319.5, 239.5)
+    assert warp_residual(a, b) < 0.0008
+    assert 2 < np.median(points_camera(a)[:, 2]) < 6
+    upright = TUM(data("icl_nuim_tum"), intrinsics=Intrinsics(481.2, 480.0, 319.5, 239.5))
+    assert warp_residual(upright[0], upright[2]) > 0.0015
 
 
-def test_a_trajectory_is_never_extrapolated():
-    stamps = np.array([10, 20, 30], dtype=np.int64) * SECOND
-    still = Trajectory(stamps, np.arange(9.0).reshape(3, 3), np.tile([0.0, 0, 0, 1], (3, 1)))
-    middle = still.at(15 * SECOND, max_gap_ns=10 * SECOND)
-    np.testing.assert_allclose(middle[:3, 3], [1.5, 2.5, 3.5])
-    assert still.at(15 * SECOND, max_gap_ns=9 * SECOND) is None
-    assert still.at(9 * SECOND, max_gap_ns=99 * SECOND) is None
-    assert still.at(31 * SECOND, max_gap_ns=99 * SECOND) is None
-    for exact in (10, 20, 30):
-        np.testing.assert_allclose(still.at(exact * SECOND, max_gap_ns=1)[0, 3], (exact - 10) * 0.3)
+def icl(root: Path, order: str, truth: Path) -> Path:
+    """As the archive is: frames from 0, a list of pairs; the trajectory from 1, downloaded by itself."""
+    rows = []
+    for number in range(3):
+        written_recordings.write(root / "depth" / f"{number}.png", np.full((480, 640), 5000, np.uint16))
+        written_recordings.write(root / "rgb" / f"{number}.png", np.full((480, 640, 3), number, np.uint8))
+        depth, color = f"{number} depth/{number}.png", f"{number} rgb/{number}.png"
+        rows.append(f"{depth} {color}" if order == "depth" else f"{color} {depth}")
+    (root / "associations.txt").write_text("\n".join(rows) + "\n")
+    truth.write_text("1 0 0 -2.25 0 0 0 1\n2 0.1 0 -2.25 0 0 0 1\n")
+    return root
 
 
-def test_stamps_keep_every_digit():
-    here = Path("list.txt")
-    assert nanoseconds("1305031790.645155", here, 1) == 1305031790645155000
-    assert nanoseconds("1.5e3", here, 1) == 1500 * SECOND
-    assert nanoseconds("7", here, 1) == 7 * SECOND
-    for bad in ("-1", "nan", "inf", "x", ""):
-        with pytest.raises(DatasetError, match=r"list\.txt:1: timestamp must be seconds"):
-            nanoseconds(bad, here, 1)
+@pytest.mark.parametrize("order", ["depth", "rgb"])
+@pytest.mark.parametrize(
+    ("name", "truth"),
+    [
+        ("living_room_traj2_frei_png", "livingRoom2.gt.freiburg"),
+        ("living_room_traj2_frei_png", "living_room_traj2_frei_png/livingRoom2.gt.freiburg"),
+        ("traj1_frei_png", "traj1.gt.freiburg"),
+        ("mine", "mine/livingRoom0.gt.freiburg"),
+    ],
+)
+def test_icl_nuim_as_published(tmp_path, order, name, truth):
+    (tmp_path / name).mkdir()
+    (tmp_path / "livingRoom9.gt.freiburg").write_text("7 0 0 0 0 0 0 1\n")  # another sequence's
+    dataset = open_dataset(icl(tmp_path / name, order, tmp_path / truth))
+    assert isinstance(dataset, TUM)
+    assert dataset.name == f"ICL-NUIM {name}"
+    assert dataset.intrinsics == Intrinsics(481.2, -480.0, 319.5, 239.5)
+    assert dataset.skipped == {"without a pose in time": 1}
+    assert [keyframe.T_world_camera[0, 3] for keyframe in dataset] == [0, 0.1]
+    assert [int(keyframe.color[0, 0, 0]) for keyframe in dataset] == [1, 2]
+    unposed = open_dataset(tmp_path / name, posed=False)
+    assert [unposed.pose(index) is None for index in range(3)] == [True, False, False]
+
+
+def test_icl_nuim_by_its_list_of_pairs_alone(data, tmp_path):
+    for folder in ("depth", "rgb"):
+        shutil.copytree(data("icl_nuim_tum") / folder, tmp_path / "icl-nuim" / folder)
+    shutil.copy(data("icl_nuim_tum") / "associations.txt", tmp_path / "icl-nuim")
+    shutil.copy(data("icl_nuim_tum") / "groundtruth.txt", tmp_path / "icl-nuim" / "livingRoom2.gt.freiburg")
+    ours, theirs = open_dataset(tmp_path / "icl-nuim"), open_dataset(data("icl_nuim_tum"))
+    assert len(ours) == len(theirs) == 3
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(a.T_world_camera, b.T_world_camera)
+        np.testing.assert_array_equal(a.color, b.color)
+    assert warp_residual(ours[0], ours[2]) < 0.0008
+
+
+@pytest.mark.parametrize("line", ["1 a.png 2 b.png", "1 depth/1.png 1 depth/2.png", "1 depth/1.png"])
+def test_a_broken_list_of_pairs_is_one_clear_line(tmp_path, line):
+    (tmp_path / "associations.txt").write_text(line + "\n")
+    one_line(lambda: TUM(tmp_path), r"associations\.txt:1: .*; expected `timestamp depth/…")
+
+
+def test_stamps_can_be_shifted(tmp_path):
+    (tmp_path / "icl").mkdir()
+    root = icl(tmp_path / "icl", "depth", tmp_path / "icl" / "groundtruth.txt")
+    late = TUM(root, time_offset_s=1.0)
+    assert [keyframe.T_world_camera[0, 3] for keyframe in late] == [0, 0.1]
+    assert list(late.timestamps_ns) == [0, 1_000_000_000]
+    assert TUM(root, time_offset_s=0.5, max_gap_s=2).skipped == {"without a pose in time": 2}

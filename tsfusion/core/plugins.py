@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: MIT
+"""Functions of other packages, named by entry points, and calls with options that a user gave by name."""
+
+import inspect
+from collections.abc import Callable
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin
+
+import msgspec
+
+from tsfusion.core.errors import TsfusionError
+
+_TYPES = {
+    bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path",
+}  # fmt: skip
+_T = TypeVar("_T")
+
+
+def load(point: EntryPoint, error: type[TsfusionError]) -> Any:
+    """The object that an entry point names; whatever its import raises becomes one `error`."""
+    try:
+        return point.load()
+    except Exception as problem:
+        raise error(
+            f"{point.name} ({point.value}), an entry point of {point.group}, cannot be loaded: {problem!r}"
+        ) from problem
+
+
+def takes(function: Callable[..., Any], option: str) -> bool:
+    """Whether a function has a parameter of that name, or takes any."""
+    parameters = inspect.signature(function).parameters
+    return option in parameters or any(each.kind is each.VAR_KEYWORD for each in parameters.values())
+
+
+def call(
+    function: Callable[..., _T], options: dict[str, Any], *, name: str, error: type[TsfusionError]
+) -> _T:
+    """Call a function with options by name; those that are None are left out.
+
+    A number is taken where text is expected, an integer where a float is, and a list for a struct such as
+    `Intrinsics`. A parameter of another type than these takes anything.
+
+    Args:
+        name: of what is called, for the message.
+        error: class of the error for an unknown option or a value of the wrong type.
+    """
+    parameters = inspect.signature(function).parameters
+    given = {key: value for key, value in options.items() if value is not None}
+    for key, value in given.items():
+        if not takes(function, key):
+            raise error(f"{name} takes no `{key}`; it takes {', '.join(parameters)}")
+        if key in parameters:
+            given[key] = _converted(key, value, parameters[key].annotation, error)
+    return function(**given)
+
+
+def _converted(key: str, value: Any, annotation: Any, error: type[TsfusionError]) -> Any:
+    is_union = get_origin(annotation) in (Union, UnionType)
+    kinds = [kind for kind in (get_args(annotation) if is_union else (annotation,)) if kind is not NoneType]
+    structs = [kind for kind in kinds if isinstance(kind, type) and issubclass(kind, msgspec.Struct)]
+    if not all(kind in _TYPES or kind in structs for kind in kinds):
+        return value
+    if isinstance(value, tuple(kinds)) and isinstance(value, bool) == (bool in kinds):
+        return value
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if float in kinds:
+            return float(value)
+        if str in kinds:
+            return str(value)
+    try:
+        return msgspec.convert(value, structs[0])
+    except (IndexError, msgspec.ValidationError) as problem:
+        fields = ", ".join(structs[0].__struct_fields__) if structs else ""
+        expected = f"numbers [{fields}]" if structs else _TYPES[kinds[0]]
+        raise error(f"`{key}` must be {expected}, got {value!r}") from problem
