@@ -15,6 +15,7 @@ from tsfusion.core import logs
 from tsfusion.core.errors import MissingDependency
 
 os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # programs that tests start find what tests find
+OPTIONAL = ("kiss_icp", "pooch", "pyrealsense2", "rosbags", "scipy")
 DATA = Path(os.environ.get("TSFUSION_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
@@ -41,13 +42,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 class SkippableModule(pytest.Module):
-    """A test module that is skipped where Taichi does not load."""
+    """A test module that is skipped where Taichi or an optional package does not load."""
 
     def collect(self) -> Iterable[pytest.Item | pytest.Collector]:
         try:
             return super().collect()
         except MissingDependency as error:
             pytest.skip(str(error), allow_module_level=True)
+        except self.CollectError as error:
+            missing = getattr(error.__cause__, "name", None) or ""
+            if missing.partition(".")[0] not in OPTIONAL:
+                raise
+            pytest.skip(f"{missing} does not load: {error.__cause__}", allow_module_level=True)
 
 
 def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> pytest.Module:
