@@ -61,12 +61,12 @@ def _list(recordings: "list[PublicRecording]", *, json: bool) -> None:
 
 
 def _fetch(recording: "PublicRecording", to: Path, base: str | None, *, json: bool) -> None:
-    from tsfusion.cli import output
+    from tsfusion.cli import output, progress
     from tsfusion.datasets.download import download
 
     if not json:
         typer.echo(f"{recording.title}\nlicence: {recording.licence}; {recording.page}", err=True)
-    with output.reading(f"fetching {recording.name}", quiet=json) as watch:
+    with progress.reading(f"fetching {recording.name}", quiet=json) as watch:
         done = download.fetch(recording, to, watch, base=base)
     if json:
         output.as_json({"path": str(done.path), "files": [_row(one) for one in done.files]})

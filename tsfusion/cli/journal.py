@@ -45,11 +45,11 @@ def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
 
     Exit status 0 also for a damaged journal: `verify` is the judge.
     """
-    from tsfusion.cli import output
+    from tsfusion.cli import output, progress
     from tsfusion.journal.inspection import summarize
 
     place = _find(path, map_)
-    with output.reading(f"reading {place.path}", quiet=json) as watch:
+    with progress.reading(f"reading {place.path}", quiet=json) as watch:
         found = summarize(place, watch)
     if json:
         output.as_json(found)
@@ -66,11 +66,11 @@ def verify(path: Where, map_: Map = None, json: options.Json = False) -> None:
     took; it was never acknowledged, and its scanner sends it again. `note`:
     odd, but nothing is wrong with what is there.
     """
-    from tsfusion.cli import output
+    from tsfusion.cli import output, progress
     from tsfusion.journal.inspection import verify as check
 
     place = _find(path, map_)
-    with output.reading(f"checking {place.path}", quiet=json) as watch:
+    with progress.reading(f"checking {place.path}", quiet=json) as watch:
         verdict = check(place, watch)
     if json:
         output.as_json(verdict)
@@ -100,12 +100,12 @@ def recover(
     Exit status 1: OUT is there, but some keyframes could not be saved; the
     damaged places are named.
     """
-    from tsfusion.cli import output
+    from tsfusion.cli import output, progress
     from tsfusion.core.config import ServerConfig
     from tsfusion.journal.recovery import recover as save
 
     place = _find(path, map_)
-    with output.reading(f"saving {place.path}", quiet=json) as watch:
+    with progress.reading(f"saving {place.path}", quiet=json) as watch:
         done = save(place, out, ServerConfig().segment_bytes, watch)
     if json:
         output.as_json(done)
@@ -146,11 +146,11 @@ def export(
 
     Exit status 1: OUT is there, but without the damaged keyframes.
     """
-    from tsfusion.cli import output
+    from tsfusion.cli import output, progress
     from tsfusion.journal.ros2_export import export as write
 
     place = _find(path, map_)
-    with output.reading(f"exporting {place.path}", quiet=json) as watch:
+    with progress.reading(f"exporting {place.path}", quiet=json) as watch:
         done = write(place, out, watch)
     if json:
         output.as_json(done)

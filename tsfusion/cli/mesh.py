@@ -106,18 +106,18 @@ def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bo
 
 def _fuse(recording: "JournalRecording", volume: "Volume", quiet: bool) -> "Volume":
     """Add every keyframe; as in the server, one that the map cannot take is counted and left out."""
-    from tsfusion.cli import output
+    from tsfusion.cli import progress
     from tsfusion.core.errors import MapError
 
     left_out: Counter[str] = Counter()
-    with output.progress(quiet=quiet) as progress:
-        progress.stage(f"fusing {recording.name}")
+    with progress.shown(quiet=quiet) as display:
+        display.stage(f"fusing {recording.name}")
         for index, keyframe in enumerate(recording, 1):
             try:
                 volume.integrate(keyframe)
             except MapError as error:
                 left_out[str(error)] += 1
-            progress.count(index, volume.keyframes, len(recording))
+            display.update(index, volume.keyframes, len(recording))
     for reason, count in left_out.items():
         typer.echo(f"left out {count} keyframes: {reason}", err=True)
     return volume

@@ -182,11 +182,39 @@ def dataset_options(given: list[str] | None) -> dict[str, Any]:
     return found
 
 
-def local(client: "ClientConfig") -> "ClientConfig":
-    """Settings of a client whose server is its own: nobody else is there, so no keys."""
+def client_settings(
+    config: "Config",
+    *,
+    connect: str | None = None,
+    control: str | None = None,
+    map_: str | None = None,
+    key: str | None = None,
+    server_key: str | None = None,
+) -> "ClientConfig":
+    """The client's settings with every flag that was given on top; without `connect` it needs no keys."""
     from msgspec.structs import replace
 
-    return replace(client, key=None, server_key=None)
+    from tsfusion.core.config import override
+
+    client = override(config.client, control=control, map=map_, key=key, server_key=server_key)
+    return client if connect is not None else replace(client, key=None, server_key=None)
+
+
+def check_target_flags(
+    context: typer.Context, connect: str | None, *, own: Collection[str], remote: Collection[str]
+) -> None:
+    """Raise InvalidConfig for a typed flag that would be ignored.
+
+    Args:
+        connect: address of a server elsewhere; None = the run starts its own.
+        own: parameters for a server of the run's own.
+        remote: parameters, besides the connection's, for a server elsewhere.
+    """
+    if connect is None:
+        refuse(context, {"control", "key", "server_key", *remote}, "has no effect without --connect")
+    else:
+        reason = "has no effect with --connect: give it to the `tsfusion serve` that listens there"
+        refuse(context, own, reason)
 
 
 def _band(truncation: float | None, support: str | None) -> dict[str, float]:

@@ -9,7 +9,6 @@ import typer
 from tsfusion.cli import options
 
 if TYPE_CHECKING:
-    from tsfusion.core.config import Config
     from tsfusion.datasets import Dataset
 
 _DATASET = "Dataset"
@@ -75,15 +74,14 @@ def replay(
     **settings: Any,
 ) -> None:
     """Send a recorded dataset (or a journal) through the whole path; leave mesh, picture and figures."""
+    from msgspec.structs import replace
+
+    from tsfusion.core.config import override
     from tsfusion.datasets import select
 
-    if connect is not None:
-        options.refuse(
-            context, {*options.MAP_OPTIONS, "state"} - {"min_weight"},
-            "has no effect with --connect: give it to the `tsfusion serve` that listens there",
-        )  # fmt: skip
-    else:
-        options.refuse(context, ("control", "key", "server_key"), "has no effect without --connect")
+    # Any server makes a mesh with another `min_weight`.
+    own = {*options.MAP_OPTIONS, "state"} - {"min_weight"}
+    options.check_target_flags(context, connect, own=own, remote=())
     dataset = open_recording(
         path, unpack=unpack, sequence=sequence, modality=modality, poses=poses,
         **options.dataset_options(option),
@@ -96,10 +94,17 @@ def replay(
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count} frames {reason}", err=True)
     if check_ and not _is_synthetic(path):
-        _warn(dataset)
+        _warn_of_disagreement(dataset)
+    server = None
+    if state is not None:  # only this machine reaches the run's own server; its errors are shown here
+        server = override(chosen.server, listen="tcp://127.0.0.1:0", state=str(state))
+        server = replace(server, keys=None, metrics=None, log_format="text")
+    client = options.client_settings(
+        chosen, connect=connect, control=control, map_=map_, key=key, server_key=server_key
+    )
     _run(
-        dataset, out, chosen, connect=connect, control=control, map_=map_, rate=rate, state=state, json=json,
-        min_weight=settings["min_weight"], key=key, server_key=server_key,
+        dataset, out, json=json, volume=chosen.volume, server=server, client=client, connect=connect,
+        rate=rate, min_weight=settings["min_weight"],
     )  # fmt: skip
 
 
@@ -136,8 +141,8 @@ def _is_journal(path: Path) -> bool:
     return (path.suffix == ".mcap" or any(path.glob("*.mcap"))) and not rosbag_dataset.recognises(path)
 
 
-def _warn(dataset: "Dataset") -> None:
-    """One line on stderr when poses and depth disagree."""
+def _warn_of_disagreement(dataset: "Dataset") -> None:
+    """Print a line on stderr when poses and depth disagree."""
     from tsfusion.evaluation import pose_check
 
     report = pose_check.check(dataset)
@@ -172,40 +177,20 @@ def demo(
     dataset = Synthetic(
         world, sensor=chosen.volume.sensor, count=count or usual_count, seed=seed, path=path
     )  # fmt: skip
-    _run(dataset, out, chosen, rate=rate or usual_rate, min_weight=settings["min_weight"], json=json)
+    _run(
+        dataset, out, json=json, volume=chosen.volume, client=options.client_settings(chosen),
+        rate=rate or usual_rate,
+        min_weight=settings["min_weight"],
+    )  # fmt: skip
 
 
-def _run(
-    dataset: "Dataset",
-    out: Path,
-    chosen: "Config",
-    *,
-    json: bool,
-    state: Path | None = None,
-    connect: str | None = None,
-    control: str | None = None,
-    map_: str | None = None,
-    key: str | None = None,
-    server_key: str | None = None,
-    **settings: Any,
-) -> None:
-    from msgspec.structs import replace
+def _run(dataset: "Dataset", out: Path, *, json: bool, **settings: Any) -> None:
+    from tsfusion.cli import output, progress, run_summary
+    from tsfusion.pipelines.replay import replay as run
 
-    from tsfusion.cli import output
-    from tsfusion.core.config import override
-    from tsfusion.pipelines import replay as pipelines_replay
-
-    server = override(chosen.server, listen="tcp://127.0.0.1:0", state=str(state)) if state else None
-    client = override(chosen.client, control=control, map=map_, key=key, server_key=server_key)
-    if connect is None:  # a server of its own: only this machine reaches it, its errors are told here
-        server = replace(server, keys=None, metrics=None, log_format="text") if server else None
-        client = options.local(client)
-    with output.progress(quiet=json) as progress:
-        run = pipelines_replay.replay(
-            dataset, out, volume=chosen.volume, server=server, client=client, progress=progress,
-            connect=connect, **settings,
-        )  # fmt: skip
+    with progress.shown(quiet=json) as display:
+        result = run(dataset, out, progress=display, **settings)
     if json:
-        output.as_json(run)
+        output.as_json(result)
     else:
-        output.summary(run, out)
+        run_summary.print_replay(result, out)

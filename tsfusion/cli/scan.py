@@ -110,40 +110,34 @@ def scan(
     Without --connect it starts a server of its own and leaves the mesh. With it, what the server does not
     have in the end stays in the spool, and the next scan sends it first.
     """
-    if connect is not None:
-        options.refuse(
-            context, options.MAP_OPTIONS,
-            "has no effect with --connect: give it to the `tsfusion serve` that listens there",
-        )  # fmt: skip
-    else:
-        options.refuse(context, ("control", "key", "server_key", "spool"), "has no effect without --connect")
-    from tsfusion.cli import output, scan_output
+    options.check_target_flags(context, connect, own=options.MAP_OPTIONS, remote={"spool"})
+    from tsfusion.cli import output, progress, run_summary
     from tsfusion.core.config import override
-    from tsfusion.pipelines import scan as pipelines_scan
+    from tsfusion.pipelines.scan import scan as run
 
     recording = {"sequence": sequence, "modality": modality, **options.dataset_options(option)}
     opened = _open(
         context, source, recording, calibration=calibration, rate=rate,
         part={"start": start, "stride": stride, "limit": max_frames},
     )  # fmt: skip
-    with opened, _ended_by_signals(opened), scan_output.watching(quiet=json) as progress:
+    with opened, _ended_by_signals(opened), progress.shown(quiet=json) as display:
         chosen = options.configuration(config, preset={"sensor": opened.sensor}, **settings)
         rules = override(
             chosen.scan, localizer=localizer, trajectory=trajectory, feed=feed, loop_closure=loop_closure,
             time_offset=time_offset, max_gap=max_gap,
             patience=patience, min_overlap=min_overlap, distance=distance, angle=angle, max_rate=max_rate,
         )  # fmt: skip
-        client = override(chosen.client, control=control, map=map_, key=key, server_key=server_key)
-        if connect is None:
-            client = options.local(client)
-        result = pipelines_scan.scan(
+        client = options.client_settings(
+            chosen, connect=connect, control=control, map_=map_, key=key, server_key=server_key
+        )
+        result = run(
             opened, out, config=rules, volume=chosen.volume, client=client, connect=connect, spool=spool,
-            min_weight=settings["min_weight"], progress=progress,
+            min_weight=settings["min_weight"], progress=display,
         )  # fmt: skip
     if json:
         output.as_json(result)
     else:
-        scan_output.summary(result, out, spool, connect)
+        run_summary.print_scan(result, out, spool, connect)
 
 
 def _open(
