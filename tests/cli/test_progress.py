@@ -46,17 +46,22 @@ def test_plain_lines(capsys: pytest.CaptureFixture[str]) -> None:
     assert words[2].startswith("frames 30 of 60, ")
     assert words[4:6] == ["to send 1 (5 kB)", "server 8 acknowledged, 7 fused, delay 41 ms"]
     assert words[6:] == ["left out 1 × quota"]
-        "to send 1 (5 kB)",
-        "server 8 acknowledged, 7 fused, delay 41 ms",
-        "left out 1 × quota",
-    ]
     assert "frames 30, " in endless
+
+
+@pytest.mark.usefixtures("eager")
+def test_bytes_are_read_in_lines_too(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress.reading("checking a journal", quiet=False) as watch:
+        watch(1_500_000, 3_000_000)
+    assert capsys.readouterr().err == "  checking a journal 1.5 MB of 3 MB, 0 B/s\n"
 
 
 def test_quiet_is_silent(capsys: pytest.CaptureFixture[str]) -> None:
     with progress.shown(quiet=True) as display:
         display.stage("scanning the room")
         display.update(3, 2, 10)
+    with progress.reading("checking a journal", quiet=True) as watch:
+        watch(1, 2)
     assert capsys.readouterr().err == ""
 
 

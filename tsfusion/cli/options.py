@@ -182,21 +182,13 @@ def dataset_options(given: list[str] | None) -> dict[str, Any]:
     return found
 
 
-def client_settings(
-    config: "Config",
-    *,
-    connect: str | None = None,
-    control: str | None = None,
-    map_: str | None = None,
-    key: str | None = None,
-    server_key: str | None = None,
-) -> "ClientConfig":
-    """The client's settings with every flag that was given on top; without `connect` it needs no keys."""
+def client_settings(config: "Config", connect: str | None = None, **flags: str | None) -> "ClientConfig":
+    """The client's settings with every flag that was given on top; a server of the run's own has no keys."""
     from msgspec.structs import replace
 
     from tsfusion.core.config import override
 
-    client = override(config.client, control=control, map=map_, key=key, server_key=server_key)
+    client = override(config.client, **flags)
     return client if connect is not None else replace(client, key=None, server_key=None)
 
 

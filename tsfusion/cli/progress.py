@@ -29,52 +29,74 @@ _BAR_WIDTH = 32  # columns
 @contextmanager
 def shown(*, quiet: bool) -> "Iterator[Progress]":
     """The progress of a run: nothing is shown when `quiet`."""
+    with _display(quiet=quiet) as display:
+        yield display
+
+
+@contextmanager
+def reading(text: str, *, quiet: bool) -> "Iterator[Callable[[int, int], None]]":
+    """A function that takes the bytes read and all bytes, and shows them after `text`."""
+    with _display(quiet=quiet) as display:
+        yield lambda done, total: display.show([_byte_row(text, done, total, display.rates)])
+
+
+def _display(*, quiet: bool) -> "Quiet":
     if quiet:
-        yield Quiet()
-    elif sys.stderr.isatty():
-        with Table() as table:
-            yield table
-    else:
-        yield Lines()
+        return Quiet()
+    return Table() if sys.stderr.isatty() else Lines()
 
 
 class Quiet:
     """Progress that is not shown."""
 
+    def __init__(self) -> None:
+        self.rates = _Rates()
+
+    def __enter__(self) -> "Quiet":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
     def stage(self, text: str) -> None:
-        """Show nothing."""
+        """Show which part of the run begins."""
 
     def update(self, taken: int, fused: int, total: int | None, scan: "ScanState | None" = None) -> None:
-        """Show nothing."""
+        """Show the counts; see `Progress`."""
+        if scan is None:
+            self.show(_keyframe_rows(taken, fused, total, self.rates))
+        else:
+            self.show(_scan_rows(scan, total, self.rates))
+
+    def show(self, rows: "list[_Row]") -> None:
+        """Show these rows in place of the last ones."""
 
 
-class Lines:
-    """A line for each stage, and one every few seconds while frames or keyframes are taken."""
+class Lines(Quiet):
+    """A line for each stage, and one for the rows every few seconds."""
 
     def __init__(self) -> None:
+        super().__init__()
         self._last = time.monotonic()
-        self._rates = _Rates()
 
     def stage(self, text: str) -> None:
-        """Print it."""
         typer.echo(f"{text} …", err=True)
         self._last = time.monotonic()
 
-    def update(self, taken: int, fused: int, total: int | None, scan: "ScanState | None" = None) -> None:
-        """Print a line, unless the last one is recent."""
-        rows = _rows(taken, fused, total, scan, self._rates)
+    def show(self, rows: "list[_Row]") -> None:
         if time.monotonic() - self._last >= _LINE_INTERVAL:
             self._last = time.monotonic()
             typer.echo("  " + "; ".join(f"{row.name} {row.text}" for row in rows if row.text), err=True)
 
 
-class Table:
-    """A few rows with bars, drawn again a few times a second; warnings are printed above them."""
+class Table(Quiet):
+    """A line for each stage, and below a table with bars, drawn again a few times a second."""
 
     def __init__(self) -> None:
         from rich.console import Console
         from rich.live import Live
 
+        super().__init__()
         self._console = Console(stderr=True)
         self._live = Live(
             console=self._console,
@@ -84,7 +106,7 @@ class Table:
             redirect_stderr=False,
         )
         self._drawn = 0.0
-        self._rates = _Rates()
+        self._rows: list[_Row] = []
         self._warnings = _Warnings(self._console)
 
     def __enter__(self) -> "Table":
@@ -97,24 +119,25 @@ class Table:
         logging.getLogger("tsfusion").removeHandler(self._warnings)
 
     def stage(self, text: str) -> None:
-        """Print it above the table."""
+        self._draw()  # the last counts, for as long as the stage takes
         self._console.print(f"[cyan]›[/] {text}", highlight=False)
 
-    def update(self, taken: int, fused: int, total: int | None, scan: "ScanState | None" = None) -> None:
-        """Draw the table, unless the last drawing is recent."""
-        rows = _rows(taken, fused, total, scan, self._rates)
-        if time.monotonic() - self._drawn < _DRAW_INTERVAL:
-            return
-        self._drawn = time.monotonic()
+    def show(self, rows: "list[_Row]") -> None:
+        self._rows = rows
+        if time.monotonic() - self._drawn >= _DRAW_INTERVAL:
+            self._draw()
+
+    def _draw(self) -> None:
         from rich.progress_bar import ProgressBar
         from rich.table import Table as Grid
         from rich.text import Text
 
+        self._drawn = time.monotonic()
         grid = Grid.grid(padding=(0, 2))
-        for row in rows:
+        for row in self._rows:
             text = Text(row.text, style="bold red" if row.alarm else "")
-            done = "" if row.share is None else ProgressBar(1.0, row.share, width=_BAR_WIDTH)
-            grid.add_row(Text(row.name, style="dim"), text, done)
+            bar = "" if row.share is None else ProgressBar(1.0, row.share, width=_BAR_WIDTH)
+            grid.add_row(Text(row.name, style="dim"), text, bar)
         self._live.update(grid, refresh=True)
 
 
@@ -155,15 +178,17 @@ class _Rates:
         return (first - first_then) / seconds, (second - second_then) / seconds
 
 
-def _rows(taken: int, fused: int, total: int | None, scan: "ScanState | None", rates: _Rates) -> list[_Row]:
-    if scan is not None:
-        return _scan_rows(scan, total, rates)
-    sent_rate, fused_rate = rates(taken, fused)
-    left = f", {(total - fused) / fused_rate:.0f} s left" if total and fused_rate else ""
+def _keyframe_rows(taken: int, fused: int, total: int | None, rates: _Rates) -> list[_Row]:
+    taken_rate, fused_rate = rates(taken, fused)
+    left = f", {(total - fused) / fused_rate:.0f} s left" if total and fused < total and fused_rate else ""
     return [
-        _Row("keyframes", f"{taken}{_of(total)}, {sent_rate:.1f}/s", _share(taken, total)),
+        _Row("keyframes", f"{taken}{_of(total)}, {taken_rate:.1f}/s", _share(taken, total)),
         _Row("fused", f"{fused}{_of(total)}, {fused_rate:.1f}/s{left}", _share(fused, total)),
     ]
+
+
+def _byte_row(text: str, done: int, total: int, rates: _Rates) -> _Row:
+    return _Row(text, f"{size(done)} of {size(total)}, {size(rates(done, 0)[0])}/s", _share(done, total))
 
 
 def _scan_rows(state: "ScanState", total: int | None, rates: _Rates) -> list[_Row]:
@@ -194,37 +219,3 @@ def _sensor(state: "ScanState") -> str:
     if state.submaps > 1:
         words += f"; map {state.submap} ({state.submaps} so far)"
     return words + (f"; {state.loops} loops closed" if state.loops else "")
-
-
-@contextmanager
-def reading(text: str, *, quiet: bool) -> "Iterator[Callable[[int, int], None]]":
-    """A function that takes the bytes read and all bytes, and shows them as `shown` does."""
-    if quiet:
-        yield lambda _done, _all: None
-    elif sys.stderr.isatty():
-        from rich import progress as rp
-        from rich.console import Console
-
-        columns = (
-            rp.TextColumn("{task.description}"), rp.BarColumn(bar_width=_BAR_WIDTH), rp.DownloadColumn(),
-            rp.TransferSpeedColumn(), rp.TimeRemainingColumn(),
-        )  # fmt: skip
-        with rp.Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-            task = bars.add_task(text, total=None)
-            yield lambda done, total: bars.update(task, completed=done, total=total)
-    else:
-        yield _ByteLines(text).count
-
-
-class _ByteLines:
-    """A line every few seconds; none for a short job."""
-
-    def __init__(self, text: str) -> None:
-        self._text = text
-        self._last = time.monotonic()
-
-    def count(self, done: int, total: int) -> None:
-        now = time.monotonic()
-        if now - self._last >= _LINE_INTERVAL:
-            self._last = now
-            typer.echo(f"{self._text}: {size(done)} of {size(total)}", err=True)

@@ -100,7 +100,7 @@ def replay(
         server = override(chosen.server, listen="tcp://127.0.0.1:0", state=str(state))
         server = replace(server, keys=None, metrics=None, log_format="text")
     client = options.client_settings(
-        chosen, connect=connect, control=control, map_=map_, key=key, server_key=server_key
+        chosen, connect, control=control, map=map_, key=key, server_key=server_key
     )
     _run(
         dataset, out, json=json, volume=chosen.volume, server=server, client=client, connect=connect,

@@ -128,7 +128,7 @@ def scan(
             patience=patience, min_overlap=min_overlap, distance=distance, angle=angle, max_rate=max_rate,
         )  # fmt: skip
         client = options.client_settings(
-            chosen, connect=connect, control=control, map_=map_, key=key, server_key=server_key
+            chosen, connect, control=control, map=map_, key=key, server_key=server_key
         )
         result = run(
             opened, out, config=rules, volume=chosen.volume, client=client, connect=connect, spool=spool,
