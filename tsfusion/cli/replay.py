@@ -12,12 +12,12 @@ if TYPE_CHECKING:
     from tsfusion.datasets import Dataset
 
 _DATASET = "Dataset"
-_STREET = {"sensor": "stereo", "voxel_size": 0.1}  # a Kinect sees no street
-Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Where the results go.")]
+_STREET = {"sensor": "stereo", "voxel_size": 0.1}  # a Kinect does not work in daylight
+Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
 Rate = Annotated[
     float | None,
     typer.Option(
-        "--rate", metavar="HZ", min=1e-3, help="Keyframes per second; else as fast as they are fused."
+        "--rate", metavar="HZ", min=1e-3, help="Keyframes per second; default: as fast as they are fused."
     ),
 ]
 Limit = Annotated[
@@ -42,13 +42,14 @@ def replay(
     rate: Rate = None,
     max_keyframes: Limit = None,
     start: Annotated[
-        int, typer.Option(metavar="N", min=0, rich_help_panel=_DATASET, help="Skip so many first.")
+        int,
+        typer.Option(metavar="N", min=0, rich_help_panel=_DATASET, help="Skip so many at the start."),
     ] = 0,
     stride: Annotated[
-        int, typer.Option(metavar="N", min=1, rich_help_panel=_DATASET, help="Every N-th keyframe.")
+        int, typer.Option(metavar="N", min=1, rich_help_panel=_DATASET, help="Take every N-th keyframe only.")
     ] = 1,
     sequence: Annotated[
-        str | None, typer.Option(metavar="NN", rich_help_panel=_DATASET, help="KITTI: the sequence.")
+        str | None, typer.Option(metavar="NN", rich_help_panel=_DATASET, help="KITTI: which sequence.")
     ] = None,
     modality: Annotated[
         str | None, typer.Option(metavar="KIND", rich_help_panel=_DATASET, help="KITTI: stereo or lidar.")
@@ -56,7 +57,9 @@ def replay(
     poses: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", rich_help_panel=_DATASET, help="KITTI, TUM, Redwood: poses to use instead."
+            metavar="FILE",
+            rich_help_panel=_DATASET,
+            help="KITTI, TUM, Redwood: poses to use instead of its own.",
         ),
     ] = None,
     unpack: Annotated[
@@ -64,7 +67,8 @@ def replay(
     ] = False,
     option: options.DatasetOptions = None,
     state: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Keep the own server's journal and map here.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Keep journal and map of the run's server here."),
     ] = None,
     check_: Annotated[
         bool, typer.Option("--check/--no-check", help="Warn when the dataset's poses and depth disagree.")
@@ -73,7 +77,7 @@ def replay(
     json: options.Json = False,
     **settings: Any,
 ) -> None:
-    """Send a recorded dataset (or a journal) through the whole path; leave mesh, picture and figures."""
+    """Send a recorded dataset or a journal to a server, and write mesh, picture and figures."""
     from msgspec.structs import replace
 
     from tsfusion.core.config import override
@@ -109,14 +113,19 @@ def replay(
 
 
 def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dataset":
-    """A dataset, or a journal; `given` are settings of a dataset, None = left out."""
+    """Open a dataset or a journal.
+
+    Args:
+        unpack: whether to unpack an archive beside itself.
+        given: settings of the dataset; None = not given.
+    """
     if _is_journal(path):
         from tsfusion.core.errors import DatasetError
         from tsfusion.journal.recording import JournalRecording
 
         for name, value in given.items():
             if value is not None and name != "posed":
-                raise DatasetError(f"--{name} has no effect on a journal")
+                raise DatasetError(f"--{name} has no effect on a journal: leave it out")
         return JournalRecording(path)
     from tsfusion.datasets import describe, open_dataset
 
@@ -127,7 +136,7 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
 
 
 def _is_synthetic(path: Path) -> bool:
-    """Whether there is nothing to be found out: the first frame would have to be rendered."""
+    """Whether it is a synthetic dataset: what there is to say of one would have to be rendered first."""
     return str(path).startswith("synthetic:")
 
 
@@ -154,14 +163,20 @@ def _warn_of_disagreement(dataset: "Dataset") -> None:
 def demo(
     *,
     out: Out = Path("out"),
-    world: Annotated[str, typer.Option(metavar="NAME", help="room, or street (stereo, 0.1 m).")] = "room",
+    world: Annotated[
+        str,
+        typer.Option(metavar="NAME", help="room, or street (stereo, 0.1 m)."),
+    ] = "room",
     count: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Keyframes; else 90, in the street 40.")
+        int | None,
+        typer.Option(metavar="N", min=1, help="Keyframes; default 90, in the street 40."),
     ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the sensor's noise.")] = 0,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Random seed of the sensor's noise.")] = 0,
     rate: Annotated[
         float | None,
-        typer.Option("--rate", metavar="HZ", min=1e-3, help="Keyframes per second; else 6, in the street 4."),
+        typer.Option(
+            "--rate", metavar="HZ", min=1e-3, help="Keyframes a second; default 6, in the street 4."
+        ),
     ] = None,
     config: options.ConfigFile = None,
     json: options.Json = False,

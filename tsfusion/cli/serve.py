@@ -25,19 +25,21 @@ def serve(
     listen: Annotated[
         str | None,
         typer.Option(
-            metavar="ADDRESS", envvar="TSFUSION_LISTEN", help="Where keyframes arrive; port 0 = any free."
+            metavar="ADDRESS", envvar="TSFUSION_LISTEN", help="Address for keyframes; port 0 = any free port."
         ),
     ] = None,
     control: Annotated[
         str | None,
         typer.Option(
-            metavar="ADDRESS", envvar="TSFUSION_CONTROL", help="Where commands do; else the next port."
+            metavar="ADDRESS", envvar="TSFUSION_CONTROL", help="Address for commands; default: the next port."
         ),
     ] = None,
     state: Annotated[
         str | None,
         typer.Option(
-            metavar="DIR", envvar="TSFUSION_STATE", help="Journal and map; what is there is taken up again."
+            metavar="DIR",
+            envvar="TSFUSION_STATE",
+            help="Folder of journals and maps; those there are continued.",
         ),
     ] = None,
     metrics: Annotated[
@@ -45,23 +47,27 @@ def serve(
         typer.Option(
             metavar="HOST:PORT",
             envvar="TSFUSION_METRICS",
-            help="Where Prometheus and health checks ask, such as 127.0.0.1:9464; this machine only.",
+            help="Address for Prometheus and health checks, such as 127.0.0.1:9464; this machine only.",
         ),
     ] = None,
     log_format: Annotated[
         str | None,
-        typer.Option(metavar="FORMAT", envvar="TSFUSION_LOG_FORMAT", help="Of stderr: text or json."),
+        typer.Option(metavar="FORMAT", envvar="TSFUSION_LOG_FORMAT", help="Log on stderr as text or json."),
     ] = None,
     log_level: Annotated[
         str | None,
-        typer.Option(metavar="LEVEL", envvar="TSFUSION_LOG_LEVEL", help="debug, info, warning or error."),
+        typer.Option(
+            metavar="LEVEL",
+            envvar="TSFUSION_LOG_LEVEL",
+            help="Log from debug, info, warning or error on.",
+        ),
     ] = None,
     keys: Annotated[
         str | None,
         typer.Option(
             metavar="DIR",
             envvar="TSFUSION_KEYS",
-            help="Let in only who `tsfusion keys allow` named; needed to listen beyond this machine.",
+            help="Let only those connect whom `tsfusion keys allow` named; needed beyond this machine.",
         ),
     ] = None,
     config: options.ConfigFile = None,
@@ -69,9 +75,9 @@ def serve(
     until_eof: Annotated[bool, typer.Option("--until-eof", hidden=True)] = False,
     **settings: Any,
 ) -> int:
-    """Fuse keyframes that scanners send; SIGTERM or Ctrl-C saves the map and ends.
+    """Fuse keyframes that scanners send; SIGTERM or Ctrl-C saves the map and ends the server.
 
-    Prints one line with `ready` once keyframes are welcome: every kernel is compiled by then.
+    A line with `ready` is printed once keyframes may come: every kernel is compiled by then.
     """
     started = time.monotonic()
     from tsfusion import server
@@ -94,7 +100,7 @@ def serve(
     except TsfusionError as error:
         if chosen.server.log_format == "text":
             raise
-        log.critical("%s", error)  # the last line is an object, too
+        log.critical("%s", error)  # the last line is a JSON object too
         return 1
 
 
@@ -117,7 +123,7 @@ def _announce(addresses: "Addresses", state: str, seconds: float, json: bool) ->
 
 
 def _stop_at_eof() -> None:
-    """End as by SIGTERM when the parent closes our stdin, which it does even when it is killed."""
+    """End as by SIGTERM when the parent closes stdin, which happens also when it is killed."""
     while os.read(sys.stdin.fileno(), 4096):  # unbuffered: no lock is held when the interpreter ends
         pass
     os.kill(os.getpid(), signal.SIGTERM)
