@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -97,13 +96,7 @@ def test_every_verb_has_help(here: Here, verb: str) -> None:
     assert "Usage" in done.stdout
 
 
-def test_help_is_quick() -> None:
-    def seconds() -> float:
-        started = time.perf_counter()
-        tsfusion("--help")
-        return time.perf_counter() - started
-
-    assert min(seconds() for _ in range(3)) < 1.0  # 0.15 s on a quiet machine; CI is not quiet
+def test_help_loads_little() -> None:
     program = (
         "import sys, tsfusion.cli; "
         "sys.exit(', '.join({'numpy', 'zmq', 'cv2', 'msgspec', 'taichi', 'trimesh'} & set(sys.modules)) or 0)"
