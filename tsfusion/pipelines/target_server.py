@@ -59,11 +59,12 @@ class ServerChild:
         self.start_seconds = time.monotonic() - started
 
     def check(self) -> None:
-        """Raise TransportError, with the last line of the server's log, unless it is running."""
+        """Raise TransportError, with the server's own error message, unless it is running."""
         if self._process.poll() is not None:
-            lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-            reason = lines[-1].removeprefix("tsfusion: ") if lines else "it logged nothing"
-            raise TransportError(f"the server ended with status {self._process.returncode}: {reason}")
+            lines = self._log.read_text(encoding="utf-8", errors="replace").splitlines()
+            errors = [line.removeprefix("tsfusion") for line in lines if line.startswith("tsfusion: ")]
+            reason = errors[-1] if errors else "; was it killed?"
+            raise TransportError(f"the server ended with status {self._process.returncode}{reason}")
 
     def stop(self) -> None:
         """SIGTERM, and after a deadline SIGKILL to it and its fuser."""
