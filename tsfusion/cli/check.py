@@ -15,13 +15,10 @@ def check(
         Path, typer.Argument(metavar="PATH", help="A dataset or a journal, as `tsfusion replay` takes it.")
     ],
     *,
-    sequence: Annotated[str | None, typer.Option(metavar="NN", help="KITTI: which sequence.")] = None,
-    modality: Annotated[str | None, typer.Option(metavar="KIND", help="KITTI: stereo or lidar.")] = None,
-    poses: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="KITTI, TUM, Redwood: poses to use instead of its own."),
-    ] = None,
-    unpack: Annotated[bool, typer.Option("--unpack", help="Unpack an archive beside itself.")] = False,
+    sequence: options.Sequence = None,
+    modality: options.Modality = None,
+    poses: options.Poses = None,
+    unpack: options.Unpack = False,
     option: options.DatasetOptions = None,
     json: options.Json = False,
 ) -> None:

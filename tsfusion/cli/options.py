@@ -116,6 +116,19 @@ DatasetOptions = Annotated[
         help="A setting of the dataset's class, such as depth_topic=/camera/depth; may be repeated.",
     ),
 ]  # fmt: skip
+
+
+def _dataset_option(flag: str, metavar: str | None, help_: str) -> Any:
+    return typer.Option(flag, metavar=metavar, rich_help_panel="Dataset", help=help_)
+
+
+Sequence = Annotated[str | None, _dataset_option("--sequence", "NN", "KITTI: which sequence.")]
+Modality = Annotated[str | None, _dataset_option("--modality", "KIND", "KITTI: stereo or lidar.")]
+Poses = Annotated[
+    Path | None,
+    _dataset_option("--poses", "FILE", "KITTI, TUM, Redwood: poses to use instead of the dataset's own."),
+]
+Unpack = Annotated[bool, _dataset_option("--unpack", None, "Unpack an archive beside itself.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for a program to read.")]
 
 

@@ -17,7 +17,6 @@ from tsfusion.core.logs import printable
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from tsfusion.pipelines.engine import Progress
     from tsfusion.scanner.scanner import ScanState
 
 _LINE_INTERVAL = 2.0  # seconds between plain lines
@@ -26,24 +25,18 @@ _RATE_SECONDS = 5.0  # over which rates are counted
 _BAR_WIDTH = 32  # columns
 
 
-@contextmanager
-def shown(*, quiet: bool) -> "Iterator[Progress]":
-    """The progress of a run: nothing is shown when `quiet`."""
-    with _display(quiet=quiet) as display:
-        yield display
-
-
-@contextmanager
-def reading(text: str, *, quiet: bool) -> "Iterator[Callable[[int, int], None]]":
-    """A function that takes the bytes read and all bytes, and shows them after `text`."""
-    with _display(quiet=quiet) as display:
-        yield lambda done, total: display.show([_byte_row(text, done, total, display.rates)])
-
-
-def _display(*, quiet: bool) -> "Quiet":
+def shown(*, quiet: bool) -> "Quiet":
+    """The progress of a run, to be entered: nothing is shown when `quiet`."""
     if quiet:
         return Quiet()
     return Table() if sys.stderr.isatty() else Lines()
+
+
+@contextmanager
+def reading(text: str, *, quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """A function that takes the bytes read and all bytes, and shows them after `text`."""
+    with shown(quiet=quiet) as display:
+        yield lambda done, total: display.show([_byte_row(text, done, total, display.rates)])
 
 
 class Quiet:

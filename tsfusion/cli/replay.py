@@ -48,23 +48,10 @@ def replay(
     stride: Annotated[
         int, typer.Option(metavar="N", min=1, rich_help_panel=_DATASET, help="Take every N-th keyframe only.")
     ] = 1,
-    sequence: Annotated[
-        str | None, typer.Option(metavar="NN", rich_help_panel=_DATASET, help="KITTI: which sequence.")
-    ] = None,
-    modality: Annotated[
-        str | None, typer.Option(metavar="KIND", rich_help_panel=_DATASET, help="KITTI: stereo or lidar.")
-    ] = None,
-    poses: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            rich_help_panel=_DATASET,
-            help="KITTI, TUM, Redwood: poses to use instead of its own.",
-        ),
-    ] = None,
-    unpack: Annotated[
-        bool, typer.Option("--unpack", rich_help_panel=_DATASET, help="Unpack an archive beside itself.")
-    ] = False,
+    sequence: options.Sequence = None,
+    modality: options.Modality = None,
+    poses: options.Poses = None,
+    unpack: options.Unpack = False,
     option: options.DatasetOptions = None,
     state: Annotated[
         Path | None,

@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -19,57 +20,28 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-@options.takes_map_settings
+def _flag(flag: str, metavar: str, help_: str) -> Any:
+    variable = "TSFUSION_" + flag.strip("-").replace("-", "_").upper()
+    return Annotated[str | None, typer.Option(flag, metavar=metavar, envvar=variable, help=help_)]
+
+
+# By name: settings of the `server` table.
+SERVER_OPTIONS: dict[str, Any] = {
+    "listen": _flag("--listen", "ADDRESS", "Address for keyframes; port 0 = any free port."),
+    "control": _flag("--control", "ADDRESS", "Address for commands; default: the next port."),
+    "state": _flag("--state", "DIR", "Folder of journals and maps; those there are continued."),
+    "metrics": _flag("--metrics", "HOST:PORT",
+                     "Address for Prometheus and health checks, such as 127.0.0.1:9464; this machine only."),
+    "log_format": _flag("--log-format", "FORMAT", "Log on stderr as text or json."),
+    "log_level": _flag("--log-level", "LEVEL", "Log from debug, info, warning or error on."),
+    "keys": _flag("--keys", "DIR",
+                  "Let only those connect whom `tsfusion keys allow` named; needed beyond this machine."),
+}  # fmt: skip
+
+
+@partial(options.takes_map_settings, also=SERVER_OPTIONS)
 def serve(
     *,
-    listen: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS", envvar="TSFUSION_LISTEN", help="Address for keyframes; port 0 = any free port."
-        ),
-    ] = None,
-    control: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS", envvar="TSFUSION_CONTROL", help="Address for commands; default: the next port."
-        ),
-    ] = None,
-    state: Annotated[
-        str | None,
-        typer.Option(
-            metavar="DIR",
-            envvar="TSFUSION_STATE",
-            help="Folder of journals and maps; those there are continued.",
-        ),
-    ] = None,
-    metrics: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HOST:PORT",
-            envvar="TSFUSION_METRICS",
-            help="Address for Prometheus and health checks, such as 127.0.0.1:9464; this machine only.",
-        ),
-    ] = None,
-    log_format: Annotated[
-        str | None,
-        typer.Option(metavar="FORMAT", envvar="TSFUSION_LOG_FORMAT", help="Log on stderr as text or json."),
-    ] = None,
-    log_level: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LEVEL",
-            envvar="TSFUSION_LOG_LEVEL",
-            help="Log from debug, info, warning or error on.",
-        ),
-    ] = None,
-    keys: Annotated[
-        str | None,
-        typer.Option(
-            metavar="DIR",
-            envvar="TSFUSION_KEYS",
-            help="Let only those connect whom `tsfusion keys allow` named; needed beyond this machine.",
-        ),
-    ] = None,
     config: options.ConfigFile = None,
     json: options.Json = False,
     until_eof: Annotated[bool, typer.Option("--until-eof", hidden=True)] = False,
@@ -84,10 +56,7 @@ def serve(
     from tsfusion.core import logs
     from tsfusion.core.errors import TsfusionError
 
-    chosen = options.configuration(
-        config, listen=listen, control=control, state=state, keys=keys, metrics=metrics,
-        log_format=log_format, log_level=log_level, **settings,
-    )  # fmt: skip
+    chosen = options.configuration(config, **settings)
     logs.configure(chosen.server.log_format, chosen.server.log_level)
     if until_eof:
         threading.Thread(target=_stop_at_eof, daemon=True).start()

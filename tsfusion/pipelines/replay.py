@@ -75,15 +75,14 @@ def replay(
             progress.stage("writing the results")
             running.wait_meshed([sender])
             status, mesh = run_files.write_map(work, target, target.link.map, ups, min_weight=min_weight)
-            stats, records = sender.stats, sender.records
         if not len(mesh.faces):
-            raise OutputError(run_files.no_surface(stats))
+            raise OutputError(run_files.no_surface(sender.stats))
         result = replay_results.summarise(
-            dataset, stats, records, mesh, status,
+            dataset, sender, mesh, status,
             seconds=seconds, rate=rate, peak_rss_bytes=peak,
             server_start_seconds=target.child.start_seconds if target.child else None,
         )  # fmt: skip
-        run_files.write_ledger(work, records)
+        run_files.write_ledger(work, sender.records)
         run_files.write_record(work, result)
         return result
 

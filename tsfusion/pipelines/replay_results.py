@@ -7,12 +7,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.client import ClientStats
+from tsfusion.client import Client
 from tsfusion.datasets import Dataset
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.pipelines import latency_ledger, run_files
 from tsfusion.wire.health import Status
-from tsfusion.wire.keyframe_times import KeyframeTimes, Spread
+from tsfusion.wire.keyframe_times import Spread
 
 
 @runtime_checkable
@@ -58,8 +58,7 @@ class ReplaySummary(msgspec.Struct, frozen=True, kw_only=True):
 
 def summarise(
     dataset: Dataset,
-    stats: ClientStats,
-    records: list[KeyframeTimes],
+    sender: Client,
     mesh: Mesh,
     status: Status,
     *,
@@ -71,14 +70,13 @@ def summarise(
     """A replay in figures.
 
     Args:
-        stats, records: of the client that sent the keyframes.
-        mesh, status: of the map they went into.
+        mesh, status: of the map that the keyframes went into.
         seconds: from the first keyframe handed over to the last one fused.
         rate: keyframes a second that were asked for; None = as fast as they are fused.
         peak_rss_bytes: of the sending process.
         server_start_seconds: of the own server; None = the server was there already.
     """
-    delays = latency_ledger.summarise(records)
+    stats, delays = sender.stats, latency_ledger.summarise(sender.records)
     return ReplaySummary(
         dataset=dataset.name,
         keyframes_sent=stats.sent,

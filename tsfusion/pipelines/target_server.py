@@ -45,15 +45,19 @@ class ServerChild:
         self.control = ""
         self.start_seconds = 0.0
 
-    def wait_ready(self, deadline: float = START_DEADLINE) -> None:
+    def wait_ready(self) -> None:
         """Read the line that says the server is ready; raise TransportError when it ends or stays silent."""
         started = time.monotonic()
-        line = _read_line(self._process, deadline)
-        if not line:
-            self.check()
+        stdout = self._process.stdout
+        assert stdout is not None
+        if not select.select([stdout], [], [], START_DEADLINE)[0]:
             raise TransportError(
-                f"the server was not ready within {deadline:.0f} s: is this machine busy with other work?"
+                f"the server was not ready within {START_DEADLINE:.0f} s: is this machine very busy?"
             )
+        line = stdout.readline()
+        if not line:
+            self._process.wait(STOP_DEADLINE)
+            self.check()
         ready = json.loads(line)
         self.listen, self.control = ready["listen"], ready["control"]
         self.start_seconds = time.monotonic() - started
@@ -67,25 +71,19 @@ class ServerChild:
             raise TransportError(f"the server ended with status {self._process.returncode}{reason}")
 
     def stop(self) -> None:
-        """SIGTERM, and after a deadline SIGKILL to it and its fuser."""
+        """Let the server drain and save its map; kill it when that takes too long."""
         self._process.terminate()
         try:
             self._process.wait(STOP_DEADLINE)
         except subprocess.TimeoutExpired:
             self.kill()
-        self._close()
+        with self._process:  # closes its pipes
+            pass
 
     def kill(self) -> None:
-        """End the server and its fuser at once; what they wrote is thrown away."""
-        with suppress(ProcessLookupError):
+        """End the server and its fuser at once, if they run; what they wrote is thrown away."""
+        with self._process, suppress(ProcessLookupError):  # closes its pipes and waits for it
             os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait()
-        self._close()
-
-    def _close(self) -> None:
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                pipe.close()
 
 
 @contextmanager
@@ -125,16 +123,6 @@ def _start(settings: Path, stderr: IO[str]) -> subprocess.Popen[str]:
         env=environment,
         start_new_session=True,  # Ctrl-C is ours to handle
     )
-
-
-def _read_line(process: subprocess.Popen[str], seconds: float) -> str:
-    """The first line of stdout; empty when the process ends or the time is over."""
-    assert process.stdout is not None
-    readable, _, _ = select.select([process.stdout], [], [], seconds)
-    line = process.stdout.readline() if readable else ""
-    if readable and not line:
-        process.wait(STOP_DEADLINE)
-    return line
 
 
 @dataclass(frozen=True)
