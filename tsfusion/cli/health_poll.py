@@ -9,7 +9,6 @@ import msgspec
 from msgspec import Struct
 
 from tsfusion.core.errors import ServerUnreachable, TransportError
-from tsfusion.wire.curve import ClientKeys
 from tsfusion.wire.health import Health, MapHealth, Status
 from tsfusion.wire.queries import fetch_health, fetch_status
 
@@ -79,24 +78,16 @@ class ServerWatcher:
 
     Args:
         address: the server's data address.
-        control: its control address; None = the port after the other.
-        keys: of the connection; None = without.
         timeout: seconds to wait for an answer.
         stall_after: seconds without a keyframe fused, while some wait, that make a stall.
         only: one map's name; empty = all.
+        connection: `control` and `keys` of `fetch_health`.
     """
 
     def __init__(
-        self,
-        address: str,
-        *,
-        control: str | None,
-        keys: ClientKeys | None,
-        timeout: float,
-        stall_after: float,
-        only: str = "",
+        self, address: str, *, timeout: float, stall_after: float, only: str = "", **connection: Any
     ) -> None:
-        self._address, self._control, self._keys = address, control, keys
+        self._address, self._connection = address, connection
         self._timeout, self._stall_after, self._only = timeout, stall_after, only
         self._moved: dict[str, tuple[object, float]] = {}  # map → how far it was, since when
         self._statuses: dict[str, tuple[object, Status]] = {}  # map → how far it was, and its status then
@@ -138,7 +129,7 @@ class ServerWatcher:
         return time.monotonic() - self._well >= self._stall_after
 
     def _health(self) -> Health:
-        return fetch_health(self._address, control=self._control, timeout=self._timeout, keys=self._keys)
+        return fetch_health(self._address, timeout=self._timeout, **self._connection)
 
     def _selected(self, health: Health) -> dict[str, MapHealth]:
         return {name: one for name, one in health.maps.items() if self._only in ("", name)}
@@ -174,9 +165,7 @@ class ServerWatcher:
                     continue
                 timeout = max(deadline - time.monotonic(), _MIN_TIMEOUT)
                 try:
-                    status = fetch_status(
-                        self._address, control=self._control, map_name=name, timeout=timeout, keys=self._keys
-                    )
+                    status = fetch_status(self._address, map_name=name, timeout=timeout, **self._connection)
                 except ServerUnreachable:
                     unavailable[name] = f"its fuser did not answer within {timeout:.1f} s"
                     continue

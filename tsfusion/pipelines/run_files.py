@@ -66,19 +66,9 @@ def no_surface(stats: ClientStats) -> str:
 
 def versions() -> dict[str, str]:
     """Versions of Python, the platform, tsfusion and the packages it stands on."""
-    packages = (
-        "tsfusion",
-        "taichi",
-        "numpy",
-        "opencv-python-headless",
-        "pyzmq",
-        "trimesh",
-        "mcap",
-        "msgspec",
-        "zstandard",
-    )
+    packages = "tsfusion taichi numpy opencv-python-headless pyzmq trimesh mcap msgspec zstandard"
     found = {"python": platform.python_version(), "platform": platform.platform()}
-    for name in packages:
+    for name in packages.split():
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

@@ -159,18 +159,14 @@ class Target:
             self.child.check()
 
     def status(self, map_name: str, *, timeout: float = 10.0) -> Status:
-        """How a map is doing; see `fetch_status`."""
-        link = self.link
-        return fetch_status(
-            link.address, control=link.control, map_name=map_name, timeout=timeout, keys=self.keys
-        )
+        """The status of a map; see `fetch_status`."""
+        address, control, keys = self.link.address, self.link.control, self.keys
+        return fetch_status(address, control=control, map_name=map_name, timeout=timeout, keys=keys)
 
     def mesh(self, map_name: str, *, min_weight: float | None) -> Mesh:
-        """A map's mesh of now; see `fetch_mesh`."""
-        link = self.link
-        return fetch_mesh(
-            link.address, control=link.control, map_name=map_name, min_weight=min_weight, keys=self.keys
-        )
+        """The mesh of a map, as of now; see `fetch_mesh`."""
+        address, control, keys = self.link.address, self.link.control, self.keys
+        return fetch_mesh(address, control=control, map_name=map_name, min_weight=min_weight, keys=keys)
 
 
 @contextmanager
