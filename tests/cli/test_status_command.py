@@ -4,6 +4,7 @@
 import json
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from health_snapshots import client, health, map_health
 from rich.console import Console
 
 from tsfusion.cli import main
-from tsfusion.cli.health_poll import Look
+from tsfusion.cli.health_poll import ServerSnapshot as Seen
 from tsfusion.cli.status_view import MAX_CLIENTS, render
 from tsfusion.core.errors import TransportError
 from tsfusion.wire.health import Health
@@ -29,11 +30,11 @@ NOBODY = "tcp://127.0.0.1:9"
 Asking = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
-def shown(look: Look, width: int = 160) -> str:
+def screen(snapshot: Seen, width: int = 160) -> str:
     """The screen, as text."""
     console = Console(width=width, highlight=False)
     with console.capture() as captured:
-        console.print(render(look))
+        console.print(render(snapshot))
     return captured.get()
 
 
@@ -58,10 +59,10 @@ def asking(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_screen_shows_corrections_where_there_are_any() -> None:
     told = health(client("cart", revision=3, corrected=120), client("drone"))
-    lines = [line.split() for line in shown(Look(address="tcp://host:5555", health=told)).splitlines()]
+    lines = [line.split() for line in screen(Seen(address="tcp://host:5555", health=told)).splitlines()]
     assert next(words[-1] for words in lines if words[:1] == ["client"]) == "corrected"
     assert next(words[-1] for words in lines if words[:1] == ["cart"]) == "120"
-    assert "corrected" not in shown(Look(address="tcp://host:5555", health=health(client("drone"))))
+    assert "corrected" not in screen(Seen(address="tcp://host:5555", health=health(client("drone"))))
 
 
 def test_a_screen_shows_it_all() -> None:
@@ -75,12 +76,12 @@ def test_a_screen_shows_it_all() -> None:
         ready=False, problems=("map yard: the disk is full",), refused={"gap": 3, "header": 1}, duplicates=9,
         maps={"yard": yard, "shed": map_health(state="restarting", last_keyframe_s=None, rejected={})},
     )  # fmt: skip
-    look = Look(
+    seen = Seen(
         address="tcp://host:5555", health=told, maps={"yard": status(map="yard")},
         unavailable={"shed": "the fuser restarts; ask again"},
     )  # fmt: skip
     for width in (80, 160):
-        text = shown(look, width)
+        text = screen(seen, width)
         lines = [" ".join(line.split()) for line in text.splitlines()]
         assert lines[0] == "✗ map yard: the disk is full"
         assert "tcp://host:5555 not ready up 1 h 2 min, gateway 62.9 MB, 9 duplicates" in lines
@@ -95,10 +96,10 @@ def test_a_screen_shows_it_all() -> None:
 
 
 def test_a_server_that_is_well_says_little() -> None:
-    look = Look(
+    seen = Seen(
         address="tcp://host:5555", health=health(maps={"default": map_health(rejected={}, quarantined=0)})
     )
-    text = shown(look)
+    text = screen(seen)
     assert "ready" in text
     assert not any(word in text for word in ("✗", "refused", "client", "duplicates", "quarantined", "not"))
 
@@ -109,19 +110,19 @@ def test_nothing_that_peers_say_commands_the_terminal() -> None:
         client("x", skipped={evil: 1}, held=evil), problems=(evil,), refused={evil: 1},
         maps={"default": map_health(problem=evil, rejected={evil: 1})},
     )  # fmt: skip
-    text = shown(Look(address="tcp://host:5555", health=told, unavailable={"default": evil}))
+    text = screen(Seen(address="tcp://host:5555", health=told, unavailable={"default": evil}))
     assert all(line.isprintable() for line in text.splitlines())
     assert text.count("[red]") == 6
 
 
 def test_many_clients_are_cut_short() -> None:
     told = health(*(client(f"robot{i}", heard_s=1000 - i) for i in range(500)))
-    text = shown(Look(address="tcp://host:5555", health=told))
+    text = screen(Seen(address="tcp://host:5555", health=told))
     assert "robot499 " in text
     assert "robot0 " not in text
     assert f"and {500 - MAX_CLIENTS} more sessions" in text
-    only = shown(
-        Look(address="x", health=health(client("a", map="yard"), client("b", map="shed")), only="shed")
+    only = screen(
+        Seen(address="x", health=health(client("a", map="yard"), client("b", map="shed")), only="shed")
     )
     assert "b " in only
     assert "yard" not in only
@@ -168,7 +169,7 @@ def test_one_that_knows_no_health_is_1(asking: Asking) -> None:
     with serving(lambda command: Reply(name="health", status=status())) as (control, _):
         done = asking(control)
     assert done.returncode == 1
-    assert "does not tell its health" in done.stderr
+    assert "answered without its health" in done.stderr
 
 
 def test_a_fuser_that_restarts_is_said_and_no_failure(asking: Asking) -> None:
@@ -203,10 +204,8 @@ def test_stalled_is_3(asking: Asking) -> None:
         done = asking(control, "--stall-after", 0.6, "--json")
         assert done.returncode == 3
         assert json.loads(done.stdout)["stalled"] == ["yard"]
-        assert (
-            "✗ map yard: 3 keyframes wait, and none was fused for 1 s"
-            in asking(control, "--stall-after", 0.6).stdout
-        )
+        plain = asking(control, "--stall-after", 0.6).stdout
+        assert re.search(r"✗ map yard: 3 keyframes wait, and none was fused for \d+ s", plain)
         assert asking(control, "--stall-after", 60, "--map", "shed").returncode == 0
     assert len([command for command in asked if command.name == "health"]) > 4
 
@@ -327,5 +326,5 @@ def test_help_needs_none_of_it() -> None:
 
 
 def test_errors_stay_errors() -> None:
-    look: Any = Look(address="tcp://host:5555", error=str(TransportError("no server\x1b[2J answered")))
-    assert shown(look) == "✗ no server\\x1b[2J answered\n"
+    seen: Any = Seen(address="tcp://host:5555", error=str(TransportError("no server\x1b[2J answered")))
+    assert screen(seen) == "✗ no server\\x1b[2J answered\n"

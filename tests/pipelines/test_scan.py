@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +18,15 @@ from command_processes import end, environment, eventually, read_until, server, 
 from small_recordings import seven_scenes
 
 from tsfusion import open_dataset
-from tsfusion.core.config import ScanConfig, VolumeConfig
+from tsfusion.cli.progress import Quiet
+from tsfusion.core.config import ClientConfig, ScanConfig, VolumeConfig
 from tsfusion.core.errors import InvalidConfig, InvalidKeyframe
 from tsfusion.datasets.trajectory_files import read_tum, write_tum
 from tsfusion.evaluation.held_out_views import compare_scans
 from tsfusion.geometry.frame import Frame
 from tsfusion.journal.recording import JournalRecording
+from tsfusion.pipelines import engine
 from tsfusion.pipelines import scan as pipelines_scan
-from tsfusion.pipelines import target_server
-from tsfusion.scanner.scanner import ScanState
 from tsfusion.scanner.sources.source import LiveSource
 from tsfusion.wire.queries import fetch_status
 
@@ -255,16 +254,6 @@ def test_a_mesh_with_poses_of_its_own_is_as_good_as_with_the_true_ones(
     assert own["predicted"] > 95
 
 
-class Told:
-    """keeps what a scan tells."""
-
-    def stage(self, text: str) -> None:
-        pass
-
-    def scan(self, state: ScanState, length: int | None) -> None:
-        self.state = state
-
-
 class Frames(LiveSource):
     """Frames from a list."""
 
@@ -289,12 +278,12 @@ def unposed(count: int) -> list[Frame]:
 def test_a_live_sources_first_frame_is_taken_unless_it_is_old(
     count: int, gap_ns: int, taken: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipelines_scan, "_LINGER", 0.2)
+    monkeypatch.setattr(engine, "LINGER", 0.2)
     first, *others = unposed(count)
     later = [dataclasses.replace(frame, timestamp_ns=frame.timestamp_ns + gap_ns) for frame in others]
     result = pipelines_scan.scan(
         Frames([first, *later], live=True), tmp_path / "out", config=ScanConfig(), volume=VolumeConfig(),
-        connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Told(),
+        connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Quiet(),
     )  # fmt: skip
     assert (result.frames, result.frames_tracked) == (taken, taken)
 
@@ -302,12 +291,12 @@ def test_a_live_sources_first_frame_is_taken_unless_it_is_old(
 def test_what_waits_for_the_map_is_of_another_world(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(pipelines_scan, "_LINGER", 0.2)
+    monkeypatch.setattr(engine, "LINGER", 0.2)
     for left in (1, 2):
         assert "of an earlier scan" not in caplog.text
         result = pipelines_scan.scan(
             Frames(unposed(1)), tmp_path / "out", config=ScanConfig(), volume=VolumeConfig(),
-            connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Told(),
+            connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Quiet(),
         )  # fmt: skip
         assert result.left == left
     assert "of an earlier scan wait for the map default" in caplog.text
@@ -316,12 +305,12 @@ def test_what_waits_for_the_map_is_of_another_world(
 def test_a_frame_that_cannot_be_followed_keeps_what_came_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipelines_scan, "_LINGER", 0.2)
+    monkeypatch.setattr(engine, "LINGER", 0.2)
     points = Frame(sensor="lidar", points=np.ones((9, 3), np.float32), timestamp_ns=10**9)
     with pytest.raises(InvalidKeyframe, match="needs a depth"):
         pipelines_scan.scan(
             Frames([*unposed(4), points]), tmp_path / "out", config=ScanConfig(loop_closure=False),
-            volume=VolumeConfig(), connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Told(),
+            volume=VolumeConfig(), connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Quiet(),
         )  # fmt: skip
     run = json.loads((tmp_path / "out" / "run.json").read_text())
     assert (run["frames_tracked"], run["complete"]) == (4, False)
@@ -329,7 +318,7 @@ def test_a_frame_that_cannot_be_followed_keeps_what_came_before(
     with pytest.raises(InvalidConfig, match="rgbd follows depth images, and this source gives points"):
         pipelines_scan.scan(
             Frames([points]), tmp_path / "none", config=ScanConfig(localizer="rgbd"),
-            volume=VolumeConfig(), connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Told(),
+            volume=VolumeConfig(), connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Quiet(),
         )  # fmt: skip
     assert not (tmp_path / "none").exists()
 
@@ -352,17 +341,23 @@ def test_keyframes_that_are_refused_do_not_cost_the_results(walk: Path, tmp_path
 def test_a_map_without_a_surface_keeps_the_trajectory(walk: Path, tmp_path: Path) -> None:
     done = scan("--source", walk, "--max-frames", 2, "--min-weight", 1000, "--out", tmp_path / "out")
     assert done.returncode == 1
-    assert "the map has no surface to write: 1 keyframes fused" in done.stderr.splitlines()[-1]
+    assert "the map has no surface to write: 1 of 1 keyframes fused" in done.stderr.splitlines()[-1]
     assert len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) == 2
     assert not (tmp_path / "out" / "mesh.ply").exists()
 
 
-@pytest.mark.parametrize(("live", "policy"), [(True, "thin"), (False, "spool_all")])
-def test_only_what_cannot_wait_is_thinned_out(live: bool, policy: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("live", [True, False])
+def test_only_what_cannot_wait_is_thinned_out(
+    live: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Also where nobody knows how many frames there will be, as in a folder or a camera's recording."""
-    source = Frames([], live=live)
+    monkeypatch.setattr(engine, "LINGER", 0.2)
+    source = Frames(unposed(6), live=live)
     source.length = None
-    with ExitStack() as stack:
-        place = target_server.elsewhere(None, "tcp://127.0.0.1:9", tmp_path / "spool")
-        _, connect = target_server.opener(stack, place, source)
-        assert connect("hall")._config.policy == policy
+    result = pipelines_scan.scan(
+        source, tmp_path / "out", config=ScanConfig(distance=1e-6), volume=VolumeConfig(),
+        client=ClientConfig(backlog=1), connect="tcp://127.0.0.1:9", spool=tmp_path / "spool",
+        progress=Quiet(),
+    )  # fmt: skip
+    assert bool(result.keyframes_rejected.get("thinned")) == live
+    assert live or result.left == 6

@@ -12,7 +12,6 @@ import pytest
 from keyframes_and_servers import CAMERA, pose, serving, until, wall
 
 from tsfusion import Client
-from tsfusion.cli import scan_output
 from tsfusion.core.config import ScanConfig
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
@@ -176,14 +175,6 @@ def test_in_the_end_keyframes_since_the_last_loop_are_moved_too(tmp_path: Path) 
     (sent,) = found.values()
     assert len(sent) == 4
     np.testing.assert_allclose(sent.poses[3], pose(0, 0.05) @ submap.located.poses()[3])
-
-
-def test_warnings_stand_above_the_table(capsys: pytest.CaptureFixture[str]) -> None:
-    with scan_output._Table():
-        logging.getLogger("tsfusion.scanner.scanner").warning("lost [at %s]\x1b[2J", "sea")
-        logging.getLogger("tsfusion.scanner.scanner").info("nothing")
-    assert capsys.readouterr().err.strip() == "lost [at sea]\\x1b[2J"
-    assert not logging.getLogger("tsfusion").handlers
 
 
 def test_a_track_gives_back_what_it_took() -> None:

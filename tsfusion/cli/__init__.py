@@ -104,5 +104,5 @@ def _fail(message: str, code: int) -> NoReturn:
 
 
 def _terminated(signum: int, frame: FrameType | None) -> NoReturn:
-    """Unwind as Ctrl-C does: what was half-built goes, children end."""
+    """Unwind as Ctrl-C does: half-written results are removed, and child processes end."""
     sys.exit(TERMINATED)

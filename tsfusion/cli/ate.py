@@ -19,14 +19,17 @@ _FORMATS = "TUM, KITTI or Redwood .log."
 def ate(
     estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE", help=f"A trajectory file: {_FORMATS}")],
     reference: Annotated[
-        Path, typer.Argument(metavar="REFERENCE", help="The truth: likewise, or a dataset whose poses it is.")
+        Path,
+        typer.Argument(metavar="REFERENCE", help="The true one: such a file, or a dataset with poses."),
     ],
     *,
     max_difference: Annotated[
-        float, typer.Option(metavar="SECONDS", min=0.0, help="Between two poses that belong together.")
+        float,
+        typer.Option(metavar="SECONDS", min=0.0, help="Largest time between two matching poses."),
     ] = 0.01,
     align: Annotated[
-        bool, typer.Option("--align/--no-align", help="Lay one upon the other first, by a rigid motion.")
+        bool,
+        typer.Option("--align/--no-align", help="First move the estimate onto the truth (rigidly)."),
     ] = True,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Draw the trajectory, coloured by its error.")
@@ -34,7 +37,7 @@ def ate(
     option: options.DatasetOptions = None,
     json: options.Json = False,
 ) -> None:
-    """Absolute trajectory error (ATE): how far an estimated trajectory is from a true one."""
+    """Print the absolute trajectory error (ATE): how far an estimated trajectory is from the true one."""
     from tsfusion.cli import output
     from tsfusion.core.output_folder import check_writable
     from tsfusion.evaluation import trajectory_error
@@ -60,7 +63,7 @@ def ate(
 
 
 def _truth(reference: Path, given: dict[str, Any]) -> "Path | Dataset":
-    """A trajectory file as it is; anything else is opened, frames without a pose included: they count."""
+    """A trajectory file as it is, or a dataset with all its frames: those without a pose count too."""
     if reference.is_file() and not given:
         return reference
     from tsfusion.cli.replay import open_recording
@@ -69,7 +72,7 @@ def _truth(reference: Path, given: dict[str, Any]) -> "Path | Dataset":
 
 
 def table(rows: "list[tuple[str, TrajectoryError]]") -> str:
-    """The field's table of trajectories, metres."""
+    """The usual table of trajectory errors, a line a trajectory."""
     head = ("min", "max", "mean", "median", "std", "RMSE")
     width = max(len(name) for name, _ in rows)
     lines = [" " * width + "".join(f"{name:>10}" for name in head) + "   poses      length       drift"]

@@ -15,16 +15,17 @@ def check(
         Path, typer.Argument(metavar="PATH", help="A dataset or a journal, as `tsfusion replay` takes it.")
     ],
     *,
-    sequence: Annotated[str | None, typer.Option(metavar="NN", help="KITTI: the sequence.")] = None,
-    modality: Annotated[str | None, typer.Option(metavar="KIND", help="KITTI: stereo or lidar.")] = None,
-    poses: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="KITTI, TUM, Redwood: poses to use instead.")
-    ] = None,
-    unpack: Annotated[bool, typer.Option("--unpack", help="Unpack an archive beside itself.")] = False,
+    sequence: options.Sequence = None,
+    modality: options.Modality = None,
+    poses: options.Poses = None,
+    unpack: options.Unpack = False,
     option: options.DatasetOptions = None,
     json: options.Json = False,
 ) -> None:
-    """See whether a dataset's poses and depth agree; if not, say why. Status 1 when they disagree."""
+    """Check that a dataset's poses and depth agree, and say what is wrong if not.
+
+    Exit status 1 when they disagree.
+    """
     from tsfusion.cli import output
     from tsfusion.evaluation import pose_check
 

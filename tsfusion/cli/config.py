@@ -10,13 +10,12 @@ app = typer.Typer(help="The settings and their defaults.")
 
 @app.callback()
 def _group() -> None:
-    """Keeps `dump` a verb of its own while it is the only one."""
+    """Keep `dump` a verb of its own while it is the only one."""
 
 
 @app.command()
 def dump(config: options.ConfigFile = None, json: options.Json = False) -> None:
-    """Print every setting as commented TOML: the defaults, or what FILE makes of them."""
-    from tsfusion.core import config as core_config
+    """Print every setting as commented TOML: the defaults, or with --config those of FILE."""
     from tsfusion.core import config as settings
 
     loaded = settings.load(config)
@@ -25,4 +24,4 @@ def dump(config: options.ConfigFile = None, json: options.Json = False) -> None:
 
         output.as_json(loaded)
     else:
-        typer.echo(core_config.to_toml(loaded), nl=False)
+        typer.echo(settings.to_toml(loaded), nl=False)

@@ -22,12 +22,12 @@ class _ListByDefault(TyperGroup):
         return super().parse_args(ctx, args)
 
 
-app = typer.Typer(cls=_ListByDefault, help="What can be replayed.")
+app = typer.Typer(cls=_ListByDefault, help="The datasets that can be replayed.")
 
 
 @app.callback()
 def _group() -> None:
-    """Keeps `list` a verb of its own while it is the only one."""
+    """Keep `list` a verb of its own while it is the only one."""
 
 
 @app.command("list")
@@ -37,7 +37,7 @@ def list_(
     ] = None,
     json: options.Json = False,
 ) -> None:
-    """Name the layouts that `replay` recognises, or the datasets under PATH."""
+    """List the layouts that `replay` recognises, or the datasets in and under PATH."""
     from tsfusion.cli import output
 
     rows = _layouts() if path is None else list(_found(path, _DEPTH))
@@ -74,7 +74,7 @@ def _layouts() -> list[dict[str, Any]]:
 
 
 def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
-    """The datasets in and under a folder, not looking inside one that was found.
+    """The datasets in and under a folder; a dataset is not searched for others.
 
     Raises:
         DatasetError: when there is no folder.
@@ -105,5 +105,5 @@ def _folders_in(path: Path) -> list[Path]:
     try:
         return sorted(child for child in path.iterdir() if child.is_dir())
     except OSError as error:
-        typer.echo(f"cannot look into {path}: {error.strerror}", err=True)
+        typer.echo(f"cannot read the folder {path}: {error.strerror}", err=True)
         return []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion doctor`: is everything here that a run needs, and if not, what to do."""
+"""`tsfusion doctor`: check that everything a run needs is here, and say what to do if not."""
 
 import platform
 import shutil
@@ -29,7 +29,7 @@ _MODULES = {
 }  # fmt: skip
 
 
-# The scanner's parts that not everybody needs: extra → its package, and what it is for.
+# Parts that not everybody needs: name of the extra → its package, and what that is for.
 _EXTRAS = {
     "slam": ("scipy", "loop closure"),
     "lidar": ("kiss-icp", "LiDAR odometry"),
@@ -41,27 +41,37 @@ _EXTRAS = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One check: what was looked at, what was found, and what to do if it is wrong."""
+    """Result of one check.
+
+    Attributes:
+        name: what was checked.
+        found: its version or state, or what is wrong with it.
+        advice: what to do; empty = nothing.
+        optional: a part that is not installed, and need not be.
+    """
 
     name: str
     ok: bool
     found: str
     advice: str = ""
-    optional: bool = False  # and not there
+    optional: bool = False
 
 
 def doctor(
     path: Annotated[
-        Path, typer.Argument(metavar="DIR", help="A folder on the disk that is to hold maps.")
+        Path, typer.Argument(metavar="DIR", help="A folder on the disk where maps will be kept.")
     ] = Path(),
     json: options.Json = False,
 ) -> int:
-    """Check the installation, a line a check, and say what to do; status 1 when something is wrong."""
+    """Check the installation, and say what to do about each fault.
+
+    Exit status 1 when something is wrong.
+    """
     findings = []
     for finding in check(path):
         findings.append(finding)
         if not json:
-            _show(finding)
+            _print_finding(finding)
     ok = all(finding.ok for finding in findings)
     if json:
         from tsfusion.cli import output
@@ -73,7 +83,7 @@ def doctor(
 
 
 def check(path: Path) -> Iterator[Finding]:
-    """Every finding, as soon as it is known."""
+    """Findings, each as soon as it is known."""
     yield _python()
     yield from _packages()
     yield from map(_extra, _EXTRAS)
@@ -82,7 +92,7 @@ def check(path: Path) -> Iterator[Finding]:
     yield _disk(path)
 
 
-def _show(finding: Finding) -> None:
+def _print_finding(finding: Finding) -> None:
     mark = typer.style("✓", fg="green") if finding.ok else typer.style("✗", fg="red")
     mark = "–" if finding.optional else mark
     advice = f" → {finding.advice}" if finding.advice else ""
@@ -131,7 +141,7 @@ def _package(requirement: "Requirement") -> Finding:
 
 
 def _extra(name: str) -> Finding:
-    """An optional part is no fault when it is missing; one that is broken is."""
+    """A finding for an optional part: no fault when it is missing, one when it is broken."""
     package, purpose = _EXTRAS[name]
     install = f"pip install 'tsfusion[{name}]'"
     try:
@@ -146,7 +156,7 @@ def _extra(name: str) -> Finding:
 
 
 def _kernels() -> Finding:
-    """Compile (or load) and run a kernel, and compare with what it must give."""
+    """Compile (or load) and run a kernel, and compare its result with the right one."""
     import numpy as np
 
     from tsfusion.geometry.mesh import Mesh
@@ -185,9 +195,9 @@ def _disk(path: Path) -> Finding:
     return Finding(name, not advice, f"{free / 1e9:.1f} GB free", advice)
 
 
-def _guarded(look: Callable[[], Finding], name: str, advice: str) -> Finding:
-    """The finding, or what went wrong while looking."""
+def _guarded(check: Callable[[], Finding], name: str, advice: str) -> Finding:
+    """The finding of a check, or the error that it raised."""
     try:
-        return look()
-    except Exception as error:  # noqa: BLE001  a doctor reports what it meets
+        return check()
+    except Exception as error:  # noqa: BLE001  any error of a check is its finding
         return Finding(name, False, f"{type(error).__name__}: {error}", advice)

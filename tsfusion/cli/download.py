@@ -15,27 +15,27 @@ if TYPE_CHECKING:
 
 def download(
     name: Annotated[
-        str | None, typer.Argument(metavar="NAME", help="What to fetch; without it, what there is.")
+        str | None, typer.Argument(metavar="NAME", help="The recording to fetch; default: list all.")
     ] = None,
     *,
-    to: Annotated[Path, typer.Option("--to", metavar="DIR", help="Where recordings are kept.")] = Path(
+    to: Annotated[Path, typer.Option("--to", metavar="DIR", help="Folder where recordings are kept.")] = Path(
         "datasets"
     ),
     base: Annotated[
         str | None,
         typer.Option(
             "--from", metavar="URL", envvar="TSFUSION_DOWNLOAD_FROM",
-            help="A mirror: the folder that has the archives by their names.",
+            help="URL of a mirror: a folder with the archives under their own names.",
         ),
     ] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Only compare the archives in DIR with their checksums.")
+        bool, typer.Option("--check", help="Do not fetch; compare the archives in DIR with their checksums.")
     ] = False,
     json: options.Json = False,
 ) -> None:  # fmt: skip
-    """Fetch a public recording, or list those that are known.
+    """Fetch a public recording, or list the known ones.
 
-    An interrupted download goes on with the same command. Mind each recording's licence.
+    To go on with an interrupted download, give the same command again. Mind each recording's licence.
     """
     from tsfusion.datasets.download import catalogue
 
@@ -61,18 +61,18 @@ def _list(recordings: "list[PublicRecording]", *, json: bool) -> None:
 
 
 def _fetch(recording: "PublicRecording", to: Path, base: str | None, *, json: bool) -> None:
-    from tsfusion.cli import output
+    from tsfusion.cli import output, progress
     from tsfusion.datasets.download import download
 
     if not json:
         typer.echo(f"{recording.title}\nlicence: {recording.licence}; {recording.page}", err=True)
-    with output.reading(f"fetching {recording.name}", quiet=json) as watch:
+    with progress.reading(f"fetching {recording.name}", quiet=json) as watch:
         done = download.fetch(recording, to, watch, base=base)
     if json:
         output.as_json({"path": str(done.path), "files": [_row(one) for one in done.files]})
         return
     for one in done.files:
-        _say(one)
+        _print_archive(one)
     typer.echo(f"{done.path}\nnext: tsfusion replay {done.path}")
 
 
@@ -85,7 +85,7 @@ def _check(recordings: "list[PublicRecording]", to: Path, *, json: bool) -> None
         output.as_json([_row(one) for one in found])
         return
     for one in found:
-        _say(one)
+        _print_archive(one)
     if not found:
         typer.echo(f"no archives of these recordings in {to}", err=True)
 
@@ -94,6 +94,6 @@ def _row(one: "CheckedFile") -> dict[str, object]:
     return {**one._asdict(), "path": str(one.path)}
 
 
-def _say(one: "CheckedFile") -> None:
+def _print_archive(one: "CheckedFile") -> None:
     verdict = "as expected" if one.known else "unverified: no checksum is published; recorded for later"
     typer.echo(f"{one.path}  sha256 {one.sha256}  {verdict}", err=True)

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Asking a server how it is, once or again and again, and judging what it says."""
+"""Ask a server how it is, once or again and again, and judge whether it is well."""
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -10,24 +9,25 @@ from msgspec import Struct
 
 from tsfusion.core.errors import ServerUnreachable, TransportError
 from tsfusion.wire.health import Health, MapHealth, Status
-from tsfusion.wire.messages import Command, Reply
-from tsfusion.wire.queries import CommandRefused
+from tsfusion.wire.queries import CommandRefused, fetch_health, fetch_status
 
 READY, NOT_READY = 0, 3  # exit statuses; 1 is every error's, also that nobody answers
-_AGAIN = 0.5  # seconds between the looks that tell a stall from a pause
-_MIN_WAIT = 0.2  # seconds; of a fuser's answer
-
-Ask = Callable[[Command, float], Reply]  # a command and seconds to wait for its answer
+_RECHECK_INTERVAL = 0.5  # seconds between the checks that tell a stall from a pause
+_MIN_TIMEOUT = 0.2  # seconds for a fuser's answer
 
 
-class Look(Struct, frozen=True, kw_only=True):
-    """What was seen of a server at one moment.
+class ServerSnapshot(Struct, frozen=True, kw_only=True):
+    """State of a server at one moment.
 
     Attributes:
-        health: None = it did not answer, and `error` says how.
-        maps: what their fusers told; a map that is in `unavailable` instead could not say, and why.
-        stalled: maps where keyframes wait and nothing is fused, and for how many seconds.
+        address: of the server, for a person.
+        health: the gateway's answer; None = it did not answer.
+        error: why it did not answer.
+        maps: map → status of its fuser, where that answered.
+        unavailable: map → why its fuser's status is not known.
+        stalled: map → seconds for which keyframes have waited there and none was fused.
         missing: the map that was asked for and is not open; empty = it is, or none was asked for.
+        only: the map that was asked for; empty = all.
     """
 
     address: str
@@ -41,7 +41,7 @@ class Look(Struct, frozen=True, kw_only=True):
 
     @property
     def problems(self) -> list[str]:
-        """What is wrong, a line each; empty = all is well."""
+        """Faults of the server, one sentence each; empty = all is well."""
         if self.health is None:
             return [self.error]
         found = [*self.health.problems]
@@ -56,7 +56,7 @@ class Look(Struct, frozen=True, kw_only=True):
 
     @property
     def exit_status(self) -> int:
-        """0 = ready; 3 = it answers, but is not, or a map is stalled. Of one map, if one was asked for."""
+        """0 = ready; 3 = not ready, or a map is stalled. Counts the map that was asked for, or all."""
         assert self.health is not None
         if self.only and not self.missing:
             one = self.health.maps[self.only]
@@ -66,68 +66,69 @@ class Look(Struct, frozen=True, kw_only=True):
         return READY if well and not self.stalled else NOT_READY
 
     def as_json(self) -> dict[str, Any]:
-        """For a program."""
-        shown = {"health": self.health, "maps": self.maps, "unavailable": self.unavailable,
-                 "stalled": list(self.stalled), "exit_status": self.exit_status}  # fmt: skip
-        return msgspec.to_builtins(shown)  # type: ignore[no-any-return]
+        """The snapshot as plain values that JSON has."""
+        fields = {"health": self.health, "maps": self.maps, "unavailable": self.unavailable,
+                  "stalled": list(self.stalled), "exit_status": self.exit_status}  # fmt: skip
+        return msgspec.to_builtins(fields)  # type: ignore[no-any-return]
 
 
-class Watcher:
-    """Remembers from look to look when each map last moved.
+class ServerWatcher:
+    """Takes snapshots of a server, and remembers when each map last fused something.
 
     Args:
-        address: of the server, to be shown.
-        ask: answers a command, or raises TransportError.
-        only: one map's name; empty = all.
+        address: the server's data address.
+        timeout: seconds to wait for an answer.
         stall_after: seconds without a keyframe fused, while some wait, that make a stall.
+        only: one map's name; empty = all.
+        connection: `control` and `keys` of `fetch_health`.
     """
 
-    def __init__(self, address: str, ask: Ask, *, timeout: float, stall_after: float, only: str = "") -> None:
-        self._address, self._ask, self._timeout = address, ask, timeout
-        self._stall_after, self._only = stall_after, only
+    def __init__(
+        self, address: str, *, timeout: float, stall_after: float, only: str = "", **connection: Any
+    ) -> None:
+        self._address, self._connection = address, connection
+        self._timeout, self._stall_after, self._only = timeout, stall_after, only
         self._moved: dict[str, tuple[object, float]] = {}  # map → how far it was, since when
-        self._told: dict[str, tuple[object, Status]] = {}
+        self._statuses: dict[str, tuple[object, Status]] = {}  # map → how far it was, and its status then
         self._well = time.monotonic()
 
-    def once(self) -> Look:
-        """A look; where keyframes wait, it takes until one is fused or `stall_after` is over.
+    def check_once(self) -> ServerSnapshot:
+        """A snapshot; where keyframes wait, it takes until one is fused or `stall_after` is over.
 
         Raises:
             TransportError: when the server does not answer.
         """
         began = {name: self._progress(one) for name, one in self._selected(self._health()).items()}
         while True:
-            look = self._judged(self._health())
-            assert look.health is not None
+            health = self._health()
+            snapshot = self._judge(health)
             waiting = [
-                name for name, one in self._selected(look.health).items()
+                name for name, one in self._selected(health).items()
                 if one.waiting and self._progress(one) == began.get(name)
             ]  # fmt: skip
-            if not waiting or look.exit_status != READY:
-                return self._with_maps(look, always=True)
-            time.sleep(_AGAIN)
+            if not waiting or snapshot.exit_status != READY:
+                return self._with_maps(snapshot, health, always=True)
+            time.sleep(_RECHECK_INTERVAL)
 
-    def again(self) -> Look:
-        """The next look of many: a fuser is asked only when it has nothing else to do.
+    def check_again(self) -> ServerSnapshot:
+        """The next snapshot of many: a fuser is asked only when it has nothing else to do.
 
         Raises:
             TransportError: when the server does not answer.
         """
-        look = self._with_maps(self._judged(self._health()), always=False)
-        if look.exit_status == READY:
+        health = self._health()
+        snapshot = self._with_maps(self._judge(health), health, always=False)
+        if snapshot.exit_status == READY:
             self._well = time.monotonic()
-        return look
+        return snapshot
 
     @property
     def unwell(self) -> bool:
-        """Whether `again` has seen nothing good for `stall_after` seconds, or a stall."""
+        """Whether no snapshot of the last `stall_after` seconds was ready."""
         return time.monotonic() - self._well >= self._stall_after
 
     def _health(self) -> Health:
-        reply = self._ask(Command(name="health"), self._timeout)
-        if reply.health is None:
-            raise TransportError(f"the server at {self._address} does not tell its health: is it older?")
-        return reply.health
+        return fetch_health(self._address, timeout=self._timeout, **self._connection)
 
     def _selected(self, health: Health) -> dict[str, MapHealth]:
         return {name: one for name, one in health.maps.items() if self._only in ("", name)}
@@ -135,7 +136,7 @@ class Watcher:
     def _progress(self, one: MapHealth) -> object:
         return one.keyframes_fused, one.rejected
 
-    def _judged(self, health: Health) -> Look:
+    def _judge(self, health: Health) -> ServerSnapshot:
         now = time.monotonic()
         stalled = {}
         selected = self._selected(health)
@@ -148,30 +149,28 @@ class Watcher:
             if one.waiting and now - since >= self._stall_after:
                 stalled[name] = now - since
         missing = self._only if self._only and not selected else ""
-        return Look(
+        return ServerSnapshot(
             address=self._address, health=health, stalled=stalled, missing=missing, only=self._only
         )  # fmt: skip
 
-    def _with_maps(self, look: Look, *, always: bool) -> Look:
-        assert look.health is not None
+    def _with_maps(self, snapshot: ServerSnapshot, health: Health, *, always: bool) -> ServerSnapshot:
         deadline = time.monotonic() + self._timeout
         maps, unavailable = {}, {}
-        for name, one in self._selected(look.health).items():
-            version = (look.health.epoch, one.keyframes_durable, one.keyframes_fused)
-            told, status = self._told.get(name, (None, None))
-            if told != version or status is None:
+        for name, one in self._selected(health).items():
+            version = (health.epoch, one.keyframes_durable, one.keyframes_fused)
+            known, status = self._statuses.get(name, (None, None))
+            if known != version or status is None:
                 if one.waiting and not always:
                     continue
-                wait = max(deadline - time.monotonic(), _MIN_WAIT)
+                timeout = max(deadline - time.monotonic(), _MIN_TIMEOUT)
                 try:
-                    status = self._ask(Command(name="status", map=name), wait).status
+                    status = fetch_status(self._address, map_name=name, timeout=timeout, **self._connection)
                 except ServerUnreachable:
-                    unavailable[name] = f"its fuser did not answer within {wait:.1f} s"
+                    unavailable[name] = f"its fuser did not answer within {timeout:.1f} s"
                     continue
                 except TransportError as error:
                     unavailable[name] = error.reason if isinstance(error, CommandRefused) else str(error)
                     continue
-            if status is not None:
-                self._told[name] = (version, status)
-                maps[name] = status
-        return msgspec.structs.replace(look, maps=maps, unavailable=unavailable)
+            self._statuses[name] = (version, status)
+            maps[name] = status
+        return msgspec.structs.replace(snapshot, maps=maps, unavailable=unavailable)

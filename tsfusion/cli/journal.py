@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion journal`: look into a journal, check it, save what is whole, hand it to other tools."""
+"""`tsfusion journal`: describe a journal, check it, save its whole keyframes, export it to other tools."""
 
 import datetime
 from pathlib import Path
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     from tsfusion.journal.inspection import JournalInfo, Problem, SessionInfo, Verdict
     from tsfusion.journal.state_folder import JournalPlace
 
-_MOST_LINES = 20  # of one kind, for a person; --json has all
+_MOST_LINES = 20  # printed of one kind; --json has all
 
 app = typer.Typer(
-    help="Look into a journal, check it, save what is whole, hand it to other tools. "
-    "None of this changes a journal, and all of it works beside a running server."
+    help="Describe a journal, check it, save its whole keyframes, export it to other tools. "
+    "None of this changes a journal, and all of it works while a server runs."
 )
 
 Where = Annotated[
@@ -34,7 +34,7 @@ Map = Annotated[
 
 @app.command()
 def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
-    """Say what a journal holds: segments, sessions, keyframes, damage, quarantine.
+    """Describe what a journal holds: segments, sessions, keyframes, damage, quarantine.
 
     Checks the CRC of each keyframe and decodes none: as fast as the disk.
 
@@ -43,13 +43,13 @@ def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
     too fast. A segment is closed, with an index, or open: being written, or
     cut short by a crash, which costs nothing.
 
-    Exit status 0 also for a damaged journal: `verify` is the judge.
+    Exit status 0 also for a damaged journal; `verify` has another for it.
     """
-    from tsfusion.cli import output
+    from tsfusion.cli import output, progress
     from tsfusion.journal.inspection import summarize
 
     place = _find(path, map_)
-    with output.reading(f"reading {place.path}", quiet=json) as watch:
+    with progress.reading(f"reading {place.path}", quiet=json) as watch:
         found = summarize(place, watch)
     if json:
         output.as_json(found)
@@ -61,16 +61,16 @@ def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
 def verify(path: Where, map_: Map = None, json: options.Json = False) -> None:
     """Read and decode every keyframe; exit status 1 when anything is damaged.
 
-    Each bad place is named by segment and byte. `damage`: bytes are not
-    what was written. `torn`: the end of a write that a crash or a power cut
-    took; it was never acknowledged, and its scanner sends it again. `note`:
-    odd, but nothing is wrong with what is there.
+    Each bad place is named by segment and byte. `damage`: the bytes are not
+    those that were written. `torn`: a crash or a power cut took the end of a
+    write; it was never acknowledged, and its scanner sends it again. `note`:
+    unusual, but nothing is wrong with the keyframes.
     """
-    from tsfusion.cli import output
+    from tsfusion.cli import output, progress
     from tsfusion.journal.inspection import verify as check
 
     place = _find(path, map_)
-    with output.reading(f"checking {place.path}", quiet=json) as watch:
+    with progress.reading(f"checking {place.path}", quiet=json) as watch:
         verdict = check(place, watch)
     if json:
         output.as_json(verdict)
@@ -100,12 +100,12 @@ def recover(
     Exit status 1: OUT is there, but some keyframes could not be saved; the
     damaged places are named.
     """
-    from tsfusion.cli import output
+    from tsfusion.cli import output, progress
     from tsfusion.core.config import ServerConfig
     from tsfusion.journal.recovery import recover as save
 
     place = _find(path, map_)
-    with output.reading(f"saving {place.path}", quiet=json) as watch:
+    with progress.reading(f"saving {place.path}", quiet=json) as watch:
         done = save(place, out, ServerConfig().segment_bytes, watch)
     if json:
         output.as_json(done)
@@ -146,11 +146,11 @@ def export(
 
     Exit status 1: OUT is there, but without the damaged keyframes.
     """
-    from tsfusion.cli import output
+    from tsfusion.cli import output, progress
     from tsfusion.journal.ros2_export import export as write
 
     place = _find(path, map_)
-    with output.reading(f"exporting {place.path}", quiet=json) as watch:
+    with progress.reading(f"exporting {place.path}", quiet=json) as watch:
         done = write(place, out, watch)
     if json:
         output.as_json(done)

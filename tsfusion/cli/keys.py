@@ -10,7 +10,7 @@ import typer
 from tsfusion.cli import options
 
 app = typer.Typer(
-    help="""Who may connect to a server.
+    help="""Make keys, and choose who may connect to a server.
 
     Three steps let a scanner in, and nobody else:
 
@@ -29,7 +29,7 @@ app = typer.Typer(
 Dir = Annotated[
     Path,
     typer.Option(
-        "--dir", metavar="DIR", envvar="TSFUSION_KEYS", help="The folder of keys, its owner's alone."
+        "--dir", metavar="DIR", envvar="TSFUSION_KEYS", help="The folder of keys; only its owner may read it."
     ),
 ]
 Name = Annotated[str, typer.Argument(metavar="NAME", help="1 to 32 letters, digits and . _ -")]
@@ -41,7 +41,7 @@ def new(
     name: Name,
     *,
     folder: Dir = _FOLDER,
-    force: Annotated[bool, typer.Option("--force", help="Replace the pair that is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace a pair that exists already.")] = False,
 ) -> None:
     """Make a pair of keys: NAME.key_secret stays here, NAME.key is for the other side.
 
@@ -74,10 +74,10 @@ def allow(
     *,
     folder: Dir = _FOLDER,
 ) -> None:
-    """Let a scanner in; a running server does so at once.
+    """Let a scanner connect; a running server lets it in at once.
 
-    A name has one key: allowing another replaces it, and the name keeps its sessions. KEY holds characters
-    that a shell would read: put it in single quotes, and -- before it if it begins with a dash.
+    A name has one key: a new one replaces the old, and the name keeps its sessions. KEY may hold characters
+    that mean something to a shell: put it in single quotes, with -- before it if it begins with a dash.
     """
     from tsfusion.wire import key_folder
 
@@ -89,7 +89,7 @@ def allow(
 
 @app.command()
 def revoke(name: Name, *, folder: Dir = _FOLDER) -> None:
-    """Keep a scanner out; a running server cuts its connections at once."""
+    """Keep a scanner out; a running server closes its connections at once."""
     from tsfusion.wire import key_folder
 
     key = key_folder.revoke(folder, name)
@@ -98,7 +98,7 @@ def revoke(name: Name, *, folder: Dir = _FOLDER) -> None:
 
 @app.command("list")
 def list_(*, folder: Dir = _FOLDER, json: options.Json = False) -> None:
-    """Show the folder's own pairs (public halves), and on a server who is allowed and who was revoked."""
+    """List the folder's own public keys, and on a server who is allowed and who was revoked."""
     from tsfusion.wire import key_folder
 
     own = key_folder.list_pairs(folder)

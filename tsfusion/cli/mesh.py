@@ -22,12 +22,13 @@ def mesh(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="SOURCE", help="A map (.tsf), a state folder, a journal (folder or .mcap), or tcp://…"
+            metavar="SOURCE",
+            help="A map (.tsf), a state folder, a journal (folder or .mcap), or tcp://HOST:PORT.",
         ),
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="A .ply, .glb or .obj file.")],
     *,
-    preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw it, too.")] = None,
+    preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw a picture, too.")] = None,
     control: options.Control = None,
     map_: options.Map = None,
     key: options.Key = None,
@@ -36,7 +37,10 @@ def mesh(
     json: options.Json = False,
     **settings: Any,
 ) -> None:
-    """Write the mesh of a saved map, of a journal (fused anew, with these map flags), or of a live server."""
+    """Write the mesh of a saved map, of a live server, or of a journal.
+
+    A journal is fused again, with the map flags given here.
+    """
     from tsfusion.core.output_folder import check_writable
     from tsfusion.geometry.mesh import FORMATS
 
@@ -76,11 +80,11 @@ def mesh(
         from tsfusion.pipelines.mesh_preview import render
 
         render(made, preview)
-    _tell(made, out, json)
+    _print_result(made, out, json)
 
 
 def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bool, quiet: bool) -> "Volume":
-    """The saved map where there is a complete one, else a new one of every keyframe of the journal."""
+    """The saved map where it is complete; otherwise a new map of every keyframe of the journal."""
     from tsfusion.core.config import VIEW_SETTINGS
     from tsfusion.core.errors import DatasetError
     from tsfusion.tsdf.volume import Volume
@@ -105,28 +109,28 @@ def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bo
 
 
 def _fuse(recording: "JournalRecording", volume: "Volume", quiet: bool) -> "Volume":
-    """Add every keyframe; as in the server, one that the map cannot take is counted and left out."""
-    from tsfusion.cli import output
+    """Add every keyframe; one that the map cannot take is counted and left out, as in the server."""
+    from tsfusion.cli import progress
     from tsfusion.core.errors import MapError
 
     left_out: Counter[str] = Counter()
-    with output.progress(quiet=quiet) as progress:
-        progress.stage(f"fusing {recording.name}")
+    with progress.shown(quiet=quiet) as display:
+        display.stage(f"fusing {recording.name}")
         for index, keyframe in enumerate(recording, 1):
             try:
                 volume.integrate(keyframe)
             except MapError as error:
                 left_out[str(error)] += 1
-            progress.count(index, volume.keyframes, len(recording))
+            display.update(index, volume.keyframes, len(recording))
     for reason, count in left_out.items():
         typer.echo(f"left out {count} keyframes: {reason}", err=True)
     return volume
 
 
-def _tell(made: "Mesh", out: Path, json: bool) -> None:
+def _print_result(mesh: "Mesh", out: Path, json: bool) -> None:
     from tsfusion.cli import output
 
-    figures: dict[str, Any] = {"path": str(out), "vertices": len(made.vertices), "triangles": len(made.faces)}
+    figures: dict[str, Any] = {"path": str(out), "vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
     if json:
         output.as_json(figures)
     else:

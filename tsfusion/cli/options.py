@@ -31,37 +31,38 @@ MAP_OPTIONS: dict[str, Any] = {
     "sensor": Annotated[str | None, _map_option(
         "--sensor", "NAME", "Noise model and presets: kinect, tof, realsense, stereo, lidar or scanner.")],
     "regularizer": Annotated[str | None, _map_option(
-        "--regularizer", "MODE", "Smoothing along rays: off, paper or ray; else the sensor's.")],
+        "--regularizer", "MODE", "Smoothing along rays: off, paper or ray; default: the sensor's.")],
     "surface": Annotated[str | None, _map_option(
-        "--surface", "MODE", "What is meshed: raw, normal or field (smoothed); else the sensor's.")],
+        "--surface", "MODE", "Surface to mesh: raw, normal or field (smoothed); default: the sensor's.")],
     "lambda_": Annotated[float | None, _map_option(
-        "--lambda", "NUMBER", "Strength of the smoothing, along rays and of the field; else the sensor's.")],
+        "--lambda", "NUMBER", "Smoothing along rays and of the field; default: the sensor's.")],
     "truncation": Annotated[float | None, _map_option(
-        "--truncation", "VOXELS", "One half-width for every ray's band, instead of 3 sigma of its noise.")],
+        "--truncation", "VOXELS", "Half-width of every ray's band, instead of 3 sigma of its noise.")],
     "support": Annotated[str | None, _map_option(
-        "--support", "LEAST:MOST", "Bounds of a band's half-width, voxels, such as 3:6; else the sensor's.")],
+        "--support", "LEAST:MOST", "Bounds of that half-width, such as 3:6; default: the sensor's.")],
     "max_range": Annotated[float | None, _map_option(
-        "--max-range", "METRES", "Measurements beyond it are left out; else the sensor's.")],
+        "--max-range", "METRES", "Leave out measurements farther away; default: the sensor's.")],
     "min_weight": Annotated[float | None, _map_option(
-        "--min-weight", "SAMPLES", "Full-confidence samples a voxel needs to be meshed; else the sensor's.")],
+        "--min-weight", "SAMPLES", "Full-confidence samples that mesh a voxel; default: the sensor's.")],
     "space_carving": Annotated[bool | None, _map_option(
         "--space-carving/--no-space-carving", None, "Let rays clear what they pass: slower, no ghosts.")],
     "threads": Annotated[int | None, _map_option(
-        "--threads", "N", "Kernel threads; else all cores. Results do not depend on it.")],
+        "--threads", "N", "Threads of the kernels; default: all cores. Results do not depend on it.")],
 }  # fmt: skip
 VIEW_OPTIONS = ("min_weight", "surface", "lambda_", "threads")  # these change nothing that is stored
 
 
-def takes_map_settings(verb: Callable[..., Any]) -> Callable[..., Any]:
-    """Let Typer see every one of `MAP_OPTIONS` as a flag of a verb whose last parameter is `**settings`."""
+def takes_map_settings(verb: Callable[..., Any], also: dict[str, Any] | None = None) -> Callable[..., Any]:
+    """Let Typer see every one of `MAP_OPTIONS` and `also` as a flag of a verb that ends with `**settings`."""
     signature = inspect.signature(verb)
     own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+    added = {**(also or {}), **MAP_OPTIONS}
     shared = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=option)
-        for name, option in MAP_OPTIONS.items()
+        for name, option in added.items()
     ]
     verb.__signature__ = signature.replace(parameters=[*own, *shared])  # type: ignore[attr-defined]
-    verb.__annotations__ |= MAP_OPTIONS
+    verb.__annotations__ |= added
     return verb
 
 
@@ -86,13 +87,26 @@ DatasetOptions = Annotated[
         help="A setting of the dataset's class, such as depth_topic=/camera/depth; may be repeated.",
     ),
 ]  # fmt: skip
+
+
+def _dataset_option(flag: str, metavar: str | None, help_: str) -> Any:
+    return typer.Option(flag, metavar=metavar, rich_help_panel="Dataset", help=help_)
+
+
+Sequence = Annotated[str | None, _dataset_option("--sequence", "NN", "KITTI: which sequence.")]
+Modality = Annotated[str | None, _dataset_option("--modality", "KIND", "KITTI: stereo or lidar.")]
+Poses = Annotated[
+    Path | None,
+    _dataset_option("--poses", "FILE", "KITTI, TUM, Redwood: poses to use instead of the dataset's own."),
+]
+Unpack = Annotated[bool, _dataset_option("--unpack", None, "Unpack an archive beside itself.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for a program to read.")]
 
 
 def refuse(context: typer.Context, names: Collection[str], reason: str) -> None:
     """Raise InvalidConfig when one of these parameters was typed: it would be ignored.
 
-    One that the environment sets may be meant for other commands.
+    One that the environment sets is no error: it may be meant for other commands.
     """
     from tsfusion.core.errors import InvalidConfig
 
@@ -107,7 +121,7 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
 
     Args:
         preset: settings of the `volume` table that beat the defaults, and nothing else.
-        flags: settings of the `volume` and `server` tables by name; None = not given.
+        flags: settings of the `volume`, `server` and `scan` tables by name; None = not given.
 
     Raises:
         InvalidConfig: for a bad file or value.
@@ -118,16 +132,12 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
     flags |= _band(flags.pop("truncation", None), flags.pop("support", None))
     if (smoothness := flags.pop("lambda_", None)) is not None:
         flags |= {"smoothness": smoothness, "field_smoothness": smoothness}
-    volume, server = (
-        {key: value for key, value in flags.items() if key in struct.__struct_fields__}
-        for struct in (config.VolumeConfig, config.ServerConfig)
-    )
-    return config.Config(
-        volume=config.override(loaded.volume, **volume),
-        server=config.override(loaded.server, **server),
-        client=loaded.client,
-        scan=loaded.scan,
-    )
+    tables = {
+        name: {key: value for key, value in flags.items() if key in getattr(loaded, name).__struct_fields__}
+        for name in ("volume", "server", "scan")
+    }
+    changed = {name: config.override(getattr(loaded, name), **given) for name, given in tables.items()}
+    return config.Config(client=loaded.client, **changed)
 
 
 def dataset_options(given: list[str] | None) -> dict[str, Any]:
@@ -152,11 +162,31 @@ def dataset_options(given: list[str] | None) -> dict[str, Any]:
     return found
 
 
-def local(client: "ClientConfig") -> "ClientConfig":
-    """Settings of a client whose server is its own: nobody else is there, so no keys."""
+def client_settings(config: "Config", connect: str | None = None, **flags: str | None) -> "ClientConfig":
+    """The client's settings with every flag that was given on top; a server of the run's own has no keys."""
     from msgspec.structs import replace
 
-    return replace(client, key=None, server_key=None)
+    from tsfusion.core.config import override
+
+    client = override(config.client, **flags)
+    return client if connect is not None else replace(client, key=None, server_key=None)
+
+
+def check_target_flags(
+    context: typer.Context, connect: str | None, *, own: Collection[str], remote: Collection[str]
+) -> None:
+    """Raise InvalidConfig for a typed flag that would be ignored.
+
+    Args:
+        connect: address of a server elsewhere; None = the run starts its own.
+        own: parameters for a server of the run's own.
+        remote: parameters, besides the connection's, for a server elsewhere.
+    """
+    if connect is None:
+        refuse(context, {"control", "key", "server_key", *remote}, "has no effect without --connect")
+    else:
+        reason = "has no effect with --connect: give it to the `tsfusion serve` that listens there"
+        refuse(context, own, reason)
 
 
 def _band(truncation: float | None, support: str | None) -> dict[str, float]:
@@ -165,7 +195,7 @@ def _band(truncation: float | None, support: str | None) -> dict[str, float]:
 
     if truncation is not None and support is not None:
         raise InvalidConfig(
-            "--truncation and --support exclude each other: one fixes the band, one bounds it"
+            "--truncation and --support exclude each other (the band is fixed, or bounded): give one of them"
         )
     if truncation is not None:
         return {"min_support": truncation, "max_support": truncation}

@@ -9,16 +9,15 @@ import typer
 from tsfusion.cli import options
 
 if TYPE_CHECKING:
-    from tsfusion.core.config import Config
     from tsfusion.datasets import Dataset
 
 _DATASET = "Dataset"
-_STREET = {"sensor": "stereo", "voxel_size": 0.1}  # a Kinect sees no street
-Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Where the results go.")]
+_STREET = {"sensor": "stereo", "voxel_size": 0.1}  # a Kinect does not work in daylight
+Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
 Rate = Annotated[
     float | None,
     typer.Option(
-        "--rate", metavar="HZ", min=1e-3, help="Keyframes per second; else as fast as they are fused."
+        "--rate", metavar="HZ", min=1e-3, help="Keyframes per second; default: as fast as they are fused."
     ),
 ]
 Limit = Annotated[
@@ -43,29 +42,20 @@ def replay(
     rate: Rate = None,
     max_keyframes: Limit = None,
     start: Annotated[
-        int, typer.Option(metavar="N", min=0, rich_help_panel=_DATASET, help="Skip so many first.")
+        int,
+        typer.Option(metavar="N", min=0, rich_help_panel=_DATASET, help="Skip so many at the start."),
     ] = 0,
     stride: Annotated[
-        int, typer.Option(metavar="N", min=1, rich_help_panel=_DATASET, help="Every N-th keyframe.")
+        int, typer.Option(metavar="N", min=1, rich_help_panel=_DATASET, help="Take every N-th keyframe only.")
     ] = 1,
-    sequence: Annotated[
-        str | None, typer.Option(metavar="NN", rich_help_panel=_DATASET, help="KITTI: the sequence.")
-    ] = None,
-    modality: Annotated[
-        str | None, typer.Option(metavar="KIND", rich_help_panel=_DATASET, help="KITTI: stereo or lidar.")
-    ] = None,
-    poses: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", rich_help_panel=_DATASET, help="KITTI, TUM, Redwood: poses to use instead."
-        ),
-    ] = None,
-    unpack: Annotated[
-        bool, typer.Option("--unpack", rich_help_panel=_DATASET, help="Unpack an archive beside itself.")
-    ] = False,
+    sequence: options.Sequence = None,
+    modality: options.Modality = None,
+    poses: options.Poses = None,
+    unpack: options.Unpack = False,
     option: options.DatasetOptions = None,
     state: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Keep the own server's journal and map here.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Keep journal and map of the run's server here."),
     ] = None,
     check_: Annotated[
         bool, typer.Option("--check/--no-check", help="Warn when the dataset's poses and depth disagree.")
@@ -74,16 +64,15 @@ def replay(
     json: options.Json = False,
     **settings: Any,
 ) -> None:
-    """Send a recorded dataset (or a journal) through the whole path; leave mesh, picture and figures."""
+    """Send a recorded dataset or a journal to a server, and write mesh, picture and figures."""
+    from msgspec.structs import replace
+
+    from tsfusion.core.config import override
     from tsfusion.datasets import select
 
-    if connect is not None:
-        options.refuse(
-            context, {*options.MAP_OPTIONS, "state"} - {"min_weight"},
-            "has no effect with --connect: give it to the `tsfusion serve` that listens there",
-        )  # fmt: skip
-    else:
-        options.refuse(context, ("control", "key", "server_key"), "has no effect without --connect")
+    # Any server makes a mesh with another `min_weight`.
+    own = {*options.MAP_OPTIONS, "state"} - {"min_weight"}
+    options.check_target_flags(context, connect, own=own, remote=())
     dataset = open_recording(
         path, unpack=unpack, sequence=sequence, modality=modality, poses=poses,
         **options.dataset_options(option),
@@ -96,15 +85,27 @@ def replay(
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count} frames {reason}", err=True)
     if check_ and not _is_synthetic(path):
-        _warn(dataset)
+        _warn_of_disagreement(dataset)
+    server = None
+    if state is not None:  # only this machine reaches the run's own server; its errors are shown here
+        server = override(chosen.server, listen="tcp://127.0.0.1:0", state=str(state))
+        server = replace(server, keys=None, metrics=None, log_format="text")
+    client = options.client_settings(
+        chosen, connect, control=control, map=map_, key=key, server_key=server_key
+    )
     _run(
-        dataset, out, chosen, connect=connect, control=control, map_=map_, rate=rate, state=state, json=json,
-        min_weight=settings["min_weight"], key=key, server_key=server_key,
+        dataset, out, json=json, volume=chosen.volume, server=server, client=client, connect=connect,
+        rate=rate, min_weight=settings["min_weight"],
     )  # fmt: skip
 
 
 def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dataset":
-    """A dataset, or a journal; `given` are settings of a dataset, None = left out."""
+    """Open a dataset or a journal.
+
+    Args:
+        unpack: whether to unpack an archive beside itself.
+        given: settings of the dataset; None = not given.
+    """
     from tsfusion.journal.state_folder import is_journal
 
     if is_journal(path):
@@ -113,7 +114,7 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
 
         for name, value in given.items():
             if value is not None and name != "posed":
-                raise DatasetError(f"--{name} has no effect on a journal")
+                raise DatasetError(f"--{name} has no effect on a journal: leave it out")
         return JournalRecording(path)
     from tsfusion.datasets import describe, open_dataset
 
@@ -124,12 +125,12 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
 
 
 def _is_synthetic(path: Path) -> bool:
-    """Whether there is nothing to be found out: the first frame would have to be rendered."""
+    """Whether it is a synthetic dataset: what there is to say of one would have to be rendered first."""
     return str(path).startswith("synthetic:")
 
 
-def _warn(dataset: "Dataset") -> None:
-    """One line on stderr when poses and depth disagree."""
+def _warn_of_disagreement(dataset: "Dataset") -> None:
+    """Print a line on stderr when poses and depth disagree."""
     from tsfusion.evaluation import pose_check
 
     report = pose_check.check(dataset)
@@ -141,14 +142,20 @@ def _warn(dataset: "Dataset") -> None:
 def demo(
     *,
     out: Out = Path("out"),
-    world: Annotated[str, typer.Option(metavar="NAME", help="room, or street (stereo, 0.1 m).")] = "room",
+    world: Annotated[
+        str,
+        typer.Option(metavar="NAME", help="room, or street (stereo, 0.1 m)."),
+    ] = "room",
     count: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Keyframes; else 90, in the street 40.")
+        int | None,
+        typer.Option(metavar="N", min=1, help="Keyframes; default 90, in the street 40."),
     ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the sensor's noise.")] = 0,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Random seed of the sensor's noise.")] = 0,
     rate: Annotated[
         float | None,
-        typer.Option("--rate", metavar="HZ", min=1e-3, help="Keyframes per second; else 6, in the street 4."),
+        typer.Option(
+            "--rate", metavar="HZ", min=1e-3, help="Keyframes a second; default 6, in the street 4."
+        ),
     ] = None,
     config: options.ConfigFile = None,
     json: options.Json = False,
@@ -164,40 +171,20 @@ def demo(
     dataset = Synthetic(
         world, sensor=chosen.volume.sensor, count=count or usual_count, seed=seed, path=path
     )  # fmt: skip
-    _run(dataset, out, chosen, rate=rate or usual_rate, min_weight=settings["min_weight"], json=json)
+    _run(
+        dataset, out, json=json, volume=chosen.volume, client=options.client_settings(chosen),
+        rate=rate or usual_rate,
+        min_weight=settings["min_weight"],
+    )  # fmt: skip
 
 
-def _run(
-    dataset: "Dataset",
-    out: Path,
-    chosen: "Config",
-    *,
-    json: bool,
-    state: Path | None = None,
-    connect: str | None = None,
-    control: str | None = None,
-    map_: str | None = None,
-    key: str | None = None,
-    server_key: str | None = None,
-    **settings: Any,
-) -> None:
-    from msgspec.structs import replace
+def _run(dataset: "Dataset", out: Path, *, json: bool, **settings: Any) -> None:
+    from tsfusion.cli import output, progress, run_summary
+    from tsfusion.pipelines.replay import replay as run
 
-    from tsfusion.cli import output
-    from tsfusion.core.config import override
-    from tsfusion.pipelines import replay as pipelines_replay
-
-    server = override(chosen.server, listen="tcp://127.0.0.1:0", state=str(state)) if state else None
-    client = override(chosen.client, control=control, map=map_, key=key, server_key=server_key)
-    if connect is None:  # a server of its own: only this machine reaches it, its errors are told here
-        server = replace(server, keys=None, metrics=None, log_format="text") if server else None
-        client = options.local(client)
-    with output.progress(quiet=json) as progress:
-        run = pipelines_replay.replay(
-            dataset, out, volume=chosen.volume, server=server, client=client, progress=progress,
-            connect=connect, **settings,
-        )  # fmt: skip
+    with progress.shown(quiet=json) as display:
+        result = run(dataset, out, progress=display, **settings)
     if json:
-        output.as_json(run)
+        output.as_json(result)
     else:
-        output.summary(run, out)
+        run_summary.print_replay(result, out)

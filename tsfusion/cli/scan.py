@@ -5,6 +5,7 @@ import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +17,7 @@ from tsfusion.cli import options
 if TYPE_CHECKING:
     from tsfusion.scanner.sources.source import Source
 
-_ENDING = b"\nending: what is on its way is finished (again: at once)\n"
+_ENDING = b"\nending: what is on its way is finished (press Ctrl-C again to end at once)\n"
 _SOURCE, _POSES, _KEYFRAMES = "Source", "Poses", "Keyframes"
 
 
@@ -24,7 +25,37 @@ def _option(panel: str, metavar: str, help_: str, **settings: Any) -> Any:
     return typer.Option(metavar=metavar, help=help_, rich_help_panel=panel, **settings)
 
 
-@options.takes_map_settings
+# By name: settings of the `scan` table.
+SCAN_OPTIONS: dict[str, Any] = {
+    "localizer": Annotated[str | None, _option(
+        _POSES, "NAME",
+        "What finds poses: rgbd, stereo or lidar (default: by what the source gives); given (the source's "
+        "own poses); trajectory or feed (those of another SLAM).")],
+    "trajectory": Annotated[str | None, _option(
+        _POSES, "FILE", "Take poses from this file of another SLAM, in TUM's or KITTI's format.")],
+    "feed": Annotated[str | None, _option(
+        _POSES, "ADDRESS", "Take poses live from the SLAM that publishes them at tcp://HOST:PORT.")],
+    "time_offset": Annotated[float | None, _option(
+        _POSES, "SECONDS", "Added to a frame's time to look up its pose in --trajectory or --feed.")],
+    "max_gap": Annotated[float | None, _option(
+        _POSES, "SECONDS", "Longest gap to bridge in --trajectory or --feed; default 0.2.")],
+    "loop_closure": Annotated[bool | None, typer.Option(
+        "--loop-closure/--no-loop-closure", rich_help_panel=_POSES,
+        help="Recognise places seen before, and correct the poses since.")],
+    "patience": Annotated[float | None, _option(
+        _POSES, "SECONDS", "A sensor lost for so long begins a new map; default 1.", min=0.0)],
+    "min_overlap": Annotated[float | None, _option(
+        _KEYFRAMES, "SHARE", "New keyframe when less of the last one's view is still seen; default 0.8.")],
+    "distance": Annotated[float | None, _option(
+        _KEYFRAMES, "METRES", "New keyframe after so much movement; default 0.1, for stereo and LiDAR 2.")],
+    "angle": Annotated[float | None, _option(
+        _KEYFRAMES, "DEGREES", "New keyframe after so much turning; default 10.")],
+    "max_rate": Annotated[float | None, _option(
+        _KEYFRAMES, "HZ", "At most so many keyframes a second; default: no limit.")],
+}  # fmt: skip
+
+
+@partial(options.takes_map_settings, also=SCAN_OPTIONS)
 def scan(
     context: typer.Context,
     *,
@@ -34,60 +65,28 @@ def scan(
     ],
     calibration: Annotated[
         Path | None,
-        _option(_SOURCE, "FILE", "Of a camera: Kalibr, OpenCV, ROS or EuRoC (a file, or a folder of two)."),
+        _option(
+            _SOURCE,
+            "FILE",
+            "Of a live camera: Kalibr, OpenCV, ROS or EuRoC (a file, or a folder of two).",
+        ),
     ] = None,
     rate: Annotated[
         float | None,
-        _option(_SOURCE, "HZ", "Frames a second of a recording; else as fast as they go.", min=1e-3),
-    ] = None,
-    max_frames: Annotated[int | None, _option(_SOURCE, "N", "Stop after so many.", min=1)] = None,
-    start: Annotated[int, _option(_SOURCE, "N", "Skip so many first.", min=0)] = 0,
-    stride: Annotated[int, _option(_SOURCE, "N", "Every N-th frame.", min=1)] = 1,
-    sequence: Annotated[str | None, _option(_SOURCE, "NN", "KITTI: the sequence.")] = None,
-    modality: Annotated[str | None, _option(_SOURCE, "KIND", "KITTI: stereo or lidar.")] = None,
-    option: options.DatasetOptions = None,
-    localizer: Annotated[
-        str | None,
         _option(
-            _POSES,
-            "NAME",
-            "rgbd, stereo or lidar (by what the source gives); given (its own poses), trajectory or feed.",
+            _SOURCE,
+            "HZ",
+            "Frames a second of a recording; default: as fast as they are taken.",
+            min=1e-3,
         ),
     ] = None,
-    trajectory: Annotated[
-        str | None, _option(_POSES, "FILE", "Poses of another SLAM: a TUM or KITTI file.")
-    ] = None,
-    feed: Annotated[
-        str | None, _option(_POSES, "ADDRESS", "Poses of another SLAM, live: tcp://… it is heard at.")
-    ] = None,
-    time_offset: Annotated[
-        float | None,
-        _option(_POSES, "SECONDS", "Added to a frame's time before its pose is looked up there."),
-    ] = None,
-    max_gap: Annotated[
-        float | None,
-        _option(_POSES, "SECONDS", "Between two such poses; across a longer gap there is none; else 0.2."),
-    ] = None,
-    loop_closure: Annotated[
-        bool | None,
-        typer.Option(
-            "--loop-closure/--no-loop-closure", help="Look for places seen before.", rich_help_panel=_POSES
-        ),
-    ] = None,
-    patience: Annotated[
-        float | None, _option(_POSES, "SECONDS", "Lost for so long, a new map begins; else 1.", min=0.0)
-    ] = None,
-    min_overlap: Annotated[
-        float | None, _option(_KEYFRAMES, "SHARE", "Of the last keyframe's view; below, a new one; else 0.8.")
-    ] = None,
-    distance: Annotated[
-        float | None, _option(_KEYFRAMES, "METRES", "To the next; else 0.1, for stereo and LiDAR 2.")
-    ] = None,
-    angle: Annotated[float | None, _option(_KEYFRAMES, "DEGREES", "To the next; else 10.")] = None,
-    max_rate: Annotated[
-        float | None, _option(_KEYFRAMES, "HZ", "At most so many a second; else as many as the rules take.")
-    ] = None,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Where the results go.")] = Path("out"),
+    max_frames: Annotated[int | None, _option(_SOURCE, "N", "Stop after so many frames.", min=1)] = None,
+    start: Annotated[int, _option(_SOURCE, "N", "Skip so many frames at the beginning.", min=0)] = 0,
+    stride: Annotated[int, _option(_SOURCE, "N", "Take every N-th frame only.", min=1)] = 1,
+    sequence: options.Sequence = None,
+    modality: options.Modality = None,
+    option: options.DatasetOptions = None,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")] = Path("out"),
     connect: options.Connect = None,
     control: options.Control = None,
     map_: options.Map = None,
@@ -98,52 +97,40 @@ def scan(
         typer.Option(
             metavar="DIR",
             envvar="TSFUSION_SPOOL",
-            help="With --connect: keyframes wait here until the server has them.",
+            help="With --connect: the folder where keyframes wait until the server has them.",
         ),
     ] = Path("tsfusion-spool"),
     config: options.ConfigFile = None,
     json: options.Json = False,
     **settings: Any,
 ) -> None:
-    """Localise a sensor, pick keyframes and send them; Ctrl-C ends well.
+    """Localise a sensor, choose keyframes and send them; Ctrl-C ends the scan and keeps its results.
 
-    Without --connect it starts a server of its own and leaves the mesh. With it, what the server does not
-    have in the end stays in the spool, and the next scan sends it first.
+    Without --connect, the scan starts its own server and leaves the mesh. With it, keyframes that the server
+    does not have at the end stay in the spool, and the next scan sends them first.
     """
-    if connect is not None:
-        options.refuse(
-            context, options.MAP_OPTIONS,
-            "has no effect with --connect: give it to the `tsfusion serve` that listens there",
-        )  # fmt: skip
-    else:
-        options.refuse(context, ("control", "key", "server_key", "spool"), "has no effect without --connect")
-    from tsfusion.cli import output, scan_output
-    from tsfusion.core.config import override
-    from tsfusion.pipelines import scan as pipelines_scan
+    options.check_target_flags(context, connect, own=options.MAP_OPTIONS, remote={"spool"})
+    from tsfusion.cli import output, progress, run_summary
+    from tsfusion.pipelines.scan import scan as run
 
     recording = {"sequence": sequence, "modality": modality, **options.dataset_options(option)}
     opened = _open(
         context, source, recording, calibration=calibration, rate=rate,
         part={"start": start, "stride": stride, "limit": max_frames},
     )  # fmt: skip
-    with opened, _ended_by_signals(opened), scan_output.watching(quiet=json) as progress:
+    with opened, _ended_by_signals(opened), progress.shown(quiet=json) as display:
         chosen = options.configuration(config, preset={"sensor": opened.sensor}, **settings)
-        rules = override(
-            chosen.scan, localizer=localizer, trajectory=trajectory, feed=feed, loop_closure=loop_closure,
-            time_offset=time_offset, max_gap=max_gap,
-            patience=patience, min_overlap=min_overlap, distance=distance, angle=angle, max_rate=max_rate,
-        )  # fmt: skip
-        client = override(chosen.client, control=control, map=map_, key=key, server_key=server_key)
-        if connect is None:
-            client = options.local(client)
-        result = pipelines_scan.scan(
-            opened, out, config=rules, volume=chosen.volume, client=client, connect=connect, spool=spool,
-            min_weight=settings["min_weight"], progress=progress,
+        client = options.client_settings(
+            chosen, connect, control=control, map=map_, key=key, server_key=server_key
+        )
+        result = run(
+            opened, out, config=chosen.scan, volume=chosen.volume, client=client, connect=connect,
+            spool=spool, min_weight=settings["min_weight"], progress=display,
         )  # fmt: skip
     if json:
         output.as_json(result)
     else:
-        scan_output.summary(result, out, spool, connect)
+        run_summary.print_scan(result, out, spool, connect)
 
 
 def _open(
@@ -155,7 +142,7 @@ def _open(
     rate: float | None,
     part: dict[str, Any],
 ) -> "Source":
-    """The source by its name, as much of it as is asked for."""
+    """The source of that name; of a recording, the part that is asked for."""
     from tsfusion.scanner.sources.recorded import LimitedSource
     from tsfusion.scanner.sources.registry import is_live, open_source
 
@@ -163,11 +150,11 @@ def _open(
         options.refuse(
             context,
             ("sequence", "modality", "option", "rate", "start", "stride"),
-            "is for recordings, and this source is live",
+            "is for recordings, and this source is live: leave it out",
         )
         live = open_source(spec, calibration=calibration)
         return live if part["limit"] is None else LimitedSource(live, part["limit"])
-    options.refuse(context, ("calibration",), "is for a live camera")
+    options.refuse(context, ("calibration",), "is for a live camera, and this is a recording: leave it out")
     from tsfusion.cli.replay import open_recording
     from tsfusion.core.errors import DatasetError
     from tsfusion.datasets import select
@@ -185,9 +172,9 @@ def _open(
 
 @contextmanager
 def _ended_by_signals(source: "Source") -> Iterator[None]:
-    """The first Ctrl-C or SIGTERM closes the source, and the scan ends as at the end of a recording.
+    """Close the source at the first Ctrl-C or SIGTERM: the scan ends as at the end of a recording.
 
-    The second one does what it always does.
+    The second one interrupts as usual.
     """
     before = {signum: signal.getsignal(signum) for signum in (signal.SIGINT, signal.SIGTERM)}
 

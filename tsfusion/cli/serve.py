@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -19,69 +20,43 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-@options.takes_map_settings
+def _flag(flag: str, metavar: str, help_: str) -> Any:
+    variable = "TSFUSION_" + flag.strip("-").replace("-", "_").upper()
+    return Annotated[str | None, typer.Option(flag, metavar=metavar, envvar=variable, help=help_)]
+
+
+# By name: settings of the `server` table.
+SERVER_OPTIONS: dict[str, Any] = {
+    "listen": _flag("--listen", "ADDRESS", "Address for keyframes; port 0 = any free port."),
+    "control": _flag("--control", "ADDRESS", "Address for commands; default: the next port."),
+    "state": _flag("--state", "DIR", "Folder of journals and maps; those there are continued."),
+    "metrics": _flag("--metrics", "HOST:PORT",
+                     "Address for Prometheus and health checks, such as 127.0.0.1:9464; this machine only."),
+    "log_format": _flag("--log-format", "FORMAT", "Log on stderr as text or json."),
+    "log_level": _flag("--log-level", "LEVEL", "Log from debug, info, warning or error on."),
+    "keys": _flag("--keys", "DIR",
+                  "Let only those connect whom `tsfusion keys allow` named; needed beyond this machine."),
+}  # fmt: skip
+
+
+@partial(options.takes_map_settings, also=SERVER_OPTIONS)
 def serve(
     *,
-    listen: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS", envvar="TSFUSION_LISTEN", help="Where keyframes arrive; port 0 = any free."
-        ),
-    ] = None,
-    control: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS", envvar="TSFUSION_CONTROL", help="Where commands do; else the next port."
-        ),
-    ] = None,
-    state: Annotated[
-        str | None,
-        typer.Option(
-            metavar="DIR", envvar="TSFUSION_STATE", help="Journal and map; what is there is taken up again."
-        ),
-    ] = None,
-    metrics: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HOST:PORT",
-            envvar="TSFUSION_METRICS",
-            help="Where Prometheus and health checks ask, such as 127.0.0.1:9464; this machine only.",
-        ),
-    ] = None,
-    log_format: Annotated[
-        str | None,
-        typer.Option(metavar="FORMAT", envvar="TSFUSION_LOG_FORMAT", help="Of stderr: text or json."),
-    ] = None,
-    log_level: Annotated[
-        str | None,
-        typer.Option(metavar="LEVEL", envvar="TSFUSION_LOG_LEVEL", help="debug, info, warning or error."),
-    ] = None,
-    keys: Annotated[
-        str | None,
-        typer.Option(
-            metavar="DIR",
-            envvar="TSFUSION_KEYS",
-            help="Let in only who `tsfusion keys allow` named; needed to listen beyond this machine.",
-        ),
-    ] = None,
     config: options.ConfigFile = None,
     json: options.Json = False,
     until_eof: Annotated[bool, typer.Option("--until-eof", hidden=True)] = False,
     **settings: Any,
 ) -> int:
-    """Fuse keyframes that scanners send; SIGTERM or Ctrl-C saves the map and ends.
+    """Fuse keyframes that scanners send; SIGTERM or Ctrl-C saves the map and ends the server.
 
-    Prints one line with `ready` once keyframes are welcome: every kernel is compiled by then.
+    A line with `ready` is printed once keyframes may come: every kernel is compiled by then.
     """
     started = time.monotonic()
     from tsfusion import server
     from tsfusion.core import logs
     from tsfusion.core.errors import TsfusionError
 
-    chosen = options.configuration(
-        config, listen=listen, control=control, state=state, keys=keys, metrics=metrics,
-        log_format=log_format, log_level=log_level, **settings,
-    )  # fmt: skip
+    chosen = options.configuration(config, **settings)
     logs.configure(chosen.server.log_format, chosen.server.log_level)
     if until_eof:
         threading.Thread(target=_stop_at_eof, daemon=True).start()
@@ -94,7 +69,7 @@ def serve(
     except TsfusionError as error:
         if chosen.server.log_format == "text":
             raise
-        log.critical("%s", error)  # the last line is an object, too
+        log.critical("%s", error)  # the last line is a JSON object too
         return 1
 
 
@@ -117,7 +92,7 @@ def _announce(addresses: "Addresses", state: str, seconds: float, json: bool) ->
 
 
 def _stop_at_eof() -> None:
-    """End as by SIGTERM when the parent closes our stdin, which it does even when it is killed."""
+    """End as by SIGTERM when the parent closes stdin, which happens also when it is killed."""
     while os.read(sys.stdin.fileno(), 4096):  # unbuffered: no lock is held when the interpreter ends
         pass
     os.kill(os.getpid(), signal.SIGTERM)

@@ -1,45 +1,45 @@
 # SPDX-License-Identifier: MIT
-"""A server's health on one screen."""
+"""A server's health on one screen, for a person."""
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from tsfusion.cli.health_poll import Look
+from tsfusion.cli.health_poll import ServerSnapshot
 from tsfusion.cli.output import size
 from tsfusion.core.logs import printable
 from tsfusion.wire.health import ClientHealth, Health, MapHealth, Status
 from tsfusion.wire.keyframe_times import Spread
 
-GONE = 30.0  # seconds without a word
-MAX_CLIENTS = 40  # rows; those heard last
+SILENT_AFTER = 30.0  # seconds without a message: the row is dimmed
+MAX_CLIENTS = 40  # rows: the clients with the newest messages
 _STATE_STYLES = {"idle": "green", "busy": "green", "failed": "bold red"}
 
 
-def render(look: Look) -> RenderableType:
+def render(snapshot: ServerSnapshot) -> RenderableType:
     """Problems first, then the server, its maps, its clients, and what it refused."""
-    parts: list[RenderableType] = [Text(f"✗ {printable(one)}", style="bold red") for one in look.problems]
-    if look.health is None:
+    parts: list[RenderableType] = [Text(f"✗ {printable(one)}", style="bold red") for one in snapshot.problems]
+    if snapshot.health is None:
         return Group(*parts)
-    maps = {name: one for name, one in look.health.maps.items() if look.only in ("", name)}
-    parts += [_server(look.address, look.health), _maps(maps)]
+    maps = {name: one for name, one in snapshot.health.maps.items() if snapshot.only in ("", name)}
+    parts += [_server(snapshot.address, snapshot.health), _maps(maps)]
     parts += [note for name, one in maps.items() for note in _notes(name, one)]
-    parts += [_details(name, status) for name, status in look.maps.items()]
+    parts += [_details(name, status) for name, status in snapshot.maps.items()]
     parts += [
         Text(printable(f"map {name}: hash and settings are not known now: {why}"), style="yellow")
-        for name, why in look.unavailable.items()
+        for name, why in snapshot.unavailable.items()
     ]
-    if clients := [one for one in look.health.clients if look.only in ("", one.map)]:
+    if clients := [one for one in snapshot.health.clients if snapshot.only in ("", one.map)]:
         parts += _clients(clients)
-    if look.health.refused:
-        parts.append(Text(f"refused messages: {_reasons(look.health.refused)}", style="yellow"))
+    if snapshot.health.refused:
+        parts.append(Text(f"refused messages: {_reasons(snapshot.health.refused)}", style="yellow"))
     return Group(*parts)
 
 
 def _server(address: str, health: Health) -> Text:
     line = Text(f"{printable(address)}  ")
     line.append(*("ready", "bold green") if health.ready else ("not ready", "bold red"))
-    line.append(f"  up {_lasting(health.uptime_s)}, gateway {size(health.rss_bytes)}")
+    line.append(f"  up {_duration(health.uptime_s)}, gateway {size(health.rss_bytes)}")
     if health.duplicates:
         line.append(f", {health.duplicates} duplicates")
     return line
@@ -55,7 +55,7 @@ def _maps(maps: dict[str, MapHealth]) -> RenderableType:
             _plain(name), _plain(one.state, style=_STATE_STYLES.get(one.state, "yellow")),
             f"{one.keyframes_fused}/{one.keyframes_durable}", _waiting(one.waiting),
             _delay(one.delay_ms, one.delay_bound_ms), str(one.blocks), size(one.map_bytes),
-            size(one.journal_bytes), _lasting(one.last_keyframe_s),
+            size(one.journal_bytes), _duration(one.last_keyframe_s),
         )  # fmt: skip
     return table
 
@@ -70,17 +70,17 @@ def _clients(clients: list[ClientHealth]) -> list[RenderableType]:
     for one in latest[:MAX_CLIENTS]:
         table.add_row(
             _plain(one.client or "-"), _plain(one.session), _plain(one.map), f"{one.fused}/{one.durable}",
-            size(one.received_bytes), _waiting(one.waiting), _lasting(one.heard_s),
+            size(one.received_bytes), _waiting(one.waiting), _duration(one.heard_s),
             _plain(one.held, style="yellow"), Text(_reasons(one.skipped), style="yellow"),
             *([str(one.corrected)] if corrects else ()),
-            style="dim" if one.heard_s > GONE else "",
+            style="dim" if one.heard_s > SILENT_AFTER else "",
         )  # fmt: skip
     more = len(latest) - MAX_CLIENTS
     return [table, Text(f"and {more} more sessions")] if more > 0 else [table]
 
 
 def _details(name: str, status: Status) -> Text:
-    """What only the fuser knows."""
+    """The hash, settings and memory of a map, which only its fuser knows."""
     volume = status.config.get("volume", {})
     settings = ", ".join(f"{key} {volume[key]}" for key in ("voxel_size", "sensor") if key in volume)
     peak = status.peak_rss_bytes.get("fuser", 0)
@@ -96,7 +96,7 @@ def _delay(delay: Spread, bound_ms: float) -> str:
 
 
 def _notes(name: str, one: MapHealth) -> list[Text]:
-    """What does not happen to a map that is well."""
+    """Counts that are zero for a map that is well."""
     counts = {
         "quarantined": one.quarantined, "× the fuser restarted": one.fuser_restarts,
         "damaged records": one.journal_damaged,
@@ -115,7 +115,7 @@ def _waiting(count: int) -> Text:
     return Text(str(count), style="yellow" if count else "")
 
 
-def _lasting(seconds: float | None) -> str:
+def _duration(seconds: float | None) -> str:
     """3725 → 1 h 2 min."""
     if seconds is None:
         return "–"
@@ -128,7 +128,7 @@ def _lasting(seconds: float | None) -> str:
 
 
 def _table(*titles: str) -> Table:
-    """Titles that begin with `>` are of numbers."""
+    """A table; a title that begins with `>` stands over numbers."""
     table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 1, 0, 0))
     for title in titles:
         table.add_column(
@@ -138,5 +138,5 @@ def _table(*titles: str) -> Table:
 
 
 def _plain(text: str, *, style: str = "") -> Text:
-    """Clients and files have a say in this: no terminal commands, and no markup."""
+    """Text that clients or files may have chosen: no terminal commands, no markup."""
     return Text(printable(text), style=style)

@@ -1,51 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""A recorded dataset through the whole path: scanner → sockets → journal → fuser → mesh → files."""
+"""A whole replay: every keyframe of a recorded dataset sent and fused, and its results left in a folder."""
 
 import dataclasses
 import os
-import shutil
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext, suppress
-from functools import partial
-from typing import Protocol
+from collections.abc import Iterator
 
-from tsfusion.client import Client
+from tsfusion.client import ClientStats
 from tsfusion.core import process
-from tsfusion.core.config import ClientConfig, ServerConfig, VolumeConfig, override
-from tsfusion.core.errors import FlushTimeout, OutputError, TransportError
+from tsfusion.core.config import ClientConfig, ServerConfig, VolumeConfig
+from tsfusion.core.errors import OutputError
 from tsfusion.core.output_folder import building
 from tsfusion.datasets import Dataset
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.pipelines import mesh_preview, replay_results
-from tsfusion.pipelines.replay_results import KnownSurface, RunSummary, Sent
-from tsfusion.pipelines.target_server import ServerChild, own_server
-from tsfusion.wire.curve import client_keys
-from tsfusion.wire.queries import fetch_mesh, fetch_status
-
-AHEAD = 3  # keyframes under way when no rate is asked for: fusing, waiting, travelling
-PATIENCE = 60.0  # seconds without a newly fused keyframe before a run gives up
-_POLL = 0.01  # seconds
-
-
-class Progress(Protocol):
-    """What a run tells while it goes; the command line draws it."""
-
-    def stage(self, text: str) -> None:
-        """Something that takes a while begins."""
-
-    def count(self, sent: int, fused: int, total: int) -> None:
-        """Keyframes handed over and keyframes in the map, of how many."""
-
-
-class Silent:
-    """Progress that nobody watches."""
-
-    def stage(self, text: str) -> None:
-        """Nothing."""
-
-    def count(self, sent: int, fused: int, total: int) -> None:
-        """Nothing."""
+from tsfusion.pipelines import engine, mesh_preview, replay_results, run_files, target_server
+from tsfusion.pipelines.engine import AHEAD, Engine, Progress
+from tsfusion.pipelines.replay_results import ReplaySummary
 
 
 def replay(
@@ -53,13 +23,13 @@ def replay(
     out: str | os.PathLike[str],
     *,
     volume: VolumeConfig,
+    progress: Progress,
     server: ServerConfig | None = None,
     client: ClientConfig | None = None,
     connect: str | None = None,
     rate: float | None = None,
     min_weight: float | None = None,
-    progress: Progress | None = None,
-) -> RunSummary:
+) -> ReplaySummary:
     """Send every keyframe of `dataset` to a server and leave the results in the folder `out`.
 
     `mesh.ply`, `mesh.glb`, `preview.png`, `delay.csv`, `delay.png` and `run.json` appear together when all of
@@ -77,115 +47,53 @@ def replay(
         TransportError: the server cannot be reached, ended, or stopped fusing.
         DatasetError: a keyframe cannot be read.
     """
-    progress = progress or Silent()
-    client = client or ClientConfig()
     with building(out) as work:
-        scratch = work / ".scratch"
-        scratch.mkdir()
-        first = dataset[0]  # a dataset that cannot be read is told before a server starts
-        place: AbstractContextManager[tuple[ClientConfig, ServerChild | None]]
-        if connect is None:
-            progress.stage("starting a server (the first start compiles kernels)")
-            place = own_server(client, server, volume, scratch)
-        else:
-            progress.stage(f"connecting to {connect}")
-            place = nullcontext((override(client, address=connect), None))
-        with place as (link, child):
-            keys = client_keys(link.key, link.server_key)
-            # a recording leaves nothing out, however slow the map is
-            with Client(
-                link.address, spool=scratch / "spool", control=link.control, policy="block", config=link
-            ) as scanner:
-                scanner.connect()
-                run = _Run(dataset, first, scanner, child, progress)
-                run.feed(rate)
-                progress.stage("fetching the mesh")
-                with suppress(FlushTimeout):  # a stamp less in the ledger is no reason to lose the run
-                    scanner.wait_meshed()
-                run.sent.records = scanner.records
-            status = fetch_status(link.address, control=link.control, map_name=link.map, keys=keys)
-            mesh = fetch_mesh(
-                link.address, control=link.control, map_name=link.map, min_weight=min_weight, keys=keys
-            )
+        first = dataset[0]  # a dataset that cannot be read is an error before a server starts
+        progress.stage(engine.STARTING if connect is None else f"connecting to {connect}")
+        with target_server.opened(
+            connect, work / ".scratch", volume=volume, client=client, server=server
+        ) as target:
+            # A recording leaves nothing out: `wait_turn` keeps the spool short, not the policy.
+            sender = target.client(target.link.map, policy="spool_all")
+            sender.connect()
+
+            def observe() -> ClientStats:
+                stats = sender.stats
+                progress.update(stats.sent, stats.fused, len(dataset))
+                return stats
+
+            running = Engine(target, observe)
+            progress.stage(f"scanning {dataset.name}")
+            ups, started = [], time.monotonic()
+            for keyframe in _keyframes(dataset, first, running, rate):
+                running.wait_turn(AHEAD if rate is None else target.link.backlog)
+                sender.send(dataclasses.replace(keyframe, captured_ns=time.monotonic_ns()))
+                ups.append(mesh_preview.sensor_up(keyframe.T_world_camera, dataset.sensor))
+            running.wait_fused()
+            seconds = time.monotonic() - started
+            peak = process.peak_rss_bytes()  # of sending: drawing the result is not the scanner's work
+            progress.stage("writing the results")
+            running.wait_meshed([sender])
+            status, mesh = run_files.write_map(work, target, target.link.map, ups, min_weight=min_weight)
         if not len(mesh.faces):
-            raise OutputError(
-                f"the map has no surface to write: {run.sent.stats.fused} of {run.sent.stats.sent} keyframes "
-                "fused; send more of them or lower --min-weight"
-            )
-        progress.stage("writing the results")
-        shutil.rmtree(scratch)
-        result = replay_results.summarise(run.sent, mesh, status, child.start_seconds if child else None)
-        replay_results.write_mesh(work, mesh, run.sent.ups)
-        replay_results.write_ledger(work, run.sent.records)
-        replay_results.write_record(work, result)
+            raise OutputError(run_files.no_surface(sender.stats))
+        result = replay_results.summarise(
+            dataset, sender, mesh, status,
+            seconds=seconds, rate=rate, peak_rss_bytes=peak,
+            server_start_seconds=target.child.start_seconds if target.child else None,
+        )  # fmt: skip
+        run_files.write_ledger(work, sender.records)
+        run_files.write_record(work, result)
         return result
 
 
-class _Run:
-    """The scanner's loop: hand keyframes over at their time, and watch what becomes of them."""
-
-    def __init__(
-        self,
-        dataset: Dataset,
-        first: Keyframe,
-        scanner: Client,
-        child: ServerChild | None,
-        progress: Progress,
-    ) -> None:
-        self.dataset = dataset
-        surface = dataset if isinstance(dataset, KnownSurface) else None
-        self.sent = Sent(name=dataset.name, stats=scanner.stats, surface=surface)
-        self._first = first
-        self._scanner = scanner
-        self._child = child
-        self._progress = progress
-        self._done = 0
-        self._moved = 0.0
-
-    def feed(self, rate: float | None) -> None:
-        """Send every keyframe and wait until each is fused or refused."""
-        self.sent.rate = rate
-        self._progress.stage(f"scanning {self.dataset.name}")
-        keyframe = self._first
-        started = due = self._moved = time.monotonic()
-        for index in range(len(self.dataset)):
-            keyframe = self.dataset[index] if index else keyframe
-            if rate is None:
-                self._wait(partial(self._may_send, index))
-            elif index:
-                due = max(due + 1 / rate, time.monotonic())  # a sensor that was late does not catch up
-                self._wait(partial(_is_time, due), patience=None)
-            self._scanner.send(dataclasses.replace(keyframe, captured_ns=time.monotonic_ns()))
-            self.sent.ups.append(mesh_preview.sensor_up(keyframe.T_world_camera, self.dataset.sensor))
-        self._wait(lambda: self._done >= len(self.dataset))
-        self.sent.seconds = time.monotonic() - started
-        self.sent.peak_rss_bytes = process.peak_rss_bytes()
-
-    def _may_send(self, index: int) -> bool:
-        return index - self._done < AHEAD
-
-    def _wait(self, ready: Callable[[], bool], *, patience: float | None = PATIENCE) -> None:
-        while True:
-            self._look()
-            if ready():
-                return
-            if patience is not None and time.monotonic() - self._moved > patience:
-                raise TransportError(f"the server has fused nothing for {patience:.0f} s")
-            time.sleep(_POLL)
-
-    def _look(self) -> None:
-        stats = self.sent.stats = self._scanner.stats
-        done = stats.fused + sum(map(_total, (stats.refused, stats.rejected, stats.skipped)))
-        if done != self._done:
-            self._done, self._moved = done, time.monotonic()
-        self._progress.count(stats.sent, stats.fused, len(self.dataset))
-        if self._child is not None:
-            self._child.check()
-
-
-def _total(counts: dict[str, int]) -> int:
-    return sum(counts.values())
-
-
-def _is_time(due: float) -> bool:
-    return time.monotonic() >= due
+def _keyframes(dataset: Dataset, first: Keyframe, running: Engine, rate: float | None) -> Iterator[Keyframe]:
+    """Each keyframe at its time; a sensor that was late does not catch up."""
+    due = time.monotonic()
+    yield first
+    for index in range(1, len(dataset)):
+        keyframe = dataset[index]
+        if rate is not None:
+            due = max(due + 1 / rate, time.monotonic())
+            running.wait_until(due)
+        yield keyframe

@@ -1,55 +1,32 @@
 # SPDX-License-Identifier: MIT
-"""A whole scan: a source's frames localised, chosen, sent and fused, and what is left in a folder."""
+"""A whole scan: a source's frames localised, chosen, sent and fused, and its results left in a folder."""
 
 import dataclasses
+import logging
 import os
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
-from itertools import chain
+from functools import partial
 from pathlib import Path
-from typing import Protocol
 
+from tsfusion.client import Client, ClientStats
 from tsfusion.core import process
-from tsfusion.core.config import ClientConfig, ScanConfig, ServerConfig, VolumeConfig
-from tsfusion.core.errors import (
-    DatasetError,
-    FlushTimeout,
-    KeyframeRefused,
-    OutputError,
-    SourceError,
-    TransportError,
-    TsfusionError,
-)
+from tsfusion.core.config import ClientConfig, ScanConfig, VolumeConfig
+from tsfusion.core.errors import DatasetError, OutputError, SourceError, TransportError, TsfusionError
 from tsfusion.core.output_folder import building
 from tsfusion.geometry.frame import Frame
-from tsfusion.pipelines import mesh_preview, replay_results, scan_results, target_server
+from tsfusion.pipelines import engine, mesh_preview, run_files, scan_results, target_server
+from tsfusion.pipelines.engine import Engine, Progress
 from tsfusion.pipelines.scan_results import MapResult, ScanSummary
-from tsfusion.pipelines.target_server import Destination
+from tsfusion.pipelines.target_server import Target
 from tsfusion.scanner.localization import registry
-from tsfusion.scanner.scanner import Scanner, ScanState, Submap
+from tsfusion.scanner.scanner import Scanner, Submap
 from tsfusion.scanner.sources.source import Source
-from tsfusion.wire.curve import client_keys
-from tsfusion.wire.queries import fetch_mesh, fetch_status
 
 OUTDOOR_SENSORS = ("stereo", "lidar")
-_PATIENCE = 60.0  # seconds without progress before an own server is given up
-_LINGER = 10.0  # seconds without progress before what a distant server does not take is left in the spool
-_FUSED = 5.0  # seconds for a distant server to say when it fused the last ones: for the figures only
-_POLL = 0.05  # seconds
 
-_NO_SURFACE = "the map has no surface to write: {} keyframes fused; scan for longer or lower --min-weight"
-
-
-class ScanProgress(Protocol):
-    """What a scan tells while it goes; the command line draws it."""
-
-    def stage(self, text: str) -> None:
-        """Something that takes a while begins."""
-
-    def scan(self, state: ScanState, length: int | None) -> None:
-        """After every frame, and while the rest is being fused; `length` of the source, where it is known."""
+log = logging.getLogger(__name__)
 
 
 def scan(
@@ -58,12 +35,11 @@ def scan(
     *,
     config: ScanConfig,
     volume: VolumeConfig,
-    server: ServerConfig | None = None,
+    progress: Progress,
     client: ClientConfig | None = None,
     connect: str | None = None,
     spool: str | os.PathLike[str] = "tsfusion-spool",
     min_weight: float | None = None,
-    progress: ScanProgress,
 ) -> ScanSummary:
     """Take a source's frames to its end, or until it is closed, and leave the results in the folder `out`.
 
@@ -86,6 +62,7 @@ def scan(
         TransportError: the server cannot be reached or stopped fusing.
     """
     failure: list[Exception] = []
+    own = connect is None
     with building(out) as work, ExitStack() as stack:
         frames = _until_failure(iter(source), failure)
         first = next(frames, None)
@@ -93,57 +70,60 @@ def scan(
             raise failure[0] if failure else SourceError(f"{source.name} gave no frames")
         localizer = registry.create_localizer(config, first)
         stack.callback(getattr(localizer, "close", lambda: None))
-        if connect is None:
-            progress.stage("starting a server (the first start compiles kernels)")
-            place = target_server.of_its_own(stack, client, server, volume, work / ".scratch")
-        else:
-            place = target_server.elsewhere(client, connect, Path(spool))
-            if not localizer.absolute:
-                target_server.warn_of_another_world(place)
-        leftovers, open_client = target_server.opener(stack, place, source)
-        scanner = Scanner(
-            localizer, config, open_client, map_name=place.link.map, taken=leftovers,
-            outdoors=source.sensor in OUTDOOR_SENSORS, most=target_server.MAPS - 1 if place.child else None,
-        )  # fmt: skip
-        progress.stage(f"scanning {source.name}")
-        started = time.monotonic()
-        if source.live:
-            frames = _fresh(first, frames, config.patience)
-        else:
-            frames = chain([dataclasses.replace(first, captured_ns=time.monotonic_ns())], frames)
-        _run(scanner, frames, _watcher(source, place, progress), failure)
-        peak = process.peak_rss_bytes()
-        if not any(submap.located for submap in scanner.submaps):
-            raise failure[0] if failure else OutputError(_nowhere(scanner.state()))
-        scanner.finish()
-        _settle(scanner, source, place, progress)
-        seconds = time.monotonic() - started
-        progress.stage("writing the results")
-        maps = [
-            _write(
-                work,
-                place,
-                submap,
-                f"-{number}" if number > 1 else "",
-                sensor=source.sensor,
-                min_weight=min_weight,
-            )
-            for number, submap in enumerate(scanner.submaps, 1)
-        ]
-        complete = not failure
-        if place.child is not None and not any(found.mesh["triangles"] for found in maps if found.mesh):
-            failure.append(OutputError(_NO_SURFACE.format(scanner.state().stats.fused)))
-        records = scan_results.records(scanner.submaps)
-        replay_results.write_ledger(work, records)
-        result = scan_results.summarise(
-            source, scanner, maps, records,
-            localizer=registry.localizer_name(config, first), complete=complete, seconds=seconds,
-            peak_rss_bytes=peak, config=config, volume=volume if place.child else None,
-        )  # fmt: skip
-        stack.close()  # clients and server end before the folder of theirs goes
-        if place.child is not None:
-            shutil.rmtree(place.spools.parent)
-        replay_results.write_record(work, result)
+        if own:
+            progress.stage(engine.STARTING)
+        with target_server.opened(
+            connect, work / ".scratch", volume=volume, client=client, spools=Path(spool)
+        ) as target:
+            if not own and not localizer.absolute:
+                _warn_if_map_is_in_use(target)
+            # A recording waits, so nothing of it is left out; what a live source gives is thinned out.
+            open_client = partial(target.client, policy=None if source.live else "spool_all")
+            scanner = Scanner(
+                localizer, config, open_client, map_name=target.link.map,
+                taken=_send_leftovers(target, open_client), outdoors=source.sensor in OUTDOOR_SENSORS,
+                most=target_server.MAPS - 1 if own else None,
+            )  # fmt: skip
+
+            def observe() -> ClientStats:
+                state = scanner.state()
+                progress.update(state.frames, state.stats.fused, source.length, state)
+                return state.stats
+
+            running = Engine(target, observe)
+            pace = running.wait_turn if own and not source.live else running.check
+            progress.stage(f"scanning {source.name}")
+            started = time.monotonic()
+            _take(scanner, _timely(source, first, frames, config.patience), pace, failure)
+            peak = process.peak_rss_bytes()
+            if not any(submap.located for submap in scanner.submaps):
+                raise failure[0] if failure else _not_localised(scanner)
+            scanner.finish()
+            clients = [submap.client for submap in scanner.submaps]
+            if own:
+                progress.stage("fusing what is on its way")
+                running.wait_fused()
+                running.wait_meshed(clients)
+            else:
+                progress.stage("sending what is on its way")
+                running.wait_acknowledged(clients)
+            seconds = time.monotonic() - started
+            progress.stage("writing the results")
+            complete = not failure
+            maps = [
+                _write(work, target, submap, number, sensor=source.sensor, min_weight=min_weight)
+                for number, submap in enumerate(scanner.submaps, 1)
+            ]
+            if own and not any(found.mesh["triangles"] for found in maps if found.mesh):
+                failure.append(OutputError(run_files.no_surface(scanner.state().stats)))
+            records = scan_results.records(scanner.submaps)
+            run_files.write_ledger(work, records)
+            result = scan_results.summarise(
+                source, scanner, maps, records,
+                localizer=registry.localizer_name(config, first), complete=complete, seconds=seconds,
+                peak_rss_bytes=peak, config=config, volume=volume if own else None,
+            )  # fmt: skip
+        run_files.write_record(work, result)
     if failure:
         raise failure[0]
     return result
@@ -157,20 +137,27 @@ def _until_failure(frames: Iterator[Frame], failure: list[Exception]) -> Iterato
         failure.append(error)
 
 
-def _fresh(first: Frame, frames: Iterator[Frame], patience: float) -> Iterator[Frame]:
-    """A live source's frames, but for the first if it grew old while the server started."""
-    second = next(frames, None)
-    if second is None or second.timestamp_ns - first.timestamp_ns <= 1e9 * patience:
-        yield first
-    if second is not None:
-        yield second
+def _timely(source: Source, first: Frame, frames: Iterator[Frame], patience: float) -> Iterator[Frame]:
+    """All frames; but for a live source's first if it grew old while the server started."""
+    if not source.live:
+        yield dataclasses.replace(first, captured_ns=time.monotonic_ns())
+    else:
+        second = next(frames, None)
+        if second is None or second.timestamp_ns - first.timestamp_ns <= 1e9 * patience:
+            yield first
+        if second is not None:
+            yield second
     yield from frames
 
 
-def _run(
-    scanner: Scanner, frames: Iterator[Frame], watch: Callable[[Scanner], None], failure: list[Exception]
+def _take(
+    scanner: Scanner, frames: Iterator[Frame], pace: Callable[[], object], failure: list[Exception]
 ) -> None:
-    """Take the frames; what stops that ends the scan, but what was localised before is not thrown away."""
+    """Take the frames; an error ends the scan, but what was localised before is not thrown away."""
+
+    def watch(_: Scanner) -> None:
+        pace()
+
     try:
         scanner.run(frames, watch)
     except TsfusionError as error:
@@ -179,66 +166,50 @@ def _run(
         failure.append(error)
 
 
-def _watcher(source: Source, place: Destination, progress: ScanProgress) -> Callable[[Scanner], None]:
-    def watch(scanner: Scanner) -> None:
-        if place.child is not None:
-            place.child.check()
-        progress.scan(scanner.state(), source.length)
-
-    return watch
+def _not_localised(scanner: Scanner) -> OutputError:
+    state = scanner.state()
+    return OutputError(f"the sensor was not localised in any of {state.frames} frames: {state.why}")
 
 
-def _nowhere(state: ScanState) -> str:
-    return f"the sensor was not localised in any of {state.frames} frames: {state.why}"
+def _send_leftovers(target: Target, open_client: Callable[[str], Client]) -> set[str]:
+    """Names of the maps that keyframes of an earlier scan wait for.
+
+    Those keyframes are sent along with this scan's, which begins no submap of their names.
+    """
+    names = {path.parent.name for path in target.spools.glob("*/*.mcap")} - {target.link.map}
+    for name in sorted(names):
+        try:
+            count = open_client(name).stats.waiting
+            if count:
+                log.warning("an earlier scan left %d keyframes for the map %s: sent too", count, name)
+        except TsfusionError as error:
+            log.warning("the keyframes waiting in %s are not sent: %s", target.spools / name, error)
+    return names
 
 
-def _settle(scanner: Scanner, source: Source, place: Destination, progress: ScanProgress) -> None:
-    """Wait until everything is fused; with a server elsewhere, for as long as it takes any."""
-    progress.stage("fusing what is on its way" if place.child else "sending what is on its way")
-    patience = _PATIENCE if place.child else _LINGER
-    last, moved = (-1, -1), time.monotonic()
-    while True:
-        state = scanner.state()
-        progress.scan(state, source.length)
-        stats = state.stats
-        done = stats.fused + sum(stats.rejected.values()) if place.child else stats.durable
-        lost = sum(stats.refused.values()) + stats.skipped.get("dropped", 0)
-        if not stats.waiting and (not place.child or done + lost >= stats.sent):
-            break
-        if (stats.waiting, done) != last:
-            last, moved = (stats.waiting, done), time.monotonic()
-        if time.monotonic() - moved > patience:
-            if place.child:
-                raise TransportError(f"the server has fused nothing for {patience:.0f} s")
-            return
-        if place.child is not None:
-            place.child.check()
-        time.sleep(_POLL)
-    for submap in scanner.submaps:
-        # Stamps and corrections are no reason to lose the scan; what was refused is counted.
-        with suppress(FlushTimeout, KeyframeRefused):
-            if place.child:
-                submap.client.wait_meshed()
-            else:
-                submap.client.flush()
-                submap.client.wait_fused(_FUSED)
+def _warn_if_map_is_in_use(target: Target) -> None:
+    """Log a warning when the map has keyframes already, or gets some: this scan's world is not theirs."""
+    name = target.link.map
+    advice = "a scan that localises itself begins its own world; give it a map of its own (--map NAME)"
+    if any((target.spools / name).glob("*.mcap")):
+        log.warning("keyframes of an earlier scan wait for the map %s: %s", name, advice)
+        return
+    with suppress(TransportError):  # a server that is not there yet, or has no such map
+        count = target.status(name, timeout=2.0).keyframes_durable
+        if count:
+            log.warning("the map %s has %d keyframes already: %s", name, count, advice)
 
 
 def _write(
-    work: Path, place: Destination, submap: Submap, suffix: str, *, sensor: str, min_weight: float | None
+    work: Path, target: Target, submap: Submap, number: int, *, sensor: str, min_weight: float | None
 ) -> MapResult:
-    """The files of one submap."""
-    if submap.located:
-        scan_results.write_trajectory(work, submap, suffix)
-    if place.child is None or not submap.located:
-        return scan_results.describe(submap, None, None)
-    link = place.link
-    keys = client_keys(link.key, link.server_key)
-    status = fetch_status(link.address, control=link.control, map_name=submap.name, keys=keys)
-    mesh = fetch_mesh(
-        link.address, control=link.control, map_name=submap.name, min_weight=min_weight, keys=keys
-    )
-    if len(mesh.faces):
-        ups = [mesh_preview.sensor_up(T, sensor) for T in submap.located.poses()]
-        replay_results.write_mesh(work, mesh, ups, suffix)
-    return scan_results.describe(submap, status, mesh)
+    """Write the files of one submap, and give its figures."""
+    if not submap.located:
+        return scan_results.describe(submap, None)
+    suffix = f"-{number}" if number > 1 else ""
+    scan_results.write_trajectory(work, submap, suffix)
+    if target.child is None:
+        return scan_results.describe(submap, None)
+    ups = [mesh_preview.sensor_up(T, sensor) for T in submap.located.poses()]
+    in_map = run_files.write_map(work, target, submap.name, ups, suffix=suffix, min_weight=min_weight)
+    return scan_results.describe(submap, in_map)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a scan leaves: trajectories, the mesh of each submap, and `run.json`."""
+"""What a scan leaves: the trajectories, and what `run.json` of a scan holds."""
 
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from tsfusion.core.config import ScanConfig, VolumeConfig
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.pipelines import latency_ledger, replay_results
+from tsfusion.pipelines import latency_ledger, run_files
 from tsfusion.scanner.localization.localizer import PoseCorrections
 from tsfusion.scanner.scanner import Scanner, Submap
 from tsfusion.scanner.sources.source import Source
@@ -20,12 +20,15 @@ from tsfusion.wire.keyframe_times import KeyframeTimes, Spread
 
 
 class MapResult(msgspec.Struct, frozen=True, kw_only=True):
-    """One submap.
+    """One submap in figures.
 
     Attributes:
-        trajectory_error: against the source's own poses, as they were tracked; None = it has none.
+        frames: that have a pose.
+        keyframes: of them, sent to the map.
+        loops: closed by loop closure.
+        trajectory_error: of the poses as they were tracked, against the source's own; None = it has none.
         corrected_error: the same after loop closure; None = there were no corrections.
-        keyframes, blocks, map_hash, mesh: of the own server's map; 0 and empty with a server elsewhere.
+        blocks, map_hash, mesh: of the own server's map; 0 and empty with a server elsewhere.
     """
 
     name: str
@@ -43,9 +46,11 @@ class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
     """What `run.json` of a scan holds.
 
     Attributes:
-        complete: whether the source came to its end; not so after a failure, or of a recording after Ctrl-C.
-        left: keyframes that are still in the spool.
-        link: why the server takes nothing at the moment; empty when it does.
+        complete: whether the source was read to its end: false after a failure, and for a recording after
+            Ctrl-C.
+        left: keyframes still in the spool at the end.
+        link: why the server took nothing at the end; empty = it did.
+        seconds: from the first frame until the last keyframe was fused (or acknowledged, elsewhere).
         tracking_cpu_ms: CPU milliseconds of the localizer a frame.
     """
 
@@ -72,9 +77,9 @@ class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def write_trajectory(work: Path, submap: Submap, suffix: str) -> None:
-    """In the TUM format: `trajectory.txt` of all frames, `keyframes.txt` of those in the map.
+    """Write `trajectory.txt` of all frames and `keyframes.txt` of those in the map, in the TUM format.
 
-    Where loops were closed `trajectory-corrected.txt`, too.
+    Where loops were closed, `trajectory-corrected.txt` too.
     """
     track = submap.located
     stamps, tracked = track.stamps_ns, list(track.poses())
@@ -86,14 +91,17 @@ def write_trajectory(work: Path, submap: Submap, suffix: str) -> None:
         write_tum(work / f"trajectory-corrected{suffix}.txt", stamps, now)
 
 
-def describe(submap: Submap, status: Status | None, mesh: Mesh | None) -> MapResult:
-    """A submap in figures; its map's only where its server was asked."""
-    in_map: dict[str, Any] = {}
-    if status is not None and mesh is not None:
-        in_map = {
-            "map_hash": status.map_hash, "blocks": status.blocks,
-            "mesh": {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)},
-        }  # fmt: skip
+def describe(submap: Submap, in_map: tuple[Status, Mesh] | None) -> MapResult:
+    """A submap in figures.
+
+    Args:
+        in_map: its map's status and mesh; None = its server was not asked.
+    """
+    figures: dict[str, Any] = {}
+    if in_map is not None:
+        status, mesh = in_map
+        triangles = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
+        figures = {"map_hash": status.map_hash, "blocks": status.blocks, "mesh": triangles}
     corrections = submap.corrections
     return MapResult(
         name=submap.name,
@@ -102,7 +110,7 @@ def describe(submap: Submap, status: Status | None, mesh: Mesh | None) -> MapRes
         loops=corrections.loops if corrections else 0,
         trajectory_error=_error(submap, None),
         corrected_error=_error(submap, corrections) if corrections else None,
-        **in_map,
+        **figures,
     )
 
 
@@ -143,17 +151,17 @@ def summarise(
         delay_ms=latency_ledger.summarise(times).delay_ms,
         peak_rss_bytes={"client": peak_rss_bytes},
         config={name: msgspec.to_builtins(each) for name, each in settings.items()},
-        versions=replay_results.versions(),
+        versions=run_files.versions(),
     )
 
 
 def records(submaps: list[Submap]) -> list[KeyframeTimes]:
-    """The ledger of all submaps, one after the other."""
+    """Stamps of all submaps' keyframes, one submap after the other."""
     return [record for submap in submaps for record in submap.client.records]
 
 
 def _error(submap: Submap, corrections: PoseCorrections | None) -> TrajectoryError | None:
-    """Against the source's own poses, over the frames that have one."""
+    """Error against the source's own poses, over the frames that have one; None = fewer than two have."""
     which, references = submap.located.with_reference()
     if len(which) < 2:
         return None

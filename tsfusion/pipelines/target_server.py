@@ -1,30 +1,32 @@
 # SPDX-License-Identifier: MIT
-"""A server of one's own: `tsfusion serve` as a child process, for as long as a block runs."""
+"""The server that a run sends its keyframes to: one started for this run, or one that runs elsewhere."""
 
 import json
-import logging
 import os
 import select
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from tsfusion.client import Client
 from tsfusion.core import config
-from tsfusion.core.config import ClientConfig, Config, ServerConfig, VolumeConfig, override
-from tsfusion.core.errors import TransportError, TsfusionError
-from tsfusion.scanner.sources.source import Source
-from tsfusion.wire.curve import client_keys
-from tsfusion.wire.queries import fetch_status
+from tsfusion.core.config import ClientConfig, Config, Policy, ServerConfig, VolumeConfig, override
+from tsfusion.core.errors import TransportError
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.wire.curve import ClientKeys, client_keys
+from tsfusion.wire.health import Status
+from tsfusion.wire.queries import fetch_mesh, fetch_status
 
 START_DEADLINE = 180.0  # seconds; a cold kernel compilation on a slow machine
 STOP_DEADLINE = 60.0  # seconds; draining and the checkpoint
+MAPS = 16  # that a run's own server may have open: its default one, and one for each submap
 
 
 class ServerChild:
@@ -33,7 +35,7 @@ class ServerChild:
     Attributes:
         listen: its data address.
         control: its control address.
-        start_seconds: from start to ready.
+        start_seconds: from its start until it was ready.
     """
 
     def __init__(self, process: subprocess.Popen[str], log: Path) -> None:
@@ -43,47 +45,45 @@ class ServerChild:
         self.control = ""
         self.start_seconds = 0.0
 
-    def wait_ready(self, deadline: float = START_DEADLINE) -> None:
-        """Read the ready line; raises TransportError when the server ends or stays silent instead."""
+    def wait_ready(self) -> None:
+        """Read the line that says the server is ready; raise TransportError when it ends or stays silent."""
         started = time.monotonic()
-        line = _read_line(self._process, deadline)
+        stdout = self._process.stdout
+        assert stdout is not None
+        if not select.select([stdout], [], [], START_DEADLINE)[0]:
+            raise TransportError(
+                f"the server was not ready within {START_DEADLINE:.0f} s: is this machine very busy?"
+            )
+        line = stdout.readline()
         if not line:
+            self._process.wait(STOP_DEADLINE)
             self.check()
-            raise TransportError(f"the server was not ready after {deadline:.0f} s")
         ready = json.loads(line)
         self.listen, self.control = ready["listen"], ready["control"]
         self.start_seconds = time.monotonic() - started
 
     def check(self) -> None:
-        """Raise TransportError, with the server's last words, unless it is running."""
+        """Raise TransportError, with the server's own error message, unless it is running."""
         if self._process.poll() is not None:
-            raise TransportError(self._last_words())
+            lines = self._log.read_text(encoding="utf-8", errors="replace").splitlines()
+            errors = [line.removeprefix("tsfusion") for line in lines if line.startswith("tsfusion: ")]
+            reason = errors[-1] if errors else "; was it killed?"
+            raise TransportError(f"the server ended with status {self._process.returncode}{reason}")
 
     def stop(self) -> None:
-        """SIGTERM, and after a deadline SIGKILL to it and its fuser."""
+        """Let the server drain and save its map; kill it when that takes too long."""
         self._process.terminate()
         try:
             self._process.wait(STOP_DEADLINE)
         except subprocess.TimeoutExpired:
             self.kill()
-        self._close()
+        with self._process:  # closes its pipes
+            pass
 
     def kill(self) -> None:
-        """End the server and its fuser at once; what they wrote is thrown away."""
-        with suppress(ProcessLookupError):
+        """End the server and its fuser at once, if they run; what they wrote is thrown away."""
+        with self._process, suppress(ProcessLookupError):  # closes its pipes and waits for it
             os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait()
-        self._close()
-
-    def _close(self) -> None:
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                pipe.close()
-
-    def _last_words(self) -> str:
-        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        said = lines[-1].removeprefix("tsfusion: ") if lines else "nothing"
-        return f"the server ended with status {self._process.returncode}: {said}"
 
 
 @contextmanager
@@ -125,106 +125,84 @@ def _start(settings: Path, stderr: IO[str]) -> subprocess.Popen[str]:
     )
 
 
-def _read_line(process: subprocess.Popen[str], seconds: float) -> str:
-    """The first line of stdout; empty when the process ends or the time is over."""
-    assert process.stdout is not None
-    readable, _, _ = select.select([process.stdout], [], [], seconds)
-    line = process.stdout.readline() if readable else ""
-    if readable and not line:
-        process.wait(STOP_DEADLINE)
-    return line
+@dataclass(frozen=True)
+class Target:
+    """The server that a run sends to.
+
+    Attributes:
+        link: settings of the connection: the server's addresses, and the map to scan into.
+        keys: of the connection; None = it has none.
+        spools: folder that holds one spool a map.
+        child: the server started for this run; None = the server runs elsewhere.
+    """
+
+    link: ClientConfig
+    keys: ClientKeys | None
+    spools: Path
+    child: ServerChild | None
+    _clients: ExitStack
+
+    def client(self, map_name: str, *, policy: Policy | None = None) -> Client:
+        """A client that sends to a map; closed with the target.
+
+        Args:
+            policy: None = the settings' own.
+        """
+        link = override(self.link, map=map_name, policy=policy)
+        client = Client(link.address, spool=self.spools / map_name, control=link.control, config=link)
+        self._clients.callback(client.close)
+        return client
+
+    def check(self) -> None:
+        """Raise TransportError when the server started for this run has ended."""
+        if self.child is not None:
+            self.child.check()
+
+    def status(self, map_name: str, *, timeout: float = 10.0) -> Status:
+        """The status of a map; see `fetch_status`."""
+        address, control, keys = self.link.address, self.link.control, self.keys
+        return fetch_status(address, control=control, map_name=map_name, timeout=timeout, keys=keys)
+
+    def mesh(self, map_name: str, *, min_weight: float | None) -> Mesh:
+        """The mesh of a map, as of now; see `fetch_mesh`."""
+        address, control, keys = self.link.address, self.link.control, self.keys
+        return fetch_mesh(address, control=control, map_name=map_name, min_weight=min_weight, keys=keys)
 
 
 @contextmanager
-def own_server(
-    client: ClientConfig, server: ServerConfig | None, volume: VolumeConfig, scratch: Path
-) -> Iterator[tuple[ClientConfig, ServerChild | None]]:
-    """Where to send, and the server that runs there for as long as the block."""
-    server = server or ServerConfig(listen="tcp://127.0.0.1:0", state=str(scratch / "state"))
-    with serving(server, volume, scratch) as child:
-        yield override(client, address=child.listen, control=child.control), child
-
-
-AHEAD = 3  # keyframes of a recording under way: fusing, waiting, travelling
-MAPS = 16  # of an own server: its default one, and a submap each
-
-log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Destination:
-    """The link's settings, the own server (None: it is elsewhere), and the folder of spools."""
-
-    link: ClientConfig
-    child: ServerChild | None
-    spools: Path
-
-
-def elsewhere(client: ClientConfig | None, connect: str, spool: Path) -> Destination:
-    """A running server at a data address."""
-    return Destination(override(client or ClientConfig(), address=connect), None, spool)
-
-
-def of_its_own(
-    stack: ExitStack,
-    client: ClientConfig | None,
-    server: ServerConfig | None,
-    volume: VolumeConfig,
+def opened(
+    connect: str | None,
     scratch: Path,
-) -> Destination:
-    """A server that runs until the stack is closed, and keeps its files in `scratch`.
+    *,
+    volume: VolumeConfig,
+    client: ClientConfig | None = None,
+    server: ServerConfig | None = None,
+    spools: Path | None = None,
+) -> Iterator[Target]:
+    """The target of a run; its clients are closed, and its own server is stopped, at the end of the block.
+
+    Args:
+        connect: data address of a server that runs elsewhere; None starts one.
+        scratch: a folder that does not exist yet, removed at the end of the block.
+        volume: the map of the server started here.
+        server: settings of the server started here; None = a free port, and a state folder in `scratch`.
+        spools: with `connect`, the folder of spools; None = one in `scratch`.
 
     Raises:
-        TransportError: when it does not start.
+        TransportError: when the server does not start.
+        InvalidConfig: for keys that are of no use.
     """
     scratch.mkdir()
-    own = server or ServerConfig(listen="tcp://127.0.0.1:0", state=str(scratch / "state"))
-    own = override(own, max_maps=max(own.max_maps, MAPS))
-    link, child = stack.enter_context(own_server(client or ClientConfig(), own, volume, scratch))
-    return Destination(link, child, scratch / "spool")
-
-
-def _pace(source: Source, place: Destination) -> dict[str, Any]:
-    """What waits leaves nothing out: a recording waits for a server of its own, and for no other."""
-    if source.live:
-        return {}
-    return {"policy": "block", "backlog": AHEAD} if place.child else {"policy": "spool_all"}
-
-
-def opener(stack: ExitStack, place: Destination, source: Source) -> tuple[set[str], Callable[[str], Client]]:
-    """The maps that an earlier scan's keyframes wait for, and what opens a client and closes it in the end.
-
-    Those keyframes are sent, too, but this scan begins no submap of their names.
-    """
-
-    pace = _pace(source, place)
-
-    def connect(name: str) -> Client:
-        link = override(place.link, map=name, **pace)
-        client = Client(link.address, spool=place.spools / name, control=link.control, config=link)
-        stack.callback(client.close)
-        return client
-
-    waiting = {path.parent.name for path in place.spools.glob("*/*.mcap")} - {place.link.map}
-    for name in sorted(waiting):
-        try:
-            left = connect(name).stats.waiting
-            if left:
-                log.warning("an earlier scan left %d keyframes for the map %s: they go, too", left, name)
-        except TsfusionError as error:
-            log.warning("what waits in %s is not sent: %s", place.spools / name, error)
-    return waiting, connect
-
-
-def warn_of_another_world(place: Destination) -> None:
-    """Say so when the map has keyframes already, or will have: this scan's world is not theirs."""
-    link = place.link
-    begins = "a scan that localises itself begins its own world; give it a map of its own (--map NAME)"
-    if any((place.spools / link.map).glob("*.mcap")):
-        log.warning("keyframes of an earlier scan wait for the map %s: %s", link.map, begins)
-        return
-    with suppress(TransportError):  # a server that is not there yet, or has no such map
+    link, child = client or ClientConfig(), None
+    with ExitStack() as stack:
+        if connect is None:
+            server = server or ServerConfig(
+                listen="tcp://127.0.0.1:0", state=str(scratch / "state"), max_maps=MAPS
+            )
+            child = stack.enter_context(serving(server, volume, scratch))
+            link, spools = override(link, address=child.listen, control=child.control), None
+        else:
+            link = override(link, address=connect)
         keys = client_keys(link.key, link.server_key)
-        status = fetch_status(link.address, control=link.control, map_name=link.map, timeout=2.0, keys=keys)
-        if status.keyframes_durable:
-            log.warning("the map %s has %d keyframes already: %s", link.map, status.keyframes_durable, begins)
+        yield Target(link, keys, spools or scratch / "spool", child, stack)
+    shutil.rmtree(scratch)

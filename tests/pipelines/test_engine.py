@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: MIT
+"""The engine of whole runs: when the next keyframe may go, and how long a run waits for the map."""
+
+from typing import Any, cast
+
+import pytest
+
+from tsfusion.client import Client, ClientStats
+from tsfusion.core.errors import FlushTimeout, TransportError
+from tsfusion.pipelines import engine
+from tsfusion.pipelines.engine import Engine
+from tsfusion.pipelines.target_server import Target
+
+
+class Run:
+    """A target and clients whose counts are given, one a look; the last one stays."""
+
+    def __init__(self, *looks: ClientStats, dies_after: int | None = None) -> None:
+        self.looks = 0
+        self._stats, self._dies_after = looks, dies_after
+
+    def check(self) -> None:
+        if self._dies_after is not None and self.looks >= self._dies_after:
+            raise TransportError("the server ended with status -9")
+
+    def observe(self) -> ClientStats:
+        self.looks += 1
+        return self._stats[min(self.looks, len(self._stats)) - 1]
+
+    @property
+    def engine(self) -> Engine:
+        return Engine(cast(Target, self), self.observe)
+
+
+class SlowClient:
+    """A client that never hears of its last keyframe."""
+
+    def flush(self) -> None:
+        raise FlushTimeout("late")
+
+    wait_meshed = flush
+
+
+def stats(sent: int, fused: int, **others: Any) -> ClientStats:
+    given = {"durable": fused, "refused": {}, "rejected": {}, "skipped": {}, "waiting": 0, "waiting_bytes": 0}
+    return ClientStats(sent=sent, fused=fused, state="ok", **{**given, **others})
+
+
+def test_the_next_keyframe_goes_when_fewer_are_under_way() -> None:
+    run = Run(stats(5, 1), stats(5, 2), stats(5, 3))
+    run.engine.wait_turn(3)
+    assert run.looks == 3
+
+
+def test_what_was_turned_away_is_not_waited_for() -> None:
+    run = Run(stats(9, 3, rejected={"MapFull": 2}, refused={"quota": 3}, skipped={"dropped": 1, "disk": 7}))
+    run.engine.wait_fused()
+    assert run.looks == 1
+
+
+def test_a_run_whose_server_ends_while_it_waits_says_so() -> None:
+    with pytest.raises(TransportError, match="ended with status -9"):
+        Run(stats(5, 1), dies_after=2).engine.wait_turn(3)
+
+
+def test_a_server_that_fuses_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine, "STALL_TIMEOUT", 0.05)
+    with pytest.raises(TransportError, match="the server has fused nothing for 0 s"):
+        Run(stats(5, 1, waiting=4)).engine.wait_fused()
+
+
+def test_a_server_elsewhere_that_takes_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine, "LINGER", 0.05)
+    Run(stats(5, 0, waiting=5)).engine.wait_acknowledged([])
+
+
+def test_missing_stamps_do_not_cost_the_run() -> None:
+    late = [cast(Client, SlowClient())]
+    run = Run(stats(5, 5))
+    run.engine.wait_meshed(late)
+    run.engine.wait_acknowledged(late)

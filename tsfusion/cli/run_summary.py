@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: MIT
+"""What a replay or a scan prints at its end: the run in a few lines."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from tsfusion.cli.output import counted, grouped, size
+
+if TYPE_CHECKING:
+    from tsfusion.evaluation.trajectory_error import TrajectoryError
+    from tsfusion.pipelines.replay_results import ReplaySummary
+    from tsfusion.pipelines.scan_results import MapResult, ScanSummary
+
+
+def print_replay(run: "ReplaySummary", out: Path) -> None:
+    """Print a replay in a few lines."""
+    delay = run.delay_ms
+    lines = [
+        f"keyframes  {run.keyframes_fused}/{run.keyframes_sent} fused in {run.seconds:.1f} s",
+        f"delay      mean {delay.mean:.0f} ms, p50 {delay.p50:.0f}, p95 {delay.p95:.0f}, "
+        f"p99 {delay.p99:.0f}, max {delay.max:.0f}; slope {run.delay_slope_ms_per_keyframe:+.2f} ms/keyframe",
+        f"mesh       {grouped(run.mesh['vertices'])} vertices, {grouped(run.mesh['triangles'])} triangles",
+        f"map        {grouped(run.blocks)} blocks, hash {run.map_hash}",
+        "memory     " + ", ".join(f"{name} {size(peak)}" for name, peak in run.peak_rss_bytes.items()),
+    ]
+    if run.keyframes_rejected:
+        lines.insert(1, f"rejected   {counted(run.keyframes_rejected)}")
+    if run.accuracy is not None:
+        error = run.accuracy
+        lines.append(
+            f"accuracy   mean {error.mean_mm:.2f} mm, p50 {error.p50_mm:.2f}, p95 {error.p95_mm:.2f} mm "
+            "from the known surface"
+        )
+    lines.append(f"results    {out}/: mesh.ply mesh.glb preview.png delay.csv delay.png run.json")
+    typer.echo("\n".join(lines))
+
+
+def print_scan(result: "ScanSummary", out: Path, spool: Path, connect: str | None) -> None:
+    """Print a scan in a few lines.
+
+    Args:
+        connect: address of the server elsewhere that has the map; None = it was the scan's own.
+    """
+    delay = result.delay_ms
+    ended = "" if result.complete else "; the source was not read to its end"
+    lines = [
+        f"frames     {result.frames_tracked}/{result.frames} localised by {result.localizer}, "
+        f"{result.tracking_cpu_ms:.0f} CPU ms each{ended}",
+        f"keyframes  {result.keyframes_sent} sent, {result.keyframes_durable} acknowledged, "
+        f"{result.keyframes_fused} fused ({counted(result.keyframes_by_rule)})",
+        f"delay      mean {delay.mean:.0f} ms, p50 {delay.p50:.0f}, p95 {delay.p95:.0f}, max {delay.max:.0f}"
+        if delay.count
+        else "delay      not known: nothing was fused yet",
+    ]
+    if result.frames_skipped:
+        lines.append(f"left out   {counted(result.frames_skipped)}")
+    if result.keyframes_rejected:
+        lines.append(f"rejected   {counted(result.keyframes_rejected)}")
+    for found in result.maps:
+        lines += _map_lines(found)
+    if result.left:
+        why = f" ({result.link})" if result.link else ""
+        lines.append(
+            f"spool      {result.left} keyframes are not acknowledged{why}: the next scan with "
+            f"--spool {spool} sends them"
+        )
+    lines.append(f"results    {out}/")
+    if connect is not None and result.keyframes_durable:
+        lines.append(
+            f"mesh       tsfusion mesh {connect} {result.maps[0].name}.glb --map {result.maps[0].name}"
+        )
+    typer.echo("\n".join(lines))
+
+
+def _map_lines(found: "MapResult") -> list[str]:
+    mesh = f", {grouped(found.mesh['triangles'])} triangles" if found.mesh else ""
+    lines = [f"map        {found.name}: {found.frames} frames, {found.keyframes} keyframes{mesh}"]
+    if found.trajectory_error is not None:
+        lines.append(f"ATE        {_ate(found.trajectory_error)}")
+    if found.corrected_error is not None:
+        lines.append(f"  loops    {_ate(found.corrected_error)} ({found.loops} loops)")
+    return lines
+
+
+def _ate(error: "TrajectoryError") -> str:
+    """The field's table of trajectory error as one line, in millimetres below a metre."""
+    unit, factor = ("mm", 1000.0) if error.rmse < 1 else ("m", 1.0)
+    figures: list[tuple[str, Any]] = [
+        (name, factor * getattr(error, name)) for name in ("rmse", "mean", "median", "std", "min", "max")
+    ]
+    words = ", ".join(f"{name} {value:.3g}" for name, value in figures)
+    return f"{words} {unit}; drift {error.drift_percent:.2g} % of {error.length:.3g} m"

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: MIT
+"""What a replay and a scan have in common: the pace of sending, the wait for the map, and progress.
+
+A replay has its poses already and sends every keyframe; a scan finds poses and chooses among frames. From the
+client on they are the same: each hands keyframes to the clients of one `Target` and asks this engine when the
+next one may go and when all of them are in the map.
+"""
+
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from typing import Protocol
+
+from tsfusion.client import Client, ClientStats
+from tsfusion.core.errors import FlushTimeout, KeyframeRefused, TransportError
+from tsfusion.pipelines.target_server import Target
+from tsfusion.scanner.scanner import ScanState
+
+AHEAD = 3  # keyframes of a recording under way: fusing, waiting, travelling
+# Seconds without progress before a run that needs the map gives up: a server restarts a stuck fuser after 60.
+STALL_TIMEOUT = 120.0
+LINGER = 10.0  # seconds without progress before what a distant server does not take is left in the spool
+_STAMPS_TIMEOUT = 5.0  # seconds for a distant server to say when it fused the last ones: for the figures only
+_POLL = 0.01  # seconds
+
+STARTING = "starting a server (the first start compiles kernels)"
+
+
+class Progress(Protocol):
+    """Shows a person how far a run is."""
+
+    def stage(self, text: str) -> None:
+        """Announce the next part of the run."""
+
+    def update(self, taken: int, fused: int, total: int | None, scan: ScanState | None = None) -> None:
+        """Show the counts; called often.
+
+        Args:
+            taken: frames or keyframes taken from the source.
+            fused: keyframes in the map.
+            total: frames or keyframes of the source; None = nobody knows.
+            scan: of a scan: the sensor, the keyframes and the link.
+        """
+
+
+class Engine:
+    """Watches keyframes on their way into the maps of a target.
+
+    Args:
+        target: where they go.
+        observe: shows how far the run is, and returns the counts of all its clients together.
+    """
+
+    def __init__(self, target: Target, observe: Callable[[], ClientStats]) -> None:
+        self._target, self._observe = target, observe
+
+    def check(self) -> ClientStats:
+        """Show how far the run is; raise TransportError when its own server has ended."""
+        self._target.check()
+        return self._observe()
+
+    def wait_until(self, due: float) -> None:
+        """Wait for a moment of `time.monotonic`."""
+        self.check()
+        while time.monotonic() < due:
+            time.sleep(_POLL)
+            self.check()
+
+    def wait_turn(self, ahead: int = AHEAD) -> None:
+        """Wait until fewer than `ahead` keyframes are under way; raise TransportError when nothing moves."""
+        self._wait_map(lambda stats: stats.sent - _settled(stats) < ahead)
+
+    def wait_fused(self) -> None:
+        """Wait until each keyframe is in the map or turned away; raise TransportError when nothing moves."""
+        self._wait_map(lambda stats: not stats.waiting and _settled(stats) >= stats.sent)
+
+    def wait_meshed(self, clients: Iterable[Client]) -> None:
+        """Wait until the mesh shows every keyframe: the last stamp of the ledger, which may be missing."""
+        for client in clients:
+            with suppress(FlushTimeout):
+                client.wait_meshed()
+
+    def wait_acknowledged(self, clients: Iterable[Client]) -> None:
+        """Wait until the server has every keyframe on its disk, or takes none any more."""
+        if self._wait(lambda stats: not stats.waiting, LINGER):
+            for client in clients:
+                # Corrections and stamps are no reason to lose a scan; what was refused is counted.
+                with suppress(FlushTimeout, KeyframeRefused):
+                    client.flush()
+                    client.wait_fused(_STAMPS_TIMEOUT)
+
+    def _wait_map(self, reached: Callable[[ClientStats], bool]) -> None:
+        if not self._wait(reached, STALL_TIMEOUT):
+            raise TransportError(
+                f"the server has fused nothing for {STALL_TIMEOUT:.0f} s, and keyframes wait: "
+                "`tsfusion status` says how a server is"
+            )
+
+    def _wait(self, reached: Callable[[ClientStats], bool], timeout: float) -> bool:
+        """Whether it was reached; False = nothing has moved for `timeout` seconds."""
+        last, moved = (-1, -1), time.monotonic()
+        while True:
+            stats = self.check()
+            if reached(stats):
+                return True
+            if (now := (stats.waiting, stats.durable + _settled(stats))) != last:
+                last, moved = now, time.monotonic()
+            elif time.monotonic() - moved > timeout:
+                return False
+            time.sleep(_POLL)
+
+
+def _settled(stats: ClientStats) -> int:
+    """Sent keyframes that are in the map, or never will be."""
+    turned_away = sum(stats.rejected.values()) + sum(stats.refused.values())
+    return stats.fused + turned_away + stats.skipped.get("dropped", 0)
