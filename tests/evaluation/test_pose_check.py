@@ -327,9 +327,9 @@ def test_replay_warns(data: Data, tmp_path: Path, capsys: pytest.CaptureFixture[
     from tsfusion.cli import replay
 
     wrong = inverted(data(FOLDERS["open3d"]), tmp_path)
-    replay._warn(open_dataset(wrong))
+    replay._warn_of_disagreement(open_dataset(wrong))
     assert capsys.readouterr().err.startswith(
         "warning: poses and depth disagree: the poses are world-to-camera"
     )
-    replay._warn(open_dataset(data(FOLDERS["open3d"])))
+    replay._warn_of_disagreement(open_dataset(data(FOLDERS["open3d"])))
     assert capsys.readouterr().err == ""

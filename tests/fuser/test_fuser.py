@@ -12,7 +12,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from keyframes_and_servers import alive, serving, until, wall
+from command_processes import alive
+from keyframes_and_servers import serving, until, wall
 
 import tsfusion
 from tsfusion import VolumeConfig

@@ -3,7 +3,7 @@
 
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.sessions import Sessions
-from tsfusion.journal import Position, Scan
+from tsfusion.journal import Position, RecordEntry
 from tsfusion.wire.keyframe_times import Stamps
 
 SESSION = bytes(range(16))
@@ -11,7 +11,7 @@ SESSION = bytes(range(16))
 
 def index_of(*records: tuple[int, int, bytes, int]) -> tuple[KeyframeIndex, Sessions]:
     index, sessions = KeyframeIndex(), Sessions()
-    index.recover([Scan(Position(a, b), key, seq, "", 0) for a, b, key, seq in records], sessions)
+    index.recover([RecordEntry(Position(a, b), key, seq, "", 0) for a, b, key, seq in records], sessions)
     return index, sessions
 
 
@@ -46,7 +46,7 @@ def test_keyframes_whose_segments_are_gone_are_forgotten() -> None:
     assert [index.after(first, seq) for seq in (1, 2, 3)] == [0, 0, 1]
     assert (index.segment(3), index.segment(4)) == (2, 3)
     assert index.add(Position(3, 2), second, 7) == 5
-    index.fused(5, 8, 9)
+    index.set_fused(5, 8, 9)
     assert (index[5].stamps.seq, index[5].stamps.fused_ns, list(second.entries)) == (7, 9, [4, 5])
     first.handed = second.handed = 1
     index.forget(9, sessions)
@@ -56,6 +56,6 @@ def test_keyframes_whose_segments_are_gone_are_forgotten() -> None:
 def test_the_index_keeps_stamps() -> None:
     index, sessions = KeyframeIndex(), Sessions()
     index.add(Position(1, 42), sessions.open(SESSION), 1, captured_ns=5, received_ns=6, durable_ns=7)
-    index.fused(0, 8, 9)
+    index.set_fused(0, 8, 9)
     assert index[0].stamps == Stamps(1, 6, 7, 8, 9, 0)
     assert index[0].captured_ns == 5

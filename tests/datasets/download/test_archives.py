@@ -12,9 +12,9 @@ import pytest
 from download_server import Server, one, silent, tarred
 from small_recordings import corbs, one_line, seven_scenes
 
+from tsfusion.core import durable_files
 from tsfusion.core.errors import DatasetError, OutputError
 from tsfusion.datasets import describe, find, open_dataset
-from tsfusion.datasets.download import archives
 from tsfusion.datasets.download.catalogue import File, PublicRecording
 from tsfusion.datasets.download.download import fetch
 
@@ -72,10 +72,10 @@ def test_archives_that_unfold_to_more_than_the_disk_holds_are_refused(
     name: str,
     content: bytes,
 ) -> None:
-    monkeypatch.setattr(archives, "_RESERVE_BYTES", 1 << 20)
+    monkeypatch.setattr(durable_files, "_RESERVE_BYTES", 1 << 20)
     disk = small_disk(4)
     (disk / name).write_bytes(content)
-    with pytest.raises(OutputError, match=r"it unpacks to 8 MB, \d MB are free on that disk"):
+    with pytest.raises(OutputError, match=r"8 MB are needed, \d MB are free on that disk"):
         fetch(one(server.url, name), disk, silent)
     assert sorted(path.name for path in disk.iterdir()) == [name, f"{name}.sha256"]
 

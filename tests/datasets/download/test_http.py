@@ -11,6 +11,7 @@ import pytest
 from command_processes import eventually
 from download_server import CONTENT, Server, one, serving, sha256, silent
 
+from tsfusion.core import durable_files
 from tsfusion.core.errors import DatasetError, OutputError
 from tsfusion.datasets.download import http as download_http
 from tsfusion.datasets.download.download import fetch
@@ -89,8 +90,8 @@ def test_a_server_that_never_ends_does_not_fill_the_disk(
 ) -> None:
     disk = small_disk(4)
     server.with_length, server.files["file.bin"] = False, bytes(32 << 20)
-    monkeypatch.setattr(download_http, "_RESERVE_BYTES", 1 << 20)
-    with pytest.raises(OutputError, match=r"1 MB are to come, \d MB are free on that disk"):
+    monkeypatch.setattr(durable_files, "_RESERVE_BYTES", 1 << 20)
+    with pytest.raises(OutputError, match=r"1 MB are needed, \d MB are free on that disk"):
         fetch(one(server.url), disk, silent)
     assert shutil.disk_usage(disk).free >= 1 << 20
 
@@ -142,7 +143,7 @@ def test_a_disk_without_room_is_said_before(
     server: Server, small_disk: Callable[[int], Path], tmp_path: Path
 ) -> None:
     disk = small_disk(4)
-    with pytest.raises(OutputError, match=r"3 MB are to come, 4 MB are free"):
+    with pytest.raises(OutputError, match=r"3 MB are needed, 4 MB are free"):
         fetch(one(server.url), disk, silent)
 
 
@@ -150,7 +151,7 @@ def test_a_disk_that_fills_keeps_the_part(
     server: Server, small_disk: Callable[[int], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk = small_disk(2)
-    monkeypatch.setattr(download_http, "_RESERVE_BYTES", -(1 << 40))
+    monkeypatch.setattr(durable_files, "_RESERVE_BYTES", -(1 << 40))
     with pytest.raises(OutputError, match="No space left on device; what has come stays"):
         fetch(one(server.url), disk, silent)
     part = disk / "file.bin.part"
