@@ -16,7 +16,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import TracebackType
 
 import numpy as np
@@ -28,9 +28,8 @@ from tsfusion.delivery.backpressure import Backpressure
 from tsfusion.delivery.outbox import ClientStats, Outbox
 from tsfusion.delivery.sender import Sender
 from tsfusion.delivery.spool import Spool
-from tsfusion.geometry.keyframe import Keyframe, check_pose
+from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.wire import corrections, sockets
-from tsfusion.wire.corrections import SessionCorrections
 from tsfusion.wire.curve import client_keys
 from tsfusion.wire.keyframe_times import KeyframeTimes
 from tsfusion.wire.sockets import control_address
@@ -114,41 +113,40 @@ class Client:
             return seq
 
     def correct(
-        self, poses: Mapping[int, NDArray[np.float64]], *, T_map_odometry: NDArray[np.float64] | None = None
-    ) -> int:
-        """Say where keyframes that were sent before really were taken; which call of this it was, from 1.
+        self,
+        poses: Mapping[int, NDArray[np.float64]],
+        *,
+        T_map_odometry: NDArray[np.float64] | None = None,
+        removed: Iterable[int] = (),
+    ) -> int | None:
+        """Correct where keyframes that were sent before were taken; the correction's number, or None.
 
-        The newest pose of a keyframe counts; one that is not named keeps what was said of it before. Kept in
-        the spool until the server has it on its disk (`stats.corrections_acknowledged`); never waits for it.
+        A correction is a record like a keyframe: its number is the session's next, it waits in the spool
+        until the server has it on its disk (`stats.corrections_acknowledged`), and it is None when the spool
+        cannot keep it (`stats.skipped`). The newest pose of a keyframe counts; one that is not named keeps
+        its pose. Never waits, whatever the policy.
 
         Args:
-            poses: by the number that `send` returned, (4, 4) float64 `T_world_camera`, at most 100,000.
+            poses: by the number that `send` returned, (4, 4) float64 `T_world_camera`.
             T_map_odometry: (4, 4) float64, what poses after the last keyframe are to be multiplied by from
                 the left; None = as before.
+            removed: the numbers of keyframes that are to be taken out of the map.
 
         Raises:
             InvalidKeyframe: for a number that was never sent, a pose that is no rigid transform, or more
-                keyframes than a session may have corrected.
+                than 100,000 keyframes.
             TransportError: after `close`.
         """
-        seqs, checked = corrections.checked(poses)
-        T = None if T_map_odometry is None else check_pose(T_map_odometry)
-        box = self._outbox
+        correction = corrections.checked(poses, T_map_odometry=T_map_odometry, removed=removed)
         with self._sending:
             self._check_running()
-            with box.changed:
-                box.check_taken(seqs)
-                new = SessionCorrections(
-                    session=box.spool.session,
-                    seqs=seqs,
-                    poses=checked,
-                    T_map_odometry=T,
-                    map=self._config.map,
-                )
-                content, number = box.correcting.add(new), box.correcting.taken
-            box.correcting.save(content)
-        self._sender.wake()
-        return number
+            with self._outbox.changed:
+                self._outbox.check_taken(correction.seqs)
+                self._outbox.check_taken(correction.removed)
+            seq = self._pressure.put_correction(correction)
+        if seq is not None:
+            self._sender.wake()
+        return seq
 
     def connect(self, timeout: float | None = None) -> None:
         """Wait until the server has answered. Not needed before `send`.
@@ -167,27 +165,23 @@ class Client:
             raise ServerUnreachable(f"{self._why()} (waited {timeout:g} s)")
 
     def flush(self, timeout: float = 10.0) -> None:
-        """Wait until everything sent is on the server's disk, corrections included (but where it takes none).
+        """Wait until everything sent is on the server's disk, corrections included.
 
         Raises:
             FlushTimeout: after `timeout` seconds; the rest stays in the spool and is still being sent.
             KeyframeRefused: when the server turned some away for good since the last flush.
         """
         box = self._outbox
-        done = self._wait(lambda: not box.spool.waiting and box.correcting.settled, timeout)
+        done = self._wait(lambda: not box.spool.waiting, timeout)
         with box.changed:
             refusals, first = box.take_refusals()
-            refusal = box.correcting.take_refusal()
         if refusals:
             more = f" (and {refusals - 1} more)" if refusals > 1 else ""
-            raise KeyframeRefused(f"keyframe {first}{more}")
-        if refusal:
-            raise KeyframeRefused(refusal)
+            raise KeyframeRefused(f"{first}{more}")
         if not done:
-            what, why = f"{len(box.spool.waiting)} keyframes", self._why()
-            if not box.spool.waiting:
-                what, why = f"corrections of {box.correcting.pending} keyframes", box.correcting.held or why
-            raise FlushTimeout(f"{what} are not acknowledged after {timeout:g} s: {why}")
+            with box.changed:
+                what = box.spool.describe()
+            raise FlushTimeout(f"{what} are not acknowledged after {timeout:g} s: {self._why()}")
 
     def wait_fused(self, timeout: float = 60.0) -> None:
         """Wait until the map has taken or rejected everything sent (`stats.rejected` says what).
@@ -250,10 +244,9 @@ class Client:
             atexit.unregister(self.close)
             self._sender.stop()
             self._thread.join()
-            lost = len(self._outbox.spool.waiting) if self._outbox.spool.temporary else 0
-            if lost:
-                log.error("%d keyframes are lost: not acknowledged, and the spool was temporary", lost)
-            self._outbox.correcting.close()
+            spool = self._outbox.spool
+            if spool.temporary and spool.waiting:
+                log.error("%s are lost: not acknowledged, and the spool was temporary", spool.describe())
             self._outbox.spool.close()
 
     def __enter__(self) -> "Client":

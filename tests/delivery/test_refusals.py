@@ -15,8 +15,8 @@ from tsfusion.core.errors import FlushTimeout, InvalidConfig, JournalError, Keyf
 from tsfusion.delivery.spool import Spool
 from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec
-from tsfusion.wire.keyframe_header import unpack
 from tsfusion.wire.queries import fetch_status
+from tsfusion.wire.record_header import unpack
 
 # --- for a while ---
 

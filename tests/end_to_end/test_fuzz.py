@@ -11,7 +11,7 @@ from fuzz_engine import fuzz
 from fuzz_targets import TARGETS
 
 from tsfusion.wire import codec
-from tsfusion.wire.keyframe_header import Refused
+from tsfusion.wire.record_header import Refused
 
 CASES = {"message": 6000, "control": 20_000, "corrections": 3000, "journal": 2000, "checkpoint": 1000}
 _CHECK_BYTES = 1 << 20  # besides the message itself

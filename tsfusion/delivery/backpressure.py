@@ -19,7 +19,8 @@ from tsfusion.core.errors import JournalError
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.spool import Waiting
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.wire import codec
+from tsfusion.wire import codec, corrections
+from tsfusion.wire.corrections import Correction
 
 _THINNEST = 4
 
@@ -56,8 +57,21 @@ class Backpressure:
             map_name=self._config.map,
             jpeg_quality=self._config.jpeg_quality,
         )
-        with process.uninterrupted():  # Ctrl-C would leave half a record, and hide what follows it
-            return self._store(frames, keyframe)
+        return self._store(frames, keyframe)
+
+    def put_correction(self, correction: Correction) -> int | None:
+        """The number under which the correction is in the spool; None = its limit or disk refused it.
+
+        No policy thins corrections out or holds them up.
+
+        Raises:
+            JournalError: as `put`.
+        """
+        box = self._outbox
+        frames = corrections.encode(
+            correction, session=box.spool.session, seq=box.spool.next_seq, map_name=self._config.map
+        )
+        return self._store(frames, None)
 
     def _is_thinned_out(self) -> bool:
         one_of = 1 + min(self._outbox.behind // self._config.backlog, _THINNEST - 1)
@@ -65,7 +79,11 @@ class Backpressure:
         self._passed_over = self._passed_over + 1 if thinned_out else 0
         return thinned_out
 
-    def _store(self, frames: list[bytes], keyframe: Keyframe) -> int | None:
+    def _store(self, frames: list[bytes], keyframe: Keyframe | None) -> int | None:
+        with process.uninterrupted():  # Ctrl-C would leave half a record, and hide what follows it
+            return self._write(frames, keyframe)
+
+    def _write(self, frames: list[bytes], keyframe: Keyframe | None) -> int | None:
         box, nbytes = self._outbox, sum(map(len, frames))
         with box.changed:
             if reason := self._no_room(nbytes):
@@ -83,7 +101,8 @@ class Backpressure:
         with box.changed:
             self._room.took(nbytes)
             box.add(entry, keyframe)
-            self._drop_to_backlog(entry)
+            if keyframe is not None:
+                self._drop_to_backlog(entry)
         return entry.seq
 
     def _no_room(self, nbytes: int) -> str:

@@ -12,7 +12,7 @@ from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.refused_keyframes import RefusedFolder
 from tsfusion.delivery.timing import SAMPLES, ClockOffset
 from tsfusion.wire import messages
-from tsfusion.wire.keyframe_header import VERSION
+from tsfusion.wire.messages import PROTOCOL_VERSION
 
 log = logging.getLogger(__name__)
 
@@ -22,9 +22,7 @@ _FIRST_PINGS_INTERVAL = 0.02  # until the clock estimate stands on all its sampl
 _REWIND_INTERVAL = 0.2  # one gap is reported by every keyframe behind it
 _LATEST = 1 << 62  # nanoseconds; no clock shows more than a century
 _HOLD = (0.05, 60.0)  # seconds: no server may hold a client for less or longer at a time
-_News: TypeAlias = (
-    messages.Ack | messages.Nack | messages.Hold | messages.Denied | messages.Corrected | messages.Uncorrected
-)
+_News: TypeAlias = messages.Ack | messages.Nack | messages.Hold | messages.Denied
 
 
 class ControlSession:
@@ -58,7 +56,7 @@ class ControlSession:
         self._refused = refused
         self._say = say
         self._address = address
-        self._hello = messages.Hello(outbox.spool.session, VERSION, map_name)
+        self._hello = messages.Hello(outbox.spool.session, PROTOCOL_VERSION, map_name)
         self._hello_due = self._ping_due = self._rewound = self._held_until = 0.0
         self._hello_interval = _HELLO_INTERVAL[0]
         self._asked_again = False
@@ -83,9 +81,6 @@ class ControlSession:
             due = min(due, self._held_until)
         if self._asked_again:
             due = min(due, self._rewound + _REWIND_INTERVAL)
-        if self.welcome is not None:
-            with self._outbox.changed:
-                due = min(due, self._outbox.correcting.due(self._outbox.durable))
         return due
 
     def tick(self, now: float) -> None:
@@ -102,8 +97,6 @@ class ControlSession:
         if self._asked_again and now - self._rewound > _REWIND_INTERVAL:
             with self._outbox.changed:
                 self.rewind()
-        if self.welcome is not None:
-            self._correct(now)
 
     def _ping(self, now: float) -> None:
         settled = self.welcome is None or self.clock.count >= SAMPLES
@@ -119,14 +112,6 @@ class ControlSession:
             skipped=skipped,
         )
         self._say(messages.encode(ping))
-
-    def _correct(self, now: float) -> None:
-        with self._outbox.changed:
-            frames = self._outbox.correcting.message(self._outbox.durable, now)
-            if self._outbox.correcting.settled:
-                self._outbox.changed.notify_all()
-        if frames:
-            self._say(*frames)
 
     def greet_again(self, after: float = 0.0) -> None:
         """Ask to be let in (once more), first after so many seconds."""
@@ -186,22 +171,20 @@ class ControlSession:
             with self._outbox.changed:
                 if isinstance(message, messages.Ack):
                     self._on_ack(message)
-                elif isinstance(message, messages.Hold):
-                    self._on_hold(message)
                 else:
-                    self._on_corrections(message)
+                    self._on_hold(message)
 
     def _on_welcome(self, welcome: messages.Welcome) -> None:
-        if welcome.version != VERSION:
+        if welcome.version != PROTOCOL_VERSION:
             self._turned_away(
-                f"the server speaks version {welcome.version} of the wire format, this client {VERSION}"
+                f"the server speaks version {welcome.version} of the wire format, "
+                f"this client {PROTOCOL_VERSION}"
             )
         elif not self._is_foreign(welcome.durable):
             self._outbox.problem, self._outbox.opening, self._outbox.turned_away = "", False, ""
             self.welcome = welcome
             self._ping_due = self._held_until = 0.0
             self._outbox.welcomed(welcome.durable, welcome.window_keyframes)
-            self._outbox.correcting.welcomed(welcome.corrections, self.heard)
             self._on_progress(welcome.durable, welcome.fused)
             self._outbox.meshed(welcome.fused)  # a new server stamps only what it fuses from here on
             self.rewind()
@@ -268,22 +251,13 @@ class ControlSession:
         self.moved = self.heard
         with self._outbox.changed:
             if nack.stage == "map":
-                log.error("keyframe %d is not in the map (%s): %s", nack.seq, nack.reason, nack.message)
+                kind = self._outbox.kind(nack.seq)
+                log.error("%s %d is not in the map (%s): %s", kind, nack.seq, nack.reason, nack.message)
                 self._outbox.reject(nack.seq, nack.reason)
                 return
             entry = self._outbox.find(nack.seq)
         if entry is not None:
             self._refused.give_up(entry, nack.reason, nack.message)
-
-    def _on_corrections(self, answer: messages.Corrected | messages.Uncorrected) -> None:
-        if isinstance(answer, messages.Corrected):
-            self._outbox.correcting.told(answer.revision, self.heard)
-        else:
-            again_s = answer.again_s if math.isfinite(answer.again_s) else _HOLD[1]
-            self._outbox.correcting.turned_away(
-                answer.revision, answer.reason, answer.message, again_s, self.heard
-            )
-        self._outbox.changed.notify_all()
 
     def _on_hold(self, hold: messages.Hold) -> None:
         shortest, longest = _HOLD

@@ -10,7 +10,6 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidKeyframe
-from tsfusion.delivery.correction_queue import Correcting
 from tsfusion.delivery.spool import Spool, Waiting
 from tsfusion.delivery.timing import KeyframeTimesTable
 from tsfusion.geometry.keyframe import Keyframe
@@ -26,16 +25,15 @@ class ClientStats(Struct, frozen=True):
         sent: taken by `send`.
         durable: on the server's disk.
         fused: in the server's map.
-        refused: turned away by the server (or unreadable here) for good: reason → count.
+        refused: turned away by the server (or unreadable here) for good, corrections too: reason → count.
         rejected: on the server's disk, but the map could not take it: reason → count.
         skipped: never sent: reason → count. `thinned` and `dropped` by the policy (a dropped one was taken
             before), `spool` (it has reached `spool_bytes`), `disk` (full, failing or read-only).
-        waiting: in the spool.
+        waiting: keyframes and corrections in the spool.
         waiting_bytes: the bytes of those.
         state: of the spool: `ok`, or the reason why it cannot keep all that comes: `spool` or `disk`.
-        corrections_sent: calls of `correct`.
-        corrections_acknowledged: how many of them, from the first on, are on the server's disk.
-        corrections_refused: messages of corrections that were turned away for good: reason → count.
+        corrections_sent: taken by `correct`.
+        corrections_acknowledged: on the server's disk.
     """
 
     sent: int
@@ -49,7 +47,6 @@ class ClientStats(Struct, frozen=True):
     state: str
     corrections_sent: int = 0
     corrections_acknowledged: int = 0
-    corrections_refused: dict[str, int] = {}
 
 
 class Outbox:
@@ -68,7 +65,6 @@ class Outbox:
         state: see `ClientStats`.
         times: of the keyframes, as far as they are known.
         durable: the highest number that is on the server's disk, as far as it said; 0 = none.
-        correcting: corrected poses that it does not have yet.
     """
 
     def __init__(self, spool: Spool) -> None:
@@ -87,8 +83,9 @@ class Outbox:
         self.state = "ok"
         self.times = KeyframeTimesTable()
         self.durable = 0
-        self.correcting = Correcting(spool)
         self._sent = self._durable = self._fused = 0
+        self._corrections_sent = self._corrections_durable = 0
+        self._corrections = {entry.seq for entry in spool.waiting if entry.is_correction}  # not noted yet
         self._refused: Counter[str] = Counter()
         self._rejected: Counter[str] = Counter()
         self._rejected_seqs: OrderedDict[int, None] = OrderedDict()
@@ -103,11 +100,15 @@ class Outbox:
     @property
     def behind(self) -> int:
         """How many keyframes the map has yet to get: those in the spool and the server's unfused ones."""
-        return len(self.spool.waiting) + len(self.unfused)
+        return len(self.spool.waiting) + len(self.unfused) - len(self._corrections)
 
-    def add(self, entry: Waiting, keyframe: Keyframe) -> None:
-        """A keyframe is in the spool."""
+    def add(self, entry: Waiting, keyframe: Keyframe | None) -> None:
+        """Queue a keyframe, or a correction (None), that was written to the spool."""
         self.spool.add(entry)
+        if keyframe is None:
+            self._corrections_sent += 1
+            self._corrections.add(entry.seq)
+            return
         self._sent += 1
         self.times.add(entry.seq, timestamp_ns=keyframe.timestamp_ns, captured_ns=keyframe.captured_ns)
 
@@ -121,7 +122,7 @@ class Outbox:
         """
         sent = max(self._perhaps_sent, self._claimed)
         for place, entry in enumerate(self.spool.waiting):
-            if entry.seq > sent:
+            if entry.seq > sent and not entry.is_correction:
                 if entry.seq == newest:
                     return False
                 self.spool.remove(place)
@@ -191,11 +192,16 @@ class Outbox:
         self.durable = max(self.durable, durable)
         dropped = self.spool.drop(durable)
         self.outstanding = max(self.outstanding - len(dropped), 0)
-        self._durable += len(dropped)
+        corrections = len(self._corrections.intersection(dropped))
+        self._corrections_durable += corrections
+        self._durable += len(dropped) - corrections
         self.unfused.extend(dropped)
         while self.unfused and self.unfused[0] <= fused:
             seq = self.unfused.popleft()
-            self._fused += seq not in self._rejected_seqs
+            if seq in self._corrections:
+                self._corrections.remove(seq)
+            else:
+                self._fused += seq not in self._rejected_seqs
             self.unmeshed.append(seq)
         self.changed.notify_all()
         return bool(dropped)
@@ -230,6 +236,10 @@ class Outbox:
         if len(self._rejected_seqs) > _MOST:
             self._rejected_seqs.popitem(last=False)
 
+    def kind(self, seq: int) -> str:
+        """Whether the record of a number that is not in the map yet is a `keyframe` or a `correction`."""
+        return "correction" if seq in self._corrections else "keyframe"
+
     def find(self, seq: int) -> Waiting | None:
         """The keyframe of this number, if it waits and was sent."""
         if seq <= self._perhaps_sent:
@@ -243,11 +253,12 @@ class Outbox:
         place = self.spool.waiting.index(entry)
         self.outstanding = min(self.outstanding, place)
         self.spool.remove(place)
+        self._corrections.discard(entry.seq)
         self._claimed = 0
         self._refused[reason] += 1
         self.refusals += 1
         if self.refusals == 1:
-            self.first_refusal = f"{entry.seq} was refused ({reason}): {message}"
+            self.first_refusal = f"{entry.kind} {entry.seq} was refused ({reason}): {message}"
         self.changed.notify_all()
 
     # --- told ---
@@ -269,7 +280,6 @@ class Outbox:
             waiting=len(self.spool.waiting),
             waiting_bytes=self.spool.waiting_bytes,
             state=self.state,
-            corrections_sent=self.correcting.taken,
-            corrections_acknowledged=self.correcting.acknowledged,
-            corrections_refused=dict(self.correcting.refused),
+            corrections_sent=self._corrections_sent,
+            corrections_acknowledged=self._corrections_durable,
         )

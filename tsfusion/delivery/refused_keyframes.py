@@ -28,12 +28,12 @@ class RefusedFolder:
 
     def give_up(self, entry: Waiting, reason: str, message: str, *, readable: bool = True) -> None:
         """Take a keyframe out of the queue for good. Not while holding `changed`: this uses the disk."""
-        log.error("keyframe %d is lost (%s): %s", entry.seq, reason, message)
+        log.error("%s %d is lost (%s): %s", entry.kind, entry.seq, reason, message)
         if readable and not self._outbox.spool.temporary and entry.nbytes + _FILE_OVERHEAD <= MAX_BYTES:
             try:
                 self._keep(entry)
             except (JournalError, OSError) as error:
-                log.warning("keyframe %d could not be kept aside: %s", entry.seq, error)
+                log.warning("%s %d could not be kept aside: %s", entry.kind, entry.seq, error)
         with self._outbox.changed:
             self._outbox.refuse(entry, reason, message)
 
@@ -48,7 +48,8 @@ class RefusedFolder:
                 break
             self._journal.forget(number)
         position = self._journal.append(frames, session=spool.session, seq=entry.seq)
-        log.info("keyframe %d is in %s", entry.seq, journal.segment_path(self._folder, position.segment))
+        path = journal.segment_path(self._folder, position.segment)
+        log.info("%s %d is in %s", entry.kind, entry.seq, path)
 
     def close(self) -> None:
         """Finish; what was kept stays."""

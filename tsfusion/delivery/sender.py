@@ -24,7 +24,7 @@ from tsfusion.delivery.refused_keyframes import RefusedFolder
 from tsfusion.delivery.spool import Waiting
 from tsfusion.wire import sockets
 from tsfusion.wire.curve import ClientKeys
-from tsfusion.wire.keyframe_header import stamp
+from tsfusion.wire.record_header import stamp
 
 log = logging.getLogger(__name__)
 
@@ -115,12 +115,9 @@ class Sender:
         with suppress(BlockingIOError):
             self._woken.recv(4096)
 
-    def _say(self, *frames: bytes) -> None:
+    def _say(self, frame: bytes) -> None:
         with suppress(zmq.Again):
-            if len(frames) == 1:
-                self._link.socket.send(frames[0], zmq.NOBLOCK)
-            else:
-                self._link.socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
+            self._link.socket.send(frame, zmq.NOBLOCK)
 
     def _watch_connections(self, now: float) -> None:
         for connection in (self._link, self._data):

@@ -21,7 +21,7 @@ from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.delivery.tombstones import Tombstones
-from tsfusion.wire.keyframe_header import unpack
+from tsfusion.wire.record_header import is_correction, unpack
 
 log = logging.getLogger(__name__)
 
@@ -36,11 +36,17 @@ _RECORD_OVERHEAD = 512  # what MCAP adds to a keyframe, its share of the index a
 
 
 class Waiting(Struct, frozen=True, gc=False):
-    """A keyframe the server does not have yet."""
+    """A keyframe or correction that the server does not have yet."""
 
     seq: int
     position: journal.Position
     nbytes: int
+    is_correction: bool = False
+
+    @property
+    def kind(self) -> str:
+        """`keyframe` or `correction`."""
+        return "correction" if self.is_correction else "keyframe"
 
 
 class Segment(Struct):
@@ -66,7 +72,6 @@ class Spool:
         used_bytes: of the disk; keyframes that have left the queue but share a file with others count.
         next_seq: the number of the next keyframe.
         left: the last number that an earlier scanner is known to have used; 0 = there was none.
-        pinned: there is more to say of its session: an empty spool keeps it, too.
 
     Raises:
         JournalError: when the folder cannot be used, another scanner uses it, or it waits for another map.
@@ -81,9 +86,14 @@ class Spool:
     ) -> None:
         self.temporary = folder is None
         self.map_name = map_name
-        self.pinned = False
         self.folder = _temporary_folder() if folder is None else Path(folder)
         self._lock = lock_folder(self.folder, "spool", "scanner")
+        if (old := self.folder / "corrections.tsc").exists():
+            log.warning(
+                "%s holds corrected poses as an earlier development version kept them: it is not read; "
+                "delete it to silence this",
+                old,
+            )
         try:
             self._open(segment_bytes, map_name)
         except JournalError:
@@ -107,7 +117,8 @@ class Spool:
                 segment.gone.append(record.seq)
             else:
                 segment.waiting += 1
-                self.waiting.append(Waiting(record.seq, record.position, record.nbytes))
+                place = (record.seq, record.position, record.nbytes)
+                self.waiting.append(Waiting(*place, record.is_correction))
         self.waiting_bytes = sum(entry.nbytes for entry in self.waiting)
         last = max([record.seq for record in found] + [*self._gone.numbers], default=0)
         self.left = last
@@ -150,7 +161,7 @@ class Spool:
         except JournalError:
             self._gone.add(seq)
             raise
-        return Waiting(seq, position, sum(map(len, frames)))
+        return Waiting(seq, position, sum(map(len, frames)), is_correction(frames[0]))
 
     def add(self, entry: Waiting) -> None:
         """Queue a written keyframe."""
@@ -163,6 +174,14 @@ class Spool:
         self.used_bytes += end - segment.nbytes
         segment.nbytes = end
         self._idle.discard(number)
+
+    def describe(self) -> str:
+        """What waits, counted."""
+        corrections = sum(entry.is_correction for entry in self.waiting)
+        keyframes = len(self.waiting) - corrections
+        counts = [(keyframes, "keyframes")] if keyframes or not corrections else []
+        counts += [(corrections, "corrections")] if corrections else []
+        return " and ".join(f"{count} {noun}" for count, noun in counts)
 
     def read(self, entry: Waiting) -> list[memoryview]:
         """The frames of a keyframe.
@@ -209,7 +228,7 @@ class Spool:
     def _delete_segments(self, below: int | None = None) -> None:
         # The newest stays: a keyframe that `write` has just put there may not be queued yet.
         newest = next(reversed(self._segments), 0)
-        for number in [n for n in self._idle if n < (newest if below is None or self.pinned else below)]:
+        for number in [n for n in self._idle if n < (newest if below is None else below)]:
             self._forget(number)
 
     def _forget(self, number: int) -> None:
@@ -229,7 +248,7 @@ class Spool:
             log.warning("%s", error)
         if self.temporary:
             shutil.rmtree(self.folder, ignore_errors=True)
-        elif not self.waiting and not self.pinned:
+        elif not self.waiting:
             for number in list(self._segments):
                 self._forget(number)
             self._gone.clear()

@@ -110,9 +110,7 @@ class FuserSupervisor:
     def fuse(self, order: fuser_messages.Fuse) -> bool:
         """Hand out a keyframe; False when it has to be tried again."""
         if self._blame.get(order.index, 0) >= _ENOUGH:
-            order = fuser_messages.Fuse(
-                order.index, order.position, order.session, order.seq, order.client, "crash"
-            )
+            order = msgspec.structs.replace(order, skip="crash")
         if not self.send(order):
             return False
         if not self.in_flight:

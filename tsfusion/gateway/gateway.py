@@ -19,7 +19,6 @@ from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import fuser_queries
 from tsfusion.gateway.access_control import AccessControl
 from tsfusion.gateway.client_routes import ClientRoute, ClientRoutes
-from tsfusion.gateway.correction_intake import Corrector
 from tsfusion.gateway.fuser_queries import FuserQueries
 from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.keyframe_intake import KeyframeIntake
@@ -28,10 +27,7 @@ from tsfusion.gateway.memory_guard import MemoryGuard
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Ports, Subscriptions, each, send_now
 from tsfusion.wire import messages, sockets
-from tsfusion.wire.corrections import Corrections
 from tsfusion.wire.health import Health
-from tsfusion.wire.keyframe_header import VERSION
-from tsfusion.wire.messages import said
 from tsfusion.wire.sockets import mesh_topic
 
 log = logging.getLogger(__name__)
@@ -67,7 +63,6 @@ class Gateway:
         self._routes = ClientRoutes()
         self._intake = KeyframeIntake(server, self.maps, door, self)
         self._refused = self._intake.refused
-        self._corrector = Corrector(server, self.maps, self._intake)
         self._questions = FuserQueries(self._answer, server.memory_bytes // _MESHES_SHARE)
         self._topics = Subscriptions()
         self._watched: dict[str, bool] = {}  # what each fuser knows of it
@@ -192,22 +187,17 @@ class Gateway:
         if client is None:
             self._refused["key"] += 1
             return
-        identity, *rest = frames
         try:
-            message = said([frame.buffer for frame in rest])
-        except DecodeError as error:
+            identity, content = frames
+            message = messages.decode_to_server(content.buffer)
+        except (DecodeError, ValueError) as error:
             self._refused["control"] += 1
             log.debug("%s", error)
             return
-        self._on_message(identity.bytes, message, client, [frame.buffer for frame in rest[1:]])
+        self._on_message(identity.bytes, message, client)
 
-    def _on_message(
-        self, identity: bytes, message: messages.ToServer, client: str, arrays: Sequence[Any]
-    ) -> None:
-        if isinstance(message, Corrections):
-            if self._accepting and (answer := self._corrector.take(message, arrays, client)) is not None:
-                self._answer(identity, answer)
-        elif isinstance(message, messages.Command):
+    def _on_message(self, identity: bytes, message: messages.ToServer, client: str) -> None:
+        if isinstance(message, messages.Command):
             self._on_command(identity, message, client)
         elif isinstance(message, messages.Hello):
             self._on_hello(identity, message, client)
@@ -221,20 +211,19 @@ class Gateway:
         durable, fused = self.maps.progress(hello.map, hello.session)
         welcome = messages.Welcome(
             epoch=self.epoch,
-            version=VERSION,
+            version=messages.PROTOCOL_VERSION,
             durable=durable,
             fused=fused,
             window_keyframes=self._server.window_keyframes,
             window_bytes=self._server.window_bytes,
             max_frame_bytes=self._server.max_frame_bytes,
-            corrections=self.maps.corrected(hello.map, hello.session)[0],
         )
         self._answer(identity, welcome)
 
     def _denial(self, identity: bytes, hello: messages.Hello, client: str) -> tuple[str, str] | None:
         """Why a session is not opened, or None."""
-        if hello.version != VERSION:
-            speaks = f"the server speaks version {VERSION} of the wire format"
+        if hello.version != messages.PROTOCOL_VERSION:
+            speaks = f"the server speaks version {messages.PROTOCOL_VERSION} of the wire format"
             return "version", f"{speaks}, this client {hello.version}"
         hosted = self.maps.open_for_client(hello.map)
         if hosted is None:
@@ -298,7 +287,7 @@ class Gateway:
             duplicates=self._intake.duplicates,
             maps=found,
             clients=tuple(
-                route.health(now, self.maps.progress(*route.place), self.maps.corrected(*route.place))
+                route.health(now, self.maps.progress(*route.place), self.maps.corrections(*route.place))
                 for route in self._routes
             ),
         )

@@ -4,6 +4,7 @@
 import logging
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import zmq
@@ -12,7 +13,6 @@ from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.gateway.correction_store import Revisions
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.journal_retention import JournalRetention
 from tsfusion.gateway.keyframe_index import KeyframeIndex
@@ -22,7 +22,7 @@ from tsfusion.journal import Journal, state_folder
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import keyframe_times
 from tsfusion.wire.health import MapHealth, MapState
-from tsfusion.wire.keyframe_header import KeyframeHeader
+from tsfusion.wire.record_header import CorrectionHeader, RecordHeader
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +38,6 @@ class HostedMap:
     Attributes:
         warm: the fuser has been ready once: what the map has of each session is known.
         problem: why keyframes are not taken now; empty = they are.
-        revisions: the corrected poses of its keyframes.
     """
 
     def __init__(
@@ -60,14 +59,14 @@ class HostedMap:
         self._journal = Journal(
             self.folder / state_folder.JOURNAL_FOLDER, segment, min_free_bytes=server.min_free_bytes
         )
-        self.revisions = Revisions(self.folder / state_folder.CORRECTIONS_FOLDER, server.min_free_bytes)
         self._quarantine = Quarantine(self.folder / state_folder.QUARANTINE_FOLDER, server.quarantine_bytes)
         self.sessions = Sessions()
         self._index = KeyframeIndex()
         self._index.recover(self._journal.found, self.sessions)
         self._journal.found = []
         self._turns = FairQueue()
-        self._waiting = len(self._index)
+        self._count_waiting()
+        self._corrections = self._waiting_corrections
         self._outcomes = KeyframeOutcomes(
             name,
             self._index,
@@ -80,12 +79,13 @@ class HostedMap:
         self._held_until = 0.0
         self._lost = ""
         self._retention = JournalRetention(self._journal, self._index, self.sessions, most)
+        _warn_of_old_corrections(self.folder)
         self.fuser = FuserSupervisor(context, self.folder, server, volume)
 
     @property
     def drained(self) -> bool:
         """Whether the map has every keyframe of the journal."""
-        return self.fuser.idle and not self._waiting
+        return self.fuser.idle and not self._waiting and not self._waiting_corrections
 
     @property
     def settled(self) -> bool:
@@ -110,8 +110,8 @@ class HostedMap:
         """Seconds for which nothing is taken because the disk refused."""
         return max(self._held_until - now, 0.0)
 
-    def accept(self, header: KeyframeHeader, frames: Sequence[Any], client: str, received_ns: int) -> None:
-        """Write the session's next keyframe to the journal, and say so.
+    def accept(self, header: RecordHeader, frames: Sequence[Any], client: str, received_ns: int) -> None:
+        """Write the session's next keyframe or correction to the journal, and say so.
 
         Raises:
             JournalError: when the disk refuses; `held` says for how long nothing is tried.
@@ -129,18 +129,24 @@ class HostedMap:
         session = self.sessions.open(header.session, client)
         session.durable = header.seq
         durable_ns = time.monotonic_ns()
+        is_correction = isinstance(header, CorrectionHeader)
         self._index.add(
             position,
             session,
             header.seq,
-            captured_ns=header.captured_ns,
+            captured_ns=0 if isinstance(header, CorrectionHeader) else header.captured_ns,
             received_ns=received_ns,
             durable_ns=durable_ns,
+            is_correction=is_correction,
         )
-        self._waiting += 1
-        self._last = durable_ns / 1e9
         self._turns.add(session)
-        self._clients.observe(self.name, "journal", (durable_ns - received_ns) / 1e9)
+        if is_correction:
+            self._corrections += 1
+            self._waiting_corrections += 1
+        else:
+            self._waiting += 1
+            self._last = durable_ns / 1e9
+            self._clients.observe(self.name, "journal", (durable_ns - received_ns) / 1e9)
         self._outcomes.acknowledge(
             header.session, [keyframe_times.Stamps(header.seq, received_ns, durable_ns)]
         )
@@ -164,7 +170,9 @@ class HostedMap:
         while (heard := self.fuser.receive()) is not None:
             message, frames = heard
             if isinstance(message, fuser_messages.Done):
-                self._waiting -= 1
+                is_correction = self._index[message.index].is_correction
+                self._waiting_corrections -= is_correction
+                self._waiting -= not is_correction
                 self._outcomes.on_done(message)
             elif isinstance(message, fuser_messages.Ready):
                 self._on_ready(message)
@@ -203,7 +211,12 @@ class HostedMap:
         while self.fuser.wants_work and (session := self._turns.next()) is not None:
             entry = self._index[session.entries[session.handed]]
             order = fuser_messages.Fuse(
-                entry.index, entry.position, session.key, entry.stamps.seq, session.client
+                entry.index,
+                entry.position,
+                session.key,
+                entry.stamps.seq,
+                session.client,
+                is_correction=entry.is_correction,
             )
             if not self.fuser.fuse(order):
                 return
@@ -216,20 +229,25 @@ class HostedMap:
             session.durable = max(session.durable, progress.seq)
             session.fused = max(session.fused, progress.seq)
         self._turns.clear()
-        self._waiting = 0
         for session in self.sessions:
             done = ready.done.get(session.key)
             session.in_map = done.seq if done else 0
             session.handed = self._index.after(session, done.seq) if done else 0
-            self._waiting += len(session.entries) - session.handed
             if session.handed < len(session.entries):
                 self._turns.add(session)
+        self._count_waiting()
         self._outcomes.on_ready(ready)
         self._retention.on_ready()
         if not self.warm:
             self.warm = True
             log.info("the map is open", extra=logs.about(map=self.name))
         self._check_begin(ready)
+
+    def _count_waiting(self) -> None:
+        """Count the keyframes and the corrections that were not given to the fuser."""
+        waiting = [session.entries[session.handed :] for session in self.sessions]
+        self._waiting_corrections = sum(map(self._index.corrections, waiting))
+        self._waiting = sum(map(len, waiting)) - self._waiting_corrections
 
     def _check_begin(self, ready: fuser_messages.Ready) -> None:
         self._lost = ""
@@ -256,8 +274,6 @@ class HostedMap:
         """What a person should know, though keyframes are taken and fused."""
         damaged = self._journal.damaged
         told = [f"{damaged} keyframes of its journal are damaged and lost"] if damaged else []
-        if self.revisions.damaged:
-            told.append(f"the corrections of {self.revisions.damaged} sessions are damaged and lost")
         return [*told, self._lost] if self._lost else told
 
     def health(self) -> MapHealth:
@@ -280,5 +296,15 @@ class HostedMap:
             last_keyframe_s=None if self._last is None else max(now - self._last, 0.0),
             delay_ms=told.delays.summary(),
             delay_bound_ms=told.delays.bound_ms,
-            corrections=self.revisions.taken,
+            corrections=self._corrections,
+        )
+
+
+def _warn_of_old_corrections(folder: Path) -> None:
+    old = folder / "corrections"
+    if any(old.glob("*.tsc")):
+        log.warning(
+            "%s holds corrected poses as an earlier development version kept them: they are not read; "
+            "delete the folder to silence this",
+            old,
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Todo."""
+"""The records of a map's journal in memory: where each lies, and when it passed which stage."""
 
 from array import array
 from bisect import bisect_left, bisect_right
@@ -13,23 +13,24 @@ from tsfusion.wire.keyframe_times import Stamps
 
 
 class IndexEntry(Struct, frozen=True):
-    """One journaled keyframe."""
+    """One journaled keyframe or correction."""
 
     index: int
     position: Position
     session: int
     stamps: Stamps
     captured_ns: int
+    is_correction: bool
 
 
 _COLUMNS = (
-    *("segment", "offset", "session", "seq", "captured_ns"),
+    *("segment", "offset", "session", "seq", "captured_ns", "is_correction"),
     *("received_ns", "durable_ns", "fuse_start_ns", "fused_ns"),  # as in Stamps
 )
 
 
 class KeyframeIndex:
-    """Every keyframe of the journal in order: 72 bytes each. Stamps are 0 for those of earlier runs.
+    """Every record of the journal in order: 80 bytes each. Stamps are 0 for those of earlier runs.
 
     An index stays what it is when the keyframes before it are forgotten.
     """
@@ -50,7 +51,7 @@ class KeyframeIndex:
             session = sessions.open(record.session, record.client)
             if record.seq > session.durable:
                 session.durable = record.seq
-                self.add(record.position, session, record.seq)
+                self.add(record.position, session, record.seq, is_correction=record.is_correction)
 
     def add(
         self,
@@ -61,9 +62,11 @@ class KeyframeIndex:
         captured_ns: int = 0,
         received_ns: int = 0,
         durable_ns: int = 0,
+        is_correction: bool = False,
     ) -> int:
-        """Append a keyframe; its index."""
-        place = (position.segment, position.offset, session.number, seq, captured_ns)
+        """Append a record; its index."""
+        session.corrections += is_correction
+        place = (position.segment, position.offset, session.number, seq, captured_ns, is_correction)
         values = (*place, received_ns, durable_ns, 0, 0)
         for column, value in zip(self._columns.values(), values, strict=True):
             column.append(value)
@@ -96,10 +99,16 @@ class KeyframeIndex:
         self._columns["fused_ns"][index - self._first] = fused_ns
 
     def __getitem__(self, index: int) -> IndexEntry:
-        segment, offset, session, seq, captured, *stamps = (
+        segment, offset, session, seq, captured, is_correction, *stamps = (
             column[index - self._first] for column in self._columns.values()
         )
-        return IndexEntry(index, Position(segment, offset), session, Stamps(seq, *stamps), captured)
+        place, times = Position(segment, offset), Stamps(seq, *stamps)
+        return IndexEntry(index, place, session, times, captured, bool(is_correction))
+
+    def corrections(self, indices: Iterable[int]) -> int:
+        """How many of these records are corrections."""
+        column, first = self._columns["is_correction"], self._first
+        return sum(column[index - first] for index in indices)
 
     def after(self, session: Session, seq: int) -> int:
         """How many keyframes of a session, of those not forgotten, have a number up to `seq`."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What becomes of a keyframe message: checked, and journaled, held, refused or known already.
+"""What becomes of a keyframe or correction that arrives: checked; journaled, held, refused or known.
 
 Cheapest first, and nothing is answered before it is known to be the session's own client that asks: a
 forged message must not have a good keyframe given up.
@@ -21,7 +21,7 @@ from tsfusion.gateway.keyframe_outcomes import Clients
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.wire import codec, messages
-from tsfusion.wire.keyframe_header import KeyframeHeader, Refused, unpack
+from tsfusion.wire.record_header import RecordHeader, Refused, unpack
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class KeyframeIntake:
         elif not self.owns(hosted, header.session, client):
             self.refused["session"] += 1
             subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
-            log.warning("a keyframe is refused: its session is another client's", extra=subject)
+            log.warning("a %s is refused: its session is another client's", header.kind, extra=subject)
         elif not self._has_to_wait(hosted, header.session, client, nbytes):
             self._on_checked(hosted, header, buffers, client, received_ns)
 
@@ -110,7 +110,7 @@ class KeyframeIntake:
         self._clients.send(key, messages.Hold(key, seconds, reason, message))
 
     def _on_checked(
-        self, hosted: HostedMap, header: KeyframeHeader, buffers: list[Any], client: str, received_ns: int
+        self, hosted: HostedMap, header: RecordHeader, buffers: list[Any], client: str, received_ns: int
     ) -> None:
         # before all else: what is journaled must not be refused when it comes again
         verdict = hosted.sessions.admit(header.session, header.seq, header.previous)
@@ -122,7 +122,7 @@ class KeyframeIntake:
             return
         try:
             codec.check(buffers, self._server.max_frame_bytes)
-            self.quotas.check(header)
+            self.quotas.check(header, buffers)
             self._clients.heard(header.session, client, scans=True)
             hosted.accept(header, buffers, client, received_ns)
         except Refused as error:
@@ -130,7 +130,7 @@ class KeyframeIntake:
         except JournalError:
             self._hold(header.session, hosted.held(time.monotonic()), "disk", hosted.problem)
 
-    def _refuse(self, error: Refused, client: str, header: KeyframeHeader | None = None) -> None:
+    def _refuse(self, error: Refused, client: str, header: RecordHeader | None = None) -> None:
         """Count a bad message; answer it when it says whose it is, so that it is not sent for ever."""
         self.refused[error.reason] += 1
         if header is None:
@@ -140,5 +140,5 @@ class KeyframeIntake:
             return
         key, seq = header.session, header.seq
         subject = logs.about(map=header.map, session=key, seq=seq, client=client, reason=error.reason)
-        log.warning("a keyframe is refused: %s", error, extra=subject)
+        log.warning("a %s is refused: %s", header.kind, error, extra=subject)
         self._clients.send(key, messages.Nack(key, seq, "door", error.reason, str(error)))

@@ -102,10 +102,9 @@ class KeyframeOutcomes:
         session = self._sessions.numbered(entry.session)
         session.in_map = entry.stamps.seq
         self.unmeshed.append(done.index)
-        if done.reason is None:
-            self.fused += 1
-        else:
-            self.rejected[done.reason] += 1
+        if not entry.is_correction:
+            self.fused += done.reason is None
+            self.rejected.update([done.reason] if done.reason else [])
         told = done.index in self._told_rejected if done.reason else entry.stamps.fused_ns > 0
         if told:
             return  # a fuser that died before its checkpoint had said so
@@ -120,7 +119,7 @@ class KeyframeOutcomes:
 
     def _on_fused(self, session: Session, entry: IndexEntry) -> None:
         route, stamps = self._clients.route(session.key), entry.stamps
-        if stamps.durable_ns:  # 0: journaled by an earlier server
+        if stamps.durable_ns and not entry.is_correction:  # 0: journaled by an earlier server
             waited, fused = stamps.fuse_start_ns - stamps.durable_ns, stamps.fused_ns - stamps.fuse_start_ns
             self._clients.observe(self._name, "queue", waited / 1e9)
             self._clients.observe(self._name, "fuse", fused / 1e9)
@@ -136,7 +135,8 @@ class KeyframeOutcomes:
         subject = logs.about(
             map=self._name, session=session.key, seq=seq, client=session.client, reason=done.reason
         )  # fmt: skip
-        log.error("a keyframe is not in the map: %s", done.message or done.reason, extra=subject)
+        kind = "correction" if entry.is_correction else "keyframe"
+        log.error("a %s is not in the map: %s", kind, done.message or done.reason, extra=subject)
         self._clients.send(session.key, messages.Nack(session.key, seq, "map", done.reason, done.message))
         try:
             frames = read(self._journal, entry.position).frames
@@ -153,7 +153,7 @@ class KeyframeOutcomes:
 
     def _stamp_meshed(self, index: int, meshed_ns: int) -> None:
         entry = self._index[index]
-        if entry.stamps.fused_ns:
+        if entry.stamps.fused_ns and not entry.is_correction:
             self._clients.observe(self._name, "mesh", (meshed_ns - entry.stamps.fused_ns) / 1e9)
         stamps = msgspec.structs.replace(entry.stamps, meshed_ns=meshed_ns)
         self.acknowledge(self._sessions.numbered(entry.session).key, [stamps])

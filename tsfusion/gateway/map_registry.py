@@ -48,13 +48,11 @@ class MapRegistry:
         hosted = self.get(name)
         return hosted.sessions.progress(session) if hosted else (0, 0)
 
-    def corrected(self, name: str, session: bytes) -> tuple[int, int]:
-        """Of a session's corrections the newest revision, and how many keyframes they name."""
+    def corrections(self, name: str, key: bytes) -> int:
+        """How many corrections of a session were journaled."""
         hosted = self.get(name)
-        if hosted is None:
-            return 0, 0
-        kept = hosted.revisions.of(session)
-        return kept.revision, kept.keyframes
+        session = hosted.sessions.get(key) if hosted else None
+        return session.corrections if session else 0
 
     def begin(self, volumes: Mapping[str, VolumeConfig]) -> None:
         """Open these maps with these settings; one that a client asks for gets those of the default map.

@@ -27,6 +27,7 @@ class Scan(Struct, frozen=True):
     seq: int
     client: str
     nbytes: int
+    is_correction: bool = False
 
 
 def segments(folder: Path) -> list[int]:
@@ -95,7 +96,8 @@ def scan(path: Path) -> tuple[list[Scan], int]:
             level = logging.ERROR if step.lost else logging.WARNING
             log.log(level, "%s", describe(path, step))
         else:
-            found.append(Scan(step.position, step.session, step.seq, step.client, step.nbytes))
+            place = (step.position, step.session, step.seq, step.client)
+            found.append(Scan(*place, step.nbytes, step.is_correction))
     return found, lost
 
 

@@ -15,7 +15,6 @@ from tsfusion.journal.segments import segment_path, segments
 MAPS_FOLDER = "maps"
 JOURNAL_FOLDER = "journal"
 QUARANTINE_FOLDER = "quarantine"
-CORRECTIONS_FOLDER = "corrections"
 MAP_FILE = "map.tsf"
 PREVIOUS_FILE = "map.previous.tsf"
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")  # as config.MapName
@@ -77,12 +76,10 @@ class JournalPlace(Struct, frozen=True):
     Attributes:
         path: a folder of segments, or one segment file.
         quarantine: where the server of its map keeps what could not be fused; None = it is no map's.
-        corrections: where it keeps corrected poses; None = it is no map's.
     """
 
     path: Path
     quarantine: Path | None = None
-    corrections: Path | None = None
 
     def files(self) -> list[Path]:
         """Its segments, oldest first.
@@ -148,12 +145,11 @@ def find(path: Path, map_name: str | None = None) -> JournalPlace:
 
 
 def _of_map(folder: Path) -> JournalPlace:
-    beside = (folder / name for name in (QUARANTINE_FOLDER, CORRECTIONS_FOLDER))
-    return JournalPlace(folder / JOURNAL_FOLDER, *beside)
+    return JournalPlace(folder / JOURNAL_FOLDER, folder / QUARANTINE_FOLDER)
 
 
 def _is_map(folder: Path) -> bool:
-    return any((folder / name).is_dir() for name in (QUARANTINE_FOLDER, CORRECTIONS_FOLDER))
+    return (folder / QUARANTINE_FOLDER).is_dir()
 
 
 def _size(path: Path) -> int:

@@ -36,23 +36,24 @@ class Submap:
         client: sends its keyframes.
         located: its frames, in order.
         corrections: the newest of loop closure, None = there were none.
-        said: number of the last keyframe whose correction the client was told.
+        corrected_to: number of the last keyframe that a correction on its way names.
     """
 
     name: str
     client: Client
     located: TrackedTrajectory = field(default_factory=TrackedTrajectory)
     corrections: PoseCorrections | None = None
-    said: int = 0
+    corrected_to: int = 0
 
     def correct(self) -> None:
-        """Have the client say where its keyframes were, by the newest corrections."""
+        """Send where the keyframes were, by the newest corrections."""
         assert self.corrections is not None
         seqs, poses = self.located.keyframes(self.corrections)
         if len(seqs):
-            self.said = int(seqs[-1])
-            said = dict(zip(seqs.tolist(), poses, strict=True))
-            self.client.correct(said, T_map_odometry=self.corrections.T_corrected_world)
+            poses_by_seq = dict(zip(seqs.tolist(), poses, strict=True))
+            sent = self.client.correct(poses_by_seq, T_map_odometry=self.corrections.T_corrected_world)
+            if sent is not None:  # else it was skipped, and `finish` tries again
+                self.corrected_to = int(seqs[-1])
 
 
 class ScanState(msgspec.Struct, frozen=True, kw_only=True):
@@ -144,7 +145,7 @@ class Scanner:
     def finish(self) -> None:
         """No frame comes any more: keyframes since the last loops are moved by what those said, too."""
         for submap in self.submaps:
-            if submap.corrections is not None and submap.located.last_seq > submap.said:
+            if submap.corrections is not None and submap.located.last_seq > submap.corrected_to:
                 submap.correct()
 
     @property
