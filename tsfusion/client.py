@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""The scanner's sending side: five lines for whoever brings a localiser of their own.
+"""The client: sends keyframes to a server, in five lines for whoever brings a localiser of their own.
 
     with tsfusion.Client("tcp://127.0.0.1:5555", spool="spool-dir") as client:
         for keyframe in keyframes:
             client.send(keyframe)
         client.flush(timeout=10.0)
 
-`send` encodes and writes to the spool; a thread of its own does the talking. What happens when keyframes come
-faster than the map takes them is the policy's choice (`tsfusion.delivery.backpressure`). Taichi is never
-imported.
+`send` encodes a keyframe and writes it to the spool; a thread of its own sends what is there. The policy
+decides what happens when keyframes come faster than the map takes them (`tsfusion.delivery.backpressure`).
+Taichi is never imported.
 """
 
 import atexit
@@ -48,7 +48,7 @@ class Client:
     Args:
         address: the server's data address.
         spool: a folder for keyframes that are not acknowledged yet; what a dead client left there is sent
-            first. None = a temporary one, gone with `close`.
+            first. None = a temporary one, deleted by `close`.
         control: the server's control address; default the port after `address`.
         map: the map to scan into; default the config's, as with the following.
         policy: what happens to keyframes that the map has no time for.
@@ -91,10 +91,10 @@ class Client:
         self._began = time.monotonic()
         self._thread = threading.Thread(target=self._sender.run, name="tsfusion-client", daemon=True)
         self._thread.start()
-        atexit.register(self.close)  # also who forgets to leaves no temporary spool behind
+        atexit.register(self.close)  # no temporary spool stays behind when nobody calls `close`
 
     def send(self, keyframe: Keyframe) -> int | None:
-        """Take a keyframe; its number once it is in the spool, None when it is skipped (`stats.skipped`).
+        """Put a keyframe into the spool; its number there, None when it is skipped (`stats.skipped`).
 
         Never waits for the network, unless the policy is `block`; never fails because of the disk.
 
@@ -140,9 +140,8 @@ class Client:
         correction = corrections.checked(poses, T_map_odometry=T_map_odometry, removed=removed)
         with self._sending:
             self._check_running()
-            with self._outbox.changed:
-                self._outbox.check_taken(correction.seqs)
-                self._outbox.check_taken(correction.removed)
+            self._outbox.check_taken(correction.seqs)
+            self._outbox.check_taken(correction.removed)
             seq = self._pressure.put_correction(correction)
         if seq is not None:
             self._sender.wake()
@@ -158,10 +157,11 @@ class Client:
         """
         timeout = self._config.connect_timeout if timeout is None else timeout
         box = self._outbox
-        self._wait(lambda: box.connected or bool(box.turned_away), timeout)
-        if box.turned_away:
-            raise (NotAllowed if box.turned_away == "keys" else ServerUnreachable)(self._why())
-        if not box.connected:
+        self._wait(lambda: box.link_state.is_connected or box.link_state.is_refused, timeout)
+        state = box.link_state
+        if state.is_refused:
+            raise (NotAllowed if state.kind == "locked_out" else ServerUnreachable)(state.why)
+        if not state.is_connected:
             raise ServerUnreachable(f"{self._why()} (waited {timeout:g} s)")
 
     def flush(self, timeout: float = 10.0) -> None:
@@ -171,26 +171,20 @@ class Client:
             FlushTimeout: after `timeout` seconds; the rest stays in the spool and is still being sent.
             KeyframeRefused: when the server turned some away for good since the last flush.
         """
-        box = self._outbox
-        done = self._wait(lambda: not box.spool.waiting, timeout)
-        with box.changed:
-            refusals, first = box.take_refusals()
-        if refusals:
-            more = f" (and {refusals - 1} more)" if refusals > 1 else ""
-            raise KeyframeRefused(f"{first}{more}")
+        done = self._wait(lambda: self._outbox.is_durable, timeout)
+        if refusals := self._outbox.take_refusals():
+            raise KeyframeRefused(refusals)
         if not done:
-            with box.changed:
-                what = box.spool.describe()
-            raise FlushTimeout(f"{what} are not acknowledged after {timeout:g} s: {self._why()}")
+            waiting = self._outbox.describe_waiting()
+            raise FlushTimeout(f"{waiting} are not acknowledged after {timeout:g} s: {self._why()}")
 
     def wait_fused(self, timeout: float = 60.0) -> None:
-        """Wait until the map has taken or rejected everything sent (`stats.rejected` says what).
+        """Wait until the map has taken or rejected everything sent (`stats.rejected` counts the latter).
 
         Raises:
             FlushTimeout: after `timeout` seconds.
         """
-        box = self._outbox
-        if not self._wait(lambda: not box.spool.waiting and not box.unfused, timeout):
+        if not self._wait(lambda: self._outbox.is_fused, timeout):
             raise FlushTimeout(f"the map does not have every keyframe after {timeout:g} s: {self._why()}")
 
     def wait_meshed(self, timeout: float = 60.0) -> None:
@@ -199,39 +193,35 @@ class Client:
         Raises:
             FlushTimeout: after `timeout` seconds.
         """
-        box = self._outbox
-        if not self._wait(lambda: not (box.spool.waiting or box.unfused or box.unmeshed), timeout):
+        if not self._wait(lambda: self._outbox.is_meshed, timeout):
             raise FlushTimeout(f"the mesh is not up to date after {timeout:g} s: {self._why()}")
 
     @property
     def records(self) -> list[KeyframeTimes]:
         """When each keyframe passed each stage, on this process's monotonic clock (the last 65536)."""
-        with self._outbox.changed:
-            return self._outbox.times.copy()
+        return self._outbox.times()
 
     @property
     def newest_fused(self) -> KeyframeTimes | None:
         """The stamps of the newest keyframe that is in the map; None = none is."""
-        with self._outbox.changed:
-            return self._outbox.times.newest_fused()
+        return self._outbox.newest_fused()
 
     @property
     def stats(self) -> ClientStats:
         """Counts since this client began."""
-        with self._outbox.changed:
-            return self._outbox.stats()
+        return self._outbox.stats()
 
     @property
     def connected(self) -> bool:
         """Whether the server answered and has not fallen silent."""
-        return self._outbox.connected
+        return self._outbox.link_state.is_connected
 
     @property
     def problem(self) -> str:
         """Why the server takes nothing at the moment; empty when it does."""
-        box = self._outbox
-        early = time.monotonic() - self._began < _SILENCE and not box.problem
-        return "" if (box.connected or early) and not box.turned_away else self._why()
+        state = self._outbox.link_state
+        is_early = time.monotonic() - self._began < _SILENCE and (state.kind == "opening" or not state.why)
+        return "" if state.is_connected or (is_early and not state.is_refused) else self._why()
 
     def close(self) -> None:
         """Stop sending. Call `flush` first: what a temporary spool still holds is lost (and logged)."""
@@ -239,15 +229,13 @@ class Client:
             if self._closed:
                 return
             self._closed = True
-            with self._outbox.changed:
-                self._outbox.changed.notify_all()
+            self._outbox.wake_waiting()
             atexit.unregister(self.close)
             self._sender.stop()
             self._thread.join()
-            spool = self._outbox.spool
-            if spool.temporary and spool.waiting:
-                log.error("%s are lost: not acknowledged, and the spool was temporary", spool.describe())
-            self._outbox.spool.close()
+            waiting = self._outbox.describe_waiting()
+            if self._outbox.close():
+                log.error("%s are lost: not acknowledged, and the spool was temporary", waiting)
 
     def __enter__(self) -> "Client":
         return self
@@ -258,10 +246,7 @@ class Client:
         self.close()
 
     def _await_turn(self) -> None:
-        with self._outbox.changed:
-            while self._pressure.must_wait:
-                self._check_running()
-                self._outbox.changed.wait(0.5)
+        self._outbox.wait(lambda: not self._pressure.must_wait, None, self._check_running)
 
     def _check_running(self) -> None:
         if self._closed:
@@ -270,26 +255,17 @@ class Client:
             raise TransportError("the client's sending thread has died")
 
     def _wait(self, reached: Callable[[], bool], timeout: float) -> bool:
-        deadline = time.monotonic() + timeout
-        with self._outbox.changed:
-            while not reached():
-                self._check_running()
-                left = deadline - time.monotonic()
-                if left <= 0:
-                    return False
-                self._outbox.changed.wait(min(left, 0.5))
-        return True
+        return self._outbox.wait(reached, timeout, self._check_running)
 
     def _why(self) -> str:
-        if self._outbox.problem:
-            return self._outbox.problem
-        if self._outbox.opening:
-            return f"the server is opening the map {self._config.map}"
-        heard = self._sender.heard
-        silence = time.monotonic() - heard
-        if not heard:
+        """Why not everything is at the server, for a person."""
+        box, last_heard = self._outbox, self._sender.last_heard
+        if box.link_state.why:
+            return box.link_state.why
+        silence = time.monotonic() - last_heard
+        if not last_heard:
             return f"no server answers at {self._control}"
         why = "the server is behind"
         if silence > _SILENCE:
             why = f"nothing was heard from the server at {self._control} for {silence:.1f} s"
-        return why if self._outbox.spool.temporary else f"{why}; they stay in {self._outbox.spool.folder}"
+        return why if box.is_temporary else f"{why}; they stay in {box.spool_folder}"

@@ -53,7 +53,7 @@ class Link:
     def __init__(self, meanwhile: Callable[[], None] = lambda: None) -> None:
         self.meanwhile = meanwhile  # what other threads do while this one sends
         self.socket = self
-        self.problem, self.refused, self.due, self.made = "", False, 0.0, True
+        self.problem, self.refused, self.due, self.is_made = "", False, 0.0, True
         self.there: deque[Any] = deque()
         self.back: deque[Any] = deque()
         self.old: list[deque[Any]] = []  # what earlier connections still have under way
@@ -75,7 +75,7 @@ class Link:
             raise zmq.Again
         return [self.back.popleft()]
 
-    def look(self, _: float) -> tuple[None, bool]:
+    def check(self, _: float) -> tuple[None, bool]:
         ended, self.ended = self.ended, False
         return None, ended
 
@@ -169,7 +169,7 @@ class World:
         self.pressure = Backpressure(self.outbox, self.config)
         self.sender = Sender("tcp://data", "tcp://control", self.outbox, self.config)
         self.control, self.data = Link(), Link(self.meanwhile)
-        self.sender._link, self.sender._data = self.control, self.data  # type: ignore[assignment]
+        self.sender._control, self.sender._data = self.control, self.data  # type: ignore[assignment]
         self.sender._wait = lambda now: None  # type: ignore[method-assign]
 
     def kill_client(self) -> None:
@@ -284,9 +284,9 @@ class World:
             for happens in (self.run_client, self.deliver_data, self.deliver_control, self.fuse):
                 happens()
             self.check_order()
-            if not self.spool.waiting and not self.outbox.unfused:
+            if self.outbox.is_fused:
                 return
-        raise AssertionError(f"it does not come to an end: {self.outbox.stats()}, {self.outbox.problem}")
+        raise AssertionError(f"it does not come to an end: {self.outbox.stats()}, {self.outbox.link_state}")
 
     # --- what must hold ---
 

@@ -343,7 +343,7 @@ def test_a_keyframe_that_stays_unreadable_is_given_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read = journal.read
-    monkeypatch.setattr("tsfusion.delivery.sender._READ_AGAIN", 0.01)
+    monkeypatch.setattr("tsfusion.delivery.sender._READ_INTERVAL", 0.01)
 
     def damaged(folder: Path, position: journal.Position) -> journal.Record:
         record = read(folder, position)

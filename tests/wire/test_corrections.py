@@ -61,9 +61,7 @@ def test_corrections_survive_the_wire_to_the_bit(count: int) -> None:
 def test_the_golden_correction_stays_readable() -> None:
     """As others implement it: a change here is a new version of the record."""
     quarter = np.array([[0.0, -1, 0, 1.5], [1, 0, 0, -2], [0, 0, 1, 1 / 3], [0, 0, 0, 1]])
-    wanted = checked(
-        {2: quarter, 7: pose(1e5, -1e-300)}, T_map_odometry=pose(0.1, 0.2, 0.3), removed=[3, 5]
-    )
+    wanted = checked({2: quarter, 7: pose(1e5, -1e-300)}, T_map_odometry=pose(0.1, 0.2, 0.3), removed=[3, 5])
     stored = (GOLDEN / "correction-v1.bin").read_bytes()
     count, head, body = struct.unpack_from("<BII", stored)
     frames = [stored[9 : 9 + head], stored[9 + head :]]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Keyframes that are given up, kept aside so that a person can see what was wrong with them."""
+"""Records that are given up, kept aside so that a person can see what was wrong with them."""
 
 import logging
 
@@ -16,30 +16,28 @@ log = logging.getLogger(__name__)
 
 
 class RefusedFolder:
-    """A small journal inside the spool, one segment a keyframe; the oldest go first.
+    """A small journal inside the spool, one segment a record; the oldest go first.
 
     A temporary spool keeps nothing.
     """
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
-        self._folder = outbox.spool.folder / FOLDER
+        self._folder = outbox.spool_folder / FOLDER
         self._journal: journal.Journal | None = None
 
     def give_up(self, entry: Waiting, reason: str, message: str, *, readable: bool = True) -> None:
-        """Take a keyframe out of the queue for good. Not while holding `changed`: this uses the disk."""
+        """Take a record out of the spool for good, and keep a copy when it can be read."""
         log.error("%s %d is lost (%s): %s", entry.kind, entry.seq, reason, message)
-        if readable and not self._outbox.spool.temporary and entry.nbytes + _FILE_OVERHEAD <= MAX_BYTES:
+        if readable and not self._outbox.is_temporary and entry.nbytes + _FILE_OVERHEAD <= MAX_BYTES:
             try:
                 self._keep(entry)
             except (JournalError, OSError) as error:
                 log.warning("%s %d could not be kept aside: %s", entry.kind, entry.seq, error)
-        with self._outbox.changed:
-            self._outbox.refuse(entry, reason, message)
+        self._outbox.refuse(entry, reason, message)
 
     def _keep(self, entry: Waiting) -> None:
-        spool = self._outbox.spool
-        frames = spool.read(entry)
+        frames = self._outbox.read(entry)
         if self._journal is None:
             self._journal = journal.Journal(self._folder, 1, sync=False)
             self._journal.found = []
@@ -47,7 +45,7 @@ class RefusedFolder:
             if self._journal.nbytes + entry.nbytes + _FILE_OVERHEAD <= MAX_BYTES:
                 break
             self._journal.forget(number)
-        position = self._journal.append(frames, session=spool.session, seq=entry.seq)
+        position = self._journal.append(frames, session=self._outbox.session, seq=entry.seq)
         path = journal.segment_path(self._folder, position.segment)
         log.info("%s %d is in %s", entry.kind, entry.seq, path)
 

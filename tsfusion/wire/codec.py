@@ -19,7 +19,6 @@ from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, MAX_POINTS, Keyframe, che
 from tsfusion.wire import array_encoding, corrections, image_headers
 from tsfusion.wire.corrections import Correction
 from tsfusion.wire.record_header import (
-    VERSION,
     ArrayCodec,
     ArrayName,
     Buffer,
@@ -28,9 +27,7 @@ from tsfusion.wire.record_header import (
     RecordHeader,
     Refused,
     pack,
-    stamp,
     unpack,
-    unpack_keyframe,
 )
 
 MIN_FRAMES, MAX_FRAMES = 2, 5
@@ -128,10 +125,10 @@ def decode(frames: Sequence[Any]) -> Keyframe | Correction:
 
 def decode_keyframe(frames: Sequence[Any]) -> Keyframe:
     """The keyframe of a message; raises as `decode`, and DecodeError for a correction."""
-    unpack_keyframe(frames[0] if frames else b"")
-    keyframe = decode(frames)
-    assert isinstance(keyframe, Keyframe)
-    return keyframe
+    found = decode(frames)
+    if not isinstance(found, Keyframe):
+        raise Refused("magic", "a keyframe is expected, got a correction")
+    return found
 
 
 def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> RecordHeader:
@@ -258,6 +255,3 @@ def _unpack(buffer: Buffer, frame: Any) -> NDArray[Any]:
     if buffer.codec == "mm+dzp+zstd":
         return array_encoding.unpack_mm(frame, buffer.shape)
     return array_encoding.unpack_image(frame, dtype, buffer.shape)
-
-
-__all__ = ["VERSION", "Buffer", "KeyframeHeader", "Refused", "check", "decode", "encode", "stamp", "unpack"]

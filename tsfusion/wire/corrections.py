@@ -32,7 +32,7 @@ Transforms = NDArray[np.float64]  # (n, 4, 4)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Correction:
-    """What one correction says.
+    """The content of one correction.
 
     Attributes:
         seqs: (n,) int64, rising: the numbers of the keyframes that get another pose.

@@ -79,7 +79,7 @@ class KeyframeHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class CorrectionHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """What a correction says beside the numbers and poses in its body.
+    """The first frame of a correction, before the numbers and poses of its body.
 
     Attributes:
         session, seq, previous, map, sent_ns: as of a keyframe.
