@@ -70,24 +70,23 @@ class Run:
         return True
 
     def serve(self, now: int) -> None:
-        """What the link and the server do at this moment."""
-        box = self._outbox
+        """Let link and server do what they do at this moment."""
         if now >= self._free_at and self._journal:
             self._fused = self._journal.popleft()
             self.fused[self._fused] = now
             self._free_at = now + self._fuse_ms
         if now not in self._outage_ms:
-            with box.changed:
-                self._deliver(box)
-        self.spool = max(self.spool, len(box.spool.waiting))
+            self._deliver(self._outbox)
+        self.spool = max(self.spool, self._outbox.stats().waiting)
 
     def _deliver(self, box: Outbox) -> None:
-        box.progress(0, self._fused)
+        box.acknowledge(0, self._fused)
         ahead = self._config.backlog if self._config.policy == "drop_oldest" else None
-        while (entry := box.claim(*_WINDOW, ahead)) is not None:
+        while (claimed := box.claim(*_WINDOW, ahead)) is not None:
+            entry, _ = claimed
             box.sent(entry, 0)
             self._journal.append(entry.seq)
-            box.progress(entry.seq, self._fused)
+            box.acknowledge(entry.seq, self._fused)
 
     @property
     def done(self) -> bool:
@@ -96,7 +95,7 @@ class Run:
 
     def close(self) -> None:
         """Remove the spool."""
-        self._outbox.spool.close()
+        self._outbox.close()
 
 
 def simulate(

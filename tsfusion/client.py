@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""The scanner's sending side: five lines for whoever brings a localiser of their own.
+"""The client: sends keyframes to a server, in five lines for whoever brings a localiser of their own.
 
     with tsfusion.Client("tcp://127.0.0.1:5555", spool="spool-dir") as client:
         for keyframe in keyframes:
             client.send(keyframe)
         client.flush(timeout=10.0)
 
-`send` encodes and writes to the spool; a thread of its own does the talking. What happens when keyframes come
-faster than the map takes them is the policy's choice (`tsfusion.delivery.backpressure`). Taichi is never
-imported.
+`send` encodes a keyframe and writes it to the spool; a thread of its own sends what is there. The policy
+decides what happens when keyframes come faster than the map takes them (`tsfusion.delivery.backpressure`).
+Taichi is never imported.
 """
 
 import atexit
@@ -16,7 +16,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import TracebackType
 
 import numpy as np
@@ -28,9 +28,8 @@ from tsfusion.delivery.backpressure import Backpressure
 from tsfusion.delivery.outbox import ClientStats, Outbox
 from tsfusion.delivery.sender import Sender
 from tsfusion.delivery.spool import Spool
-from tsfusion.geometry.keyframe import Keyframe, check_pose
+from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.wire import corrections, sockets
-from tsfusion.wire.corrections import SessionCorrections
 from tsfusion.wire.curve import client_keys
 from tsfusion.wire.keyframe_times import KeyframeTimes
 from tsfusion.wire.sockets import control_address
@@ -49,7 +48,7 @@ class Client:
     Args:
         address: the server's data address.
         spool: a folder for keyframes that are not acknowledged yet; what a dead client left there is sent
-            first. None = a temporary one, gone with `close`.
+            first. None = a temporary one, deleted by `close`.
         control: the server's control address; default the port after `address`.
         map: the map to scan into; default the config's, as with the following.
         policy: what happens to keyframes that the map has no time for.
@@ -92,10 +91,10 @@ class Client:
         self._began = time.monotonic()
         self._thread = threading.Thread(target=self._sender.run, name="tsfusion-client", daemon=True)
         self._thread.start()
-        atexit.register(self.close)  # also who forgets to leaves no temporary spool behind
+        atexit.register(self.close)  # no temporary spool stays behind when nobody calls `close`
 
     def send(self, keyframe: Keyframe) -> int | None:
-        """Take a keyframe; its number once it is in the spool, None when it is skipped (`stats.skipped`).
+        """Put a keyframe into the spool; its number there, None when it is skipped (`stats.skipped`).
 
         Never waits for the network, unless the policy is `block`; never fails because of the disk.
 
@@ -114,41 +113,39 @@ class Client:
             return seq
 
     def correct(
-        self, poses: Mapping[int, NDArray[np.float64]], *, T_map_odometry: NDArray[np.float64] | None = None
-    ) -> int:
-        """Say where keyframes that were sent before really were taken; which call of this it was, from 1.
+        self,
+        poses: Mapping[int, NDArray[np.float64]],
+        *,
+        T_map_odometry: NDArray[np.float64] | None = None,
+        removed: Iterable[int] = (),
+    ) -> int | None:
+        """Correct where keyframes that were sent before were taken; the correction's number, or None.
 
-        The newest pose of a keyframe counts; one that is not named keeps what was said of it before. Kept in
-        the spool until the server has it on its disk (`stats.corrections_acknowledged`); never waits for it.
+        A correction is a record like a keyframe: its number is the session's next, it waits in the spool
+        until the server has it on its disk (`stats.corrections_acknowledged`), and it is None when the spool
+        cannot keep it (`stats.skipped`). The newest pose of a keyframe counts; one that is not named keeps
+        its pose. Never waits, whatever the policy.
 
         Args:
-            poses: by the number that `send` returned, (4, 4) float64 `T_world_camera`, at most 100,000.
+            poses: by the number that `send` returned, (4, 4) float64 `T_world_camera`.
             T_map_odometry: (4, 4) float64, what poses after the last keyframe are to be multiplied by from
                 the left; None = as before.
+            removed: the numbers of keyframes that are to be taken out of the map.
 
         Raises:
             InvalidKeyframe: for a number that was never sent, a pose that is no rigid transform, or more
-                keyframes than a session may have corrected.
+                than 100,000 keyframes.
             TransportError: after `close`.
         """
-        seqs, checked = corrections.checked(poses)
-        T = None if T_map_odometry is None else check_pose(T_map_odometry)
-        box = self._outbox
+        correction = corrections.checked(poses, T_map_odometry=T_map_odometry, removed=removed)
         with self._sending:
             self._check_running()
-            with box.changed:
-                box.check_taken(seqs)
-                new = SessionCorrections(
-                    session=box.spool.session,
-                    seqs=seqs,
-                    poses=checked,
-                    T_map_odometry=T,
-                    map=self._config.map,
-                )
-                content, number = box.correcting.add(new), box.correcting.taken
-            box.correcting.save(content)
-        self._sender.wake()
-        return number
+            self._outbox.check_taken(correction.seqs)
+            self._outbox.check_taken(correction.removed)
+            seq = self._pressure.put_correction(correction)
+        if seq is not None:
+            self._sender.wake()
+        return seq
 
     def connect(self, timeout: float | None = None) -> None:
         """Wait until the server has answered. Not needed before `send`.
@@ -160,43 +157,34 @@ class Client:
         """
         timeout = self._config.connect_timeout if timeout is None else timeout
         box = self._outbox
-        self._wait(lambda: box.connected or bool(box.turned_away), timeout)
-        if box.turned_away:
-            raise (NotAllowed if box.turned_away == "keys" else ServerUnreachable)(self._why())
-        if not box.connected:
+        self._wait(lambda: box.link_state.is_connected or box.link_state.is_refused, timeout)
+        state = box.link_state
+        if state.is_refused:
+            raise (NotAllowed if state.kind == "locked_out" else ServerUnreachable)(state.why)
+        if not state.is_connected:
             raise ServerUnreachable(f"{self._why()} (waited {timeout:g} s)")
 
     def flush(self, timeout: float = 10.0) -> None:
-        """Wait until everything sent is on the server's disk, corrections included (but where it takes none).
+        """Wait until everything sent is on the server's disk, corrections included.
 
         Raises:
             FlushTimeout: after `timeout` seconds; the rest stays in the spool and is still being sent.
             KeyframeRefused: when the server turned some away for good since the last flush.
         """
-        box = self._outbox
-        done = self._wait(lambda: not box.spool.waiting and box.correcting.settled, timeout)
-        with box.changed:
-            refusals, first = box.take_refusals()
-            refusal = box.correcting.take_refusal()
-        if refusals:
-            more = f" (and {refusals - 1} more)" if refusals > 1 else ""
-            raise KeyframeRefused(f"keyframe {first}{more}")
-        if refusal:
-            raise KeyframeRefused(refusal)
+        done = self._wait(lambda: self._outbox.is_durable, timeout)
+        if refusals := self._outbox.take_refusals():
+            raise KeyframeRefused(refusals)
         if not done:
-            what, why = f"{len(box.spool.waiting)} keyframes", self._why()
-            if not box.spool.waiting:
-                what, why = f"corrections of {box.correcting.pending} keyframes", box.correcting.held or why
-            raise FlushTimeout(f"{what} are not acknowledged after {timeout:g} s: {why}")
+            waiting = self._outbox.describe_waiting()
+            raise FlushTimeout(f"{waiting} are not acknowledged after {timeout:g} s: {self._why()}")
 
     def wait_fused(self, timeout: float = 60.0) -> None:
-        """Wait until the map has taken or rejected everything sent (`stats.rejected` says what).
+        """Wait until the map has taken or rejected everything sent (`stats.rejected` counts the latter).
 
         Raises:
             FlushTimeout: after `timeout` seconds.
         """
-        box = self._outbox
-        if not self._wait(lambda: not box.spool.waiting and not box.unfused, timeout):
+        if not self._wait(lambda: self._outbox.is_fused, timeout):
             raise FlushTimeout(f"the map does not have every keyframe after {timeout:g} s: {self._why()}")
 
     def wait_meshed(self, timeout: float = 60.0) -> None:
@@ -205,39 +193,35 @@ class Client:
         Raises:
             FlushTimeout: after `timeout` seconds.
         """
-        box = self._outbox
-        if not self._wait(lambda: not (box.spool.waiting or box.unfused or box.unmeshed), timeout):
+        if not self._wait(lambda: self._outbox.is_meshed, timeout):
             raise FlushTimeout(f"the mesh is not up to date after {timeout:g} s: {self._why()}")
 
     @property
     def records(self) -> list[KeyframeTimes]:
         """When each keyframe passed each stage, on this process's monotonic clock (the last 65536)."""
-        with self._outbox.changed:
-            return self._outbox.times.copy()
+        return self._outbox.times()
 
     @property
     def newest_fused(self) -> KeyframeTimes | None:
         """The stamps of the newest keyframe that is in the map; None = none is."""
-        with self._outbox.changed:
-            return self._outbox.times.newest_fused()
+        return self._outbox.newest_fused()
 
     @property
     def stats(self) -> ClientStats:
         """Counts since this client began."""
-        with self._outbox.changed:
-            return self._outbox.stats()
+        return self._outbox.stats()
 
     @property
     def connected(self) -> bool:
         """Whether the server answered and has not fallen silent."""
-        return self._outbox.connected
+        return self._outbox.link_state.is_connected
 
     @property
     def problem(self) -> str:
         """Why the server takes nothing at the moment; empty when it does."""
-        box = self._outbox
-        early = time.monotonic() - self._began < _SILENCE and not box.problem
-        return "" if (box.connected or early) and not box.turned_away else self._why()
+        state = self._outbox.link_state
+        is_early = time.monotonic() - self._began < _SILENCE and (state.kind == "opening" or not state.why)
+        return "" if state.is_connected or (is_early and not state.is_refused) else self._why()
 
     def close(self) -> None:
         """Stop sending. Call `flush` first: what a temporary spool still holds is lost (and logged)."""
@@ -245,16 +229,13 @@ class Client:
             if self._closed:
                 return
             self._closed = True
-            with self._outbox.changed:
-                self._outbox.changed.notify_all()
+            self._outbox.wake_waiting()
             atexit.unregister(self.close)
             self._sender.stop()
             self._thread.join()
-            lost = len(self._outbox.spool.waiting) if self._outbox.spool.temporary else 0
-            if lost:
-                log.error("%d keyframes are lost: not acknowledged, and the spool was temporary", lost)
-            self._outbox.correcting.close()
-            self._outbox.spool.close()
+            waiting = self._outbox.describe_waiting()
+            if self._outbox.close():
+                log.error("%s are lost: not acknowledged, and the spool was temporary", waiting)
 
     def __enter__(self) -> "Client":
         return self
@@ -265,10 +246,7 @@ class Client:
         self.close()
 
     def _await_turn(self) -> None:
-        with self._outbox.changed:
-            while self._pressure.must_wait:
-                self._check_running()
-                self._outbox.changed.wait(0.5)
+        self._outbox.wait(lambda: not self._pressure.must_wait, None, self._check_running)
 
     def _check_running(self) -> None:
         if self._closed:
@@ -277,26 +255,17 @@ class Client:
             raise TransportError("the client's sending thread has died")
 
     def _wait(self, reached: Callable[[], bool], timeout: float) -> bool:
-        deadline = time.monotonic() + timeout
-        with self._outbox.changed:
-            while not reached():
-                self._check_running()
-                left = deadline - time.monotonic()
-                if left <= 0:
-                    return False
-                self._outbox.changed.wait(min(left, 0.5))
-        return True
+        return self._outbox.wait(reached, timeout, self._check_running)
 
     def _why(self) -> str:
-        if self._outbox.problem:
-            return self._outbox.problem
-        if self._outbox.opening:
-            return f"the server is opening the map {self._config.map}"
-        heard = self._sender.heard
-        silence = time.monotonic() - heard
-        if not heard:
+        """Why not everything is at the server, for a person."""
+        box, last_heard = self._outbox, self._sender.last_heard
+        if box.link_state.why:
+            return box.link_state.why
+        silence = time.monotonic() - last_heard
+        if not last_heard:
             return f"no server answers at {self._control}"
         why = "the server is behind"
         if silence > _SILENCE:
             why = f"nothing was heard from the server at {self._control} for {silence:.1f} s"
-        return why if self._outbox.spool.temporary else f"{why}; they stay in {self._outbox.spool.folder}"
+        return why if box.is_temporary else f"{why}; they stay in {box.spool_folder}"

@@ -5,7 +5,8 @@ import json
 import shutil
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,6 @@ from tsfusion.journal import Journal, segment_path
 from tsfusion.journal.recording import JournalRecording
 from tsfusion.journal.state_folder import find_journal
 from tsfusion.wire import codec, corrections
-from tsfusion.wire.corrections import SessionCorrections
 
 Run = Callable[..., tuple[int, str, str]]
 ANNA, BOB = b"a" * 16, b"b" * 16
@@ -125,19 +125,38 @@ def test_a_path_without_a_journal_says_what_was_expected(state: Path, tmp_path: 
 
 
 def test_info_says_what_is_corrected(state: Path, run: Run) -> None:
-    folder = state / "maps" / "hall" / "corrections"
-    folder.mkdir()
-    seqs, poses = corrections.checked({2: se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2])), 3: pose(0.12, 4.0)})
-    path = folder / "a.tsc"
-    corrections.write(path, SessionCorrections(session=ANNA, seqs=seqs, poses=poses, revision=7))
+    """By the newest pose of each keyframe."""
+    turned = se3.exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))
+    correct(state, 4, {2: pose(50), 3: pose(0.12, 4.0)})
+    correct(state, 5, {2: turned}, removed=[1])
     _, out, _ = run("info", state)
+    assert "corrections 2" in out.splitlines()
     (anna,) = [line for line in out.splitlines() if " anna " in line]
-    assert anna.endswith("2 corrected by up to 4 m, 90° (revision 7)")
+    assert anna.endswith("2 corrected by up to 4 m, 90°, 1 removed (2 corrections)")
     assert "corrected" not in next(line for line in out.splitlines() if " bob " in line)
-    path.write_bytes(path.read_bytes()[:-1])
-    status, out, _ = run("info", state)
-    assert status == 0
-    assert "damage  corrections, byte 0: " in out
+
+
+def correct(state: Path, seq: int, poses: dict[int, np.ndarray], removed: Sequence[int] = ()) -> None:
+    """Append a correction of Anna's to the journal."""
+    with closing(journal.Journal(state / "maps" / "hall" / "journal", 1 << 20)) as log:
+        frames = corrections.encode(corrections.checked(poses, removed=removed), session=ANNA, seq=seq)
+        log.append(frames, session=ANNA, seq=seq, client="anna")
+
+
+def test_corrections_are_checked_and_recovered_but_no_keyframes(
+    state: Path, run: Run, tmp_path: Path
+) -> None:
+    correct(state, 4, {2: pose(1)})
+    status, out, _ = run("verify", state)
+    assert (status, "6 keyframes and 1 correction in" in out) == (0, True)
+    status, out, _ = run("recover", state, tmp_path / "out")
+    assert (status, "6 keyframes and 1 correction in" in out) == (0, True)
+    assert len(JournalRecording(tmp_path / "out")) == 6
+    with closing(journal.Journal(state / "maps" / "hall" / "journal", 1 << 20)) as log:
+        log.append([b"TSC\x01nonsense", b""], session=ANNA, seq=5)
+    status, out, _ = run("verify", state)
+    assert status == 1
+    assert f"correction 5 of session {ANNA.hex()[:8]} is no correction" in out
 
 
 def test_info_counts_what_is_there(state: Path, run: Run) -> None:
@@ -154,7 +173,7 @@ def test_info_counts_what_is_there(state: Path, run: Run) -> None:
         {
             "session": session.hex(), "client": client, "keyframes": 3, "first_seq": 1, "last_seq": 3,
             "first_logged_ns": 10**18 + first, "last_logged_ns": 10**18 + first + 4,
-                "revision": 0, "corrected": 0, "moved_m": 0.0, "turned_deg": 0.0,
+            "corrections": 0, "corrected": 0, "removed": 0, "moved_m": 0.0, "turned_deg": 0.0,
         }
         for first, (session, client) in enumerate([(ANNA, "anna"), (BOB, "bob")])
     ]  # fmt: skip

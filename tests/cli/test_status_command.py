@@ -58,11 +58,11 @@ def asking(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_screen_shows_corrections_where_there_are_any() -> None:
-    told = health(client("cart", revision=3, corrected=120), client("drone"))
+    told = health(client("cart", corrections=3), client("drone"))
     lines = [line.split() for line in screen(Seen(address="tcp://host:5555", health=told)).splitlines()]
-    assert next(words[-1] for words in lines if words[:1] == ["client"]) == "corrected"
-    assert next(words[-1] for words in lines if words[:1] == ["cart"]) == "120"
-    assert "corrected" not in screen(Seen(address="tcp://host:5555", health=health(client("drone"))))
+    assert next(words[-1] for words in lines if words[:1] == ["client"]) == "corrections"
+    assert next(words[-1] for words in lines if words[:1] == ["cart"]) == "3"
+    assert "corrections" not in screen(Seen(address="tcp://host:5555", health=health(client("drone"))))
 
 
 def test_a_screen_shows_it_all() -> None:

@@ -9,10 +9,11 @@ import sys
 import threading
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 from clients_and_spools import NOBODY, joined, send_all
-from keyframes_and_servers import DEADLINE, serving, until, wall
+from keyframes_and_servers import DEADLINE, pose, serving, until, wall
 from repository import ROOT
 from scripted_server import scripted
 
@@ -139,6 +140,26 @@ def test_drop_oldest_does_not_run_ahead_of_the_map() -> None:
         server.fuse_to = None
         client.wait_fused(DEADLINE)
         assert server.numbers == [*range(8), 39]
+
+
+@pytest.mark.parametrize("policy", ["thin", "drop_oldest", "block"])
+def test_corrections_are_never_thinned_dropped_or_held_up(tmp_path: Path, policy: Any) -> None:
+    config = ClientConfig(policy=policy, backlog=2)
+    with Client(NOBODY, spool=tmp_path, config=config) as client:
+        first = client.send(wall(0))
+        assert first is not None
+        taken = [client.correct({first: pose(i)}) for i in range(20)]
+        assert client.send(wall(1)) == 22
+        stats = client.stats
+        assert (stats.sent, stats.corrections_sent, stats.waiting) == (2, 20, 22)
+        if policy == "drop_oldest":
+            send_all(client, range(2, 9))
+            assert client.stats.skipped == {"dropped": 7}
+    with scripted() as server, joined(server, spool=tmp_path) as client:
+        client.flush(DEADLINE)
+        assert server.corrections == taken == [*range(2, 22)]
+        assert client.stats.corrections_acknowledged == 20
+        assert client.stats.durable == len(server.taken)
 
 
 def test_spool_all_keeps_everything(tmp_path: Path) -> None:

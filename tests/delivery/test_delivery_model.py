@@ -3,7 +3,7 @@
 
 Anything may be lost or late on either socket, data that was under way may arrive after what was sent later,
 both ends may die at any time. Whatever happens: each keyframe is journaled once and in order, or refused, or
-counted as skipped. Nothing else. And the newest corrected pose of each that is journaled gets to the server.
+counted as skipped. Nothing else. And each correction is journaled once, in order among them.
 """
 
 import math
@@ -26,12 +26,12 @@ from tsfusion.delivery.backpressure import Backpressure
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.sender import Sender
 from tsfusion.delivery.spool import Spool
-from tsfusion.wire import corrections, messages
-from tsfusion.wire.corrections import Corrections, SessionCorrections, nothing
-from tsfusion.wire.keyframe_header import VERSION, unpack
+from tsfusion.wire import codec, corrections, messages
+from tsfusion.wire.record_header import KeyframeHeader, unpack
 
 POLICIES = ("thin", "drop_oldest", "spool_all", "block")
 SEEDS = 40
+CORRECTION = -1  # in place of a keyframe's number in the journal
 
 
 class Clock:
@@ -53,7 +53,7 @@ class Link:
     def __init__(self, meanwhile: Callable[[], None] = lambda: None) -> None:
         self.meanwhile = meanwhile  # what other threads do while this one sends
         self.socket = self
-        self.problem, self.refused, self.due, self.made = "", False, 0.0, True
+        self.problem, self.refused, self.due, self.is_made = "", False, 0.0, True
         self.there: deque[Any] = deque()
         self.back: deque[Any] = deque()
         self.old: list[deque[Any]] = []  # what earlier connections still have under way
@@ -75,7 +75,7 @@ class Link:
             raise zmq.Again
         return [self.back.popleft()]
 
-    def look(self, _: float) -> tuple[None, bool]:
+    def check(self, _: float) -> tuple[None, bool]:
         ended, self.ended = self.ended, False
         return None, ended
 
@@ -101,8 +101,6 @@ class ModelServer:
         self.hasty = rng.random() < 0.5  # refuses before it looks for gaps
         self.hold = 0.0  # how likely it is that a keyframe is not wanted now
         self.deny = 0.0
-        self.corrects = rng.random() < 0.8  # else it is of an older version
-        self.corrected: dict[bytes, SessionCorrections] = {}
 
     def durable(self, session: bytes) -> int:
         return max((seq for one, seq, _ in self.journal if one == session), default=0)
@@ -112,7 +110,8 @@ class ModelServer:
 
     def on_keyframe(self, frames: list[bytes]) -> list[messages.ToClient]:
         header = unpack(frames[0])
-        session, durable, number = header.session, self.durable(header.session), header.timestamp_ns
+        session, durable = header.session, self.durable(header.session)
+        number = header.timestamp_ns if isinstance(header, KeyframeHeader) else CORRECTION
         if self.rng.random() < self.hold:
             seconds = self.rng.choice((-1.0, 0.0, 0.1, 1.0, math.nan))
             return [messages.Hold(session, seconds, "quota", "slower")]
@@ -124,35 +123,20 @@ class ModelServer:
                 return [messages.Nack(session, header.seq, "door", "values", "a three")]
             if not resend:
                 self.journal.append((session, header.seq, number))
+                if number == CORRECTION:
+                    assert max(codec.decode(frames).seqs) < header.seq
         return [messages.Ack(session, self.durable(session), self.fused.get(session, 0), (), resend)]
 
-    def revision(self, session: bytes) -> int:
-        return self.corrected.get(session, nothing(session)).revision
-
-    def on_corrections(self, head: Corrections, frames: list[bytes]) -> list[messages.ToClient]:
-        session = head.session
-        assert self.corrects
-        if self.rng.random() < self.hold:
-            return [messages.Uncorrected(session, head.revision, "quota", "slower", self.rng.random())]
-        if head.revision > self.revision(session):
-            new = corrections.unpack(head, frames)
-            assert new.seqs[-1] <= self.durable(session)
-            self.corrected[session] = self.corrected.get(session, nothing(session)).merged(new)
-        return [messages.Corrected(session, self.revision(session))]
-
-    def on_control(self, frames: bytes | list[bytes], now_ns: int) -> list[messages.ToClient]:
-        head, *others = [frames] if isinstance(frames, bytes) else frames
-        message = messages.decode_to_server(head)
+    def on_control(self, frame: bytes, now_ns: int) -> list[messages.ToClient]:
+        message = messages.decode_to_server(frame)
         assert not isinstance(message, messages.Command)
-        if isinstance(message, Corrections):
-            return self.on_corrections(message, others)
         durable, fused = self.durable(message.session), self.fused.get(message.session, 0)
         if isinstance(message, messages.Ping):
             return [messages.Pong(self.epoch, message.sent_ns, now_ns, now_ns, durable, fused)]
         if self.rng.random() < self.deny:
             return [messages.Denied(message.session, self.rng.choice(("opening", "map")), "not yet")]
-        terms = (self.window, 1 << 20, 1 << 20, self.revision(message.session) if self.corrects else None)
-        return [messages.Welcome(self.epoch, VERSION, durable, fused, *terms)]
+        terms = (self.window, 1 << 20, 1 << 20)
+        return [messages.Welcome(self.epoch, messages.PROTOCOL_VERSION, durable, fused, *terms)]
 
 
 class World:
@@ -172,7 +156,7 @@ class World:
         self.offered = 0
         self.skipped: set[int] = set()
         self.dropped: set[int] = set()
-        self.corrected: dict[tuple[bytes, int], int] = {}  # the x of the newest pose
+        self.corrections: list[tuple[bytes, int]] = []  # session, seq
         self.deaths = 0
         self.busy = True
         self.start_client()
@@ -185,7 +169,7 @@ class World:
         self.pressure = Backpressure(self.outbox, self.config)
         self.sender = Sender("tcp://data", "tcp://control", self.outbox, self.config)
         self.control, self.data = Link(), Link(self.meanwhile)
-        self.sender._link, self.sender._data = self.control, self.data  # type: ignore[assignment]
+        self.sender._control, self.sender._data = self.control, self.data  # type: ignore[assignment]
         self.sender._wait = lambda now: None  # type: ignore[method-assign]
 
     def kill_client(self) -> None:
@@ -228,13 +212,10 @@ class World:
         session = self.spool.session
         taken = [seq for one, seq in self.numbers if one == session]
         if taken:
-            seqs = sorted(self.rng.sample(taken, min(len(taken), self.rng.choice((1, 5)))))
-            x = len(self.corrected) + self.rng.randrange(1000)
-            seqs, poses = corrections.checked({seq: pose(x) for seq in seqs})
-            new = SessionCorrections(session=session, seqs=seqs, poses=poses)
-            self.outbox.check_taken(seqs)
-            self.outbox.correcting.save(self.outbox.correcting.add(new))
-            self.corrected.update({(session, seq): x for seq in seqs.tolist()})
+            seqs = self.rng.sample(taken, min(len(taken), self.rng.choice((1, 5))))
+            seq = self.pressure.put_correction(corrections.checked({seq: pose(1) for seq in seqs}))
+            assert seq is not None
+            self.corrections.append((session, seq))
 
     # --- the network ---
 
@@ -286,7 +267,7 @@ class World:
     def step(self) -> None:
         happens: dict[Callable[[], None], float] = {
             self.run_client: 10, self.deliver_data: 6, self.deliver_control: 6, self.offer: 3, self.fuse: 2,
-            self.correct: 0.2,
+            self.correct: 0.4,
             self.cut_data: 0.1, self.cut_control: 0.1, self.kill_server: 0.05, self.kill_client: 0.05,
         }  # fmt: skip
         self.data.open = self.rng.random() < 0.95
@@ -303,9 +284,9 @@ class World:
             for happens in (self.run_client, self.deliver_data, self.deliver_control, self.fuse):
                 happens()
             self.check_order()
-            if not self.outbox.behind and self.outbox.correcting.settled:
+            if self.outbox.is_fused:
                 return
-        raise AssertionError(f"it does not come to an end: {self.outbox.stats()}, {self.outbox.problem}")
+        raise AssertionError(f"it does not come to an end: {self.outbox.stats()}, {self.outbox.link_state}")
 
     # --- what must hold ---
 
@@ -315,24 +296,20 @@ class World:
             assert journaled[0][1] < journaled[1][1]
 
     def check_corrections(self) -> None:
-        """Those of keyframes that never got to the server may have been said, or not."""
-        kept = {
-            (session, seq): int(T[0, 3])
-            for session, one in self.server.corrected.items()
-            for seq, T in zip(one.seqs.tolist(), one.poses, strict=True)
-        }
-        assert kept.keys() <= self.corrected.keys()
-        if self.server.corrects:
-            for session, seq, _ in self.server.journal:
-                assert kept.get((session, seq)) == self.corrected.get((session, seq))
+        journaled = [(session, seq) for session, seq, number in self.server.journal if number == CORRECTION]
+        assert journaled == self.corrections
+        if not self.deaths:
+            stats = self.outbox.stats()
+            assert stats.corrections_sent == stats.corrections_acknowledged == len(journaled)
 
     def check_fates(self) -> None:
-        journaled = [number for _, _, number in self.server.journal]
+        keyframes = [entry for entry in self.server.journal if entry[2] != CORRECTION]
+        journaled = [number for _, _, number in keyframes]
         assert len(set(journaled)) == len(journaled)
-        for session in {session for session, _, _ in self.server.journal}:
-            own = [number for one, _, number in self.server.journal if one == session]
+        for session in {session for session, _, _ in keyframes}:
+            own = [number for one, _, number in keyframes if one == session]
             assert own == sorted(own)
-        for session, seq, number in self.server.journal:
+        for session, seq, number in keyframes:
             assert self.numbers[session, seq] == number
         refused = self.server.refused
         fates = [set(journaled), refused, self.skipped, self.dropped]

@@ -15,8 +15,8 @@ from tsfusion.core.errors import FlushTimeout, InvalidConfig, JournalError, Keyf
 from tsfusion.delivery.spool import Spool
 from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec
-from tsfusion.wire.keyframe_header import unpack
 from tsfusion.wire.queries import fetch_status
+from tsfusion.wire.record_header import unpack
 
 # --- for a while ---
 
@@ -44,8 +44,8 @@ def test_no_server_holds_a_client_for_ever_or_in_a_frenzy(seconds: float) -> Non
         if seconds in (-5.0, 0.0):
             client.flush(DEADLINE)
         else:
-            until(lambda: client._sender._talk.held)
-            held = client._sender._talk._held_until - time.monotonic()
+            until(lambda: client._sender._control_session.held)
+            held = client._sender._control_session._held_until - time.monotonic()
             assert 30 < held <= 60
 
 
@@ -163,8 +163,8 @@ def test_what_is_kept_aside_is_bounded(tmp_path: Path, monkeypatch: pytest.Monke
 def test_keyframes_say_which_map_they_are_for(tmp_path: Path) -> None:
     with Client(NOBODY, spool=tmp_path, map="yard") as client:
         client.send(wall())
-        (entry,) = client._outbox.spool.waiting
-        assert unpack(client._outbox.spool.read(entry)[0]).map == "yard"
+        (entry,) = client._outbox._spool.waiting
+        assert unpack(client._outbox.read(entry)[0]).map == "yard"
 
 
 def test_leftovers_for_another_map_are_not_sent_there(tmp_path: Path) -> None:

@@ -263,6 +263,22 @@ def _size(folder: Path) -> int:
     return sum(file.stat().st_size for file in folder.glob("*.mcap"))
 
 
+def test_a_correction_that_the_spool_cannot_keep_is_counted(tmp_path: Path) -> None:
+    config = ClientConfig(policy="spool_all", spool_bytes=1 << 20)
+    with Client(NOBODY, spool=tmp_path, config=config) as client:
+        first = client.send(noise(0))
+        assert first is not None
+        while client.send(noise(1)) is not None:
+            pass
+        skipped = client.stats.skipped["spool"]
+        many = {1: pose(1), **dict.fromkeys(range(2, client.stats.sent), pose(2))}
+        assert client.correct(many, removed=[client.stats.sent]) in (None, client.stats.sent + 1)
+        while client.correct(many) is not None:
+            pass
+        assert client.stats.skipped == {"spool": skipped + 1}
+        assert client.stats.state == "spool"
+
+
 def test_drop_oldest_makes_room_instead(tmp_path: Path) -> None:
     config = ClientConfig(policy="drop_oldest", backlog=1000, spool_bytes=1 << 20)
     with Client(NOBODY, spool=tmp_path, config=config) as client:
@@ -327,7 +343,7 @@ def test_a_keyframe_that_stays_unreadable_is_given_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read = journal.read
-    monkeypatch.setattr("tsfusion.delivery.sender._READ_AGAIN", 0.01)
+    monkeypatch.setattr("tsfusion.delivery.sender._READ_INTERVAL", 0.01)
 
     def damaged(folder: Path, position: journal.Position) -> journal.Record:
         record = read(folder, position)

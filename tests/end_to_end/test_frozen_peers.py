@@ -25,8 +25,8 @@ from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, ServerUnreachable, TransportError
 from tsfusion.delivery import control_session, spool
 from tsfusion.wire import codec, messages, sockets
-from tsfusion.wire.keyframe_header import VERSION
 from tsfusion.wire.queries import fetch_status
+from tsfusion.wire.record_header import VERSION
 
 FREEZE = 6.0  # seconds: longer than any timeout of client and server
 SHORT_FREEZE = 3.0  # where the gateway lives, and would have noticed by then
@@ -209,7 +209,7 @@ def test_two_that_share_a_session_at_once_spoil_nothing(tmp_path: Path) -> None:
 
 def test_another_version_is_named(shared: Server) -> None:
     before = fetch_status(shared.address)
-    hello = messages.Hello(os.urandom(16), VERSION + 1)
+    hello = messages.Hello(os.urandom(16), messages.PROTOCOL_VERSION + 1)
     with connected(sockets.dealer, shared.control) as stranger:
         stranger.send(messages.encode(hello))
         assert stranger.poll(10_000)
@@ -231,10 +231,10 @@ def test_another_version_is_named(shared: Server) -> None:
 
 
 def test_a_client_of_another_version_says_so(shared: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(control_session, "VERSION", VERSION + 1)
+    monkeypatch.setattr(control_session, "PROTOCOL_VERSION", messages.PROTOCOL_VERSION - 1)
     with (
         Client(shared.address) as client,
-        pytest.raises(ServerUnreachable, match=r"version 1 of the wire format, this client 2"),
+        pytest.raises(ServerUnreachable, match=r"version 2 of the wire format, this client 1"),
     ):
         client.connect(timeout=2.0)
 

@@ -11,7 +11,7 @@ from fuzz_engine import fuzz
 from fuzz_targets import TARGETS
 
 from tsfusion.wire import codec
-from tsfusion.wire.keyframe_header import Refused
+from tsfusion.wire.record_header import Refused
 
 CASES = {"message": 3000, "control": 10_000, "corrections": 1500, "journal": 1000, "checkpoint": 500}
 NIGHTLY = 20  # times as many

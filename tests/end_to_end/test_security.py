@@ -19,7 +19,6 @@ from tsfusion.core.errors import FlushTimeout, NotAllowed, TransportError
 from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec, key_folder, messages, sockets
 from tsfusion.wire.curve import ClientKeys, client_keys, server_keys
-from tsfusion.wire.keyframe_header import VERSION
 from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_status
 
 QUICK = ClientConfig(stall_timeout=0.5)
@@ -148,10 +147,10 @@ def test_anothers_session_is_not_to_be_had(site: Site, server: Server) -> None:
     with site.client(server, "robot") as client:
         client.send(wall(2))
         client.wait_fused(timeout=DEADLINE)
-        session = client._outbox.spool.session
+        session = client._outbox.session
         before = fetch_health(server.address, keys=site.of("robot"))
         with Raw(server, site.of("cart")) as cart:
-            denied = cart.say(messages.Hello(session, VERSION))
+            denied = cart.say(messages.Hello(session, messages.PROTOCOL_VERSION))
             assert isinstance(denied, messages.Denied)
             assert (denied.reason, "another client's" in denied.message) == ("session", True)
             good = codec.encode(wall(3), session=session, seq=2, jpeg_quality=90)

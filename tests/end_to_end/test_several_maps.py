@@ -26,8 +26,8 @@ from tsfusion.gateway.quotas import Quotas
 from tsfusion.journal import state_folder
 from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec, messages, sockets
-from tsfusion.wire.keyframe_header import VERSION, Refused, unpack
 from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_status
+from tsfusion.wire.record_header import Refused, unpack
 
 
 def fused_hash(numbers: range) -> str:
@@ -125,7 +125,7 @@ def test_a_map_takes_only_so_many_sessions(tmp_path: Path) -> None:
 def test_a_name_is_never_a_path(name: str) -> None:
     with pytest.raises(tsfusion.InvalidConfig):
         config.make_settings(config.ClientConfig, {"map": name})
-    hello = messages.encode(messages.Hello(bytes(16), VERSION, map=name))
+    hello = messages.encode(messages.Hello(bytes(16), messages.PROTOCOL_VERSION, map=name))
     with pytest.raises(tsfusion.DecodeError):
         messages.decode_to_server(hello)
     frames = codec.encode(wall(), session=bytes(16), seq=1, map_name=name, jpeg_quality=90)
@@ -176,16 +176,14 @@ def test_who_sends_too_much_has_to_wait_and_loses_nothing(tmp_path: Path) -> Non
 
 
 def test_too_many_points_or_too_far_is_refused() -> None:
-    quotas = Quotas(ServerConfig(quota_points=3000, quota_extent=100.0))
-    far = wall()
-    header = unpack(codec.encode(far, session=bytes(16), seq=1, jpeg_quality=90)[0])
+    frames = codec.encode(wall(), session=bytes(16), seq=1, jpeg_quality=90)
     with pytest.raises(Refused, match="a keyframe may have 3000 points, got 3072"):
-        quotas.check(header)
+        Quotas(ServerConfig(quota_points=3000)).check(codec.check(frames), frames)
     pose = wall().T_world_camera.copy()
     pose[:3, 3] = 80, 80, 0
-    header = unpack(codec.encode(wall(T_world_camera=pose), session=bytes(16), seq=1, jpeg_quality=90)[0])
+    frames = codec.encode(wall(T_world_camera=pose), session=bytes(16), seq=1, jpeg_quality=90)
     with pytest.raises(Refused, match="a sensor may be 100 m from the origin, got 113 m"):
-        Quotas(ServerConfig(quota_extent=100.0)).check(header)
+        Quotas(ServerConfig(quota_extent=100.0)).check(codec.check(frames), frames)
 
 
 def test_quotas_are_of_each_client_and_forget_strangers() -> None:

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 from command_processes import alive
-from keyframes_and_servers import serving, until, wall
+from keyframes_and_servers import pose, serving, until, wall
 
 import tsfusion
 from tsfusion import VolumeConfig
@@ -31,7 +31,7 @@ from tsfusion.fuser.fuser import Fuser
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.journal import Journal, Position
 from tsfusion.journal.state_folder import MAP_FILE, PREVIOUS_FILE
-from tsfusion.wire import codec
+from tsfusion.wire import codec, corrections
 from tsfusion.wire.messages import Command
 from tsfusion.wire.queries import fetch_health
 
@@ -155,6 +155,27 @@ def test_what_cannot_be_fused_is_counted_also_after_a_restart(tmp_path: Path) ->
     rejected = {"JournalError": 1, "crash": 1}
     assert status(fuser, link).keyframes_rejected == rejected
     assert status(*opened(tmp_path)).keyframes_rejected == rejected
+
+
+def test_corrections_are_noted_and_leave_the_map_as_it_is(tmp_path: Path) -> None:
+    positions = fill(tmp_path, 1)
+    log = Journal(tmp_path / "journal", 1 << 20)
+    good = corrections.encode(corrections.checked({1: pose(1)}, removed=[2]), session=SESSION, seq=2)
+    for seq, frames in ((2, good), (3, [b"TSC\x01nonsense", b""])):
+        positions.append(log.append(frames, session=SESSION, seq=seq))
+    log.close()
+    fuser, link = opened(tmp_path, checkpoint_every=1)
+    fuser.take(order(0, positions[0]))
+    before = status(fuser, link)
+    for index, reason in ((1, None), (2, "header")):
+        fuser.take(msgspec.structs.replace(order(index, positions[index]), is_correction=True))
+        assert link.done().reason == reason
+    fuser.mesh()
+    assert link.last().count == 3
+    assert status(fuser, link) == before
+    again, link_again = opened(tmp_path)
+    assert again.ready().done[SESSION].seq == 3
+    assert status(again, link_again) == before
 
 
 def saved(state: Path) -> Path:

@@ -29,9 +29,9 @@ from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.ports import Ports
 from tsfusion.journal import Position
 from tsfusion.wire import codec, health, messages, queries, sockets
-from tsfusion.wire.keyframe_header import Refused, pack, unpack
 from tsfusion.wire.messages import Command
 from tsfusion.wire.queries import fetch_mesh, fetch_status, request
+from tsfusion.wire.record_header import Refused, pack, unpack
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def test_a_client_goes_on_after_a_flood_of_greetings(shared: Server) -> None:
     with Client(shared.address) as client, connected(sockets.dealer, shared.control) as stranger:
         client.connect()
         for _ in range(1100):
-            stranger.send(messages.encode(messages.Hello(os.urandom(16), 1)))
+            stranger.send(messages.encode(messages.Hello(os.urandom(16), messages.PROTOCOL_VERSION)))
         asked = time.monotonic()
         request(shared.control, Command(name="ping"), timeout=DEADLINE)
         until(lambda: time.monotonic() - asked > 1.0)  # two pings

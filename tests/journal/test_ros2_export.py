@@ -20,7 +20,7 @@ from tsfusion.journal.ros2_export import Export, export
 from tsfusion.journal.ros2_messages import depth_image
 from tsfusion.journal.state_folder import JournalPlace
 from tsfusion.wire import codec
-from tsfusion.wire.keyframe_header import unpack
+from tsfusion.wire.record_header import unpack
 
 rosbags_highlevel = pytest.importorskip("rosbags.highlevel")
 NOW = 1_700_000_000_123_456_789

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from keyframes_and_servers import CAMERA, pose, serving, until, wall
+from keyframes_and_servers import CAMERA, journaled_corrections, pose, serving, until, wall
 
 from tsfusion import Client
 from tsfusion.core.config import ScanConfig
@@ -19,7 +19,6 @@ from tsfusion.journal.recording import JournalRecording
 from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections
 from tsfusion.scanner.scanner import Scanner
 from tsfusion.scanner.tracked_trajectory import TrackedTrajectory
-from tsfusion.wire import corrections
 
 FRAME_NS = 100_000_000
 NOBODY = "tcp://127.0.0.1:1"
@@ -139,8 +138,7 @@ def test_corrections_reach_the_server(tmp_path: Path) -> None:
         submap.client.flush(timeout=60)
         assert scanner.state().loops == 1
         assert submap.client.stats.corrections_acknowledged == 1
-        found = corrections.read(tmp_path / "state/maps/hall/corrections")
-    (sent,) = found.values()
+    (sent,) = journaled_corrections(tmp_path / "state", "hall")
     assert list(sent.seqs) == submap.located.seqs.tolist()
     np.testing.assert_allclose(sent.poses[3], pose(0, 0.05) @ submap.located.poses()[3])
     np.testing.assert_allclose(sent.T_map_odometry, pose(0, 0.05))
@@ -171,9 +169,8 @@ def test_in_the_end_keyframes_since_the_last_loop_are_moved_too(tmp_path: Path) 
         scanner.finish()
         submap.client.flush(timeout=60)
         assert submap.client.stats.corrections_sent == 2
-        found = corrections.read(tmp_path / "state/maps/hall/corrections")
-    (sent,) = found.values()
-    assert len(sent) == 4
+    _, sent = journaled_corrections(tmp_path / "state", "hall")
+    assert len(sent.seqs) == 4
     np.testing.assert_allclose(sent.poses[3], pose(0, 0.05) @ submap.located.poses()[3])
 
 

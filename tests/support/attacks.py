@@ -7,7 +7,6 @@ It prints `begun`, and in the end how many messages, connections or bytes it cam
 """
 
 import contextlib
-import dataclasses
 import itertools
 import os
 import socket
@@ -25,10 +24,8 @@ from hostile_messages import Frames, bad_values, bombs, hostile_corrections, lie
 from keyframes_and_servers import connected, wall
 
 from tsfusion.wire import codec, corrections, messages, sockets
-from tsfusion.wire.corrections import SessionCorrections
 from tsfusion.wire.curve import ClientKeys
-from tsfusion.wire.keyframe_header import VERSION
-from tsfusion.wire.messages import Command
+from tsfusion.wire.messages import PROTOCOL_VERSION, Command
 
 _HALF_OPEN = 1000
 _UNFINISHED = 400  # parts
@@ -82,7 +79,7 @@ def oversized(target: Target) -> int:
 
 def rubbish(target: Target) -> int:
     """Deep, wrong and lying msgpack, and greetings of nobody."""
-    hello = messages.encode(messages.Hello(bytes(16), VERSION))
+    hello = messages.encode(messages.Hello(bytes(16), PROTOCOL_VERSION))
     wrong = [
         b"", b"\xc1" * 1000, b"\x91" * 60_000, b"\x81" * 60_000, b"\xdf\xff\xff\xff\xff",
         b"\xdd\xff\xff\xff\xff",
@@ -105,29 +102,25 @@ def rubbish(target: Target) -> int:
 
 
 def wrong_corrections(target: Target) -> int:
-    """Poses for a session of its own that are none; and good ones as fast as they go, now and then huge."""
+    """Corrections that are none; and good ones as fast as they go, now and then huge."""
     session, sent = os.urandom(16), 0
-    many = {1 + i: np.eye(4) for i in range(corrections.MAX_KEYFRAMES)}
-    seqs, poses = corrections.checked(many)
-    huge = SessionCorrections(session=session, seqs=seqs, poses=poses)
-    last = corrections.MAX_KEYFRAMES
-    keyframe = codec.encode(wall(), session=session, seq=last, previous=0, jpeg_quality=90)
-    with connected(sockets.push, target.data) as push, connected(sockets.dealer, target.control) as link:
+    many = corrections.checked({1 + i: np.eye(4) for i in range(corrections.MAX_KEYFRAMES)})
+    few = corrections.checked({1 + i: np.eye(4) for i in range(20)})
+    seq = corrections.MAX_KEYFRAMES
+    keyframe = codec.encode(wall(), session=session, seq=seq, previous=0, jpeg_quality=90)
+    with connected(sockets.push, target.data) as push:
         if push.poll(1000, zmq.POLLOUT):
             push.send_multipart(keyframe)
-        for revision in itertools.count(1):
-            attacks = hostile_corrections(session, revision)
-            content = huge if revision % 10 == 0 else huge.up_to(20)
-            attacks.append(("good", "", corrections.pack(dataclasses.replace(content, revision=revision))))
-            for _, _, frames in attacks:
-                if target.over or not link.poll(1000, zmq.POLLOUT):
+        while True:
+            seq += 1
+            content = many if seq % 10 == 0 else few
+            good = corrections.encode(content, session=session, seq=seq, previous=0)
+            for frames in [*(frames for _, _, frames in hostile_corrections(session, seq, 0)), good]:
+                if target.over or not push.poll(1000, zmq.POLLOUT):
                     return sent
-                link.send_multipart(frames)
-                while link.poll(0):
-                    link.recv_multipart()
+                push.send_multipart(frames)
                 sent += 1
                 time.sleep(_PAUSE)
-    return sent
 
 
 def greetings(target: Target) -> int:
@@ -135,7 +128,7 @@ def greetings(target: Target) -> int:
     sent = 0
     with connected(sockets.dealer, target.control) as link:
         while not target.over and link.poll(1000, zmq.POLLOUT):
-            link.send(messages.encode(messages.Hello(os.urandom(16), VERSION, f"map{sent % 1000}")))
+            link.send(messages.encode(messages.Hello(os.urandom(16), PROTOCOL_VERSION, f"map{sent % 1000}")))
             sent += 1
             time.sleep(_PAUSE / 4)
     return sent
@@ -146,7 +139,7 @@ def sessions(target: Target) -> int:
     sent = 0
     with connected(sockets.dealer, target.control) as link:
         while not target.over and link.poll(1000, zmq.POLLOUT):
-            link.send(messages.encode(messages.Hello(os.urandom(16), VERSION)))
+            link.send(messages.encode(messages.Hello(os.urandom(16), PROTOCOL_VERSION)))
             while link.poll(0):
                 link.recv()
             sent += 1

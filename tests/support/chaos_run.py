@@ -32,6 +32,7 @@ _RECORD_OVERHEAD = 300  # bytes of MCAP a keyframe
 # Small files and frequent checkpoints: more moments at which a kill can hurt. What piled up comes faster than
 # the quota, so clients are held, too.
 SERVER = {"checkpoint_every": 20, "segment_bytes": 1 << 18, "quota_keyframes": 60.0}
+CORRECT_EVERY = 7  # keyframes
 CLIENT = ClientConfig(policy="spool_all", stall_timeout=0.4, segment_bytes=1 << 16)
 
 
@@ -216,7 +217,7 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
     if status and not problems:
         problems += server_problems(status, keyframes)
         problems += [problem for scanner in scanners for problem in client_problems(scanner.report())]
-        problems += verify(state, keyframes, status.map_hash)
+        problems += verify(state, keyframes, status.map_hash, CORRECT_EVERY)
     return Result(
         seed=seed,
         keys=keys is not UNSECURED,
@@ -267,6 +268,7 @@ def _plan(folder: Path, address: str, numbers: range, rate: float, keys: Secured
         first=numbers.start,
         step=numbers.step,
         rate=rate,
+        correct_every=CORRECT_EVERY,
         log=str(folder / f"taken-{numbers.start}"),
         report=str(folder / f"report-{numbers.start}.json"),
         patience=PATIENCE,

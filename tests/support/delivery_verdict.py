@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Check journal, map and counts after a run: walls 0 to n - 1, each once."""
+"""Check journal, map and counts after a run: walls 0 to n - 1 and the corrections, each once."""
 
 import functools
 from pathlib import Path
 
 from keyframes_and_servers import NUMBERED_NS, wall
-from scanner_process import Report, journals
+from scanner_process import Report, correction_number, journals
 
 from tsfusion import journal
 from tsfusion.wire.health import Status
-from tsfusion.wire.keyframe_header import unpack
+from tsfusion.wire.record_header import unpack_keyframe
 
 VOXEL_SIZE = 0.04  # as `wire.Server`'s map
 
@@ -31,9 +31,14 @@ def client_problems(report: Report) -> list[str]:
     return [f"the scanner counts lost keyframes: {lost}"] if lost else []
 
 
-def verify(state: Path, keyframes: int, map_hash: str) -> list[str]:
-    """List what is wrong with the files and the map that a stopped server left."""
+def verify(state: Path, keyframes: int, map_hash: str, correct_every: int = 0) -> list[str]:
+    """List what is wrong with the files and the map that a stopped server left.
+
+    Args:
+        correct_every: as in `scanner_process.Plan`.
+    """
     problems = []
+    corrected: list[int] = []
     last: dict[bytes, tuple[int, int]] = {}
     found = []
     for folder in journals(state):
@@ -42,7 +47,13 @@ def verify(state: Path, keyframes: int, map_hash: str) -> list[str]:
             if damaged := journal.list_records(path)[1]:
                 problems.append(f"{damaged} damaged records in {path.name}")
             for record in journal.records(path):
-                i = unpack(record.frames[0]).timestamp_ns - NUMBERED_NS
+                if record.is_correction:
+                    i = correction_number(record)
+                    corrected.append(i)
+                    if i != last.get(record.session, (0, i))[1]:
+                        problems.append(f"correction {i} does not follow its keyframe")
+                    continue
+                i = unpack_keyframe(record.frames[0]).timestamp_ns - NUMBERED_NS
                 if (record.seq, i) <= last.get(record.session, (0, -1)) or i < last.get(
                     record.session, (0, -1)
                 )[1]:
@@ -53,6 +64,9 @@ def verify(state: Path, keyframes: int, map_hash: str) -> list[str]:
         missing = sorted(set(range(keyframes)) - set(found))
         twice = sorted({i for i in found if found.count(i) > 1})
         problems.append(f"the journal has {len(found)} keyframes: missing {missing}, twice {twice}")
+    due = list(range(0, keyframes, correct_every)) if correct_every else []
+    if sorted(corrected) != due:
+        problems.append(f"the journal has the corrections {sorted(corrected)}, not {due}")
     return problems + _map_problems(state, keyframes, map_hash)
 
 

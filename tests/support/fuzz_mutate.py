@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Mutations that keep enough of a message's form to get past its first checks: the seeds of deeper bugs."""
 
-import contextlib
 import random
 import struct
 import zlib
@@ -179,6 +178,10 @@ def repaired(frames: list[bytes]) -> list[bytes]:
     """Correct the lengths and CRCs in the header, so that the checks behind them are reached."""
     try:
         header = msgspec.msgpack.decode(frames[0][4:])
+        if frames[0][:3] == b"TSC":
+            header["count"] = max(len(frames[1]) - 8 * header.get("removed", 0), 0) // 104
+            header["crc32"] = zlib.crc32(frames[1])
+            return [frames[0][:4] + msgspec.msgpack.encode(header), *frames[1:]]
         for buffer, frame in zip(header["buffers"], frames[1:], strict=False):
             buffer["bytes"], buffer["crc32"] = len(frame), zlib.crc32(frame)
         return [frames[0][:4] + msgspec.msgpack.encode(header), *frames[1:]]
@@ -265,34 +268,3 @@ def checkpoint(content: bytes, rng: random.Random, corpus: Sequence[bytes]) -> b
     parts[place] = changed
     body = content[:8] + b"".join(struct.pack("<I", len(part)) + part for part in parts)
     return body + (blake2b(body, digest_size=16).digest() if rng.random() < 0.9 else content[-16:])
-
-
-# --- corrections: as a message (length and bytes of each frame), or as a file ---
-
-_FILE = b"TSFCOR\x00\x01"
-
-
-def corrections(content: bytes, rng: random.Random, corpus: Sequence[bytes]) -> bytes:
-    """A change of the head or the poses, mostly with true lengths and checksums."""
-    if rng.random() < 0.1:
-        return raw(content, rng, corpus)
-    if content[:8] == _FILE:
-        (length,) = struct.unpack_from("<I", content, 8)
-        frames = _said([content[12 : 12 + length], content[12 + length : -16]], rng, corpus)
-        body = _FILE + struct.pack("<I", len(frames[0])) + b"".join(frames)
-        return body + (blake2b(body, digest_size=16).digest() if rng.random() < 0.9 else content[-16:])
-    return join(_said(split(content), rng, corpus))
-
-
-def _said(frames: list[bytes], rng: random.Random, corpus: Sequence[bytes]) -> list[bytes]:
-    if len(frames) < 2 or rng.random() < 0.3:
-        frames = [msgpack(b"".join(frames[:1]), rng, corpus), *frames[1:]]
-    else:
-        frames = [frames[0], raw(b"".join(frames[1:]), rng, ())]
-    if rng.random() < 0.8:
-        with contextlib.suppress(Exception):
-            head, body = msgspec.msgpack.decode(frames[0]), b"".join(frames[1:])
-            head["count"] = len(body) // 104
-            body = body[: 104 * head["count"]]
-            frames = [msgspec.msgpack.encode({**head, "crc32": zlib.crc32(body)}), body]
-    return frames

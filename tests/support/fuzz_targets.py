@@ -22,10 +22,8 @@ from tsfusion.geometry import se3
 from tsfusion.tsdf import checkpoint
 from tsfusion.wire import codec, corrections, keyframe_times, messages
 from tsfusion.wire.codec import measurement
-from tsfusion.wire.corrections import Corrections, SessionCorrections
 from tsfusion.wire.health import ClientHealth, Health, MapHealth, MeshLayout
-from tsfusion.wire.keyframe_header import Refused, stamp, unpack
-from tsfusion.wire.messages import decode_frames_to_server
+from tsfusion.wire.record_header import CorrectionHeader, Refused, stamp, unpack
 
 MAX_BYTES = 1 << 16  # of a case
 
@@ -96,11 +94,13 @@ def run_message(content: bytes) -> str:
     frames = fuzz_mutate.split(content)
     try:
         header = codec.check(frames)
-        _QUOTAS.check(header)
+        _QUOTAS.check(header, frames)
     except Refused as error:
         return f"refused {error.reason} {error}"
+    if isinstance(header, CorrectionHeader):
+        return _run_correction(header, frames)
     try:
-        keyframe = codec.decode(frames)
+        keyframe = codec.decode_keyframe(frames)
     except (DecodeError, InvalidKeyframe) as error:
         return f"{type(error).__name__} {error}"
     if keyframe.kind != measurement(header):
@@ -138,8 +138,6 @@ def _control_seeds() -> list[bytes]:
         messages.Nack(session, 3, "door", "size", "too large"),
         messages.Hold(session, 1.5, "disk", "full"),
         messages.Denied(session, "map", "no"),
-        messages.Corrected(session, 3),
-        messages.Uncorrected(session, 3, "disk", "full", 1.0),
         messages.Pong("e", 1, 2, 3, 4, 5),
         messages.Reply(name="health", health=health),
         messages.Reply(name="mesh", mesh=layout),
@@ -259,56 +257,38 @@ def run_checkpoint(content: bytes) -> str:
     return "good"
 
 
-# --- corrected poses ---
+# --- corrections ---
 
 
 def _correction_seeds() -> list[bytes]:
-    found, path = [], scratch() / "seed.tsc"
     rng = np.random.default_rng(0)
-    for count in (0, 1, 20):
+    found = []
+    for count, removed in ((0, []), (1, [2]), (20, [2, 3, 200])):
         poses = {1 + 3 * i: se3.exp(rng.normal(size=6)) for i in range(count)}
-        seqs, checked = corrections.checked(poses)
-        one = SessionCorrections(
-            session=bytes(16), seqs=seqs, poses=checked, revision=3, T_map_odometry=pose(1.0)
-        )
-        corrections.write(path, one)
-        found += [fuzz_mutate.join(corrections.pack(one)), path.read_bytes()]
+        correction = corrections.checked(poses, T_map_odometry=pose(1.0), removed=removed)
+        found.append(fuzz_mutate.join(corrections.encode(correction, session=bytes(16), seq=300)))
     return found
 
 
-def run_corrections(content: bytes) -> str:
-    """The server's door, or a file that is read; what passes is as good as what a client would send."""
-    try:
-        one = _corrections_of(content)
-    except (DecodeError, JournalError) as error:
-        return f"{type(error).__name__} {str(error).replace(str(scratch()), '')}"
+def _run_correction(header: CorrectionHeader, frames: list[bytes]) -> str:
+    """What passes the door is as good as what a client would send."""
+    one = corrections.unpack(header, frames[1])
     poses = dict(zip(one.seqs.tolist(), one.poses, strict=True))
-    seqs, checked = corrections.checked(poses)
-    if seqs.tobytes() != one.seqs.tobytes() or checked.tobytes() != one.poses.tobytes():
+    again = corrections.checked(poses, T_map_odometry=one.T_map_odometry, removed=one.removed.tolist())
+    sent = corrections.encode(
+        again, session=header.session, seq=header.seq, previous=header.previous, map_name=header.map
+    )
+    if bytes(frames[1]) != sent[1]:
         raise Broken("a client would not have sent it so")
-    head, *frames = corrections.pack(one)
-    again = messages.decode_to_server(head)
-    if not isinstance(again, Corrections) or corrections.unpack(again, frames).without(one):
-        raise Broken("it does not encode to the same bytes again")
-    return f"good {min(len(one), 3)} {one.T_map_odometry is None}"
-
-
-def _corrections_of(content: bytes) -> SessionCorrections:
-    if content[:3] == b"TSF":
-        path = scratch() / "case.tsc"
-        path.write_bytes(content)
-        return corrections.load(path)
-    frames = fuzz_mutate.split(content)
-    head = decode_frames_to_server(frames)
-    if not isinstance(head, Corrections):
-        raise DecodeError(f"a {type(head).__name__}")
-    return corrections.unpack(head, frames[1:])
+    if msgspec.structs.replace(header, sent_ns=0) != unpack(sent[0]):
+        raise Broken("it is not said again as it was")
+    return f"good {min(header.count, 3)} {header.removed} {header.T_map_odometry is None}"
 
 
 TARGETS: dict[str, Target] = {
     "message": Target(_message_seeds, run_message, fuzz_mutate.message),
     "control": Target(_control_seeds, run_control, fuzz_mutate.msgpack),
-    "corrections": Target(_correction_seeds, run_corrections, fuzz_mutate.corrections),
+    "corrections": Target(_correction_seeds, run_message, fuzz_mutate.message),
     "journal": Target(_segment_seeds, run_journal, fuzz_mutate.mcap),
     "checkpoint": Target(_checkpoint_seeds, run_checkpoint, fuzz_mutate.checkpoint),
 }

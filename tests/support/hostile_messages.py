@@ -14,7 +14,7 @@ import zstandard
 from keyframes_and_servers import wall
 
 from tsfusion.wire import codec, corrections
-from tsfusion.wire.keyframe_header import Buffer, pack, unpack
+from tsfusion.wire.record_header import Buffer, pack, unpack
 
 Frames = list[bytes]
 
@@ -109,15 +109,16 @@ def lies() -> Iterator[Frames]:
     yield [b""]
 
 
-def hostile_corrections(session: bytes, revision: int = 1) -> list[tuple[str, str, Frames]]:
-    """A name, the reason it is refused for (`control`: as no message at all), and the frames."""
-    good = corrections.pack(_two(session, revision))
-    fields, body = msgspec.msgpack.decode(good[0]), good[1]
+def hostile_corrections(session: bytes, seq: int = 3, previous: int = 2) -> list[tuple[str, str, Frames]]:
+    """A name, the reason it is refused for, and the frames of a correction of keyframes 1 and 2."""
+    correction = corrections.checked({1: np.eye(4), 2: np.eye(4)})
+    frames = corrections.encode(correction, session=session, seq=seq, previous=previous)
+    fields, body = msgspec.msgpack.decode(frames[0][4:]), frames[1]
 
     def changed(content: bytes = body, **changes: Any) -> Frames:
-        """Encode a message whose checksum is right."""
-        said = {**fields, "crc32": zlib.crc32(content), **changes}
-        return [msgspec.msgpack.encode(said), *([content] if content else [])]
+        """With a true checksum."""
+        header = {**fields, "crc32": zlib.crc32(content), **changes}
+        return [b"TSC\x01" + msgspec.msgpack.encode(header), content]
 
     def valued(at: int, value: float) -> Frames:
         return changed(body[: 16 + 8 * at] + struct.pack("<d", value) + body[24 + 8 * at :])
@@ -125,37 +126,42 @@ def hostile_corrections(session: bytes, revision: int = 1) -> list[tuple[str, st
     def numbered(*numbers: int) -> Frames:
         return changed(struct.pack("<2q", *numbers) + body[16:])
 
+    def removing(*numbers: int) -> Frames:
+        return changed(body + struct.pack(f"<{len(numbers)}q", *numbers), removed=len(numbers))
+
     identity = np.eye(4)[:3].ravel().tolist()
     found = [
         ("cut short", "size", changed(body[:-1])),
         ("too long", "size", changed(body + b"x")),
         ("no poses", "size", changed(b"")),
         ("more announced", "size", changed(count=corrections.MAX_KEYFRAMES)),
-        ("huge count", "control", changed(count=1 << 62)),
-        ("negative count", "control", changed(count=-1)),
+        ("too many", "limits", changed(count=corrections.MAX_KEYFRAMES, removed=1)),
+        ("huge count", "limits", changed(count=1 << 62)),
+        ("negative count", "header", changed(count=-1)),
+        ("negative removed", "header", changed(removed=-1)),
         ("damaged", "crc", changed(crc32=1)),
-        ("revision 0", "control", changed(revision=0)),
-        ("revision beyond", "control", changed(revision=1 << 63)),
-        ("a path as map", "control", changed(map="../../etc")),
-        ("short session", "control", changed(session=b"short")),
-        ("short T", "control", changed(T_map_odometry=identity[:11])),
+        ("a path as map", "header", changed(map="../../etc")),
+        ("short session", "header", changed(session=b"short")),
+        ("short T", "header", changed(T_map_odometry=identity[:11])),
         ("NaN in T", "values", changed(T_map_odometry=[*identity[:11], math.nan])),
         ("mirror in T", "values", changed(T_map_odometry=[-1.0, *identity[1:]])),
         ("number 0", "values", numbered(0, 1)),
         ("negative number", "values", numbered(-5, 1)),
         ("falling numbers", "values", numbered(2, 1)),
         ("one number twice", "values", numbered(1, 1)),
+        ("removed 0", "values", removing(0)),
+        ("removed twice", "values", removing(5, 5)),
+        ("corrected and removed", "values", removing(2)),
         ("mirror", "values", valued(0, -1.0)),
         ("sheared", "values", valued(1, 0.01)),
         ("far", "values", valued(3, 1e7)),
-        ("not a message", "control", [b"\xc1", body]),
-        ("deep", "control", [b"\x91" * 4000, body]),
+        ("no body", "frames", frames[:1]),
+        ("two bodies", "frames", [*frames, body]),
+        ("as a keyframe", "header", [b"TSF" + frames[0][3:], body]),
+        ("version 2", "version", [b"TSC\x02" + frames[0][4:], body]),
+        ("not a header", "header", [b"TSC\x01\xc1", body]),
+        ("deep", "header", [b"TSC\x01" + b"\x91" * 4000, body]),
     ]
     for value in (math.nan, math.inf, -math.inf, 1e300, -1e300):
         found += [(f"{value}", "values", valued(at, value)) for at in (0, 3, 23)]
     return found
-
-
-def _two(session: bytes, revision: int) -> corrections.SessionCorrections:
-    seqs, poses = corrections.checked({1: np.eye(4), 2: np.eye(4)})
-    return corrections.SessionCorrections(session=session, seqs=seqs, poses=poses, revision=revision)

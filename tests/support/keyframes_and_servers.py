@@ -15,9 +15,11 @@ import msgspec
 import numpy as np
 import zmq
 
-from tsfusion import Intrinsics, Keyframe
+from tsfusion import Intrinsics, Keyframe, journal
 from tsfusion.core.config import ServerConfig, VolumeConfig
-from tsfusion.wire import key_folder, sockets
+from tsfusion.journal import state_folder
+from tsfusion.wire import codec, key_folder, sockets
+from tsfusion.wire.corrections import Correction
 from tsfusion.wire.curve import ClientKeys, client_keys
 
 DEADLINE = 60.0
@@ -52,6 +54,19 @@ def wall(i: int = 0, **fields: Any) -> Keyframe:
     color = np.dstack([u * 3, v * 4, np.full(SHAPE, (37 * i) % 256)]).astype(np.uint8)
     given = {"T_world_camera": pose(0.03 * i), "timestamp_ns": NUMBERED_NS + i, **fields}
     return Keyframe(depth=depth, color=color, intrinsics=CAMERA, **given)
+
+
+def journaled_corrections(state: Path, map_name: str = "default") -> list[Correction]:
+    """The corrections in a map's journal, in its order."""
+    folder = state_folder.folder(state, map_name) / state_folder.JOURNAL_FOLDER
+    found = []
+    for number in journal.segments(folder):
+        for record in journal.records(journal.segment_path(folder, number)):
+            if record.is_correction:
+                decoded = codec.decode(record.frames)
+                assert isinstance(decoded, Correction)
+                found.append(decoded)
+    return found
 
 
 def until(reached: Callable[[], bool], deadline: float = DEADLINE) -> None:

@@ -10,18 +10,18 @@ were taken: what is in the spool or in the server's journal was, whatever its pr
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgspec
 import numpy as np
-from keyframes_and_servers import NUMBERED_NS, wall
+from keyframes_and_servers import NUMBERED_NS, pose, wall
 from msgspec import Struct
 
 from tsfusion import Client, Intrinsics, Keyframe, journal
 from tsfusion.core.config import ClientConfig
-from tsfusion.wire.keyframe_header import unpack
 from tsfusion.wire.keyframe_times import KeyframeTimes
+from tsfusion.wire.record_header import CorrectionHeader, unpack, unpack_keyframe
 
 LOST = 3  # exit status
 
@@ -36,6 +36,8 @@ class Plan(Struct, kw_only=True):
         count: keyframes to send, all lives together.
         first, step: which numbers below `count` are this scanner's; the others have others.
         rate: of sending, a second; None = as fast as `send` returns (`block`: as the map follows).
+        correct_every: after each keyframe whose number is a multiple of this comes a correction that carries
+            the number in its `T_map_odometry`; 0 = none.
         log: a line is on the disk here for each `send` that returned.
         report: where the `Report` goes when all is fused.
         room: a file of `save_room`, seen again and again; None = `wire.wall`s, each elsewhere.
@@ -51,6 +53,7 @@ class Plan(Struct, kw_only=True):
     step: int = 1
     control: str | None = None
     rate: float | None = None
+    correct_every: int = 0
     log: str | None = None
     report: str | None = None
     room: str | None = None
@@ -75,11 +78,29 @@ class Report(Struct, kw_only=True):
 
 def numbers(folder: Path) -> list[int]:
     """Which keyframes lie in a spool or journal folder, in its order."""
-    found = []
+    return [
+        unpack_keyframe(record.frames[0]).timestamp_ns - NUMBERED_NS
+        for record in _records(folder)
+        if not record.is_correction
+    ]
+
+
+def corrections(folder: Path) -> list[int]:
+    """The numbers that corrections in a spool or journal folder carry, in its order."""
+    return [correction_number(record) for record in _records(folder) if record.is_correction]
+
+
+def correction_number(record: journal.Record) -> int:
+    """The number that `scan` gave a correction."""
+    header = unpack(record.frames[0])
+    assert isinstance(header, CorrectionHeader)
+    assert header.T_map_odometry is not None
+    return round(header.T_map_odometry[3])
+
+
+def _records(folder: Path) -> Iterator[journal.Record]:
     for number in journal.segments(folder):
-        for record in journal.records(journal.segment_path(folder, number)):
-            found.append(unpack(record.frames[0]).timestamp_ns - NUMBERED_NS)
-    return found
+        yield from journal.records(journal.segment_path(folder, number))
 
 
 def journals(state: Path) -> list[Path]:
@@ -140,6 +161,18 @@ def unsent(plan: Plan) -> range:
     return own[len(taken) :]
 
 
+def uncorrected(plan: Plan, left: range) -> list[int]:
+    """The corrections of keyframes that were taken, which an earlier life did not come to send."""
+    due = [i for i in range(plan.first, plan.count, plan.step) if i not in left and _corrects(plan, i)]
+    folders = [Path(plan.spool)] if Path(plan.spool).is_dir() else []
+    sent = {i for folder in [*folders, *journals(Path(plan.state))] for i in corrections(folder)}
+    return [i for i in due if i not in sent]
+
+
+def _corrects(plan: Plan, i: int) -> bool:
+    return plan.correct_every > 0 and i % plan.correct_every == 0
+
+
 def _lines(log: str | None) -> list[str]:
     if log is None or not Path(log).exists():
         return []
@@ -149,10 +182,13 @@ def _lines(log: str | None) -> list[str]:
 def scan(plan: Plan) -> Report:
     """Send what is left and see it fused."""
     left, keyframe = unsent(plan), source(plan.room)
+    late = uncorrected(plan, left)
     with (
         Path(os.devnull if plan.log is None else plan.log).open("ab", buffering=0) as log,
         Client(plan.address, spool=plan.spool, control=plan.control, config=plan.client) as client,
     ):
+        for i in late:
+            client.correct({}, T_map_odometry=pose(i))
         started = due = time.monotonic()
         for i in left:
             if plan.until is not None and Path(plan.until).exists():
@@ -160,11 +196,14 @@ def scan(plan: Plan) -> Report:
             if plan.rate is not None:
                 due = max(due + 1 / plan.rate, time.monotonic())
                 time.sleep(max(due - time.monotonic(), 0))
-            if client.send(keyframe(i, captured_ns=time.monotonic_ns())) is None:
+            seq = client.send(keyframe(i, captured_ns=time.monotonic_ns()))
+            if seq is None:
                 continue  # skipped, by its policy: the report counts it
             log.write(f"\n{i}\n".encode())  # a torn line ends at the next one's beginning
             if plan.log is not None:
                 os.fdatasync(log.fileno())
+            if _corrects(plan, i):
+                client.correct({seq: pose(i)}, T_map_odometry=pose(i))
         client.wait_fused(timeout=plan.patience)
         stats, times = client.stats, client.records
         seconds = time.monotonic() - started

@@ -14,7 +14,7 @@ import zmq
 from tsfusion.gateway.access_control import ZapHandler
 from tsfusion.wire import codec, messages, sockets
 from tsfusion.wire.curve import ServerKeys
-from tsfusion.wire.keyframe_header import VERSION, KeyframeHeader
+from tsfusion.wire.record_header import KeyframeHeader
 
 
 def number(header: KeyframeHeader) -> int:
@@ -46,6 +46,7 @@ class ScriptedServer:
         clock: its own, nanoseconds.
         refuses: whether a keyframe is turned away at the door.
         taken: (session, number) of every journaled keyframe, in order; it outlives `stop`.
+        corrections: numbers of the journaled corrections, in order.
         refused, hellos, pings: what came.
     """
 
@@ -63,6 +64,7 @@ class ScriptedServer:
         self.clock = time.monotonic_ns
         self.window = 8
         self.taken: list[tuple[bytes, int]] = []
+        self.corrections: list[int] = []
         self.refused: list[int] = []
         self.hellos: list[messages.Hello] = []
         self.pings: list[messages.Ping] = []
@@ -130,7 +132,13 @@ class ScriptedServer:
             self._say(
                 message.session,
                 messages.Welcome(
-                    self.epoch, VERSION, session.durable, session.fused, self.window, 16 << 20, 1 << 20
+                    self.epoch,
+                    messages.PROTOCOL_VERSION,
+                    session.durable,
+                    session.fused,
+                    self.window,
+                    16 << 20,
+                    1 << 20,
                 ),
             )
         elif isinstance(message, messages.Ping):
@@ -149,14 +157,17 @@ class ScriptedServer:
         if self.hold is not None:
             self.held += 1
             self._say(header.session, messages.Hold(header.session, *self.hold))
-        elif new and not gap and self.refuses(header):
+        elif new and not gap and isinstance(header, KeyframeHeader) and self.refuses(header):
             self.refused.append(number(header))
             nack = messages.Nack(header.session, header.seq, "door", "values", "it will not do")
             self._say(header.session, nack)
         else:
             if new and not gap:
                 session.durable = header.seq
-                self.taken.append((header.session, number(header)))
+                if isinstance(header, KeyframeHeader):
+                    self.taken.append((header.session, number(header)))
+                else:
+                    self.corrections.append(header.seq)
             self._ack(session, resend=new and gap)
 
     def _ack(self, session: Session, *, resend: bool = False) -> None:

@@ -20,7 +20,7 @@ from tsfusion import Keyframe
 from tsfusion.core.config import ServerConfig, override
 from tsfusion.core.errors import DecodeError, InvalidConfig, InvalidKeyframe
 from tsfusion.wire import array_encoding, codec
-from tsfusion.wire.keyframe_header import VERSION, Refused, pack, stamp, unpack
+from tsfusion.wire.record_header import VERSION, Refused, pack, stamp, unpack
 
 SESSION = bytes(range(16))
 

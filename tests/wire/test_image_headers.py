@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tsfusion.wire import image_headers
-from tsfusion.wire.keyframe_header import Refused
+from tsfusion.wire.record_header import Refused
 
 SHAPE = (48, 64)
 IMAGE = (np.arange(48 * 64) % 251).astype(np.uint8).reshape(SHAPE)

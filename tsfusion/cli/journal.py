@@ -11,6 +11,7 @@ from tsfusion.cli import options
 
 if TYPE_CHECKING:
     from tsfusion.journal.inspection import JournalInfo, Problem, SessionInfo, Verdict
+    from tsfusion.journal.recovery import Recovery
     from tsfusion.journal.state_folder import JournalPlace
 
 _MOST_LINES = 20  # printed of one kind; --json has all
@@ -111,11 +112,10 @@ def recover(
         output.as_json(done)
     else:
         typer.echo(
-            f"{out}: {_count(done.keyframes, 'keyframe')} in {_count(done.segments, 'segment')}, "
-            f"{output.size(done.nbytes)}"
+            f"{out}: {_records(done)} in {_count(done.segments, 'segment')}, {output.size(done.nbytes)}"
         )
         if done.copies:
-            typer.echo(f"{_count(done.copies, 'keyframe')} stood there twice and is saved once")
+            typer.echo(f"{_count(done.copies, 'record')} stood there twice and is saved once")
         typer.echo("\n".join([*_problem_lines(done.problems), _loss(done.lost)]))
     if done.lost:
         raise typer.Exit(1)
@@ -172,6 +172,11 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def _records(found: "Recovery | Verdict") -> str:
+    keyframes = _count(found.keyframes, "keyframe")
+    return keyframes + (f" and {_count(found.corrections, 'correction')}" if found.corrections else "")
+
+
 def _loss(lost: int) -> str:
     return f"{_count(lost, 'keyframe')} lost, at least" if lost else "no keyframe is lost"
 
@@ -182,6 +187,7 @@ def _describe_info(found: "JournalInfo") -> str:
     lines = [
         f"journal    {found.path}",
         f"keyframes  {found.keyframes}, {size(found.nbytes)}",
+        *([f"corrections {found.corrections}"] if found.corrections else []),
         f"damage     {_loss(found.lost)}",
     ]
     kept = sum(one["bytes"] for one in found.quarantined)
@@ -207,10 +213,11 @@ def _session(one: "SessionInfo") -> str:
 
 
 def _corrected(one: "SessionInfo") -> str:
-    if not one.revision:
+    if not one.corrections:
         return ""
     most = f"{one.moved_m:.3g} m, {one.turned_deg:.2g}°"
-    return f"  {one.corrected} corrected by up to {most} (revision {one.revision})"
+    removed = f", {one.removed} removed" if one.removed else ""
+    return f"  {one.corrected} corrected by up to {most}{removed} ({_count(one.corrections, 'correction')})"
 
 
 def _clock(stamp_ns: int) -> str:
@@ -224,7 +231,7 @@ def _clock(stamp_ns: int) -> str:
 def _describe_verdict(verdict: "Verdict") -> str:
     from tsfusion.cli.output import size
 
-    read = f"{_count(verdict.keyframes, 'keyframe')} in {_count(verdict.segments, 'segment')}"
+    read = f"{_records(verdict)} in {_count(verdict.segments, 'segment')}"
     judged = "intact" if verdict.intact else f"damaged; {_loss(verdict.lost)}"
     return "\n".join(
         [*_problem_lines(verdict.problems), f"{verdict.path}: {read}, {size(verdict.nbytes)}: {judged}"]

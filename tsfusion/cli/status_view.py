@@ -61,10 +61,10 @@ def _maps(maps: dict[str, MapHealth]) -> RenderableType:
 
 
 def _clients(clients: list[ClientHealth]) -> list[RenderableType]:
-    corrects = any(one.revision for one in clients)
+    corrects = any(one.corrections for one in clients)
     table = _table(
         "client", "session", "map", ">fused", ">received", ">waiting", ">heard", "held", "skipped",
-        *([">corrected"] if corrects else ()),
+        *([">corrections"] if corrects else ()),
     )  # fmt: skip
     latest = sorted(clients, key=lambda one: one.heard_s)
     for one in latest[:MAX_CLIENTS]:
@@ -72,7 +72,7 @@ def _clients(clients: list[ClientHealth]) -> list[RenderableType]:
             _plain(one.client or "-"), _plain(one.session), _plain(one.map), f"{one.fused}/{one.durable}",
             size(one.received_bytes), _waiting(one.waiting), _duration(one.heard_s),
             _plain(one.held, style="yellow"), Text(_reasons(one.skipped), style="yellow"),
-            *([str(one.corrected)] if corrects else ()),
+            *([str(one.corrections)] if corrects else ()),
             style="dim" if one.heard_s > SILENT_AFTER else "",
         )  # fmt: skip
     more = len(latest) - MAX_CLIENTS

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A socket that connects, watched: it says why it cannot, and is made anew when ZeroMQ has given up on it."""
+"""A connecting socket under watch: why it cannot connect, and a new one when ZeroMQ has given up on it."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ _RETRY_INTERVAL = 2.0  # seconds; an allowed key is let in soon, a forbidden one
 
 
 class Connection:
-    """One of a client's two. For one thread.
+    """One connection to the server: of the client's control or its data socket. For one thread.
 
     Args:
         make: `sockets.push` or `sockets.dealer`.
@@ -47,31 +47,36 @@ class Connection:
 
     @property
     def events(self) -> sockets.AnySocket:
-        """Readable when `look` has something to find."""
+        """The socket that is readable when `check` has news."""
         return self._monitor.socket
 
     @property
-    def made(self) -> bool:
-        """Whether it stands."""
+    def is_made(self) -> bool:
+        """Whether the connection stands."""
         return self._monitor.connected
 
     @property
     def refused(self) -> bool:
-        """Whether the server has certainly turned us away."""
+        """Whether the server has certainly refused this client's key."""
         return self._monitor.refused
 
     @property
     def due(self) -> float:
-        """When `look` should be called next, whatever happens; 0 = whenever."""
+        """When `check` must be called next (`time.monotonic()`), without any event; 0 = only after one."""
         return self._retry_due
 
     def reopen(self) -> None:
-        """Connect anew; what the old connection held is lost."""
+        """Replace the socket; what the old connection held is lost."""
         self.close()
         self._open()
 
-    def look(self, now: float) -> tuple[str | None, bool]:
-        """What is new: the problem (empty = it is over, None = nothing), and whether a connection ended."""
+    def check(self, now: float) -> tuple[str | None, bool]:
+        """Read the events, and connect anew when that is due.
+
+        Returns:
+            The problem, if that is a new one (empty = it is over, None = nothing new), and whether a
+            connection ended.
+        """
         news = self._monitor.problem()
         ended, self._lost = self._monitor.lost > self._lost, self._monitor.lost
         if news == self.problem:

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""What the client says and hears on the control socket: greetings, pings, progress, refusals. No sockets."""
+"""The client's side of the control socket, without the socket: greetings, pings, progress, refusals."""
 
 import logging
 import math
 import time
 from collections.abc import Callable
-from typing import Literal, TypeAlias
 
 from tsfusion.core.errors import DecodeError
+from tsfusion.delivery.link_state import LinkState
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.refused_keyframes import RefusedFolder
 from tsfusion.delivery.timing import SAMPLES, ClockOffset
 from tsfusion.wire import messages
-from tsfusion.wire.keyframe_header import VERSION
+from tsfusion.wire.keyframe_times import Stamps
+from tsfusion.wire.messages import PROTOCOL_VERSION
 
 log = logging.getLogger(__name__)
 
@@ -22,50 +23,46 @@ _FIRST_PINGS_INTERVAL = 0.02  # until the clock estimate stands on all its sampl
 _REWIND_INTERVAL = 0.2  # one gap is reported by every keyframe behind it
 _LATEST = 1 << 62  # nanoseconds; no clock shows more than a century
 _HOLD = (0.05, 60.0)  # seconds: no server may hold a client for less or longer at a time
-_News: TypeAlias = (
-    messages.Ack | messages.Nack | messages.Hold | messages.Denied | messages.Corrected | messages.Uncorrected
-)
 
 
 class ControlSession:
-    """One client's side. For the sending thread only; `heard` may be read by any.
+    """The client's side of the control socket. For the sending thread; `last_heard` may be read by any.
 
     Args:
-        say: sends the frames of a message, or drops them when they cannot leave at once: what they say is
-            said again when due.
+        send: sends a message, or drops it when it cannot leave at once: it is sent again when due.
         address: of the control socket, for messages to people.
 
     Attributes:
         welcome: the server's terms; None = it has not let us in (yet).
         clock: the server's against ours.
-        heard: when it last said something, `time.monotonic()`; 0 = never.
-        moved: when something last left the spool, or was sent while nothing was on its way.
+        last_heard: time of the last message of the server, `time.monotonic()`; 0 = never.
+        last_moved: when something last left the spool, or was sent while nothing was on its way.
     """
 
     def __init__(
         self,
         outbox: Outbox,
         refused: RefusedFolder,
-        say: Callable[..., None],
+        send: Callable[[bytes], None],
         *,
         address: str,
         map_name: str,
     ) -> None:
         self.welcome: messages.Welcome | None = None
         self.clock = ClockOffset()
-        self.heard = self.moved = 0.0
+        self.last_heard = self.last_moved = 0.0
         self._outbox = outbox
         self._refused = refused
-        self._say = say
+        self._send = send
         self._address = address
-        self._hello = messages.Hello(outbox.spool.session, VERSION, map_name)
+        self._hello = messages.Hello(outbox.session, PROTOCOL_VERSION, map_name)
         self._hello_due = self._ping_due = self._rewound = self._held_until = 0.0
         self._hello_interval = _HELLO_INTERVAL[0]
         self._asked_again = False
 
     @property
     def terms(self) -> messages.Welcome | None:
-        """The server's terms while keyframes may be sent: it let us in, and its answers fit our clock."""
+        """The server's terms while records may be sent: it let us in, and its answers fit our clock."""
         return self.welcome if self.clock.count and not self._held_until else None
 
     @property
@@ -75,7 +72,7 @@ class ControlSession:
 
     @property
     def due(self) -> float:
-        """When `tick` has something to do next."""
+        """When `tick` has something to do next, `time.monotonic()`."""
         due = self._ping_due
         if self.welcome is None:
             due = min(due, self._hello_due)
@@ -83,50 +80,35 @@ class ControlSession:
             due = min(due, self._held_until)
         if self._asked_again:
             due = min(due, self._rewound + _REWIND_INTERVAL)
-        if self.welcome is not None:
-            with self._outbox.changed:
-                due = min(due, self._outbox.correcting.due(self._outbox.durable))
         return due
 
     def tick(self, now: float) -> None:
-        """Say what is due."""
+        """Send the messages that are due."""
         if self.welcome is None and now >= self._hello_due:
             self._hello_due = now + self._hello_interval
             self._hello_interval = min(2 * self._hello_interval, _HELLO_INTERVAL[1])
-            self._say(messages.encode(self._hello))
+            self._send(messages.encode(self._hello))
         if now >= self._ping_due:
             self._ping(now)
         if self._held_until and now >= self._held_until:
             self._held_until = self._rewound = 0.0
             self._asked_again = True
         if self._asked_again and now - self._rewound > _REWIND_INTERVAL:
-            with self._outbox.changed:
-                self.rewind()
-        if self.welcome is not None:
-            self._correct(now)
+            self.rewind()
 
     def _ping(self, now: float) -> None:
         settled = self.welcome is None or self.clock.count >= SAMPLES
         self._ping_due = now + (_PING_INTERVAL if settled else _FIRST_PINGS_INTERVAL)
-        with self._outbox.changed:
-            waiting, skipped = len(self._outbox.spool.waiting), dict(self._outbox.skipped)
+        stats = self._outbox.stats()
         ping = messages.Ping(
             session=self._hello.session,
             sent_ns=time.monotonic_ns(),
             offset_ns=self.clock.offset_ns,
             bound_ns=self.clock.bound_ns,
-            waiting=waiting,
-            skipped=skipped,
+            waiting=stats.waiting,
+            skipped=stats.skipped,
         )
-        self._say(messages.encode(ping))
-
-    def _correct(self, now: float) -> None:
-        with self._outbox.changed:
-            frames = self._outbox.correcting.message(self._outbox.durable, now)
-            if self._outbox.correcting.settled:
-                self._outbox.changed.notify_all()
-        if frames:
-            self._say(*frames)
+        self._send(messages.encode(ping))
 
     def greet_again(self, after: float = 0.0) -> None:
         """Ask to be let in (once more), first after so many seconds."""
@@ -136,93 +118,88 @@ class ControlSession:
 
     def rewind(self) -> None:
         """Send everything that is not acknowledged once more."""
-        self._outbox.outstanding = 0
+        self._outbox.rewind()
         self._asked_again = False
-        self._rewound = self.moved = time.monotonic()
+        self._rewound = self.last_moved = time.monotonic()
 
     def on_connection(self, problem: str, before: str, *, refused: bool) -> None:
-        """A connection cannot be made, or is (empty), after there was another problem with it.
+        """Note that a connection cannot be made, or can be (empty), after another problem with it."""
+        if refused:
+            self._turned_away(self._outbox.link_state.locked_out(problem))
+        elif not problem:
+            self._outbox.change_link_state(self._outbox.link_state.reachable(before))
+        elif not self.last_heard:
+            self._outbox.change_link_state(self._outbox.link_state.unreachable(problem))
 
-        Who talked to us before is rather slow or gone than somebody else: `heard` says more then.
-        """
-        with self._outbox.changed:
-            if refused:
-                self._turned_away(problem, "keys")
-            elif (problem and not self.heard) or (not problem and self._outbox.problem == before):
-                self._outbox.problem, self._outbox.turned_away = problem, ""
+    def on_silence(self) -> None:
+        """Note that no message of the server came for too long."""
+        self._outbox.change_link_state(self._outbox.link_state.silent())
 
-    # --- hearing ---
+    # --- messages of the server ---
 
-    def hear(self, frames: list[bytes]) -> None:
-        """Deal with what the server said."""
+    def receive(self, frames: list[bytes]) -> None:
+        """Deal with a message of the server."""
         returned_ns = time.monotonic_ns()
         try:
             message = messages.decode_to_client(b"".join(frames))
         except DecodeError as error:
             self._on_nonsense(error)
             return
-        self.heard = time.monotonic()
+        self.last_heard = time.monotonic()
         if isinstance(message, messages.Pong):
-            with self._outbox.changed:
-                self._on_pong(message, returned_ns)
+            self._on_pong(message, returned_ns)
         elif isinstance(message, messages.Welcome):
-            with self._outbox.changed:
-                self._on_welcome(message)
-        elif not isinstance(message, messages.Reply) and message.session == self._hello.session:
-            self._on_news(message)
-
-    def _on_nonsense(self, error: DecodeError) -> None:
-        if self.welcome is None and not self._outbox.problem:
-            with self._outbox.changed:
-                self._outbox.problem = f"what answers at {self._address} is no tsfusion server: {error}"
-        log.debug("the server sent %s", error)
-
-    def _on_news(self, message: _News) -> None:
-        if isinstance(message, messages.Denied):
+            self._on_welcome(message)
+        elif isinstance(message, messages.Reply) or message.session != self._hello.session:
+            return
+        elif isinstance(message, messages.Denied):
             self._on_denied(message)
         elif isinstance(message, messages.Nack):
             self._on_nack(message)
-        elif self.welcome is not None:  # else it is from before: the Welcome will say where the server stands
-            with self._outbox.changed:
-                if isinstance(message, messages.Ack):
-                    self._on_ack(message)
-                elif isinstance(message, messages.Hold):
-                    self._on_hold(message)
-                else:
-                    self._on_corrections(message)
+        elif self.welcome is None:
+            return  # it is from before: the Welcome will say where the server stands
+        elif isinstance(message, messages.Ack):
+            self._on_ack(message)
+        else:
+            self._on_hold(message)
+
+    def _on_nonsense(self, error: DecodeError) -> None:
+        if self.welcome is None:
+            why = f"what answers at {self._address} is no tsfusion server: {error}"
+            self._outbox.change_link_state(self._outbox.link_state.misunderstood(why))
+        log.debug("the server sent %s", error)
 
     def _on_welcome(self, welcome: messages.Welcome) -> None:
-        if welcome.version != VERSION:
-            self._turned_away(
-                f"the server speaks version {welcome.version} of the wire format, this client {VERSION}"
+        if welcome.version != PROTOCOL_VERSION:
+            self._refuse(
+                f"the server speaks version {welcome.version} of the wire format, "
+                f"this client {PROTOCOL_VERSION}"
             )
         elif not self._is_foreign(welcome.durable):
-            self._outbox.problem, self._outbox.opening, self._outbox.turned_away = "", False, ""
+            self._outbox.change_link_state(self._outbox.link_state.welcomed())
             self.welcome = welcome
             self._ping_due = self._held_until = 0.0
-            self._outbox.welcomed(welcome.durable, welcome.window_keyframes)
-            self._outbox.correcting.welcomed(welcome.corrections, self.heard)
+            self._outbox.welcome(welcome.durable, welcome.window_keyframes)
             self._on_progress(welcome.durable, welcome.fused)
-            self._outbox.meshed(welcome.fused)  # a new server stamps only what it fuses from here on
+            self._outbox.note_meshed(welcome.fused)  # a new server stamps only what it fuses from here on
             self.rewind()
 
     def _on_denied(self, denied: messages.Denied) -> None:
-        with self._outbox.changed:
-            self._outbox.opening = denied.reason == "opening"
-            if self._outbox.opening:
-                self._outbox.problem = self._outbox.turned_away = ""
-                self.greet_again(_HELLO_INTERVAL[1])
-            else:
-                self._turned_away(f"the server at {self._address} refuses this client: {denied.message}")
+        if denied.reason == "opening":
+            why = f"the server is opening the map {self._hello.map}"
+            self._outbox.change_link_state(self._outbox.link_state.opening(why))
+            self.greet_again(_HELLO_INTERVAL[1])
+        else:
+            self._refuse(f"the server at {self._address} refuses this client: {denied.message}")
 
-    def _turned_away(self, problem: str, by: Literal["server", "keys"] = "server") -> None:
+    def _refuse(self, why: str) -> None:
+        self._turned_away(self._outbox.link_state.refused(why))
+
+    def _turned_away(self, state: LinkState) -> None:
         """Keep asking: a person may put it right at the other end."""
         self.greet_again(_HELLO_INTERVAL[1])
-        self._outbox.connected, self._outbox.turned_away = False, by
-        if problem != self._outbox.problem:
-            self._outbox.problem = problem
-            self._outbox.changed.notify_all()
-            log.error("%s", problem)
+        if self._outbox.change_link_state(state):
+            log.error("%s", state.why)
 
     def _on_pong(self, pong: messages.Pong, returned_ns: int) -> None:
         if self.welcome is None or pong.epoch != self.welcome.epoch:
@@ -235,61 +212,49 @@ class ControlSession:
         if not all(0 <= stamp < _LATEST for stamp in stamps):
             log.debug("the server's clock is none: %s", pong)
             return
-        self._outbox.connected = True
         if not self.clock.count:
             self._ping_due = 0.0  # tells the server the offset before the first keyframe comes
         self.clock.add(pong.ping_sent_ns, pong.received_ns, pong.sent_ns, returned_ns)
+        self._outbox.change_link_state(self._outbox.link_state.answered())
         self._on_progress(pong.durable, pong.fused)
 
     def _on_ack(self, ack: messages.Ack) -> None:
-        moved = self._on_progress(ack.durable, ack.fused)
-        for stamps in ack.stamps:
-            self._outbox.stamp(stamps, self.clock.offset_ns or 0, self.clock.bound_ns)
+        moved = self._on_progress(ack.durable, ack.fused, ack.stamps)
         self._asked_again = ack.resend or (self._asked_again and not moved)
 
-    def _on_progress(self, durable: int, fused: int) -> bool:
-        if self._is_foreign(durable) or not self._outbox.progress(durable, fused):
+    def _on_progress(self, durable: int, fused: int, stamps: tuple[Stamps, ...] = ()) -> bool:
+        """Note what the server has; whether anything left the spool."""
+        if self._is_foreign(durable):
             return False
-        self._outbox.problem = ""
-        self.moved = self.heard
-        return True
+        offset_ns, bound_ns = self.clock.offset_ns or 0, self.clock.bound_ns
+        moved = self._outbox.acknowledge(durable, fused, stamps, offset_ns=offset_ns, bound_ns=bound_ns)
+        if moved:
+            self._outbox.change_link_state(self._outbox.link_state.moved())
+            self.last_moved = self.last_heard
+        return moved
 
     def _is_foreign(self, durable: int) -> bool:
-        """Whether somebody else sends under our session; then nothing it says of its keyframes is of ours."""
-        foreign = self._outbox.foreign(durable)
+        """Whether somebody else sends under our session; then nothing the server has of it is of ours."""
+        foreign = self._outbox.is_foreign(durable)
         if foreign:
-            self._turned_away(
+            self._refuse(
                 f"the server has keyframe {durable} of this session, which was never sent from here: another "
-                f"scanner works with a copy of {self._outbox.spool.folder}; give each a folder of its own"
+                f"scanner works with a copy of {self._outbox.spool_folder}; give each a folder of its own"
             )
         return foreign
 
     def _on_nack(self, nack: messages.Nack) -> None:
-        self.moved = self.heard
-        with self._outbox.changed:
-            if nack.stage == "map":
-                log.error("keyframe %d is not in the map (%s): %s", nack.seq, nack.reason, nack.message)
-                self._outbox.reject(nack.seq, nack.reason)
-                return
-            entry = self._outbox.find(nack.seq)
-        if entry is not None:
+        self.last_moved = self.last_heard
+        if nack.stage == "map":
+            kind = self._outbox.reject(nack.seq, nack.reason)
+            log.error("%s %d is not in the map (%s): %s", kind, nack.seq, nack.reason, nack.message)
+        elif (entry := self._outbox.find_sent(nack.seq)) is not None:
             self._refused.give_up(entry, nack.reason, nack.message)
-
-    def _on_corrections(self, answer: messages.Corrected | messages.Uncorrected) -> None:
-        if isinstance(answer, messages.Corrected):
-            self._outbox.correcting.told(answer.revision, self.heard)
-        else:
-            again_s = answer.again_s if math.isfinite(answer.again_s) else _HOLD[1]
-            self._outbox.correcting.turned_away(
-                answer.revision, answer.reason, answer.message, again_s, self.heard
-            )
-        self._outbox.changed.notify_all()
 
     def _on_hold(self, hold: messages.Hold) -> None:
         shortest, longest = _HOLD
         seconds = min(max(hold.seconds, shortest), longest) if math.isfinite(hold.seconds) else longest
-        self._held_until = self.heard + seconds
-        problem = f"the server at {self._address} takes nothing for now ({hold.reason}): {hold.message}"
-        if problem != self._outbox.problem:
-            self._outbox.problem = problem
-            log.warning("%s", problem)
+        self._held_until = self.last_heard + seconds
+        why = f"the server at {self._address} takes nothing for now ({hold.reason}): {hold.message}"
+        if self._outbox.change_link_state(self._outbox.link_state.held(why)):
+            log.warning("%s", why)

@@ -1,41 +1,46 @@
 # SPDX-License-Identifier: MIT
-"""What the client knows of its keyframes: shared by the thread that sends and those that call."""
+"""The client's records and what became of each: shared by the thread that sends and those that call.
+
+Every method locks by itself and gives out copies, so callers cannot hold the lock too briefly or too long.
+`write`, `read` and `tidy` use the disk and are outside the lock.
+"""
 
 import threading
+import time
 from collections import Counter, OrderedDict, deque
-from typing import Literal
+from collections.abc import Callable
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidKeyframe
-from tsfusion.delivery.correction_queue import Correcting
+from tsfusion.delivery.link_state import LinkState
 from tsfusion.delivery.spool import Spool, Waiting
 from tsfusion.delivery.timing import KeyframeTimesTable
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.wire.keyframe_times import Stamps
+from tsfusion.wire.keyframe_times import KeyframeTimes, Stamps
 
-_MOST = 65536  # numbers that are remembered: rejected ones, and fused ones that no mesh shows yet
+_MOST_REMEMBERED = 65536  # numbers: of rejected keyframes, and of fused ones that no mesh shows yet
+_CHECK_INTERVAL = 0.5  # seconds between two calls of what `wait` was given to check
 
 
 class ClientStats(Struct, frozen=True):
     """Counts since the client began; leftovers of an earlier one count from `durable` on.
 
     Attributes:
-        sent: taken by `send`.
-        durable: on the server's disk.
-        fused: in the server's map.
-        refused: turned away by the server (or unreadable here) for good: reason → count.
+        sent: keyframes that `send` took.
+        durable: keyframes on the server's disk.
+        fused: keyframes in the server's map.
+        refused: turned away by the server (or unreadable here) for good, corrections too: reason → count.
         rejected: on the server's disk, but the map could not take it: reason → count.
         skipped: never sent: reason → count. `thinned` and `dropped` by the policy (a dropped one was taken
             before), `spool` (it has reached `spool_bytes`), `disk` (full, failing or read-only).
-        waiting: in the spool.
+        waiting: keyframes and corrections in the spool.
         waiting_bytes: the bytes of those.
         state: of the spool: `ok`, or the reason why it cannot keep all that comes: `spool` or `disk`.
-        corrections_sent: calls of `correct`.
-        corrections_acknowledged: how many of them, from the first on, are on the server's disk.
-        corrections_refused: messages of corrections that were turned away for good: reason → count.
+        corrections_sent: corrections that `correct` took.
+        corrections_acknowledged: corrections on the server's disk.
     """
 
     sent: int
@@ -49,47 +54,38 @@ class ClientStats(Struct, frozen=True):
     state: str
     corrections_sent: int = 0
     corrections_acknowledged: int = 0
-    corrections_refused: dict[str, int] = {}
 
 
 class Outbox:
-    """The spool and the fate of what passed through it. Hold `changed` around every call.
+    """The spool, the fate of what passed through it, and the state of the link. For any thread.
 
     Attributes:
-        outstanding: how many of the spool's oldest keyframes are on their way.
-        unfused: durable keyframes the map has not answered for.
-        unmeshed: those the mesh does not show yet.
-        refusals: how many keyframes the next `flush` has to complain of, and the `first_refusal` in words.
-        connected: the server answers.
-        problem: why it does so in vain.
-        turned_away: who will not have us: the `server`, or the `keys` on its connection; empty = nobody.
-        opening: it answers, but the map is not open yet.
-        skipped: see `ClientStats`.
-        state: see `ClientStats`.
-        times: of the keyframes, as far as they are known.
-        durable: the highest number that is on the server's disk, as far as it said; 0 = none.
-        correcting: corrected poses that it does not have yet.
+        link_state: how client and server stand with each other; replaced whole, by the sending thread alone.
+        session: 16 bytes that name the spool's session.
+        spool_folder: where the spool is.
+        is_temporary: the spool goes away when it is closed.
+        state: of the spool, as in `ClientStats`; set by the one thread that writes to it.
     """
 
     def __init__(self, spool: Spool) -> None:
-        self.changed = threading.Condition()
-        self.spool = spool
-        self.outstanding = 0
-        self.unfused: deque[int] = deque()
-        self.unmeshed: deque[int] = deque(maxlen=_MOST)
-        self.refusals = 0
-        self.first_refusal = ""
-        self.connected = False
-        self.problem = ""
-        self.turned_away: Literal["", "server", "keys"] = ""
-        self.opening = False
-        self.skipped: Counter[str] = Counter()
+        self._changed = threading.Condition()
+        self._spool = spool
+        self.link_state = LinkState()
+        self.session = spool.session
+        self.spool_folder = spool.folder
+        self.is_temporary = spool.temporary
         self.state = "ok"
-        self.times = KeyframeTimesTable()
-        self.durable = 0
-        self.correcting = Correcting(spool)
+        self._outstanding = 0  # of the oldest in the spool, so many are on their way
+        self._unfused: deque[int] = deque()  # durable, and not answered by the map
+        self._unmeshed: deque[int] = deque(maxlen=_MOST_REMEMBERED)
+        self._skipped: Counter[str] = Counter()
+        self._times = KeyframeTimesTable()
         self._sent = self._durable = self._fused = 0
+        self._corrections_sent = self._corrections_durable = 0
+        self._corrections = {entry.seq for entry in spool.waiting if entry.is_correction}  # not noted yet
         self._refused: Counter[str] = Counter()
+        self._refusal_count = 0  # of which `flush` has not complained yet
+        self._first_refusal = ""  # of those, in words
         self._rejected: Counter[str] = Counter()
         self._rejected_seqs: OrderedDict[int, None] = OrderedDict()
         # Of what a dead scanner left, any may have been sent; and what a power cut took of it, too.
@@ -98,178 +94,346 @@ class Outbox:
         self._claimed = 0
         self._welcomed = False
 
+    # --- for those who wait ---
+
+    def wait(self, reached: Callable[[], bool], timeout: float | None, check: Callable[[], None]) -> bool:
+        """Wait until `reached()`, asked at every change; False when it is not after `timeout` seconds.
+
+        Args:
+            timeout: None = for ever.
+            check: called in between; ends the wait when it raises.
+        """
+        deadline = None if timeout is None else time.monotonic() + timeout
+        with self._changed:
+            while not reached():
+                check()
+                left = _CHECK_INTERVAL if deadline is None else deadline - time.monotonic()
+                if left <= 0:
+                    return False
+                self._changed.wait(min(left, _CHECK_INTERVAL))
+        return True
+
+    def wake_waiting(self) -> None:
+        """Have everybody who waits look again."""
+        with self._changed:
+            self._changed.notify_all()
+
+    def change_link_state(self, state: LinkState) -> bool:
+        """Replace the link's state; whether that is another one."""
+        with self._changed:
+            is_new = state != self.link_state
+            self.link_state = state
+            if is_new:
+                self._changed.notify_all()
+            return is_new
+
     # --- into the spool ---
 
     @property
     def behind(self) -> int:
-        """How many keyframes the map has yet to get: those in the spool and the server's unfused ones."""
-        return len(self.spool.waiting) + len(self.unfused)
+        """Number of keyframes that the map has yet to get: in the spool, or durable and unfused."""
+        with self._changed:
+            return len(self._spool.waiting) + len(self._unfused) - len(self._corrections)
 
-    def add(self, entry: Waiting, keyframe: Keyframe) -> None:
-        """A keyframe is in the spool."""
-        self.spool.add(entry)
-        self._sent += 1
-        self.times.add(entry.seq, timestamp_ns=keyframe.timestamp_ns, captured_ns=keyframe.captured_ns)
+    @property
+    def next_seq(self) -> int:
+        """The number of the next record. For the one thread that writes."""
+        return self._spool.next_seq
 
-    def drop_oldest_unsent(self, newest: int | None = None) -> bool:
+    def write(self, frames: list[bytes]) -> Waiting:
+        """Write the record that was encoded as `next_seq`; `add` then makes it count. Outside the lock.
+
+        Raises:
+            JournalError: when the disk refuses.
+        """
+        return self._spool.write(frames)
+
+    def add(self, entry: Waiting, keyframe: Keyframe | None) -> None:
+        """Queue a keyframe, or a correction (None), that was written."""
+        with self._changed:
+            self._spool.add(entry)
+            if keyframe is None:
+                self._corrections_sent += 1
+                self._corrections.add(entry.seq)
+                return
+            self._sent += 1
+            self._times.add(entry.seq, timestamp_ns=keyframe.timestamp_ns, captured_ns=keyframe.captured_ns)
+
+    def skip(self, reason: str) -> None:
+        """Count a record that is not sent."""
+        with self._changed:
+            self._skipped[reason] += 1
+
+    def usage(self) -> tuple[int, int]:
+        """Bytes of the disk that the spool takes, and records in it."""
+        with self._changed:
+            return self._spool.used_bytes, len(self._spool.waiting)
+
+    def tidy(self) -> None:
+        """Delete files that hold nothing any more. For the one thread that writes."""
+        with self._changed:
+            self._spool.tidy()
+
+    def drop_oldest(self) -> bool:
         """Take the oldest keyframe that was never sent out of the spool; False = there is none.
 
-        One that was sent may be in the server's journal by now, whatever was heard of it: it stays.
-
-        Args:
-            newest: this one stays too.
+        One that was sent may be in the server's journal by now, though nothing was heard of it: it stays.
+        Corrections stay, too.
         """
+        with self._changed:
+            return self._drop_oldest()
+
+    def drop_to(self, backlog: int, newest: int) -> None:
+        """Drop the oldest until no more than `backlog` are behind; the keyframe `newest` stays."""
+        with self._changed:
+            while self.behind > backlog and self._drop_oldest(newest):
+                pass
+
+    def _drop_oldest(self, newest: int | None = None) -> bool:
         sent = max(self._perhaps_sent, self._claimed)
-        for place, entry in enumerate(self.spool.waiting):
-            if entry.seq > sent:
+        for place, entry in enumerate(self._spool.waiting):
+            if entry.seq > sent and not entry.is_correction:
                 if entry.seq == newest:
                     return False
-                self.spool.remove(place)
-                self.times.remove(entry.seq)
-                self.skipped["dropped"] += 1
-                self.changed.notify_all()
+                self._spool.remove(place)
+                self._times.remove(entry.seq)
+                self._skipped["dropped"] += 1
+                self._changed.notify_all()
                 return True
         return False
 
-    # --- on their way ---
-
-    def claim(self, window_keyframes: int, window_bytes: int, ahead: int | None = None) -> Waiting | None:
-        """The next keyframe to send, if the credit allows it (one is always allowed).
-
-        It stays in the spool until `sent`, `unclaim` or `refuse` says what became of it.
-
-        Args:
-            ahead: so many keyframes may be on their way or unfused; None = any number.
-        """
-        waiting, count = self.spool.waiting, self.outstanding
-        if count >= min(max(window_keyframes, 1), len(waiting)):
-            return None
-        if ahead is not None and count + len(self.unfused) >= ahead:
-            return None
-        entry = waiting[count]
-        under_way = sum(waiting[i].nbytes for i in range(count))
-        if count and under_way + entry.nbytes > window_bytes:
-            return None
-        self._claimed = entry.seq
-        return entry
-
-    def unclaim(self) -> None:
-        """The claimed keyframe was not sent after all."""
-        self._claimed = 0
-
-    @property
-    def last_on_its_way(self) -> int:
-        """The newest number that is on its way; 0 = none."""
-        return self.spool.waiting[self.outstanding - 1].seq if self.outstanding else 0
-
-    def sent(self, entry: Waiting, sent_ns: int) -> None:
-        """The claimed keyframe is on its way."""
-        self.outstanding += 1
-        self._perhaps_sent = max(self._perhaps_sent, entry.seq)
-        self._claimed = 0
-        self.times.sent(entry.seq, sent_ns)
-
-    # --- at the server ---
-
-    def welcomed(self, durable: int, window_keyframes: int) -> None:
-        """Of what a dead scanner left, only a window's worth can have been sent and not be durable yet.
-
-        (Were that server's window larger, one that is dropped now might be in the journal all the same.)
-        """
-        if not self._welcomed and self.spool.waiting:
-            left = [entry.seq for entry in self.spool.waiting if entry.seq > durable]
-            window = left[: max(window_keyframes, 1)]
-            self._perhaps_sent = min(self._perhaps_sent, window[-1] if window else durable)
-        self._welcomed = True
-
-    def foreign(self, durable: int) -> bool:
-        """Whether the server has keyframes of this session that were never sent from here."""
-        return durable > max(self._perhaps_sent, self._used_before)
-
-    def progress(self, durable: int, fused: int) -> bool:
-        """The server has these; whether anything left the spool."""
-        self.durable = max(self.durable, durable)
-        dropped = self.spool.drop(durable)
-        self.outstanding = max(self.outstanding - len(dropped), 0)
-        self._durable += len(dropped)
-        self.unfused.extend(dropped)
-        while self.unfused and self.unfused[0] <= fused:
-            seq = self.unfused.popleft()
-            self._fused += seq not in self._rejected_seqs
-            self.unmeshed.append(seq)
-        self.changed.notify_all()
-        return bool(dropped)
-
-    def meshed(self, seq: int) -> None:
-        """The mesh shows everything up to `seq`."""
-        while self.unmeshed and self.unmeshed[0] <= seq:
-            self.unmeshed.popleft()
-        self.changed.notify_all()
-
-    def stamp(self, stamps: Stamps, offset_ns: int, bound_ns: int) -> None:
-        """Note the server's stamps, on our clock."""
-        if stamps.seq not in self._rejected_seqs:
-            self.times.stamp(stamps, offset_ns, bound_ns)
-        if stamps.meshed_ns:
-            self.meshed(stamps.seq)
-
     def check_taken(self, seqs: NDArray[np.int64]) -> None:
-        """Raise InvalidKeyframe unless each is the number of a keyframe of this session, now or before."""
-        known = (seqs <= self.spool.left) | ((seqs > self._used_before) & (seqs < self.spool.next_seq))
+        """Raise InvalidKeyframe unless each is the number of a record of this session, now or before."""
+        with self._changed:
+            known = (seqs <= self._spool.left) | ((seqs > self._used_before) & (seqs < self._spool.next_seq))
         if not known.all():
             raise InvalidKeyframe(f"keyframe {seqs[np.argmin(known)]} was never sent from here")
 
+    # --- on their way ---
+
+    @property
+    def outstanding(self) -> int:
+        """Number of records on their way."""
+        with self._changed:
+            return self._outstanding
+
+    def claim(
+        self, window_keyframes: int, window_bytes: int, ahead: int | None = None
+    ) -> tuple[Waiting, int] | None:
+        """The next record to send and the number sent before it, if the credit allows it.
+
+        One on its way is always allowed. It stays in the spool until `sent`, `unclaim` or `refuse` says
+        what became of it.
+
+        Args:
+            ahead: so many may be on their way or unfused; None = any number.
+        """
+        with self._changed:
+            waiting, count = self._spool.waiting, self._outstanding
+            if count >= min(max(window_keyframes, 1), len(waiting)):
+                return None
+            if ahead is not None and count + len(self._unfused) >= ahead:
+                return None
+            entry = waiting[count]
+            under_way = sum(waiting[i].nbytes for i in range(count))
+            if count and under_way + entry.nbytes > window_bytes:
+                return None
+            self._claimed = entry.seq
+            return entry, waiting[count - 1].seq if count else 0
+
+    def unclaim(self) -> None:
+        """Note that the claimed record was not sent after all."""
+        with self._changed:
+            self._claimed = 0
+
+    def read(self, entry: Waiting) -> list[memoryview]:
+        """The frames of a record. Outside the lock.
+
+        Raises:
+            JournalError: when the disk has lost it.
+        """
+        return self._spool.read(entry)
+
+    def sent(self, entry: Waiting, sent_ns: int) -> bool:
+        """Note that the claimed record is on its way; whether it is the only one."""
+        with self._changed:
+            self._outstanding += 1
+            self._perhaps_sent = max(self._perhaps_sent, entry.seq)
+            self._claimed = 0
+            self._times.sent(entry.seq, sent_ns)
+            return self._outstanding == 1
+
+    def rewind(self) -> None:
+        """Count nothing as on its way: all that is not acknowledged is sent once more."""
+        with self._changed:
+            self._outstanding = 0
+
+    # --- at the server ---
+
+    def welcome(self, durable: int, window_keyframes: int) -> None:
+        """Note how far the server is, when it lets this client in.
+
+        Of what a dead scanner left, only a window's worth can have been sent and not be durable yet.
+        (Were that server's window larger, one that is dropped now might be in the journal all the same.)
+        """
+        with self._changed:
+            if not self._welcomed and self._spool.waiting:
+                left = [entry.seq for entry in self._spool.waiting if entry.seq > durable]
+                window = left[: max(window_keyframes, 1)]
+                self._perhaps_sent = min(self._perhaps_sent, window[-1] if window else durable)
+            self._welcomed = True
+
+    def is_foreign(self, durable: int) -> bool:
+        """Whether the server has records of this session that were never sent from here."""
+        with self._changed:
+            return durable > max(self._perhaps_sent, self._used_before)
+
+    def acknowledge(
+        self,
+        durable: int,
+        fused: int,
+        stamps: tuple[Stamps, ...] = (),
+        *,
+        offset_ns: int = 0,
+        bound_ns: int = 0,
+    ) -> bool:
+        """Let go of what the server has, and note its stamps; whether anything left the spool.
+
+        Args:
+            offset_ns, bound_ns: the server's clock minus ours, and how wrong that may be.
+        """
+        with self._changed:
+            dropped = self._spool.drop(durable)
+            self._outstanding = max(self._outstanding - len(dropped), 0)
+            corrections = len(self._corrections.intersection(dropped))
+            self._corrections_durable += corrections
+            self._durable += len(dropped) - corrections
+            self._unfused.extend(dropped)
+            while self._unfused and self._unfused[0] <= fused:
+                self._note_fused(self._unfused.popleft())
+            for one in stamps:
+                if one.seq not in self._rejected_seqs:
+                    self._times.stamp(one, offset_ns, bound_ns)
+                if one.meshed_ns:
+                    self.note_meshed(one.seq)
+            self._changed.notify_all()
+            return bool(dropped)
+
+    def _note_fused(self, seq: int) -> None:
+        if seq in self._corrections:
+            self._corrections.remove(seq)
+        else:
+            self._fused += seq not in self._rejected_seqs
+        self._unmeshed.append(seq)
+
+    def note_meshed(self, seq: int) -> None:
+        """Note that the mesh shows everything up to `seq`."""
+        with self._changed:
+            while self._unmeshed and self._unmeshed[0] <= seq:
+                self._unmeshed.popleft()
+            self._changed.notify_all()
+
     # --- turned away ---
 
-    def reject(self, seq: int, reason: str) -> None:
-        """The server has it, the map will not."""
-        if seq in self._rejected_seqs:
-            return
-        self._rejected[reason] += 1
-        self._rejected_seqs[seq] = None
-        if len(self._rejected_seqs) > _MOST:
-            self._rejected_seqs.popitem(last=False)
+    def reject(self, seq: int, reason: str) -> str:
+        """Count a record that the server has and the map will not take; its kind in words."""
+        with self._changed:
+            is_correction = seq in self._corrections
+            if seq not in self._rejected_seqs:
+                self._rejected[reason] += 1
+                self._rejected_seqs[seq] = None
+                if len(self._rejected_seqs) > _MOST_REMEMBERED:
+                    self._rejected_seqs.popitem(last=False)
+            return "correction" if is_correction else "keyframe"
 
-    def find(self, seq: int) -> Waiting | None:
-        """The keyframe of this number, if it waits and was sent."""
-        if seq <= self._perhaps_sent:
-            for entry in self.spool.waiting:
-                if entry.seq >= seq:
-                    return entry if entry.seq == seq else None
-        return None
+    def find_sent(self, seq: int) -> Waiting | None:
+        """The record of this number, if it waits and was sent."""
+        with self._changed:
+            if seq <= self._perhaps_sent:
+                for entry in self._spool.waiting:
+                    if entry.seq >= seq:
+                        return entry if entry.seq == seq else None
+            return None
 
     def refuse(self, entry: Waiting, reason: str, message: str) -> None:
-        """Give a keyframe up. What was sent behind it has to be sent again: the server saw a gap there."""
-        place = self.spool.waiting.index(entry)
-        self.outstanding = min(self.outstanding, place)
-        self.spool.remove(place)
-        self._claimed = 0
-        self._refused[reason] += 1
-        self.refusals += 1
-        if self.refusals == 1:
-            self.first_refusal = f"{entry.seq} was refused ({reason}): {message}"
-        self.changed.notify_all()
+        """Give a record up. What was sent behind it has to be sent again: the server saw a gap there."""
+        with self._changed:
+            place = self._spool.waiting.index(entry)
+            self._outstanding = min(self._outstanding, place)
+            self._spool.remove(place)
+            self._corrections.discard(entry.seq)
+            self._claimed = 0
+            self._refused[reason] += 1
+            if not self._refusal_count:
+                self._first_refusal = f"{entry.kind} {entry.seq} was refused ({reason}): {message}"
+            self._refusal_count += 1
+            self._changed.notify_all()
 
-    # --- told ---
+    # --- snapshots ---
 
-    def take_refusals(self) -> tuple[int, str]:
-        """How many keyframes were given up since this was asked last, and the first of them in words."""
-        refusals, self.refusals = self.refusals, 0
-        return refusals, self.first_refusal
+    @property
+    def is_durable(self) -> bool:
+        """Whether everything sent is on the server's disk, or was given up."""
+        with self._changed:
+            return not self._spool.waiting
+
+    @property
+    def is_fused(self) -> bool:
+        """Whether the map has answered for everything sent."""
+        with self._changed:
+            return not self._spool.waiting and not self._unfused
+
+    @property
+    def is_meshed(self) -> bool:
+        """Whether the mesh shows everything sent."""
+        with self._changed:
+            return not (self._spool.waiting or self._unfused or self._unmeshed)
+
+    def describe_waiting(self) -> str:
+        """The records in the spool, counted: `3 keyframes and 1 corrections`."""
+        with self._changed:
+            corrections = sum(entry.is_correction for entry in self._spool.waiting)
+            keyframes = len(self._spool.waiting) - corrections
+        counts = [f"{keyframes} keyframes"] if keyframes or not corrections else []
+        return " and ".join([*counts, *([f"{corrections} corrections"] if corrections else [])])
+
+    def take_refusals(self) -> str:
+        """The records given up since the last call, in words; empty = none."""
+        with self._changed:
+            count, self._refusal_count = self._refusal_count, 0
+            more = f" (and {count - 1} more)" if count > 1 else ""
+            return f"{self._first_refusal}{more}" if count else ""
+
+    def times(self) -> list[KeyframeTimes]:
+        """When each keyframe passed each stage, oldest first, as far as it is known."""
+        with self._changed:
+            return self._times.copy()
+
+    def newest_fused(self) -> KeyframeTimes | None:
+        """The stamps of the newest keyframe that is in the map; None = none is."""
+        with self._changed:
+            return self._times.newest_fused()
 
     def stats(self) -> ClientStats:
         """A copy of the counts."""
-        return ClientStats(
-            sent=self._sent,
-            durable=self._durable,
-            fused=self._fused,
-            refused=dict(self._refused),
-            rejected=dict(self._rejected),
-            skipped=dict(self.skipped),
-            waiting=len(self.spool.waiting),
-            waiting_bytes=self.spool.waiting_bytes,
-            state=self.state,
-            corrections_sent=self.correcting.taken,
-            corrections_acknowledged=self.correcting.acknowledged,
-            corrections_refused=dict(self.correcting.refused),
-        )
+        with self._changed:
+            return ClientStats(
+                sent=self._sent,
+                durable=self._durable,
+                fused=self._fused,
+                refused=dict(self._refused),
+                rejected=dict(self._rejected),
+                skipped=dict(self._skipped),
+                waiting=len(self._spool.waiting),
+                waiting_bytes=self._spool.waiting_bytes,
+                state=self.state,
+                corrections_sent=self._corrections_sent,
+                corrections_acknowledged=self._corrections_durable,
+            )
+
+    def close(self) -> bool:
+        """Release the spool; whether that loses what a temporary one still holds."""
+        with self._changed:
+            loses = self.is_temporary and bool(self._spool.waiting)
+            self._spool.close()
+            return loses

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Keyframes that are given up, kept aside so that a person can see what was wrong with them."""
+"""Records that are given up, kept aside so that a person can see what was wrong with them."""
 
 import logging
 
@@ -15,27 +15,25 @@ log = logging.getLogger(__name__)
 
 
 class RefusedFolder:
-    """The refused keyframes of a spool, in a folder inside it. A temporary spool keeps none."""
+    """The refused records of a spool, in a folder inside it. A temporary spool keeps none."""
 
     def __init__(self, outbox: Outbox) -> None:
         self._outbox = outbox
-        self._kept = Quarantine(outbox.spool.folder / FOLDER, MAX_BYTES)
+        self._kept = Quarantine(outbox.spool_folder / FOLDER, MAX_BYTES)
 
     def give_up(self, entry: Waiting, reason: str, message: str, *, readable: bool = True) -> None:
-        """Take a keyframe out of the queue for good. Not while holding `changed`: this uses the disk."""
-        log.error("keyframe %d is lost (%s): %s", entry.seq, reason, message)
-        if readable and not self._outbox.spool.temporary:
+        """Take a record out of the spool for good, and keep a copy when it can be read."""
+        log.error("%s %d is lost (%s): %s", entry.kind, entry.seq, reason, message)
+        if readable and not self._outbox.is_temporary:
             self._keep(entry, reason)
-        with self._outbox.changed:
-            self._outbox.refuse(entry, reason, message)
+        self._outbox.refuse(entry, reason, message)
 
     def _keep(self, entry: Waiting, reason: str) -> None:
-        spool = self._outbox.spool
         try:
-            frames = spool.read(entry)
+            frames = self._outbox.read(entry)
         except (JournalError, OSError) as error:
-            log.warning("keyframe %d could not be kept aside: %s", entry.seq, error)
+            log.warning("%s %d could not be kept aside: %s", entry.kind, entry.seq, error)
             return
-        path = self._kept.keep(frames, session=spool.session, seq=entry.seq, reason=reason)
+        path = self._kept.keep(frames, session=self._outbox.session, seq=entry.seq, reason=reason)
         if path is not None:
-            log.info("keyframe %d is in %s", entry.seq, path)
+            log.info("%s %d is in %s", entry.kind, entry.seq, path)

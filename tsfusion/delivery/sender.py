@@ -24,12 +24,12 @@ from tsfusion.delivery.refused_keyframes import RefusedFolder
 from tsfusion.delivery.spool import Waiting
 from tsfusion.wire import sockets
 from tsfusion.wire.curve import ClientKeys
-from tsfusion.wire.keyframe_header import stamp
+from tsfusion.wire.record_header import stamp
 
 log = logging.getLogger(__name__)
 
-_READ_AGAIN = 0.5  # seconds
-_READ_TRIES = 6
+_READ_INTERVAL = 0.5  # seconds until a record that could not be read is tried again
+_MAX_READS = 6
 _SCARCE = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # what others of this machine will give back
 
 
@@ -44,29 +44,31 @@ class Sender:
         config: ClientConfig,
         keys: ClientKeys | None = None,
     ) -> None:
-        self._address = address
-        self._control = control
+        self._data_address = address
+        self._control_address = control
         self._keys = keys
         self._outbox = outbox
         self._config = config
         self._refused = RefusedFolder(outbox)
-        self._talk = ControlSession(outbox, self._refused, self._say, address=control, map_name=config.map)
+        self._control_session = ControlSession(
+            outbox, self._refused, self._send_control, address=control, map_name=config.map
+        )
         self._stopping = threading.Event()
         self._waker, self._woken = socket.socketpair()
         self._waker.setblocking(False)
         self._woken.setblocking(False)
         self._ahead = config.backlog if config.policy == "drop_oldest" else None
         self._blocked = False  # the data socket takes no more for now
-        self._unread = 0  # times that the next keyframe could not be read
+        self._unread = 0  # times that the next record could not be read
         self._read_due = 0.0
 
     @property
-    def heard(self) -> float:
-        """When the server last said something, `time.monotonic()`; 0 = never. From any thread."""
-        return self._talk.heard
+    def last_heard(self) -> float:
+        """Time of the server's last message, `time.monotonic()`; 0 = never. From any thread."""
+        return self._control_session.last_heard
 
     def wake(self) -> None:
-        """There is something new in the outbox. From any thread."""
+        """Have the thread look into the outbox. From any thread."""
         with suppress(OSError):  # it is being woken already, or has ended
             self._waker.send(b"\0")
 
@@ -76,15 +78,15 @@ class Sender:
         self.wake()
 
     def run(self) -> None:
-        """Talk to the server until stopped."""
+        """Exchange messages with the server until stopped."""
         context: zmq.Context[Any] = zmq.Context()
-        self._link = Connection(context, sockets.dealer, self._control, self._keys)
-        self._data = Connection(context, sockets.push, self._address, self._keys)
+        self._control = Connection(context, sockets.dealer, self._control_address, self._keys)
+        self._data = Connection(context, sockets.push, self._data_address, self._keys)
         try:
             while not self._stopping.is_set():
                 self._step()
         finally:
-            self._link.close()
+            self._control.close()
             self._data.close()
             self._waker.close()
             self._woken.close()
@@ -93,68 +95,74 @@ class Sender:
     def _step(self) -> None:
         for _ in range(64):
             try:
-                self._talk.hear(self._link.socket.recv_multipart(zmq.NOBLOCK))
+                self._control_session.receive(self._control.socket.recv_multipart(zmq.NOBLOCK))
             except zmq.Again:
                 break
         now = time.monotonic()
         self._watch_connections(now)
-        self._talk.tick(now)
+        self._control_session.tick(now)
         self._watch_for_stall(now)
         self._pump(now)
         self._wait(now)
 
     def _wait(self, now: float) -> None:
-        sources: list[Any] = [self._link.socket, self._link.events, self._data.events, self._woken.fileno()]
+        sources: list[Any] = [
+            self._control.socket,
+            self._control.events,
+            self._data.events,
+            self._woken.fileno(),
+        ]
         polled = [(source, zmq.POLLIN) for source in sources]
         if self._blocked:
             polled.append((self._data.socket, zmq.POLLOUT))
-        others = (self._read_due if self._unread else 0.0, self._link.due, self._data.due)
-        due = min([self._talk.due, *filter(None, others)])
+        others = (
+            self._read_due if self._unread else 0.0,
+            self._control.due,
+            self._data.due,
+        )
+        due = min([self._control_session.due, *filter(None, others)])
         zmq.zmq_poll(polled, max(int((due - now) * 1000), 1))
         with suppress(BlockingIOError):
             self._woken.recv(4096)
 
-    def _say(self, *frames: bytes) -> None:
+    def _send_control(self, frame: bytes) -> None:
         with suppress(zmq.Again):
-            if len(frames) == 1:
-                self._link.socket.send(frames[0], zmq.NOBLOCK)
-            else:
-                self._link.socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
+            self._control.socket.send(frame, zmq.NOBLOCK)
 
     def _watch_connections(self, now: float) -> None:
-        for connection in (self._link, self._data):
+        for connection in (self._control, self._data):
             before = connection.problem
-            news, ended = connection.look(now)
-            if news is not None and (connection is self._link or self._link.made):  # else it is said twice
-                self._talk.on_connection(news, before, refused=connection.refused)
-            if ended and connection is self._link:
-                self._talk.greet_again()  # the server does not know the new connection yet
+            news, ended = connection.check(now)
+            is_reported = connection is self._control or self._control.is_made  # once, where both fail
+            if news is not None and is_reported:
+                self._control_session.on_connection(news, before, refused=connection.refused)
+            if ended and connection is self._control:
+                self._control_session.greet_again()  # the server does not know the new connection yet
             elif ended:
-                with self._outbox.changed:
-                    self._talk.rewind()  # what was under way is lost
+                self._control_session.rewind()  # what was under way is lost
 
     def _watch_for_stall(self, now: float) -> None:
         patience = self._config.stall_timeout
-        if now - self._talk.heard > patience:
-            with self._outbox.changed:
-                self._outbox.connected = False
-        if self._outbox.outstanding and not self._talk.held and now - self._talk.moved > patience:
-            log.info("nothing moves: connecting to %s again", self._address)
+        if now - self._control_session.last_heard > patience:
+            self._control_session.on_silence()
+        stalled = now - self._control_session.last_moved > patience
+        if stalled and not self._control_session.held and self._outbox.outstanding:
+            log.info("nothing moves: connecting to %s again", self._data_address)
             self._data.reopen()
-            self._talk.greet_again()
-            with self._outbox.changed:
-                self._talk.rewind()
+            self._control_session.greet_again()
+            self._control_session.rewind()
 
-    # --- keyframes ---
+    # --- records ---
 
     def _pump(self, now: float) -> None:
         self._blocked = False
-        while (terms := self._talk.terms) is not None and not self._blocked and now >= self._read_due:
-            with self._outbox.changed:
-                previous = self._outbox.last_on_its_way
-                entry = self._outbox.claim(terms.window_keyframes, terms.window_bytes, self._ahead)
-            if entry is None:
+        while not self._blocked and now >= self._read_due:
+            if (terms := self._control_session.terms) is None:
                 return
+            claimed = self._outbox.claim(terms.window_keyframes, terms.window_bytes, self._ahead)
+            if claimed is None:
+                return
+            entry, previous = claimed
             if entry.nbytes > terms.max_frame_bytes:
                 text = f"{entry.nbytes} bytes, the server takes {terms.max_frame_bytes}"
                 self._refused.give_up(entry, "size", text)
@@ -162,9 +170,9 @@ class Sender:
                 self._send(entry, previous, frames)
 
     def _read(self, entry: Waiting, now: float) -> list[memoryview] | None:
-        """Its frames; None = not now, or never."""
+        """The frames of a record; None = they cannot be read now, or never."""
         try:
-            frames = self._outbox.spool.read(entry)
+            frames = self._outbox.read(entry)
         except JournalError as error:
             self._on_unread(entry, error, now)
             return None
@@ -173,11 +181,10 @@ class Sender:
 
     def _on_unread(self, entry: Waiting, error: JournalError, now: float) -> None:
         self._unread += 1
-        if error.errno in _SCARCE or (error.errno == errno.EIO and self._unread < _READ_TRIES):
+        if error.errno in _SCARCE or (error.errno == errno.EIO and self._unread < _MAX_READS):
             log.log(logging.WARNING if self._unread == 1 else logging.DEBUG, "%s; it is tried again", error)
-            self._read_due = now + _READ_AGAIN
-            with self._outbox.changed:
-                self._outbox.unclaim()
+            self._read_due = now + _READ_INTERVAL
+            self._outbox.unclaim()
             return
         self._unread = 0
         self._refused.give_up(entry, "spool", str(error), readable=False)
@@ -193,10 +200,7 @@ class Sender:
             self._data.socket.send_multipart([head, *frames[1:]], zmq.NOBLOCK, copy=False)
         except zmq.Again:
             self._blocked = True
-            with self._outbox.changed:
-                self._outbox.unclaim()
+            self._outbox.unclaim()
             return
-        with self._outbox.changed:
-            if self._outbox.outstanding == 0:
-                self._talk.moved = time.monotonic()
-            self._outbox.sent(entry, sent_ns)
+        if self._outbox.sent(entry, sent_ns):
+            self._control_session.last_moved = time.monotonic()

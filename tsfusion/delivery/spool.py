@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The scanner's own disk: every keyframe waits here until the server has it on its disk.
+"""The spool on the scanner's disk: every record waits there until the server has it on its own disk.
 
 A spool is one session: what a dead scanner left in it is resent under the session and numbers that the
 server may already know, and a spool that was emptied starts a new session. Reading back from the page
@@ -21,7 +21,7 @@ from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.delivery.tombstones import Tombstones
-from tsfusion.wire.keyframe_header import unpack
+from tsfusion.wire.record_header import is_correction, unpack
 
 log = logging.getLogger(__name__)
 
@@ -31,42 +31,53 @@ log = logging.getLogger(__name__)
 _RESTART_GAP = 1024
 _RESTART_SPREAD = 1 << 24
 _SESSION_BYTES = 16
-_MANY_GONE = 65536  # numbers before those of deleted files are forgotten
+_MANY_TOMBSTONES = 65536  # numbers before those of deleted files are forgotten
 _RECORD_OVERHEAD = 512  # what MCAP adds to a keyframe, its share of the index at the end included
 
 
 class Waiting(Struct, frozen=True, gc=False):
-    """A keyframe the server does not have yet."""
+    """A keyframe or correction that the server does not have yet."""
 
     seq: int
     position: journal.Position
     nbytes: int
+    is_correction: bool = False
+
+    @property
+    def kind(self) -> str:
+        """`keyframe` or `correction`."""
+        return "correction" if self.is_correction else "keyframe"
 
 
 class Segment(Struct):
-    """One file of the spool: its size on the disk, how many of its keyframes wait, and which are gone."""
+    """One file of the spool.
+
+    Attributes:
+        nbytes: its size on the disk.
+        waiting: records in it that wait.
+        withdrawn: numbers of the records in it that left the spool unsent or refused.
+    """
 
     nbytes: int = 0
     waiting: int = 0
-    gone: list[int] = []
+    withdrawn: list[int] = []
 
 
 class Spool:
-    """A folder of unacknowledged keyframes, oldest first. One process at a time.
+    """A folder of unacknowledged keyframes and corrections, oldest first. One process at a time.
 
     Threads: `write` and `tidy` may run in one while another does anything else; the rest is not thread-safe.
 
     Args:
-        folder: None = a temporary folder that goes away at `close`, with what is still in it.
-        map_name: the map that new keyframes are for.
+        folder: None = a temporary folder, deleted at `close` with all that is in it.
+        map_name: the map that new records are for.
 
     Attributes:
-        waiting: the keyframes, oldest first.
+        waiting: the records, oldest first.
         waiting_bytes: the bytes of their messages.
-        used_bytes: of the disk; keyframes that have left the queue but share a file with others count.
-        next_seq: the number of the next keyframe.
+        used_bytes: of the disk; records that have left the queue but share a file with others count.
+        next_seq: the number of the next record.
         left: the last number that an earlier scanner is known to have used; 0 = there was none.
-        pinned: there is more to say of its session: an empty spool keeps it, too.
 
     Raises:
         JournalError: when the folder cannot be used, another scanner uses it, or it waits for another map.
@@ -81,9 +92,14 @@ class Spool:
     ) -> None:
         self.temporary = folder is None
         self.map_name = map_name
-        self.pinned = False
         self.folder = _temporary_folder() if folder is None else Path(folder)
         self._lock = lock_folder(self.folder, "spool", "scanner")
+        if (old := self.folder / "corrections.tsc").exists():
+            log.warning(
+                "%s holds corrected poses as an earlier development version kept them: it is not read; "
+                "delete it to silence this",
+                old,
+            )
         try:
             self._open(segment_bytes, map_name)
         except JournalError:
@@ -97,19 +113,20 @@ class Spool:
         if len(sessions) > 1:
             raise JournalError(f"{self.folder} holds keyframes of {len(sessions)} sessions: not one spool")
         self.session = sessions.pop()
-        self._gone = Tombstones(self.folder, self.session)
-        self._many_gone = 2 * self._gone.written + _MANY_GONE
+        self._tombstones = Tombstones(self.folder, self.session)
+        self._compact_at = 2 * self._tombstones.written + _MANY_TOMBSTONES
         self._segments = {number: Segment(self._size(number)) for number in journal.segments(self.folder)}
         self.waiting: deque[Waiting] = deque()
         for record in found:
             segment = self._segments[record.position.segment]
-            if record.seq in self._gone.numbers:
-                segment.gone.append(record.seq)
+            if record.seq in self._tombstones.numbers:
+                segment.withdrawn.append(record.seq)
             else:
                 segment.waiting += 1
-                self.waiting.append(Waiting(record.seq, record.position, record.nbytes))
+                place = (record.seq, record.position, record.nbytes)
+                self.waiting.append(Waiting(*place, record.is_correction))
         self.waiting_bytes = sum(entry.nbytes for entry in self.waiting)
-        last = max([record.seq for record in found] + [*self._gone.numbers], default=0)
+        last = max([record.seq for record in found] + [*self._tombstones.numbers], default=0)
         self.left = last
         self.next_seq = last + _RESTART_GAP + secrets.randbelow(_RESTART_SPREAD) if last else 1
         self._idle = {number for number, segment in self._segments.items() if not segment.waiting}
@@ -128,16 +145,16 @@ class Spool:
             return 0
 
     def _left_for(self) -> str | None:
-        """The map of what a dead scanner left: that of the first keyframe that can be read."""
+        """The map of what a dead scanner left: that of the first record that can be read."""
         for entry in self.waiting:
             try:
                 return unpack(self.read(entry)[0]).map
             except (JournalError, DecodeError, IndexError):
-                continue  # found again, and told, when it is to be sent
+                continue  # it is found again, and reported, when it is to be sent
         return None
 
     def write(self, frames: list[bytes]) -> Waiting:
-        """Put the keyframe that was encoded as `next_seq` on the disk; `add` then makes it count.
+        """Put the record that was encoded as `next_seq` on the disk; `add` then makes it count.
 
         Raises:
             JournalError: when the disk refuses. The number is not used again: where the disk did not even
@@ -148,12 +165,12 @@ class Spool:
         try:
             position = self._journal.append(frames, session=self.session, seq=seq)
         except JournalError:
-            self._gone.add(seq)
+            self._tombstones.add(seq)
             raise
-        return Waiting(seq, position, sum(map(len, frames)))
+        return Waiting(seq, position, sum(map(len, frames)), is_correction(frames[0]))
 
     def add(self, entry: Waiting) -> None:
-        """Queue a written keyframe."""
+        """Queue a written record."""
         self.waiting.append(entry)
         self.waiting_bytes += entry.nbytes
         number = entry.position.segment
@@ -165,7 +182,7 @@ class Spool:
         self._idle.discard(number)
 
     def read(self, entry: Waiting) -> list[memoryview]:
-        """The frames of a keyframe.
+        """The frames of a record.
 
         Raises:
             JournalError: when the disk has lost it.
@@ -173,7 +190,7 @@ class Spool:
         return journal.read(self.folder, entry.position).frames
 
     def drop(self, durable: int) -> list[int]:
-        """Let go of everything up to `durable`; the numbers of what was waiting."""
+        """Let go of everything up to `durable`; the numbers of the records that waited."""
         dropped = []
         while self.waiting and self.waiting[0].seq <= durable:
             dropped.append(self.waiting[0].seq)
@@ -183,17 +200,17 @@ class Spool:
         return dropped
 
     def remove(self, place: int) -> None:
-        """Let go of one keyframe that the server does not have, by its place in the queue."""
+        """Let go of one record that the server does not have, by its place in the queue."""
         entry = self._let_go(place)
-        self._segments[entry.position.segment].gone.append(entry.seq)
-        self._gone.add(entry.seq)
+        self._segments[entry.position.segment].withdrawn.append(entry.seq)
+        self._tombstones.add(entry.seq)
         self._delete_segments()
-        if self._gone.written > self._many_gone:
-            self._gone.keep(seq for segment in self._segments.values() for seq in segment.gone)
-            self._many_gone = 2 * self._gone.written + _MANY_GONE
+        if self._tombstones.written > self._compact_at:
+            self._tombstones.keep(seq for segment in self._segments.values() for seq in segment.withdrawn)
+            self._compact_at = 2 * self._tombstones.written + _MANY_TOMBSTONES
 
     def tidy(self) -> None:
-        """Delete what `drop` had to leave. For the thread that writes, when it does not."""
+        """Delete the files that `drop` had to leave. For the thread that writes, while it does not."""
         self._delete_segments(self._journal.segment)
 
     def _let_go(self, place: int) -> Waiting:
@@ -207,9 +224,9 @@ class Spool:
         return entry
 
     def _delete_segments(self, below: int | None = None) -> None:
-        # The newest stays: a keyframe that `write` has just put there may not be queued yet.
+        # The newest stays: a record that `write` has just put there may not be queued yet.
         newest = next(reversed(self._segments), 0)
-        for number in [n for n in self._idle if n < (newest if below is None or self.pinned else below)]:
+        for number in [n for n in self._idle if n < (newest if below is None else below)]:
             self._forget(number)
 
     def _forget(self, number: int) -> None:
@@ -229,10 +246,10 @@ class Spool:
             log.warning("%s", error)
         if self.temporary:
             shutil.rmtree(self.folder, ignore_errors=True)
-        elif not self.waiting and not self.pinned:
+        elif not self.waiting:
             for number in list(self._segments):
                 self._forget(number)
-            self._gone.clear()
+            self._tombstones.clear()
         self._lock.close()
 
 

@@ -11,29 +11,29 @@ CAPACITY = 65536
 _LARGEST = (1 << 63) - 1
 _FIELDS = KeyframeTimes.__struct_fields__
 _COLUMN = {name: place for place, name in enumerate(_FIELDS)}
-_OF_THE_SERVER = ("received_ns", "durable_ns", "fuse_start_ns", "fused_ns", "meshed_ns")
+_SERVER_STAMPS = ("received_ns", "durable_ns", "fuse_start_ns", "fused_ns", "meshed_ns")
 
 
 class KeyframeTimesTable:
-    """A row a keyframe; a new one takes the place of the one that came `CAPACITY` numbers before."""
+    """One row a keyframe; a new one takes the place of the one that came `CAPACITY` numbers before."""
 
     def __init__(self) -> None:
         self._rows = np.zeros((CAPACITY, len(_FIELDS)), np.int64)  # pages are taken when they are written to
         self._newest_fused = 0
 
     def add(self, seq: int, *, timestamp_ns: int, captured_ns: int) -> None:
-        """A keyframe begins."""
+        """Begin the row of a keyframe."""
         row = self._rows[seq % CAPACITY]
         row[:] = 0
         row[:3] = seq, timestamp_ns, captured_ns
 
     def remove(self, seq: int) -> None:
-        """It was never sent."""
+        """Empty the row of a keyframe that was never sent."""
         if self._has(seq):
             self._rows[seq % CAPACITY] = 0
 
     def sent(self, seq: int, sent_ns: int) -> None:
-        """It was handed to the socket."""
+        """Note when a keyframe was handed to the socket."""
         if self._has(seq):
             self._rows[seq % CAPACITY, _COLUMN["sent_ns"]] = sent_ns
 
@@ -42,14 +42,14 @@ class KeyframeTimesTable:
         if self._has(stamps.seq):
             row = self._rows[stamps.seq % CAPACITY]
             row[_COLUMN["clock_bound_ns"]] = min(bound_ns, _LARGEST)
-            for name in _OF_THE_SERVER:
+            for name in _SERVER_STAMPS:
                 if (value := getattr(stamps, name)) and not row[_COLUMN[name]]:
                     row[_COLUMN[name]] = min(max(value - offset_ns, -_LARGEST), _LARGEST)
             if row[_COLUMN["fused_ns"]] > 0:
                 self._newest_fused = max(self._newest_fused, stamps.seq)
 
     def newest_fused(self) -> KeyframeTimes | None:
-        """The newest keyframe that is in the map; None = there is none yet."""
+        """The row of the newest keyframe that is in the map; None = there is none yet."""
         if not self._newest_fused or not self._has(self._newest_fused):
             return None
         row = self._rows[self._newest_fused % CAPACITY].tolist()
@@ -86,12 +86,12 @@ class ClockOffset:
             self._samples.append((round_trip, offset))
 
     def clear(self) -> None:
-        """Forget everything: the clock at the other end is another one."""
+        """Forget all pings: the clock at the other end is another one."""
         self._samples.clear()
 
     @property
     def count(self) -> int:
-        """How many pings the estimate stands on."""
+        """Number of pings that the estimate stands on."""
         return len(self._samples)
 
     @property

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Which keyframes left a spool unsent or refused, while their records are still in one of its files.
+"""Numbers of records that left a spool unsent or refused, while one of its files still holds them.
 
-Else a scanner that starts after a crash would find them again and send them. Not synced: what a power cut
-takes of it is found again, and sent.
+Without them a scanner that starts after a crash would find these records again and send them. Not synced: a
+record whose number a power cut takes is found again, and sent.
 """
 
 import contextlib
@@ -23,8 +23,8 @@ class Tombstones:
     """A file of numbers, behind the session they belong to. A disk that refuses is passed over.
 
     Attributes:
-        numbers: what was there at the start.
-        written: how many the file holds.
+        numbers: those in the file at the start.
+        written: count of the numbers in the file.
     """
 
     def __init__(self, folder: Path, session: bytes) -> None:
@@ -45,16 +45,16 @@ class Tombstones:
         return set(np.frombuffer(stored, _NUMBER, whole, _SESSION_BYTES).tolist())
 
     def add(self, seq: int) -> None:
-        """This one is gone."""
+        """Append a number."""
         self._write([seq])
 
     def keep(self, numbers: Iterable[int]) -> None:
-        """Forget all others: their records are gone, too."""
+        """Write the file anew with these numbers; the records of all others are deleted."""
         self.clear()
         self._write(numbers)
 
     def clear(self) -> None:
-        """Forget all."""
+        """Delete the file."""
         self.written = 0
         with contextlib.suppress(OSError):
             self._path.unlink(missing_ok=True)

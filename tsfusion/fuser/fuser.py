@@ -25,11 +25,12 @@ from tsfusion.core import process
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
+from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.journal import state_folder
 from tsfusion.wire import codec, sockets
 from tsfusion.wire.health import MeshLayout
-from tsfusion.wire.keyframe_header import Refused
+from tsfusion.wire.record_header import Refused
 
 _TAICHI_RESERVES = 2 << 30  # bytes that Taichi asks for and hardly uses
 _KEPT_FREE = 256 << 20  # bytes that keyframes leave to meshes and checkpoints
@@ -161,7 +162,9 @@ class Fuser:
             process.limit_memory(self._memory_limit - min(_KEPT_FREE, self._begin.memory_bytes // 2))
             try:
                 record = journal.read(self._folder / state_folder.JOURNAL_FOLDER, order.position)
-                self._volume.integrate(codec.decode(record.frames))
+                found = codec.decode(record.frames)
+                if isinstance(found, Keyframe):  # a correction does not change the map (yet)
+                    self._volume.integrate(found)
             except TsfusionError as error:
                 if isinstance(error, JournalError) and error.temporary:
                     log.error("%s: another process tries again, from the checkpoint", error)
@@ -172,7 +175,7 @@ class Fuser:
                 reason, message = "memory", f"no memory to fuse it: {error}"
             process.limit_memory(self._memory_limit)
             self._current.set(fuser_messages.NOT_WORKING)  # not reached if the keyframe ended the process
-        if reason is not None:
+        if reason is not None and not order.is_correction:
             self._map.rejected[reason] = self._map.rejected.get(reason, 0) + 1
         self._map.done[order.session] = fuser_messages.SessionProgress(order.seq, order.client)
         self._send(fuser_messages.Done(order.index, start, time.monotonic_ns(), reason, message))

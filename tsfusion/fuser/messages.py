@@ -49,7 +49,7 @@ class SessionProgress(Struct, frozen=True, array_like=True):
 
 
 class Fuse(Struct, frozen=True, tag="fuse"):
-    """Fuse the keyframe at a journal position, unless the map has it already.
+    """Fuse the keyframe, or note the correction, at a journal position, unless the map has it already.
 
     `skip`: reject it without a try, for this reason.
     """
@@ -60,6 +60,7 @@ class Fuse(Struct, frozen=True, tag="fuse"):
     seq: int
     client: str = ""
     skip: str | None = None
+    is_correction: bool = False
 
 
 class FuserQuery(Struct, frozen=True, tag="ask"):
@@ -132,7 +133,7 @@ class Failed(Struct, frozen=True, tag="failed"):
 
 
 class Done(Struct, frozen=True, tag="done"):
-    """A keyframe is in the map, or `reason` says why it never will be."""
+    """A keyframe is in the map or a correction is noted, or `reason` says why it never will be."""
 
     index: int
     fuse_start_ns: int

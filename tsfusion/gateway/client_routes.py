@@ -63,16 +63,15 @@ class ClientRoute(Struct, eq=False):
         possible = abs(ping.offset_ns or 0) <= _LARGEST_OFFSET_NS and 0 <= ping.bound_ns <= _LARGEST_BOUND_NS
         self.offset_ns, self.bound_ns = (ping.offset_ns, ping.bound_ns) if possible else (None, 0)
 
-    def health(self, now: float, progress: tuple[int, int], corrections: tuple[int, int]) -> ClientHealth:
+    def health(self, now: float, progress: tuple[int, int], corrections: int) -> ClientHealth:
         """How the client is doing.
 
         Args:
             now: `time.monotonic()`.
             progress: the highest seq that is durable, and that is fused.
-            corrections: their newest revision, and how many keyframes they name.
+            corrections: corrections of the session in the journal.
         """
         durable, fused = progress
-        revision, corrected = corrections
         return ClientHealth(
             client=self.client,
             session=self.session.hex()[:8],
@@ -84,8 +83,7 @@ class ClientRoute(Struct, eq=False):
             waiting=self.waiting,
             skipped=self.skipped,
             held=self.hold_reason if now < self.held_until else "",
-            revision=revision,
-            corrected=corrected,
+            corrections=corrections,
         )
 
 

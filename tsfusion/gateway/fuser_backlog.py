@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The journaled keyframes that a map's fuser has not answered, and the fair order in which it gets them."""
+"""The journaled records that a map's fuser has not answered, and the fair order in which it gets them."""
 
 from collections import OrderedDict, deque
 from collections.abc import Mapping
@@ -11,22 +11,39 @@ from tsfusion.gateway.sessions import Session, Sessions
 
 
 class FuserBacklog:
-    """Hands out keyframes of each client in turn, and of each session of a client in turn.
+    """Hands out records of each client in turn, and of each session of a client in turn.
 
     Attributes:
-        waiting: keyframes that are not answered.
+        keyframes, corrections: how many of them are not answered.
     """
 
     def __init__(self, index: KeyframeIndex, sessions: Sessions) -> None:
-        self.waiting = len(index)
         self._index = index
         self._sessions = sessions
         self._queues: OrderedDict[str, deque[Session]] = OrderedDict()  # by owner, the next one first
+        self._count()
 
-    def add(self, session: Session) -> None:
-        """Add the keyframe of a session that was journaled just now."""
-        self.waiting += 1
+    @property
+    def is_empty(self) -> bool:
+        """Whether the fuser has answered every record."""
+        return not self.keyframes and not self.corrections
+
+    def _count(self) -> None:
+        waiting = [session.entries[session.handed :] for session in self._sessions]
+        self.corrections = sum(map(self._index.corrections, waiting))
+        self.keyframes = sum(map(len, waiting)) - self.corrections
+
+    def add(self, session: Session, *, is_correction: bool = False) -> None:
+        """Add the record of a session that was journaled just now."""
+        self.keyframes += not is_correction
+        self.corrections += is_correction
         self._enqueue(session)
+
+    def on_done(self, index: int) -> None:
+        """Take out a record that the fuser answered."""
+        is_correction = self._index[index].is_correction
+        self.keyframes -= not is_correction
+        self.corrections -= is_correction
 
     def _enqueue(self, session: Session) -> None:
         if session.handed < len(session.entries):
@@ -37,21 +54,27 @@ class FuserBacklog:
     def restart(self, done: Mapping[bytes, SessionProgress]) -> None:
         """Begin where a new fuser begins, with `done` of each session: hand out all the rest again."""
         self._queues.clear()
-        self.waiting = 0
         for session in self._sessions:
             progress = done.get(session.key)
             session.in_map = progress.seq if progress else 0
             session.handed = self._index.after(session, progress.seq) if progress else 0
-            self.waiting += len(session.entries) - session.handed
             self._enqueue(session)
+        self._count()
 
     def hand_out(self, fuser: FuserSupervisor) -> None:
-        """Hand out as many keyframes as the fuser wants."""
+        """Hand out as many records as the fuser wants."""
         while self._queues and fuser.wants_work:
             owner, queue = next(iter(self._queues.items()))
             session = queue[0]
             entry = self._index[session.entries[session.handed]]
-            order = Fuse(entry.index, entry.position, session.key, entry.stamps.seq, session.client)
+            order = Fuse(
+                entry.index,
+                entry.position,
+                session.key,
+                entry.stamps.seq,
+                session.client,
+                is_correction=entry.is_correction,
+            )
             if not fuser.fuse(order):
                 return
             session.handed += 1

@@ -7,7 +7,7 @@ message is checked, journaled and acknowledged in one step; a map's fuser gets o
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import zmq
@@ -20,7 +20,6 @@ from tsfusion.gateway import fuser_queries
 from tsfusion.gateway.access_control import AccessControl
 from tsfusion.gateway.admission import Admission
 from tsfusion.gateway.client_routes import ClientRoutes
-from tsfusion.gateway.correction_intake import Corrector
 from tsfusion.gateway.fuser_queries import FuserQueries
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.keyframe_intake import KeyframeIntake
@@ -29,10 +28,7 @@ from tsfusion.gateway.memory_guard import MemoryGuard
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Ports, Subscriptions, receive_some
 from tsfusion.wire import messages, sockets
-from tsfusion.wire.corrections import Corrections
 from tsfusion.wire.health import Health
-from tsfusion.wire.keyframe_header import VERSION
-from tsfusion.wire.messages import decode_frames_to_server
 from tsfusion.wire.sockets import mesh_topic
 
 log = logging.getLogger(__name__)
@@ -70,7 +66,6 @@ class Gateway:
         self._refused = self._admission.refused
         self.maps = MapRegistry(context, server, self._routes, metrics)
         self._intake = KeyframeIntake(server, self.maps, self._admission, self._routes)
-        self._corrector = Corrector(server, self.maps, self._admission)
         self._queries = FuserQueries(ports, server.memory_bytes // _MESHES_SHARE)
         self._subscriptions = Subscriptions()
         self._publishing: dict[str, bool] = {}  # map → whether its fuser was told to send triangles
@@ -188,22 +183,17 @@ class Gateway:
         client = self._admission.client_of(frames[0])
         if client is None:
             return
-        identity, *rest = frames
         try:
-            message = decode_frames_to_server([frame.buffer for frame in rest])
-        except DecodeError as error:
+            identity, content = frames
+            message = messages.decode_to_server(content.buffer)
+        except (DecodeError, ValueError) as error:
             self._refused["control"] += 1
             log.debug("%s", error)
             return
-        self._on_message(identity.bytes, message, client, [frame.buffer for frame in rest[1:]])
+        self._on_message(identity.bytes, message, client)
 
-    def _on_message(
-        self, identity: bytes, message: messages.ToServer, client: str, arrays: Sequence[Any]
-    ) -> None:
-        if isinstance(message, Corrections):
-            if self._accepting and (answer := self._corrector.take(message, arrays, client)) is not None:
-                self.ports.reply(identity, answer)
-        elif isinstance(message, messages.Command):
+    def _on_message(self, identity: bytes, message: messages.ToServer, client: str) -> None:
+        if isinstance(message, messages.Command):
             self._on_command(identity, message, client)
         elif isinstance(message, messages.Hello):
             self._on_hello(identity, message, client)
@@ -217,20 +207,19 @@ class Gateway:
         durable, fused = self.maps.progress(hello.map, hello.session)
         welcome = messages.Welcome(
             epoch=self.epoch,
-            version=VERSION,
+            version=messages.PROTOCOL_VERSION,
             durable=durable,
             fused=fused,
             window_keyframes=self._server.window_keyframes,
             window_bytes=self._server.window_bytes,
             max_frame_bytes=self._server.max_frame_bytes,
-            corrections=self.maps.corrected(hello.map, hello.session)[0],
         )
         self.ports.reply(identity, welcome)
 
     def _denial(self, identity: bytes, hello: messages.Hello, client: str) -> tuple[str, str] | None:
         """The reason and message why a session is not opened; None = it is, and its route is made."""
-        if hello.version != VERSION:
-            speaks = f"the server speaks version {VERSION} of the wire format"
+        if hello.version != messages.PROTOCOL_VERSION:
+            speaks = f"the server speaks version {messages.PROTOCOL_VERSION} of the wire format"
             return "version", f"{speaks}, this client {hello.version}"
         hosted = self.maps.open_for_client(hello.map)
         if hosted is None:
@@ -293,7 +282,7 @@ class Gateway:
             duplicates=self._intake.duplicates,
             maps=found,
             clients=tuple(
-                route.health(now, self.maps.progress(*route.place), self.maps.corrected(*route.place))
+                route.health(now, self.maps.progress(*route.place), self.maps.corrections(*route.place))
                 for route in self._routes
             ),
         )

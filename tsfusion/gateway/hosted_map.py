@@ -14,7 +14,6 @@ from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.client_routes import ClientRoutes
-from tsfusion.gateway.correction_store import Revisions
 from tsfusion.gateway.fuser_backlog import FuserBacklog
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.journal_retention import JournalRetention
@@ -26,7 +25,7 @@ from tsfusion.journal import Journal, state_folder
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import keyframe_times
 from tsfusion.wire.health import MapHealth, MapState
-from tsfusion.wire.keyframe_header import KeyframeHeader
+from tsfusion.wire.record_header import CorrectionHeader, RecordHeader
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +41,6 @@ class HostedMap:
         folder: in the state folder.
         disk: why keyframes are not taken now, and for how long.
         outcomes: what the map has, by its fuser's answers.
-        revisions: the corrected poses of its keyframes.
         warm: whether the fuser has been ready once: from then on it is known what the map has.
     """
 
@@ -65,12 +63,12 @@ class HostedMap:
         self._loss = ""
         self._journal = _open_journal(self.folder, server)
         self.disk = DiskPause(self._journal, server.min_free_bytes, name)
-        self.revisions = Revisions(self.folder / state_folder.CORRECTIONS_FOLDER, server.min_free_bytes)
         self._quarantine = Quarantine(self.folder / state_folder.QUARANTINE_FOLDER, server.quarantine_bytes)
         self._index = KeyframeIndex()
         self._index.recover(self._journal.found, self.sessions)
         self._journal.found = []
         self._backlog = FuserBacklog(self._index, self.sessions)
+        self._corrections = self._backlog.corrections  # in the journal
         self.outcomes = KeyframeOutcomes(
             name,
             self._index,
@@ -81,12 +79,13 @@ class HostedMap:
             quarantine=self._quarantine,
         )
         self._retention = JournalRetention(self._journal, self._index, self.sessions, server.journal_bytes)
+        _warn_of_old_corrections(self.folder)
         self.fuser = FuserSupervisor(context, self.folder, server, volume)
 
     @property
     def drained(self) -> bool:
         """Whether the map has every keyframe of the journal."""
-        return self.fuser.idle and not self._backlog.waiting
+        return self.fuser.idle and self._backlog.is_empty
 
     @property
     def settled(self) -> bool:
@@ -107,8 +106,8 @@ class HostedMap:
 
     # --- keyframes ---
 
-    def accept(self, header: KeyframeHeader, frames: Sequence[Any], client: str, received_ns: int) -> None:
-        """Write the session's next keyframe to the journal, and acknowledge it.
+    def accept(self, header: RecordHeader, frames: Sequence[Any], client: str, received_ns: int) -> None:
+        """Write the session's next keyframe or correction to the journal, and acknowledge it.
 
         Raises:
             JournalError: when the disk refuses.
@@ -126,13 +125,17 @@ class HostedMap:
             position,
             session,
             header.seq,
-            captured_ns=header.captured_ns,
+            captured_ns=0 if isinstance(header, CorrectionHeader) else header.captured_ns,
             received_ns=received_ns,
             durable_ns=durable_ns,
+            is_correction=isinstance(header, CorrectionHeader),
         )
-        self._last_keyframe = durable_ns / 1e9
-        self._backlog.add(session)
-        self._metrics.observe(self.name, "journal", (durable_ns - received_ns) / 1e9)
+        self._backlog.add(session, is_correction=isinstance(header, CorrectionHeader))
+        if isinstance(header, CorrectionHeader):
+            self._corrections += 1
+        else:
+            self._last_keyframe = durable_ns / 1e9
+            self._metrics.observe(self.name, "journal", (durable_ns - received_ns) / 1e9)
         self.outcomes.acknowledge(
             header.session, [keyframe_times.Stamps(header.seq, received_ns, durable_ns)]
         )
@@ -153,7 +156,7 @@ class HostedMap:
         while (received := self.fuser.receive()) is not None:
             message, frames = received
             if isinstance(message, fuser_messages.Done):
-                self._backlog.waiting -= 1
+                self._backlog.on_done(message.index)
                 self.outcomes.on_done(message)
             elif isinstance(message, fuser_messages.Ready):
                 self._on_ready(message)
@@ -210,8 +213,6 @@ class HostedMap:
         """Losses that a person should know of, though keyframes are taken and fused."""
         damaged = self._journal.damaged
         notices = [f"{damaged} keyframes of its journal are damaged and lost"] if damaged else []
-        if self.revisions.damaged:
-            notices.append(f"the corrections of {self.revisions.damaged} sessions are damaged and lost")
         return [*notices, self._loss] if self._loss else notices
 
     def health(self) -> MapHealth:
@@ -220,9 +221,9 @@ class HostedMap:
         return MapHealth(
             state=self.state,
             problem=self.disk.problem or self.fuser.failed,
-            keyframes_durable=outcomes.fused + outcomes.rejected.total() + self._backlog.waiting,
+            keyframes_durable=outcomes.fused + outcomes.rejected.total() + self._backlog.keyframes,
             keyframes_fused=outcomes.fused,
-            waiting=self._backlog.waiting,
+            waiting=self._backlog.keyframes,
             rejected=dict(outcomes.rejected),
             quarantined=len(self._quarantine),
             sessions=len(self.sessions),
@@ -234,7 +235,7 @@ class HostedMap:
             last_keyframe_s=None if self._last_keyframe is None else max(now - self._last_keyframe, 0.0),
             delay_ms=outcomes.delays.summary(),
             delay_bound_ms=outcomes.delays.bound_ms,
-            corrections=self.revisions.taken,
+            corrections=self._corrections,
         )
 
 
@@ -244,6 +245,16 @@ def _open_journal(folder: Path, server: ServerConfig) -> Journal:
     if server.journal_bytes is not None:
         segment_bytes = min(segment_bytes, server.journal_bytes // _SEGMENTS_KEPT)
     return Journal(folder / state_folder.JOURNAL_FOLDER, segment_bytes, min_free_bytes=server.min_free_bytes)
+
+
+def _warn_of_old_corrections(folder: Path) -> None:
+    old = folder / "corrections"
+    if any(old.glob("*.tsc")):
+        log.warning(
+            "%s holds corrected poses as an earlier development version kept them: they are not read; "
+            "delete the folder to silence this",
+            old,
+        )
 
 
 class DiskPause:

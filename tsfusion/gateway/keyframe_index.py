@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where each journaled keyframe of a map lies, whose it is, and when it was received, durable and fused."""
+"""Where each journaled record of a map lies, whose it is, and when it was received, durable and fused."""
 
 from array import array
 from bisect import bisect_left, bisect_right
@@ -13,25 +13,26 @@ from tsfusion.wire.keyframe_times import Stamps
 
 
 class IndexEntry(Struct, frozen=True):
-    """One journaled keyframe."""
+    """One journaled keyframe or correction."""
 
     index: int
     position: Position
     session: int  # its number in `Sessions`
     stamps: Stamps
     captured_ns: int
+    is_correction: bool
 
 
 _COLUMNS = (
-    *("segment", "offset", "session", "seq", "captured_ns"),
+    *("segment", "offset", "session", "seq", "captured_ns", "is_correction"),
     *("received_ns", "durable_ns", "fuse_start_ns", "fused_ns"),  # as in Stamps
 )
 
 
 class KeyframeIndex:
-    """Every keyframe of the journal in order, 72 bytes each. Stamps are 0 for keyframes of earlier runs.
+    """Every record of the journal in order, 80 bytes each. Stamps are 0 for records of earlier runs.
 
-    The index of a keyframe stays the same when those before it are forgotten.
+    The index of a record stays the same when those before it are forgotten.
     """
 
     def __init__(self) -> None:
@@ -42,7 +43,7 @@ class KeyframeIndex:
         return len(self._columns["seq"])
 
     def recover(self, found: Iterable[RecordEntry], sessions: Sessions) -> None:
-        """Add the keyframes that a scan of the journal found. One that was journaled twice counts once.
+        """Add the records that a scan of the journal found. One that was journaled twice counts once.
 
         (The disk refused, the client sent it again, and the first copy had been written after all.)
         """
@@ -50,7 +51,7 @@ class KeyframeIndex:
             session = sessions.open(record.session, record.client)
             if record.seq > session.durable:
                 session.durable = record.seq
-                self.add(record.position, session, record.seq)
+                self.add(record.position, session, record.seq, is_correction=record.is_correction)
 
     def add(
         self,
@@ -61,9 +62,11 @@ class KeyframeIndex:
         captured_ns: int = 0,
         received_ns: int = 0,
         durable_ns: int = 0,
+        is_correction: bool = False,
     ) -> int:
-        """Append a keyframe; its index."""
-        place = (position.segment, position.offset, session.number, seq, captured_ns)
+        """Append a record; its index."""
+        session.corrections += is_correction
+        place = (position.segment, position.offset, session.number, seq, captured_ns, is_correction)
         values = (*place, received_ns, durable_ns, 0, 0)
         for column, value in zip(self._columns.values(), values, strict=True):
             column.append(value)
@@ -72,11 +75,11 @@ class KeyframeIndex:
         return index
 
     def forget(self, before_segment: int, sessions: Sessions, needed: Iterable[int] = ()) -> None:
-        """Forget the keyframes of deleted segments, up to the first that is still to be handed out.
+        """Forget the records of deleted segments, up to the first that is still to be handed out.
 
         Args:
             before_segment: number of the oldest segment that is still there.
-            needed: indices of keyframes that must not be forgotten.
+            needed: indices of records that must not be forgotten.
         """
         deleted = bisect_left(self._columns["segment"], before_segment)
         if not deleted:
@@ -93,21 +96,27 @@ class KeyframeIndex:
         self._first = stop
 
     def set_fused(self, index: int, fuse_start_ns: int, fused_ns: int) -> None:
-        """Write down when a keyframe entered the map."""
+        """Write down when the fuser took a record."""
         self._columns["fuse_start_ns"][index - self._first] = fuse_start_ns
         self._columns["fused_ns"][index - self._first] = fused_ns
 
     def __getitem__(self, index: int) -> IndexEntry:
-        segment, offset, session, seq, captured, *stamps = (
+        segment, offset, session, seq, captured, is_correction, *stamps = (
             column[index - self._first] for column in self._columns.values()
         )
-        return IndexEntry(index, Position(segment, offset), session, Stamps(seq, *stamps), captured)
+        place, times = Position(segment, offset), Stamps(seq, *stamps)
+        return IndexEntry(index, place, session, times, captured, bool(is_correction))
+
+    def corrections(self, indices: Iterable[int]) -> int:
+        """How many of these records are corrections."""
+        column, first = self._columns["is_correction"], self._first
+        return sum(column[index - first] for index in indices)
 
     def after(self, session: Session, seq: int) -> int:
-        """How many keyframes of a session that are not forgotten have a sequence number up to `seq`."""
+        """How many records of a session that are not forgotten have a sequence number up to `seq`."""
         seqs, first = self._columns["seq"], self._first
         return bisect_right(session.entries, seq, key=lambda index: seqs[index - first])
 
     def segment(self, index: int) -> int:
-        """The number of the segment that holds a keyframe."""
+        """The number of the segment that holds a record."""
         return self._columns["segment"][index - self._first]

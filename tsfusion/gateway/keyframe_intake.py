@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Keyframe messages from the data socket: checked, then journaled, turned away for now, or refused.
+"""Keyframes and corrections from the data socket: checked, then journaled, held off, or refused.
 
 The cheapest checks come first, and nothing is answered before the message is known to be from the session's
 own client: a forged message must not make a client give up a good keyframe.
@@ -20,7 +20,7 @@ from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.wire import codec, messages
-from tsfusion.wire.keyframe_header import KeyframeHeader, Refused, unpack
+from tsfusion.wire.record_header import RecordHeader, Refused, unpack
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +33,7 @@ class KeyframeIntake:
     """The way from the data socket into the journals.
 
     Attributes:
-        duplicates: messages with keyframes that were journaled before.
+        duplicates: messages with records that were journaled before.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class KeyframeIntake:
         self._quotas = Quotas(server)
 
     def handle(self, frames: list[zmq.Frame]) -> None:
-        """Check one message, and journal its keyframe or answer why not."""
+        """Check one message, and journal its record or answer why not."""
         received_ns = time.monotonic_ns()
         client = self._admission.client_of(frames[0])
         if client is None:
@@ -68,7 +68,7 @@ class KeyframeIntake:
         elif not self._admission.owns(hosted.sessions, header.session, client):
             self._refused["session"] += 1
             subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
-            log.warning("a keyframe is refused: its session is another client's", extra=subject)
+            log.warning("a %s is refused: its session is another client's", header.kind, extra=subject)
         elif not self._has_to_wait(hosted, header.session, client, nbytes):
             self._on_checked(hosted, header, buffers, client, received_ns)
 
@@ -103,7 +103,7 @@ class KeyframeIntake:
         self._routes.send(key, messages.Hold(key, seconds, reason, message))
 
     def _on_checked(
-        self, hosted: HostedMap, header: KeyframeHeader, buffers: list[Any], client: str, received_ns: int
+        self, hosted: HostedMap, header: RecordHeader, buffers: list[Any], client: str, received_ns: int
     ) -> None:
         # Duplicates come first: a keyframe that is journaled must not be refused when it is sent again.
         verdict = hosted.sessions.admit(header.session, header.seq, header.previous)
@@ -115,7 +115,7 @@ class KeyframeIntake:
             return
         try:
             codec.check(buffers, self._server.max_frame_bytes)
-            self._quotas.check(header)
+            self._quotas.check(header, buffers)
             self._routes.mark_alive(header.session, client, scans=True)
             hosted.accept(header, buffers, client, received_ns)
         except Refused as error:
@@ -125,7 +125,7 @@ class KeyframeIntake:
                 header.session, hosted.disk.seconds_left(time.monotonic()), "disk", hosted.disk.problem
             )
 
-    def _refuse(self, error: Refused, client: str, header: KeyframeHeader | None = None) -> None:
+    def _refuse(self, error: Refused, client: str, header: RecordHeader | None = None) -> None:
         """Count a bad message; if its session is known, tell the client not to send it again."""
         self._refused[error.reason] += 1
         if header is None:
@@ -134,5 +134,5 @@ class KeyframeIntake:
             return
         key, seq = header.session, header.seq
         subject = logs.about(map=header.map, session=key, seq=seq, client=client, reason=error.reason)
-        log.warning("a keyframe is refused: %s", error, extra=subject)
+        log.warning("a %s is refused: %s", header.kind, error, extra=subject)
         self._routes.send(key, messages.Nack(key, seq, "door", error.reason, str(error)))

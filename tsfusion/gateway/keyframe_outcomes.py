@@ -85,15 +85,14 @@ class KeyframeOutcomes:
         self._meshed = 0
 
     def on_done(self, done: fuser_messages.Done) -> None:
-        """Note the fuser's answer to a keyframe, and report it to the client."""
+        """Note the fuser's answer to a record, and report it to the client."""
         entry = self._index[done.index]
         session = self._sessions.numbered(entry.session)
         session.in_map = entry.stamps.seq
         self.unmeshed.append(done.index)
-        if done.reason is None:
-            self.fused += 1
-        else:
-            self.rejected[done.reason] += 1
+        if not entry.is_correction:
+            self.fused += done.reason is None
+            self.rejected.update([done.reason] if done.reason else [])
         if done.reason is None:
             reported = entry.stamps.fused_ns > 0
         else:
@@ -111,7 +110,7 @@ class KeyframeOutcomes:
 
     def _on_fused(self, session: Session, entry: IndexEntry) -> None:
         route, stamps = self._routes.get(session.key), entry.stamps
-        if stamps.durable_ns:  # 0: journaled by an earlier server
+        if stamps.durable_ns and not entry.is_correction:  # 0: journaled by an earlier server
             waited, fused = stamps.fuse_start_ns - stamps.durable_ns, stamps.fused_ns - stamps.fuse_start_ns
             self._metrics.observe(self._name, "queue", waited / 1e9)
             self._metrics.observe(self._name, "fuse", fused / 1e9)
@@ -125,7 +124,8 @@ class KeyframeOutcomes:
         self._reported_rejections.add(done.index)
         seq = entry.stamps.seq
         log.error(
-            "a keyframe is not in the map: %s",
+            "a %s is not in the map: %s",
+            "correction" if entry.is_correction else "keyframe",
             done.message or done.reason,
             extra=logs.about(
                 map=self._name, session=session.key, seq=seq, client=session.client, reason=done.reason
@@ -147,7 +147,7 @@ class KeyframeOutcomes:
 
     def _stamp_meshed(self, index: int, meshed_ns: int) -> None:
         entry = self._index[index]
-        if entry.stamps.fused_ns:
+        if entry.stamps.fused_ns and not entry.is_correction:
             self._metrics.observe(self._name, "mesh", (meshed_ns - entry.stamps.fused_ns) / 1e9)
         stamps = msgspec.structs.replace(entry.stamps, meshed_ns=meshed_ns)
         self.acknowledge(self._sessions.numbered(entry.session).key, [stamps])

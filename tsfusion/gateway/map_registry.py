@@ -49,13 +49,11 @@ class MapRegistry:
         hosted = self.get(name)
         return hosted.sessions.progress(session) if hosted else (0, 0)
 
-    def corrected(self, name: str, session: bytes) -> tuple[int, int]:
-        """Of a session's corrections the newest revision, and how many keyframes they name."""
+    def corrections(self, name: str, key: bytes) -> int:
+        """How many corrections of a session were journaled."""
         hosted = self.get(name)
-        if hosted is None:
-            return 0, 0
-        kept = hosted.revisions.of(session)
-        return kept.revision, kept.keyframes
+        session = hosted.sessions.get(key) if hosted else None
+        return session.corrections if session else 0
 
     def open_at_start(self, volumes: Mapping[str, VolumeConfig]) -> None:
         """Open maps by name with their settings; those that clients ask for get those of the default map.

@@ -89,7 +89,7 @@ def _of_maps(maps: dict[str, MapHealth], age: float) -> Iterator[Metric]:
     restarts = (((name,), one.fuser_restarts) for name, one in maps.items())
     yield _counter("fuser_restarts", "Fusers that took over from a dead one.", ("map",), restarts)
     corrections = (((name,), one.corrections) for name, one in maps.items())
-    yield _counter("corrections", "Messages with corrected poses that were taken.", ("map",), corrections)
+    yield _counter("corrections", "Corrections of keyframes' poses in the journal.", ("map",), corrections)
     ages = (
         ((name,), one.last_keyframe_s + age) for name, one in maps.items() if one.last_keyframe_s is not None
     )

@@ -3,12 +3,15 @@
 
 import math
 from collections import OrderedDict
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from tsfusion.core.config import ServerConfig
+from tsfusion.wire import corrections
 from tsfusion.wire.codec import measurement
-from tsfusion.wire.keyframe_header import KeyframeHeader, Refused
+from tsfusion.wire.record_header import CorrectionHeader, KeyframeHeader, RecordHeader, Refused
 
 _BURST = 2.0  # seconds' worth that may come at once
 _MAX_CLIENTS = 4096
@@ -64,14 +67,35 @@ class Quotas:
             data.spend(nbytes)
         return seconds
 
-    def check(self, header: KeyframeHeader) -> None:
-        """Raise Refused (`quota`) for a keyframe with too many points, or from too far away."""
+    def check(self, header: RecordHeader, frames: Sequence[Any]) -> None:
+        """Raise Refused for a checked record that asks too much.
+
+        Raises:
+            Refused: `quota` for too many points or a place too far away, `values` for a correction of
+                keyframes that cannot have come before it.
+        """
+        if isinstance(header, CorrectionHeader):
+            self._check_correction(header, frames[1])
+        else:
+            self._check_keyframe(header)
+
+    def _check_keyframe(self, header: KeyframeHeader) -> None:
         server = self._server
         shape = next(buffer.shape for buffer in header.buffers if buffer.name == measurement(header))
         points = shape[0] if len(shape) == 2 and measurement(header) == "points" else int(np.prod(shape))
         if points > server.quota_points:
             raise Refused("quota", f"a keyframe may have {server.quota_points} points, got {points}")
-        away = math.dist(header.pose[3::4], (0.0, 0.0, 0.0))
+        self._check_place(math.dist(header.pose[3::4], (0.0, 0.0, 0.0)))
+
+    def _check_correction(self, header: CorrectionHeader, body: Any) -> None:
+        seqs, rows, removed = corrections.arrays(header, body)
+        last = max(seqs.max(initial=0), removed.max(initial=0))
+        if last >= header.seq:
+            raise Refused("values", f"correction {header.seq} names keyframe {last}, which comes after it")
+        self._check_place(float(np.linalg.norm(rows[:, :, 3], axis=1).max(initial=0.0)))
+
+    def _check_place(self, away: float) -> None:
+        server = self._server
         if away > server.quota_extent:
             raise Refused(
                 "quota", f"a sensor may be {server.quota_extent:g} m from the origin, got {away:.0f} m"

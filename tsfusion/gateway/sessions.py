@@ -23,6 +23,7 @@ class Session(Struct, eq=False):
         in_map: the same for the present fuser: one that takes over begins at the checkpoint again.
         entries: the indices of its keyframes that are not forgotten.
         handed: how many of these the fuser was given.
+        corrections: records of corrected poses that came.
     """
 
     key: bytes
@@ -33,6 +34,7 @@ class Session(Struct, eq=False):
     in_map: int = 0
     entries: "array[int]" = field(default_factory=lambda: array("q"))
     handed: int = 0
+    corrections: int = 0
 
     @property
     def owner(self) -> str:

@@ -2,24 +2,25 @@
 """What a journal holds, and whether all of it is as it was written."""
 
 import math
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from tsfusion import journal
-from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError
+from tsfusion.core.errors import DecodeError, InvalidKeyframe
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import check_pose
-from tsfusion.journal import state_folder
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.record_scan import Damage
 from tsfusion.journal.state_folder import JournalPlace, Watcher
-from tsfusion.wire import codec, corrections
-from tsfusion.wire.corrections import SessionCorrections
-from tsfusion.wire.keyframe_header import unpack
+from tsfusion.wire import codec
+from tsfusion.wire.corrections import Correction
+from tsfusion.wire.record_header import unpack, unpack_keyframe
 
 
 class Problem(Struct, frozen=True):
@@ -43,17 +44,19 @@ class SegmentInfo(Struct, kw_only=True):
     name: str
     nbytes: int
     keyframes: int = 0
+    corrections: int = 0
     lost: int = 0
     state: Literal["closed", "open", "damaged"] = "open"
 
 
 class SessionInfo(Struct, kw_only=True):
-    """The keyframes of one spool: `seq` numbers them, `client` is whose key they came under.
+    """The records of one spool: `seq` numbers them, `client` is whose key they came under.
 
     Attributes:
-        revision: of its corrections the newest; 0 = there are none.
-        corrected: keyframes that they name.
-        moved_m, turned_deg: the most that any of these in the journal is away from where it was sent.
+        corrected: keyframes whose pose a correction names.
+        removed: keyframes that a correction takes out of the map.
+        moved_m, turned_deg: the most that any corrected keyframe in the journal is away from where it was
+            sent, in metres and degrees, by the newest pose of each.
     """
 
     session: str
@@ -63,8 +66,9 @@ class SessionInfo(Struct, kw_only=True):
     last_seq: int
     first_logged_ns: int  # wall clock
     last_logged_ns: int
-    revision: int = 0
+    corrections: int = 0
     corrected: int = 0
+    removed: int = 0
     moved_m: float = 0.0
     turned_deg: float = 0.0
 
@@ -74,6 +78,7 @@ class JournalInfo(Struct, kw_only=True):
 
     path: str
     keyframes: int
+    corrections: int
     nbytes: int
     lost: int
     segments: list[SegmentInfo]
@@ -88,6 +93,7 @@ class Verdict(Struct, kw_only=True):
     path: str
     intact: bool
     keyframes: int
+    corrections: int
     segments: int
     nbytes: int
     lost: int
@@ -95,7 +101,7 @@ class Verdict(Struct, kw_only=True):
 
 
 def summarize(place: JournalPlace, watch: Watcher) -> JournalInfo:
-    """Read every record's CRC and head; nothing is decoded.
+    """Read every record's CRC and header; of arrays only those of corrections.
 
     Raises:
         JournalError: when the folder cannot be listed.
@@ -103,7 +109,7 @@ def summarize(place: JournalPlace, watch: Watcher) -> JournalInfo:
     segments = {path: _segment(path) for path in place.files()}
     sessions: dict[bytes, SessionInfo] = {}
     problems: list[Problem] = []
-    moves = _Moves(_corrections(place, problems))
+    moves: dict[bytes, _Moves] = {}
     for path, step in place.steps(watch):
         segment = segments.setdefault(path, _segment(path))
         if isinstance(step, Damage):
@@ -111,11 +117,16 @@ def summarize(place: JournalPlace, watch: Watcher) -> JournalInfo:
             segment.lost += step.lost
             segment.state = segment.state if step.torn else "damaged"
         else:
-            segment.keyframes += 1
-            moves.note(_count(sessions, step), step)
+            segment.keyframes += not step.is_correction
+            segment.corrections += step.is_correction
+            _count(sessions, step)
+            moves.setdefault(step.session, _Moves()).note(step)
+    for key, session in sessions.items():
+        moves[key].describe(session)
     return JournalInfo(
         path=str(place.path),
         keyframes=sum(segment.keyframes for segment in segments.values()),
+        corrections=sum(segment.corrections for segment in segments.values()),
         nbytes=sum(segment.nbytes for segment in segments.values()),
         lost=sum(segment.lost for segment in segments.values()),
         segments=list(segments.values()),
@@ -133,42 +144,50 @@ def _segment(path: Path) -> SegmentInfo:
     return SegmentInfo(name=path.name, nbytes=nbytes, state="closed" if journal.is_closed(path) else "open")
 
 
-def _corrections(place: JournalPlace, problems: list[Problem]) -> dict[bytes, SessionCorrections]:
-    try:
-        return {} if place.corrections is None else corrections.read(place.corrections)
-    except JournalError as error:
-        problems.append(Problem("damage", state_folder.CORRECTIONS_FOLDER, 0, 0, 0, str(error)))
-        return {}
-
-
 class _Moves:
-    """How far corrections move what a journal holds."""
+    """How far corrections move the keyframes of one session."""
 
-    def __init__(self, said: dict[bytes, SessionCorrections]) -> None:
-        self._said = said
+    def __init__(self) -> None:
+        self._seqs = array("q")
+        self._poses = array("d")  # 12 numbers a keyframe, as it was sent
+        self._corrected: dict[int, NDArray[np.float64]] = {}  # the newest pose by number
+        self._removed: set[int] = set()
 
-    def note(self, session: SessionInfo, record: Record) -> None:
-        said = self._said.get(record.session)
-        if said is None:
-            return
-        session.revision, session.corrected = said.revision, len(said)
-        at = int(np.searchsorted(said.seqs, record.seq))
-        if at == len(said) or said.seqs[at] != record.seq:
-            return
+    def note(self, record: Record) -> None:
+        """Take in the poses of a record; one that cannot be read is left to `verify`."""
         try:
-            sent = check_pose([*_rows(unpack(record.frames[0]).pose), (0.0, 0.0, 0.0, 1.0)])
-        except (DecodeError, InvalidKeyframe, IndexError):
-            return  # `verify` says so
-        move = se3.inverse(sent) @ said.poses[at]
-        session.moved_m = max(session.moved_m, se3.distance(move))
-        session.turned_deg = max(session.turned_deg, math.degrees(se3.angle(move)))
+            if record.is_correction:
+                self._correct(record)
+            else:
+                pose = unpack_keyframe(record.frames[0]).pose
+                self._seqs.append(record.seq)
+                self._poses.extend(pose)
+        except (DecodeError, IndexError):
+            return
+
+    def _correct(self, record: Record) -> None:
+        found = codec.decode(record.frames)
+        assert isinstance(found, Correction)
+        self._corrected.update(zip(found.seqs.tolist(), found.poses, strict=True))
+        self._removed.update(found.removed.tolist())
+
+    def describe(self, session: SessionInfo) -> None:
+        """Fill in the figures of a session."""
+        session.corrected, session.removed = len(self._corrected), len(self._removed)
+        for at, seq in enumerate(self._seqs):
+            if seq not in self._corrected:
+                continue
+            rows = np.array(self._poses[12 * at : 12 * (at + 1)]).reshape(3, 4)
+            try:
+                sent = check_pose(np.vstack([rows, (0.0, 0.0, 0.0, 1.0)]))
+            except InvalidKeyframe:
+                continue
+            move = se3.inverse(sent) @ self._corrected[seq]
+            session.moved_m = max(session.moved_m, se3.distance(move))
+            session.turned_deg = max(session.turned_deg, math.degrees(se3.angle(move)))
 
 
-def _rows(pose: tuple[float, ...]) -> list[tuple[float, ...]]:
-    return [pose[at : at + 4] for at in (0, 4, 8)]
-
-
-def _count(sessions: dict[bytes, SessionInfo], record: Record) -> SessionInfo:
+def _count(sessions: dict[bytes, SessionInfo], record: Record) -> None:
     known = sessions.get(record.session)
     if known is None:
         known = sessions[record.session] = SessionInfo(
@@ -180,10 +199,10 @@ def _count(sessions: dict[bytes, SessionInfo], record: Record) -> SessionInfo:
             first_logged_ns=record.logged_ns,
             last_logged_ns=record.logged_ns,
         )
-    known.keyframes += 1
+    known.keyframes += not record.is_correction
+    known.corrections += record.is_correction
     known.last_seq = record.seq
     known.last_logged_ns = record.logged_ns
-    return known
 
 
 def problem(path: Path, damage: Damage) -> Problem:
@@ -193,7 +212,7 @@ def problem(path: Path, damage: Damage) -> Problem:
 
 
 def verify(place: JournalPlace, watch: Watcher) -> Verdict:
-    """Read and decode every keyframe.
+    """Read and decode every record.
 
     Raises:
         JournalError: when the folder cannot be listed.
@@ -201,17 +220,19 @@ def verify(place: JournalPlace, watch: Watcher) -> Verdict:
     files = place.files()
     checks = _Checks()
     problems = list(_missing(files))
-    keyframes = 0
+    keyframes = corrections = 0
     for path, step in place.steps(watch):
         if isinstance(step, Damage):
             problems.append(problem(path, step))
         else:
-            keyframes += 1
+            keyframes += not step.is_correction
+            corrections += step.is_correction
             problems += checks.of(path, step)
     return Verdict(
         path=str(place.path),
         intact=not any(one.kind == "damage" for one in problems),
         keyframes=keyframes,
+        corrections=corrections,
         segments=len(files),
         nbytes=sum(_segment(path).nbytes for path in files),
         lost=sum(one.lost for one in problems),
@@ -254,12 +275,16 @@ def _content(record: Record) -> Iterator[tuple[Literal["damage"], int, str]]:
         header = unpack(record.frames[0] if record.frames else b"")
         codec.decode(record.frames)
     except (DecodeError, InvalidKeyframe) as error:
-        yield "damage", 1, f"{_name(record)} is no keyframe: {error}"
+        yield "damage", 1, f"{_name(record)} is no {_kind(record)}: {error}"
         return
     if (header.session, header.seq) != (record.session, record.seq):
-        said = f"{header.seq} of session {header.session.hex()[:8]}"
-        yield "damage", 0, f"{_name(record)} says of itself that it is {said}"
+        name = f"{header.seq} of session {header.session.hex()[:8]}"
+        yield "damage", 0, f"{_name(record)} says of itself that it is {name}"
+
+
+def _kind(record: Record) -> str:
+    return "correction" if record.is_correction else "keyframe"
 
 
 def _name(record: Record) -> str:
-    return f"keyframe {record.seq} of session {record.session.hex()[:8]}"
+    return f"{_kind(record)} {record.seq} of session {record.session.hex()[:8]}"

@@ -20,6 +20,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from msgspec import Struct
 
 from tsfusion.core.errors import JournalError
+from tsfusion.wire.record_header import is_correction
 
 TOPIC = "/keyframes"
 ENCODING = "x-tsfusion"
@@ -60,7 +61,7 @@ class Position(Struct, frozen=True, order=True, array_like=True):
 
 
 class Record(Struct, frozen=True):
-    """One journaled keyframe message."""
+    """One journaled message: a keyframe or a correction."""
 
     position: Position
     session: bytes
@@ -73,6 +74,11 @@ class Record(Struct, frozen=True):
     def nbytes(self) -> int:
         """Bytes of the message."""
         return sum(frame.nbytes for frame in self.frames)
+
+    @property
+    def is_correction(self) -> bool:
+        """Whether the message is a correction, by its first bytes."""
+        return bool(self.frames) and is_correction(self.frames[0])
 
 
 class ChunkHead(NamedTuple):

@@ -24,7 +24,7 @@ class JournalRecording:
     spool folder or one `.mcap` segment.
 
     Each once and in journal order, also when a crash left a second copy. Keyframes the map had to reject
-    are among them.
+    are among them; corrections are left out, so poses are those that the keyframes came with.
 
     Raises:
         JournalError: when there is no keyframe.
@@ -50,7 +50,7 @@ class JournalRecording:
         """A keyframe; raises JournalError when it cannot be read any more."""
         path, offset = self._places[index]
         try:
-            return codec.decode(journal.read_at(path, offset).frames)
+            return codec.decode_keyframe(journal.read_at(path, offset).frames)
         except DecodeError as error:
             raise JournalError(f"{path}: keyframe {index} is of no use: {error}") from error
 
@@ -66,5 +66,6 @@ def _places(place: state_folder.JournalPlace) -> list[tuple[Path, int]]:
             log.log(logging.WARNING if step.torn else logging.ERROR, "%s: %s", file, step.what)
         elif step.seq > last.get(step.session, 0):
             last[step.session] = step.seq
-            found.append((file, step.position.offset))
+            if not step.is_correction:
+                found.append((file, step.position.offset))
     return found

@@ -17,10 +17,11 @@ from tsfusion.journal.writer import Journal
 
 
 class Recovery(Struct, kw_only=True):
-    """Result of a recovery. `copies`: keyframes that the journal held twice, the new one holds once."""
+    """Result of a recovery. `copies`: records that the journal held twice, the new one holds once."""
 
     path: str
     keyframes: int
+    corrections: int
     copies: int
     segments: int
     nbytes: int
@@ -29,7 +30,7 @@ class Recovery(Struct, kw_only=True):
 
 
 def recover(place: JournalPlace, out: Path, segment_bytes: int, watch: Watcher) -> Recovery:
-    """Write every whole keyframe of a journal into the new folder `out`, in order, in closed segments.
+    """Write every whole record of a journal into the new folder `out`, in order, in closed segments.
 
     The journal itself is only read. `out` appears when all of it is on the disk, and not at all otherwise.
 
@@ -38,7 +39,7 @@ def recover(place: JournalPlace, out: Path, segment_bytes: int, watch: Watcher) 
         JournalError: nothing can be saved, or the disk refuses.
     """
     _check(place, out)
-    problems, copies, seen = [], 0, set[tuple[bytes, int]]()
+    problems, copies, corrections, seen = [], 0, 0, set[tuple[bytes, int]]()
     with suppress(OSError):  # an empty one: a whole folder then takes its place in one step
         out.rmdir()
     with building(out) as work, closing(Journal(work, segment_bytes, sync=False)) as new:
@@ -49,6 +50,7 @@ def recover(place: JournalPlace, out: Path, segment_bytes: int, watch: Watcher) 
                 copies += 1
             else:
                 seen.add((step.session, step.seq))
+                corrections += step.is_correction
                 new.append(
                     step.frames,
                     session=step.session,
@@ -63,7 +65,8 @@ def recover(place: JournalPlace, out: Path, segment_bytes: int, watch: Watcher) 
     durable_files.sync_folder(out.absolute().parent)
     return Recovery(
         path=str(out),
-        keyframes=len(seen),
+        keyframes=len(seen) - corrections,
+        corrections=corrections,
         copies=copies,
         segments=segments,
         nbytes=new.nbytes,

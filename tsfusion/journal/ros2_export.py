@@ -18,7 +18,7 @@ from tsfusion.journal.record_scan import Damage
 from tsfusion.journal.ros2_messages import Converter, Outgoing
 from tsfusion.journal.state_folder import JournalPlace, Watcher
 from tsfusion.wire import codec
-from tsfusion.wire.keyframe_header import unpack
+from tsfusion.wire.record_header import unpack_keyframe
 
 _INSTALL = "export needs rosbags: pip install 'tsfusion[ros]'"
 _LAST_SECOND = 2**31 - 1  # of a ROS 2 time stamp
@@ -117,7 +117,7 @@ class _Exporter:
         for path, step in place.steps(watch):
             if isinstance(step, Damage):
                 self._problems.append(problem(path, step))
-            elif (step.session, step.seq) not in self._seen:
+            elif not step.is_correction and (step.session, step.seq) not in self._seen:
                 self._seen.add((step.session, step.seq))
                 self._take(path, step)
         for path, record in self._held.values():
@@ -132,7 +132,7 @@ class _Exporter:
         A first keyframe at time 0 may come from a clock that started with it, or from a sensor without one.
         """
         try:
-            has_stamp = unpack(record.frames[0]).timestamp_ns > 0
+            has_stamp = unpack_keyframe(record.frames[0]).timestamp_ns > 0
         except (DecodeError, IndexError) as error:
             self._refuse(path, record, error)
             return
@@ -148,14 +148,14 @@ class _Exporter:
 
     def _write(self, path: Path, record: Record) -> None:
         try:
-            keyframe = codec.decode(record.frames)
+            keyframe = codec.decode_keyframe(record.frames)
         except (DecodeError, InvalidKeyframe) as error:
             self._refuse(path, record, error)
             return
         stamp_ns = keyframe.timestamp_ns if self._has_clock.get(record.session) else record.logged_ns
         if stamp_ns // 10**9 > _LAST_SECOND:
             stamp_ns = min(record.logged_ns, _LAST_SECOND * 10**9)
-        header = unpack(record.frames[0])
+        header = unpack_keyframe(record.frames[0])
         for message in self._converter.convert(keyframe, header, record, self._name(record), stamp_ns):
             self._bag.write(message, stamp_ns)
         self._keyframes += 1

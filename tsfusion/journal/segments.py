@@ -27,6 +27,7 @@ class RecordEntry(Struct, frozen=True):
     seq: int
     client: str
     nbytes: int
+    is_correction: bool = False
 
 
 def segments(folder: Path) -> list[int]:
@@ -95,7 +96,8 @@ def list_records(path: Path) -> tuple[list[RecordEntry], int]:
             level = logging.ERROR if step.lost else logging.WARNING
             log.log(level, "%s", describe(path, step))
         else:
-            found.append(RecordEntry(step.position, step.session, step.seq, step.client, step.nbytes))
+            place = (step.position, step.session, step.seq, step.client)
+            found.append(RecordEntry(*place, step.nbytes, step.is_correction))
     return found, lost
 
 

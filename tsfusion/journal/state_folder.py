@@ -17,7 +17,6 @@ from tsfusion.journal.segments import is_segment, segment_path, segments
 MAPS_FOLDER = "maps"
 JOURNAL_FOLDER = "journal"
 QUARANTINE_FOLDER = "quarantine"
-CORRECTIONS_FOLDER = "corrections"
 MAP_FILE = "map.tsf"
 PREVIOUS_FILE = "map.previous.tsf"
 
@@ -78,12 +77,10 @@ class JournalPlace(Struct, frozen=True):
     Attributes:
         path: a folder of segments, or one segment file.
         quarantine: folder of the keyframes that could not be fused; None = the journal is no map's.
-        corrections: where it keeps corrected poses; None = it is no map's.
     """
 
     path: Path
     quarantine: Path | None = None
-    corrections: Path | None = None
 
     def files(self) -> list[Path]:
         """Its segments, oldest first; of a quarantine its files.
@@ -163,12 +160,11 @@ def is_journal(path: Path) -> bool:
 
 
 def _of_map(folder: Path) -> JournalPlace:
-    beside = (folder / name for name in (QUARANTINE_FOLDER, CORRECTIONS_FOLDER))
-    return JournalPlace(folder / JOURNAL_FOLDER, *beside)
+    return JournalPlace(folder / JOURNAL_FOLDER, folder / QUARANTINE_FOLDER)
 
 
 def _is_map(folder: Path) -> bool:
-    return any((folder / name).is_dir() for name in (QUARANTINE_FOLDER, CORRECTIONS_FOLDER))
+    return (folder / QUARANTINE_FOLDER).is_dir()
 
 
 def _size(path: Path) -> int:

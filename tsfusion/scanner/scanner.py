@@ -36,7 +36,7 @@ class Submap:
         client: client that sends its keyframes.
         located: its frames with a pose, in order.
         corrections: the newest from loop closure; None = there were none.
-        corrected_seq: number of the last keyframe whose corrected pose was handed to the client.
+        corrected_seq: number of the last keyframe that the last sent correction names.
     """
 
     name: str
@@ -50,9 +50,10 @@ class Submap:
         assert self.corrections is not None
         seqs, poses = self.located.keyframes(self.corrections)
         if len(seqs):
-            self.corrected_seq = int(seqs[-1])
             corrected = dict(zip(seqs.tolist(), poses, strict=True))
-            self.client.correct(corrected, T_map_odometry=self.corrections.T_corrected_world)
+            sent = self.client.correct(corrected, T_map_odometry=self.corrections.T_corrected_world)
+            if sent is not None:  # else the spool had no room, and `finish` tries again
+                self.corrected_seq = int(seqs[-1])
 
 
 class ScanState(msgspec.Struct, frozen=True, kw_only=True):

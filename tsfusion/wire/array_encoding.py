@@ -14,7 +14,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from tsfusion.wire.keyframe_header import Refused
+from tsfusion.wire.record_header import Refused
 
 _ZSTD_LEVEL = 1
 _MAX_WINDOW_BYTES = 1 << 24

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A keyframe as a multipart message, and the checks a stranger's message passes before it is stored.
+"""A keyframe as a multipart message, and the checks a stranger's record passes before it is stored.
 
 Order of the checks (cheapest first; none allocates more than the message itself): frame count and header
 length, magic, struct limits, lengths against shapes, what the compressed frames announce, finite values
@@ -17,12 +17,15 @@ from numpy.typing import NDArray
 from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, MAX_POINTS, Keyframe, check_intrinsics, check_pose
-from tsfusion.wire import array_encoding, image_headers
-from tsfusion.wire.keyframe_header import (
+from tsfusion.wire import array_encoding, corrections, image_headers
+from tsfusion.wire.corrections import Correction
+from tsfusion.wire.record_header import (
     ArrayCodec,
     ArrayName,
     Buffer,
+    CorrectionHeader,
     KeyframeHeader,
+    RecordHeader,
     Refused,
     pack,
     unpack,
@@ -95,14 +98,16 @@ def encode(
     return [pack(header), *frames]
 
 
-def decode(frames: Sequence[Any]) -> Keyframe:
-    """Decode the keyframe of a message.
+def decode(frames: Sequence[Any]) -> Keyframe | Correction:
+    """Decode the keyframe or correction of a message.
 
     Raises:
-        DecodeError: when the bytes are not a keyframe.
-        InvalidKeyframe: when they are one with impossible values.
+        DecodeError: when the bytes are neither.
+        InvalidKeyframe: when they are a keyframe with impossible values.
     """
     header = check(frames)
+    if isinstance(header, CorrectionHeader):
+        return corrections.unpack(header, frames[1])
     fields: dict[str, Any] = {
         buffer.name: _unpack(buffer, frame) for buffer, frame in zip(header.buffers, frames[1:], strict=True)
     }
@@ -119,7 +124,15 @@ def decode(frames: Sequence[Any]) -> Keyframe:
     )
 
 
-def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> KeyframeHeader:
+def decode_keyframe(frames: Sequence[Any]) -> Keyframe:
+    """Decode the keyframe of a message; raises as `decode`, and DecodeError for a correction."""
+    found = decode(frames)
+    if not isinstance(found, Keyframe):
+        raise Refused("magic", "a keyframe is expected, got a correction")
+    return found
+
+
+def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> RecordHeader:
     """Check everything that can be checked in a message without decompressing it; returns its header.
 
     Raises:
@@ -127,10 +140,16 @@ def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> Key
             `version`, `limits`, `size`, `payload`, `values` or `crc`.
     """
     if not MIN_FRAMES <= len(frames) <= MAX_FRAMES:
-        raise Refused("frames", f"a keyframe has {MIN_FRAMES} to {MAX_FRAMES} frames, got {len(frames)}")
+        raise Refused("frames", f"a record has {MIN_FRAMES} to {MAX_FRAMES} frames, got {len(frames)}")
     header = unpack(frames[0])
+    total = sum(memoryview(frame).nbytes for frame in frames)
+    if total > max_frame_bytes:
+        raise Refused("size", f"a {header.kind} must be at most {max_frame_bytes} bytes, got {total}")
+    if isinstance(header, CorrectionHeader):
+        corrections.check(header, frames[1:])
+        return header
     _check_limits(header, len(frames))
-    _check_sizes(header, frames, max_frame_bytes)
+    _check_sizes(header, frames)
     _check_values(header)
     for buffer, frame in zip(header.buffers, frames[1:], strict=True):
         if zlib.crc32(frame) != buffer.crc32:
@@ -175,15 +194,11 @@ def _expected_shapes(kind: str, shapes: dict[ArrayName, tuple[int, ...]]) -> dic
     return {kind: [shape], "origins": origins, "color": [three], "confidence": [one]}
 
 
-def _check_sizes(header: KeyframeHeader, frames: Sequence[Any], max_frame_bytes: int) -> None:
-    total = memoryview(frames[0]).nbytes
+def _check_sizes(header: KeyframeHeader, frames: Sequence[Any]) -> None:
     for buffer, frame in zip(header.buffers, frames[1:], strict=True):
         size = memoryview(frame).nbytes
-        total += size
         if size != buffer.bytes:
             raise Refused("size", f"{buffer.name} was announced with {buffer.bytes} bytes, got {size}")
-    if total > max_frame_bytes:
-        raise Refused("size", f"a keyframe must be at most {max_frame_bytes} bytes, got {total}")
     for buffer, frame in zip(header.buffers, frames[1:], strict=True):
         if buffer.codec in _ZSTD:
             array_encoding.check_zstd(frame, _decoded_bytes(buffer))

@@ -47,7 +47,7 @@ class MapHealth(Struct, frozen=True, kw_only=True):
     last_keyframe_s: float | None
     delay_ms: Spread
     delay_bound_ms: float
-    corrections: int = 0  # messages with corrected poses that were taken since the server began
+    corrections: int = 0  # records of corrected poses: in the journal at the start, and journaled since
 
 
 class ClientHealth(Struct, frozen=True, kw_only=True):
@@ -59,7 +59,7 @@ class ClientHealth(Struct, frozen=True, kw_only=True):
         heard_s: seconds since its last message.
         waiting, skipped: as in its last Ping.
         held: reason why no keyframe of it is accepted now; empty = they are.
-        revision, corrected: of its corrections the newest, and how many keyframes they name.
+        corrections: corrections of its session in the journal.
     """
 
     client: str
@@ -72,8 +72,7 @@ class ClientHealth(Struct, frozen=True, kw_only=True):
     waiting: int
     skipped: dict[str, int]
     held: str
-    revision: int = 0
-    corrected: int = 0
+    corrections: int = 0
 
 
 class Health(Struct, frozen=True, kw_only=True):

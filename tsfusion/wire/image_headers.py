@@ -10,7 +10,7 @@ import struct
 from itertools import islice
 from typing import Any
 
-from tsfusion.wire.keyframe_header import Refused
+from tsfusion.wire.record_header import Refused
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_HEADER = struct.Struct(">I4sII")  # length, kind, width, height

@@ -4,7 +4,6 @@
 All `*_ns` stamps of the server are its own monotonic clock; the client shifts them to its own.
 """
 
-from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -12,12 +11,11 @@ from msgspec import Meta, Struct
 
 from tsfusion.core.config import MapName
 from tsfusion.core.errors import DecodeError
-from tsfusion.wire import corrections
-from tsfusion.wire.corrections import Corrections
 from tsfusion.wire.health import Health, MeshLayout, Status
 from tsfusion.wire.keyframe_times import Seq, Stamps
+from tsfusion.wire.record_header import SessionId
 
-SessionId = Annotated[bytes, Meta(min_length=16, max_length=16)]
+PROTOCOL_VERSION = 2  # of these messages and of which kinds of records a server takes
 Counts = dict[Annotated[str, Meta(max_length=32)], Annotated[int, Meta(ge=0)]]  # by reason
 
 
@@ -25,15 +23,12 @@ class Hello(Struct, frozen=True, tag="hello", omit_defaults=True):
     """A client opens (or re-opens) its session."""
 
     session: SessionId
-    version: int  # wire format it speaks
+    version: int  # `PROTOCOL_VERSION` of the client
     map: MapName = "default"
 
 
 class Welcome(Struct, frozen=True, tag="welcome"):
-    """The server's answer. A new `epoch` is a new server process: resend everything after `durable`.
-
-    `corrections`: the revision of this session's that is on the server's disk; None = it takes none.
-    """
+    """The server's answer. A new `epoch` is a new server process: resend everything after `durable`."""
 
     epoch: str
     version: int
@@ -42,7 +37,6 @@ class Welcome(Struct, frozen=True, tag="welcome"):
     window_keyframes: int  # credit: sent, not yet durable
     window_bytes: int
     max_frame_bytes: int
-    corrections: Annotated[int, Meta(ge=0)] | None = None
 
 
 class Ack(Struct, frozen=True, tag="ack"):
@@ -59,7 +53,7 @@ class Ack(Struct, frozen=True, tag="ack"):
 
 
 class Nack(Struct, frozen=True, tag="nack"):
-    """This keyframe will never be in the map.
+    """This record, a keyframe or a correction, will never count.
 
     Attributes:
         stage: `door` = it was not journaled and must not be sent again; `map` = it is journaled, but the
@@ -83,26 +77,6 @@ class Hold(Struct, frozen=True, tag="hold"):
     seconds: float
     reason: str
     message: str
-
-
-class Corrected(Struct, frozen=True, tag="corrected"):
-    """The answer to Corrections: this revision of the session is on the server's disk, or a later one."""
-
-    session: SessionId
-    revision: Annotated[int, Meta(ge=0)]
-
-
-class Uncorrected(Struct, frozen=True, tag="uncorrected"):
-    """The answer to Corrections that are not taken.
-
-    `again_s`: seconds after which they may be sent again; 0 = they never will be.
-    """
-
-    session: SessionId
-    revision: Annotated[int, Meta(ge=0)]
-    reason: str
-    message: str
-    again_s: float = 0.0
 
 
 class Denied(Struct, frozen=True, tag="denied"):
@@ -171,8 +145,8 @@ class Reply(Struct, frozen=True, tag="reply", kw_only=True):
     mesh: "MeshLayout | None" = None
 
 
-ToServer = Hello | Ping | Command | Corrections
-ToClient = Welcome | Denied | Hold | Ack | Nack | Corrected | Uncorrected | Pong | Reply
+ToServer = Hello | Ping | Command
+ToClient = Welcome | Denied | Hold | Ack | Nack | Pong | Reply
 _TO_SERVER = msgspec.msgpack.Decoder(ToServer)
 _TO_CLIENT = msgspec.msgpack.Decoder(ToClient)
 encode = msgspec.msgpack.encode
@@ -193,17 +167,3 @@ def _decode(decoder: Any, frame: Any) -> Any:
         return decoder.decode(frame)
     except Exception as error:  # msgspec also raises UnicodeDecodeError and RecursionError
         raise DecodeError(f"not a control message: {error}") from error
-
-
-def decode_frames_to_server(frames: Sequence[Any]) -> ToServer:
-    """Decode a control message of several frames; only corrections have any behind the first.
-
-    Raises:
-        DecodeError: for anything but a message to the server.
-    """
-    if len(frames) > 1 + corrections.MAX_FRAMES:
-        raise DecodeError(f"a control message of {len(frames)} frames")
-    message = decode_to_server(frames[0] if frames else b"")
-    if len(frames) > 1 and not isinstance(message, Corrections):
-        raise DecodeError(f"a {type(message).__name__} of {len(frames)} frames")
-    return message

@@ -1,0 +1,339 @@
+# SPDX-License-Identifier: MIT
+"""Corrections from a scanner to a server's journal, whoever dies on the way or would rather not have them."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hostile_messages import hostile_corrections
+from keyframes_and_servers import (
+    DEADLINE,
+    Secured,
+    Server,
+    connected,
+    journaled_corrections,
+    pose,
+    secured,
+    serving,
+    until,
+    wall,
+)
+from repository import SUPPORT
+
+from tsfusion import Client, journal
+from tsfusion.core.config import ClientConfig
+from tsfusion.core.errors import FlushTimeout, InvalidKeyframe, KeyframeRefused
+from tsfusion.geometry import se3
+from tsfusion.journal import state_folder
+from tsfusion.journal.inspection import summarize
+from tsfusion.wire import codec, corrections, key_folder, sockets
+from tsfusion.wire.queries import fetch_health, fetch_status
+
+SESSION = bytes(range(16))
+QUICK = ClientConfig(stall_timeout=0.5)
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, Path]]:
+    state = tmp_path_factory.mktemp("shared")
+    with serving(state) as server:
+        yield server, state
+
+
+def scan(client: Client, count: int = 3) -> list[int]:
+    """So many keyframes that the server has."""
+    found = [client.send(wall(i)) for i in range(count)]
+    client.flush(DEADLINE)
+    return [seq for seq in found if seq is not None]
+
+
+def session_of(client: Client) -> bytes:
+    return client._outbox.session
+
+
+def records(state: Path, session: bytes) -> list[tuple[int, bool]]:
+    """Number and whether it is a correction, of a session's records in the journal."""
+    folder = state_folder.folder(state, "default") / "journal"
+    paths = [journal.segment_path(folder, number) for number in journal.segments(folder)]
+    found = [record for path in paths for record in journal.records(path)]
+    return [(record.seq, record.is_correction) for record in found if record.session == session]
+
+
+def test_corrections_stand_in_the_journal_between_keyframes(
+    shared: tuple[Server, Path], tmp_path: Path
+) -> None:
+    server, state = shared
+    rng = np.random.default_rng(0)
+    first = [se3.exp(rng.normal(size=6)) for _ in range(3)]
+    with Client(server.address, spool=tmp_path) as client:
+        session = session_of(client)
+        seqs = scan(client)
+        assert client.correct(dict(zip(seqs, first, strict=True)), T_map_odometry=pose(0.5)) == 4
+        assert client.send(wall(3)) == 5
+        assert client.correct({seqs[1]: pose(9)}, removed=[5]) == 6
+        client.wait_fused(DEADLINE)
+        stats = client.stats
+        assert (stats.sent, stats.durable, stats.fused, stats.waiting) == (4, 4, 4, 0)
+        assert (stats.corrections_sent, stats.corrections_acknowledged) == (2, 2)
+        assert [one.seq for one in client.records] == [1, 2, 3, 5]
+        client.wait_meshed(DEADLINE)
+        health = fetch_health(server.address)
+        (own,) = [one for one in health.clients if one.session == session.hex()[:8]]
+        assert (own.corrections, own.durable, own.fused) == (2, 6, 6)
+        told = health.maps["default"]
+        assert told.corrections >= 2
+        assert (told.waiting, told.keyframes_durable) == (0, told.keyframes_fused)
+    assert records(state, session) == [(1, False), (2, False), (3, False), (4, True), (5, False), (6, True)]
+    older, newer = journaled_corrections(state)[-2:]
+    assert older.poses.tobytes() == np.array(first).tobytes()
+    assert np.array_equal(older.T_map_odometry, pose(0.5))  # type: ignore[arg-type]
+    assert (newer.seqs.tolist(), newer.removed.tolist()) == ([seqs[1]], [5])
+    info = summarize(state_folder.find(state), lambda *_: None)
+    (shown,) = [one for one in info.sessions if one.session == session.hex()]
+    assert (shown.keyframes, shown.corrections, shown.corrected, shown.removed) == (4, 2, 3, 1)
+    newest = [first[0], pose(9), first[2]]
+    moves = [se3.inverse(pose(0.03 * i)) @ T for i, T in enumerate(newest)]
+    assert shown.moved_m == pytest.approx(max(map(se3.distance, moves)))
+    assert shown.turned_deg == pytest.approx(np.degrees(max(map(se3.angle, moves))))
+
+
+def test_only_what_was_sent_can_be_corrected(shared: tuple[Server, Path], tmp_path: Path) -> None:
+    server, _ = shared
+    with Client(server.address, spool=tmp_path) as client:
+        (seq,) = scan(client, 1)
+        for poses, removed in (({seq: pose(), seq + 1: pose()}, []), ({seq: pose()}, [seq + 1])):
+            with pytest.raises(InvalidKeyframe, match=f"keyframe {seq + 1} was never sent from here"):
+                client.correct(poses, removed=removed)
+        with pytest.raises(InvalidKeyframe, match="T_world_camera must have shape"):
+            client.correct({seq: pose()}, T_map_odometry=np.eye(3))
+        assert client.stats.corrections_sent == 0
+
+
+def test_ten_thousand_poses_while_keyframes_go_on(shared: tuple[Server, Path], tmp_path: Path) -> None:
+    server, state = shared
+    count = 10_000
+    left = journal.Journal(tmp_path, 1 << 20, sync=False)  # of a scanner that came so far
+    frames = codec.encode(wall(), session=SESSION, seq=count, previous=0, jpeg_quality=90)
+    left.append(frames, session=SESSION, seq=count)
+    left.close()
+    rng = np.random.default_rng(0)
+    poses = {1 + i: se3.exp(rng.normal(size=6)) for i in range(count)}
+    with Client(server.address, spool=tmp_path) as client:
+        client.correct(poses)
+        scan(client)
+        assert client.stats.corrections_acknowledged == 1
+    assert journaled_corrections(state)[-1].poses.tobytes() == np.array(list(poses.values())).tobytes()
+
+
+def test_what_the_server_refuses_is_told_and_kept_aside(tmp_path: Path) -> None:
+    with (
+        serving(tmp_path / "state", quota_extent=100.0) as server,
+        Client(server.address, spool=tmp_path / "spool") as client,
+    ):
+        (seq,) = scan(client, 1)
+        client.correct({seq: pose(101)})
+        with pytest.raises(KeyframeRefused, match=r"correction 2 was refused \(quota\): a sensor may be 100"):
+            client.flush(DEADLINE)
+        assert client.stats.refused == {"quota": 1}
+        assert len(list((tmp_path / "spool" / "refused").glob("*.mcap"))) == 1
+        client.correct({seq: pose(99)})
+        scan(client, 1)
+    (found,) = journaled_corrections(tmp_path / "state")
+    assert found.poses[0, 0, 3] == 99
+
+
+# --- strangers ---
+
+
+def test_hostile_corrections_are_counted_and_change_nothing(
+    shared: tuple[Server, Path], tmp_path: Path
+) -> None:
+    server, state = shared
+    with Client(server.address, spool=tmp_path) as client:
+        session = session_of(client)
+        seqs = scan(client)
+        client.correct({seqs[0]: pose(1)})
+        client.flush(DEADLINE)
+        before = records(state, session)
+        later = corrections.checked({9: pose()})
+        hostile = [
+            *hostile_corrections(session, seq=5, previous=4),
+            ("of one to come", "values", corrections.encode(later, session=session, seq=5)),
+        ]
+        refused = fetch_health(server.address).refused
+        with connected(sockets.push, server.address) as stranger:
+            for _, _, frames in hostile:
+                stranger.send_multipart(frames)
+            expected = {reason: sum(one == reason for _, one, _ in hostile) for _, reason, _ in hostile}
+            until(
+                lambda: all(
+                    fetch_health(server.address).refused.get(reason, 0) >= refused.get(reason, 0) + count
+                    for reason, count in expected.items()
+                )
+            )
+        assert records(state, session) == before
+        client.correct({seqs[0]: pose(2)})
+        client.flush(DEADLINE)
+        assert records(state, session) == [*before, (5, True)]
+
+
+def test_another_clients_session_cannot_be_corrected(tmp_path: Path) -> None:
+    robot = secured(tmp_path)
+    key_folder.allow(tmp_path / "server", "cart", key_folder.create(tmp_path / "cart", "cart").public)
+    cart = Secured({}, {**robot.client, "key": str(tmp_path / "cart" / "cart.key_secret")})
+    with (
+        serving(tmp_path / "state", **robot.server) as server,  # type: ignore[arg-type]
+        Client(server.address, spool=tmp_path / "spool", **robot.client) as client,  # type: ignore[arg-type]
+    ):
+        seqs = scan(client)
+        forged = corrections.checked({seqs[0]: pose(7)})
+        frames = corrections.encode(forged, session=session_of(client), seq=seqs[-1] + 1)
+        with connected(lambda context: sockets.push(context, cart.keys), server.address) as thief:
+            thief.send_multipart(frames)
+            until(lambda: fetch_health(server.address, keys=robot.keys).refused.get("session", 0) == 1)
+        assert journaled_corrections(tmp_path / "state") == []
+        client.correct({seqs[0]: pose(8)})
+        client.flush(DEADLINE)
+    (found,) = journaled_corrections(tmp_path / "state")
+    assert found.poses[0, 0, 3] == 8
+
+
+def test_corrections_count_in_the_quota(tmp_path: Path) -> None:
+    with (
+        serving(tmp_path / "state", quota_keyframes=10.0) as server,
+        Client(server.address, spool=tmp_path / "spool") as client,
+    ):
+        seqs = scan(client)
+        for i in range(30):
+            client.correct({seqs[0]: pose(i)})
+        client.flush(DEADLINE)
+        assert fetch_health(server.address).refused["held"] > 0
+    found = journaled_corrections(tmp_path / "state")
+    assert [one.poses[0, 0, 3] for one in found] == list(range(30))
+
+
+# --- who dies ---
+
+_DIES = """
+import os, signal
+from tsfusion.journal import writer
+real = writer.Journal.append
+def append(self, frames, **record):
+    if bytes(frames[0][:3]) == b"TSC":
+        if {writes}:
+            real(self, frames, **record)
+        os.kill(os.getpid(), signal.SIGKILL)
+    return real(self, frames, **record)
+writer.Journal.append = append
+"""
+
+
+@pytest.mark.parametrize("writes", [False, True])
+def test_a_server_that_dies_before_it_answers(tmp_path: Path, writes: bool) -> None:
+    state = tmp_path / "state"
+    with serving(state, code=_DIES.format(writes=writes)) as first:  # type: ignore[arg-type]
+        address = first.address
+        client = Client(address, spool=tmp_path / "spool", config=QUICK)
+        try:
+            seqs = scan(client)
+            client.correct({seqs[0]: pose(1)}, T_map_odometry=pose(2))
+            first.process.wait(DEADLINE)
+            assert len(journaled_corrections(state)) == writes
+            client.correct({seqs[1]: pose(3)})
+            client.send(wall(3))
+            with pytest.raises(FlushTimeout, match="1 keyframes and 2 corrections are not acknowledged"):
+                client.flush(0.1)
+            assert client.stats.corrections_acknowledged == 0
+            with serving(state, listen=address):
+                client.wait_fused(DEADLINE)
+                assert client.stats.corrections_acknowledged == 2
+                status = fetch_status(address)
+                assert (status.keyframes_durable, status.keyframes_fused) == (4, 4)
+        finally:
+            client.close()
+    assert [one.poses[0, 0, 3] for one in journaled_corrections(state)] == [1, 3]
+
+
+_SCANS = """
+import os, signal, sys
+from keyframes_and_servers import pose, wall
+from tsfusion import Client
+client = Client(sys.argv[1], spool=sys.argv[2])
+seqs = [client.send(wall(i)) for i in range(3)]
+client.flush(60)
+print("durable", flush=True)
+sys.stdin.readline()
+client.correct({seqs[0]: pose(1)})
+client.correct({seqs[1]: pose(2)})
+if sys.argv[3] == "killed":
+    os.kill(os.getpid(), signal.SIGKILL)
+client.close()
+"""
+
+
+@pytest.mark.parametrize("end", ["killed", "closed"])
+def test_a_scanner_that_dies_before_the_answer_leaves_them_to_the_next(tmp_path: Path, end: str) -> None:
+    state, spool = tmp_path / "state", tmp_path / "spool"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(SUPPORT), *sys.path])}
+    with serving(state) as server:
+        command = [sys.executable, "-c", _SCANS, server.address, str(spool), end]
+        with subprocess.Popen(command, stdin=-1, stdout=-1, text=True, env=environment) as scanner:
+            assert scanner.stdin is not None
+            assert scanner.stdout is not None
+            assert scanner.stdout.readline() == "durable\n"
+            server.kill()
+            scanner.stdin.write("\n")
+            scanner.stdin.flush()
+            assert scanner.wait(DEADLINE) == (-signal.SIGKILL if end == "killed" else 0)
+    assert journaled_corrections(state) == []
+    with serving(state) as server, Client(server.address, spool=spool) as client:
+        session = session_of(client)
+        client.flush(DEADLINE)
+        assert client.stats.corrections_acknowledged == 2
+        client.correct({1: pose(5)})
+        client.flush(DEADLINE)
+        assert fetch_health(server.address).maps["default"].keyframes_durable == 3
+    assert [one.poses[0, 0, 3] for one in journaled_corrections(state)] == [1, 2, 5]
+    with Client("tcp://127.0.0.1:9", spool=spool) as client:
+        assert session_of(client) != session
+
+
+def test_a_restart_goes_on_behind_corrections(tmp_path: Path) -> None:
+    """The checkpoint covers them; without one the journal is read again, and no count is off."""
+    state = tmp_path / "state"
+    with serving(state) as server, Client(server.address, spool=tmp_path / "spool") as client:
+        seqs = scan(client)
+        client.correct({seqs[0]: pose(1)})
+        client.wait_fused(DEADLINE)
+        map_hash = fetch_status(server.address).map_hash
+        assert server.terminate() == 0
+    for lost in (False, True):
+        if lost:
+            (state / "maps" / "default" / "map.tsf").unlink()
+        with serving(state) as server:
+            until(lambda: fetch_status(server.address).fuser == "idle")
+            status = fetch_status(server.address)
+            assert (status.keyframes_durable, status.keyframes_fused) == (3, 3)
+            assert status.map_hash == map_hash
+            assert fetch_health(server.address).maps["default"].corrections == 1
+            assert server.terminate() == 0
+
+
+def test_what_an_earlier_development_version_left_is_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    state, spool = tmp_path / "state", tmp_path / "spool"
+    old = state / "maps" / "default" / "corrections"
+    for folder, name in ((old, f"{bytes(16).hex()}.tsc"), (spool, "corrections.tsc")):
+        folder.mkdir(parents=True)
+        (folder / name).write_bytes(b"TSFCOR")
+    with serving(state) as server, Client(server.address, spool=spool) as client:
+        scan(client)
+        assert server.terminate() == 0
+        assert server.said().count("as an earlier development version kept them") == 1
+        assert caplog.text.count("as an earlier development version kept them") == 1
