@@ -58,7 +58,7 @@ def session_of(client: Client) -> bytes:
 
 def records(state: Path, session: bytes) -> list[tuple[int, bool]]:
     """Number and whether it is a correction, of a session's records in the journal."""
-    folder = state_folder.folder(state, "default") / "journal"
+    folder = state_folder.map_folder(state, "default") / "journal"
     paths = [journal.segment_path(folder, number) for number in journal.segments(folder)]
     found = [record for path in paths for record in journal.records(path)]
     return [(record.seq, record.is_correction) for record in found if record.session == session]
@@ -93,7 +93,7 @@ def test_corrections_stand_in_the_journal_between_keyframes(
     assert older.poses.tobytes() == np.array(first).tobytes()
     assert np.array_equal(older.T_map_odometry, pose(0.5))  # type: ignore[arg-type]
     assert (newer.seqs.tolist(), newer.removed.tolist()) == ([seqs[1]], [5])
-    info = summarize(state_folder.find(state), lambda *_: None)
+    info = summarize(state_folder.find_journal(state), lambda *_: None)
     (shown,) = [one for one in info.sessions if one.session == session.hex()]
     assert (shown.keyframes, shown.corrections, shown.corrected, shown.removed) == (4, 2, 3, 1)
     newest = [first[0], pose(9), first[2]]
@@ -184,7 +184,7 @@ def test_hostile_corrections_are_counted_and_change_nothing(
 
 def test_another_clients_session_cannot_be_corrected(tmp_path: Path) -> None:
     robot = secured(tmp_path)
-    key_folder.allow(tmp_path / "server", "cart", key_folder.create(tmp_path / "cart", "cart").public)
+    key_folder.allow(tmp_path / "server", "cart", key_folder.create_pair(tmp_path / "cart", "cart").public)
     cart = Secured({}, {**robot.client, "key": str(tmp_path / "cart" / "cart.key_secret")})
     with (
         serving(tmp_path / "state", **robot.server) as server,  # type: ignore[arg-type]

@@ -58,7 +58,7 @@ def wall(i: int = 0, **fields: Any) -> Keyframe:
 
 def journaled_corrections(state: Path, map_name: str = "default") -> list[Correction]:
     """The corrections in a map's journal, in its order."""
-    folder = state_folder.folder(state, map_name) / state_folder.JOURNAL_FOLDER
+    folder = state_folder.map_folder(state, map_name) / state_folder.JOURNAL_FOLDER
     found = []
     for number in journal.segments(folder):
         for record in journal.records(journal.segment_path(folder, number)):
