@@ -12,6 +12,10 @@ One unit of parallel work is a band, a contiguous run of tiles with a region of 
 import taichi as ti
 
 from tsfusion.kernels.sensor_noise import (
+    DROPS_LONE_SAMPLES,
+    MAX_RANGE,
+    MIN_RANGE,
+    VOXEL_SIZE,
     before_width,
     bundle_weight,
     fixed_point,
@@ -228,9 +232,9 @@ def rays_from_image(
     corner = vec3(camera[2, 0], camera[2, 1], camera[2, 2])
     origin = vec3(camera[3, 0], camera[3, 1], camera[3, 2])
     pitch = ti.max(du.norm(), dv.norm())
-    unit = model[5] / 1024.0  # metres
+    unit = model[VOXEL_SIZE] / 1024.0  # metres
     factor, per_metre = ti.cast(scale, ti.f32), ti.cast(1.0 / unit, ti.f32)
-    near, far = ti.cast(model[7], ti.f32), ti.cast(model[8], ti.f32)
+    near, far = ti.cast(model[MIN_RANGE], ti.f32), ti.cast(model[MAX_RANGE], ti.f32)
     for run in range(count * RUN):
         if run % RUN == 0:
             band = run // RUN
@@ -251,7 +255,7 @@ def rays_from_image(
                     if bundle == 1:
                         wide, high = cell_shape(mean * pitch)
                         sigma = noise_sigma(model, mean)
-                        if sigma < PLANE_SIGMA * model[5]:
+                        if sigma < PLANE_SIGMA * model[VOXEL_SIZE]:
                             anchor = ti.cast(mean / unit, ti.i32)
                             planar, slope_x, slope_y = fit_plane(depths, band, anchor, sigma / unit)
                     across = TILE // wide
@@ -274,7 +278,7 @@ def rays_from_image(
                                     depths, band, x0, y0, wide, high, above, low + tolerance
                                 )
                             keep = n > 0
-                            if n == 1 and model[9] > 0.0:
+                            if n == 1 and model[DROPS_LONE_SAMPLES] > 0.0:
                                 keep = 1 == is_supported(
                                     image, is_disparity, factor, confidence, has_confidence, near, far,
                                     per_metre, top + sum_y, left + sum_x, low, tolerance,

@@ -8,6 +8,9 @@ One unit of parallel work is a band, a contiguous run of points with a region of
 import taichi as ti
 
 from tsfusion.kernels.sensor_noise import (
+    MAX_RANGE,
+    MIN_RANGE,
+    VOXEL_SIZE,
     before_width,
     bundle_weight,
     fixed_point,
@@ -50,8 +53,9 @@ def rays_from_points(
     """Consecutive points within a voxel of the first become one ray; range is measured along the ray."""
     count = points.shape[0]
     own_starts = ti.select(starts.shape[0] == 1, 0, 1)
-    nearest, farthest = ti.cast(model[7] * model[7], ti.f32), ti.cast(model[8] * model[8], ti.f32)
-    spread = ti.cast(model[5] * model[5], ti.f32)
+    nearest = ti.cast(model[MIN_RANGE] * model[MIN_RANGE], ti.f32)
+    farthest = ti.cast(model[MAX_RANGE] * model[MAX_RANGE], ti.f32)
+    spread = ti.cast(model[VOXEL_SIZE] * model[VOXEL_SIZE], ti.f32)
     for run in range(bands.shape[0] * RUN):
         if run % RUN == 0:
             band = run // RUN

@@ -1,18 +1,29 @@
 # SPDX-License-Identifier: MIT
-"""What the sensor model says of a sample: its noise, and with it the weight and the band of its ray."""
+"""The sensor model inside kernels: the noise of a sample, and from it the weight and the band of its ray.
+
+`model` is one float64 array of `MODEL_FIELDS` numbers, made by `ray_buffers.model_parameters` from a
+`config.SensorModel` and the map's settings.
+"""
 
 import taichi as ti
 
 from tsfusion.kernels.voxel_traversal import VOXEL_LIMIT, vec3i
 
+MODEL_FIELDS = 12
+# σ(z) = SIGMA_FLOOR + SIGMA_SLOPE · (z − SIGMA_Z0)², metres
+SIGMA_FLOOR, SIGMA_SLOPE, SIGMA_Z0 = 0, 1, 2
+LEAST_SUPPORT, MOST_SUPPORT = 3, 4  # half-width of the band, voxels
+VOXEL_SIZE = 5  # metres
+FULL_WEIGHT_SIGMA = 6  # metres: a sample with less noise has its full weight
+MIN_RANGE, MAX_RANGE = 7, 8  # metres
+DROPS_LONE_SAMPLES = 9  # 1 or 0
+SUPPORT_PER_SIGMA = 10  # half-width for σ = 1 m, 2⁻⁸ voxel: three σ
+CARVES_SPACE = 11  # 1 or 0
+
 WEIGHT_ONE = 16  # a full-confidence sample
 MAX_BUNDLE_WEIGHT = 255  # more samples of one cell are not independent evidence
 LEAST_SHARE = 1.0 / WEIGHT_ONE  # of a sample's weight stays, however noisy it is
 LAYER_SIGMAS = 4.0  # samples this many σ (and a voxel) apart are not one surface
-
-# `model`: σ floor, σ slope, σ z0, least and most half-width (voxels), voxel size, σ below which the weight is
-# full, least and most range, whether lone samples are dropped, three σ of 1 m in 2⁻⁸ voxel, whether the space
-# before the band is carved. See config.SensorModel.
 MAX_CARVED = 2048.0  # voxels
 NEVER_CARVED = 16.0  # voxels in front of the sensor, where all rays meet: their lanes would soon be full
 
@@ -22,15 +33,17 @@ vec3f = ti.types.vector(3, ti.f32)
 
 @ti.func
 def noise_sigma(model: ti.template(), z):
-    return model[0] + model[1] * (z - model[2]) * (z - model[2])
+    """Standard deviation of a sample at depth (or range) z, metres."""
+    away = z - model[SIGMA_Z0]
+    return model[SIGMA_FLOOR] + model[SIGMA_SLOPE] * away * away
 
 
 @ti.func
 def bundle_weight(model: ti.template(), sigma, trust):
     """Weight of samples whose confidences (0 … 255) sum to `trust`."""
     w = ti.cast(trust, ti.f64) * (WEIGHT_ONE / 255.0)
-    if sigma > model[6]:
-        ratio = model[6] / sigma
+    if sigma > model[FULL_WEIGHT_SIGMA]:
+        ratio = model[FULL_WEIGHT_SIGMA] / sigma
         w *= ti.max(ratio * ratio, LEAST_SHARE)
     return ti.min(ti.max(ti.cast(w + 0.5, ti.i32), 1), MAX_BUNDLE_WEIGHT)
 
@@ -38,7 +51,9 @@ def bundle_weight(model: ti.template(), sigma, trust):
 @ti.func
 def half_width(model: ti.template(), sigma):
     """Support half-width, 2⁻⁸ voxel: three sigma, held between the preset's bounds."""
-    width = ti.min(ti.max(sigma * model[10], model[3] * 256.0), model[4] * 256.0)
+    width = ti.min(
+        ti.max(sigma * model[SUPPORT_PER_SIGMA], model[LEAST_SUPPORT] * 256.0), model[MOST_SUPPORT] * 256.0
+    )
     return ti.cast(width, ti.i32)
 
 
@@ -46,7 +61,7 @@ def half_width(model: ti.template(), sigma):
 def before_width(model: ti.template(), half, length):
     """How far before its end a ray of `length` voxels begins, 2⁻⁸ voxel: its band, or nearly all."""
     before = half
-    if model[11] > 0.0:
+    if model[CARVES_SPACE] > 0.0:
         before = ti.max(half, ti.cast((ti.min(length, MAX_CARVED) - NEVER_CARVED) * 256.0, ti.i32))
     return before
 
@@ -54,11 +69,12 @@ def before_width(model: ti.template(), half, length):
 @ti.func
 def layer_depth(model: ti.template(), z):
     """How far apart in depth samples of one surface may be, metres."""
-    return model[5] + LAYER_SIGMAS * noise_sigma(model, z)
+    return model[VOXEL_SIZE] + LAYER_SIGMAS * noise_sigma(model, z)
 
 
 @ti.func
 def in_reach(p):
+    """Whether the voxels around p (voxels) have keys."""
     limit = ti.cast(VOXEL_LIMIT - 64, ti.f64)
     return ti.abs(p[0]) < limit and ti.abs(p[1]) < limit and ti.abs(p[2]) < limit
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.config import SensorModel, VolumeConfig
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.kernels import ray_smoothing, rays_from_images, rays_from_points
+from tsfusion.kernels import ray_smoothing, rays_from_images, rays_from_points, sensor_noise
 from tsfusion.kernels.integrate import CUBE, TOUCHED_COUNT, TOUCHED_HEADER, TOUCHED_OVERFLOW
 from tsfusion.kernels.voxel_traversal import BAND_FIELDS, MAX_CROSSED, RAY_FIELDS, SAMPLES
 from tsfusion.tsdf.growing_array import GrowingArray
@@ -121,17 +121,24 @@ def model_parameters(
     outlier_filter: bool = True,
     space_carving: bool = False,
 ) -> NDArray[np.float64]:
-    """The kernel's `model` argument (12 float64, see kernels/rays.py)."""
+    """The sensor model as the kernels read it: (12,) float64, indices in kernels/sensor_noise.py."""
     slope, z0 = model.sigma_slope, model.sigma_z0
     if baseline_fx is not None and model.disparity_sigma > 0:
         slope, z0 = model.disparity_sigma / baseline_fx, 0.0
-    return np.array(
-        [
-            model.sigma_floor, slope, z0, model.min_support, model.max_support, voxel_size,
-            FULL_WEIGHT_SIGMA * voxel_size, model.min_range, model.max_range, outlier_filter,
-            3 * 256 / voxel_size, space_carving,
-        ]
-    )  # fmt: skip
+    parameters = np.empty(sensor_noise.MODEL_FIELDS)
+    parameters[sensor_noise.SIGMA_FLOOR] = model.sigma_floor
+    parameters[sensor_noise.SIGMA_SLOPE] = slope
+    parameters[sensor_noise.SIGMA_Z0] = z0
+    parameters[sensor_noise.LEAST_SUPPORT] = model.min_support
+    parameters[sensor_noise.MOST_SUPPORT] = model.max_support
+    parameters[sensor_noise.VOXEL_SIZE] = voxel_size
+    parameters[sensor_noise.FULL_WEIGHT_SIGMA] = FULL_WEIGHT_SIGMA * voxel_size
+    parameters[sensor_noise.MIN_RANGE] = model.min_range
+    parameters[sensor_noise.MAX_RANGE] = model.max_range
+    parameters[sensor_noise.DROPS_LONE_SAMPLES] = outlier_filter
+    parameters[sensor_noise.SUPPORT_PER_SIGMA] = 3 * 256 / voxel_size
+    parameters[sensor_noise.CARVES_SPACE] = space_carving
+    return parameters
 
 
 def _depth_scale(keyframe: Keyframe) -> float:
