@@ -13,24 +13,19 @@ import taichi as ti
 from tsfusion.kernels.block_hash import map_find, set_insert
 from tsfusion.kernels.voxel_traversal import (
     COUNT,
-    CROSSING,
     DEFERRED,
-    DISTANCE,
     END,
-    INTERVAL,
     LENGTH,
-    LOSS,
     RUN,
     START,
     UPDATES,
-    VOXEL,
     WEIGHT_COLOR,
+    advance,
+    begin_walk,
     block_key,
     next_step,
     offset_in_block,
-    ray_vector,
     ray_weight,
-    steps,
     vec3i,
 )
 
@@ -50,11 +45,13 @@ TOUCHED_COUNT, TOUCHED_OVERFLOW, TOUCHED_MISMATCH, TOUCHED_HEADER = 0, 1, 2, 3
 
 @ti.func
 def lane_weight(packed):
+    """Σ w of a voxel's sum."""
     return ti.cast(packed & WEIGHT_MASK, ti.i32)
 
 
 @ti.func
 def lane_distance(packed):
+    """Σ w·m of a voxel's sum."""
     return packed >> WEIGHT_BITS
 
 
@@ -97,6 +94,67 @@ def vote_color(
             touched[TOUCHED_MISMATCH] = 1
 
 
+@ti.func
+def enter_block(
+    key, hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(), stamp,
+    stamps: ti.template(), places: ti.template(), dirty: ti.template(), touched: ti.template(),
+):  # fmt: skip
+    """Slot of a block, which is listed in `touched`; −1, and its key in `missing`, if the map lacks it."""
+    slot = map_find(hash_keys, hash_slots, hash_keys.shape[0] - 1, key)
+    if slot < 0:
+        if set_insert(missing, missing.shape[0] - 1, key) == 1:
+            touched[TOUCHED_OVERFLOW] = 1
+    else:
+        touch(slot, stamp, stamps, places, dirty, touched)
+    return slot
+
+
+@ti.func
+def add_ray(
+    rays: ti.template(), r, sign_, oldest, last: ti.template(), slot: ti.template(), hash_keys: ti.template(),
+    hash_slots: ti.template(), missing: ti.template(), stamp, stamps: ti.template(), places: ti.template(),
+    dirty: ti.template(), touched: ti.template(), sums: ti.template(), has_color, color_rgn: ti.template(),
+    color_b: ti.template(),
+):  # fmt: skip
+    """Add a ray to every voxel it crosses. `last` and its `slot`: the block entered last, by any ray.
+
+    Returns how many voxels it was added to, and whether it crosses blocks that the map does not have.
+    """
+    weight = ray_weight(rays, r)
+    length = rays[r, LENGTH]
+    end = rays[r, END] & ~7
+    reach = length - end
+    updates, incomplete, colored = 0, 0, 1 - has_color
+    walk = begin_walk(rays, r)
+    inside = ti.cast(weight > 0, ti.i32)
+    while inside == 1:
+        block = walk.voxel >> 3
+        if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
+            last = block
+            slot = enter_block(
+                block_key(walk.voxel), hash_keys, hash_slots, missing, stamp, stamps, places, dirty, touched
+            )
+        step, leaves = next_step(walk.crossing)
+        if slot >= oldest:
+            o = offset_in_block(walk.voxel)
+            m, w = quantize(walk.distance), sign_ * weight
+            if leaves < end - reach:  # in free space before the band
+                m, w = quantize(reach), sign_ * ti.max(weight >> FREE_SHIFT, 1)
+            # both sums in one addition; their quotient minimises Σ w (x − m)²: paper eq. 2
+            ti.atomic_add(sums[slot, o], (ti.cast(m * w, ti.i64) << WEIGHT_BITS) + w)
+            updates += 1
+            if colored == 0 and leaves > end:
+                vote_color(slot, o, sign_, rays[r, WEIGHT_COLOR], color_rgn, color_b, touched)
+        if slot < 0:
+            incomplete = 1
+        if leaves > end:
+            colored = 1
+        if leaves >= length:
+            inside = 0
+        advance(walk, step)
+    return updates, incomplete
+
+
 @ti.kernel
 def add_rays(
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
@@ -125,77 +183,32 @@ def add_rays(
     Rays that cross blocks the map does not have are listed in `deferred`, the keys in `missing`; when those
     blocks exist, a second call with `only_deferred` and `oldest` = the first new slot adds the rest.
     """
-    mask = missing.shape[0] - 1
-    hash_mask = hash_keys.shape[0] - 1
     for run in range((last_band - first_band) * RUN):
         if run % RUN == 0:
             band = first_band + run // RUN
             start = bands[band, START]
             count = bands[band, COUNT]
+            updates = 0
             if only_deferred == 1:
                 count = bands[band, DEFERRED]
-            last = vec3i(2147483647)
-            slot = -1
+                updates = bands[band, UPDATES]
+            last, slot = vec3i(2147483647), -1
             postponed = 0
-            updates = 0
             for n in range(count):
                 r = start + n
                 if only_deferred == 1:
                     r = deferred[start + n]
-                weight = ray_weight(rays, r)
-                if weight > 0:
-                    voxel = ray_vector(rays, r, VOXEL)
-                    crossing = ray_vector(rays, r, CROSSING)
-                    interval = ray_vector(rays, r, INTERVAL)
-                    loss = ray_vector(rays, r, LOSS)
-                    towards = steps(rays[r, END])
-                    distance = rays[r, DISTANCE]
-                    length = rays[r, LENGTH]
-                    end = rays[r, END] & ~7
-                    reach = length - end
-                    band_start = end - reach
-                    colored = 1 - has_color
-                    incomplete = 0
-                    inside = 1
-                    while inside == 1:
-                        block = voxel >> 3
-                        if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
-                            last = block
-                            key = block_key(voxel)
-                            slot = map_find(hash_keys, hash_slots, hash_mask, key)
-                            if slot < 0:
-                                if set_insert(missing, mask, key) == 1:
-                                    touched[TOUCHED_OVERFLOW] = 1
-                            else:
-                                touch(slot, stamp, stamps, places, dirty, touched)
-                        step, next_crossing = next_step(crossing)
-                        if slot >= oldest:
-                            o = offset_in_block(voxel)
-                            m, w = quantize(distance), sign_ * weight
-                            if next_crossing < band_start:
-                                m, w = quantize(reach), sign_ * ti.max(weight >> FREE_SHIFT, 1)
-                            ti.atomic_add(sums[slot, o], (ti.cast(m * w, ti.i64) << WEIGHT_BITS) + w)
-                            updates += 1
-                            if colored == 0 and next_crossing > end:
-                                packed = rays[r, WEIGHT_COLOR]
-                                vote_color(slot, o, sign_, packed, color_rgn, color_b, touched)
-                        if slot < 0:
-                            incomplete = 1
-                        if next_crossing > end:
-                            colored = 1
-                        if next_crossing >= length:
-                            inside = 0
-                        crossing += interval & step
-                        voxel += towards & step
-                        distance -= (loss & step).sum()
-                    if incomplete == 1:
-                        deferred[start + postponed] = r
-                        postponed += 1
+                added, incomplete = add_ray(
+                    rays, r, sign_, oldest, last, slot, hash_keys, hash_slots, missing, stamp, stamps,
+                    places, dirty, touched, sums, has_color, color_rgn, color_b,
+                )  # fmt: skip
+                updates += added
+                if incomplete == 1:
+                    deferred[start + postponed] = r
+                    postponed += 1
+            bands[band, UPDATES] = updates
             if only_deferred == 0:
                 bands[band, DEFERRED] = postponed
-                bands[band, UPDATES] = updates
-            else:
-                bands[band, UPDATES] = bands[band, UPDATES] + updates
 
 
 @ti.kernel

@@ -25,22 +25,16 @@ from tsfusion.kernels.integrate import (
 )
 from tsfusion.kernels.voxel_traversal import (
     COUNT,
-    CROSSING,
-    DISTANCE,
-    END,
-    INTERVAL,
     LENGTH,
-    LOSS,
     MAX_CROSSED,
     RUN,
     START,
-    VOXEL,
+    advance,
+    begin_walk,
     block_key,
     next_step,
     offset_in_block,
-    ray_vector,
     ray_weight,
-    steps,
     vec3i,
 )
 
@@ -110,28 +104,22 @@ def smooth_rays(
             slot = -1
             for r in range(bands[band, START], bands[band, START] + bands[band, COUNT]):
                 if ray_weight(rays, r) > 0:
-                    voxel = ray_vector(rays, r, VOXEL)
-                    crossing = ray_vector(rays, r, CROSSING)
-                    interval = ray_vector(rays, r, INTERVAL)
-                    loss = ray_vector(rays, r, LOSS)
-                    towards = steps(rays[r, END])
-                    distance = rays[r, DISTANCE]
-                    length = rays[r, LENGTH]
+                    walk = begin_walk(rays, r)
                     n = 0
                     total = ti.f32(0.0)
                     inside = 1
                     while inside == 1 and n < MAX_CROSSED:
-                        block = voxel >> 3
+                        block = walk.voxel >> 3
                         if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
                             last = block
-                            slot = map_find(hash_keys, hash_slots, hash_mask, block_key(voxel))
-                        o = offset_in_block(voxel)
+                            slot = map_find(hash_keys, hash_slots, hash_mask, block_key(walk.voxel))
+                        o = offset_in_block(walk.voxel)
                         packed = sums[slot, o]
                         w = ti.cast(lane_weight(packed), ti.f32)
                         s = ti.cast(lane_distance(packed), ti.f32)
                         if feedback == 1:
                             s += correction[slot, o]
-                        t = ti.cast(distance, ti.f32) * (QUANTA_PER_VOXEL / 65536.0)
+                        t = ti.cast(walk.distance, ti.f32) * (QUANTA_PER_VOXEL / 65536.0)
                         signal[band, n, 0] = t
                         signal[band, n, 1] = s / w - t
                         signal[band, n, 2] = w
@@ -139,12 +127,10 @@ def smooth_rays(
                         crossed[band, n, 1] = o
                         total += w
                         n += 1
-                        step, next_crossing = next_step(crossing)
-                        if next_crossing >= length:
+                        step, next_crossing = next_step(walk.crossing)
+                        if next_crossing >= rays[r, LENGTH]:
                             inside = 0
-                        crossing += interval & step
-                        voxel += towards & step
-                        distance -= (loss & step).sum()
+                        advance(walk, step)
                     for i in range(n):
                         signal[band, i, 2] = ti.select(weighted == 1, signal[band, i, 2] * n / total, 1.0)
                     if n >= 3:

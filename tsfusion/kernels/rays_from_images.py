@@ -25,7 +25,7 @@ from tsfusion.kernels.sensor_noise import (
     noise_sigma,
     vec3,
 )
-from tsfusion.kernels.voxel_traversal import COUNT, RUN, SAMPLES, START, WEIGHT, write_ray
+from tsfusion.kernels.voxel_traversal import RUN, write_band, write_ray
 
 TILE = 12  # divided by both sides of every cell
 TILE_SAMPLES = TILE * TILE
@@ -39,21 +39,41 @@ PLANE_SIGMA = 1.0  # voxels: with more noise than that a plane says nothing abou
 LEAST_FACING = 0.15  # cosine between plane normal and ray: what is seen more edge-on has no plane
 
 
+# How an image's numbers become depths. `per_metre`: 2⁻¹⁰ voxels a metre.
+Reading = ti.types.struct(
+    is_disparity=ti.i32, scale=ti.f32, has_confidence=ti.i32, near=ti.f32, far=ti.f32, per_metre=ti.f32
+)
+# Voxels: what a step right, a step down and pixel (0, 0) add to the direction of a pixel's ray; its start.
+Camera = ti.types.struct(du=vec3, dv=vec3, corner=vec3, origin=vec3)
+# Pixels of a tile: from (x, y), counted from the tile's corner (left, top).
+Cell = ti.types.struct(left=ti.i32, top=ti.i32, x=ti.i32, y=ti.i32, wide=ti.i32, high=ti.i32)
+# A tile's plane, if it is flat: slopes of the depth, 2⁻¹⁰ voxel a pixel.
+Plane = ti.types.struct(is_flat=ti.i32, slope_x=ti.f32, slope_y=ti.f32)
+# Samples of a cell with depths in [low, up_to]: the deepest, their number, Σ depth, Σ x, Σ y.
+Layer = ti.types.struct(
+    low=ti.i32, up_to=ti.i32, deepest=ti.i32, n=ti.i32, sum_q=ti.i64, sum_x=ti.i32, sum_y=ti.i32
+)
+
+
 @ti.func
-def depth_at(
-    image: ti.template(), is_disparity, scale, confidence: ti.template(), has_confidence, near, far, unit,
-    v, u,
-):  # fmt: skip
-    """Depth of a pixel in 2⁻¹⁰ voxel (`unit` = 1 / metres of that); 0 = no usable return. All float32."""
+def camera_of(rows: ti.template()):
+    du, dv = vec3(rows[0, 0], rows[0, 1], rows[0, 2]), vec3(rows[1, 0], rows[1, 1], rows[1, 2])
+    corner, origin = vec3(rows[2, 0], rows[2, 1], rows[2, 2]), vec3(rows[3, 0], rows[3, 1], rows[3, 2])
+    return Camera(du, dv, corner, origin)
+
+
+@ti.func
+def depth_at(image: ti.template(), confidence: ti.template(), reading, v, u):
+    """Depth of a pixel in 2⁻¹⁰ voxel; 0 = no usable return. All float32."""
     raw = ti.cast(image[v, u], ti.f32)
-    z = raw * scale
-    if is_disparity == 1:
-        z = scale / ti.max(raw, 1e-9)
+    z = raw * reading.scale
+    if reading.is_disparity == 1:
+        z = reading.scale / ti.max(raw, 1e-9)
     q = 0
     # False for NaN as well
-    if raw > 0.0 and z >= near and z <= far:
-        q = ti.cast(z * unit, ti.i32)
-        if has_confidence == 1:
+    if raw > 0.0 and z >= reading.near and z <= reading.far:
+        q = ti.cast(z * reading.per_metre, ti.i32)
+        if reading.has_confidence == 1:
             if confidence[v, u] == 0:
                 q = 0
     return q
@@ -61,9 +81,8 @@ def depth_at(
 
 @ti.func
 def load_tile(
-    image: ti.template(), is_disparity, scale, confidence: ti.template(), has_confidence, near, far, unit,
-    top, left, depths: ti.template(), band,
-):  # fmt: skip
+    image: ti.template(), confidence: ti.template(), reading, left, top, depths: ti.template(), band
+):
     """Fill `depths[band]` with the tile's depths. Returns their count and sum."""
     bottom = ti.min(TILE, image.shape[0] - top)
     right = ti.min(TILE, image.shape[1] - left)
@@ -74,9 +93,7 @@ def load_tile(
     total = ti.i64(0)
     for y in range(bottom):
         for x in range(right):
-            q = depth_at(
-                image, is_disparity, scale, confidence, has_confidence, near, far, unit, top + y, left + x
-            )
+            q = depth_at(image, confidence, reading, top + y, left + x)
             depths[band, y * TILE + x] = q
             valid += ti.cast(q > 0, ti.i32)
             total += q
@@ -86,7 +103,7 @@ def load_tile(
 @ti.func
 def fit_plane(depths: ti.template(), band, anchor, sigma):
     """Least squares q = c + x·slope_x + y·slope_y over a lattice of the tile; depths and `sigma` in 2⁻¹⁰
-    voxel, `anchor` near the depths. Returns (1, slope_x, slope_y), or zeros where the tile is not flat."""
+    voxel, `anchor` near the depths."""
     sx, sy, sxx, sxy, syy, n = 0, 0, 0, 0, 0, 0
     sq, sxq, syq, sqq = ti.i64(0), ti.i64(0), ti.i64(0), ti.i64(0)
     for row in range(TILE // PLANE_STEP):
@@ -112,7 +129,7 @@ def fit_plane(depths: ti.template(), band, anchor, sigma):
         sq += row_q
         sxq += row_xq
         syq += row_q * y
-    planar, slope_x, slope_y = 0, 0.0, 0.0
+    is_flat, slope_x, slope_y = 0, 0.0, 0.0
     if n >= LEAST_PLANE:
         mean_q = ti.cast(sq, ti.f64) / n
         cxx = sxx - ti.cast(sx * sx, ti.f64) / n
@@ -126,8 +143,18 @@ def fit_plane(depths: ti.template(), band, anchor, sigma):
             slope_y = (cyq * cxx - cxq * cxy) / determinant
             left_over = ti.cast(sqq, ti.f64) - mean_q * sq - slope_x * cxq - slope_y * cyq
             if left_over < n * (PLANE_NOISE * sigma * sigma + PLANE_ROUGHNESS * PLANE_ROUGHNESS):
-                planar = 1
-    return planar, slope_x, slope_y
+                is_flat = 1
+    return Plane(is_flat, slope_x, slope_y)
+
+
+@ti.func
+def tile_plane(model: ti.template(), unit, mean, depths: ti.template(), band):
+    """The plane of a tile of `mean` depth (metres), if it is flat and noise does not hide it."""
+    plane = Plane(0, 0.0, 0.0)
+    sigma = noise_sigma(model, mean)
+    if sigma < PLANE_SIGMA * model[VOXEL_SIZE]:
+        plane = fit_plane(depths, band, ti.cast(mean / unit, ti.i32), sigma / unit)
+    return plane
 
 
 @ti.func
@@ -152,59 +179,106 @@ def cell_shape(pixel):
 
 
 @ti.func
-def layer_sums(depths: ti.template(), band, x0, y0, wide, high, above, up_to):
-    """Of the cell's depths in (`above`, `up_to`]: least, largest, count, Σ depth, Σ x, Σ y."""
-    low, top, n, sum_q, sum_x, sum_y = 1 << 30, 0, 0, ti.i64(0), 0, 0
-    for y in range(y0, y0 + high):
-        for x in range(x0, x0 + wide):
+def layer_sums(depths: ti.template(), band, cell, above, up_to):
+    """The cell's samples with depths in (`above`, `up_to`], as a `Layer`."""
+    low, deepest, n, sum_q, sum_x, sum_y = 1 << 30, 0, 0, ti.i64(0), 0, 0
+    for y in range(cell.y, cell.y + cell.high):
+        for x in range(cell.x, cell.x + cell.wide):
             q = depths[band, y * TILE + x]
             if q > above and q <= up_to:
                 low = ti.min(low, q)
-                top = ti.max(top, q)
+                deepest = ti.max(deepest, q)
                 n += 1
                 sum_q += q
                 sum_x += x
                 sum_y += y
-    return low, top, n, sum_q, sum_x, sum_y
+    return Layer(low, up_to, deepest, n, sum_q, sum_x, sum_y)
+
+
+@ti.func
+def nearest_layer(model: ti.template(), unit, depths: ti.template(), band, cell, above):
+    """The nearest samples of a cell beyond depth `above` that may belong to one surface (n = 0: none), and
+    whether there are samples behind them."""
+    layer = layer_sums(depths, band, cell, above, 1 << 30)
+    if layer.n > 0:
+        tolerance = ti.cast(ti.min(layer_depth(model, layer.low * unit) / unit, 1e9), ti.i32)
+        layer.up_to = layer.low + tolerance
+    more = layer.n > 1 and layer.deepest > layer.up_to
+    if more:
+        layer = layer_sums(depths, band, cell, above, layer.up_to)
+    return layer, more
+
+
+@ti.func
+def is_supported(image: ti.template(), confidence: ti.template(), reading, cell, layer):
+    """Whether one of the eight neighbours of a layer's only sample has nearly the same depth."""
+    v, u = cell.top + layer.sum_y, cell.left + layer.sum_x
+    found = 0
+    for k in range(9):
+        y = v + k // 3 - 1
+        x = u + k % 3 - 1
+        if found == 0 and k != 4 and y >= 0 and y < image.shape[0] and x >= 0 and x < image.shape[1]:
+            other = depth_at(image, confidence, reading, y, x)
+            if other > 0 and abs(other - layer.low) <= layer.up_to - layer.low:
+                found = 1
+    return found
 
 
 @ti.func
 def layer_color(
-    color: ti.template(), has_color, confidence: ti.template(), has_confidence, top, left,
-    depths: ti.template(), band, x0, y0, wide, high, low, up_to, n,
+    color: ti.template(), has_color, confidence: ti.template(), has_confidence, depths: ti.template(), band,
+    cell, layer,
 ):  # fmt: skip
-    """Mean colour 0xRRGGBB and summed confidence of the cell's `n` samples with depths in [low, up_to]."""
+    """Mean colour 0xRRGGBB and summed confidence of a layer's samples."""
     red, green, blue, trust = 0, 0, 0, 0
-    for y in range(y0, y0 + high):
-        for x in range(x0, x0 + wide):
+    for y in range(cell.y, cell.y + cell.high):
+        for x in range(cell.x, cell.x + cell.wide):
             q = depths[band, y * TILE + x]
-            if q >= low and q <= up_to:
+            if q >= layer.low and q <= layer.up_to:
                 if has_confidence == 1:
-                    trust += ti.cast(confidence[top + y, left + x], ti.i32)
+                    trust += ti.cast(confidence[cell.top + y, cell.left + x], ti.i32)
                 if has_color == 1:
-                    blue += ti.cast(color[top + y, left + x, 0], ti.i32)
-                    green += ti.cast(color[top + y, left + x, 1], ti.i32)
-                    red += ti.cast(color[top + y, left + x, 2], ti.i32)
+                    blue += ti.cast(color[cell.top + y, cell.left + x, 0], ti.i32)
+                    green += ti.cast(color[cell.top + y, cell.left + x, 1], ti.i32)
+                    red += ti.cast(color[cell.top + y, cell.left + x, 2], ti.i32)
+    n = layer.n
     if has_confidence == 0:
         trust = 255 * n
     return ((red // n) << 16) | ((green // n) << 8) | (blue // n), trust
 
 
 @ti.func
-def is_supported(
-    image: ti.template(), is_disparity, scale, confidence: ti.template(), has_confidence, near, far, unit,
-    v, u, q, tolerance,
+def write_layer_ray(
+    rays: ti.template(), r, model: ti.template(), camera, plane, unit,
+    color: ti.template(), has_color, confidence: ti.template(), has_confidence, depths: ti.template(), band,
+    cell, layer,
 ):  # fmt: skip
-    """Whether one of the eight neighbours has nearly the same depth."""
-    found = 0
-    for k in range(9):
-        y = v + k // 3 - 1
-        x = u + k % 3 - 1
-        if found == 0 and k != 4 and y >= 0 and y < image.shape[0] and x >= 0 and x < image.shape[1]:
-            other = depth_at(image, is_disparity, scale, confidence, has_confidence, near, far, unit, y, x)
-            if other > 0 and abs(other - q) <= tolerance:
-                found = 1
-    return found
+    """Write ray `r` through the mean of a layer's samples; returns its weight, 0 if it is out of reach.
+
+    paper eq. 1 (u = column, v = row), in voxels: point = origin + z (u·du + v·dv + corner).
+    """
+    n = layer.n
+    z = (ti.cast(layer.sum_q, ti.f64) / n + 0.5) * unit
+    u = cell.left + ti.cast(layer.sum_x, ti.f64) / n
+    v = cell.top + ti.cast(layer.sum_y, ti.f64) / n
+    direction = camera.corner + camera.du * u + camera.dv * v
+    p = camera.origin + direction * z
+    weight = 0
+    if in_reach(p):
+        rgb, trust = 0, 255 * n
+        if has_confidence == 1 or has_color == 1:
+            rgb, trust = layer_color(color, has_color, confidence, has_confidence, depths, band, cell, layer)
+        gradient = vec3(0.0)
+        if plane.is_flat == 1:
+            gradient = plane_gradient(
+                direction, camera.du, camera.dv, z, plane.slope_x * unit, plane.slope_y * unit
+            )
+        sigma = noise_sigma(model, z)
+        weight = bundle_weight(model, sigma, trust)
+        half = half_width(model, sigma)
+        before = before_width(model, half, direction.norm() * z)
+        write_ray(rays, r, fixed_point(p), direction, gradient, before, half, weight, rgb)
+    return weight
 
 
 @ti.kernel
@@ -216,105 +290,55 @@ def rays_from_image(
     has_color: ti.i32,
     confidence: ti.types.ndarray(dtype=ti.u8, ndim=2),
     has_confidence: ti.i32,
-    camera: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (4, 3) voxels: du, dv, corner direction, origin
+    camera_rows: ti.types.ndarray(dtype=ti.f64, ndim=2),  # (4, 3): `Camera`
     model: ti.types.ndarray(dtype=ti.f64, ndim=1),
     bundle: ti.i32,
     depths: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (bands, TILE_SAMPLES)
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
     bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
-    """paper eq. 1 (with u = column, v = row), in voxel units: point = origin + z (u·du + v·dv + corner)."""
+    """Fill `rays`: one a layer of depth, cell by cell, tile by tile."""
     tiles_x = (image.shape[1] + TILE - 1) // TILE
     tiles = tiles_x * ((image.shape[0] + TILE - 1) // TILE)
     count = bands.shape[0]
-    du = vec3(camera[0, 0], camera[0, 1], camera[0, 2])
-    dv = vec3(camera[1, 0], camera[1, 1], camera[1, 2])
-    corner = vec3(camera[2, 0], camera[2, 1], camera[2, 2])
-    origin = vec3(camera[3, 0], camera[3, 1], camera[3, 2])
-    pitch = ti.max(du.norm(), dv.norm())
     unit = model[VOXEL_SIZE] / 1024.0  # metres
-    factor, per_metre = ti.cast(scale, ti.f32), ti.cast(1.0 / unit, ti.f32)
-    near, far = ti.cast(model[MIN_RANGE], ti.f32), ti.cast(model[MAX_RANGE], ti.f32)
     for run in range(count * RUN):
         if run % RUN == 0:
             band = run // RUN
+            camera = camera_of(camera_rows)
+            near, far = ti.cast(model[MIN_RANGE], ti.f32), ti.cast(model[MAX_RANGE], ti.f32)
+            factor, per_metre = ti.cast(scale, ti.f32), ti.cast(1.0 / unit, ti.f32)
+            reading = Reading(is_disparity, factor, has_confidence, near, far, per_metre)
             first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // count, ti.i32)
             last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // count, ti.i32)
             out = first_tile * TILE_SAMPLES
             samples, total_weight = 0, 0
             for tile in range(first_tile, last_tile):
-                top = tile // tiles_x * TILE
-                left = tile % tiles_x * TILE
-                valid, total = load_tile(
-                    image, is_disparity, factor, confidence, has_confidence, near, far, per_metre, top, left,
-                    depths, band,
-                )  # fmt: skip
-                if valid > 0:
+                left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
+                valid, total = load_tile(image, confidence, reading, left, top, depths, band)
+                wide, high, plane = 1, 1, Plane(0, 0.0, 0.0)
+                if valid > 0 and bundle == 1:
                     mean = ti.cast(total, ti.f64) / valid * unit
-                    wide, high, planar, slope_x, slope_y = 1, 1, 0, 0.0, 0.0
-                    if bundle == 1:
-                        wide, high = cell_shape(mean * pitch)
-                        sigma = noise_sigma(model, mean)
-                        if sigma < PLANE_SIGMA * model[VOXEL_SIZE]:
-                            anchor = ti.cast(mean / unit, ti.i32)
-                            planar, slope_x, slope_y = fit_plane(depths, band, anchor, sigma / unit)
-                    across = TILE // wide
-                    for cell in range(across * (TILE // high)):
-                        y0 = cell // across * high
-                        x0 = cell % across * wide
-                        above = 0
-                        while above >= 0:  # one layer of depth after the other
-                            low, deepest, n, sum_q, sum_x, sum_y = layer_sums(
-                                depths, band, x0, y0, wide, high, above, 1 << 30
-                            )
-                            tolerance = 0
-                            if n > 0:
-                                tolerance = ti.cast(
-                                    ti.min(layer_depth(model, low * unit) / unit, 1e9), ti.i32
-                                )
-                            more = n > 1 and deepest - low > tolerance
-                            if more:
-                                low, deepest, n, sum_q, sum_x, sum_y = layer_sums(
-                                    depths, band, x0, y0, wide, high, above, low + tolerance
-                                )
-                            keep = n > 0
-                            if n == 1 and model[DROPS_LONE_SAMPLES] > 0.0:
-                                keep = 1 == is_supported(
-                                    image, is_disparity, factor, confidence, has_confidence, near, far,
-                                    per_metre, top + sum_y, left + sum_x, low, tolerance,
-                                )  # fmt: skip
-                            if keep:
-                                z = (ti.cast(sum_q, ti.f64) / n + 0.5) * unit
-                                u = left + ti.cast(sum_x, ti.f64) / n
-                                v = top + ti.cast(sum_y, ti.f64) / n
-                                ray = corner + du * u + dv * v
-                                p = origin + ray * z
-                                if in_reach(p):
-                                    rgb, trust = 0, 255 * n
-                                    if has_confidence == 1 or has_color == 1:
-                                        rgb, trust = layer_color(
-                                            color, has_color, confidence, has_confidence, top, left, depths,
-                                            band, x0, y0, wide, high, low, low + tolerance, n,
-                                        )  # fmt: skip
-                                    gradient = vec3(0.0)
-                                    if planar == 1:
-                                        gradient = plane_gradient(
-                                            ray, du, dv, z, slope_x * unit, slope_y * unit
-                                        )
-                                    sigma = noise_sigma(model, z)
-                                    weight = bundle_weight(model, sigma, trust)
-                                    half = half_width(model, sigma)
-                                    before = before_width(model, half, ray.norm() * z)
-                                    write_ray(
-                                        rays, out, fixed_point(p), ray, gradient, before, half, weight, rgb
-                                    )
-                                    total_weight += weight
-                                    samples += n
-                                    out += 1
-                            above = -1
-                            if more:
-                                above = low + tolerance
-            bands[band, START] = first_tile * TILE_SAMPLES
-            bands[band, COUNT] = out - first_tile * TILE_SAMPLES
-            bands[band, SAMPLES] = samples
-            bands[band, WEIGHT] = total_weight
+                    wide, high = cell_shape(mean * ti.max(camera.du.norm(), camera.dv.norm()))
+                    plane = tile_plane(model, unit, mean, depths, band)
+                across = TILE // wide
+                cells = ti.select(valid > 0, across * (TILE // high), 0)
+                for c in range(cells):
+                    cell = Cell(left, top, c % across * wide, c // across * high, wide, high)
+                    above = 0
+                    while above >= 0:  # one layer of depth after the other
+                        layer, more = nearest_layer(model, unit, depths, band, cell, above)
+                        keep = layer.n > 0
+                        if layer.n == 1 and model[DROPS_LONE_SAMPLES] > 0.0:
+                            keep = 1 == is_supported(image, confidence, reading, cell, layer)
+                        if keep:
+                            weight = write_layer_ray(
+                                rays, out, model, camera, plane, unit, color, has_color,
+                                confidence, has_confidence, depths, band, cell, layer,
+                            )  # fmt: skip
+                            if weight > 0:
+                                total_weight += weight
+                                samples += layer.n
+                                out += 1
+                        above = ti.select(more, layer.up_to, -1)
+            write_band(bands, band, first_tile * TILE_SAMPLES, out, samples, total_weight)

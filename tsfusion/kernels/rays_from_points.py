@@ -20,7 +20,7 @@ from tsfusion.kernels.sensor_noise import (
     vec3,
     vec3f,
 )
-from tsfusion.kernels.voxel_traversal import COUNT, RUN, SAMPLES, START, WEIGHT, write_ray
+from tsfusion.kernels.voxel_traversal import RUN, write_band, write_ray
 
 
 @ti.func
@@ -120,7 +120,4 @@ def rays_from_points(
                         blue += ti.cast(color[i, 0], ti.i32)
                         green += ti.cast(color[i, 1], ti.i32)
                         red += ti.cast(color[i, 2], ti.i32)
-            bands[band, START] = first_point
-            bands[band, COUNT] = out - first_point
-            bands[band, SAMPLES] = samples
-            bands[band, WEIGHT] = total_weight
+            write_band(bands, band, first_point, out, samples, total_weight)

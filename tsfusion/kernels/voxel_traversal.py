@@ -47,6 +47,7 @@ def pack(x, y, z):
 
 @ti.func
 def unpack(key):
+    """The three coordinates of a key: the inverse of `pack`."""
     return vec3i(
         ti.cast((key >> 42) & 2097151, ti.i32) - 1048576,
         ti.cast((key >> 21) & 2097151, ti.i32) - 1048576,
@@ -114,12 +115,23 @@ def write_ray(rays: ti.template(), r, end, direction, gradient, before, behind, 
 
 
 @ti.func
+def write_band(bands: ti.template(), band, first, end, samples, weight):
+    """Write what a band holds: rays `first` … `end` − 1 of so many samples and of `weight` in all."""
+    bands[band, START] = first
+    bands[band, COUNT] = end - first
+    bands[band, SAMPLES] = samples
+    bands[band, WEIGHT] = weight
+
+
+@ti.func
 def ray_weight(rays: ti.template(), r):
+    """Weight of ray `r`, 0 … 255."""
     return (rays[r, WEIGHT_COLOR] >> 24) & 255
 
 
 @ti.func
 def ray_vector(rays: ti.template(), r, first: ti.template()):
+    """Three neighbouring fields of ray `r`: `VOXEL`, `CROSSING`, `INTERVAL` or `LOSS`."""
     return vec3i(rays[r, first], rays[r, first + 1], rays[r, first + 2])
 
 
@@ -139,11 +151,37 @@ def steps(end):
     return vec3i(1 - 2 * (end & 1), 1 - (end & 2), 1 - ((end & 4) >> 1))
 
 
+# Where a ray is: the voxel, the distance of its centre to the surface, where along the band the ray crosses
+# each axis next; and what a step along each axis adds to the three.
+Walk = ti.types.struct(
+    voxel=vec3i, distance=ti.i32, crossing=vec3i, towards=vec3i, loss=vec3i, interval=vec3i
+)
+
+
+@ti.func
+def begin_walk(rays: ti.template(), r):
+    """Ray `r` in the first voxel of its band."""
+    return Walk(
+        ray_vector(rays, r, VOXEL), rays[r, DISTANCE], ray_vector(rays, r, CROSSING), steps(rays[r, END]),
+        ray_vector(rays, r, LOSS), ray_vector(rays, r, INTERVAL),
+    )  # fmt: skip
+
+
+@ti.func
+def advance(walk: ti.template(), step):
+    """Go on to the next voxel, along the axis that `next_step` found."""
+    walk.crossing += walk.interval & step
+    walk.voxel += walk.towards & step
+    walk.distance -= (walk.loss & step).sum()
+
+
 @ti.func
 def offset_in_block(voxel):
+    """Number of a voxel in its block, 0 … 511: 64 x + 8 y + z."""
     return ((voxel[0] & 7) << 6) | ((voxel[1] & 7) << 3) | (voxel[2] & 7)
 
 
 @ti.func
 def block_key(voxel):
+    """Key of the block that holds a voxel."""
     return pack(voxel[0] >> 3, voxel[1] >> 3, voxel[2] >> 3)
