@@ -68,24 +68,24 @@ class Map:
     """A store and the means to put rays into it, without keyframes."""
 
     def __init__(self) -> None:
-        self.store = BlockStore(color=True, corrected=True)
-        self.scratch = RayBuffers(color=True, regularised=True)
-        self._integrator = Integrator(self.store, self.scratch, VolumeConfig())
+        self.store = BlockStore(voxel_size=1.0, color=True, corrected=True)
+        self.buffers = RayBuffers(color=True, regularised=True)
+        self._integrator = Integrator(self.store, self.buffers, VolumeConfig(regularizer="off"))
 
     def apply(self, rays: NDArray[np.int32], sign: int = 1) -> int:
         """Add the rays, spread unevenly over bands."""
-        scratch = self.scratch
-        scratch.rays = np.vstack([rays, np.zeros((1, RAY_FIELDS), np.int32)])
-        scratch.deferred = np.zeros(len(scratch.rays), np.int32)
-        scratch.colored = True
+        buffers = self.buffers
+        buffers.rays = np.vstack([rays, np.zeros((1, RAY_FIELDS), np.int32)])
+        buffers.deferred = np.zeros(len(buffers.rays), np.int32)
+        buffers.colored = True
         cuts = np.sort(np.random.default_rng(0).integers(0, len(rays) + 1, BANDS - 1))
         edges = np.array([0, *cuts, len(rays)])
-        scratch.bands[:, START], scratch.bands[:, COUNT] = edges[:-1], np.diff(edges)
-        scratch.bands[:, WEIGHT] = 255 * np.diff(edges)
+        buffers.bands[:, START], buffers.bands[:, COUNT] = edges[:-1], np.diff(edges)
+        buffers.bands[:, WEIGHT] = 255 * np.diff(edges)
         return self._integrator.apply(sign)
 
     def smooth(self, smoothness: float, *, weighted: bool = True, feedback: bool = True) -> None:
-        s, store = self.scratch, self.store
+        s, store = self.buffers, self.store
         s.reserve_votes()
         ray_smoothing.smooth_rays(
             s.rays, s.bands, store.hash_keys, store.hash_slots, store.places, smoothness, int(weighted),
@@ -128,7 +128,7 @@ def test_the_maps_blocks_are_those_of_the_crossed_voxels(case: str) -> None:
     found = [tuple(key) for key in unpack_keys(here.store.keys).tolist()]
     assert len(set(found)) == len(found)
     assert set(found) == kernel_twins.blocks_of(CASES[case])
-    assert sorted(here.scratch.touched_slots.tolist()) == list(range(len(found)))
+    assert sorted(here.buffers.touched_slots.tolist()) == list(range(len(found)))
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -214,7 +214,7 @@ def test_smoothing_equals_a_dense_solve(case: str, weighted: bool) -> None:
     assert max(abs(here.value(voxels[v]) - expected[v]) for v in expected) < 0.2
     for voxel in before.keys() - expected.keys():
         assert abs(here.value(voxels[voxel]) - before[voxel][0]) < 1e-3
-    assert not here.scratch.votes.any()
+    assert not here.buffers.votes.any()
 
 
 def test_a_ramp_passes_the_smoother_unchanged() -> None:
@@ -330,8 +330,8 @@ def ray_ends(rays: NDArray[np.float64]) -> NDArray[np.float64]:
     return (((rays[:, :3] + 0.5) * gradient).sum(axis=1) + rays[:, 12]) / 65536
 
 
-def rays_of(scratch: RayBuffers) -> NDArray[np.int32]:
-    return np.vstack([scratch.rays[s : s + n] for s, n in scratch.bands[:, [START, COUNT]]])
+def rays_of(buffers: RayBuffers) -> NDArray[np.int32]:
+    return np.vstack([buffers.rays[s : s + n] for s, n in buffers.bands[:, [START, COUNT]]])
 
 
 @pytest.mark.parametrize("bundled", [True, False])
@@ -339,14 +339,14 @@ def rays_of(scratch: RayBuffers) -> NDArray[np.int32]:
 def test_rays_from_images_equal_the_twin(kind: str, bundled: bool) -> None:
     keyframe, voxel_size = image_keyframe(11, kind), 0.05
     parameters = model_parameters(SENSORS["stereo"], voxel_size, keyframe.baseline_fx)
-    scratch = RayBuffers(color=False, regularised=False)
-    samples = scratch.make_rays(
+    buffers = RayBuffers(color=False, regularised=False)
+    samples = buffers.make_rays(
         keyframe, VolumeConfig(sensor="stereo", voxel_size=voxel_size, bundle=bundled)
     )
     expected, used = expected_rays(keyframe, parameters, voxel_size, bundled, filtered=True)
     assert 0 < used < np.count_nonzero(depth_of(keyframe, parameters))  # some lone pixels are dropped
     assert samples == used
-    close(rays_of(scratch), expected)
+    close(rays_of(buffers), expected)
 
 
 def test_a_plane_is_met_exactly_by_every_voxel_beside_a_ray() -> None:
@@ -354,8 +354,8 @@ def test_a_plane_is_met_exactly_by_every_voxel_beside_a_ray() -> None:
     keyframe = formula_scenes.plane_keyframe(np.eye(4), normal, offset)
     voxel_size = 0.05
     here = Map()
-    here.scratch.make_rays(keyframe, VolumeConfig(voxel_size=voxel_size))
-    here.apply(rays_of(here.scratch))
+    here.buffers.make_rays(keyframe, VolumeConfig(voxel_size=voxel_size))
+    here.apply(rays_of(here.buffers))
     errors, across = [], []
     for voxel, at in here.voxels().items():
         centre = (np.array(voxel) + 0.5) * voxel_size
@@ -383,9 +383,9 @@ def test_rays_from_points_equal_the_twin(own_origins: bool, bundled: bool) -> No
     pose[:3, 3] = (1.0, -2.0, 3.0)
     keyframe = Keyframe(points=points, origins=origins, T_world_camera=pose)
     voxel_size, model = 0.2, SENSORS["scanner"]
-    scratch = RayBuffers(color=False, regularised=False)
+    buffers = RayBuffers(color=False, regularised=False)
     config = VolumeConfig(sensor="scanner", voxel_size=voxel_size, bundle=bundled)
-    samples = scratch.make_rays(keyframe, config)
+    samples = buffers.make_rays(keyframe, config)
     parameters = model_parameters(model, voxel_size, None)
     starts = np.zeros((700, 3)) if origins is None else origins.astype(np.float64)
     expected = []
@@ -399,7 +399,7 @@ def test_rays_from_points_equal_the_twin(own_origins: bool, bundled: bool) -> No
             end = kernel_twins.fixed((end + pose[:3, 3]) / voxel_size)
             expected.append(kernel_twins.make_ray(end, p[run].mean(axis=0) - start, half, weight))
     assert samples == 699
-    close(rays_of(scratch), expected)
+    close(rays_of(buffers), expected)
 
 
 def test_marching_cubes_cases_are_closed_and_complementary() -> None:

@@ -4,23 +4,15 @@
 import kernel_twins
 import numpy as np
 import pytest
+from block_stores import store_of
 from numpy.typing import NDArray
 
 from tsfusion.kernels import block_hash, marching_tables, runtime, surface_cells
 from tsfusion.tsdf.block_store import cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.mesh_extraction import MeshBuffers
-from tsfusion.tsdf.surface_values import Layers, values_of
+from tsfusion.tsdf.surface_values import values_of
 
 PATCH = np.array([(x, y, z) for x in (-2, -1, 0) for y in (-1, 0) for z in (-1, 0, 1) if x + y + z], np.int32)
-
-
-def layers_of(coordinates: NDArray[np.int32], sums: NDArray[np.int64], correction: NDArray | None) -> Layers:
-    """A map whose block i is in slot i."""
-    runtime.start(2)
-    hash_keys, hash_slots = np.zeros(256, np.int64), np.zeros(256, np.int32)
-    block_hash.insert_blocks(pack_keys(coordinates), 0, len(coordinates), 0, hash_keys, hash_slots)
-    no_color = np.zeros((1, 512), np.int32)
-    return Layers(sums, None, no_color, correction, hash_keys, hash_slots, len(coordinates), 1.0)
 
 
 @pytest.mark.parametrize("smoothed", [False, True])
@@ -30,9 +22,9 @@ def test_values_equal_the_twin(smoothed: bool) -> None:
     sums = (weight * random.integers(-1023, 1024, weight.shape) << 27) + weight
     sums[0, :2] = ((1 << 36) - 1 << 27) + 77, (-(1 << 36) << 27) + 99
     correction = random.normal(0, 99, weight.shape).astype(np.float32) if smoothed else None
-    layers = layers_of(PATCH, sums, correction)
+    store = store_of(pack_keys(PATCH), sums, correction=correction)
     absent = pack_keys(np.array([[7, 7, 7]], np.int32))
-    found = values_of(np.concatenate([pack_keys(PATCH), absent]), layers, 2.0)
+    found = values_of(np.concatenate([pack_keys(PATCH), absent]), store, 2.0)
     distance, weight = (sums >> 27).astype(np.float32), (sums & 0x7FFFFFF).astype(np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
         moved = distance if correction is None else distance + correction
@@ -45,17 +37,17 @@ def test_values_equal_the_twin(smoothed: bool) -> None:
 def test_a_lane_becomes_the_nearest_float() -> None:
     """The two halves a lane is converted in round once, like the whole."""
     lane = np.random.default_rng(6).integers(-(1 << 36), 1 << 36, (1, 512))
-    layers = layers_of(PATCH[:1], (lane << 27) + 1, None)
-    assert np.array_equal(values_of(pack_keys(PATCH[:1]), layers, 0.0), lane.astype(np.float32))
+    store = store_of(pack_keys(PATCH[:1]), (lane << 27) + 1)
+    assert np.array_equal(values_of(pack_keys(PATCH[:1]), store, 0.0), lane.astype(np.float32))
 
 
 @pytest.mark.parametrize("wanted", [0, 1, 2, 4, len(PATCH)])
 def test_the_blocks_around_equal_the_twin(wanted: int) -> None:
-    layers = layers_of(PATCH, np.zeros((len(PATCH), 512), np.int64), None)
+    store = store_of(pack_keys(PATCH), np.zeros((len(PATCH), 512), np.int64))
     chosen = np.random.default_rng(wanted).permutation(PATCH)[:wanted]
     around = (chosen[:, None] + np.array([*np.ndindex(3, 3, 3)]) - 1).reshape(-1, 3)
     expected = {tuple(b) for b in around.tolist()} & {tuple(b) for b in PATCH.tolist()}
-    found = MeshBuffers().keys_around(np.sort(pack_keys(chosen)), layers)
+    found = MeshBuffers().keys_around(np.sort(pack_keys(chosen)), store)
     assert (np.diff(found) > 0).all()
     assert {tuple(b) for b in unpack_keys(found).tolist()} == expected
 
@@ -72,11 +64,11 @@ def test_cells_and_edges_equal_the_twin(known: float, wanted: int) -> None:
     rows[3] = np.abs(rows[3])  # a block without a sign change of its own
     chosen = np.sort(random.permutation(count)[:wanted])
     runtime.start(2)
-    scratch = MeshBuffers()
-    scratch.reserve(count)
-    s = {name: getattr(scratch, name).array for name in
+    buffers = MeshBuffers()
+    buffers.reserve(count)
+    s = {name: getattr(buffers, name).array for name in
          ("around", "seen", "inside", "active", "edges", "starts", "state", "first")}  # fmt: skip
-    table = scratch.table(count)
+    table = buffers.table(count)
     block_hash.insert_blocks(keys, 0, count, 0, *table)
     surface_cells.find_cells(
         count, keys, wanted, keys[chosen], *table, rows, marching_tables.TRIANGLE_COUNT, *s.values()
@@ -110,19 +102,19 @@ def voxels_in(planes: NDArray[np.uint64], corner: list[int]) -> set[kernel_twins
 
 
 def test_no_blocks_have_no_cells() -> None:
-    layers = layers_of(PATCH, np.zeros((len(PATCH), 512), np.int64), None)
-    assert len(MeshBuffers().keys_around(np.zeros(0, np.int64), layers)) == 0
+    store = store_of(pack_keys(PATCH), np.zeros((len(PATCH), 512), np.int64))
+    assert len(MeshBuffers().keys_around(np.zeros(0, np.int64), store)) == 0
     assert cells_of(np.zeros((0, 3), np.int32)).shape == (0, 3)
 
 
-def test_the_scratch_gives_the_memory_of_a_large_mesh_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tsfusion.tsdf.mesh_extraction._KEEP", 100)
-    scratch = MeshBuffers()
-    scratch.reserve(50)
-    small = scratch.nbytes
-    scratch.release()
-    assert scratch.nbytes == small
-    scratch.reserve(500)
-    assert scratch.nbytes > small
-    scratch.release()
-    assert scratch.nbytes < small
+def test_the_buffers_give_the_memory_of_a_large_mesh_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tsfusion.tsdf.mesh_extraction.KEPT_BLOCKS", 100)
+    buffers = MeshBuffers()
+    buffers.reserve(50)
+    small = buffers.nbytes
+    buffers.release()
+    assert buffers.nbytes == small
+    buffers.reserve(500)
+    assert buffers.nbytes > small
+    buffers.release()
+    assert buffers.nbytes < small

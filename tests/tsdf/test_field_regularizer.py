@@ -12,28 +12,20 @@ import formula_scenes
 import kernel_twins
 import numpy as np
 import pytest
+from block_stores import store_of
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tsfusion import Volume
-from tsfusion.kernels import block_hash, runtime
 from tsfusion.tsdf import field_regularizer
 from tsfusion.tsdf.block_store import pack_keys
 from tsfusion.tsdf.field_regularizer import FieldSettings, along_normals, solve
 from tsfusion.tsdf.mesh_extraction import extract
-from tsfusion.tsdf.surface_values import Layers, values_of
+from tsfusion.tsdf.surface_values import values_of
 
 QUANTA = 60
 SETTINGS = FieldSettings(smoothness=10.0, edge=0.03, reweightings=2)
 STRONG = FieldSettings(smoothness=500.0, edge=0.03, reweightings=2)
-
-
-def layers_of(keys: NDArray[np.int64], sums: NDArray[np.int64]) -> Layers:
-    runtime.start(2)
-    size = 1 << (4 * len(keys) + 4).bit_length()
-    hash_keys, hash_slots = np.zeros(size, np.int64), np.zeros(size, np.int32)
-    block_hash.insert_blocks(keys, 0, len(keys), 0, hash_keys, hash_slots)
-    return Layers(sums, None, np.zeros((1, 512), np.int32), None, hash_keys, hash_slots, len(keys), 1.0)
 
 
 def map_of(
@@ -74,14 +66,14 @@ def test_the_solver_equals_its_twin(monkeypatch: pytest.MonkeyPatch, seed: int) 
     keys, sums = map_of(distance, weight, (-2, -1, -1))
     raw = np.where(weight > 0, np.rint(distance * QUANTA), np.nan)
     expected = kernel_twins.field(raw, weight / 16, SETTINGS, QUANTA)
-    rows = solve(keys, layers_of(keys, sums), 1.0, settings=SETTINGS)
+    rows = solve(keys, store_of(keys, sums), 1.0, settings=SETTINGS)
     error = abs(dense(rows, distance.shape) - expected) / QUANTA
     assert (np.isnan(error) == (weight == 0)).all()
     assert np.nanmean(error) < 0.003  # voxel
     assert np.nanmax(error) < 0.1
     monkeypatch.setattr(field_regularizer, "ITERATIONS", 400)
     monkeypatch.setattr(field_regularizer, "LOWEST", 0.0005)
-    rows = solve(keys, layers_of(keys, sums), 1.0, settings=SETTINGS)
+    rows = solve(keys, store_of(keys, sums), 1.0, settings=SETTINGS)
     assert np.nanmax(abs(dense(rows, distance.shape) - expected)) / QUANTA < 1e-3
 
 
@@ -95,7 +87,7 @@ def test_a_coarser_start_leads_to_the_same_field(monkeypatch: pytest.MonkeyPatch
     expected = kernel_twins.field(raw, weight / 16, often, QUANTA)
     monkeypatch.setattr(field_regularizer, "ITERATIONS", 100)
     monkeypatch.setattr(field_regularizer, "LOWEST", 0.0005)
-    rows = solve(keys, layers_of(keys, sums), 1.0, settings=often)
+    rows = solve(keys, store_of(keys, sums), 1.0, settings=often)
     error = abs(dense(rows, distance.shape) - expected) / QUANTA
     assert np.nanmax(error) < 0.05
     assert np.nanmean(error) < 0.005
@@ -104,7 +96,7 @@ def test_a_coarser_start_leads_to_the_same_field(monkeypatch: pytest.MonkeyPatch
 def test_without_smoothness_the_field_is_raw() -> None:
     distance, weight = noisy_roof(3)
     keys, sums = map_of(distance, weight, (0, 0, 0))
-    layers = layers_of(keys, sums)
+    layers = store_of(keys, sums)
     rows = solve(keys, layers, 1.0, settings=FieldSettings(smoothness=0.0, edge=0.03, reweightings=2))
     assert np.array_equal(rows, values_of(keys, layers, 1.0), equal_nan=True)
     expected = np.where(weight > 0, np.rint(distance * QUANTA), np.nan)
@@ -118,11 +110,11 @@ def test_a_ramp_passes_unchanged(settings: FieldSettings) -> None:
     distance = np.clip((p - 8) @ (0.5, 0.25, -0.25), -10, 10)  # sixtieths of a voxel, exactly
     weight = random.integers(16, 160, distance.shape) * (random.random(distance.shape) < 0.9)
     keys, sums = map_of(distance, weight, (0, 0, 0))
-    rows = solve(keys, layers_of(keys, sums), 1.0, settings=settings)
+    rows = solve(keys, store_of(keys, sums), 1.0, settings=settings)
     error = dense(rows, distance.shape) / QUANTA - distance
     assert np.nanmax(abs(error)) < (1e-4 if settings is SETTINGS else 5e-2)
     assert (np.isnan(error) == (weight == 0)).all()
-    rows = along_normals(keys, layers_of(keys, sums), 1.0, smoothness=10.0)
+    rows = along_normals(keys, store_of(keys, sums), 1.0, smoothness=10.0)
     error = dense(rows, distance.shape) / QUANTA - distance
     assert np.nanmax(abs(error)) < 1e-4
 
@@ -131,12 +123,12 @@ def test_a_ramp_passes_unchanged(settings: FieldSettings) -> None:
 def test_a_shift_by_whole_blocks_and_the_order_of_slots_change_no_bit(settings: FieldSettings) -> None:
     distance, weight = noisy_roof(5)
     keys, sums = map_of(distance, weight, (0, 0, 0))
-    rows = solve(keys, layers_of(keys, sums), 1.0, settings=settings)
+    rows = solve(keys, store_of(keys, sums), 1.0, settings=settings)
     shifted, _ = map_of(distance, weight, (-7, 3, -1))
-    other = solve(shifted, layers_of(shifted, sums), 1.0, settings=settings)
+    other = solve(shifted, store_of(shifted, sums), 1.0, settings=settings)
     assert np.array_equal(rows, other, equal_nan=True)
     order = np.random.default_rng(0).permutation(len(keys))
-    mixed = layers_of(np.ascontiguousarray(keys[order]), np.ascontiguousarray(sums[order]))
+    mixed = store_of(np.ascontiguousarray(keys[order]), np.ascontiguousarray(sums[order]))
     other = solve(keys, mixed, 1.0, settings=settings)
     assert np.array_equal(rows, other, equal_nan=True)
 
@@ -145,7 +137,7 @@ def test_threads_change_no_bit() -> None:
     program = (
         "import test_field_regularizer as t; from tsfusion.kernels import runtime;"
         "runtime.start({}); d, w = t.noisy_roof(6); k, s = t.map_of(d, w, (0, 0, 0));"
-        "print(t.digest(t.solve(k, t.layers_of(k, s), 1.0, settings=t.STRONG)))"
+        "print(t.digest(t.solve(k, t.store_of(k, s), 1.0, settings=t.STRONG)))"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     found = {
@@ -168,12 +160,12 @@ def digest(rows: NDArray[np.float32]) -> str:
 def test_unseen_voxels_stay_unseen_and_block_nothing_else() -> None:
     distance, weight = noisy_roof(7, seen=0.5)
     keys, sums = map_of(distance, weight, (0, 0, 0))
-    rows = solve(keys, layers_of(keys, sums), 5.0, settings=STRONG)
+    rows = solve(keys, store_of(keys, sums), 5.0, settings=STRONG)
     assert (np.isnan(dense(rows, distance.shape)) == (weight < 80)).all()
 
 
 def test_an_empty_map_and_absent_blocks() -> None:
-    empty = layers_of(np.zeros(0, np.int64), np.zeros((1, 512), np.int64))
+    empty = store_of(np.zeros(0, np.int64), np.zeros((1, 512), np.int64))
     for wanted in (np.zeros(0, np.int64), pack_keys(np.array([[1, 2, 3]], np.int32))):
         for rows in (
             solve(wanted, empty, 1.0, settings=STRONG),
@@ -182,7 +174,7 @@ def test_an_empty_map_and_absent_blocks() -> None:
             assert rows.shape == (len(wanted), 512)
             assert np.isnan(rows).all()
     keys, sums = map_of(np.full((8, 8, 8), 0.5), np.zeros((8, 8, 8), np.int64), (0, 0, 0))
-    rows = solve(keys, layers_of(keys, sums), 1.0, settings=STRONG)
+    rows = solve(keys, store_of(keys, sums), 1.0, settings=STRONG)
     assert np.isnan(rows).all()
 
 
@@ -198,12 +190,12 @@ def test_a_part_equals_the_whole_to_a_hundredth_voxel(monkeypatch: pytest.Monkey
     model = volume.model
     settings = FieldSettings(model.field_smoothness, model.field_edge, model.field_reweightings)
     before = np.sort(volume._store.keys)
-    old = solve(before, layers(volume), 0.5, settings=settings)
+    old = solve(before, volume._store, 0.5, settings=settings)
     volume.integrate(formula_scenes.with_noise(views[-1], 0.004, random))
-    changed = field_regularizer.spread(pack_keys(volume.take_dirty()), layers(volume), settings)
+    changed = field_regularizer.spread(pack_keys(volume.take_dirty()), volume._store, settings)
     keys = np.sort(volume._store.keys)
-    whole = solve(keys, layers(volume), 0.5, settings=settings)
-    part = solve(changed, layers(volume), 0.5, settings=settings)
+    whole = solve(keys, volume._store, 0.5, settings=settings)
+    part = solve(changed, volume._store, 0.5, settings=settings)
     assert 0 < len(changed) < len(keys)
     apart = abs(part - whole[np.searchsorted(keys, changed)]) / QUANTA
     assert np.nanmax(apart) < 0.01
@@ -212,13 +204,8 @@ def test_a_part_equals_the_whole_to_a_hundredth_voxel(monkeypatch: pytest.Monkey
     moved = abs(old - whole[np.searchsorted(keys, before)])[untouched] / QUANTA
     assert np.nanmax(moved, initial=0.0) < 0.01
     monkeypatch.setattr(field_regularizer, "BATCH", 100)
-    batched = solve(keys, layers(volume), 0.5, settings=settings)
+    batched = solve(keys, volume._store, 0.5, settings=settings)
     assert np.nanmax(abs(batched - whole)) / QUANTA < 0.01
-
-
-def layers(volume: Volume) -> Layers:
-    store = volume._store
-    return Layers(store.sums, None, store.color_b, None, store.hash_keys, store.hash_slots, store.count, 0.02)
 
 
 def test_a_cube_keeps_its_edges_and_its_faces_lose_their_noise() -> None:
@@ -228,7 +215,7 @@ def test_a_cube_keeps_its_edges_and_its_faces_lose_their_noise() -> None:
     distance = np.clip(exact + 0.15 * random.standard_normal(exact.shape), -4, 4)
     weight = np.full(distance.shape, 80) * (abs(exact) < 3.5)
     keys, sums = map_of(distance, weight, (0, 0, 0))
-    raw = layers_of(keys, sums)
+    raw = store_of(keys, sums)
     errors = {}
     for name, settings in (("raw", FieldSettings(0.0, 0.03, 0)), ("field", FieldSettings(30.0, 0.01, 4))):
         mesh = extract(keys, raw, 1.0, view=partial(solve, settings=settings))
@@ -247,7 +234,7 @@ def test_a_cube_keeps_its_edges_and_its_faces_lose_their_noise() -> None:
 def test_smoothing_along_normals_equals_its_twin() -> None:
     distance, weight = noisy_roof(9)
     keys, sums = map_of(distance, weight, (-2, -1, -1))
-    rows = along_normals(keys, layers_of(keys, sums), 1.0, smoothness=10.0)
+    rows = along_normals(keys, store_of(keys, sums), 1.0, smoothness=10.0)
     found = dense(rows, distance.shape)
     raw = np.where(weight > 0, np.rint(distance * QUANTA), np.nan)
     moved = 0

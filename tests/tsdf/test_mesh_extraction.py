@@ -13,16 +13,15 @@ import kernel_twins
 import numpy as np
 import pytest
 import trimesh
+from block_stores import store_of
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tsfusion import Mesh, Volume
 from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.datasets.formats import stanford_bunny
-from tsfusion.kernels import block_hash, runtime
-from tsfusion.tsdf.block_store import cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
-from tsfusion.tsdf.surface_values import Layers
 
 
 def edge_uses(faces: NDArray[np.int32]) -> NDArray[np.int64]:
@@ -38,14 +37,16 @@ def check_sound(mesh: Mesh) -> None:
     assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-5)
 
 
-def random_layers(
+def random_map(
     seed: int, known: float
 ) -> tuple[
-    Layers, NDArray[np.int64], dict[kernel_twins.Voxel, float], dict[kernel_twins.Voxel, tuple[float, ...]]
+    BlockStore,
+    NDArray[np.int64],
+    dict[kernel_twins.Voxel, float],
+    dict[kernel_twins.Voxel, tuple[float, ...]],
 ]:
     """A 3×2×2 patch of blocks around the origin: noise in all 256 cases, a share of voxels unseen, a third
-    coloured. Returns the layers, the keys, and values and colours by voxel."""
-    runtime.start(2)
+    coloured. Returns the map, the keys, and values and colours by voxel."""
     random = np.random.default_rng(seed)
     coordinates = np.array([(x, y, z) for x in (-2, -1, 0) for y in (-1, 0) for z in (-1, 0)], np.int32)
     keys = pack_keys(coordinates)
@@ -55,8 +56,6 @@ def random_layers(
     votes = random.integers(1, 9, (12, 512)) * (random.random((12, 512)) < 0.33)
     channels = random.integers(0, 256, (3, 12, 512)) * votes
     rgn = (channels[0] << 40) + (channels[1] << 16) + votes
-    hash_keys, hash_slots = np.zeros(64, np.int64), np.zeros(64, np.int32)
-    block_hash.insert_blocks(keys, 0, 12, 0, hash_keys, hash_slots)
     values, colors = {}, {}
     for slot, offset in np.ndindex(12, 512):
         voxel = coordinates[slot] * 8 + (offset >> 6, offset >> 3 & 7, offset & 7)
@@ -65,8 +64,7 @@ def random_layers(
             values[key] = float(distance[slot, offset])
         if votes[slot, offset]:
             colors[key] = tuple(channels[:, slot, offset] / votes[slot, offset])
-    layers = Layers(sums, rgn, channels[2].astype(np.int32), None, hash_keys, hash_slots, 12, 1.0)
-    return layers, keys, values, colors
+    return store_of(keys, sums, color_rgn=rgn, color_b=channels[2]), keys, values, colors
 
 
 def triangles_of(mesh: Mesh) -> Counter:
@@ -82,8 +80,8 @@ def summary(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("known", [1.0, 0.9])
 def test_extraction_equals_the_twin_on_noise(known: float) -> None:
-    layers, keys, values, colors = random_layers(3, known)
-    mesh = extract(np.sort(keys), layers, 1.0)
+    store, keys, values, colors = random_map(3, known)
+    mesh = extract(np.sort(keys), store, 1.0)
     expected = np.array(kernel_twins.marching_cubes(values))
     found = mesh.vertices[mesh.faces].astype(np.float64)
     assert found.shape == expected.shape
@@ -100,8 +98,8 @@ def test_extraction_equals_the_twin_on_noise(known: float) -> None:
 
 
 def test_noise_gives_a_manifold_with_a_border_only_where_the_map_ends() -> None:
-    layers, keys, _, _ = random_layers(4, 1.0)
-    mesh = extract(np.sort(keys), layers, 1.0)
+    store, keys, _, _ = random_map(4, 1.0)
+    mesh = extract(np.sort(keys), store, 1.0)
     edges = np.sort(
         np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1
     )
@@ -181,21 +179,21 @@ def test_the_mesh_does_not_depend_on_where_blocks_lie_in_memory() -> None:
 
 @pytest.mark.parametrize("known", [1.0, 0.9])
 def test_a_part_equals_the_same_cells_of_the_whole(known: float) -> None:
-    layers, keys, _, _ = random_layers(5, known)
+    store, keys, _, _ = random_map(5, known)
     keys = np.sort(keys)
-    whole = extract(keys, layers, 1.0)
+    whole = extract(keys, store, 1.0)
     assert whole.colors is not None
     looks = {tuple(v): (*n, *c) for v, n, c in zip(
         whole.vertices.tolist(), whole.normals.tolist(), whole.colors.tolist(), strict=True)}  # fmt: skip
     scratch = MeshBuffers()  # what an earlier mesh left in it must not show
     total: Counter = Counter()
     for part in (keys[:0], keys[:1], keys[1:8], keys[8:9], keys[9:]):
-        mesh = extract(part, layers, 1.0, scratch)
+        mesh = extract(part, store, 1.0, scratch)
         assert mesh.colors is not None
         total += triangles_of(mesh)
         for v, n, c in zip(mesh.vertices.tolist(), mesh.normals.tolist(), mesh.colors.tolist(), strict=True):
             assert looks[tuple(v)] == (*n, *c)
-        again = extract(part, layers, 1.0)
+        again = extract(part, store, 1.0)
         assert again.faces.tobytes() == mesh.faces.tobytes()
         assert again.vertices.tobytes() == mesh.vertices.tobytes()
     assert total == triangles_of(whole)

@@ -40,8 +40,8 @@ def test_the_volume_holds_exactly_the_twins_sums(bundle: bool) -> None:
     depth[40:70, 60:95] = VIEWS[0].measurement[40:70, 60:95]
     keyframe = Keyframe(depth=depth, intrinsics=formula_scenes.CAMERA, T_world_camera=VIEWS[0].T_world_camera)
     volume = volume_of([keyframe, keyframe], bundle=bundle)
-    scratch = volume._scratch
-    rays = np.vstack([scratch.rays[start : start + count] for start, count in scratch.bands[:, :2]])
+    buffers = volume._ray_buffers
+    rays = np.vstack([buffers.rays[start : start + count] for start, count in buffers.bands[:, :2]])
     expected = kernel_twins.integrate(rays, QUANTA_PER_VOXEL)
     found = {}
     for slot, corner in enumerate(unpack_keys(volume._store.keys) * 8):
@@ -242,7 +242,7 @@ def test_a_bound_that_is_too_cautious_is_looked_up() -> None:
     volume.integrate(VIEWS[1])
     assert volume.map_hash() == volume_of(VIEWS[:2]).map_hash()
     weight = (volume._store.sums & ((1 << 27) - 1)).max(axis=1)
-    touched = volume._scratch.touched_slots
+    touched = volume._ray_buffers.touched_slots
     assert (volume._store.bounds[touched] == weight[touched]).all()
 
 
@@ -278,11 +278,11 @@ def test_whatever_fails_leaves_the_map_as_it_was(monkeypatch: pytest.MonkeyPatch
 
     with monkeypatch.context() as patched:
         if where == "_smooth":
-            patched.setattr(volume, "_smooth", fail)
+            patched.setattr(volume._integrator, "_smooth", fail)
         elif where == "reserve_touched":
-            first = [True]
-            usual = volume._scratch.reserve_touched
-            patched.setattr(volume._scratch, "reserve_touched", lambda n: usual(n) if first.pop() else fail())
+            first, buffers = [True], volume._ray_buffers
+            usual = buffers.reserve_touched
+            patched.setattr(buffers, "reserve_touched", lambda n: usual(n) if first.pop() else fail())
             first.insert(0, False)
         else:
             patched.setattr("tsfusion.kernels.integrate.largest_weights", fail)
@@ -342,9 +342,9 @@ def test_a_keyframe_too_heavy_for_one_go_gives_the_same_map(monkeypatch: pytest.
 
 def test_a_full_set_of_missing_blocks_is_grown_and_loses_nothing() -> None:
     volume = Volume(voxel_size=0.005, threads=2)
-    volume._scratch.missing = np.zeros(64, np.int64)
+    volume._ray_buffers.missing = np.zeros(64, np.int64)
     volume.integrate(VIEWS[0])
-    assert len(volume._scratch.missing) > 64
+    assert len(volume._ray_buffers.missing) > 64
     assert volume.map_hash() == volume_of(VIEWS[:1], voxel_size=0.005).map_hash()
 
 

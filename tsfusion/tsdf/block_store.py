@@ -26,7 +26,9 @@ class BlockStore:
     A layer the map does not have is one row of zeros, so that kernels can be handed it.
     """
 
-    def __init__(self, *, color: bool, corrected: bool) -> None:
+    def __init__(self, *, voxel_size: float, color: bool, corrected: bool) -> None:
+        self.voxel_size = voxel_size
+        self.color, self.corrected = color, corrected
         self.count = 0
         self.hash_keys = np.zeros(4 * _FIRST_CAPACITY, np.int64)
         self.hash_slots = np.zeros(4 * _FIRST_CAPACITY, np.int32)
@@ -109,7 +111,7 @@ class BlockStore:
         self._hash(0)
 
     def slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
-        """(n,) slots of keys, -1 where there is no such block."""
+        """(n,) slots of (n,) keys, −1 where there is no such block."""
         slots = np.empty(len(keys), np.int32)
         block_hash.find_blocks(keys, self.hash_keys, self.hash_slots, slots)
         return slots

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The field regulariser's planning: which blocks, how many iterations; the work is in `kernels/field.py`.
+"""Plans the field regulariser: which blocks, how many iterations. `kernels/field_smoothing.py` solves.
 
 A view of the map's sums: no order of keyframes or threads can show. Blocks are solved with a halo of their
 neighbours, so that some blocks' values are nearly those of the whole map (docs/method.md says how nearly).
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from tsfusion.kernels import field_smoothing as kernels
 from tsfusion.kernels import normal_smoothing
-from tsfusion.kernels.block_hash import find_blocks
 from tsfusion.kernels.integrate import CUBE, QUANTA_PER_VOXEL
-from tsfusion.tsdf.surface_values import Layers, values_of
+from tsfusion.tsdf.block_store import BlockStore
+from tsfusion.tsdf.surface_values import values_of
 
 BATCH = 8192  # blocks solved at once, beside their halo; some 10 kB each
 ITERATIONS = 12  # Chebyshev steps a re-weighting: the mesh is 1 % (Kinect) to 6 % (stereo) from the limit
@@ -51,30 +51,33 @@ class FieldSettings:
 
 def solve(
     keys: NDArray[np.int64],
-    layers: Layers,
+    store: BlockStore,
     min_weight: float,
     out: NDArray[np.float32] | None = None,
     *,
     settings: FieldSettings,
 ) -> NDArray[np.float32]:
-    """The `View` of the regularised signed distances."""
+    """Regularised signed distances: the `SurfaceView` of the surface `field`."""
     if out is None:
         out = np.empty((len(keys), CUBE), np.float32)
     for first in range(0, len(keys), BATCH):
         part = keys[first : first + BATCH]
-        _Batch(part, layers, min_weight, settings).solve(out[first : first + len(part)])
+        _Batch(part, store, min_weight, settings).solve(out[first : first + len(part)])
     return out[: len(keys)]
 
 
 def along_normals(
     keys: NDArray[np.int64],
-    layers: Layers,
+    store: BlockStore,
     min_weight: float,
     out: NDArray[np.float32] | None = None,
     *,
     smoothness: float,
 ) -> NDArray[np.float32]:
-    """The `View` of values smoothed along the normals only: paper eq. 3 on samples along the gradient."""
+    """Signed distances smoothed along the normals only: the `SurfaceView` of the surface `normal`.
+
+    paper eq. 3 on samples along the gradient.
+    """
     centre = np.zeros((NORMAL_SAMPLES + 1, NORMAL_SAMPLES + 1), np.float32)
     for n in range(NORMAL_SAMPLES + 1):
         D2 = np.diff(np.eye(2 * n + 1), 2, axis=0)
@@ -83,17 +86,17 @@ def along_normals(
         out = np.empty((len(keys), CUBE), np.float32)
     for first in range(0, len(keys), BATCH):
         part = keys[first : first + BATCH]
-        read = around(part, layers, 1)
+        read = around(part, store, 1)
         normal_smoothing.smooth_along_normals(
-            _index(read, part), _index(read, part[:, None] + _AROUND), values_of(read, layers, min_weight),
+            _index(read, part), _index(read, part[:, None] + _AROUND), values_of(read, store, min_weight),
             LEAST_REACH * QUANTA_PER_VOXEL, centre, out[first : first + len(part)],
         )  # fmt: skip
     return out[: len(keys)]
 
 
-def spread(keys: NDArray[np.int64], layers: Layers, settings: FieldSettings) -> NDArray[np.int64]:
+def spread(keys: NDArray[np.int64], store: BlockStore, settings: FieldSettings) -> NDArray[np.int64]:
     """The blocks whose field may move by more than a hundredth of a voxel with the sums of these."""
-    return around(keys, layers, 1 + settings.coarser)
+    return around(keys, store, 1 + settings.coarser)
 
 
 @dataclass
@@ -134,12 +137,12 @@ class _Batch:
     """Some blocks and their halo, as lists of cells."""
 
     def __init__(
-        self, wanted: NDArray[np.int64], layers: Layers, min_weight: float, settings: FieldSettings
+        self, wanted: NDArray[np.int64], store: BlockStore, min_weight: float, settings: FieldSettings
     ) -> None:
         self.wanted, self.settings = wanted, settings
-        self.keys = keys = around(wanted, layers, 2 + settings.coarser)
-        self.values = values_of(keys, layers, min_weight)
-        self.levels = self._list(layers)
+        self.keys = keys = around(wanted, store, 2 + settings.coarser)
+        self.values = values_of(keys, store, min_weight)
+        self.levels = self._list(store)
 
     def solve(self, solved: NDArray[np.float32]) -> None:
         """Write the values of the wanted blocks."""
@@ -161,7 +164,7 @@ class _Batch:
         rows = _index(self.keys, self.wanted)
         kernels.write_values(rows, self.values, finest.number, finest.starts, finest.x, solved)
 
-    def _list(self, layers: Layers) -> list[_Level]:
+    def _list(self, store: BlockStore) -> list[_Level]:
         """The voxels near the surface, and their coarser cells."""
         blocks = len(self.keys)
         sides = _index(self.keys, self.keys[:, None] + _SIDES)
@@ -169,7 +172,7 @@ class _Batch:
         kernels.number_voxels(self.values, self.settings.reach * QUANTA_PER_VOXEL, number, counts)
         fine = _Level.make(3, number, counts)
         kernels.list_voxels(
-            self.values, _slots(self.keys, layers), layers.sums, sides,
+            self.values, store.slots_of(self.keys), store.sums, sides,
             fine.number, fine.starts, fine.links, fine.y, fine.weight, fine.x,
         )  # fmt: skip
         levels = [fine]
@@ -196,11 +199,11 @@ def _chebyshev() -> Iterator[tuple[float, float]]:
         yield rho * last, 2 * rho / half
 
 
-def around(keys: NDArray[np.int64], layers: Layers, rings: int = 1) -> NDArray[np.int64]:
+def around(keys: NDArray[np.int64], store: BlockStore, rings: int = 1) -> NDArray[np.int64]:
     """The blocks of the map up to so many blocks away, these among them; sorted."""
     for _ in range(rings):
         keys = np.unique((keys[:, None] + _AROUND).ravel())
-        keys = keys[_slots(keys, layers) >= 0]
+        keys = keys[store.slots_of(keys) >= 0]
     return keys
 
 
@@ -210,9 +213,3 @@ def _index(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.in
         return np.full(queries.shape, -1, np.int32)
     at = np.minimum(np.searchsorted(keys, queries), len(keys) - 1)
     return np.where(keys[at] == queries, at, -1).astype(np.int32)
-
-
-def _slots(keys: NDArray[np.int64], layers: Layers) -> NDArray[np.int32]:
-    slots = np.empty(len(keys), np.int32)
-    find_blocks(keys, layers.hash_keys, layers.hash_slots, slots)
-    return slots

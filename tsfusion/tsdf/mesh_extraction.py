@@ -1,27 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""Mesh extraction: which blocks are read, and working memory; the work is in `kernels/cells.py` and
-`kernels/marching.py`."""
+"""Mesh extraction: which blocks are read, and working memory; the work is in
+`kernels/surface_cells.py` and `kernels/marching_cubes.py`."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.kernels import marching_cubes, marching_tables, surface_cells
-from tsfusion.kernels.block_hash import find_blocks, insert_blocks
+from tsfusion.kernels.block_hash import insert_blocks
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.voxel_values import BANDS
+from tsfusion.tsdf.block_store import BlockStore
 from tsfusion.tsdf.growing_array import GrowingArray
-from tsfusion.tsdf.surface_values import Layers, SurfaceView, values_of
+from tsfusion.tsdf.surface_values import SurfaceView, values_of
 
-_KEEP = 1 << 14  # blocks whose working memory is kept for the next mesh: 45 MB
-_NO_COLOR = np.zeros((1, CUBE), np.int64)
-_NO_SLOTS = np.zeros(1, np.int32)
+KEPT_BLOCKS = 1 << 14  # working memory for so many is kept for the next mesh: 45 MB
 
 
 class MeshBuffers:
     """Working memory of one extraction: a row a block, and one row for the blocks that are not there.
 
-    What the arrays hold is said in `kernels/cells.py`.
+    `kernels/surface_cells.py` explains what the arrays hold.
     """
 
     def __init__(self) -> None:
@@ -51,7 +50,7 @@ class MeshBuffers:
 
     def release(self) -> None:
         """Give the memory of a large mesh back."""
-        if self.values.capacity > _KEEP:
+        if self.values.capacity > KEPT_BLOCKS:
             self._forget()
 
     def table(self, keys: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
@@ -62,15 +61,15 @@ class MeshBuffers:
         self._table[:size] = 0
         return self._table[:size], self._table_rows[:size]
 
-    def keys_around(self, wanted: NDArray[np.int64], layers: Layers) -> NDArray[np.int64]:
+    def keys_around(self, wanted: NDArray[np.int64], store: BlockStore) -> NDArray[np.int64]:
         """Sorted keys of the map's blocks that are, or touch, a wanted one."""
-        if len(wanted) == layers.count:
+        if len(wanted) == store.count:
             return wanted
-        most = min(surface_cells.AROUND * len(wanted), layers.count)
+        most = min(surface_cells.AROUND * len(wanted), store.count)
         self._found.reserve(most)
         table, _ = self.table(most)
         found = surface_cells.collect_around(
-            len(wanted), wanted, layers.hash_keys, layers.hash_slots, table, self._found.array
+            len(wanted), wanted, store.hash_keys, store.hash_slots, table, self._found.array
         )
         return np.sort(self._found.array[:found])
 
@@ -83,33 +82,32 @@ class MeshBuffers:
 
 def extract(
     wanted: NDArray[np.int64],
-    layers: Layers,
+    store: BlockStore,
     min_weight: float,
-    scratch: MeshBuffers | None = None,
+    buffers: MeshBuffers | None = None,
     view: SurfaceView = values_of,
 ) -> Mesh:
     """Mesh of the cells of the map's blocks `wanted` (sorted distinct keys)."""
-    scratch = scratch or MeshBuffers()
-    keys = scratch.keys_around(wanted, layers)
+    buffers = buffers or MeshBuffers()
+    keys = buffers.keys_around(wanted, store)
     count = len(keys)
-    scratch.reserve(count)
-    values = view(keys, layers, min_weight, scratch.values.array)
-    table, table_rows = scratch.table(count)
+    buffers.reserve(count)
+    values = view(keys, store, min_weight, buffers.values.array)
+    table, table_rows = buffers.table(count)
     insert_blocks(keys, 0, count, 0, table, table_rows)
-    around, inside, active = scratch.around.array, scratch.inside.array, scratch.active.array
-    edges, starts, first = scratch.edges.array, scratch.starts.array, scratch.first.array
+    around, inside, active = buffers.around.array, buffers.inside.array, buffers.active.array
+    edges, starts, first = buffers.edges.array, buffers.starts.array, buffers.first.array
     surface_cells.find_cells(
         count, keys, len(wanted), wanted, table, table_rows, values, marching_tables.TRIANGLE_COUNT,
-        around, scratch.seen.array, inside, active, edges, starts, scratch.state.array, first,
+        around, buffers.seen.array, inside, active, edges, starts, buffers.state.array, first,
     )  # fmt: skip
     vertices, triangles = first[count]
     positions, normals = np.empty((vertices, 3), np.float32), np.empty((vertices, 3), np.float32)
-    has_color = layers.color_rgn is not None
-    colors = np.empty((vertices if has_color else 0, 3), np.uint8)
-    slots = _slots(keys, layers) if has_color else _NO_SLOTS
+    colors = np.empty((vertices if store.color else 0, 3), np.uint8)
+    slots = np.append(store.slots_of(keys), np.int32(-1))  # the last stands for the blocks that are not there
     marching_cubes.emit_vertices(
-        count, keys, around, values, edges, first, scratch.padded, layers.voxel_size, slots,
-        _NO_COLOR if layers.color_rgn is None else layers.color_rgn, layers.color_b, int(has_color),
+        count, keys, around, values, edges, first, buffers.padded, store.voxel_size, slots,
+        store.color_rgn, store.color_b, int(store.color),
         positions, normals, colors,
     )  # fmt: skip
     faces = np.empty((triangles, 3), np.int32)
@@ -117,12 +115,5 @@ def extract(
         count, around, inside, active, edges, starts, first,
         marching_tables.TRIANGLE_COUNT, marching_tables.TRIANGLE_STARTS, faces,
     )  # fmt: skip
-    scratch.release()
-    return Mesh(positions, faces, normals, colors if has_color else None)
-
-
-def _slots(keys: NDArray[np.int64], layers: Layers) -> NDArray[np.int32]:
-    """The slot of every key, and −1 for the row of the blocks that are not there."""
-    slots = np.full(len(keys) + 1, -1, np.int32)
-    find_blocks(keys, layers.hash_keys, layers.hash_slots, slots)
-    return slots
+    buffers.release()
+    return Mesh(positions, faces, normals, colors if store.color else None)

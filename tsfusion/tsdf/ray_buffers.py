@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import SensorModel, VolumeConfig
-from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.kernels import ray_smoothing, rays_from_images, rays_from_points, sensor_noise
 from tsfusion.kernels.integrate import CUBE, TOUCHED_COUNT, TOUCHED_HEADER, TOUCHED_OVERFLOW
 from tsfusion.kernels.voxel_traversal import BAND_FIELDS, MAX_CROSSED, RAY_FIELDS, SAMPLES
@@ -160,3 +160,23 @@ def _camera(keyframe: Keyframe, voxel_size: float) -> NDArray[np.float64]:
 
 def _optional(array: NDArray[np.uint8] | None, dims: int) -> tuple[NDArray[Any], int]:
     return (_NOTHING[dims], 0) if array is None else (array, 1)
+
+
+def keyframes_of_every_kind(model: SensorModel, voxel_size: float) -> list[Keyframe]:
+    """Keyframes of 16×16 samples within the sensor's range, one for each way through `make_rays`."""
+    near = max(model.min_range * 1.5, 4 * voxel_size)
+    pose, camera = np.eye(4), Intrinsics(20.0, 20.0, 8.0, 8.0)
+    color = np.zeros((16, 16, 3), np.uint8)
+    metres = np.full((16, 16), near, np.float32)
+    units = np.full((16, 16), 1000, np.uint16)
+    rays = np.dstack(
+        [*np.meshgrid(np.linspace(-0.4, 0.4, 16), np.linspace(-0.4, 0.4, 16)), np.ones((16, 16))]
+    )
+    points = (rays * near).reshape(-1, 3).astype(np.float32)
+    return [
+        Keyframe(depth=metres, intrinsics=camera, T_world_camera=pose, color=color),
+        Keyframe(depth=units, depth_scale=near / 1000, intrinsics=camera, T_world_camera=pose),
+        Keyframe(disparity=units, disparity_scale=1 / 16, baseline_fx=near * 1000 / 16,
+                 intrinsics=camera, T_world_camera=pose),
+        Keyframe(points=points, T_world_camera=pose, color=color.reshape(-1, 3)),
+    ]  # fmt: skip

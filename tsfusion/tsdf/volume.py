@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""The map: exact integer sums in sparse blocks of 8³ voxels, and the views derived from them."""
+"""The map: a sum of integers in sparse blocks of 8³ voxels, and the surfaces read from it.
+
+A voxel holds Σ w·m and Σ w over all rays that crossed it: m is the signed distance to the surface along the
+ray, as an integer, w the ray's weight. A keyframe is a list of such additions. Hence the order of keyframes
+does not matter, and subtraction removes a keyframe to the last bit. Smoothed values and meshes are read from
+the sums and never change them.
+"""
 
 import hashlib
 import os
@@ -13,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import process
-from tsfusion.core.config import VIEW_SETTINGS, SensorModel, Surface, VolumeConfig, make, override
+from tsfusion.core.config import VIEW_SETTINGS, Surface, VolumeConfig, make, override
 from tsfusion.core.errors import InvalidConfig, MapError
-from tsfusion.geometry.keyframe import Intrinsics, Keyframe
+from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.kernels import integrate, ray_smoothing, runtime
+from tsfusion.kernels import integrate, runtime
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.voxel_traversal import COUNT
@@ -25,8 +31,8 @@ from tsfusion.tsdf import checkpoint, field_regularizer
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.integrator import Integrator
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
-from tsfusion.tsdf.ray_buffers import RayBuffers
-from tsfusion.tsdf.surface_values import Layers, SurfaceView, values_of
+from tsfusion.tsdf.ray_buffers import RayBuffers, keyframes_of_every_kind
+from tsfusion.tsdf.surface_values import SurfaceView, values_of
 
 
 class IntegrateStats(msgspec.Struct, frozen=True):
@@ -82,11 +88,11 @@ class Volume:
         self.meta: dict[str, Any] = {}
         self.keyframes = 0
         runtime.start(config.threads)
-        self._smooths = model.regularizer != "off"
-        self._scratch = RayBuffers(color=config.color, regularised=self._smooths)
-        self._store = BlockStore(color=config.color, corrected=self._smooths)
-        self._integrator = Integrator(self._store, self._scratch, config)
-        self._mesh_scratch = MeshBuffers()
+        smooths = model.regularizer != "off"
+        self._store = BlockStore(voxel_size=config.voxel_size, color=config.color, corrected=smooths)
+        self._ray_buffers = RayBuffers(color=config.color, regularised=smooths)
+        self._mesh_buffers = MeshBuffers()
+        self._integrator = Integrator(self._store, self._ray_buffers, config)
 
     def integrate(self, keyframe: Keyframe) -> IntegrateStats:
         """Add a keyframe. On an error the map is as it was.
@@ -119,9 +125,9 @@ class Volume:
         Of what is meshed raw, normals at the rim may be a keyframe behind.
         """
         if self.model.surface == "normal":
-            dirty = unpack_keys(field_regularizer.around(pack_keys(dirty), self._layers(), 1))
+            dirty = unpack_keys(field_regularizer.around(pack_keys(dirty), self._store, 1))
         if self.model.surface == "field":
-            dirty = unpack_keys(field_regularizer.spread(pack_keys(dirty), self._layers(), self._field))
+            dirty = unpack_keys(field_regularizer.spread(pack_keys(dirty), self._store, self._field))
         return cells_of(dirty)
 
     def extract_mesh(
@@ -148,12 +154,10 @@ class Volume:
         if blocks is not None:
             if np.shape(blocks)[1:] != (3,) or np.asarray(blocks).dtype.kind != "i":
                 raise InvalidConfig(f"blocks must be (n, 3) integers, got {np.asarray(blocks)!r}")
-            reachable = (np.abs(np.asarray(blocks, np.int64)) < 1 << 18).all(
-                axis=1
-            )  # beyond it coordinates have no key
+            reachable = (np.abs(np.asarray(blocks, np.int64)) < 1 << 18).all(axis=1)  # others have no key
             chosen = np.unique(pack_keys(blocks[reachable]))
             chosen = chosen[store.slots_of(chosen) >= 0]
-        return extract(np.sort(chosen), self._layers(), min_weight, self._mesh_scratch, self._view(surface))
+        return extract(np.sort(chosen), self._store, min_weight, self._mesh_buffers, self._view(surface))
 
     def map_hash(self) -> str:
         """Hex digest of the exact sums: equal for the same keyframes in any order, on any number of threads.
@@ -186,13 +190,13 @@ class Volume:
             voxels=store.count * CUBE,
             bytes=store.nbytes,
             bytes_per_block=store.bytes_per_block,
-            scratch_bytes=self._scratch.nbytes + self._mesh_scratch.nbytes,
+            scratch_bytes=self._ray_buffers.nbytes + self._mesh_buffers.nbytes,
         )
 
     def warm_up(self) -> None:
         """Compile every kernel, so that the first keyframe is not slower than the rest."""
         throwaway = Volume(override(self.config, max_blocks=1 << 14, max_blocks_per_keyframe=1 << 14))
-        for keyframe in warm_up_keyframes(self.model, self.config.voxel_size):
+        for keyframe in keyframes_of_every_kind(self.model, self.config.voxel_size):
             throwaway.integrate(keyframe)
             throwaway.retract(keyframe)
             throwaway.integrate(keyframe)
@@ -211,9 +215,12 @@ class Volume:
         """
         layers = self._store.layers()
         header = checkpoint.CheckpointHeader(
-            config=self.config, keyframes=self.keyframes, map_hash=self.map_hash(),
-            meta=self.meta if meta is None else meta, layers=list(layers),
-        )  # fmt: skip
+            config=self.config,
+            keyframes=self.keyframes,
+            map_hash=self.map_hash(),
+            meta=self.meta if meta is None else meta,
+            layers=list(layers),
+        )
         used = self._store.used()
         return checkpoint.write(Path(path), header, self._store.keys[used], used, layers)
 
@@ -249,16 +256,19 @@ class Volume:
     def _apply(self, keyframe: Keyframe, sign: int) -> IntegrateStats:
         if sign < 0 and self.keyframes == 0:
             raise MapError("cannot retract a keyframe from a map that holds none")
-        scratch, store, before = self._scratch, self._store, self._store.count
-        samples = scratch.make_rays(keyframe, self.config)
+        blocks_before = self._store.count
+        samples = self._ray_buffers.make_rays(keyframe, self.config)  # paper eq. 1
         with process.uninterrupted():
-            updates = self._integrator.apply(sign, lambda: self._smooth(sign))
+            updates = self._integrator.apply(sign)  # paper eq. 2 and 3
             self.keyframes += sign
-        total = int(np.prod(keyframe.shape))
         return IntegrateStats(
-            samples=samples, invalid=total - samples, rays=int(scratch.bands[:, COUNT].sum()),
-            blocks=len(scratch.touched_slots), new_blocks=store.count - before, updates=updates,
-        )  # fmt: skip
+            samples=samples,
+            invalid=int(np.prod(keyframe.shape)) - samples,
+            rays=int(self._ray_buffers.bands[:, COUNT].sum()),
+            blocks=len(self._ray_buffers.touched_slots),
+            new_blocks=self._store.count - blocks_before,
+            updates=updates,
+        )
 
     @property
     def _field(self) -> field_regularizer.FieldSettings:
@@ -268,7 +278,7 @@ class Volume:
         )
 
     def _view(self, surface: Surface | None) -> SurfaceView:
-        """What the surface is read from."""
+        """The function that reads a surface's signed distances from the map."""
         surface = surface or self.model.surface
         if surface not in get_args(Surface):
             raise InvalidConfig(f"surface must be one of {', '.join(get_args(Surface))}, got {surface!r}")
@@ -277,52 +287,3 @@ class Volume:
         if surface == "normal":
             return partial(field_regularizer.along_normals, smoothness=self.model.smoothness)
         return values_of
-
-    def _layers(self) -> Layers:
-        store = self._store
-        return Layers(
-            sums=store.sums,
-            color_rgn=store.color_rgn if self.config.color else None,
-            color_b=store.color_b,
-            correction=store.correction if self._smooths else None,
-            hash_keys=store.hash_keys,
-            hash_slots=store.hash_slots,
-            count=store.count,
-            voxel_size=self.config.voxel_size,
-        )
-
-    def _smooth(self, sign: int) -> None:
-        """Bring the regularised layer up to date in the blocks just touched."""
-        s, store, model = self._scratch, self._store, self.model
-        if not self._smooths:
-            return
-        if sign < 0:
-            store.correction[s.touched_slots] = 0
-            return
-        s.reserve_votes()
-        weighted = model.regularizer == "ray"
-        ray_smoothing.smooth_rays(
-            s.rays, s.bands, store.hash_keys, store.hash_slots, store.places, model.smoothness, int(weighted),
-            int(model.feedback or not weighted), store.sums, store.correction, s.signal, s.crossed, s.votes,
-        )  # fmt: skip
-        ray_smoothing.commit_votes(s.touched, store.sums, s.votes, store.correction)
-
-
-def warm_up_keyframes(model: SensorModel, voxel_size: float) -> list[Keyframe]:
-    """One of each kind and depth type, 16×16, all within the sensor's range."""
-    near = max(model.min_range * 1.5, 4 * voxel_size)
-    pose, camera = np.eye(4), Intrinsics(20.0, 20.0, 8.0, 8.0)
-    color = np.zeros((16, 16, 3), np.uint8)
-    metres = np.full((16, 16), near, np.float32)
-    units = np.full((16, 16), 1000, np.uint16)
-    rays = np.dstack(
-        [*np.meshgrid(np.linspace(-0.4, 0.4, 16), np.linspace(-0.4, 0.4, 16)), np.ones((16, 16))]
-    )
-    points = (rays * near).reshape(-1, 3).astype(np.float32)
-    return [
-        Keyframe(depth=metres, intrinsics=camera, T_world_camera=pose, color=color),
-        Keyframe(depth=units, depth_scale=near / 1000, intrinsics=camera, T_world_camera=pose),
-        Keyframe(disparity=units, disparity_scale=1 / 16, baseline_fx=near * 1000 / 16,
-                 intrinsics=camera, T_world_camera=pose),
-        Keyframe(points=points, T_world_camera=pose, color=color.reshape(-1, 3)),
-    ]  # fmt: skip
