@@ -30,7 +30,7 @@ def number_voxels(
     counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
     """Number the voxels of each block that were seen within `reach` quanta of the surface; −1 elsewhere."""
-    for run in range(values.shape[0] * RUN):
+    for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             b = run // RUN
             n = 0
@@ -76,7 +76,7 @@ def list_voxels(
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
     """Fill the list: each voxel's value, its weight in full-confidence samples, and its neighbours."""
-    for run in range(values.shape[0] * RUN):
+    for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             b = run // RUN
             for o in range(CUBE):
@@ -110,7 +110,7 @@ def number_parents(
     coarse_counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
     """Number the cells that hold a listed finer cell."""
-    for run in range(number.shape[0] * RUN):
+    for run in range(number.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             b = run // RUN
             for c in range(coarse_number.shape[1]):
@@ -168,7 +168,7 @@ def list_parents(
 
     Each value is moved to the cell's centre along its own slope: ramps stay ramps where cells are missing.
     """
-    for run in range(number.shape[0] * RUN):
+    for run in range(number.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             b = run // RUN
             for c in range(coarse_number.shape[1]):
@@ -216,7 +216,7 @@ def refine(
     x: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
     """Start the finer cells from the coarse solution, linear inside each coarse cell."""
-    for run in range(number.shape[0] * RUN):
+    for run in range(number.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             b = run // RUN
             for o in range(number.shape[1]):
@@ -315,7 +315,7 @@ def write_values(
     solved: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
     """The field where it was solved, the value as it was elsewhere."""
-    for run in range(rows.shape[0] * RUN):
+    for run in range(rows.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             r = run // RUN
             b = rows[r]

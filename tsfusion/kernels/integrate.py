@@ -183,7 +183,7 @@ def add_rays(
     Rays that cross blocks the map does not have are listed in `deferred`, the keys in `missing`; when those
     blocks exist, a second call with `only_deferred` and `oldest` = the first new slot adds the rest.
     """
-    for run in range((last_band - first_band) * RUN):
+    for run in range((last_band - first_band) * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = first_band + run // RUN
             start = bands[band, START]
@@ -219,7 +219,7 @@ def largest_weights(
 ):
     """`bounds[slot]` = the largest weight lane in each touched block."""
     count = touched[TOUCHED_COUNT]
-    for run in range(count * RUN):
+    for run in range(count * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             slot = touched[TOUCHED_HEADER + run // RUN]
             most = 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Marching cubes: vertices and triangles of the cells that `kernels/cells.py` found. Every vertex belongs to
+"""Marching cubes: vertices and triangles of the cells that `surface_cells.py` found. Every vertex belongs to
 one voxel edge and exists once, whichever block's cells use it: no cracks, no duplicates.
 
 Vertices are numbered by block, x, axis of their edge, y, z. A vertex's number is then its plane's start and
@@ -94,6 +94,7 @@ def normal_at(padded: ti.template(), band, i, axis, t):
 
 @ti.func
 def axis_step(axis):
+    """How far apart neighbours along an axis are in `padded`."""
     return ti.select(axis == 0, PAD * PAD, ti.select(axis == 1, PAD, 1))
 
 
@@ -160,7 +161,7 @@ def emit_vertices(
     colors: ti.types.ndarray(dtype=ti.u8, ndim=2),
 ):
     """Position, unit normal and colour of every vertex: where the value crosses zero along its edge."""
-    for run in range(BANDS * RUN):
+    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
@@ -220,7 +221,7 @@ def emit_faces(
     faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
     """Each cell's triangles, as the numbers of the vertices on its edges."""
-    for run in range(BANDS * RUN):
+    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):

@@ -50,7 +50,7 @@ def smooth_along_normals(
     smoothed: ti.types.ndarray(dtype=ti.f32, ndim=2),
 ):
     """Replace the values within `reach` of the surface."""
-    for run in range(rows.shape[0] * RUN):
+    for run in range(rows.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             r = run // RUN
             for o in range(CUBE):

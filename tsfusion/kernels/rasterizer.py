@@ -14,6 +14,7 @@ EMPTY = (1 << 63) - 1
 
 @ti.func
 def corner(vertices: ti.types.ndarray(), i):
+    """Row i of an array as a vector."""
     return tm.vec3(vertices[i, 0], vertices[i, 1], vertices[i, 2])
 
 
@@ -26,6 +27,7 @@ def cut(a, b, near):
 
 @ti.func
 def edge(a, b, p):
+    """Twice the signed area of the triangle a, b, p in the image."""
     return (b.x - a.x) * (p.y - a.y) - (b.y - a.y) * (p.x - a.x)
 
 

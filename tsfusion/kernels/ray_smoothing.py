@@ -97,7 +97,7 @@ def smooth_rays(
 ):
     """Gather y along each ray, solve, and add x̂ to `votes` as (Σ x̂ · 16) · 2²⁴ + n."""
     hash_mask = hash_keys.shape[0] - 1
-    for run in range(bands.shape[0] * RUN):
+    for run in range(bands.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN
             last = vec3i(2147483647)
@@ -152,7 +152,7 @@ def commit_votes(
 ):
     """A voxel's value (Σ w·m + correction) / Σ w becomes the mean that its rays propose; clears `votes`."""
     count = touched[TOUCHED_COUNT]
-    for run in range(count * RUN):
+    for run in range(count * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             i = run // RUN
             slot = touched[TOUCHED_HEADER + i]

@@ -57,6 +57,7 @@ Layer = ti.types.struct(
 
 @ti.func
 def camera_of(rows: ti.template()):
+    """The (4, 3) rows of `ray_buffers._camera` as a `Camera`."""
     du, dv = vec3(rows[0, 0], rows[0, 1], rows[0, 2]), vec3(rows[1, 0], rows[1, 1], rows[1, 2])
     corner, origin = vec3(rows[2, 0], rows[2, 1], rows[2, 2]), vec3(rows[3, 0], rows[3, 1], rows[3, 2])
     return Camera(du, dv, corner, origin)
@@ -302,7 +303,7 @@ def rays_from_image(
     tiles = tiles_x * ((image.shape[0] + TILE - 1) // TILE)
     count = bands.shape[0]
     unit = model[VOXEL_SIZE] / 1024.0  # metres
-    for run in range(count * RUN):
+    for run in range(count * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN
             camera = camera_of(camera_rows)

@@ -25,11 +25,13 @@ from tsfusion.kernels.voxel_traversal import RUN, write_band, write_ray
 
 @ti.func
 def row(array: ti.template(), n):
+    """Row n of an array as a vector."""
     return vec3f(array[n, 0], array[n, 1], array[n, 2])
 
 
 @ti.func
 def transform(pose: ti.template(), q):
+    """The point q (sensor frame, metres) in the map's frame, voxels."""
     p = vec3(0.0)
     for a in ti.static(range(3)):
         p[a] = pose[a, 0] * q[0] + pose[a, 1] * q[1] + pose[a, 2] * q[2] + pose[a, 3]
@@ -56,7 +58,7 @@ def rays_from_points(
     nearest = ti.cast(model[MIN_RANGE] * model[MIN_RANGE], ti.f32)
     farthest = ti.cast(model[MAX_RANGE] * model[MAX_RANGE], ti.f32)
     spread = ti.cast(model[VOXEL_SIZE] * model[VOXEL_SIZE], ti.f32)
-    for run in range(bands.shape[0] * RUN):
+    for run in range(bands.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN
             first_point = ti.cast(ti.cast(band, ti.i64) * count // bands.shape[0], ti.i32)

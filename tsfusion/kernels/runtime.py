@@ -4,13 +4,12 @@
 import os
 from contextlib import redirect_stdout
 from io import StringIO
-from types import ModuleType
 
 _started_threads: int | None = None
 
 
-def start(threads: int | None = None) -> ModuleType:
-    """Start Taichi's CPU backend (once a process) and return the `taichi` module.
+def start(threads: int | None = None) -> None:
+    """Start Taichi's CPU backend, once a process.
 
     The thread count of the first call stands: a second `ti.init` would tear kernels down. Results never
     depend on it.
@@ -31,5 +30,3 @@ def start(threads: int | None = None) -> ModuleType:
                 offline_cache=True,
                 log_level=ti.ERROR,
             )
-    module: ModuleType = ti
-    return module

@@ -32,16 +32,19 @@ def next_z(plane, block_z):
 
 @ti.func
 def next_y(plane, block_y):
+    """The plane of each voxel's neighbour at y + 1; `block_y` is the same plane of the next block."""
     return (plane >> ti.u64(8)) | (block_y << ti.u64(56))
 
 
 @ti.func
 def previous_z(plane, block_z):
+    """The plane of each voxel's neighbour at z − 1; `block_z` is the same plane of the block before."""
     return ((plane & ti.u64(Z06)) << ti.u64(1)) | ((block_z >> ti.u64(7)) & ti.u64(Z0))
 
 
 @ti.func
 def previous_y(plane, block_y):
+    """The plane of each voxel's neighbour at y − 1; `block_y` is the same plane of the block before."""
     return (plane << ti.u64(8)) | (block_y >> ti.u64(56))
 
 
@@ -250,12 +253,12 @@ def find_cells(
     state: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (row, 4): wanted, signs, triangles, vertices
     first: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (row, 2): first vertex and triangle; last the totals
 ):
-    """All about the mesh but its numbers: see the arguments. Rows with no vertex keep old `edges`."""
+    """Find the crossed cells and the edges with vertices. Rows without vertices keep old `edges`."""
     for r in range(count + 1):
         state[r, 0] = 0
     for n in range(wanted_count):
         state[map_find(table, table_rows, table.shape[0] - 1, wanted[n]), 0] = 1
-    for run in range(BANDS * RUN):
+    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
@@ -268,7 +271,7 @@ def find_cells(
             active[r, x] = ti.u64(0)
         for k in range(4):
             state[r, k] = 0
-    for run in range(BANDS * RUN):
+    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
@@ -281,7 +284,7 @@ def find_cells(
                 else:
                     for x in range(8):
                         active[r, x] = ti.u64(0)
-    for run in range(BANDS * RUN):
+    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Ray casting into worlds of analytic solids, with procedural colour.
 
-A world is a table of solids (`datasets/worlds.py` names the columns). Every ray is independent and in
-float64, so images do not depend on the thread count.
+A world is a table of solids (`datasets/synthetic/worlds.py` names the columns). Every ray is independent and
+in float64, so images do not depend on the thread count.
 """
 
 import taichi as ti
@@ -48,6 +48,7 @@ def quadric_ray(a, b, c):
 
 @ti.func
 def to_local(p, cosine, sine):
+    """p turned about z into the axes of a solid."""
     return vec3(cosine * p[0] + sine * p[1], cosine * p[1] - sine * p[0], p[2])
 
 

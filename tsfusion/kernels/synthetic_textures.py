@@ -41,11 +41,13 @@ def noise(p, scale, salt):
 
 @ti.func
 def fract(x):
+    """The fractional part of x, in [0, 1)."""
     return x - ti.floor(x)
 
 
 @ti.func
 def mix(a, b, share):
+    """a and b blended: a at share 0, b at 1."""
     return a + (b - a) * tm.clamp(share, 0.0, 1.0)
 
 

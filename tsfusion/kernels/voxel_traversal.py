@@ -24,9 +24,7 @@ START, COUNT, SAMPLES, WEIGHT, DEFERRED, UPDATES = 0, 1, 2, 3, 4, 5
 MAX_CROSSED = 64  # voxels in one ray's band: 2 · 16 · √3 and the ends
 VOXEL_LIMIT = 1 << 20  # |voxel coordinate| < VOXEL_LIMIT − 64, so that a band stays inside 21 bits
 
-# Taichi 1.7's CPU backend hands out a parallel loop in runs of 512 iterations, whatever `block_dim` says
-# (measured: a loop of 512 heavy iterations ran on one thread). One unit of work is therefore one run.
-RUN = 512
+RUN = 512  # iterations that one thread takes at a time: kernels/__init__.py explains the run loop
 
 DIRECTION_ONE = 1 << 16
 NEVER = 1 << 30  # a crossing far behind the longest band

@@ -36,7 +36,7 @@ def read_values(
 ):
     """Row r of `values`: smoothed or raw values of block `keys[r]` in quanta; NaN below `min_weight`."""
     mask = map_keys.shape[0] - 1
-    for run in range(BANDS * RUN):
+    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):

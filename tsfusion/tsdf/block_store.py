@@ -13,14 +13,15 @@ from tsfusion.tsdf.growing_array import GrowingArray
 
 _FIRST_CAPACITY = 1024
 _CHUNK = 1024  # blocks read at a time where a whole layer would be copied
-_BEHIND = np.array([x << 42 | y << 21 | z for x in (0, 1) for y in (0, 1) for z in (0, 1)])  # in packed keys
+# What the keys of a block and of its neighbours towards −x, −y, −z are smaller by
+_CELL_STEPS = np.array([x << 42 | y << 21 | z for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 
 
 class BlockStore:
     """Slots 0 … count-1, each with a key and one row of 512 voxels in every layer.
 
     Layers, (slot, 512): `sums` int64; with colour `color_rgn` int64 and `color_b` int32; when smoothing
-    `correction` float32 (kernels/integrate.py and smooth.py say what they hold). Beside them, one number a
+    `correction` float32 (see kernels/integrate.py and kernels/ray_smoothing.py). Beside them, one number a
     block: `dirty` uint8, and int32 `stamps` (the last keyframe that touched it), `places` (where in that
     keyframe's list), `bounds` (no voxel has more weight than this).
     A layer the map does not have is one row of zeros, so that kernels can be handed it.
@@ -89,7 +90,7 @@ class BlockStore:
         """Append blocks with distinct new keys; their voxels are zero.
 
         Raises:
-            MemoryError: when there is none for them; the map is as it was.
+            MemoryError: when there is not enough; the map is as it was.
         """
         first, count = self.count, self.count + len(keys)
         for array in self._arrays():
@@ -123,7 +124,7 @@ class BlockStore:
             self.bounds[chunk] = (self.sums[chunk] & WEIGHT_MASK).max(axis=1)
 
     def take_dirty(self) -> NDArray[np.int64]:
-        """Slots changed since the last call."""
+        """Slots of the blocks changed since the last call."""
         slots = np.flatnonzero(self.dirty[: self.count])
         self.dirty[slots] = 0
         return slots
@@ -135,7 +136,7 @@ class BlockStore:
         return np.concatenate([order[:0], *(chunk[self.sums[chunk].any(axis=1)] for chunk in chunks)])
 
     def in_order(self, layer: str) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
-        """Keys and rows of the used blocks in key order, some at a time."""
+        """Keys and rows of the used blocks in key order, up to 1024 at a time."""
         used = self.used()
         for i in range(0, len(used), _CHUNK):
             chunk = used[i : i + _CHUNK]
@@ -149,6 +150,7 @@ class BlockStore:
 
     @property
     def bytes_per_block(self) -> int:
+        """Memory of one block in all arrays, without the hash."""
         return sum(array.item_bytes for array in self._arrays())
 
     def _arrays(self) -> tuple[GrowingArray, ...]:
@@ -157,12 +159,12 @@ class BlockStore:
 
     @property
     def nbytes(self) -> int:
-        """What the blocks and their hash take."""
+        """Memory of the blocks and their hash, bytes."""
         return self.count * self.bytes_per_block + self.hash_keys.nbytes + self.hash_slots.nbytes
 
 
 def pack_keys(coordinates: NDArray[np.int32]) -> NDArray[np.int64]:
-    """(n, 3) block coordinates → (n,) int64 keys, as `kernels.traversal.pack`."""
+    """(n, 3) block coordinates → (n,) int64 keys, as `kernels.voxel_traversal.pack`."""
     x, y, z = (np.asarray(coordinates, np.int64) + (1 << 20)).reshape(-1, 3).T
     return np.ascontiguousarray(x << 42 | y << 21 | z)
 
@@ -175,4 +177,4 @@ def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int32]:
 
 def cells_of(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
     """The blocks whose cells read these blocks: themselves and their neighbours towards −x, −y, −z."""
-    return unpack_keys(np.unique((pack_keys(coordinates)[:, None] - _BEHIND).ravel()))
+    return unpack_keys(np.unique((pack_keys(coordinates)[:, None] - _CELL_STEPS).ravel()))

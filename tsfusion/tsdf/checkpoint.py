@@ -31,7 +31,7 @@ DTYPES = {"sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "correct
 
 
 class CheckpointHeader(msgspec.Struct, kw_only=True):
-    """What a checkpoint says of itself."""
+    """First part of a checkpoint: the settings and history of the map, and what follows."""
 
     config: VolumeConfig
     keyframes: int
@@ -54,7 +54,7 @@ def write(
     writer left is overwritten.
 
     Raises:
-        CheckpointError: when the disk refuses.
+        CheckpointError: when the file cannot be written.
     """
     header.blocks = len(keys)
     partial = path.with_name(f".{path.name}.partial")
@@ -65,7 +65,7 @@ def write(
             os.fsync(file.fileno())
         os.replace(partial, path)
         durable_files.sync_folder(path.parent)
-    except BaseException as error:  # an interrupted one leaves no part either
+    except BaseException as error:  # also after an interrupt no part stays
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
         if isinstance(error, OSError):
@@ -78,8 +78,8 @@ def read(path: Path) -> tuple[CheckpointHeader, NDArray[np.int64], dict[str, NDA
     """Header, keys and layers of a checkpoint.
 
     Raises:
-        DamagedCheckpoint: when it is not to the byte what was written.
-        CheckpointError: when it is not there, cannot be read now, or is of another version.
+        DamagedCheckpoint: when a byte differs from what was written.
+        CheckpointError: when the file is missing, cannot be read now, or is of another version.
     """
     try:
         with path.open("rb") as file:
@@ -148,9 +148,9 @@ def _check_magic(file: BinaryIO, path: Path) -> None:
 
 
 def _read_header(file: BinaryIO, path: Path) -> CheckpointHeader:
-    (length,) = struct.unpack("<I", _exactly(file, 4, path))
+    (length,) = struct.unpack("<I", _read_exactly(file, 4, path))
     try:
-        header = msgspec.msgpack.decode(_exactly(file, length, path), type=CheckpointHeader)
+        header = msgspec.msgpack.decode(_read_exactly(file, length, path), type=CheckpointHeader)
     except msgspec.ValidationError as error:  # the digest agrees: it is as its writer meant it
         raise CheckpointError(f"{path} is of another version: {error}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -166,8 +166,8 @@ def _read_chunks(file: BinaryIO, path: Path, header: CheckpointHeader) -> Iterat
     per_block = 8 + sum(CUBE * np.dtype(DTYPES[name]).itemsize for name in header.layers)
     for first in range(0, header.blocks, CHUNK):
         size = min(CHUNK, header.blocks - first) * per_block
-        (length,) = struct.unpack("<I", _exactly(file, 4, path))
-        frame = _exactly(file, length, path)
+        (length,) = struct.unpack("<I", _read_exactly(file, 4, path))
+        frame = _read_exactly(file, length, path)
         try:
             if zstandard.get_frame_parameters(frame).content_size != size:
                 raise DamagedCheckpoint(f"{path} is damaged: a chunk is not of the {size} bytes expected")
@@ -177,9 +177,9 @@ def _read_chunks(file: BinaryIO, path: Path, header: CheckpointHeader) -> Iterat
 
 
 def _check_digest(file: BinaryIO, path: Path) -> None:
-    """Compare the digest of the whole file before any of it is believed; leaves `file` where it was.
+    """Compare the digest of the whole file; leaves the position in `file` as it was.
 
-    Before anything is allocated, too: a header with one flipped bit may ask for all memory there is.
+    This comes before any allocation: a header with one flipped bit may ask for all memory there is.
     """
     here = file.tell()
     remaining = file.seek(0, os.SEEK_END) - 16
@@ -194,7 +194,8 @@ def _check_digest(file: BinaryIO, path: Path) -> None:
     file.seek(here)
 
 
-def _exactly(file: BinaryIO, size: int, path: Path) -> bytes:
+def _read_exactly(file: BinaryIO, size: int, path: Path) -> bytes:
+    """Read `size` bytes, or raise DamagedCheckpoint where the file ends before."""
     if size > os.fstat(file.fileno()).st_size or len(content := file.read(size)) != size:
         raise DamagedCheckpoint(f"{path} is cut short")
     return content

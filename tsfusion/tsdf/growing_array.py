@@ -40,7 +40,7 @@ class GrowingArray:
         """Make room for `capacity` items; new items are zero.
 
         Raises:
-            MemoryError: when there is none; what there was stays.
+            MemoryError: when there is not enough; the array stays as it was.
         """
         if capacity <= self.capacity:
             return

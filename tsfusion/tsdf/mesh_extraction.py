@@ -49,7 +49,7 @@ class MeshBuffers:
             array.reserve(rows + 1)
 
     def release(self) -> None:
-        """Give the memory of a large mesh back."""
+        """Give the memory of a large mesh back to the system."""
         if self.values.capacity > KEPT_BLOCKS:
             self._forget()
 

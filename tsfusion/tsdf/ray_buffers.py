@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Memory for one keyframe at a time: its rays and what they touch. Reused, never per call."""
+"""Memory for one keyframe at a time: its rays and the blocks they touch. Every keyframe uses it again."""
 
 from typing import Any
 
@@ -48,6 +48,7 @@ class RayBuffers:
 
     @property
     def touched_slots(self) -> NDArray[np.int32]:
+        """Slots of the blocks that the current keyframe touches."""
         return self.touched[TOUCHED_HEADER : TOUCHED_HEADER + self.touched[TOUCHED_COUNT]]
 
     def reserve_touched(self, blocks: int) -> None:
@@ -89,17 +90,18 @@ class RayBuffers:
         return int(self.bands[:, SAMPLES].sum())
 
     def take_missing(self) -> NDArray[np.int64]:
-        """Keys of the missing blocks, in an order that only the set decides; it is empty after."""
+        """Keys of the missing blocks, in an order that only the set of them decides. Empties `missing`."""
         keys: NDArray[np.int64] = self.missing[self.missing != 0]
         self.missing[:] = 0
         return keys
 
     def grow_missing(self) -> None:
-        """Double the set after an overflow; it is empty after."""
+        """Double the size of `missing` after an overflow, and empty it."""
         self.missing = np.zeros(2 * len(self.missing), np.int64)
         self.touched[TOUCHED_OVERFLOW] = 0
 
     def reserve_votes(self) -> None:
+        """Make room for the votes of all touched blocks."""
         self._votes.reserve(int(self.touched[TOUCHED_COUNT]))
 
     @property
@@ -150,7 +152,7 @@ def _depth_scale(keyframe: Keyframe) -> float:
 
 
 def _camera(keyframe: Keyframe, voxel_size: float) -> NDArray[np.float64]:
-    """(4, 3) float64: what a pixel's step right, its step down, pixel (0, 0) and the centre are in voxels."""
+    """(4, 3) float64, voxels: a pixel's step right, its step down, pixel (0, 0), and the camera's centre."""
     K, T = keyframe.intrinsics, keyframe.T_world_camera
     assert K is not None  # checked by Keyframe
     R = T[:3, :3] / voxel_size
@@ -159,6 +161,7 @@ def _camera(keyframe: Keyframe, voxel_size: float) -> NDArray[np.float64]:
 
 
 def _optional(array: NDArray[np.uint8] | None, dims: int) -> tuple[NDArray[Any], int]:
+    """An array that a kernel can be handed, and whether it holds anything."""
     return (_NOTHING[dims], 0) if array is None else (array, 1)
 
 

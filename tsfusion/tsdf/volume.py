@@ -36,7 +36,7 @@ from tsfusion.tsdf.surface_values import SurfaceView, values_of
 
 
 class IntegrateStats(msgspec.Struct, frozen=True):
-    """What one keyframe did to the map."""
+    """Counts of one keyframe's integration or retraction."""
 
     samples: int  # pixels or points with a usable return
     invalid: int  # without a return, out of range, or untrusted
@@ -47,14 +47,14 @@ class IntegrateStats(msgspec.Struct, frozen=True):
 
 
 class VolumeStats(msgspec.Struct, frozen=True):
-    """What the map holds. `bytes` counts what the blocks and their hash take; scratch is beside it."""
+    """Size of the map. `bytes` is the memory of the blocks and their hash, without `scratch_bytes`."""
 
     keyframes: int
     blocks: int
     voxels: int
     bytes: int
     bytes_per_block: int
-    scratch_bytes: int
+    scratch_bytes: int  # working memory of rays and meshes
 
 
 class Volume:
