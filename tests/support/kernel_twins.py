@@ -227,7 +227,7 @@ def crossed_cells(
     values: dict[Voxel, float], meshed: set[Voxel]
 ) -> tuple[set[Voxel], set[tuple[Voxel, int]], dict[Voxel, int]]:
     """Cells of the `meshed` blocks that the surface crosses, the edges (voxel, axis) that carry their
-    vertices, and how many triangles each has: twin of `kernels.cells.find_cells`."""
+    vertices, and how many triangles each has: twin of `kernels.surface_cells.find_cells`."""
     edges, triangles = set(), {}
     for cell in values:
         corners = [tuple(int(x) for x in np.add(cell, c)) for c in marching_tables.CORNERS]
@@ -345,7 +345,7 @@ def neighbours(voxel: Voxel) -> set[Voxel]:
 
 
 def trace(distance: Any, origin: Any, directions: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
-    """Twin of `kernels.synthetic.cast`: sphere tracing on a signed distance; 0 = nothing within reach."""
+    """Twin of `kernels.synthetic_raycast.cast`: sphere tracing; 0 = nothing within reach."""
     length = np.linalg.norm(directions, axis=1)
     t = np.zeros(len(directions))
     for _ in range(300):
@@ -357,7 +357,7 @@ def trace(distance: Any, origin: Any, directions: NDArray[np.float64], reach: fl
 def see(
     vertices: NDArray[np.float32], faces: NDArray[np.int32], focal: float, shape: tuple[int, int], near: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Twin of `kernels.raster`: the front-facing triangle each pixel sees (−1 = none) and its depth."""
+    """Twin of `kernels.rasterizer`: the front-facing triangle each pixel sees (−1 = none) and its depth."""
     height, width = shape
     v, u = np.mgrid[:height, :width]
     rays = np.dstack([(u - (width - 1) / 2) / focal, (v - (height - 1) / 2) / focal, np.ones(shape)])
@@ -376,7 +376,7 @@ def see(
 
 
 def shade(corners: Any, normals: Any, colors: Any, ray: Any, up: Any) -> NDArray[np.float64]:
-    """Twin of `kernels.raster.shade` for one pixel of one triangle: linear RGB."""
+    """Twin of `kernels.rasterizer.shade` for one pixel of one triangle: linear RGB."""
     weights = np.linalg.solve(np.asarray(corners, float).T, ray)
     weights = np.clip(weights / weights.sum(), 0, 1)
     normal = weights @ np.asarray(normals, float)

@@ -38,6 +38,56 @@ def transform(pose: ti.template(), q):
     return p
 
 
+# Consecutive points that become one ray: their number, Σ confidence, Σ colour, Σ position, Σ start.
+Bundle = ti.types.struct(
+    n=ti.i32, trust=ti.i32, red=ti.i32, green=ti.i32, blue=ti.i32, sum_q=vec3, sum_o=vec3
+)
+
+
+@ti.func
+def confidence_at(q, o, nearest, farthest, confidence: ti.template(), has_confidence, i):
+    """Confidence in point i at q, seen from o; 0 if it is out of range. Ranges are squared metres."""
+    found = 0
+    span = (q - o).norm_sqr()
+    # False for NaN as well
+    if span > 0.0 and span >= nearest and span <= farthest:
+        found = 255
+        if has_confidence == 1:
+            found = ti.cast(confidence[i], ti.i32)
+    return found
+
+
+@ti.func
+def add_point(bundle: ti.template(), q, o, confident, color: ti.template(), has_color, i):
+    """Add point i at q, seen from o, to a bundle."""
+    bundle.n += 1
+    bundle.trust += confident
+    bundle.sum_q += q
+    bundle.sum_o += o
+    if has_color == 1:
+        bundle.blue += ti.cast(color[i, 0], ti.i32)
+        bundle.green += ti.cast(color[i, 1], ti.i32)
+        bundle.red += ti.cast(color[i, 2], ti.i32)
+
+
+@ti.func
+def write_bundle_ray(rays: ti.template(), r, model: ti.template(), pose: ti.template(), bundle, start):
+    """Write ray `r` from `start` through the mean of a bundle; returns its weight, 0 if out of reach."""
+    n = bundle.n
+    mean = bundle.sum_q * (1.0 / n)
+    origin, end = transform(pose, start), transform(pose, mean)
+    weight = 0
+    if in_reach(end) and in_reach(origin):
+        sigma = noise_sigma(model, (mean - start).norm())
+        weight = bundle_weight(model, sigma, bundle.trust)
+        half = half_width(model, sigma)
+        rgb = ((bundle.red // n) << 16) | ((bundle.green // n) << 8) | (bundle.blue // n)
+        direction, across = end - origin, vec3(0.0)
+        before = before_width(model, half, direction.norm())
+        write_ray(rays, r, fixed_point(end), direction, across, before, half, weight, rgb)
+    return weight
+
+
 @ti.kernel
 def rays_from_points(
     points: ti.types.ndarray(dtype=ti.f32, ndim=2),
@@ -63,63 +113,31 @@ def rays_from_points(
             band = run // RUN
             first_point = ti.cast(ti.cast(band, ti.i64) * count // bands.shape[0], ti.i32)
             last_point = ti.cast(ti.cast(band + 1, ti.i64) * count // bands.shape[0], ti.i32)
-            out = first_point
-            samples = 0
-            total_weight = 0
-            n, trust, red, green, blue = 0, 0, 0, 0, 0
+            out, samples, total_weight = first_point, 0, 0
             anchor = vec3f(0.0)
             common_start = ti.cast(row(starts, 0), ti.f64)
-            origin = transform(pose, common_start)
-            sum_q, sum_o = vec3(0.0), vec3(0.0)
+            points_of_ray = Bundle(0, 0, 0, 0, 0, vec3(0.0), vec3(0.0))
             for i in range(first_point, last_point + 1):
-                q, o = vec3f(0.0), vec3f(0.0)
-                confident = 255
-                usable = 0
+                q, o, confident = vec3f(0.0), vec3f(0.0), 0
                 if i < last_point:
-                    q = row(points, i)
-                    o = row(starts, i * own_starts)
-                    span = (q - o).norm_sqr()
-                    if has_confidence == 1:
-                        confident = ti.cast(confidence[i], ti.i32)
-                    # False for NaN as well
-                    if span > 0.0 and span >= nearest and span <= farthest and confident > 0:
-                        usable = 1
+                    q, o = row(points, i), row(starts, i * own_starts)
+                    confident = confidence_at(q, o, nearest, farthest, confidence, has_confidence, i)
+                n = points_of_ray.n
                 ends = i == last_point
-                if usable == 1 and n > 0:
+                if confident > 0 and n > 0:
                     ends = bundle == 0 or (q - anchor).norm_sqr() > spread
                 if ends and n > 0:
-                    share = 1.0 / n
-                    mean = sum_q * share
                     start = common_start
                     if own_starts == 1:
-                        start = sum_o * share
-                        origin = transform(pose, start)
-                    end = transform(pose, mean)
-                    if in_reach(end) and in_reach(origin):
-                        sigma = noise_sigma(model, (mean - start).norm())
-                        weight = bundle_weight(model, sigma, trust)
-                        half = half_width(model, sigma)
-                        rgb = 0
-                        if has_color == 1:
-                            rgb = ((red // n) << 16) | ((green // n) << 8) | (blue // n)
-                        ray, across = end - origin, vec3(0.0)
-                        before = before_width(model, half, ray.norm())
-                        write_ray(rays, out, fixed_point(end), ray, across, before, half, weight, rgb)
+                        start = points_of_ray.sum_o * (1.0 / n)
+                    weight = write_bundle_ray(rays, out, model, pose, points_of_ray, start)
+                    if weight > 0:
                         total_weight += weight
                         samples += n
                         out += 1
-                    n, trust, red, green, blue = 0, 0, 0, 0, 0
-                    sum_q, sum_o = vec3(0.0), vec3(0.0)
-                if usable == 1:
-                    if n == 0:
+                    points_of_ray = Bundle(0, 0, 0, 0, 0, vec3(0.0), vec3(0.0))
+                if confident > 0:
+                    if points_of_ray.n == 0:
                         anchor = q
-                    n += 1
-                    trust += confident
-                    sum_q += q
-                    if own_starts == 1:
-                        sum_o += o
-                    if has_color == 1:
-                        blue += ti.cast(color[i, 0], ti.i32)
-                        green += ti.cast(color[i, 1], ti.i32)
-                        red += ti.cast(color[i, 2], ti.i32)
+                    add_point(points_of_ray, q, o, confident, color, has_color, i)
             write_band(bands, band, first_point, out, samples, total_weight)
