@@ -79,6 +79,31 @@ def solve_signal(signal: ti.template(), band, n, smoothness):
         x2, x1 = x1, x
 
 
+@ti.func
+def read_signal(
+    signal: ti.template(),
+    band,
+    i,
+    distance,
+    slot,
+    o,
+    feedback,
+    sums: ti.template(),
+    correction: ti.template(),
+):
+    """Read t, y − t and W of a crossed voxel, element i of a ray's signal. Returns W."""
+    packed = sums[slot, o]
+    w = ti.cast(lane_weight(packed), ti.f32)
+    s = ti.cast(lane_distance(packed), ti.f32)
+    if feedback == 1:
+        s += correction[slot, o]
+    t = ti.cast(distance, ti.f32) * (QUANTA_PER_VOXEL / 65536.0)
+    signal[band, i, 0] = t
+    signal[band, i, 1] = s / w - t
+    signal[band, i, 2] = w
+    return w
+
+
 @ti.kernel
 def smooth_rays(
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
@@ -114,18 +139,11 @@ def smooth_rays(
                             last = block
                             slot = map_find(hash_keys, hash_slots, hash_mask, block_key(walk.voxel))
                         o = offset_in_block(walk.voxel)
-                        packed = sums[slot, o]
-                        w = ti.cast(lane_weight(packed), ti.f32)
-                        s = ti.cast(lane_distance(packed), ti.f32)
-                        if feedback == 1:
-                            s += correction[slot, o]
-                        t = ti.cast(walk.distance, ti.f32) * (QUANTA_PER_VOXEL / 65536.0)
-                        signal[band, n, 0] = t
-                        signal[band, n, 1] = s / w - t
-                        signal[band, n, 2] = w
+                        total += read_signal(
+                            signal, band, n, walk.distance, slot, o, feedback, sums, correction
+                        )
                         crossed[band, n, 0] = places[slot]
                         crossed[band, n, 1] = o
-                        total += w
                         n += 1
                         step, next_crossing = next_step(walk.crossing)
                         if next_crossing >= rays[r, LENGTH]:

@@ -234,6 +234,31 @@ def find_edges(
     return total
 
 
+@ti.func
+def clear_planes(planes: ti.template(), r):
+    """Empty the eight planes of a row."""
+    for x in range(8):
+        planes[r, x] = ti.u64(0)
+
+
+@ti.func
+def signs_around(state: ti.template(), around: ti.template(), r):
+    """Signs of the row's block and those that its cells reach into: 1 inside, 2 outside, 3 both."""
+    signs = 0
+    for c in ti.static(range(8)):
+        signs |= state[around[r, HERE + 9 * (c >> 2) + 3 * (c >> 1 & 1) + (c & 1)], 1]
+    return signs
+
+
+@ti.func
+def triangles_around(state: ti.template(), around: ti.template(), r):
+    """Not zero if a cell that has one of the row's edges has triangles."""
+    near = 0
+    for c in ti.static(range(7)):
+        near |= state[around[r, HERE - 9 * (c >> 2) - 3 * (c >> 1 & 1) - (c & 1)], 2]
+    return near
+
+
 @ti.kernel
 def find_cells(
     count: ti.i32,
@@ -265,34 +290,26 @@ def find_cells(
                 state[r, 1] = find_signs(r, values, seen, inside)
                 find_around(r, count, keys, table, table_rows, around)
     for r in range(count, count + 1):  # the blocks that are not there
-        for x in range(8):
-            seen[r, x] = ti.u64(0)
-            inside[r, x] = ti.u64(0)
-            active[r, x] = ti.u64(0)
+        clear_planes(seen, r)
+        clear_planes(inside, r)
+        clear_planes(active, r)
         for k in range(4):
             state[r, k] = 0
     for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
-                signs = 0
-                for c in ti.static(range(8)):
-                    signs |= state[around[r, HERE + 9 * (c >> 2) + 3 * (c >> 1 & 1) + (c & 1)], 1]
                 state[r, 2] = 0
-                if state[r, 0] == 1 and signs == 3:
+                if state[r, 0] == 1 and signs_around(state, around, r) == 3:
                     state[r, 2] = find_active(r, around, seen, inside, active, triangle_count)
                 else:
-                    for x in range(8):
-                        active[r, x] = ti.u64(0)
+                    clear_planes(active, r)
     for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN
             for r in range(count * band // BANDS, count * (band + 1) // BANDS):
-                near = 0  # triangles in the cells that have this row's edges
-                for c in ti.static(range(7)):
-                    near |= state[around[r, HERE - 9 * (c >> 2) - 3 * (c >> 1 & 1) - (c & 1)], 2]
                 state[r, 3] = 0
-                if near > 0:
+                if triangles_around(state, around, r) > 0:
                     state[r, 3] = find_edges(r, around, inside, active, edges, starts)
     vertices = 0
     triangles = 0
