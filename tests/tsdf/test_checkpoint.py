@@ -187,13 +187,7 @@ folder = Path(sys.argv[1])
 def save(blocks):
     keys = np.arange(blocks, dtype=np.int64)
     sums = np.random.default_rng(0).integers(0, 1 << 40, (blocks, 512))
-<<<<<<< HEAD
     header = CheckpointHeader(config=VolumeConfig(), keyframes=blocks, map_hash="", layers=["sums"], meta={})
-=======
-    header = checkpoint.CheckpointHeader(
-        config=VolumeConfig(), keyframes=blocks, map_hash="", layers=["sums"], meta={}
-    )
->>>>>>> b4f6a23 (Let subprocess tests of the map find what they import)
     checkpoint.write(folder / "map.tsf", header, keys, keys, {"sums": sums})
 save(100)
 before = (folder / "map.tsf").read_bytes()
