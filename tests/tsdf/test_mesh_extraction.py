@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Marching cubes: closed, manifold, without cracks or duplicates, and where the surface is."""
 
-import signal
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tsfusion import Mesh, Volume
-from tsfusion.core.errors import InvalidConfig, OutputError
+from tsfusion.core.errors import InvalidConfig
 from tsfusion.datasets.formats import stanford_bunny
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
@@ -220,32 +217,6 @@ def test_blocks_that_do_not_exist_give_an_empty_mesh() -> None:
     assert len(volume.extract_mesh(blocks=np.zeros((0, 3), np.int32)).faces) == 0
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
-def test_a_saved_mesh_reads_back(tmp_path: Path, suffix: str) -> None:
-    volume = Volume(voxel_size=0.02)
-    for keyframe in formula_scenes.sphere_views(0.4, 6):
-        volume.integrate(keyframe)
-    mesh = volume.extract_mesh()
-    loaded = trimesh.load(mesh.save(tmp_path / f"m{suffix}"), force="mesh", process=False)
-    assert loaded.faces.shape == mesh.faces.shape
-    assert np.allclose(np.sort(loaded.vertices, axis=0), np.sort(mesh.vertices, axis=0), atol=1e-6)
-    assert list(tmp_path.iterdir()) == [tmp_path / f"m{suffix}"]
-
-
-def test_a_mesh_that_cannot_be_saved_says_why_and_leaves_nothing(tmp_path: Path) -> None:
-    empty = Volume(voxel_size=0.02).extract_mesh()
-    with pytest.raises(OutputError, match="no triangles"):
-        empty.save(tmp_path / "m.ply")
-    volume = Volume(voxel_size=0.02)
-    volume.integrate(formula_scenes.sphere_views(0.4, 2)[0])
-    mesh = volume.extract_mesh()
-    with pytest.raises(OutputError, match=r"\.ply, \.glb, \.obj"):
-        mesh.save(tmp_path / "m.stl")
-    with pytest.raises(OutputError, match="cannot write"):
-        mesh.save(tmp_path / "missing" / "m.ply")
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("regularizer", ["off", "ray"])
 def test_the_bunny_lies_within_a_millimetre_of_its_reference(
     data: Callable[[str], Path], regularizer: str
@@ -261,33 +232,3 @@ def test_the_bunny_lies_within_a_millimetre_of_its_reference(
     assert np.median(distance) < 0.5e-3
     assert np.percentile(distance, 95) < 1e-3
     assert len(mesh.vertices) > 50_000
-
-
-_PRESSED_WHILE_IT_LOADS = """
-import os, signal, sys
-import numpy as np
-from tsfusion import Mesh
-
-class Pressing:
-    def find_spec(self, name, *_):
-        if name == "scipy.spatial":
-            sys.meta_path.remove(self)
-            os.kill(os.getpid(), int(sys.argv[1]))
-
-sys.meta_path.insert(0, Pressing())
-signal.signal(signal.SIGTERM, lambda *_: sys.exit("terminated"))
-floats = np.eye(3, dtype=np.float32)
-try:
-    Mesh(floats, np.array([[0, 1, 2]], dtype=np.int32), floats, None).encode(".ply")
-except KeyboardInterrupt:
-    sys.exit("interrupted")
-"""
-
-
-@pytest.mark.parametrize(("number", "word"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")])
-def test_who_wants_it_to_end_is_heard_while_trimesh_loads(number: signal.Signals, word: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", _PRESSED_WHILE_IT_LOADS, str(int(number))],
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
-    assert (done.returncode, done.stderr.strip()) == (1, word)

@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: MIT
+"""Blocks are found by their keys, and by nothing else."""
+
+import numpy as np
+import pytest
+from ray_maps import CASES, RayMap
+
+from tsfusion.kernels import block_hash, runtime
+
+
+@pytest.fixture(scope="module", autouse=True)
+def taichi() -> None:
+    runtime.start(2)
+
+
+def test_the_map_hash_finds_what_was_inserted_and_nothing_else() -> None:
+    keys = np.unique(np.random.default_rng(4).integers(1, 1 << 62, 3000))
+    table, slots = np.zeros(8192, np.int64), np.zeros(8192, np.int32)
+    block_hash.insert_blocks(keys, 0, 1000, 0, table, slots)
+    block_hash.insert_blocks(keys, 1000, 1000, 1000, table, slots)
+    found = np.empty(len(keys), np.int32)
+    block_hash.find_blocks(keys, table, slots, found)
+    assert (found == np.where(np.arange(len(keys)) < 2000, np.arange(len(keys)), -1)).all()
+
+
+def test_dropped_blocks_are_not_found_and_the_rest_are() -> None:
+    here = RayMap()
+    here.apply(CASES["many"])
+    keys, kept = here.store.keys.copy(), here.store.count - 5
+    here.store.sums[kept:] = 0
+    here.store.drop(kept)
+    found = here.store.slots_of(keys)
+    assert (found == np.where(np.arange(len(keys)) < kept, np.arange(len(keys)), -1)).all()
