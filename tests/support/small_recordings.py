@@ -118,7 +118,7 @@ def replace(name: str, old: str, new: str) -> Change:
     )
 
 
-def one_line(open_: Callable[[], object], match: str = "") -> None:
+def one_line(open_: Callable[[], object], match: str | None = None) -> None:
     """Opening must raise a DatasetError of one line that matches."""
     with pytest.raises(DatasetError, match=match) as caught:
         open_()
