@@ -3,6 +3,7 @@
 
 import json
 import os
+import re
 import select
 import shutil
 import signal
@@ -26,6 +27,7 @@ from tsfusion.wire.queries import fetch_mesh, fetch_status
 
 START_DEADLINE = 180.0  # seconds; a cold kernel compilation on a slow machine
 STOP_DEADLINE = 60.0  # seconds; draining and the checkpoint
+_ROUTINE = re.compile("tsfusion: (DEBUG|INFO|WARNING): ")  # lines of a server's log that are no error
 MAPS = 16  # that a run's own server may have open: its default one, and one for each submap
 
 
@@ -66,8 +68,8 @@ class ServerChild:
         """Raise TransportError, with the server's own error message, unless it is running."""
         if self._process.poll() is not None:
             lines = self._log.read_text(encoding="utf-8", errors="replace").splitlines()
-            errors = [line.removeprefix("tsfusion") for line in lines if line.startswith("tsfusion: ")]
-            reason = errors[-1] if errors else "; was it killed?"
+            errors = [line for line in lines if line.startswith("tsfusion: ") and not _ROUTINE.match(line)]
+            reason = errors[-1].removeprefix("tsfusion") if errors else "; was it killed?"
             raise TransportError(f"the server ended with status {self._process.returncode}{reason}")
 
     def stop(self) -> None:
