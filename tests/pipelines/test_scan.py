@@ -35,7 +35,7 @@ SOURCE = "synthetic:room"
 # As on a robot without Taichi: importing it fails.
 BARE = "import sys; sys.modules['taichi'] = None; from tsfusion.__main__ import main; main(sys.argv[1:])"
 IMPATIENT = (
-    "import sys; from tsfusion.pipelines import scan; scan._LINGER = 0.5; "
+    "import sys; from tsfusion.pipelines import engine; engine.LINGER = 0.5; "
     "from tsfusion.__main__ import main; main(sys.argv[1:])"
 )
 
