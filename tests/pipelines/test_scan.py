@@ -232,7 +232,7 @@ def test_the_client_is_light() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [40, pytest.param(125, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("count", [25, pytest.param(125, marks=pytest.mark.nightly)])
 def test_a_mesh_with_poses_of_its_own_is_as_good_as_with_the_true_ones(
     data, tmp_path: Path, count: int
 ) -> None:

@@ -56,7 +56,7 @@ class MetricsPage:
         self._pages = pages
         self._listener = _listen(address)
         self.address = _text(*self._listener.getsockname()[:2])
-        self._open: list[asyncio.Task[None]] = []  # the oldest first
+        self._open: dict[asyncio.Task[None], asyncio.StreamWriter] = {}  # the oldest first
         self._loop = asyncio.new_event_loop()
         self._ending = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="metrics", daemon=True)
@@ -77,26 +77,36 @@ class MetricsPage:
     async def _serve(self) -> None:
         server = await asyncio.start_server(self._connected, sock=self._listener, limit=HEAD_BYTES)
         await self._ending.wait()
+        # asyncio leaves a connection open that is being accepted while the server closes.
+        self._loop.remove_reader(self._listener.fileno())
+        for _ in range(5):
+            await asyncio.sleep(0)
         server.close()
-        others = asyncio.all_tasks() - {asyncio.current_task()}
-        for task in others:
+        tasks = list(self._open)
+        for task in tasks:
             task.cancel()
-        await asyncio.gather(*others, return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)
+        for _ in range(3):  # the transports close their sockets
+            await asyncio.sleep(0)
 
-    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None
+    def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if len(self._open) >= CONNECTIONS:
-            self._open.pop(0).cancel()
-        self._open.append(task)
-        try:
-            await asyncio.wait_for(self._exchange(reader, writer), DEADLINE)
-        except (OSError, EOFError, asyncio.TimeoutError, asyncio.LimitOverrunError):
-            pass  # the peer's own fault, and it does not read any more
-        finally:
-            with suppress(ValueError):
-                self._open.remove(task)
+            oldest = next(iter(self._open))
+            oldest.cancel()
+            self._ended(oldest)
+        task = self._loop.create_task(self._converse(reader, writer))
+        self._open[task] = writer
+        task.add_done_callback(self._ended)
+
+    def _ended(self, task: "asyncio.Task[None]") -> None:
+        writer = self._open.pop(task, None)
+        if writer is not None:
             writer.transport.abort()  # by now all is sent, or nobody reads it
+
+    async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        # The peer's own fault, and it does not read any more.
+        with suppress(OSError, EOFError, asyncio.TimeoutError, asyncio.LimitOverrunError):
+            await asyncio.wait_for(self._exchange(reader, writer), DEADLINE)
 
     async def _exchange(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
