@@ -100,14 +100,20 @@ def test_what_is_acknowledged_makes_room(full_disk: Path) -> None:
 
 def test_a_read_only_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As the kernel makes it after errors: nothing can be created or written, what is there can be read."""
-    usual, read_only = Path.open, [False]
+    usual, usual_os, read_only = Path.open, os.open, [False]
 
     def refusing(path: Path, mode: str = "r", *rest: Any, **options: Any) -> Any:
         if read_only[0] and mode not in ("r", "rb"):
             raise OSError(errno.EROFS, "Read-only file system")
         return usual(path, mode, *rest, **options)
 
+    def refusing_os(path: Any, flags: int, *rest: Any, **options: Any) -> int:
+        if read_only[0] and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
+            raise OSError(errno.EROFS, "Read-only file system")
+        return usual_os(path, flags, *rest, **options)
+
     monkeypatch.setattr(Path, "open", refusing)
+    monkeypatch.setattr(os, "open", refusing_os)
     config = ClientConfig(policy="spool_all", segment_bytes=1 << 16)
     with scripted(taking=False) as server, joined(server, spool=tmp_path, config=config) as client:
         assert [client.send(noise(i)) for i in range(4)] == [1, 2, 3, 4]

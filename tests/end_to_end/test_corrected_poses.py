@@ -335,5 +335,5 @@ def test_what_an_earlier_development_version_left_is_named(
     with serving(state) as server, Client(server.address, spool=spool) as client:
         scan(client)
         assert server.terminate() == 0
-        assert server.said().count("as an earlier development version kept them") == 1
+        assert server.stderr_text().count("as an earlier development version kept them") == 1
         assert caplog.text.count("as an earlier development version kept them") == 1

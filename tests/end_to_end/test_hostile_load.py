@@ -18,16 +18,16 @@ def test_memory_that_does_not_come_back_is_reported_once(monkeypatch: pytest.Mon
     bound = MemoryGuard(800)
     reported = []
     for held in (700, 800, 850, 900, 950, 960, 980, 1080, 1090, 400, 790, 810):  # noqa: B007
-        reported.append(bound.excess(elsewhere=0))
+        reported.append(bound.excess(uncounted=0))
     assert reported == [0, 0, 850, 0, 0, 960, 0, 1080, 0, 0, 0, 810]
-    assert bound.excess(elsewhere=100) == 0
+    assert bound.excess(uncounted=100) == 0
 
 
 def test_memory_that_was_freed_counts_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     held = [900]
     monkeypatch.setattr(process, "rss_bytes", lambda: held[0])
     monkeypatch.setattr(process, "give_back_memory", lambda: held.__setitem__(0, 500))
-    assert MemoryGuard(800).excess(elsewhere=0) == 0
+    assert MemoryGuard(800).excess(uncounted=0) == 0
 
 
 WITHOUT_KEYS = (

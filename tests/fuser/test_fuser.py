@@ -165,10 +165,10 @@ def test_corrections_are_noted_and_leave_the_map_as_it_is(tmp_path: Path) -> Non
         positions.append(log.append(frames, session=SESSION, seq=seq))
     log.close()
     fuser, link = opened(tmp_path, checkpoint_every=1)
-    fuser.take(order(0, positions[0]))
+    fuser.handle(order(0, positions[0]))
     before = status(fuser, link)
     for index, reason in ((1, None), (2, "header")):
-        fuser.take(msgspec.structs.replace(order(index, positions[index]), is_correction=True))
+        fuser.handle(msgspec.structs.replace(order(index, positions[index]), is_correction=True))
         assert link.done().reason == reason
     fuser.mesh()
     assert link.last().count == 3

@@ -45,7 +45,7 @@ def test_each_client_gets_its_turn() -> None:
     for seq in (1, 2):
         index.add(Position(2, seq), small, seq)
         backlog.add(small)
-    assert backlog.waiting == 14
+    assert (backlog.keyframes, backlog.corrections) == (14, 0)
     assert handed_out(backlog, 4) == [("a", 1), ("b", 1), ("a", 1), ("b", 2)]
     assert len(handed_out(backlog, 100)) == 10
     assert handed_out(backlog, 100) == []
