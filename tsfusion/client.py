@@ -123,8 +123,8 @@ class Client:
 
         A correction is a record like a keyframe: its number is the session's next, it waits in the spool
         until the server has it on its disk (`stats.corrections_acknowledged`), and it is None when the spool
-        cannot keep it (`stats.skipped`). The newest pose of a keyframe counts; one that is not named keeps
-        its pose. Never waits, whatever the policy.
+        cannot keep it (`stats.corrections_refused`). The newest pose of a keyframe counts; one that is not
+        named keeps its pose. Never waits, whatever the policy.
 
         Args:
             poses: by the number that `send` returned, (4, 4) float64 `T_world_camera`.

@@ -281,7 +281,8 @@ def test_a_correction_that_the_spool_cannot_keep_is_counted(tmp_path: Path) -> N
         assert client.correct(many, removed=[client.stats.sent]) in (None, client.stats.sent + 1)
         while client.correct(many) is not None:
             pass
-        assert client.stats.skipped == {"spool": skipped + 1}
+        assert client.stats.skipped == {"spool": skipped}  # keyframes alone
+        assert client.stats.corrections_refused == {"spool": 1}
         assert client.stats.state == "spool"
 
 

@@ -139,7 +139,7 @@ def test_what_the_server_refuses_is_told_and_kept_aside(tmp_path: Path) -> None:
         client.correct({seq: pose(101)})
         with pytest.raises(KeyframeRefused, match=r"correction 2 was refused \(quota\): a sensor may be 100"):
             client.flush(DEADLINE)
-        assert client.stats.refused == {"quota": 1}
+        assert (client.stats.refused, client.stats.corrections_refused) == ({}, {"quota": 1})
         assert len(list((tmp_path / "spool" / "refused").glob("*.mcap"))) == 1
         client.correct({seq: pose(99)})
         scan(client, 1)

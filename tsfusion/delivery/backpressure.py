@@ -85,7 +85,7 @@ class Backpressure:
     def _write(self, frames: list[bytes], keyframe: Keyframe | None) -> int | None:
         outbox, nbytes = self._outbox, sum(map(len, frames))
         if reason := self._why_full(nbytes):
-            outbox.skip(reason)
+            outbox.skip(reason, is_correction=keyframe is None)
             return None
         try:
             entry = outbox.write(frames)
@@ -93,7 +93,7 @@ class Backpressure:
             if error.errno is None:
                 raise
             self._limits.on_failed_write(error)
-            outbox.skip("disk")
+            outbox.skip("disk", is_correction=keyframe is None)
             return None
         self._limits.on_write(nbytes)
         outbox.add(entry, keyframe)

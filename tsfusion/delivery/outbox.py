@@ -32,15 +32,17 @@ class ClientStats(Struct, frozen=True):
         sent: keyframes that `send` took.
         durable: keyframes on the server's disk.
         fused: keyframes in the server's map.
-        refused: turned away by the server (or unreadable here) for good, corrections too: reason → count.
-        rejected: on the server's disk, but the map could not take it: reason → count.
-        skipped: never sent: reason → count. `thinned` and `dropped` by the policy (a dropped one was taken
-            before), `spool` (it has reached `spool_bytes`), `disk` (full, failing or read-only).
+        refused: keyframes that the server turned away (or that are unreadable here) for good: reason → count.
+        rejected: keyframes on the server's disk that the map could not take: reason → count.
+        skipped: keyframes that were never sent: reason → count. `thinned` and `dropped` by the policy (a
+            dropped one was taken before), `spool` (it has reached `spool_bytes`), `disk` (full, failing or
+            read-only).
         waiting: keyframes and corrections in the spool.
         waiting_bytes: the bytes of those.
         state: of the spool: `ok`, or the reason why it cannot keep all that comes: `spool` or `disk`.
         corrections_sent: corrections that `correct` took.
         corrections_acknowledged: corrections on the server's disk.
+        corrections_refused: corrections that were skipped, refused or rejected: reason → count.
     """
 
     sent: int
@@ -54,6 +56,7 @@ class ClientStats(Struct, frozen=True):
     state: str
     corrections_sent: int = 0
     corrections_acknowledged: int = 0
+    corrections_refused: dict[str, int] = {}
 
 
 class Outbox:
@@ -84,6 +87,7 @@ class Outbox:
         self._corrections_sent = self._corrections_durable = 0
         self._corrections = {entry.seq for entry in spool.waiting if entry.is_correction}  # not noted yet
         self._refused: Counter[str] = Counter()
+        self._corrections_refused: Counter[str] = Counter()
         self._refusal_count = 0  # of which `flush` has not complained yet
         self._first_refusal = ""  # of those, in words
         self._rejected: Counter[str] = Counter()
@@ -159,10 +163,10 @@ class Outbox:
             self._sent += 1
             self._times.add(entry.seq, timestamp_ns=keyframe.timestamp_ns, captured_ns=keyframe.captured_ns)
 
-    def skip(self, reason: str) -> None:
+    def skip(self, reason: str, *, is_correction: bool = False) -> None:
         """Count a record that is not sent."""
         with self._changed:
-            self._skipped[reason] += 1
+            (self._corrections_refused if is_correction else self._skipped)[reason] += 1
 
     def usage(self) -> tuple[int, int]:
         """Bytes of the disk that the spool takes, and records in it."""
@@ -340,7 +344,7 @@ class Outbox:
         with self._changed:
             is_correction = seq in self._corrections
             if seq not in self._rejected_seqs:
-                self._rejected[reason] += 1
+                (self._corrections_refused if is_correction else self._rejected)[reason] += 1
                 self._rejected_seqs[seq] = None
                 if len(self._rejected_seqs) > _MOST_REMEMBERED:
                     self._rejected_seqs.popitem(last=False)
@@ -363,7 +367,7 @@ class Outbox:
             self._spool.remove(place)
             self._corrections.discard(entry.seq)
             self._claimed = 0
-            self._refused[reason] += 1
+            (self._corrections_refused if entry.is_correction else self._refused)[reason] += 1
             if not self._refusal_count:
                 self._first_refusal = f"{entry.kind} {entry.seq} was refused ({reason}): {message}"
             self._refusal_count += 1
@@ -429,6 +433,7 @@ class Outbox:
                 state=self.state,
                 corrections_sent=self._corrections_sent,
                 corrections_acknowledged=self._corrections_durable,
+                corrections_refused=dict(self._corrections_refused),
             )
 
     def close(self) -> bool:
