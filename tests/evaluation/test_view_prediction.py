@@ -43,8 +43,7 @@ def test_points_in_the_world() -> None:
 
 
 @pytest.mark.parametrize(
-    "camera",
-    [CAMERA, Intrinsics(200.0, 210.0, 60.25, 80.75), Intrinsics(200.0, -190.0, 90.0, 40.0)],
+    "camera", [CAMERA, Intrinsics(200.0, 210.0, 60.25, 80.75), Intrinsics(200.0, -190.0, 90.0, 40.0)]
 )
 def test_the_depth_of_a_tilted_plane_through_any_pinhole(camera: Intrinsics) -> None:
     """z = 2 + 0.3 x - 0.2 y, met by a ray in closed form."""

@@ -148,21 +148,13 @@ SEQUENCE = "sequences/06"
         ("stereo", put(f"{SEQUENCE}/image_0/000002.png", "x"), r"image_0/000002\.png cannot be decoded"),
         ("stereo", put(f"{SEQUENCE}/image_0/000002.png", HUGE), r"image_0/000002\.png cannot be decoded"),
         ("stereo", put(f"{SEQUENCE}/image_0/copy.png", "x"), r"copy\.png is not named by a frame number"),
-        (
-            "stereo",
-            put(f"{SEQUENCE}/calib.txt", "hello"),
-            r"calib\.txt:1: 'hello'; expected `name: numbers`",
-        ),
+        ("stereo", put(f"{SEQUENCE}/calib.txt", "hello"), r"calib\.txt:1: 'hello'; expected `name: numbers`"),
         (
             "stereo",
             put(f"{SEQUENCE}/calib.txt", f"P0: {P0}\nP1: 1 2\n"),
             r"no usable line P1; expected `P1:` and 12 finite",
         ),
-        (
-            "stereo",
-            put(f"{SEQUENCE}/calib.txt", f"P0: {P1}\nP1: {P0}\n"),
-            r"P1 must lie to the right of P0",
-        ),
+        ("stereo", put(f"{SEQUENCE}/calib.txt", f"P0: {P1}\nP1: {P0}\n"), r"P1 must lie to the right of P0"),
         (
             "stereo",
             put(f"{SEQUENCE}/calib.txt", None),

@@ -18,10 +18,7 @@ from tsfusion.geometry.keyframe import Intrinsics
     ("change", "match"),
     [
         (put("poses.txt", (ROW + "\n") * 2), r"poses\.txt has 2 poses for 3 depth images"),
-        (
-            put("poses.txt", ROW + "\n" + ROW.replace("0.5", "inf") + "\n" + ROW),
-            r"poses\.txt:2: not finite",
-        ),
+        (put("poses.txt", ROW + "\n" + ROW.replace("0.5", "inf") + "\n" + ROW), r"poses\.txt:2: not finite"),
         (put("images/00001.png", None), r"00001\.png or \.jpg is missing, but .*depth"),
         (put("K.txt", None), r"K\.txt is missing; expected a 3×3 camera matrix"),
     ],

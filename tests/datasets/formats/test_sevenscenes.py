@@ -75,10 +75,7 @@ def test_frames_without_a_pose_are_skipped_and_counted(tmp_path):
             put("frame-000001.color.png", None),
             r"frame-000001\.color\.png is missing; expected a colour image",
         ),
-        (
-            put("frame-000001.pose.txt", POSE.replace("0.5", "nan")),
-            r"frame-000001\.pose\.txt:1: not finite",
-        ),
+        (put("frame-000001.pose.txt", POSE.replace("0.5", "nan")), r"frame-000001\.pose\.txt:1: not finite"),
         (
             put("frame-000001.pose.txt", POSE.replace("0.5", "0.5x")),
             r"pose\.txt:1: could not convert .*0\.5x",

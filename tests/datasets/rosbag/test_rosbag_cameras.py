@@ -84,10 +84,7 @@ def test_binning_and_regions_move_the_camera(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("info", "message"),
-    [
-        ({"width": 99}, "its CameraInfo says 99×48"),
-        ({"k": np.zeros(9), "p": np.zeros(12)}, "fx > 0"),
-    ],
+    [({"width": 99}, "its CameraInfo says 99×48"), ({"k": np.zeros(9), "p": np.zeros(12)}, "fx > 0")],
 )
 def test_cameras_that_do_not_fit_are_refused(tmp_path: Path, info: dict[str, Any], message: str) -> None:
     with pytest.raises(DatasetError, match=message):

@@ -478,12 +478,7 @@ def test_corrections_move_the_tracking_keyframes(feed: PoseFeed) -> None:
         assert feed.corrections() is None
         move = np.eye(4)
         move[0, 3] = 7.0
-        send(
-            {
-                **posed(1.1),
-                "corrections": {"stamps_ns": [], "poses": [], "T_corrected_world": seven(move)},
-            }
-        )
+        send({**posed(1.1), "corrections": {"stamps_ns": [], "poses": [], "T_corrected_world": seven(move)}})
         follow(feed, 1.1)
         second = feed.corrections()
         assert second is not None
