@@ -142,14 +142,10 @@ def test_seven_scenes_depth_fits_colour_twice_as_well(data: Data) -> None:
     fits = []
     for index in range(0, 125, 16):
         frame = raw.frame(index)
-        assert frame.color is not None
-        assert frame.depth_m is not None
         fits.append(edge_fit(frame.color, registration.depth_of_color(frame.depth_m)))
     assert np.mean(fits) > 2.1
 
 
 def _fit(dataset: SevenScenes, index: int) -> float:
     frame = dataset.frame(index)
-    assert frame.color is not None
-    assert frame.depth_m is not None
     return edge_fit(frame.color, frame.depth_m)

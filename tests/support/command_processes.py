@@ -47,7 +47,6 @@ _unread: "WeakKeyDictionary[subprocess.Popen[str], bytes]" = WeakKeyDictionary()
 
 def read_until(process: "subprocess.Popen[str]", word: str, timeout: float = DEADLINE) -> str:
     """The first line that holds `word`."""
-    assert process.stdout is not None
     deadline = time.monotonic() + timeout
     seen, rest = [], _unread.pop(process, b"")
     with selectors.DefaultSelector() as selector:

@@ -57,7 +57,6 @@ def plane_keyframe(T: NDArray[np.float64], normal: NDArray[np.float64], offset: 
 
 def with_noise(keyframe: Keyframe, sigma: float, random: np.random.Generator) -> Keyframe:
     """The same view with Gaussian noise of `sigma` metres on its depth."""
-    assert keyframe.depth is not None
     noisy = keyframe.depth + sigma * random.standard_normal(keyframe.depth.shape)
     depth = np.where(keyframe.depth > 0, noisy, 0).astype(np.float32)
     return Keyframe(depth=depth, intrinsics=keyframe.intrinsics, T_world_camera=keyframe.T_world_camera)

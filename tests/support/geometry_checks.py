@@ -23,7 +23,6 @@ def warp_residual(
     q = move(T_b_a, p[p[:, 2] < max_depth])
     q = q[q[:, 2] > 0.1]
     K, seen = b.intrinsics, depth_metres(b)
-    assert K is not None
     u = np.rint(q[:, 0] / q[:, 2] * K.fx + K.cx).astype(int)
     v = np.rint(q[:, 1] / q[:, 2] * K.fy + K.cy).astype(int)
     inside = (u >= 0) & (v >= 0) & (u < seen.shape[1]) & (v < seen.shape[0])

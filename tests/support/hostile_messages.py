@@ -79,7 +79,6 @@ def bad_values() -> Iterator[Frames]:
             yield with_header(good(), pose=tuple(pose[:at] + [value] + pose[at + 1 :]))
         frames = good()
         header = unpack(frames[0])
-        assert header.intrinsics is not None
         yield with_header(frames, intrinsics=msgspec.structs.replace(header.intrinsics, fx=value))
         yield with_header(frames, scale=value)
     yield with_header(good(), pose=tuple(np.diag([1.0, 1.0, -1.0, 1.0])[:3].ravel().tolist()))

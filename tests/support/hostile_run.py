@@ -163,7 +163,6 @@ def _attack(server: Server, public: str, name: str, seconds: float, rss: Rss) ->
         at = [server.address, server.control, server.publish, public]
         command = [sys.executable, str(_ATTACK), name, *at, str(seconds)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-            assert process.stdout is not None
             process.stdout.readline()
             started = time.monotonic()
             rss.highest()

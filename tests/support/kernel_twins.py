@@ -200,12 +200,6 @@ def smooth(
     return {voxel: float(np.mean(xs)) for voxel, xs in votes.items()}
 
 
-def raw_values(sums: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Σ w·m / Σ w, 0 where there is no weight."""
-    weight = sums & 0x7FFFFFF
-    return np.where(weight > 0, (sums >> 27) / np.maximum(weight, 1), 0.0)
-
-
 def marching_cubes(values: dict[Voxel, float]) -> list[tuple[tuple[float, float, float], ...]]:
     """Triangles, as positions in voxels (voxel centres at + 0.5), over all cells with eight known corners."""
     triangles = []

@@ -136,7 +136,6 @@ class Server:
 
     def wait_ready(self) -> bool:
         """Wait until it prints where it listens; False when it ended instead."""
-        assert self.process.stdout is not None
         self.address, self.control, self.publish = (self.process.stdout.readline().split() or [""] * 3)[:3]
         return bool(self.address)
 
@@ -160,7 +159,6 @@ class Server:
         """End it, if need be, and close its files."""
         if self.process.poll() is None:
             self.kill()
-        assert self.process.stdout is not None
         self.process.stdout.close()
         self._words.close()
 

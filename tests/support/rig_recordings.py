@@ -54,8 +54,6 @@ def euroc(root: Path, model: str = "radial-tangential", *, count: int = 3) -> Pa
         place = root / "mav0" / f"cam{side}"
         rows = ["#timestamp [ns],filename\r"]
         for number, view in enumerate(at(poses, width=640)):
-            assert view.color is not None
-            assert view.intrinsics is not None
             stamp = FIRST_NS + number * 50_000_000 + side * 1000
             image = cv2.cvtColor(through_lens(view.color, view.intrinsics, camera), cv2.COLOR_BGR2GRAY)
             write(place / "data" / f"{stamp}.png", image)
@@ -118,7 +116,6 @@ def kitti_raw(root: Path, *, count: int = 3, cameras: tuple[str, ...] = ("00", "
     for camera in cameras:
         poses = [T @ _column((BASELINES[camera], 0, 0)) + T for T in T_world_rectified]
         for number, view in enumerate(at(poses, width=480)):
-            assert view.color is not None
             grey = camera in ("00", "01")
             image = cv2.cvtColor(view.color, cv2.COLOR_BGR2GRAY) if grey else view.color
             write(drive / f"image_{camera}" / "data" / f"{number:010d}.png", image)

@@ -31,7 +31,6 @@ def scan(bag: BagWriter, keyframes: list[Keyframe]) -> None:
     bag.transform(T_BODY_OPTICAL, BODY, OPTICAL, T0, static=True)
     for i, keyframe in enumerate(keyframes):
         stamp = T0 + i * FRAME_NS
-        assert keyframe.color is not None
         infos(bag, stamp, keyframe.shape, keyframe.intrinsics)
         bag.transform(keyframe.T_world_camera @ se3.inverse(T_BODY_OPTICAL), WORLD, BODY, stamp)
         bag.image(DEPTH, keyframe.measurement, "16UC1", stamp)

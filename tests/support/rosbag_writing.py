@@ -79,8 +79,6 @@ class BagWriter:
               *, big: bool = False, padding: int = 0, **wrong: Any) -> None:  # fmt: skip
         """A structured (height, width) array as it lies in memory."""
         codes = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
-        assert records.dtype.names is not None
-        assert records.dtype.fields is not None
         fields = [
             self.make("sensor_msgs/msg/PointField", name=name, offset=records.dtype.fields[name][1],
                       datatype=codes[records.dtype[name].str[1:]], count=1)

@@ -94,7 +94,6 @@ def correction_number(record: journal.Record) -> int:
     """The number that `scan` gave a correction."""
     header = unpack(record.frames[0])
     assert isinstance(header, CorrectionHeader)
-    assert header.T_map_odometry is not None
     return round(header.T_map_odometry[3])
 
 

@@ -121,7 +121,6 @@ class Scanner:
     @property
     def taken(self) -> int:
         """Number of keyframes that all its processes logged as taken."""
-        assert self.plan.log is not None
         log = Path(self.plan.log)
         return len(log.read_bytes().split()) if log.exists() else 0
 
@@ -137,7 +136,6 @@ class Scanner:
 
     def report(self) -> Report:
         """Report of the process that saw everything fused."""
-        assert self.plan.report is not None
         return msgspec.json.decode(Path(self.plan.report).read_bytes(), type=Report)
 
     def close(self) -> None:

@@ -39,8 +39,6 @@ def check(dataset: Dataset, expected: tuple[Keyframe, ...], *, depth_m: float = 
     assert len(dataset) == len(expected)
     found = list(dataset)
     for a, b in zip(found, expected, strict=True):
-        assert a.color is not None
-        assert b.color is not None
         np.testing.assert_allclose(depth_metres(a), depth_metres(b), atol=depth_m)
         assert shift(a.color, b.color) < 0.15
         np.testing.assert_allclose(a.intrinsics.matrix, b.intrinsics.matrix, rtol=1e-5)
@@ -104,7 +102,6 @@ def scannet(root: Path, count: int = 4, *, lost: tuple[int, ...] = (), frames25k
     left, top = 20, 9  # of the colour image something is missing there
     for number, view in enumerate(views(count)):
         color = wide[number].color
-        assert color is not None
         name = f"{number * 7:06d}" if frames25k else str(number * 7)
         write(root / "color" / f"{name}.jpg", color[top:, left:])
         write(root / "depth" / f"{name}.png", millimetres(view))
@@ -112,12 +109,10 @@ def scannet(root: Path, count: int = 4, *, lost: tuple[int, ...] = (), frames25k
         (root / "pose").mkdir(exist_ok=True)
         (root / "pose" / f"{name}.txt").write_text(matrix(T))
     K = wide[0].intrinsics
-    assert K is not None
     cameras = {"depth": views(1)[0].intrinsics, "color": Intrinsics(K.fx, K.fy, K.cx - left, K.cy - top)}
     place = root if frames25k else root / "intrinsic"
     place.mkdir(exist_ok=True)
     for name, camera in cameras.items():
-        assert camera is not None
         file = f"intrinsics_{name}.txt" if frames25k else f"intrinsic_{name}.txt"
         (place / file).write_text(matrix(camera_matrix(camera)))
         (place / f"extrinsic_{name}.txt").write_text(matrix(np.eye(4)))
@@ -127,7 +122,6 @@ def scannet(root: Path, count: int = 4, *, lost: tuple[int, ...] = (), frames25k
 def replica(root: Path, count: int = 4) -> Path:
     """`Replica/room0` of NICE-SLAM's archive, with the camera one folder up."""
     for number, view in enumerate(views(count)):
-        assert view.color is not None
         write(root / "results" / f"frame{number:06d}.jpg", view.color)
         units = np.rint(depth_metres(view) * 6553.5).astype(np.uint16)
         write(root / "results" / f"depth{number:06d}.png", units)
@@ -154,8 +148,6 @@ def transforms(root: Path, *, lens: Camera | None = None, shrink: int = 1, count
     frames = []
     for number, view in enumerate(views(count)):
         K, color, depth = view.intrinsics, view.color, millimetres(view)
-        assert K is not None
-        assert color is not None
         if lens is not None:
             color, depth = (through_lens(image, K, lens) for image in (color, depth))
             K = lens.intrinsics

@@ -90,7 +90,6 @@ def test_extraction_equals_the_twin_on_noise(known: float) -> None:
     for i in range(0, len(mesh.vertices), 29):
         normal, rgb = kernel_twins.vertex(values, colors, mesh.vertices[i].astype(np.float64))
         assert np.allclose(mesh.normals[i], normal, atol=1e-3)
-        assert mesh.colors is not None
         assert np.abs(mesh.colors[i] - rgb).max() <= 1
 
 
@@ -124,7 +123,6 @@ def test_a_sphere_is_closed_with_the_right_radius_and_normals() -> None:
     outward = mesh.vertices / distance[:, None]
     assert (mesh.normals * outward).sum(axis=1).min() > 0.9
     assert (solid.face_normals * outward[mesh.faces[:, 0]]).sum(axis=1).min() > 0
-    assert mesh.colors is not None
     assert (mesh.colors == (220, 120, 20)).all()
 
 
@@ -179,14 +177,12 @@ def test_a_part_equals_the_same_cells_of_the_whole(known: float) -> None:
     store, keys, _, _ = random_map(5, known)
     keys = np.sort(keys)
     whole = extract(keys, store, 1.0)
-    assert whole.colors is not None
     looks = {tuple(v): (*n, *c) for v, n, c in zip(
         whole.vertices.tolist(), whole.normals.tolist(), whole.colors.tolist(), strict=True)}  # fmt: skip
     scratch = MeshBuffers()  # what an earlier mesh left in it must not show
     total: Counter = Counter()
     for part in (keys[:0], keys[:1], keys[1:8], keys[8:9], keys[9:]):
         mesh = extract(part, store, 1.0, scratch)
-        assert mesh.colors is not None
         total += triangles_of(mesh)
         for v, n, c in zip(mesh.vertices.tolist(), mesh.normals.tolist(), mesh.colors.tolist(), strict=True):
             assert looks[tuple(v)] == (*n, *c)

@@ -57,7 +57,6 @@ def expected_rays(
 ) -> tuple[list[NDArray[np.int32]], int]:
     """Rays by tile, cell and layer, and how many samples went into them."""
     K, T = keyframe.intrinsics, keyframe.T_world_camera
-    assert K is not None
     metres = depth_of(keyframe, parameters)
     pitch = max(1 / abs(K.fx), 1 / abs(K.fy)) / voxel_size
     rays, used = [], 0

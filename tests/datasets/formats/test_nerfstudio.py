@@ -96,7 +96,6 @@ def test_distorted_captures_are_undistorted(tmp_path, lens):
     good = warp_residual(frames[0], view, T_b_a=np.eye(4))
     assert good < 0.003
     K = view.intrinsics
-    assert K is not None
     seen = written_recordings.through_lens(view.color, K, Camera(frames[0].intrinsics, (120, 160)))
     assert written_recordings.shift(frames[0].color, seen) < 0.1
     rewrite(tmp_path, lambda capture: [capture.pop(f"k{i}") for i in (1, 2)])

@@ -73,7 +73,6 @@ def redwood_room(root: Path, color: str, log: str, depth: str = "depth") -> Path
     K = Intrinsics(525, 525, 319.5, 239.5)
     text = ""
     for number, view in enumerate(views()):
-        assert view.color is not None
         written_recordings.write(root / depth / f"{number:05d}.png", millimetres(view))
         written_recordings.write(root / color / f"{number:05d}.jpg", view.color)
         text += f"{number}\t{number}\t{number + 1}\n{matrix(view.T_world_camera)}"

@@ -17,7 +17,6 @@ from tsfusion.geometry.keyframe import Intrinsics
 
 def replica_with_camera(root: Path, **changed: object) -> Path:
     K = views(1)[0].intrinsics
-    assert K is not None
     camera = {"w": 160, "h": 120, "fx": K.fx, "fy": K.fy, "cx": K.cx, "cy": K.cy, "scale": 6553.5}
     root.mkdir()
     (root / "cam_params.json").write_text(json.dumps({"camera": {**camera, **changed}}))

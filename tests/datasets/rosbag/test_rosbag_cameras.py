@@ -78,7 +78,6 @@ def test_binning_and_regions_move_the_camera(tmp_path: Path) -> None:
     path = of_camera(tmp_path, shape=(12, 20), binning_x=2, binning_y=2,
                      roi={"x_offset": 8, "y_offset": 4, "width": 40, "height": 24})  # fmt: skip
     camera = Bag(path, posed=False).frame(0).intrinsics
-    assert camera is not None
     assert (camera.fx, camera.cx, camera.cy) == (20.0, (31.5 - 8) / 2, (23.5 - 4) / 2)
 
 

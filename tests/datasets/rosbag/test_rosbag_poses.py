@@ -69,7 +69,6 @@ def test_no_pose_is_made_up_across_a_gap(tmp_path: Path) -> None:
             bag.transform(turning(i * 0.1), WORLD, OPTICAL, T0 + i * 100_000_000)
     found = Bag(path)
     assert found.skipped == {"without a pose in time": 6}
-    assert found.timestamps_ns is not None
     assert found.timestamps_ns.tolist() == [stamps[i] for i in (0, 1, 2, 7)]
     everything = Bag(path, posed=False)
     known = [everything.frame(i).T_world_camera is not None for i in range(10)]

@@ -102,7 +102,6 @@ def rewritten(
         channels: dict[int, int] = {}
         for schema, channel, message in make_reader(file).iter_messages():
             if channel.id not in channels:
-                assert schema is not None
                 kind = writer.register_schema(schema.name, encoding, schema.data)
                 channels[channel.id] = writer.register_channel(channel.topic, "cdr", kind)
             writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)

@@ -171,7 +171,6 @@ class Sender:
         self._process = subprocess.Popen(
             [sys.executable, str(SENDER), address, "connect"], stdin=subprocess.PIPE, text=True
         )
-        assert self._process.stdin is not None
         self._lines: IO[str] = self._process.stdin
 
     def say(self, seconds: float, rest: str) -> None:
@@ -238,8 +237,6 @@ def test_the_documented_sender_passes_over_what_is_no_pose(feed: PoseFeed) -> No
         [sys.executable, str(SENDER), feed.address, "connect"], stdin=subprocess.PIPE, stderr=subprocess.PIPE,
         text=True,
     ) as sender:  # fmt: skip
-        assert sender.stdin is not None
-        assert sender.stderr is not None
         until = time.monotonic() + DEADLINE
         sender.stdin.write("\n".join((*lines, "NaN 0 0 0 0 0 0 1", "Infinity lost", "")))
         while not feed.received:
@@ -481,7 +478,6 @@ def test_corrections_move_the_tracking_keyframes(feed: PoseFeed) -> None:
         send({**posed(1.1), "corrections": {"stamps_ns": [], "poses": [], "T_corrected_world": seven(move)}})
         follow(feed, 1.1)
         second = feed.corrections()
-        assert second is not None
         assert second.revision == 2
         np.testing.assert_allclose(second.T_corrected_world, move, atol=1e-12)
 
@@ -539,7 +535,6 @@ def test_history_forgets_the_oldest_and_takes_any_order() -> None:
     assert 90 <= len(history) <= 100
     assert history.last_ns == 150 * SECOND
     exact = history.at(150 * SECOND, max_gap_ns=SECOND)
-    assert exact is not None
     np.testing.assert_allclose(exact, way(149.0), atol=1e-9)
     assert history.at(SECOND // 2, max_gap_ns=SECOND) is None
     history.add(150 * SECOND, None)

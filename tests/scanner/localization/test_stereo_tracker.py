@@ -50,8 +50,6 @@ def positions(found: list[Pose]) -> np.ndarray:
 
 
 def both(frame: Frame, change: Callable[[np.ndarray], np.ndarray]) -> Frame:
-    assert frame.left is not None
-    assert frame.right is not None
     return dataclasses.replace(frame, left=change(frame.left), right=change(frame.right), color=None)
 
 
@@ -208,8 +206,6 @@ def test_refinement_finds_motion_and_offset() -> None:
     measured = disparity - 0.7 + rng.normal(0, 0.1, len(old))
     bent = refine(guess, old, measured, new, rig)
     straight = refine(guess, old, measured, new, rig, with_offset=True)
-    assert bent is not None
-    assert straight is not None
     assert straight.offset == pytest.approx(0.7, abs=0.05)
     assert straight.offset_sigma < 0.1
     assert straight.agree.mean() > 0.95
@@ -220,10 +216,7 @@ def test_refinement_finds_motion_and_offset() -> None:
 
 
 def grey(path: Path) -> np.ndarray:
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    assert image is not None
-    gray: np.ndarray = image
-    return gray
+    return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
 
 
 def motorcycle(folder: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -235,7 +228,6 @@ def euroc(folder: Path, *, rectify: bool) -> list[Frame]:
 
     def numbers(name: str, text: str) -> np.ndarray:
         found = re.search(rf"^\s*{name}:\s*\[([^\]]*)\]", text, re.MULTILINE)
-        assert found is not None
         return np.array([float(word) for word in found[1].split(",")])
 
     cameras = []
@@ -273,7 +265,6 @@ def check(followed: list[Frame]) -> RectificationCheck:
     stereo = StereoLocalizer()
     for frame in followed:
         stereo.track(frame)
-    assert stereo.rectification is not None
     return stereo.rectification
 
 
@@ -299,13 +290,11 @@ def test_raw_pairs_are_reported(data: Data) -> None:
 
 
 def turned(frame: Frame, A: np.ndarray) -> Frame:
-    assert frame.right is not None
     right = cv2.warpAffine(frame.right, A, frame.right.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
     return dataclasses.replace(frame, right=right)
 
 
 def spoilt(clip: list[Frame], what: str) -> list[Frame]:
-    assert clip[0].right is not None
     height, width = clip[0].right.shape
     middle = (width / 2, height / 2)
     A = {
@@ -351,7 +340,6 @@ def test_the_faulty_clip_shows_from_its_images_alone(data: Data) -> None:
     stereo = StereoLocalizer()
     found = positions(poses(stereo, clip))
     check = stereo.rectification
-    assert check is not None
     assert check.disparity_px == pytest.approx(-0.7, abs=0.25)
     truth = np.array([frame.T_world_camera for frame in clip])
     ratio = np.linalg.norm(found[-1][:3, 3]) / np.linalg.norm((se3.inverse(truth[0]) @ truth[-1])[:3, 3])
