@@ -2,25 +2,20 @@
 """Meshes are saved whole or not at all, and an interrupt is not lost while a library loads."""
 
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
-import formula_scenes
 import numpy as np
 import pytest
 import trimesh
+from command_processes import python
+from formula_scenes import sphere_views, volume_of
 
-from tsfusion import Volume
 from tsfusion.core.errors import OutputError
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj"])
 def test_a_saved_mesh_reads_back(tmp_path: Path, suffix: str) -> None:
-    volume = Volume(voxel_size=0.02)
-    for keyframe in formula_scenes.sphere_views(0.4, 6):
-        volume.integrate(keyframe)
-    mesh = volume.extract_mesh()
+    mesh = volume_of(sphere_views(0.4, 6)).extract_mesh()
     loaded = trimesh.load(mesh.save(tmp_path / f"m{suffix}"), force="mesh", process=False)
     assert loaded.faces.shape == mesh.faces.shape
     assert np.allclose(np.sort(loaded.vertices, axis=0), np.sort(mesh.vertices, axis=0), atol=1e-6)
@@ -28,12 +23,9 @@ def test_a_saved_mesh_reads_back(tmp_path: Path, suffix: str) -> None:
 
 
 def test_a_mesh_that_cannot_be_saved_says_why_and_leaves_nothing(tmp_path: Path) -> None:
-    empty = Volume(voxel_size=0.02).extract_mesh()
     with pytest.raises(OutputError, match="no triangles"):
-        empty.save(tmp_path / "m.ply")
-    volume = Volume(voxel_size=0.02)
-    volume.integrate(formula_scenes.sphere_views(0.4, 2)[0])
-    mesh = volume.extract_mesh()
+        volume_of([]).extract_mesh().save(tmp_path / "m.ply")
+    mesh = volume_of(sphere_views(0.4, 2)[:1]).extract_mesh()
     with pytest.raises(OutputError, match=r"\.ply, \.glb, \.obj"):
         mesh.save(tmp_path / "m.stl")
     with pytest.raises(OutputError, match="cannot write"):
@@ -64,8 +56,5 @@ except KeyboardInterrupt:
 
 @pytest.mark.parametrize(("number", "word"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")])
 def test_who_wants_it_to_end_is_heard_while_trimesh_loads(number: signal.Signals, word: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", _PRESSED_WHILE_IT_LOADS, str(int(number))],
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
+    done = python(_PRESSED_WHILE_IT_LOADS, int(number))
     assert (done.returncode, done.stderr.strip()) == (1, word)

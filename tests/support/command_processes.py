@@ -33,6 +33,14 @@ def tsfusion(
     )  # fmt: skip
 
 
+def python(
+    code: str, *arguments: object, timeout: float = DEADLINE, check: bool = False, **more: Any
+) -> "subprocess.CompletedProcess[str]":
+    """Run a program in another Python to its end."""
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=check, **more)
+
+
 def started(*arguments: object) -> "subprocess.Popen[str]":
     """Start a command; its stderr goes with its stdout."""
     return subprocess.Popen(

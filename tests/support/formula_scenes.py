@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Small scenes with known answers, rendered by formula."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion import Intrinsics, Keyframe
+from tsfusion import Intrinsics, Keyframe, Volume
 
 CAMERA = Intrinsics(120.0, 120.0, 79.5, 59.5)
 SHAPE = (120, 160)
@@ -53,6 +55,23 @@ def plane_keyframe(T: NDArray[np.float64], normal: NDArray[np.float64], offset: 
         depth = (offset - T[:3, 3] @ normal) / (directions(T) @ normal)
     depth = np.where((depth > 0.1) & (depth < 4), depth, 0).astype(np.float32)
     return Keyframe(depth=depth, intrinsics=CAMERA, T_world_camera=T)
+
+
+def volume_of(keyframes: Iterable[Keyframe], **settings: object) -> Volume:
+    """A map of these keyframes."""
+    volume = Volume(**{"voxel_size": 0.02, "threads": 2, **settings})
+    for keyframe in keyframes:
+        volume.integrate(keyframe)
+    return volume
+
+
+def tilted_plane(noise: float = 0.0) -> tuple[NDArray[np.float64], list[Keyframe]]:
+    """The normal of a plane 0.1 m from the origin, and four views of it with `noise` metres of noise."""
+    normal, random = np.array([0.3, -0.2, 0.93]), np.random.default_rng(0)
+    normal /= np.linalg.norm(normal)
+    eyes = [(0.0, 0.0, 1.5), (0.5, 0.2, 1.5), (-0.4, 0.3, 1.5), (0.1, -0.6, 1.5)]
+    poses = [look_at(np.array(eye), np.array([0.1, 0.0, 0.0])) for eye in eyes]
+    return normal, [with_noise(plane_keyframe(T, normal, 0.1), noise, random) for T in poses]
 
 
 def with_noise(keyframe: Keyframe, sigma: float, random: np.random.Generator) -> Keyframe:

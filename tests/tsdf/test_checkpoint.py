@@ -9,24 +9,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import formula_scenes
 import msgspec
 import numpy as np
 import pytest
 import small_disk
+from formula_scenes import sphere_views, volume_of
 
 from tsfusion import Volume
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, WeightOverflow
 from tsfusion.tsdf import checkpoint
 
-VIEWS = formula_scenes.sphere_views(0.4, 4)
+VIEWS = sphere_views(0.4, 4)
 
 
 def small(**settings: object) -> Volume:
-    volume = Volume(**{"voxel_size": 0.03, **settings})
-    for keyframe in VIEWS[:3]:
-        volume.integrate(keyframe)
-    return volume
+    return volume_of(VIEWS[:3], voxel_size=0.03, **settings)
 
 
 @pytest.mark.parametrize("settings", [{}, {"regularizer": "ray"}, {"color": False}])
@@ -161,11 +158,8 @@ def test_a_failed_save_keeps_the_old_file(
     before = path.read_bytes()
     volume.integrate(VIEWS[3])
 
-    def fail(*_: object) -> None:
-        raise OSError(code, os.strerror(code))
-
     with monkeypatch.context() as patched:
-        patched.setattr(os, call, fail)
+        patched.setattr(os, call, failing(OSError(code, os.strerror(code))))
         with pytest.raises(CheckpointError, match=os.strerror(code)):
             volume.save(path)
     assert path.read_bytes() == before
@@ -204,9 +198,8 @@ print(checkpoint.read(folder / "map.tsf")[0].keyframes)
 
 
 def test_a_loaded_map_knows_how_full_its_voxels_are(tmp_path: Path) -> None:
-    volume = Volume(voxel_size=0.02)
-    view = formula_scenes.sphere_views(0.4, 1)[0]
-    volume.integrate(view)
+    (view,) = sphere_views(0.4, 1)
+    volume = volume_of([view])
     slot, voxel = np.argwhere(volume._store.sums != 0)[0]
     volume._store.sums[slot, voxel] |= (1 << 26) - 1
     loaded = Volume.load(volume.save(tmp_path / "full.tsf"))
@@ -215,9 +208,7 @@ def test_a_loaded_map_knows_how_full_its_voxels_are(tmp_path: Path) -> None:
 
 
 def test_a_saved_map_can_be_read_with_another_surface_but_not_with_another_voxel_size(tmp_path: Path) -> None:
-    volume = Volume(voxel_size=0.02, surface="raw")
-    volume.integrate(formula_scenes.sphere_views(0.4, 1)[0])
-    path = volume.save(tmp_path / "map.tsf")
+    path = volume_of(sphere_views(0.4, 1), surface="raw").save(tmp_path / "map.tsf")
     again, other = Volume.load(path), Volume.load(path, surface="field", min_weight=None)
     assert (again.config.surface, other.config.surface) == ("raw", "field")
     assert again.map_hash() == other.map_hash()

@@ -2,21 +2,19 @@
 """The field regulariser: what it solves, what it leaves alone, and that only the sums decide it."""
 
 import hashlib
-import os
-import subprocess
-import sys
 from functools import partial
 from itertools import product
+from pathlib import Path
 
-import formula_scenes
 import kernel_twins
 import numpy as np
 import pytest
 from block_stores import store_of
+from command_processes import python
+from formula_scenes import sphere_views, tilted_plane, volume_of, with_noise
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tsfusion import Volume
 from tsfusion.tsdf import field_regularizer
 from tsfusion.tsdf.block_store import pack_keys
 from tsfusion.tsdf.field_regularizer import FieldSettings, along_normals, solve
@@ -139,17 +137,8 @@ def test_threads_change_no_bit() -> None:
         "runtime.start({}); d, w = t.noisy_roof(6); k, s = t.map_of(d, w, (0, 0, 0));"
         "print(t.digest(t.solve(k, t.store_of(k, s), 1.0, settings=t.STRONG)))"
     )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    found = {
-        subprocess.run(
-            [sys.executable, "-c", program.format(threads)],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for threads in (1, 3)
-    }
+    here = Path(__file__).parent
+    found = {python(program.format(threads), check=True, cwd=here).stdout for threads in (1, 3)}
     assert len(found) == 1
 
 
@@ -181,17 +170,15 @@ def test_an_empty_map_and_absent_blocks() -> None:
 @pytest.mark.parametrize("sensor", ["kinect", "stereo"])
 def test_a_part_equals_the_whole_to_a_hundredth_voxel(monkeypatch: pytest.MonkeyPatch, sensor: str) -> None:
     """What a keyframe changes is found again by solving its blocks and those around; nothing else moves."""
-    volume = Volume(voxel_size=0.02, sensor=sensor, regularizer="off")
     random = np.random.default_rng(0)
-    views = formula_scenes.sphere_views(0.5, 8)
-    for view in views[:-1]:
-        volume.integrate(formula_scenes.with_noise(view, 0.004, random))
+    *views, last = (with_noise(view, 0.004, random) for view in sphere_views(0.5, 8))
+    volume = volume_of(views, sensor=sensor, regularizer="off")
     volume.take_dirty()
     model = volume.model
     settings = FieldSettings(model.field_smoothness, model.field_edge, model.field_reweightings)
     before = np.sort(volume._store.keys)
     old = solve(before, volume._store, 0.5, settings=settings)
-    volume.integrate(formula_scenes.with_noise(views[-1], 0.004, random))
+    volume.integrate(last)
     changed = field_regularizer.spread(pack_keys(volume.take_dirty()), volume._store, settings)
     keys = np.sort(volume._store.keys)
     whole = solve(keys, volume._store, 0.5, settings=settings)
@@ -247,16 +234,9 @@ def test_smoothing_along_normals_equals_its_twin() -> None:
 
 @pytest.mark.parametrize(("surface", "share"), [("normal", 0.9), ("field", 0.7)])
 def test_the_surface_of_a_noisy_plane_improves(surface: str, share: float) -> None:
-    normal = np.array([0.3, -0.2, 0.93])
-    normal /= np.linalg.norm(normal)
+    normal, views = tilted_plane(noise=0.01)
     errors = {}
     for mode in ("raw", surface):
-        volume = Volume(voxel_size=0.02, surface=mode)
-        random = np.random.default_rng(0)
-        for x, y in ((0.0, 0.0), (0.5, 0.2), (-0.4, 0.3), (0.1, -0.6)):
-            T = formula_scenes.look_at(np.array([x, y, 1.5]), np.array([0.1, 0.0, 0.0]))
-            volume.integrate(
-                formula_scenes.with_noise(formula_scenes.plane_keyframe(T, normal, 0.1), 0.01, random)
-            )
-        errors[mode] = abs(volume.extract_mesh(min_weight=1).vertices @ normal - 0.1).mean()
+        mesh = volume_of(views, surface=mode).extract_mesh(min_weight=1)
+        errors[mode] = abs(mesh.vertices @ normal - 0.1).mean()
     assert errors[surface] < share * errors["raw"]

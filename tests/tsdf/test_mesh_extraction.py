@@ -3,14 +3,16 @@
 
 from collections import Counter
 from collections.abc import Callable
+from math import inf, nan
 from pathlib import Path
 
-import formula_scenes
 import kernel_twins
 import numpy as np
 import pytest
 import trimesh
 from block_stores import store_of
+from formula_scenes import sphere_views, tilted_plane, volume_of
+from kernel_twins import Voxel
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -21,14 +23,14 @@ from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_ke
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
 
 
-def edge_uses(faces: NDArray[np.int32]) -> NDArray[np.int64]:
-    """How many triangles use each edge."""
+def edge_uses(faces: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """The edges (n, 2), and how many triangles use each."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    return np.unique(edges, axis=0, return_counts=True)[1]
+    return np.unique(edges, axis=0, return_counts=True)
 
 
 def check_sound(mesh: Mesh) -> None:
-    assert edge_uses(mesh.faces).max() <= 2
+    assert edge_uses(mesh.faces)[1].max() <= 2
     assert len(np.unique(mesh.faces)) == len(mesh.vertices)  # none unused
     assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)  # none twice
     assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-5)
@@ -36,12 +38,7 @@ def check_sound(mesh: Mesh) -> None:
 
 def random_map(
     seed: int, known: float
-) -> tuple[
-    BlockStore,
-    NDArray[np.int64],
-    dict[kernel_twins.Voxel, float],
-    dict[kernel_twins.Voxel, tuple[float, ...]],
-]:
+) -> tuple[BlockStore, NDArray[np.int64], dict[Voxel, float], dict[Voxel, tuple[float, ...]]]:
     """A 3×2×2 patch of blocks around the origin: noise in all 256 cases, a share of voxels unseen, a third
     coloured. Returns the map, the keys, and values and colours by voxel."""
     random = np.random.default_rng(seed)
@@ -96,11 +93,8 @@ def test_extraction_equals_the_twin_on_noise(known: float) -> None:
 def test_noise_gives_a_manifold_with_a_border_only_where_the_map_ends() -> None:
     store, keys, _, _ = random_map(4, 1.0)
     mesh = extract(np.sort(keys), store, 1.0)
-    edges = np.sort(
-        np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1
-    )
-    unique, uses = np.unique(edges, axis=0, return_counts=True)
-    ends = mesh.vertices[unique[uses == 1]]  # (n, 2, 3)
+    edges, uses = edge_uses(mesh.faces)
+    ends = mesh.vertices[edges[uses == 1]]  # (n, 2, 3)
     low, high = np.array([-15.5, -7.5, -7.5]), np.array([7.5, 7.5, 7.5])
     on_border = (np.isclose(ends, low) | np.isclose(ends, high)).all(axis=1).any(axis=1)
     assert on_border.all()
@@ -108,10 +102,7 @@ def test_noise_gives_a_manifold_with_a_border_only_where_the_map_ends() -> None:
 
 def test_a_sphere_is_closed_with_the_right_radius_and_normals() -> None:
     radius, voxel_size = 0.4, 0.02
-    volume = Volume(voxel_size=voxel_size)
-    for keyframe in formula_scenes.sphere_views(radius):
-        volume.integrate(keyframe)
-    mesh = volume.extract_mesh(min_weight=2)
+    mesh = volume_of(sphere_views(radius)).extract_mesh(min_weight=2)
     check_sound(mesh)
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert solid.is_watertight
@@ -128,13 +119,8 @@ def test_a_sphere_is_closed_with_the_right_radius_and_normals() -> None:
 
 @pytest.mark.parametrize("regularizer", ["off", "ray", "paper"])
 def test_a_plane_is_flat_to_a_tenth_of_a_voxel(regularizer: str) -> None:
-    normal = np.array([0.3, -0.2, 0.93])
-    normal /= np.linalg.norm(normal)
-    volume = Volume(voxel_size=0.02, regularizer=regularizer)
-    for x, y in ((0.0, 0.0), (0.5, 0.2), (-0.4, 0.3), (0.1, -0.6)):
-        T = formula_scenes.look_at(np.array([x, y, 1.5]), np.array([0.1, 0.0, 0.0]))
-        volume.integrate(formula_scenes.plane_keyframe(T, normal, 0.1))
-    mesh = volume.extract_mesh()
+    normal, views = tilted_plane()
+    mesh = volume_of(views, regularizer=regularizer).extract_mesh()
     error = mesh.vertices @ normal - 0.1
     # a border cell's corners were seen from one side only
     assert np.sqrt(np.mean(error**2)) < 0.1 * 0.02
@@ -142,32 +128,23 @@ def test_a_plane_is_flat_to_a_tenth_of_a_voxel(regularizer: str) -> None:
 
 
 def test_tiles_of_dirty_blocks_make_up_the_whole_mesh() -> None:
-    views = formula_scenes.sphere_views(0.4, 6)
-    volume = Volume(voxel_size=0.02)
-    tiles: Counter = Counter()
-    for keyframe in views[:5]:
-        volume.integrate(keyframe)
+    views = sphere_views(0.4, 6)
+    volume = volume_of(views[:5])
     volume.take_dirty()
     whole = triangles_of(volume.extract_mesh(min_weight=1))
     volume.integrate(views[5])
     changed = cells_of(volume.take_dirty())
-    kept = volume.extract_mesh(
-        min_weight=1, blocks=np.array([b for b in blocks_of(volume) if b not in as_set(changed)])
-    )
-    tiles = triangles_of(volume.extract_mesh(min_weight=1, blocks=changed)) + triangles_of(kept)
+    kept = np.array([b for b in blocks_of(volume) if b not in as_set(changed)])
+    tiles = Counter[object]()
+    for blocks in (changed, kept):
+        tiles += triangles_of(volume.extract_mesh(min_weight=1, blocks=blocks))
     assert tiles == triangles_of(volume.extract_mesh(min_weight=1))
     assert tiles != whole
 
 
 def test_the_mesh_does_not_depend_on_where_blocks_lie_in_memory() -> None:
-    views = formula_scenes.sphere_views(0.4, 4)
-    meshes = []
-    for keyframes in (views, views[::-1]):
-        volume = Volume(voxel_size=0.02)
-        for keyframe in keyframes:
-            volume.integrate(keyframe)
-        meshes.append(volume.extract_mesh(min_weight=1))
-    a, b = meshes
+    views = sphere_views(0.4, 4)
+    a, b = (volume_of(each).extract_mesh(min_weight=1) for each in (views, views[::-1]))
     for name in ("vertices", "faces", "normals", "colors"):
         assert getattr(a, name).tobytes() == getattr(b, name).tobytes(), name
 
@@ -200,17 +177,26 @@ def as_set(blocks: NDArray[np.int32]) -> set[tuple[int, ...]]:
     return {tuple(int(c) for c in b) for b in blocks}
 
 
-@pytest.mark.parametrize("weight", [-1.0, float("nan"), float("inf"), 1e308])
-def test_an_impossible_weight_is_named(weight: float) -> None:
-    with pytest.raises(InvalidConfig, match="min_weight must be from 0 to"):
-        Volume(voxel_size=0.02).extract_mesh(min_weight=weight)
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        *[("min_weight", weight, "min_weight must be from 0 to") for weight in (-1.0, nan, inf, 1e308)],
+        ("blocks", np.zeros((2, 2), np.int32), "blocks must be"),
+        ("blocks", np.zeros((1, 3)), "blocks must be"),
+        ("blocks", np.zeros(3, np.int32), "blocks must be"),
+        ("surface", "fild", "surface must be one of"),
+    ],
+)
+def test_what_cannot_be_extracted_is_named(name: str, value: object, message: str) -> None:
+    with pytest.raises(InvalidConfig, match=message):
+        volume_of([]).extract_mesh(**{name: value})
 
 
 def test_blocks_that_do_not_exist_give_an_empty_mesh() -> None:
-    volume = Volume(voxel_size=0.02)
-    volume.integrate(formula_scenes.sphere_views(0.4, 2)[0])
-    assert len(volume.extract_mesh(blocks=np.array([[500, 0, 0]], np.int32)).faces) == 0
-    assert len(volume.extract_mesh(blocks=np.zeros((0, 3), np.int32)).faces) == 0
+    volume = volume_of(sphere_views(0.4, 2)[:1])
+    beyond_reach = [[-1, -1, (1 << 21) + 1], [1 << 30, 0, 0]]
+    for blocks in ([[500, 0, 0]], beyond_reach, np.zeros((0, 3))):
+        assert len(volume.extract_mesh(blocks=np.array(blocks, np.int32)).faces) == 0
 
 
 @pytest.mark.parametrize("regularizer", ["off", "ray"])
@@ -218,10 +204,8 @@ def test_the_bunny_lies_within_a_millimetre_of_its_reference(
     data: Callable[[str], Path], regularizer: str
 ) -> None:
     folder = data("stanford_bunny")
-    volume = Volume(voxel_size=0.001, sensor="scanner", regularizer=regularizer)
-    for keyframe in stanford_bunny.scans(folder):
-        volume.integrate(keyframe)
-    mesh = volume.extract_mesh()
+    scans = stanford_bunny.scans(folder)
+    mesh = volume_of(scans, voxel_size=0.001, sensor="scanner", regularizer=regularizer).extract_mesh()
     surface = trimesh.load(folder / "reconstruction" / "bun_zipper.ply", process=False)
     samples, _ = trimesh.sample.sample_surface(surface, 200_000, seed=0)
     distance = cKDTree(samples).query(mesh.vertices)[0]

@@ -3,9 +3,9 @@
 
 from dataclasses import replace
 
-import formula_scenes
 import numpy as np
 import pytest
+from formula_scenes import CAMERA, SHAPE, directions, look_at, plane_keyframe, volume_of
 from numpy.typing import NDArray
 
 from tsfusion import Keyframe, Volume
@@ -13,7 +13,7 @@ from tsfusion.core.errors import InvalidConfig
 from tsfusion.datasets import Synthetic
 from tsfusion.tsdf.block_store import unpack_keys
 
-WALL = formula_scenes.plane_keyframe(np.eye(4), np.array([0.0, 0.0, 1.0]), 2.0)
+WALL = plane_keyframe(np.eye(4), np.array([0.0, 0.0, 1.0]), 2.0)
 
 
 def with_depth(depth: NDArray[np.float32]) -> Keyframe:
@@ -22,21 +22,15 @@ def with_depth(depth: NDArray[np.float32]) -> Keyframe:
 
 def passer_by() -> Keyframe:
     """Somebody, a disc 60 cm wide, before the wall."""
-    v, u = np.mgrid[: formula_scenes.SHAPE[0], : formula_scenes.SHAPE[1]]
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     depth = WALL.measurement.copy()
-    depth[
-        np.hypot(u - formula_scenes.CAMERA.cx, v - formula_scenes.CAMERA.cy)
-        < 0.3 * formula_scenes.CAMERA.fx / 1.2
-    ] = 1.2
+    depth[np.hypot(u - CAMERA.cx, v - CAMERA.cy) < 0.3 * CAMERA.fx / 1.2] = 1.2
     return with_depth(depth)
 
 
 def mesh_depths(keyframes: list[Keyframe], **settings: object) -> NDArray[np.float32]:
     """z of every vertex."""
-    volume = Volume(**{"voxel_size": 0.03, "threads": 2, "color": False, **settings})
-    for keyframe in keyframes:
-        volume.integrate(keyframe)
-    return volume.extract_mesh().vertices[:, 2]
+    return volume_of(keyframes, voxel_size=0.03, color=False, **settings).extract_mesh().vertices[:, 2]
 
 
 def test_lone_pixels_are_dropped_and_counted() -> None:
@@ -75,17 +69,13 @@ def test_carving_removes_who_has_left_and_keeps_the_wall() -> None:
 
 
 def test_carving_is_a_sum_like_everything_else() -> None:
-    volumes = []
-    for order in (1, -1):
-        volume = Volume(voxel_size=0.03, threads=2, space_carving=True, regularizer="off")
-        for keyframe in [passer_by(), WALL][::order]:
-            volume.integrate(keyframe)
-        volumes.append(volume)
-    assert volumes[0].map_hash() == volumes[1].map_hash()
-    volumes[0].retract(passer_by())
-    alone = Volume(voxel_size=0.03, threads=2, space_carving=True, regularizer="off")
-    alone.integrate(WALL)
-    assert volumes[0].map_hash() == alone.map_hash()
+    keyframes = ([passer_by(), WALL], [WALL, passer_by()], [WALL])
+    both, turned, alone = (
+        volume_of(each, voxel_size=0.03, space_carving=True, regularizer="off") for each in keyframes
+    )
+    assert both.map_hash() == turned.map_hash()
+    both.retract(passer_by())
+    assert both.map_hash() == alone.map_hash()
 
 
 def test_carving_and_smoothing_along_rays_exclude_each_other() -> None:
@@ -99,14 +89,12 @@ def plate_views(thickness: float) -> list[Keyframe]:
     for side in (-1, 1):
         for x in (-0.6, -0.3, 0.0, 0.3, 0.6):
             eye = np.array([x, 0.1 * x, side * 1.0])
-            T = formula_scenes.look_at(eye, np.zeros(3))
-            normal = np.array([0.0, 0.0, float(side)])
-            keyframe = formula_scenes.plane_keyframe(T, normal, thickness / 2)
-            d = formula_scenes.directions(T) * keyframe.measurement[..., None] + eye
+            T = look_at(eye, np.zeros(3))
+            keyframe = plane_keyframe(T, np.array([0.0, 0.0, float(side)]), thickness / 2)
+            d = directions(T) * keyframe.measurement[..., None] + eye
             inside = (np.abs(d[..., 0]) < 0.3) & (np.abs(d[..., 1]) < 0.3)
-            views.append(
-                replace(keyframe, depth=np.where(inside, keyframe.measurement, 0).astype(np.float32))
-            )
+            depth = np.where(inside, keyframe.measurement, 0)
+            views.append(replace(keyframe, depth=depth.astype(np.float32)))
     return views
 
 
@@ -117,9 +105,7 @@ def test_a_plate_seen_from_both_sides_is_no_worse_than_without_bundling(voxels: 
     size, thickness = 0.02, voxels * 0.02
     errors = []
     for settings in ({"bundle": True}, {"bundle": False, "outlier_filter": False}):
-        volume = Volume(voxel_size=size, threads=2, color=False, regularizer="off", **settings)
-        for keyframe in plate_views(thickness):
-            volume.integrate(keyframe)
+        volume = volume_of(plate_views(thickness), color=False, regularizer="off", **settings)
         vertices = volume.extract_mesh().vertices
         middle = vertices[(np.abs(vertices[:, :2]) < 0.25).all(axis=1)]
         both = (middle[:, 2] > 0).any() and (middle[:, 2] < 0).any()
@@ -141,10 +127,7 @@ def test_gross_outliers_do_not_reach_the_surface() -> None:
         depth[wrong] = random.uniform(0.5 / room[i].depth_scale, 3 / room[i].depth_scale, wrong.sum())
         keyframes.append(replace(room[i], depth=depth))
     for chosen in (False, True):
-        volume = Volume(voxel_size=0.03, threads=2, color=False, outlier_filter=chosen)
-        for keyframe in keyframes:
-            volume.integrate(keyframe)
-        vertices = volume.extract_mesh().vertices.astype(np.float64)
-        errors.append(np.abs(room.distance(vertices)).mean() * 1e3)
+        mesh = volume_of(keyframes, voxel_size=0.03, color=False, outlier_filter=chosen).extract_mesh()
+        errors.append(np.abs(room.distance(mesh.vertices.astype(np.float64))).mean() * 1e3)
     assert errors[0] > 20.0
     assert errors[1] < 3.0

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Rays of images and of points, against their NumPy twins."""
 
-import formula_scenes
 import kernel_twins
 import numpy as np
 import pytest
+from formula_scenes import plane_keyframe
 from numpy.typing import NDArray
 from ray_maps import QUANTA, RayMap, rays_of
 
@@ -119,9 +119,8 @@ def test_rays_from_images_equal_the_twin(kind: str, bundled: bool) -> None:
     keyframe, voxel_size = image_keyframe(11, kind), 0.05
     parameters = model_parameters(SENSORS["stereo"], voxel_size, keyframe.baseline_fx)
     buffers = RayBuffers(color=False, regularised=False)
-    samples = buffers.make_rays(
-        keyframe, VolumeConfig(sensor="stereo", voxel_size=voxel_size, bundle=bundled)
-    )
+    config = VolumeConfig(sensor="stereo", voxel_size=voxel_size, bundle=bundled)
+    samples = buffers.make_rays(keyframe, config)
     expected, used = expected_rays(keyframe, parameters, voxel_size, bundled, filtered=True)
     assert 0 < used < np.count_nonzero(depth_of(keyframe, parameters))  # some lone pixels are dropped
     assert samples == used
@@ -130,7 +129,7 @@ def test_rays_from_images_equal_the_twin(kind: str, bundled: bool) -> None:
 
 def test_a_plane_is_met_exactly_by_every_voxel_beside_a_ray() -> None:
     normal, offset = np.array([0.6, -0.48, 0.64]), 1.5
-    keyframe = formula_scenes.plane_keyframe(np.eye(4), normal, offset)
+    keyframe = plane_keyframe(np.eye(4), normal, offset)
     voxel_size = 0.05
     here = RayMap()
     here.buffers.make_rays(keyframe, VolumeConfig(voxel_size=voxel_size))
@@ -153,9 +152,8 @@ def test_a_plane_is_met_exactly_by_every_voxel_beside_a_ray() -> None:
 @pytest.mark.parametrize("own_origins", [True, False])
 def test_rays_from_points_equal_the_twin(own_origins: bool, bundled: bool) -> None:
     random = np.random.default_rng(13)
-    points = (random.uniform(-3, 3, 3) + np.cumsum(random.normal(0, 0.1, (700, 3)), axis=0)).astype(
-        np.float32
-    )
+    points = random.uniform(-3, 3, 3) + np.cumsum(random.normal(0, 0.1, (700, 3)), axis=0)
+    points = points.astype(np.float32)
     points[5] = np.nan
     origins = random.uniform(-0.2, 0.2, (700, 3)).astype(np.float32) if own_origins else None
     pose = np.eye(4)

@@ -2,31 +2,22 @@
 """Laws of the map: it is a sum, whatever the order, the threads or the history."""
 
 import os
-import subprocess
-import sys
+import signal
 from dataclasses import replace
-from pathlib import Path
 
-import formula_scenes
 import kernel_twins
 import numpy as np
 import pytest
+from command_processes import python
+from formula_scenes import CAMERA, SHAPE, plane_keyframe, sphere_views, volume_of
 from numpy.typing import NDArray
-from repository import SUPPORT
 
 from tsfusion import Keyframe, Volume
 from tsfusion.core.errors import InvalidConfig, MapError, MapFull, WeightOverflow
 from tsfusion.kernels.integrate import QUANTA_PER_VOXEL
 from tsfusion.tsdf.block_store import cells_of, unpack_keys
 
-VIEWS = formula_scenes.sphere_views(0.4, 8)
-
-
-def volume_of(keyframes: list[Keyframe], **settings: object) -> Volume:
-    volume = Volume(**{"voxel_size": 0.02, "threads": 2, **settings})
-    for keyframe in keyframes:
-        volume.integrate(keyframe)
-    return volume
+VIEWS = sphere_views(0.4, 8)
 
 
 def bytes_of(volume: Volume) -> dict[str, bytes]:
@@ -36,9 +27,9 @@ def bytes_of(volume: Volume) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("bundle", [True, False])
 def test_the_volume_holds_exactly_the_twins_sums(bundle: bool) -> None:
-    depth = np.zeros(formula_scenes.SHAPE, np.float32)
+    depth = np.zeros(SHAPE, np.float32)
     depth[40:70, 60:95] = VIEWS[0].measurement[40:70, 60:95]
-    keyframe = Keyframe(depth=depth, intrinsics=formula_scenes.CAMERA, T_world_camera=VIEWS[0].T_world_camera)
+    keyframe = Keyframe(depth=depth, intrinsics=CAMERA, T_world_camera=VIEWS[0].T_world_camera)
     volume = volume_of([keyframe, keyframe], bundle=bundle)
     buffers = volume._ray_buffers
     rays = np.vstack([buffers.rays[start : start + count] for start, count in buffers.bands[:, :2]])
@@ -60,21 +51,14 @@ def test_any_order_gives_the_same_hash(regularizer: str) -> None:
 
 def test_one_thread_gives_the_hash_of_two() -> None:
     script = (
-        "import formula_scenes; from tsfusion import Volume\n"
+        "from formula_scenes import sphere_views, volume_of\n"
         "for regularizer in ('off', 'ray'):\n"
-        "    v = Volume(voxel_size=0.02, threads={}, regularizer=regularizer)\n"
-        "    [v.integrate(k) for k in formula_scenes.sphere_views(0.4, 4)]\n"
+        "    v = volume_of(sphere_views(0.4, 4), threads={}, regularizer=regularizer)\n"
         "    layers = v._store.layers().values()\n"
         "    print(v.map_hash(), v.color_hash(), [hash(layer.tobytes()) for layer in layers])\n"
     )
-    found = {
-        subprocess.run(
-            [sys.executable, "-c", script.format(threads)],
-            cwd=SUPPORT, env={"PYTHONPATH": os.environ["PYTHONPATH"], "PYTHONHASHSEED": "0"},
-            capture_output=True, text=True, check=True, timeout=120,
-        ).stdout
-        for threads in (1, 2)
-    }  # fmt: skip
+    environment = {"PYTHONPATH": os.environ["PYTHONPATH"], "PYTHONHASHSEED": "0"}
+    found = {python(script.format(threads), env=environment, check=True).stdout for threads in (1, 2)}
     assert len(found) == 1
 
 
@@ -124,12 +108,6 @@ def test_an_empty_map_has_nothing_to_retract() -> None:
         Volume(voxel_size=0.02).retract(nothing)
 
 
-@pytest.mark.parametrize("blocks", [np.zeros((2, 2), np.int32), np.zeros((1, 3)), np.zeros(3, np.int32)])
-def test_blocks_to_mesh_must_be_integer_triples(blocks: NDArray) -> None:
-    with pytest.raises(InvalidConfig, match="blocks must be"):
-        Volume(voxel_size=0.02).extract_mesh(blocks=blocks)
-
-
 def test_a_shift_by_whole_blocks_shifts_the_map() -> None:
     shift = np.array([3, -2, 5])
     moved = []
@@ -174,10 +152,8 @@ def test_cells_of_a_block_reach_one_block_down_each_axis() -> None:
 def test_an_empty_keyframe_changes_nothing() -> None:
     volume = volume_of(VIEWS[:1])
     before = volume.map_hash()
-    empty = np.zeros(formula_scenes.SHAPE, np.uint16)
-    stats = volume.integrate(
-        Keyframe(depth=empty, intrinsics=formula_scenes.CAMERA, T_world_camera=np.eye(4))
-    )
+    empty = np.zeros(SHAPE, np.uint16)
+    stats = volume.integrate(Keyframe(depth=empty, intrinsics=CAMERA, T_world_camera=np.eye(4)))
     assert (stats.samples, stats.rays, stats.updates, stats.blocks) == (0, 0, 0, 0)
     assert stats.invalid == empty.size
     volume.integrate(Keyframe(points=np.zeros((0, 3), np.float32), T_world_camera=np.eye(4)))
@@ -199,7 +175,7 @@ def test_confidence_zero_is_no_return_and_half_is_less() -> None:
     for value, check in ((0, lambda w: w == 0), (128, lambda w: 0 < w < weights(full))):
         doubted = Keyframe(
             depth=keyframe.depth, intrinsics=keyframe.intrinsics, T_world_camera=keyframe.T_world_camera,
-            confidence=np.full(formula_scenes.SHAPE, value, np.uint8),
+            confidence=np.full(SHAPE, value, np.uint8),
         )  # fmt: skip
         assert check(weights(volume_of([doubted])))
 
@@ -295,8 +271,6 @@ def test_whatever_fails_leaves_the_map_as_it_was(monkeypatch: pytest.MonkeyPatch
 
 
 def test_an_interrupt_waits_for_the_keyframe() -> None:
-    import signal
-
     volume = volume_of(VIEWS[:1])
     usual = volume._integrator._check
 
@@ -313,21 +287,10 @@ def test_an_interrupt_waits_for_the_keyframe() -> None:
 
 def test_a_still_camera_can_carve_for_long() -> None:
     T = np.eye(4)
-    wall = formula_scenes.plane_keyframe(T, np.array([0.0, 0.0, 1.0]), 1.5)
-    volume = Volume(voxel_size=0.02, threads=2, space_carving=True)
-    volume.integrate(wall)
+    wall = plane_keyframe(T, np.array([0.0, 0.0, 1.0]), 1.5)
+    volume = volume_of([wall], space_carving=True)
     heaviest = int((volume._store.sums & ((1 << 27) - 1)).max())
     assert heaviest * 10_000 < 1 << 26
-
-
-def test_a_surface_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(InvalidConfig, match="surface must be one of"):
-        volume_of(VIEWS[:1]).extract_mesh(surface="fild")  # type: ignore[arg-type]
-
-
-def test_blocks_out_of_reach_have_no_mesh() -> None:
-    far = np.array([[-1, -1, (1 << 21) + 1], [1 << 30, 0, 0]], np.int32)
-    assert len(volume_of(VIEWS[:1]).extract_mesh(blocks=far).faces) == 0
 
 
 def test_a_keyframe_too_heavy_for_one_go_gives_the_same_map(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -374,7 +337,7 @@ def test_memory_grows_without_losing_a_bit() -> None:
     assert volume.stats().bytes_per_block <= 12_300
 
 
-def test_kernels_stay_in_bounds(tmp_path: Path) -> None:
+def test_kernels_stay_in_bounds() -> None:
     """Taichi's debug mode checks every array access; it needs a process of its own."""
     script = (
         "import numpy as np, formula_scenes\n"
@@ -391,10 +354,7 @@ def test_kernels_stay_in_bounds(tmp_path: Path) -> None:
         "assert len(v.extract_mesh(min_weight=0).faces)\n"
         "assert len(v.extract_mesh(min_weight=0, blocks=v.take_dirty()[::3]).faces)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=SUPPORT, env={"PYTHONPATH": os.environ["PYTHONPATH"]},
-        capture_output=True, text=True, timeout=240, check=False,
-    )  # fmt: skip
+    done = python(script, env={"PYTHONPATH": os.environ["PYTHONPATH"]}, timeout=240)
     assert done.returncode == 0, done.stderr[-2000:]
 
 
