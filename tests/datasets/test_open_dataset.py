@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Opening a dataset: layouts are recognised, and everything else is one clear line."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
+from command_processes import python
 from small_recordings import one_line, seven_scenes
 
 from tsfusion import datasets
@@ -121,11 +119,5 @@ def test_recorded_datasets_do_not_import_taichi_or_pykitti(tmp_path):
         "import sys; from tsfusion.datasets import open_dataset; open_dataset(sys.argv[1])[0]; "
         "sys.exit(' '.join({'taichi', 'pykitti', 'pandas'} & set(sys.modules)) or None)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(seven_scenes(tmp_path))],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = python(code, seven_scenes(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")

@@ -4,18 +4,15 @@
 import json
 import logging
 import shutil
-import struct
-import subprocess
-import sys
 import zipfile
-import zlib
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-import written_recordings
-from small_recordings import hololens, kitti, one_line, redwood, seven_scenes
+from command_processes import tsfusion
+from small_recordings import claim_size, hololens, kitti, one_line, redwood, seven_scenes
+from written_recordings import replica, scannet, transforms, write
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import Dataset, Selection, describe, find, layouts, open_dataset, select
@@ -25,13 +22,11 @@ from tsfusion.geometry.keyframe import Intrinsics
 
 def tum(root: Path) -> Path:
     """Three frames with lists and no trajectory."""
-    for name in ("depth", "rgb"):
+    images = {"depth": np.full((480, 640), 5000, np.uint16), "rgb": np.zeros((480, 640, 3), np.uint8)}
+    for name, pixels in images.items():
         lines = []
         for frame in range(3):
-            pixels = (
-                np.full((480, 640), 5000, np.uint16) if name == "depth" else np.zeros((480, 640, 3), np.uint8)
-            )
-            written_recordings.write(root / name / f"{frame}.png", pixels)
+            write(root / name / f"{frame}.png", pixels)
             lines.append(f"{frame / 30:.4f} {name}/{frame}.png\n")
         (root / f"{name}.txt").write_text("".join(lines))
     return root
@@ -52,7 +47,7 @@ def without_poses(root: Path, layout: str) -> Path:
     elif layout == "TUM RGB-D":
         tum(root)
     elif layout == "ScanNet":
-        shutil.rmtree(written_recordings.scannet(root, count=3) / "pose")
+        shutil.rmtree(scannet(root, count=3) / "pose")
     return root
 
 
@@ -132,10 +127,10 @@ def test_two_layouts_in_one_folder_are_told(tmp_path, caplog):
 
 
 def test_more_special_layouts_are_not_taken_for_plain_folders(tmp_path):
-    for name, make in (("ScanNet", written_recordings.scannet), ("Replica", written_recordings.replica)):
+    for name, make in (("ScanNet", scannet), ("Replica", replica)):
         found = find(make(tmp_path / name))
         assert (found.layout.name, found.also) == (name, ())
-    found = find(written_recordings.transforms(tmp_path / "capture"))
+    found = find(transforms(tmp_path / "capture"))
     assert (found.layout.name, found.also) == ("nerfstudio", ())
 
 
@@ -202,13 +197,6 @@ def test_no_layout_fails_on_any_file_or_folder(tmp_path):
         one_line(lambda path=path: open_dataset(path))
 
 
-def test_a_depth_image_of_the_wrong_kind_is_named(tmp_path):
-    root = redwood(tmp_path, [0], [0])
-    cv2.imwrite(str(root / "depth" / "00000.png"), np.zeros((6, 8), np.uint8))
-    with pytest.raises(DatasetError, match="must hold one 16-bit channel"):
-        open_dataset(root)[0]
-
-
 def test_what_macos_puts_beside_files_is_no_recording(tmp_path):
     redwood(tmp_path, [0, 1], [0, 1])
     for path in [path for path in tmp_path.rglob("*") if path.is_file()]:
@@ -225,11 +213,7 @@ def test_what_macos_puts_beside_files_is_no_recording(tmp_path):
 @pytest.mark.parametrize("side", [20_000, 100_000])
 def test_an_image_that_claims_to_be_huge_is_named(tmp_path, side):
     root = redwood(tmp_path, [0], [0])
-    depth = root / "depth" / "00000.png"
-    content = bytearray(depth.read_bytes())
-    struct.pack_into(">2I", content, 16, side, side)
-    struct.pack_into(">I", content, 29, zlib.crc32(content[12:29]))
-    depth.write_bytes(content)
+    claim_size(root / "depth" / "00000.png", side)
     with pytest.raises(DatasetError, match=r"00000\.png cannot be decoded; expected a 16-bit depth image"):
         open_dataset(root)[0]
 
@@ -243,38 +227,29 @@ def test_a_depth_image_of_another_size_is_named(tmp_path):
         dataset[1]
 
 
-def command(*words: object) -> tuple[int, str, str]:
-    """Exit status, output and messages of a command line."""
-    done = subprocess.run(
-        [sys.executable, "-m", "tsfusion", *map(str, words)],
-        capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
-    return done.returncode, done.stdout, done.stderr
-
-
 def test_the_command_lists_layouts_and_datasets(tmp_path):
-    status, listed, _ = command("datasets")
-    assert (status, listed) == command("datasets", "list")[:2]
-    rows = dict(line.split("  ", 1) for line in listed.splitlines())
+    listed, again = tsfusion("datasets"), tsfusion("datasets", "list")
+    assert (listed.returncode, listed.stdout) == (again.returncode, again.stdout)
+    rows = dict(line.split("  ", 1) for line in listed.stdout.splitlines())
     assert list(rows) == [*(layout.name for layout in layouts()), "synthetic"]
-    written_recordings.scannet(tmp_path / "a" / "scene0000_00")
+    scannet(tmp_path / "a" / "scene0000_00")
     expected = f"{tmp_path}/a  ScanNet scene0000_00  kinect  4 keyframes\n"
-    assert command("datasets", tmp_path) == (0, expected, "")
-    assert json.loads(command("datasets", tmp_path, "--json")[1])[0]["name"] == "ScanNet scene0000_00"
+    found = tsfusion("datasets", tmp_path)
+    assert (found.returncode, found.stdout, found.stderr) == (0, expected, "")
+    rows = json.loads(tsfusion("datasets", tmp_path, "--json").stdout)
+    assert rows[0]["name"] == "ScanNet scene0000_00"
     tum(tmp_path / "b" / "rgbd")
-    status, listed, _ = command("datasets", tmp_path / "b")
-    assert (status, listed.split("  ", 1)[1]) == (
-        0,
-        "TUM rgbd  kinect  3 frames without poses, for `tsfusion scan`\n",
-    )
+    found = tsfusion("datasets", tmp_path / "b")
+    assert found.stdout.endswith("  TUM rgbd  kinect  3 frames without poses, for `tsfusion scan`\n")
+    assert found.returncode == 0
 
 
 def test_replay_says_what_it_found(tmp_path):
-    written_recordings.scannet(tmp_path / "scene0000_00", lost=(2,))
+    scannet(tmp_path / "scene0000_00", lost=(2,))
     shutil.make_archive(str(tmp_path / "scan"), "zip", tmp_path, "scene0000_00")
-    status, _, said = command("replay", tmp_path / "scan.zip", "--unpack", "--sensor", "sonar")
-    assert status == 1
-    first, second = said.splitlines()
+    done = tsfusion("replay", tmp_path / "scan.zip", "--unpack", "--sensor", "sonar")
+    assert done.returncode == 1
+    first, second = done.stderr.splitlines()
     assert first == "found: ScanNet scene0000_00, 3 RGB-D frames 160×120, all with poses"
     assert "sonar" in second
     assert (tmp_path / "scan" / "scene0000_00").is_dir()
@@ -301,7 +276,7 @@ def test_options_are_taken_as_they_were_meant(tmp_path):
 def test_a_broken_camera_file_is_one_clear_line(tmp_path, content):
     redwood(tmp_path / "redwood", [0], [0])
     (tmp_path / "redwood" / "camera_intrinsic.json").write_text(content)
-    written_recordings.replica(tmp_path / "replica")
+    replica(tmp_path / "replica")
     (tmp_path / "replica" / "cam_params.json").write_text(content)
     for place in ("redwood", "replica"):
         one_line(lambda place=place: open_dataset(tmp_path / place), r"\.json must ")

@@ -2,14 +2,14 @@
 """The synthetic worlds: exact surfaces, the stated noise, the same bytes every time."""
 
 import hashlib
-import subprocess
 import sys
 
 import cv2
 import kernel_twins
 import numpy as np
 import pytest
-from geometry_checks import warp_residual
+from command_processes import python
+from geometry_checks import move, warp_residual
 from scipy.spatial import cKDTree
 
 from tsfusion.core.errors import DatasetError
@@ -196,13 +196,7 @@ def test_the_thread_count_changes_nothing():
         "from tsfusion.datasets import Synthetic; from test_synthetic import digest;"
         "print(digest(Synthetic('street', 'stereo', width=96)[1]), digest(Synthetic('room', 'lidar')[1]))"
     )
-    outputs = [
-        subprocess.run(
-            [sys.executable, "-c", code, threads, *sys.path],
-            capture_output=True, text=True, timeout=120, check=True,
-        ).stdout
-        for threads in ("1", "3")
-    ]  # fmt: skip
+    outputs = [python(code, threads, *sys.path, check=True).stdout for threads in (1, 3)]
     assert outputs[0] == outputs[1]
     assert len(outputs[0]) > 128
 
@@ -220,14 +214,9 @@ def test_colour_is_the_surfaces_own():
     """One place has one colour from every view, and the views are not plain."""
     dataset = Synthetic("room", "kinect", noise=False, width=160)
     a, b = dataset[0], dataset[1]
-    T = np.linalg.inv(b.T_world_camera)
-    world = points_world(a)
-    q = world @ T[:3, :3].T + T[:3, 3]
-    K = b.intrinsics
-    u, v = (
-        np.rint(q[:, 0] / q[:, 2] * K.fx + K.cx).astype(int),
-        np.rint(q[:, 1] / q[:, 2] * K.fy + K.cy).astype(int),
-    )
+    q, K = move(np.linalg.inv(b.T_world_camera), points_world(a)), b.intrinsics
+    u = np.rint(q[:, 0] / q[:, 2] * K.fx + K.cx).astype(int)
+    v = np.rint(q[:, 1] / q[:, 2] * K.fy + K.cy).astype(int)
     ok = (u >= 0) & (v >= 0) & (u < b.shape[1]) & (v < b.shape[0])
     ok[ok] &= np.abs(depth_metres(b)[v[ok], u[ok]] - q[ok, 2]) < 0.02
     colors = a.color.reshape(-1, 3)[(a.depth > 0).ravel()]
@@ -241,23 +230,11 @@ def test_the_tables_of_solids_and_materials_agree_with_the_kernel():
     Synthetic(width=16, count=1)[0]  # starts Taichi
     from tsfusion.kernels import synthetic_raycast, synthetic_textures
 
-    for name in ("ROOM", "BOX", "SPHERE", "CYLINDER", "GROUND"):
-        assert getattr(synthetic_raycast, name) == getattr(worlds, name)
-    for name in (
-        "INTERIOR",
-        "WOOD",
-        "MARBLE",
-        "STRIPES",
-        "ROAD",
-        "PAVEMENT",
-        "FACADE",
-        "PAINT",
-        "METAL",
-        "BARK",
-    ):
-        assert getattr(synthetic_textures, name) == getattr(worlds, name)
-    for name in ("LEAVES", "GLASS", "PLAIN"):
-        assert getattr(synthetic_textures, name) == getattr(worlds, name)
+    solids = "ROOM BOX SPHERE CYLINDER GROUND"
+    materials = "INTERIOR WOOD MARBLE STRIPES ROAD PAVEMENT FACADE PAINT METAL BARK LEAVES GLASS PLAIN"
+    for module, names in ((synthetic_raycast, solids), (synthetic_textures, materials)):
+        for name in names.split():
+            assert getattr(module, name) == getattr(worlds, name)
 
 
 @pytest.mark.parametrize(
@@ -280,11 +257,10 @@ def test_a_world_that_cannot_be_made_is_one_clear_line(settings, match):
 @pytest.mark.parametrize("world", ["room", "street"])
 def test_rays_meet_what_the_twin_meets_first(world):
     dataset = Synthetic(world, "kinect", noise=False, color=False, width=40)
-    for index in (3,):
-        keyframe = dataset[index]
-        T = keyframe.T_world_camera
-        directions = dataset._directions @ T[:3, :3].T
-        expected = kernel_twins.trace(dataset.distance, T[:3, 3], directions, 5.9).reshape(keyframe.shape)
-        found = np.where(depth_metres(keyframe) < 5.9, depth_metres(keyframe), 0)
-        agree = np.abs(found - expected) < 2e-4
-        assert agree.mean() > 0.99  # the rest graze an edge
+    keyframe = dataset[3]
+    T = keyframe.T_world_camera
+    directions = dataset._directions @ T[:3, :3].T
+    expected = kernel_twins.trace(dataset.distance, T[:3, 3], directions, 5.9).reshape(keyframe.shape)
+    found = np.where(depth_metres(keyframe) < 5.9, depth_metres(keyframe), 0)
+    agree = np.abs(found - expected) < 2e-4
+    assert agree.mean() > 0.99  # the rest graze an edge

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Tiny recordings in the layouts of datasets, and changes that break them."""
 
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -52,11 +54,9 @@ def hololens(root: Path, count: int = 3) -> Path:
     """Depth of (7 + frame) mm, all with one pose."""
     for name in ("depth", "images"):
         (root / name).mkdir(parents=True)
-        for frame in range(count):
-            pixels = (
-                np.full((6, 8), 7 + frame, np.uint16) if name == "depth" else np.zeros((6, 8, 3), np.uint8)
-            )
-            cv2.imwrite(str(root / name / f"{frame:05d}.png"), pixels)
+    for frame in range(count):
+        cv2.imwrite(str(root / "depth" / f"{frame:05d}.png"), np.full((6, 8), 7 + frame, np.uint16))
+        cv2.imwrite(str(root / "images" / f"{frame:05d}.png"), np.zeros((6, 8, 3), np.uint8))
     (root / "K.txt").write_text("5 0 4\n0 5 3\n0 0 1\n")
     (root / "poses.txt").write_text((ROW + "\n") * count)
     return root
@@ -116,6 +116,14 @@ def replace(name: str, old: str, new: str) -> Change:
     return lambda root: (root / name).write_bytes(
         (root / name).read_bytes().replace(old.encode(), new.encode())
     )
+
+
+def claim_size(png: Path, side: int) -> None:
+    """Let a PNG claim so many pixels a side."""
+    content = bytearray(png.read_bytes())
+    struct.pack_into(">2I", content, 16, side, side)
+    struct.pack_into(">I", content, 29, zlib.crc32(content[12:29]))
+    png.write_bytes(content)
 
 
 def one_line(open_: Callable[[], object], match: str | None = None) -> None:

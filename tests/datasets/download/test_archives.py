@@ -36,7 +36,11 @@ def zipped(*members: tuple[str, bytes], links: tuple[str, ...] = ()) -> bytes:
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.zip", zipped(("fine", b"1"), ("../outside", b"2")), "leads out"),
+        (
+            "a.zip",
+            zipped(("fine", b"1"), ("../outside", b"2")),
+            r"cannot unpack .*a\.zip: .*leads out",
+        ),
         ("a.zip", zipped(("/abs", b"1")), "leads out"),
         ("a.zip", zipped(("x\\..\\..\\outside", b"1")), "leads out"),
         ("a.zip", zipped(("C:\\outside", b"1")), "leads out"),
@@ -152,13 +156,3 @@ def test_a_broken_archive_leaves_nothing_behind(tmp_path):
     for name in ("a.zip", "b.tgz"):
         one_line(lambda name=name: open_dataset(tmp_path / name, unpack=True), rf"cannot unpack .*{name}: ")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zip", "b.tgz"]
-
-
-@pytest.mark.parametrize("name", ["..\\..\\out.txt", "/etc/out.txt", "C:\\out.txt"])
-def test_an_archive_cannot_write_beside_its_folder(tmp_path, name):
-    with zipfile.ZipFile(tmp_path / "a.zip", "w") as packed:
-        packed.writestr("in.txt", "x")
-        packed.writestr(name, "x")
-    with pytest.raises(DatasetError, match=r"cannot unpack .*a\.zip: .*leads out of the archive's folder"):
-        open_dataset(tmp_path / "a.zip", unpack=True)
-    assert [path.name for path in tmp_path.rglob("*")] == ["a.zip"]

@@ -1,11 +1,288 @@
 # SPDX-License-Identifier: MIT
-"""Depth of real folders: one view moved by the poses lands on the other."""
+"""Folders of depth and colour images: 7-Scenes, ScanNet, Replica, HoloLens, Redwood."""
 
+import json
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 from geometry_checks import warp_residual
+from small_recordings import POSE, ROW, hololens, one_line, put, redwood, seven_scenes
+from written_recordings import check, matrix, millimetres, replica, scannet, views, write
 
-from tsfusion.datasets import open_dataset
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets import HoloLens, Redwood, Replica, ScanNet, SevenScenes, open_dataset
+from tsfusion.evaluation.view_prediction import depth_metres
+from tsfusion.geometry.keyframe import Intrinsics
+
+SECOND_POSE = "frame-000001.pose.txt"
+
+
+# --- 7-Scenes ---
+
+
+def test_seven_scenes_colour_is_read_in_either_format(data):
+    jpg, png = SevenScenes(data("7scenes/redkitchen")), SevenScenes(data("7scenes/redkitchen_png"))
+    for dataset in (jpg, png):
+        assert dataset[0].color.shape == (480, 640, 3)
+        assert dataset[0].depth.dtype == np.uint16
+    assert jpg.timestamps_ns is None
+
+
+def test_seven_scenes_masks_the_original_releases_invalid_depth(tmp_path):
+    seven_scenes(tmp_path, 1)
+    depth = np.full((6, 8), 65535, np.uint16)
+    depth[2, 3] = 1234
+    cv2.imwrite(str(tmp_path / "frame-000000.depth.png"), depth)
+    assert SevenScenes(tmp_path)[0].depth.sum() == 1234
+
+
+def test_a_scene_is_all_its_sequences(tmp_path):
+    seven_scenes(tmp_path / "seq-01", 2)
+    seven_scenes(tmp_path / "seq-02", 3)
+    (tmp_path / "camera-intrinsics.txt").write_text("500 0 4\n0 501 3\n0 0 1\n")
+    scene = SevenScenes(tmp_path)
+    assert len(scene) == 5
+    assert scene.intrinsics == Intrinsics(500, 501, 4, 3)
+    assert len(SevenScenes(tmp_path / "seq-02")) == 3
+    assert SevenScenes(tmp_path / "seq-02").intrinsics.fy == 501
+
+
+def test_frames_without_a_pose_are_skipped_and_counted(tmp_path):
+    seven_scenes(tmp_path, 4)
+    (tmp_path / "frame-000002.pose.txt").unlink()
+    dataset = SevenScenes(tmp_path)
+    assert [int(keyframe.depth[0, 0]) for keyframe in dataset] == [100, 101, 103]
+    assert dataset.skipped == {"without a pose": 1}
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "match"),
+    [
+        ("frame-000001.depth.png", None, r"frame-000001\.depth\.png is missing"),
+        ("frame-000001.color.png", None, r"frame-000001\.color\.png is missing; expected a colour image"),
+        (SECOND_POSE, POSE.replace("0.5", "nan"), r"frame-000001\.pose\.txt:1: not finite"),
+        (SECOND_POSE, POSE.replace("0.5", "0.5x"), r"pose\.txt:1: could not convert .*0\.5x"),
+        (SECOND_POSE, "1 0 0\n", r"pose\.txt:1: 3 numbers, expected 4: a 4×4 camera-to-world"),
+        (SECOND_POSE, "1 0 0 0\n" * 3, r"must hold 4 rows of 4 numbers, got 3"),
+        (SECOND_POSE, "", r"frame-000001\.pose\.txt is empty; expected a 4×4"),
+        (SECOND_POSE, POSE.replace("1 0 0 0.5", "2 0 0 0.5"), r"pose\.txt: T_world_camera must"),
+        ("camera-intrinsics.txt", "1 2\n", r"camera-intrinsics\.txt:1: 2 numbers, expected 3"),
+        ("camera-intrinsics.txt", "0 0 4\n0 5 3\n0 0 1\n", r"intrinsics\.txt: intrinsics must be finite"),
+        ("frame-000001.depth.png", "", r"frame-000001\.depth\.png cannot be decoded"),
+    ],
+)
+def test_a_broken_seven_scenes_folder_is_one_clear_line(tmp_path, name, content, match):
+    put(name, content)(seven_scenes(tmp_path))
+    one_line(lambda: list(SevenScenes(tmp_path)), match)
+
+
+def test_depth_saved_as_eight_bits_or_colour_of_another_size_is_refused(tmp_path):
+    seven_scenes(tmp_path)
+    cv2.imwrite(str(tmp_path / "frame-000000.depth.png"), np.ones((6, 8), np.uint8))
+    cv2.imwrite(str(tmp_path / "frame-000001.color.png"), np.ones((3, 4, 3), np.uint8))
+    dataset = SevenScenes(tmp_path)
+    with pytest.raises(DatasetError, match=r"must hold one 16-bit channel, got .* uint8"):
+        dataset[0]
+    with pytest.raises(DatasetError, match="is 4×3, its depth image 8×6; expected equal sizes"):
+        dataset[1]
+
+
+# --- ScanNet ---
+
+
+@pytest.mark.parametrize("frames25k", [False, True])
+def test_scannet_is_read_back(tmp_path, frames25k):
+    dataset = open_dataset(scannet(tmp_path / "scene0000_00", frames25k=frames25k))
+    assert isinstance(dataset, ScanNet)
+    assert dataset.name == "ScanNet scene0000_00"
+    check(dataset, views())
+
+
+def test_scannet_frames_that_the_tracker_lost_have_no_pose(tmp_path):
+    root = scannet(tmp_path, lost=(1,))
+    (root / "pose" / "21.txt").unlink()
+    posed, all_ = ScanNet(root), ScanNet(root, posed=False)
+    assert (len(posed), posed.skipped) == (2, {"without a pose": 2})
+    assert (len(all_), all_.skipped) == (4, {})
+    assert [all_.pose(index) is None for index in range(4)] == [False, True, False, True]
+    np.testing.assert_array_equal(posed.frame(1).depth, all_.frame(2).depth)
+    with pytest.raises(DatasetError, match=r"frame 1 of ScanNet .* has no pose; `tsfusion scan"):
+        all_[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (put("intrinsic/intrinsic_depth.txt", None), r"depth\.txt is missing; expected color/N\.jpg"),
+        (put("intrinsic/intrinsic_depth.txt", "1 0 0\n"), r"must hold a 4×4 or 3×3 camera matrix, got 1×3"),
+        (put("pose/7.txt", "1 0 0 0\n"), r"pose/7\.txt must hold 4 rows of 4 numbers, got 1"),
+        (put("pose/7.txt", matrix(np.eye(4)).replace("1.0", "2.0")), r"pose/7\.txt: T_world_camera must"),
+        (put("color/7.jpg", None), r"color/7\.png or \.jpg is missing, but .*depth/7\.png is there"),
+        (put("color/7.jpg", ""), r"color/7\.jpg cannot be decoded"),
+        (put("depth/0.png", None), r"holds no usable frames"),
+    ],
+)
+def test_a_broken_scannet_scene_is_one_clear_line(tmp_path, change, match):
+    scannet(tmp_path, count=2)
+    change(tmp_path)
+    if match == r"holds no usable frames":
+        (tmp_path / "depth" / "7.png").unlink()
+    one_line(lambda: list(ScanNet(tmp_path)), match)
+
+
+# --- Replica ---
+
+
+def replica_with_camera(root: Path, **changed: object) -> Path:
+    K = views(1)[0].intrinsics
+    camera = {"w": 160, "h": 120, "fx": K.fx, "fy": K.fy, "cx": K.cx, "cy": K.cy, "scale": 6553.5}
+    root.mkdir()
+    (root / "cam_params.json").write_text(json.dumps({"camera": {**camera, **changed}}))
+    return replica(root / "room0")
+
+
+def test_replica_is_read_back(tmp_path):
+    dataset = open_dataset(replica_with_camera(tmp_path / "Replica"))
+    assert isinstance(dataset, Replica)
+    check(dataset, views(), depth_m=0.0002)
+    assert open_dataset(tmp_path / "Replica").name == "Replica room0"
+
+
+def test_replica_without_its_camera_file_has_nice_slams_camera(tmp_path):
+    root = tmp_path / "room0"
+    write(root / "results" / "depth000003.png", np.full((68, 120), 6554, np.uint16))
+    (root / "traj.txt").write_text("\n".join(" ".join(matrix(np.eye(4) * 1.0).split()) for _ in range(4)))
+    dataset = Replica(root)
+    assert dataset.intrinsics == Intrinsics(600.0, 600.0, 599.5, 339.5).scaled(0.1)
+    assert depth_metres(dataset[0])[0, 0] == pytest.approx(1, abs=1e-3)
+    assert dataset[0].color is None
+    write(root / "results" / "depth000004.png", np.full((68, 120), 6554, np.uint16))
+    assert Replica(root).skipped == {"without a pose": 1}
+    assert len(Replica(root, posed=False)) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (put("room0/traj.txt", None), r"traj\.txt is missing; expected 16 numbers a line; `tsfusion scan"),
+        (put("room0/traj.txt", "1 2 3\n"), r"traj\.txt:1: 3 numbers, expected 16"),
+        (put("cam_params.json", "{}"), r"cam_params\.json must hold camera: w, h, fx.*; KeyError: 'camera'"),
+        (put("room0/results/frame000001.jpg", None), r"frame000001\.jpg is missing, but .*depth000001\.png"),
+        (put("cam_params.json", None), r"depth000000\.png is 160×120, its camera 1200×680"),
+    ],
+)
+def test_a_broken_replica_scene_is_one_clear_line(tmp_path, change, match):
+    replica_with_camera(tmp_path / "Replica")
+    change(tmp_path / "Replica")
+    one_line(lambda: list(Replica(tmp_path / "Replica" / "room0")), match)
+
+
+# --- HoloLens and Redwood ---
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (put("poses.txt", (ROW + "\n") * 2), r"poses\.txt has 2 poses for 3 depth images"),
+        (put("poses.txt", ROW + "\n" + ROW.replace("0.5", "inf") + "\n" + ROW), r"poses\.txt:2: not finite"),
+        (put("images/00001.png", None), r"00001\.png or \.jpg is missing, but .*depth"),
+        (put("K.txt", None), r"K\.txt is missing; expected a 3×3 camera matrix"),
+    ],
+)
+def test_a_broken_hololens_folder_is_one_clear_line(tmp_path, change, match):
+    hololens(tmp_path / "h")
+    assert [int(keyframe.depth[0, 0]) for keyframe in HoloLens(tmp_path / "h")] == [7, 8, 9]
+    change(tmp_path / "h")
+    with pytest.raises(DatasetError, match=match):
+        list(HoloLens(tmp_path / "h"))
+
+
+def test_redwood_poses_go_by_number_unless_there_are_as_many_images(tmp_path):
+    fewer = Redwood(redwood(tmp_path / "fewer", [3, 5], list(range(10))))
+    assert [keyframe.T_world_camera[0, 3] for keyframe in fewer] == [3, 5]
+    shifted = Redwood(redwood(tmp_path / "shifted", [1, 2, 3], [0, 1, 2]))
+    assert [keyframe.T_world_camera[0, 3] for keyframe in shifted] == [0, 1, 2]
+    unposed = Redwood(redwood(tmp_path / "unposed", [0, 1, 2], [0, 1]))
+    assert (len(unposed), unposed.skipped) == (2, {"without a pose": 1})
+    with pytest.raises(DatasetError, match=r"holds no usable frames; expected .*\(3 without a pose\)"):
+        Redwood(redwood(tmp_path / "none", [7, 8, 9], [0, 1]))
+
+
+def test_redwood_reads_open3d_cameras(tmp_path):
+    redwood(tmp_path, [0], [0])
+    camera = {"width": 8, "height": 6, "intrinsic_matrix": [9, 0, 0, 0, 8, 0, 4, 3, 1]}
+    (tmp_path / "camera_intrinsic.json").write_text(json.dumps(camera))
+    assert Redwood(tmp_path).intrinsics == Intrinsics(9, 8, 4, 3)
+    (tmp_path / "camera_intrinsic.json").write_text("{}")
+    with pytest.raises(DatasetError, match=r"camera_intrinsic\.json must be an Open3D camera"):
+        Redwood(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("0 0 1\n" + POSE[:-8], r"trajectory\.log has 4 lines; expected five a pose"),
+        ("0 x\n" + POSE, r"trajectory\.log:1: three integers expected before each matrix"),
+        ("0 0 1\n" + POSE.replace("0.5", "nan"), r"trajectory\.log:2: not finite"),
+        ("", r"trajectory\.log has 0 lines"),
+    ],
+)
+def test_a_broken_redwood_trajectory_is_one_clear_line(tmp_path, text, match):
+    redwood(tmp_path, [0], [0])
+    (tmp_path / "trajectory.log").write_text(text)
+    with pytest.raises(DatasetError, match=match):
+        Redwood(tmp_path)
+
+
+def redwood_room(root: Path, color: str, log: str, depth: str = "depth") -> Path:
+    """Open3D's and Redwood's places for the same images and poses."""
+    K = Intrinsics(525, 525, 319.5, 239.5)
+    text = ""
+    for number, view in enumerate(views()):
+        write(root / depth / f"{number:05d}.png", millimetres(view))
+        write(root / color / f"{number:05d}.jpg", view.color)
+        text += f"{number}\t{number}\t{number + 1}\n{matrix(view.T_world_camera)}"
+        K = view.intrinsics or K
+    (root / log).parent.mkdir(exist_ok=True)
+    (root / log).write_text(text)
+    camera = {"width": 160, "height": 120, "intrinsic_matrix": [K.fx, 0, 0, 0, K.fy, 0, K.cx, K.cy, 1]}
+    (root / "intrinsic.json").write_text(json.dumps(camera))
+    return root
+
+
+@pytest.mark.parametrize(
+    ("color", "log", "depth"),
+    [
+        ("image", "trajectory.log", "depth"),
+        ("color", "odometry.log", "depth"),
+        ("rgb", "scene/trajectory.log", "depth"),
+        ("color", "lounge_trajectory.log", "depth"),
+        ("livingroom1-color", "livingroom1-traj.txt", "livingroom1-depth-clean"),
+    ],
+)
+def test_redwoods_and_open3ds_places_are_known(tmp_path, color, log, depth):
+    root = redwood_room(tmp_path / "scene1", color, log, depth)
+    dataset = open_dataset(root)
+    assert isinstance(dataset, Redwood)
+    check(dataset, views())
+    if log.endswith(".log"):
+        check(open_dataset(root / log), views())
+
+
+def test_a_log_that_is_given_beats_the_one_that_is_found(tmp_path):
+    root = redwood_room(tmp_path, "image", "trajectory.log")
+    lines = (root / "trajectory.log").read_text().splitlines()
+    (root / "other.log").write_text("\n".join(lines[:10]) + "\n")
+    for dataset in (open_dataset(root / "other.log"), open_dataset(root, poses="other.log")):
+        assert (len(dataset), dataset.skipped) == (2, {"without a pose": 2})
+    (root / "livingroom1-depth-clean").mkdir()
+    (root / "depth").rename(root / "livingroom1-depth-simulated")
+    one_line(lambda: Redwood(root), r"holds 2 depth folders \(livingroom1-depth-clean, .*simulated\)")
+
+
+# --- any of them ---
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 import rig_recordings
 from geometry_checks import move
 from rig_recordings import circle
-from small_recordings import one_line, replace
+from small_recordings import one_line, put, replace
 from written_recordings import fits_together
 
 from tsfusion.core.errors import DatasetError
@@ -117,14 +117,8 @@ def test_kitti_raw_without_a_gps_unit_serves_scans_without_poses(drive):
         (replace("../calib_velo_to_cam.txt", "R: ", "R; "), r"txt:2: .*; expected `name: numbers`"),
         (replace("oxts/data/0000000001.txt", " 4 11 4 4 0", ""), r"01\.txt:1: 25 numbers, expected 30"),
         (replace("image_00/timestamps.txt", "2011-09-26", "today"), r"timestamps\.txt: .*; expected `year"),
-        (
-            lambda root: (root / "image_00/timestamps.txt").write_text(""),
-            r"has 0 lines, but there is a frame 2",
-        ),
-        (
-            lambda root: (root / "image_00/timestamps.txt").write_text("\n\n\n"),
-            r"txt:1 is empty, but there is",
-        ),
+        (put("image_00/timestamps.txt", ""), r"has 0 lines, but there is a frame 2"),
+        (put("image_00/timestamps.txt", "\n\n\n"), r"txt:1 is empty, but there is"),
         (lambda root: root.rename(root.with_name("2011_09_26_drive_0001_extract")), r"is not rectified"),
         (
             lambda root: shutil.copytree(root, root.with_name("2011_09_26_drive_0002_sync")),

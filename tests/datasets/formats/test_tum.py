@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import written_recordings
 from geometry_checks import move, warp_residual
-from small_recordings import corbs, one_line, replace
+from small_recordings import corbs, one_line, put, replace
+from written_recordings import write
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import TUM, open_dataset
@@ -19,6 +19,7 @@ from tsfusion.geometry.keyframe import Intrinsics
 scipy_spatial = pytest.importorskip("scipy.spatial")
 
 SECOND = 1_000_000_000
+TRUTH = "../D1_Trajectory/groundtruth.txt"
 
 
 def test_corbs_as_shipped(tmp_path):
@@ -48,8 +49,8 @@ def test_corbs_camera_follows_the_image_size(tmp_path):
 
 def test_a_gap_in_the_trajectory_is_not_bridged(tmp_path):
     place = corbs(tmp_path)
-    lines = (tmp_path / "D1_Trajectory" / "groundtruth.txt").read_text().splitlines()
-    (tmp_path / "D1_Trajectory" / "groundtruth.txt").write_text("\n".join(lines[:3] + lines[6:]))
+    lines = (place / TRUTH).read_text().splitlines()
+    (place / TRUTH).write_text("\n".join(lines[:3] + lines[6:]))
     assert TUM(place).skipped == {"without a pose in time": 3}
     assert TUM(place, max_gap_s=0.3).skipped == {"without a pose in time": 1}
 
@@ -57,40 +58,16 @@ def test_a_gap_in_the_trajectory_is_not_bridged(tmp_path):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (
-            lambda p: (p / "depth" / "3.png").unlink(),
-            r"3\.png is missing \(1 of 5 images that .*depth\.txt lists\)",
-        ),
-        (
-            lambda p: (p / "rgb" / "3.png").unlink(),
-            r"3\.png is missing \(1 of 5 images that .*rgb\.txt lists\)",
-        ),
-        (
-            replace("depth.txt", "1000.100000 depth", "1000.100000depth"),
-            r"depth\.txt:4: .*expected `timestamp path`",
-        ),
+        (put("depth/3.png", None), r"3\.png is missing \(1 of 5 images that .*depth\.txt lists\)"),
+        (put("rgb/3.png", None), r"3\.png is missing \(1 of 5 images that .*rgb\.txt lists\)"),
+        (replace("depth.txt", "1000.100000 d", "1000.100000d"), r"depth\.txt:4: .*expected `timestamp path`"),
         (replace("depth.txt", "1000.100000", "then"), r"depth\.txt:4: timestamp must be seconds, got 'then'"),
-        (lambda p: (p / "depth.txt").write_text("# nothing\n"), r"depth\.txt lists no images"),
-        (
-            replace("../D1_Trajectory/groundtruth.txt", " 2 0 0", " nan 0 0"),
-            r"groundtruth\.txt:5: not finite",
-        ),
-        (
-            replace("../D1_Trajectory/groundtruth.txt", " 2 0 0", " 2 0"),
-            r"groundtruth\.txt:5: 7 numbers, expected 8",
-        ),
-        (
-            replace("../D1_Trajectory/groundtruth.txt", "2 0 0 0 0 0 1", "2 0 0 0 0 0 0"),
-            r":5: quaternion must have",
-        ),
-        (
-            replace("../D1_Trajectory/groundtruth.txt", "1000", "2000"),
-            r"no usable frames.*\(5 without a pose in time\)",
-        ),
-        (
-            lambda p: (p / "../D1_Trajectory/groundtruth.txt").unlink(),
-            r"groundtruth\.txt is missing; expected .*trajectory",
-        ),
+        (put("depth.txt", "# nothing\n"), r"depth\.txt lists no images"),
+        (replace(TRUTH, " 2 0 0", " nan 0 0"), r"groundtruth\.txt:5: not finite"),
+        (replace(TRUTH, " 2 0 0", " 2 0"), r"groundtruth\.txt:5: 7 numbers, expected 8"),
+        (replace(TRUTH, "2 0 0 0 0 0 1", "2 0 0 0 0 0 0"), r":5: quaternion must have"),
+        (replace(TRUTH, "1000", "2000"), r"no usable frames.*\(5 without a pose in time\)"),
+        (put(TRUTH, None), r"groundtruth\.txt is missing; expected .*trajectory"),
     ],
 )
 def test_a_broken_recording_is_one_clear_line(tmp_path, change, match):
@@ -156,8 +133,8 @@ def icl(root: Path, order: str, truth: Path) -> Path:
     """As the archive is: frames from 0, a list of pairs; the trajectory from 1, downloaded by itself."""
     rows = []
     for number in range(3):
-        written_recordings.write(root / "depth" / f"{number}.png", np.full((480, 640), 5000, np.uint16))
-        written_recordings.write(root / "rgb" / f"{number}.png", np.full((480, 640, 3), number, np.uint8))
+        write(root / "depth" / f"{number}.png", np.full((480, 640), 5000, np.uint16))
+        write(root / "rgb" / f"{number}.png", np.full((480, 640, 3), number, np.uint8))
         depth, color = f"{number} depth/{number}.png", f"{number} rgb/{number}.png"
         rows.append(f"{depth} {color}" if order == "depth" else f"{color} {depth}")
     (root / "associations.txt").write_text("\n".join(rows) + "\n")

@@ -17,6 +17,16 @@ pytest.importorskip("rosbags")
 WITH_ALPHA = np.dstack([BGR, np.full(SHAPE, 9, np.uint8)])
 
 
+def of_color(folder: Path, stored: np.ndarray, encoding: str, **options: Any) -> Any:
+    """What a colour image beside a depth image is read as."""
+
+    def write(bag: BagWriter) -> None:
+        bag.image(DEPTH, wall().measurement, "16UC1", T0)
+        bag.image(COLOR, stored, encoding, T0, **options)
+
+    return only_depth(folder, write)[0].color
+
+
 @pytest.mark.parametrize("padding", [0, 5])
 @pytest.mark.parametrize(
     ("encoding", "stored", "expected"),
@@ -32,23 +42,14 @@ WITH_ALPHA = np.dstack([BGR, np.full(SHAPE, 9, np.uint8)])
 def test_colour_encodings(
     tmp_path: Path, encoding: str, stored: np.ndarray, expected: np.ndarray, padding: int
 ) -> None:
-    def write(bag: BagWriter) -> None:
-        bag.image(DEPTH, wall().measurement, "16UC1", T0)
-        bag.image(COLOR, stored, encoding, T0, padding=padding)
-
-    assert np.array_equal(only_depth(tmp_path, write)[0].color, expected)
+    assert np.array_equal(of_color(tmp_path, stored, encoding, padding=padding), expected)
 
 
 @pytest.mark.parametrize(("encoding", "first"), [("yuv422", 1), ("yuv422_yuy2", 0)])
 def test_yuv_is_read(tmp_path: Path, encoding: str, first: int) -> None:
     stored = np.full((*SHAPE, 2), 128, np.uint8)
     stored[..., first if encoding != "yuv422" else 1] = 180  # luminance
-
-    def write(bag: BagWriter) -> None:
-        bag.image(DEPTH, wall().measurement, "16UC1", T0)
-        bag.image(COLOR, stored, encoding, T0)
-
-    color = only_depth(tmp_path, write)[0].color
+    color = of_color(tmp_path, stored, encoding)
     assert np.ptp(color) == 0  # grey
     assert abs(int(color[0, 0, 0]) - round(1.164 * (180 - 16))) <= 1
 
@@ -59,12 +60,7 @@ def test_yuv_is_read(tmp_path: Path, encoding: str, first: int) -> None:
 def test_bayer_patterns_have_red_where_they_say(tmp_path: Path, pattern: str, red: tuple[int, int]) -> None:
     stored = np.zeros(SHAPE, np.uint8)
     stored[red[0] :: 2, red[1] :: 2] = 200
-
-    def write(bag: BagWriter) -> None:
-        bag.image(DEPTH, wall().measurement, "16UC1", T0)
-        bag.image(COLOR, stored, f"bayer_{pattern}8", T0)
-
-    color = only_depth(tmp_path, write)[0].color
+    color = of_color(tmp_path, stored, f"bayer_{pattern}8")
     assert color[5:-5, 5:-5].reshape(-1, 3).mean(axis=0) == pytest.approx([0, 0, 200], abs=1)
 
 

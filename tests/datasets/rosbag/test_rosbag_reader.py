@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Files and folders of recordings: found, read one message at a time, damaged."""
 
-import builtins
 import logging
 import random
 import sqlite3
+import sys
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -174,13 +174,7 @@ def test_empty_and_foreign_files_are_named(tmp_path: Path) -> None:
 
 
 def test_without_rosbags_the_error_names_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, real = walls(tmp_path), builtins.__import__
-
-    def without(name: str, *arguments: Any, **more: Any) -> Any:
-        if name.startswith("rosbags"):
-            raise ImportError(name)
-        return real(name, *arguments, **more)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    path = walls(tmp_path)
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(MissingDependency, match=r"pip install 'tsfusion\[ros\]'"):
         open_dataset(path)

@@ -4,13 +4,11 @@
 import json
 import os
 import signal
-import struct
 import subprocess
 import sys
 import textwrap
 import threading
 import time
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,6 +18,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from repository import ROOT
+from small_recordings import claim_size
 
 from tsfusion.core.errors import InvalidConfig, SourceError
 from tsfusion.geometry.frame import Frame
@@ -344,11 +343,7 @@ def test_an_image_that_claims_to_be_huge_is_left_out(tmp_path: Path) -> None:
     camera(tmp_path)
     for number in (0, 1):
         rgbd(tmp_path, number)
-    first = tmp_path / "depth" / "000000.png"
-    content = bytearray(first.read_bytes())
-    struct.pack_into(">2I", content, 16, 100_000, 100_000)
-    struct.pack_into(">I", content, 29, zlib.crc32(content[12:29]))
-    first.write_bytes(content)
+    claim_size(tmp_path / "depth" / "000000.png", 100_000)
     (tmp_path / "DONE").touch()
     with WatchedFolder(tmp_path) as source:
         assert numbers(list(source)) == [1]
