@@ -255,26 +255,25 @@ def test_kittis_wrong_ground_truth_is_flagged(data: Data) -> None:
     assert "no usual unit" in report.text
 
 
-def test_frames_that_share_nothing_cannot_tell(data: Data) -> None:
-    apart = select(opened(data(FOLDERS["hololens"])), start=5, stride=32)
-    assert check(apart).verdict == "cannot tell"
+def blind(frame: Frame) -> dict[str, object]:
+    return {"depth": np.zeros(frame.shape, np.uint16)}
 
 
-def test_a_sensor_that_stands_still_cannot_tell(data: Data) -> None:
-    kitchen = opened(data(FOLDERS["7scenes"]))
-    still = Corrupted(Selection(kitchen, [0] * 20), lambda _: np.eye(4))
-    assert check(still).verdict == "cannot tell"
+def still(views: Dataset) -> Dataset:
+    return Corrupted(Selection(views, [0] * 20), lambda _: np.eye(4))
 
 
-def test_one_frame_cannot_tell(data: Data) -> None:
-    assert check(select(opened(data(FOLDERS["7scenes"])), limit=1)).verdict == "cannot tell"
-
-
-def test_frames_without_depth_cannot_tell(data: Data) -> None:
-    def blind(frame: Frame) -> dict[str, object]:
-        return {"depth": np.zeros(frame.shape, np.uint16)}
-
-    assert check(Corrupted(opened(data(FOLDERS["open3d"])), frame=blind)).verdict == "cannot tell"
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        pytest.param("hololens", lambda views: select(views, start=5, stride=32), id="shares nothing"),
+        pytest.param("7scenes", still, id="stands still"),
+        pytest.param("7scenes", lambda views: select(views, limit=1), id="one frame"),
+        pytest.param("open3d", lambda views: Corrupted(views, frame=blind), id="without depth"),
+    ],
+)
+def test_what_cannot_be_told(name: str, change: Callable[[Dataset], Dataset], data: Data) -> None:
+    assert check(change(opened(data(FOLDERS[name])))).verdict == "cannot tell"
 
 
 def test_points_that_no_lidar_measures_are_no_matter() -> None:
@@ -325,8 +324,7 @@ def test_replay_warns(data: Data, tmp_path: Path, capsys: pytest.CaptureFixture[
 
     wrong = inverted(data(FOLDERS["open3d"]), tmp_path)
     replay._warn_of_disagreement(open_dataset(wrong))
-    assert capsys.readouterr().err.startswith(
-        "warning: poses and depth disagree: the poses are world-to-camera"
-    )
+    disagree = "warning: poses and depth disagree: the poses are world-to-camera"
+    assert capsys.readouterr().err.startswith(disagree)
     replay._warn_of_disagreement(open_dataset(data(FOLDERS["open3d"])))
     assert capsys.readouterr().err == ""

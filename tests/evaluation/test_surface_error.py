@@ -6,8 +6,6 @@ import pytest
 
 from tsfusion.evaluation import surface_error
 
-# --- metrics
-
 
 def test_spread_of_known_errors() -> None:
     spread = surface_error.spread_mm(np.array([-0.003, 0.001, 0.001, 0.003]))

@@ -23,6 +23,7 @@ from tsfusion.geometry.trajectory import quaternion, rigid
 from tsfusion.scanner.sources.recorded import RecordedSource
 
 RNG = np.random.default_rng(7)
+FREIBURG = "tum_rgbd/trajectories/freiburg1_xyz"
 
 
 def walk(count: int = 40) -> np.ndarray:
@@ -79,14 +80,10 @@ def test_association_takes_the_nearest_in_time():
     assert [list(x) for x in associate(np.array([5]), np.array([4]), 2)] == [[0], [0]]
 
 
-def test_rigid_transforms_come_back():
+def test_quaternions_come_back():
     for twist in (*RNG.normal(0, 1, (200, 6)), np.zeros(6), [0, 0, 0, np.pi, 0, 0], [1, 2, 3, 0, 1e-9, 0]):
         T = se3.exp(np.array(twist))
-        np.testing.assert_allclose(se3.exp(se3.log(T)), T, atol=1e-9)
         np.testing.assert_allclose(rigid(quaternion(T[:3, :3]), T[:3, 3]), T, atol=1e-12)
-        np.testing.assert_allclose(se3.inverse(T) @ T, np.eye(4), atol=1e-12)
-        x = RNG.normal(0, 0.3, 6)
-        np.testing.assert_allclose(T @ se3.exp(x) @ se3.inverse(T), se3.exp(se3.adjoint(T) @ x), atol=1e-9)
 
 
 def test_tum_files_are_read_as_they_were_written(tmp_path):
@@ -124,11 +121,7 @@ def test_figures_are_evos(data, align):
     ("form", "estimate", "reference"),
     [
         ("kitti", "kitti_odometry/poses_estimated/00_SPTAM.txt", "kitti_odometry/poses/00.txt"),
-        (
-            "tum",
-            "tum_rgbd/trajectories/freiburg1_xyz-rgbdslam.txt",
-            "tum_rgbd/trajectories/freiburg1_xyz-groundtruth.txt",
-        ),
+        ("tum", f"{FREIBURG}-rgbdslam.txt", f"{FREIBURG}-groundtruth.txt"),
     ],
 )
 def test_evo_itself_agrees(data, tmp_path, form, estimate, reference):

@@ -43,10 +43,8 @@ def test_each_measurement_is_accepted_and_normalised() -> None:
     wide = Keyframe(points=POINTS.astype(np.float64), T_world_camera=np.eye(4))
     assert wide.measurement.dtype == np.float32
     assert np.isinf(Keyframe(points=np.full((1, 3), 1e300), T_world_camera=np.eye(4)).measurement).all()
-    assert (
-        Keyframe(depth=DEPTH.astype(">u2"), intrinsics=CAMERA, T_world_camera=np.eye(4)).measurement.max()
-        == 1
-    )
+    swapped = Keyframe(depth=DEPTH.astype(">u2"), intrinsics=CAMERA, T_world_camera=np.eye(4))
+    assert swapped.measurement.max() == 1
 
 
 @pytest.mark.parametrize(

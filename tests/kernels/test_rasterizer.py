@@ -3,17 +3,12 @@
 
 import kernel_twins
 import numpy as np
-import pytest
 
 from tsfusion.kernels import rasterizer, runtime
 
 
-@pytest.fixture(scope="module", autouse=True)
-def taichi() -> None:
-    runtime.start(2)
-
-
 def test_shading_equals_the_twin() -> None:
+    runtime.start(2)
     random = np.random.default_rng(31)
     centres = random.uniform((-2, -1.5, 2), (2, 1.5, 6), (40, 1, 3))
     vertices = (centres + random.normal(0, 0.6, (40, 3, 3))).reshape(-1, 3).astype(np.float32)

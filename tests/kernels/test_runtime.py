@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from command_processes import python
 
 _STARTS = """
 import os, threading
@@ -28,17 +29,13 @@ print("started")
 
 def run(**environment: str) -> "subprocess.CompletedProcess[str]":
     """Start Taichi in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-c", _STARTS], capture_output=True, text=True, timeout=120, check=False,
-        env={**os.environ, **environment},
-    )  # fmt: skip
+    return python(_STARTS, env={**os.environ, **environment})
 
 
 def test_nobody_is_told_that_it_runs() -> None:
     assert run().stdout == "started\n"
-    assert run(TI_SKIP_VERSION_CHECK="OFF").stdout == "would tell its makers\nstarted\n", (
-        "else this tests nothing"
-    )
+    told = run(TI_SKIP_VERSION_CHECK="OFF").stdout
+    assert told == "would tell its makers\nstarted\n", "else this tests nothing"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="libX11 is asked for on Linux")

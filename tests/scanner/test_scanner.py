@@ -192,12 +192,9 @@ def test_a_track_gives_back_what_it_took() -> None:
     moved = PoseCorrections(
         revision=1, anchors=anchors, T_corrected_world=se3.exp(rng.normal(0, 1, 6)), loops=1
     )
-    one_by_one = [
-        anchors[given.anchor] @ given.T_anchor_camera
-        if given.anchor in anchors
-        else moved.T_corrected_world @ given.T_world_camera
-        for given in poses
-    ]
+    known = [anchors[given.anchor] @ given.T_anchor_camera for given in poses if given.anchor in anchors]
+    later = [given for given in poses if given.anchor not in anchors]
+    one_by_one = [*known, *(moved.T_corrected_world @ given.T_world_camera for given in later)]
     np.testing.assert_allclose(track.poses(moved), one_by_one, atol=1e-12)
     seqs, chosen = track.keyframes(moved)
     assert seqs.tolist() == [7, 11, 15, 19, 23]

@@ -17,7 +17,7 @@ from chaos_plan import KINDS, Attack, Kind, fault, on_scanners, on_server
 from delivery_verdict import client_problems, server_problems, verify
 from keyframes_and_servers import UNSECURED, Secured, secured, until, wall
 from msgspec import Struct
-from scanner_process import Plan, journals
+from scanner_process import Plan, journals, plan_in
 from supervisors import PATIENCE, Daemon, Scanner
 
 from tsfusion import journal
@@ -260,20 +260,13 @@ def journaled(state: Path) -> int:
 
 
 def _plan(folder: Path, address: str, numbers: range, rate: float, keys: Secured) -> Plan:
-    return Plan(
-        address=address,
-        spool=str(folder / f"spool-{numbers.start}"),
-        state=str(folder / "state"),
-        count=numbers.stop,
-        first=numbers.start,
-        step=numbers.step,
-        rate=rate,
-        correct_every=CORRECT_EVERY,
-        log=str(folder / f"taken-{numbers.start}"),
-        report=str(folder / f"report-{numbers.start}.json"),
-        patience=PATIENCE,
-        client=override(CLIENT, **keys.client),
-    )
+    first, client = numbers.start, override(CLIENT, **keys.client)
+    names = {"spool": f"spool-{first}", "log": f"taken-{first}", "report": f"report-{first}.json"}
+    own = {name: str(folder / file) for name, file in names.items()}
+    return plan_in(
+        folder, address, count=numbers.stop, first=first, step=numbers.step, rate=rate,
+        correct_every=CORRECT_EVERY, patience=PATIENCE, client=client, **own,
+    )  # fmt: skip
 
 
 def _status(daemon: Daemon, keys: Secured) -> Status | None:

@@ -54,10 +54,9 @@ def verify(state: Path, keyframes: int, map_hash: str, correct_every: int = 0) -
                         problems.append(f"correction {i} does not follow its keyframe")
                     continue
                 i = unpack_keyframe(record.frames[0]).timestamp_ns - NUMBERED_NS
-                if (record.seq, i) <= last.get(record.session, (0, -1)) or i < last.get(
-                    record.session, (0, -1)
-                )[1]:
-                    problems.append(f"keyframe {i} (seq {record.seq}) comes after {last[record.session]}")
+                before = last.get(record.session, (0, -1))
+                if (record.seq, i) <= before or i < before[1]:
+                    problems.append(f"keyframe {i} (seq {record.seq}) comes after {before}")
                 last[record.session] = (record.seq, i)
                 found.append(i)
     if sorted(found) != list(range(keyframes)):
@@ -74,20 +73,14 @@ def _map_problems(state: Path, keyframes: int, map_hash: str) -> list[str]:
     from tsfusion import Volume
 
     (path,) = [*state.glob("maps/*/map.tsf"), *state.glob("map.tsf")]
-    hashes = {
-        "undisturbed": undisturbed_hash(keyframes),
-        "told": map_hash,
-        "saved": Volume.load(path).map_hash(),
-    }
+    saved = Volume.load(path).map_hash()
+    hashes = {"undisturbed": undisturbed_hash(keyframes), "told": map_hash, "saved": saved}
     return [] if len(set(hashes.values())) == 1 else [f"the map's hashes differ: {hashes}"]
 
 
 @functools.cache
 def undisturbed_hash(keyframes: int) -> str:
     """Hash of the map of an undisturbed run."""
-    from tsfusion import Volume
+    from formula_scenes import volume_of
 
-    volume = Volume(voxel_size=VOXEL_SIZE, threads=1)
-    for i in range(keyframes):
-        volume.integrate(wall(i))
-    return volume.map_hash()
+    return volume_of(map(wall, range(keyframes)), voxel_size=VOXEL_SIZE, threads=1).map_hash()

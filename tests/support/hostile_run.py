@@ -14,7 +14,7 @@ import msgspec
 from attacks import ATTACKS
 from keyframes_and_servers import UNSECURED, Secured, Server, secured, serving, until
 from msgspec import Struct
-from scanner_process import Plan, Report
+from scanner_process import Plan, Report, plan_in
 from supervisors import PATIENCE, SCANNER
 
 from tsfusion.core.config import ClientConfig, override
@@ -136,16 +136,10 @@ def _raise_file_limit() -> None:
 
 
 def _plan(folder: Path, server: Server, given: Secured) -> Plan:
-    return Plan(
-        address=server.address,
-        spool=str(folder / "spool"),
-        state=str(folder / "state"),
-        count=1_000_000,
-        rate=RATE,
-        until=str(folder / "enough"),
-        report=str(folder / "report.json"),
-        patience=PATIENCE,
-        client=override(ClientConfig(policy="spool_all"), **given.client),
+    client = override(ClientConfig(policy="spool_all"), **given.client)
+    enough = str(folder / "enough")
+    return plan_in(
+        folder, server.address, count=1_000_000, rate=RATE, until=enough, patience=PATIENCE, client=client
     )
 
 

@@ -18,9 +18,7 @@ from tsfusion.geometry.se3 import exp, inverse
 Triple = tuple[float, float, float]
 
 
-def turned(
-    degrees: tuple[float, float, float], translation: tuple[float, float, float]
-) -> NDArray[np.float64]:
+def turned(degrees: Triple, translation: Triple) -> NDArray[np.float64]:
     """A transform by rotation vector and metres."""
     return exp(np.array([0, 0, 0, *np.radians(degrees)])) + _column(translation)
 
@@ -76,9 +74,7 @@ def euroc(root: Path, model: str = "radial-tangential", *, count: int = 3) -> Pa
 def _body_truth(place: Path, T_world_left: list[NDArray[np.float64]]) -> None:
     from scipy.spatial.transform import Rotation
 
-    rows = [
-        "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
-    ]
+    rows = ["#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z"]
     bodies = [T @ inverse(T_BODY_LEFT) for T in T_world_left]
     for number in range(5 * (len(bodies) - 1) + 1):  # between two images the body turns evenly
         before = min(number // 5, len(bodies) - 2)
@@ -112,7 +108,6 @@ def kitti_raw(root: Path, *, count: int = 3, cameras: tuple[str, ...] = ("00", "
     T_world_rectified = circle(count)
     T_world_imu = [T @ R_RECT @ T_CAM0_VELO @ T_VELO_IMU for T in T_world_rectified]
     K = at(T_world_rectified[:1], width=480)[0].intrinsics
-    assert K is not None
     for camera in cameras:
         poses = [T @ _column((BASELINES[camera], 0, 0)) + T for T in T_world_rectified]
         for number, view in enumerate(at(poses, width=480)):

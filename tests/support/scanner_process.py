@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -60,6 +61,13 @@ class Plan(Struct, kw_only=True):
     until: str | None = None
     patience: float = 120.0
     client: ClientConfig = ClientConfig()
+
+
+def plan_in(folder: Path, address: str, **more: Any) -> Plan:
+    """Orders for a scanner whose spool, report and server's state lie in a folder."""
+    places = {"spool": "spool", "state": "state", "report": "report.json"}
+    paths = {name: str(folder / place) for name, place in places.items()}
+    return Plan(**{"address": address, **paths, **more})
 
 
 class Report(Struct, kw_only=True):
@@ -126,10 +134,9 @@ def source(room: str | None) -> Callable[[int], Keyframe]:
     """Keyframes by number."""
     if room is None:
         return wall
+    names = ("depth", "color", "pose", "camera", "scale")
     with np.load(room) as file:
-        depth, color, pose, camera, scale = (
-            file[name] for name in ("depth", "color", "pose", "camera", "scale")
-        )
+        depth, color, pose, camera, scale = (file[name] for name in names)
 
     def view(i: int, captured_ns: int = 0) -> Keyframe:
         at = i % len(depth)
@@ -206,17 +213,9 @@ def scan(plan: Plan) -> Report:
         client.wait_fused(timeout=plan.patience)
         stats, times = client.stats, client.records
         seconds = time.monotonic() - started
-    return Report(
-        sent=stats.sent,
-        durable=stats.durable,
-        fused=stats.fused,
-        refused=stats.refused,
-        rejected=stats.rejected,
-        skipped=stats.skipped,
-        seconds=seconds,
-        cpu_seconds=time.process_time(),
-        times=times,
-    )
+    names = ("sent", "durable", "fused", "refused", "rejected", "skipped")
+    counts: dict[str, Any] = {name: getattr(stats, name) for name in names}
+    return Report(seconds=seconds, cpu_seconds=time.process_time(), times=times, **counts)
 
 
 def main() -> None:

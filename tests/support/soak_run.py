@@ -14,7 +14,7 @@ import msgspec
 from hostile_run import rss_bytes
 from keyframes_and_servers import Server, connected, serving
 from msgspec import Struct
-from scanner_process import Plan, Report, save_room
+from scanner_process import Report, plan_in, save_room
 from supervisors import SCANNER
 
 from tsfusion import VolumeConfig
@@ -89,16 +89,8 @@ def run(folder: Path, keyframes: int, *, tolerance_mb: float = TOLERANCE_MB) -> 
 
 
 def _samples(folder: Path, server: Server, room: Path, keyframes: int) -> Iterator[Sample]:
-    plan = Plan(
-        address=server.address,
-        spool=str(folder / "spool"),
-        state=str(folder / "state"),
-        count=keyframes,
-        room=str(room),
-        report=str(folder / "report.json"),
-        patience=_PATIENCE,
-        client=ClientConfig(policy="block", backlog=16),
-    )
+    client = ClientConfig(policy="block", backlog=16)
+    plan = plan_in(folder, server.address, count=keyframes, room=str(room), patience=_PATIENCE, client=client)
     with ExitStack() as stack:
         scanner = subprocess.Popen([sys.executable, str(SCANNER), msgspec.json.encode(plan).decode()])
         stack.callback(scanner.kill)
@@ -143,14 +135,11 @@ def _rises(samples: list[Sample], keyframes: int) -> dict[str, float]:
     early, late = _windows(samples, keyframes)
     if not early:
         return {}
-    return {
-        name: round(
-            median(one.processes[name].rss_mb for one in late)
-            - median(one.processes[name].rss_mb for one in early),
-            2,
-        )
-        for name in early[0].processes
-    }
+    rises = {}
+    for name in early[0].processes:
+        before, after = (median(one.processes[name].rss_mb for one in part) for part in (early, late))
+        rises[name] = round(after - before, 2)
+    return rises
 
 
 def _problems(samples: list[Sample], keyframes: int, tolerance_mb: float) -> list[str]:

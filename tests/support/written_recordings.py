@@ -134,11 +134,8 @@ def through_lens(image: NDArray[np.generic], pinhole: Intrinsics, camera: Camera
     """The image of a camera with a distorting lens in the place of a pinhole camera; 0 beyond its image."""
     v, u = np.mgrid[: camera.size[0], : camera.size[1]]
     rays = camera.rays(np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64))
-    columns, rows = (
-        (rays * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy))
-        .astype(np.float32)
-        .T.reshape(2, *camera.size)
-    )
+    pixels = rays * (pinhole.fx, pinhole.fy) + (pinhole.cx, pinhole.cy)
+    columns, rows = pixels.astype(np.float32).T.reshape(2, *camera.size)
     mode = cv2.INTER_NEAREST if image.dtype == np.uint16 else cv2.INTER_LINEAR
     return np.asarray(cv2.remap(image, columns, rows, mode))
 

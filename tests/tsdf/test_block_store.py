@@ -2,18 +2,13 @@
 """Blocks are found by their keys, and by nothing else."""
 
 import numpy as np
-import pytest
 from ray_maps import CASES, RayMap
 
 from tsfusion.kernels import block_hash, runtime
 
 
-@pytest.fixture(scope="module", autouse=True)
-def taichi() -> None:
-    runtime.start(2)
-
-
 def test_the_map_hash_finds_what_was_inserted_and_nothing_else() -> None:
+    runtime.start(2)
     keys = np.unique(np.random.default_rng(4).integers(1, 1 << 62, 3000))
     table, slots = np.zeros(8192, np.int64), np.zeros(8192, np.int32)
     block_hash.insert_blocks(keys, 0, 1000, 0, table, slots)

@@ -36,11 +36,7 @@ def zipped(*members: tuple[str, bytes], links: tuple[str, ...] = ()) -> bytes:
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        (
-            "a.zip",
-            zipped(("fine", b"1"), ("../outside", b"2")),
-            r"cannot unpack .*a\.zip: .*leads out",
-        ),
+        ("a.zip", zipped(("fine", b"1"), ("../outside", b"2")), r"cannot unpack .*a\.zip: .*leads out"),
         ("a.zip", zipped(("/abs", b"1")), "leads out"),
         ("a.zip", zipped(("x\\..\\..\\outside", b"1")), "leads out"),
         ("a.zip", zipped(("C:\\outside", b"1")), "leads out"),

@@ -11,7 +11,7 @@ import pytest
 from drifting_localizer import Drifting
 
 from tsfusion.core.errors import MissingDependency
-from tsfusion.datasets import Synthetic, open_dataset
+from tsfusion.datasets import Dataset, Synthetic, open_dataset
 from tsfusion.datasets.dataset import frame_of
 from tsfusion.datasets.synthetic import loop_worlds
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
@@ -61,10 +61,13 @@ class Run:
         return found
 
 
+def frames_of(dataset: Dataset) -> list[Frame]:
+    return [frame_of(dataset, index) for index in range(len(dataset))]
+
+
 @cache
 def two_laps() -> list[Frame]:
-    dataset = Synthetic("corridor", count=120)
-    return [dataset.frame(index) for index in range(120)]
+    return frames_of(Synthetic("corridor", count=120))
 
 
 @cache
@@ -90,17 +93,16 @@ def test_two_laps_with_drift_become_one_place():
     last = run.corrections[-1]
     assert last.loops == len(run.loops)
     newest = max(last.anchors)
-    np.testing.assert_allclose(
-        last.T_corrected_world @ run.track.poses()[newest - 1], last.anchors[newest], atol=1e-12
-    )
+    moved = last.T_corrected_world @ run.track.poses()[newest - 1]
+    np.testing.assert_allclose(moved, last.anchors[newest], atol=1e-12)
 
 
 def test_rooms_all_alike_are_not_one_room():
     """Each view has its like 4, 8, … metres before, equal to the last pixel: found, and not accepted."""
-    dataset = Synthetic("rooms", count=45)
-    run = Run([dataset.frame(index) for index in range(45)])
+    frames = frames_of(Synthetic("rooms", count=45))
+    run = Run(frames)
     assert run.closing.counts.verified > 30
-    assert run.closing.relocalise(dataset.frame(20)) is None
+    assert run.closing.relocalise(frames[20]) is None
     assert run.closing.consensus.refused["contradicts the odometry"] > 30
     assert run.loops == []
     assert run.corrections == []
@@ -109,8 +111,7 @@ def test_rooms_all_alike_are_not_one_room():
 @pytest.mark.slow
 @pytest.mark.parametrize("identical", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_the_way_back_closes_each_room_with_itself(identical):
-    dataset = Synthetic(loop_worlds.rooms(identical=identical), count=150, path="return")
-    run = Run([dataset.frame(index) for index in range(150)])
+    run = Run(frames_of(Synthetic(loop_worlds.rooms(identical=identical), count=150, path="return")))
     assert len(run.loops) >= 30
     assert run.wrong() == []
     assert run.error(run.corrections[-1]).rmse <= 0.3 * run.error(None).rmse
@@ -119,8 +120,7 @@ def test_the_way_back_closes_each_room_with_itself(identical):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.nightly)])
 def test_a_real_kitchen_gives_no_wrong_loop(data, seed):
-    dataset = open_dataset(data("7scenes/redkitchen"))
-    run = Run([frame_of(dataset, index) for index in range(len(dataset))], seed)
+    run = Run(frames_of(open_dataset(data("7scenes/redkitchen"))), seed)
     assert len(run.loops) >= 15
     assert run.wrong() == []
     assert run.error(run.corrections[-1]).rmse < run.error(None).rmse
@@ -261,8 +261,7 @@ def test_a_lost_tracker_goes_on_where_it_has_been_before():
 
 
 def test_lidar_frames_pass_through():
-    dataset = Synthetic("room", "lidar", count=12, color=False)
-    run = Run([dataset.frame(index) for index in range(12)])
+    run = Run(frames_of(Synthetic("room", "lidar", count=12, color=False)))
     assert len(run.track) == 12
     assert run.corrections == []
 
@@ -342,9 +341,8 @@ def test_a_look_alike_nearby_makes_a_loop_doubtful():
         found = consensus.add([claim(new - 50, new), claim(new - 48, new, off=2.0)])
         assert found == []
     assert consensus.refused["fits another place too"] == 4
-    sure = LoopConsensus(
-        straight(60, OdometryDrift(translation=0.005, rotation=0.001, translation_bias=0.002))
-    )
+    small = OdometryDrift(translation=0.005, rotation=0.001, translation_bias=0.002)
+    sure = LoopConsensus(straight(60, small))
     for new in range(50, 54):
         found += sure.add([claim(new - 50, new), claim(new - 48, new, off=2.0)])
     assert len(found) == 4

@@ -8,7 +8,8 @@ import pytest
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.localization import features
-from tsfusion.scanner.localization.rgbd import point_to_plane, pose_solver
+from tsfusion.scanner.localization.rgbd.point_to_plane import correlated_blocks, equations, fit_planes, match
+from tsfusion.scanner.localization.rgbd.pose_solver import AlignmentTarget, solve
 
 K = Intrinsics(585.0, 585.0, 319.5, 239.5)
 
@@ -25,7 +26,7 @@ def corner_of_a_room(T: np.ndarray, K: Intrinsics = K, shape: tuple[int, int] = 
 
 
 def test_planes_are_those_of_the_surface():
-    seen = point_to_plane.fit_planes(corner_of_a_room(np.eye(4)), K)
+    seen = fit_planes(corner_of_a_room(np.eye(4)), K)
     assert seen.shape == (120, 160)
     assert seen.covered > 0.9
     planes = seen.planes[:, seen.planes[3] > 0]
@@ -36,7 +37,7 @@ def test_planes_are_those_of_the_surface():
 
 
 def test_the_centre_of_a_block_lies_on_its_ray():
-    seen = point_to_plane.fit_planes(np.full((480, 640), 2.0, np.float32), K)
+    seen = fit_planes(np.full((480, 640), 2.0, np.float32), K)
     u, v = seen.points[0] / seen.points[2] * K.fx + K.cx, seen.points[1] / seen.points[2] * K.fy + K.cy
     np.testing.assert_allclose(u[:3], (1.5, 5.5, 9.5), atol=1e-3)
     np.testing.assert_allclose(v[::160][:3], (1.5, 5.5, 9.5), atol=1e-3)
@@ -45,18 +46,18 @@ def test_the_centre_of_a_block_lies_on_its_ray():
 
 @pytest.mark.parametrize("depth", [np.zeros((48, 64), np.float32), np.full((1, 1), 2.0, np.float32)])
 def test_no_surface(depth):
-    seen = point_to_plane.fit_planes(depth, K)
+    seen = fit_planes(depth, K)
     assert seen.covered == 0
-    found = point_to_plane.match(seen, seen, np.eye(4), None)
+    found = match(seen, seen, np.eye(4), None)
     assert len(found.distance) == 0
-    assert point_to_plane.correlated_blocks(found, seen.shape[1]) == 1
+    assert correlated_blocks(found, seen.shape[1]) == 1
 
 
 def test_holes_and_edges_have_no_plane():
     depth = np.full((480, 640), 2.0, np.float32)
     depth[:, 320:] = 1.0
     depth[100:140, 100:140] = 0
-    seen = point_to_plane.fit_planes(depth, K)
+    seen = fit_planes(depth, K)
     planes = seen.planes[3].reshape(seen.shape)
     assert (planes[:, 79:81] == 0).all()
     assert (planes[26:34, 26:34] == 0).all()
@@ -64,23 +65,20 @@ def test_holes_and_edges_have_no_plane():
 
 
 def test_a_moved_view_is_as_far_from_the_planes_as_it_moved():
-    wall = point_to_plane.fit_planes(np.full((480, 640), 2.0, np.float32), K)
+    wall = fit_planes(np.full((480, 640), 2.0, np.float32), K)
     T = se3.exp(np.array([0, 0, 0.05, 0, 0, 0]))
-    np.testing.assert_allclose(point_to_plane.match(wall, wall, T, None).distance, 0.05, atol=1e-4)
-    assert len(point_to_plane.match(wall, wall, se3.exp(np.array([9.0, 0, 0, 0, 0, 0])), None).distance) == 0
-    assert len(point_to_plane.match(wall, wall, se3.exp(np.array([0, 0, -5.0, 0, 0, 0])), None).distance) == 0
+    np.testing.assert_allclose(match(wall, wall, T, None).distance, 0.05, atol=1e-4)
+    assert len(match(wall, wall, se3.exp(np.array([9.0, 0, 0, 0, 0, 0])), None).distance) == 0
+    assert len(match(wall, wall, se3.exp(np.array([0, 0, -5.0, 0, 0, 0])), None).distance) == 0
 
 
 def test_the_step_is_the_gradient_of_the_distances():
     """Against differences: moving by -gradient/information is what brings the sum of squares down fastest."""
     T = se3.exp(np.array([0.01, -0.02, 0.01, 0.01, 0.005, -0.01]))
-    there, here = (
-        point_to_plane.fit_planes(corner_of_a_room(np.eye(4)), K),
-        point_to_plane.fit_planes(corner_of_a_room(T), K),
-    )
-    found = point_to_plane.match(there, here, np.eye(4), None)
+    there, here = (fit_planes(corner_of_a_room(pose), K) for pose in (np.eye(4), T))
+    found = match(there, here, np.eye(4), None)
     one = np.ones(len(found.distance), np.float32)
-    _, g = point_to_plane.equations(found, one)
+    _, g = equations(found, one)
 
     def cost(step: np.ndarray) -> float:
         moved = se3.apply(se3.exp(step), found.moved.T)
@@ -94,16 +92,12 @@ def test_the_step_is_the_gradient_of_the_distances():
 
 def test_errors_that_are_alike_count_once():
     rng = np.random.default_rng(0)
-    wall = point_to_plane.fit_planes(np.full((480, 640), 2.0, np.float32), K)
+    wall = fit_planes(np.full((480, 640), 2.0, np.float32), K)
     white = (2 + 0.006 * rng.standard_normal((480, 640))).astype(np.float32)
     smooth = cv2.GaussianBlur(rng.standard_normal((480, 640)), (0, 0), 30)
     wavy = (2 + 0.006 * smooth / smooth.std()).astype(np.float32)
-    counts = [
-        point_to_plane.correlated_blocks(
-            point_to_plane.match(wall, point_to_plane.fit_planes(z, K), np.eye(4), None), 160
-        )
-        for z in (white, wavy)
-    ]
+    matched = (match(wall, fit_planes(z, K), np.eye(4), None) for z in (white, wavy))
+    counts = [correlated_blocks(each, 160) for each in matched]
     assert 1 <= counts[0] < 1.3
     assert counts[1] > 30
 
@@ -111,34 +105,27 @@ def test_errors_that_are_alike_count_once():
 @pytest.mark.parametrize("corners", [0, 200])
 def test_the_pose_is_found_from_ten_centimetres_away(corners):
     T = se3.exp(np.array([0.06, -0.05, 0.07, 0.05, -0.04, 0.05]))
-    there, here = (
-        point_to_plane.fit_planes(corner_of_a_room(np.eye(4)), K),
-        point_to_plane.fit_planes(corner_of_a_room(T), K),
-    )
+    there, here = (fit_planes(corner_of_a_room(pose), K) for pose in (np.eye(4), T))
     points = np.random.default_rng(0).uniform((-0.5, -0.5, 1), (0.5, 0.5, 2), (corners, 3))
     q = se3.apply(se3.inverse(T), points)
     pixels = np.stack([K.fx * q[:, 0] / q[:, 2] + K.cx, K.fy * q[:, 1] / q[:, 2] + K.cy], axis=1)
-    link = pose_solver.AlignmentTarget(np.eye(4), there, points, pixels.astype(np.float32))
-    off = se3.inverse(T) @ pose_solver.solve([link], here, K, 640, np.eye(4)).T_anchor_camera
+    link = AlignmentTarget(np.eye(4), there, points, pixels.astype(np.float32))
+    off = se3.inverse(T) @ solve([link], here, K, 640, np.eye(4)).T_anchor_camera
     assert se3.distance(off) < 2e-4
     assert se3.angle(off) < 2e-4
 
 
 def test_corners_alone_give_the_pose_and_outliers_do_not_matter():
     rng = np.random.default_rng(1)
-    T, nothing = (
-        se3.exp(rng.normal(0, 0.03, 6)),
-        point_to_plane.fit_planes(np.zeros((480, 640), np.float32), K),
-    )
+    T = se3.exp(rng.normal(0, 0.03, 6))
+    nothing = fit_planes(np.zeros((480, 640), np.float32), K)
     points = rng.uniform((-1, -1, 1), (1, 1, 3), (300, 3))
     q = se3.apply(se3.inverse(T), points)
     pixels = np.stack([K.fx * q[:, 0] / q[:, 2] + K.cx, K.fy * q[:, 1] / q[:, 2] + K.cy], axis=1)
     pixels[:40] += rng.normal(0, 80, (40, 2))
-    link = pose_solver.AlignmentTarget(np.eye(4), nothing, points, pixels.astype(np.float32))
-    off = (
-        se3.inverse(T)
-        @ pose_solver.solve([link], nothing, K, 640, T @ se3.exp(np.full(6, 0.005))).T_anchor_camera
-    )
+    link = AlignmentTarget(np.eye(4), nothing, points, pixels.astype(np.float32))
+    guess = T @ se3.exp(np.full(6, 0.005))
+    off = se3.inverse(T) @ solve([link], nothing, K, 640, guess).T_anchor_camera
     assert se3.distance(off) < 1e-3
 
 
@@ -146,13 +133,13 @@ def test_what_moves_in_one_view_moves_by_the_other_the_same():
     """A second view's planes are used in the first one's axes."""
     T_a_b = se3.exp(np.array([0.1, 0.05, -0.1, 0.02, 0.1, 0.05]))
     T = se3.exp(np.array([0.02, 0.03, 0.01, -0.01, 0.02, 0.02]))
-    a, b, here = (point_to_plane.fit_planes(corner_of_a_room(pose), K) for pose in (np.eye(4), T_a_b, T))
+    a, b, here = (fit_planes(corner_of_a_room(pose), K) for pose in (np.eye(4), T_a_b, T))
     none, nowhere = np.empty((0, 3)), np.empty((0, 2), np.float32)
     links = [
-        pose_solver.AlignmentTarget(np.eye(4), a, none, nowhere),
-        pose_solver.AlignmentTarget(se3.inverse(T_a_b), b, none, nowhere),
+        AlignmentTarget(np.eye(4), a, none, nowhere),
+        AlignmentTarget(se3.inverse(T_a_b), b, none, nowhere),
     ]
-    off = se3.inverse(T) @ pose_solver.solve(links, here, K, 640, np.eye(4)).T_anchor_camera
+    off = se3.inverse(T) @ solve(links, here, K, 640, np.eye(4)).T_anchor_camera
     assert se3.distance(off) < 2e-4
     assert se3.angle(off) < 2e-4
 

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: MIT
 """The RGB-D tracker: how far it drifts on recorded and on exact scenes, and that it knows when it is lost."""
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from command_processes import python
 from rgbd_scenes import CAMERA, garbage, track, wall
 
 from tsfusion.core.errors import InvalidKeyframe
@@ -67,9 +66,8 @@ def test_rooms_with_exact_poses(world, bound, path):
 
 @pytest.mark.slow
 def test_a_room_at_full_resolution():
-    result = track(
-        RGBDLocalizer(), frames(Synthetic("room", count=150, path="handheld", width=640), stride=3)
-    )
+    room = Synthetic("room", count=150, path="handheld", width=640)
+    result = track(RGBDLocalizer(), frames(room, stride=3))
     assert not result.lost
     assert result.ate() < 3
 
@@ -136,17 +134,15 @@ def test_no_pose_after_a_jump_is_wrong(kitchen, color):
         lost += len(result.lost)
         if not result.lost:
             moved = se3.inverse(result.truth[0]) @ result.truth[1]
-            assert (
-                se3.distance(se3.inverse(moved) @ result.poses[1]) < 0.06
-            )  # twice what the truth is good to
+            off = se3.distance(se3.inverse(moved) @ result.poses[1])
+            assert off < 0.06  # twice what the truth is good to
     assert lost >= 4
 
 
 def test_another_place_is_lost(kitchen, data):
     other = open_dataset(data("redwood_livingroom1")).frame(0)
-    assert track(RGBDLocalizer(), [kitchen.frame(0), replace(other, intrinsics=kitchen.intrinsics)]).lost == [
-        1
-    ]
+    other = replace(other, intrinsics=kitchen.intrinsics)
+    assert track(RGBDLocalizer(), [kitchen.frame(0), other]).lost == [1]
 
 
 @pytest.mark.parametrize("waves", [False, True])
@@ -161,9 +157,8 @@ def test_along_a_plain_wall_it_is_lost(waves):
 
 @pytest.mark.parametrize("waves", [False, True])
 def test_along_a_wall_with_a_pattern_it_goes_by_the_image(waves):
-    result = track(
-        RGBDLocalizer(), [wall(2 * index, textured=True, waves=waves, seed=index) for index in range(12)]
-    )
+    walls = (wall(2 * index, textured=True, waves=waves, seed=index) for index in range(12))
+    result = track(RGBDLocalizer(), walls)
     assert not result.lost
     expected = np.arange(12) * 2 * 2.0 / CAMERA.fx
     np.testing.assert_allclose(result.poses[:, 0, 3], expected, atol=0.003)
@@ -314,9 +309,7 @@ assert answer.anchor > 50
 assert "taichi" not in sys.modules
 print(megabytes("VmHWM"), max(sizes[200:]) - max(sizes[:200]))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, timeout=300, check=True
-    )
+    done = python(code, tmp_path, timeout=300, check=True)
     peak, growth = map(float, done.stdout.split())
     assert peak < 200
     assert growth < 10

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: MIT
 """RealSense without a camera: librealsense's software device, and what it recorded."""
 
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -12,9 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_processes import python
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, SourceError
+from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.sources.realsense import RealSense
 from tsfusion.scanner.sources.source import Source
 
@@ -129,6 +129,16 @@ def showing(camera: Camera, **options: Any) -> Iterator[None]:
         thread.join()
 
 
+def number_of(frame: Frame) -> int:
+    """The exposure's number, by its time."""
+    return round((frame.timestamp_ns / 1e6 - START_MS) / STEP_MS)
+
+
+def first_frame(camera: Camera, shown: dict[str, NDArray[Any]] | None = None, **options: Any) -> Frame:
+    with RealSense(device=camera.device, **options) as source, showing(camera, shown=shown):
+        return next(iter(source))
+
+
 def record(path: Path, numbers: list[int], **options: Any) -> Path:
     """The device's images in a file, by librealsense's own recorder."""
     camera = Camera(**options)
@@ -157,7 +167,7 @@ def test_frames_of_a_device() -> None:
     with source, showing(camera):
         frames = [frame for frame, _ in zip(source, range(5), strict=False)]
     for frame in frames:
-        number = round((frame.timestamp_ns / 1e6 - START_MS) / STEP_MS)
+        number = number_of(frame)
         assert frame.timestamp_ns == round((START_MS + number * STEP_MS) * 1e6)
         assert (frame.color == images(number)["color"]).all()
         assert frame.kind == "depth"
@@ -184,7 +194,7 @@ def test_a_slow_reader_of_a_recording_loses_nothing(recording: Path) -> None:
     numbers = []
     with RealSense(recording=recording) as source:
         for frame in source:
-            numbers.append(round((frame.timestamp_ns / 1e6 - START_MS) / STEP_MS))
+            numbers.append(number_of(frame))
             assert (frame.color == images(numbers[-1])["color"]).all()
             time.sleep(0.02)
     assert numbers == list(range(1, 13))
@@ -199,7 +209,7 @@ def test_a_recording_in_real_time_drops_and_counts(tmp_path: Path) -> None:
     with RealSense(recording=path, real_time=True) as source:
         assert source.live
         for frame in source:
-            numbers.append(round((frame.timestamp_ns / 1e6 - START_MS) / STEP_MS))
+            numbers.append(number_of(frame))
             assert (frame.color == images(numbers[-1])["color"]).all()
     assert numbers == sorted(set(numbers))
     assert len(numbers) < 199
@@ -221,8 +231,7 @@ def test_depth_is_brought_onto_colour() -> None:
     """A wall at 1 m, and a colour camera to the right: 7 pixels of the view are the depth camera's alone."""
     camera = Camera(offset=(-0.1, 0, 0), units=0.0001)
     wall = {"depth": np.full((H, W), 10_000, np.uint16), "color": images(1)["color"]}
-    with RealSense(device=camera.device) as source, showing(camera, shown=wall):
-        frame = next(iter(source))
+    frame = first_frame(camera, wall)
     assert frame.intrinsics.fx == FX + 3  # the colour camera's
     assert frame.baseline_fx == pytest.approx(BASELINE * FX)  # the depth camera's: it sets the noise
     seen = frame.depth_m > 0
@@ -242,8 +251,7 @@ def test_a_distorted_colour_camera_is_flattened() -> None:
     column, row = np.meshgrid(np.arange(W), np.arange(H))
     ramp = np.stack([column * 3, row * 4, column * 0], axis=2).astype(np.uint8)
     depth = (1000 + column * 10).astype(np.uint16)
-    with RealSense(device=camera.device) as source, showing(camera, shown={"depth": depth, "color": ramp}):
-        frame = next(iter(source))
+    frame = first_frame(camera, {"depth": depth, "color": ramp})
     own = camera.profiles["color"].as_video_stream_profile().get_intrinsics()
     flat = frame.intrinsics
     moved = 0.0
@@ -266,27 +274,21 @@ def test_the_infrared_pair() -> None:
     camera = Camera()
     with RealSense(device=camera.device, images="infrared") as source, showing(camera):
         frame = next(iter(source))
-    number = round((frame.timestamp_ns / 1e6 - START_MS) / STEP_MS)
     assert frame.kind == "pair"
-    assert (frame.left == images(number)["left"]).all()
-    assert (frame.right == images(number)["right"]).all()
+    assert (frame.left == images(number_of(frame))["left"]).all()
+    assert (frame.right == images(number_of(frame))["right"]).all()
     assert frame.baseline_fx == pytest.approx(BASELINE * (FX + 1))
     assert source.sensor == frame.sensor == "stereo"
 
 
 def test_a_time_of_flight_camera_has_no_baseline() -> None:
-    camera = Camera(stereo=False)
-    with RealSense(device=camera.device, color=False) as source, showing(camera):
-        frame = next(iter(source))
+    frame = first_frame(Camera(stereo=False), color=False)
     assert (frame.sensor, frame.baseline_fx) == ("tof", None)
 
 
 def test_colour_in_the_other_order() -> None:
-    camera = Camera(pixels="rgb8")
-    with RealSense(device=camera.device) as source, showing(camera):
-        frame = next(iter(source))
-    number = round((frame.timestamp_ns / 1e6 - START_MS) / STEP_MS)
-    assert (frame.color[:, :, ::-1] == images(number)["color"]).all()
+    frame = first_frame(Camera(pixels="rgb8"))
+    assert (frame.color[:, :, ::-1] == images(number_of(frame))["color"]).all()
 
 
 def test_what_a_slow_consumer_misses_is_counted_and_not_kept() -> None:
@@ -296,7 +298,7 @@ def test_what_a_slow_consumer_misses_is_counted_and_not_kept() -> None:
             camera.show(number)
         numbers: list[int] = []
         with pytest.raises(SourceError):
-            numbers.extend(round((frame.timestamp_ns / 1e6 - START_MS) / STEP_MS) for frame in source)
+            numbers.extend(number_of(frame) for frame in source)
     assert numbers[-1] == 100
     assert len(numbers) < 20
     assert sum(source.skipped.values()) == 101 - numbers[0] - len(numbers)
@@ -318,11 +320,8 @@ def test_the_moment_of_capture(domain: str) -> None:
     with RealSense(device=camera.device) as source:
         begun, now_ms = time.monotonic_ns(), time.time() * 1000
         for number in (1, 2, 3):
-            camera.show(
-                number,
-                stamp_ms=now_ms - late_ms + number * STEP_MS,
-                domain=getattr(rs.timestamp_domain, domain),
-            )
+            stamp_ms = now_ms - late_ms + number * STEP_MS
+            camera.show(number, stamp_ms=stamp_ms, domain=getattr(rs.timestamp_domain, domain))
         frame = next(iter(source))
     since_begin_ms = (frame.captured_ns - begun) / 1e6
     if domain == "hardware_clock":  # it says nothing of when that was here
@@ -363,9 +362,7 @@ def test_ctrl_c_comes_through() -> None:
         "except KeyboardInterrupt:\n"
         "    sys.exit(7)\n"
     )
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, cwd=Path(__file__).parent, timeout=60, check=False)
-    assert done.returncode == 7
+    assert python(program, cwd=Path(__file__).parent).returncode == 7
 
 
 def test_a_camera_that_is_not_there() -> None:

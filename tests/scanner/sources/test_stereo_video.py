@@ -3,8 +3,6 @@
 
 import http.server
 import os
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from command_processes import python
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, SourceError
@@ -122,10 +121,7 @@ def test_times_of_a_film(tmp_path: Path) -> None:
 def test_raw_pairs_are_rectified(data: Callable[[str], Path], tmp_path: Path) -> None:
     place = data("euroc_V1_01/mav0")
     names = sorted(path.name for path in (place / "cam0" / "data").glob("*.png"))
-    raw = [
-        [read_image(place / side / "data" / name, "a grey image") for side in ("cam0", "cam1")]
-        for name in names
-    ]
+    raw = [[read_image(place / side / "data" / name, "grey") for side in ("cam0", "cam1")] for name in names]
     for number, pair in enumerate(raw):
         cv2.imwrite(str(tmp_path / f"{number}.png"), np.hstack(pair))
     expected = Rectifier(read_rig(place / "cam0" / "sensor.yaml", place / "cam1" / "sensor.yaml"))
@@ -210,9 +206,7 @@ def test_ctrl_c_comes_through(quiet_ffmpeg: None) -> None:
         "    sys.exit(7)\n"
     )
     with NetworkCamera() as camera:
-        command = [sys.executable, "-c", program, camera.url]
-        done = subprocess.run(command, cwd=Path(__file__).parent, timeout=60, check=False)
-    assert done.returncode == 7
+        assert python(program, camera.url, cwd=Path(__file__).parent).returncode == 7
 
 
 def test_pictures_of_another_size(numbered: str) -> None:
@@ -229,7 +223,7 @@ def test_pictures_of_another_size(numbered: str) -> None:
     [
         (
             "97",
-            "camera 97 cannot be opened: there is no /dev/video97; (expected one of|no camera is plugged in)",
+            "camera 97 cannot be opened: there is no /dev/video97; (expected one of|no camera is)",
         ),
         ("/dev/video97", "camera /dev/video97 cannot be opened: there is no /dev/video97"),
         ("/dev/null", "camera /dev/null cannot be opened: another program uses /dev/null, or"),

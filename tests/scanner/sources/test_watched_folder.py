@@ -16,6 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from command_processes import python
 from numpy.typing import NDArray
 from repository import ROOT
 from small_recordings import claim_size
@@ -72,6 +73,13 @@ def numbers(frames: list[Frame]) -> list[int]:
             assert (frame.color == color(found[-1])).all()
         assert frame.intrinsics == K
     return found
+
+
+def whole(root: Path, **options: Any) -> tuple[WatchedFolder, list[Frame]]:
+    """A folder that is written to its end, and its frames."""
+    (root / "DONE").touch()
+    with WatchedFolder(root, **options) as source:
+        return source, list(source)
 
 
 WRITER = """
@@ -160,9 +168,7 @@ def test_names_that_are_times(tmp_path: Path) -> None:
     camera(tmp_path)
     rgbd(tmp_path, 1, name="1305031102.5")
     rgbd(tmp_path, 0, name="1305031102.175304")
-    (tmp_path / "DONE").touch()
-    with WatchedFolder(tmp_path) as source:
-        frames = list(source)
+    _, frames = whole(tmp_path)
     assert numbers(frames) == [0, 1]
     assert [frame.timestamp_ns for frame in frames] == [1305031102175304000, 1305031102500000000]
 
@@ -171,10 +177,8 @@ def test_names_that_are_no_times_take_the_files(tmp_path: Path) -> None:
     camera(tmp_path)
     rgbd(tmp_path, 0)
     os.utime(tmp_path / "depth" / "000000.png", ns=(1, 1_600_000_000_000_000_000))
-    (tmp_path / "DONE").touch()
     begun = time.monotonic_ns()
-    with WatchedFolder(tmp_path) as source:
-        (frame,) = source
+    _, (frame,) = whole(tmp_path)
     assert frame.timestamp_ns == 1_600_000_000_000_000_000
     assert frame.captured_ns >= begun  # it was captured long before; the delay is counted from the reading
 
@@ -206,9 +210,7 @@ def test_the_layout_of_7_scenes(data: Callable[[str], Path], tmp_path: Path) -> 
     for stem in stems:
         for path in recorded.glob(f"{stem}.*"):
             (tmp_path / path.name).write_bytes(path.read_bytes())
-    (tmp_path / "DONE").touch()
-    with WatchedFolder(tmp_path) as source:
-        frames = list(source)
+    _, frames = whole(tmp_path)
     assert len(frames) == len(stems) == 3
     for stem, frame in zip(stems, frames, strict=True):
         expected = cv2.imread(str(recorded / f"{stem}.depth.png"), cv2.IMREAD_UNCHANGED)
@@ -221,9 +223,7 @@ def test_an_open3d_camera_and_a_scale(tmp_path: Path) -> None:
     matrix = K.matrix.T.ravel().tolist()
     (tmp_path / "camera_intrinsic.json").write_text(json.dumps({"intrinsic_matrix": matrix}))
     rgbd(tmp_path, 0)
-    (tmp_path / "DONE").touch()
-    with WatchedFolder(tmp_path, depth_scale=0.0002, sensor="tof") as source:
-        (frame,) = source
+    _, (frame,) = whole(tmp_path, depth_scale=0.0002, sensor="tof")
     assert (frame.intrinsics, frame.depth_scale, frame.sensor) == (K, 0.0002, "tof")
 
 
@@ -232,10 +232,8 @@ def test_rectified_pairs(tmp_path: Path) -> None:
     (tmp_path / "baseline.txt").write_text("0.12\n")
     for side, number in (("left", 1), ("right", 2)):
         write(tmp_path, f"{side}/1403715273262142976.png", png(color(number)[:, :, 0]))
-    (tmp_path / "DONE").touch()
-    with WatchedFolder(tmp_path) as source:
-        assert source.sensor == "stereo"
-        (frame,) = source
+    source, (frame,) = whole(tmp_path)
+    assert source.sensor == "stereo"
     assert (frame.left == color(1)[:, :, 0]).all()
     assert (frame.right == color(2)[:, :, 0]).all()
     assert frame.baseline_fx == pytest.approx(0.12 * 40)
@@ -247,9 +245,7 @@ def test_raw_pairs_with_their_calibration(data: Callable[[str], Path], tmp_path:
     for side, name in (("cam0", "left"), ("cam1", "right")):
         for path in (place / side / "data").glob("*.png"):
             write(tmp_path, f"{name}/{path.name}", path.read_bytes())
-    (tmp_path / "DONE").touch()
-    with WatchedFolder(tmp_path, calibration=place) as source:
-        frames = list(source)
+    _, frames = whole(tmp_path, calibration=place)
     assert len(frames) >= 2
     assert frames[0].baseline_fx / frames[0].intrinsics.fx == pytest.approx(0.1101, abs=1e-4)
     keyframe = frames[0].keyframe(np.eye(4))
@@ -286,9 +282,7 @@ def test_a_lens_that_distorts(tmp_path: Path) -> None:
         f"distortion_coeffs: [-0.2, 0.02, 0, 0]\nresolution: [{W}, {H}]\n"
     )
     rgbd(tmp_path, 0)
-    (tmp_path / "DONE").touch()
-    with WatchedFolder(tmp_path, calibration=tmp_path / "calibration.yaml") as source:
-        (frame,) = source
+    _, (frame,) = whole(tmp_path, calibration=tmp_path / "calibration.yaml")
     assert frame.intrinsics.fx > 41
     assert not (frame.depth == depth(0)).all()
     assert set(np.unique(frame.depth)) <= set(np.unique(depth(0)))  # moved, never mixed
@@ -333,10 +327,9 @@ def test_files_that_go_away_while_they_are_read(tmp_path: Path, monkeypatch: pyt
         return image
 
     monkeypatch.setattr(folder_layouts, "whole_image", then_gone)
-    (tmp_path / "DONE").touch()
-    with WatchedFolder(tmp_path) as source:
-        assert numbers(list(source)) == [1]
-        assert source.skipped == {"damaged": 1}
+    source, frames = whole(tmp_path)
+    assert numbers(frames) == [1]
+    assert source.skipped == {"damaged": 1}
 
 
 def test_an_image_that_claims_to_be_huge_is_left_out(tmp_path: Path) -> None:
@@ -344,10 +337,9 @@ def test_an_image_that_claims_to_be_huge_is_left_out(tmp_path: Path) -> None:
     for number in (0, 1):
         rgbd(tmp_path, number)
     claim_size(tmp_path / "depth" / "000000.png", 100_000)
-    (tmp_path / "DONE").touch()
-    with WatchedFolder(tmp_path) as source:
-        assert numbers(list(source)) == [1]
-        assert source.skipped == {"damaged": 1}
+    source, frames = whole(tmp_path)
+    assert numbers(frames) == [1]
+    assert source.skipped == {"damaged": 1}
 
 
 def test_close_from_another_thread_ends_the_iteration(tmp_path: Path) -> None:
@@ -369,8 +361,7 @@ def test_a_handler_of_a_signal_may_close_it(tmp_path: Path) -> None:
         "        signal.setitimer(signal.ITIMER_REAL, 0.001 + turn * 1e-6)\n"
         "        assert list(source) == []\n"
     )
-    command = [sys.executable, "-c", program, str(tmp_path)]
-    subprocess.run(command, cwd=ROOT, timeout=60, check=True)
+    python(program, tmp_path, cwd=ROOT, check=True)
 
 
 def test_ctrl_c_comes_through(tmp_path: Path) -> None:
