@@ -130,9 +130,8 @@ def test_the_signed_distance_of_the_room_is_the_documented_formula():
     box = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
     w = np.stack([np.hypot(x, y + 0.8) - 0.15, np.abs(z - 0.6) - 0.6], axis=1)
     column = np.linalg.norm(np.maximum(w, 0), axis=1) + np.minimum(w.max(axis=1), 0)
-    np.testing.assert_allclose(
-        worlds.room().distance(p), np.min([walls, sphere, box, column], axis=0), atol=1e-12
-    )
+    nearest = np.min([walls, sphere, box, column], axis=0)
+    np.testing.assert_allclose(worlds.room().distance(p), nearest, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -77,11 +77,9 @@ def test_edge_error_counts_what_is_near_an_edge() -> None:
 
 def test_edges_inside_another_solid_are_none() -> None:
     """A box sunk in the floor to its middle: four edges above, four uprights that are half buried."""
-    rows = [
-        worlds.solid(worlds.GROUND, (0, 0, 0), (0, 0, 0), 0),
-        worlds.solid(worlds.BOX, (0, 0, -0.1), (0.5, 0.5, 0.5), 0),
-    ]
-    edges = edges_of(worlds.World("sunk", np.array(rows), {}))
+    floor = worlds.solid(worlds.GROUND, (0, 0, 0), (0, 0, 0), 0)
+    box = worlds.solid(worlds.BOX, (0, 0, -0.1), (0.5, 0.5, 0.5), 0)
+    edges = edges_of(worlds.World("sunk", np.array([floor, box]), {}))
     assert len(edges) == 4
     assert (edges[..., 2] == 0.4).all()
 

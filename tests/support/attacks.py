@@ -241,9 +241,8 @@ def raw(address: str, kind: bytes) -> socket.socket:
     """A connection over which a handshake as a socket of this kind was made."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     made = socket.create_connection((host, int(port)), timeout=5.0)
-    made.sendall(
-        _GREETING + _command(b"READY", _property(b"Socket-Type", kind) + _property(b"Identity", b""))
-    )
+    ready = _property(b"Socket-Type", kind) + _property(b"Identity", b"")
+    made.sendall(_GREETING + _command(b"READY", ready))
     return made
 
 

@@ -59,9 +59,8 @@ def on_server(rng: random.Random, keyframes: int, kills: int) -> list[Attack]:
 
 def fault(rng: random.Random) -> Fault:
     """A fault that networks have."""
-    what = rng.choice(
-        ["cut", "half_close", "refuse", "throttle", "delay", "freeze", "swallow", "mute", *3 * ["jam"]]
-    )
+    kinds = ["cut", "half_close", "refuse", "throttle", "delay", "freeze", "swallow", "mute", *3 * ["jam"]]
+    what = rng.choice(kinds)
     value: float | bool | None = True
     lasts, pause = rng.uniform(0.2, 2.0), rng.uniform(0.3, 2.0)
     if what in ("cut", "half_close"):

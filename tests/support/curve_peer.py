@@ -78,9 +78,8 @@ class Peer:
 
         salt, number = os.urandom(16), self._next()
         vouch = salt + _shut(public_once + server, b"VOUCH---" + salt, self._server_once, secret)
-        metadata = b"".join(
-            property_of(*one) for one in ({b"Socket-Type": b"PUSH", b"Identity": b""} | claims).items()
-        )
+        properties = {b"Socket-Type": b"PUSH", b"Identity": b"", **claims}
+        metadata = b"".join(property_of(*one) for one in properties.items())
         nonce = b"CurveZMQINITIATE" + number
         box = _shut(shown + vouch + metadata, nonce, self._server_once, secret_once)
         self._command(b"\x08INITIATE" + cookie + number + box)

@@ -32,9 +32,8 @@ class Drifting:
             step = se3.inverse(self._last) @ truth
             way = se3.distance(step) + se3.angle(step)
             noise = self._rng.normal(0, 1, 6) * ([0.01] * 3 + [0.003] * 3)
-            self._T = (
-                self._T @ step @ se3.exp(np.sqrt(way) * noise + way * np.array([0, 0, 4, 0, 1.5, 0]) / 1e3)
-            )
+            drift = np.sqrt(way) * noise + way * np.array([0, 0, 4, 0, 1.5, 0]) / 1e3
+            self._T = self._T @ step @ se3.exp(drift)
         self._last, self._number = truth, self._number + 1
         return Pose(
             T_world_camera=self._T,

@@ -86,9 +86,8 @@ def _body_truth(place: Path, T_world_left: list[NDArray[np.float64]]) -> None:
         x, y, z, w = R.as_quat()
         t = (1 - share) * A[:3, 3] + share * B[:3, 3]
         stamp = FIRST_NS + number * 10_000_000
-        rows.append(
-            f"{stamp},{t[0]:.9f},{t[1]:.9f},{t[2]:.9f},{w:.9f},{x:.9f},{y:.9f},{z:.9f},0,0,0,0,0,0,0,0,0"
-        )
+        numbers = ",".join(f"{value:.9f}" for value in (*t, w, x, y, z))
+        rows.append(f"{stamp},{numbers},0,0,0,0,0,0,0,0,0")
     place.mkdir(parents=True)
     (place / "data.csv").write_text("\n".join(rows) + "\n")
 

@@ -93,9 +93,8 @@ def corbs(root: Path, *, shape: tuple[int, int] = (480, 640)) -> Path:
         (place / f"{name}.txt").write_bytes(text.encode())
     (root / "D1_Trajectory").mkdir()
     poses = [f"{1000.01 + 0.05 * i:.4f} {i} 0 0 0 0 0 1" for i in range(-1, 7)]
-    (root / "D1_Trajectory" / "groundtruth.txt").write_bytes(
-        "\r\n".join(["# t x y z q", *poses, ""]).encode()
-    )
+    text = "\r\n".join(["# t x y z q", *poses, ""])
+    (root / "D1_Trajectory" / "groundtruth.txt").write_bytes(text.encode())
     return place
 
 

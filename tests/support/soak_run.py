@@ -70,13 +70,11 @@ def run(folder: Path, keyframes: int, *, tolerance_mb: float = TOLERANCE_MB) -> 
     report = msgspec.json.decode((folder / "report.json").read_bytes(), type=Report)
     problems = _problems(samples, keyframes, tolerance_mb)
     if (report.fused, status.keyframes_fused) != (keyframes, keyframes) or status.keyframes_rejected:
-        problems.append(
-            f"{status.keyframes_fused} of {keyframes} are fused, {status.keyframes_rejected} rejected"
-        )
+        rejected = status.keyframes_rejected
+        problems.append(f"{status.keyframes_fused} of {keyframes} are fused, {rejected} rejected")
     if stopped or status.fuser_restarts:
-        problems.append(
-            f"the server ended with status {stopped}, its fuser was restarted {status.fuser_restarts} times"
-        )
+        restarts = status.fuser_restarts
+        problems.append(f"the server ended with status {stopped}, its fuser was restarted {restarts} times")
     return Outcome(
         problems=problems,
         keyframes=keyframes,

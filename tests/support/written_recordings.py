@@ -43,9 +43,8 @@ def check(dataset: Dataset, expected: tuple[Keyframe, ...], *, depth_m: float = 
         assert shift(a.color, b.color) < 0.15
         np.testing.assert_allclose(a.intrinsics.matrix, b.intrinsics.matrix, rtol=1e-5)
         start, truth = found[0].T_world_camera, expected[0].T_world_camera
-        np.testing.assert_allclose(
-            inverse(start) @ a.T_world_camera, inverse(truth) @ b.T_world_camera, atol=1e-5
-        )
+        wanted = inverse(truth) @ b.T_world_camera
+        np.testing.assert_allclose(inverse(start) @ a.T_world_camera, wanted, atol=1e-5)
     fits_together(found[0], found[1])
 
 

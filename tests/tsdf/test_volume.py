@@ -114,10 +114,8 @@ def test_a_shift_by_whole_blocks_shifts_the_map() -> None:
     for keyframe in VIEWS[:3]:
         T = keyframe.T_world_camera.copy()
         T[:3, 3] += shift * 8 * 0.0625  # powers of two: the sums round alike
-        moved.append(Keyframe(depth=keyframe.depth, intrinsics=keyframe.intrinsics, T_world_camera=T))
-    here = [
-        Keyframe(depth=k.depth, intrinsics=k.intrinsics, T_world_camera=k.T_world_camera) for k in VIEWS[:3]
-    ]
+        moved.append(replace(keyframe, color=None, T_world_camera=T))
+    here = [replace(keyframe, color=None) for keyframe in VIEWS[:3]]
     a, b = volume_of(here, voxel_size=0.0625), volume_of(moved, voxel_size=0.0625)
     rows = [dict(zip(map(tuple, unpack_keys(v._store.keys)), v._store.sums, strict=False)) for v in (a, b)]
     shifted = {tuple(np.array(key) + shift): row for key, row in rows[0].items()}
@@ -173,10 +171,7 @@ def test_points_far_outside_the_reach_of_keys_are_dropped_and_counted() -> None:
 def test_confidence_zero_is_no_return_and_half_is_less() -> None:
     keyframe, full = VIEWS[0], volume_of(VIEWS[:1])
     for value, check in ((0, lambda w: w == 0), (128, lambda w: 0 < w < weights(full))):
-        doubted = Keyframe(
-            depth=keyframe.depth, intrinsics=keyframe.intrinsics, T_world_camera=keyframe.T_world_camera,
-            confidence=np.full(SHAPE, value, np.uint8),
-        )  # fmt: skip
+        doubted = replace(keyframe, color=None, confidence=np.full(SHAPE, value, np.uint8))
         assert check(weights(volume_of([doubted])))
 
 

@@ -18,6 +18,8 @@ from tsfusion.datasets.download.download import fetch
 
 pytest.importorskip("pooch")
 
+Disk = Callable[[int], Path]
+
 
 def test_a_file_comes_whole_with_its_progress(server: Server, tmp_path: Path) -> None:
     seen: list[tuple[int, int]] = []
@@ -86,7 +88,7 @@ def test_a_server_that_takes_back_what_it_sent_is_left(server: Server, tmp_path:
 
 
 def test_a_server_that_never_ends_does_not_fill_the_disk(
-    server: Server, small_disk: Callable[[int], Path], monkeypatch: pytest.MonkeyPatch
+    server: Server, small_disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk = small_disk(4)
     server.with_length, server.files["file.bin"] = False, bytes(32 << 20)
@@ -139,16 +141,14 @@ def test_nobody_there_is_one_clear_error(monkeypatch: pytest.MonkeyPatch, tmp_pa
             fetch(one(bad), tmp_path, silent)
 
 
-def test_a_disk_without_room_is_said_before(
-    server: Server, small_disk: Callable[[int], Path], tmp_path: Path
-) -> None:
+def test_a_disk_without_room_is_said_before(server: Server, small_disk: Disk, tmp_path: Path) -> None:
     disk = small_disk(4)
     with pytest.raises(OutputError, match=r"3 MB are needed, 4 MB are free"):
         fetch(one(server.url), disk, silent)
 
 
 def test_a_disk_that_fills_keeps_the_part(
-    server: Server, small_disk: Callable[[int], Path], monkeypatch: pytest.MonkeyPatch
+    server: Server, small_disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk = small_disk(2)
     monkeypatch.setattr(durable_files, "_RESERVE_BYTES", -(1 << 40))

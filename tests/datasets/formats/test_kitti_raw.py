@@ -41,9 +41,8 @@ def test_kitti_raw_poses_and_depth_are_the_left_cameras(drive_root, cameras, shi
     beside[0, 3] = shift
     expected = [T @ beside for T in circle(3)]
     for index in (1, 2):
-        np.testing.assert_allclose(
-            inverse(dataset.pose(0)) @ dataset.pose(index), inverse(expected[0]) @ expected[index], atol=1e-5
-        )
+        step = inverse(dataset.pose(0)) @ dataset.pose(index)
+        np.testing.assert_allclose(step, inverse(expected[0]) @ expected[index], atol=1e-5)
     np.testing.assert_allclose(dataset.pose(0)[:3, :3], expected[0][:3, :3], atol=1e-6)  # east, north, up
     fits_together(dataset[0], dataset[1], bound=0.02)
     color = dataset[0].color
@@ -67,9 +66,8 @@ def test_kitti_raw_numbers_agree_with_pykittis_own(drive_root):
 
     with contextlib.redirect_stdout(None):
         theirs = pykitti.raw(str(drive_root.parents[1]), rig_recordings.DAY, "0001")
-    grey, color, lidar = (
-        KITTIRaw(drive_root, **options) for options in ({}, {"cameras": "color"}, {"modality": "lidar"})
-    )
+    grey, color = KITTIRaw(drive_root), KITTIRaw(drive_root, cameras="color")
+    lidar = KITTIRaw(drive_root, modality="lidar")
     np.testing.assert_allclose(grey.intrinsics.matrix, theirs.calib.K_cam0)
     assert grey.baseline_fx / grey.intrinsics.fx == pytest.approx(theirs.calib.b_gray)
     assert color.baseline_fx / color.intrinsics.fx == pytest.approx(theirs.calib.b_rgb)

@@ -16,9 +16,8 @@ scipy_spatial = pytest.importorskip("scipy.spatial")
 def read_rows(path: Path) -> NDArray[np.int64]:
     """(N,) the range grid's row of every vertex."""
     head, body = path.read_bytes().replace(b"\r\n", b"\n").split(b"end_header\n", 1)
-    sizes = dict(
-        line.split()[1:3] for line in head.splitlines() if line.startswith((b"element", b"obj_info num"))
-    )
+    stated = (line for line in head.splitlines() if line.startswith((b"element", b"obj_info num")))
+    sizes = dict(line.split()[1:3] for line in stated)
     cells = body.splitlines()[int(sizes[b"vertex"]) :]
     rows = np.full(int(sizes[b"vertex"]), -1)
     for index, cell in enumerate(cells):

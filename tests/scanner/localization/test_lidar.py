@@ -27,9 +27,8 @@ Data = Callable[[str], Path]
 
 @pytest.fixture
 def kitti(data: Data) -> list[Frame]:
-    dataset = open_dataset(
-        data("kitti_odometry"), sequence="00", modality="lidar", poses="poses_estimated/00_ORB.txt"
-    )
+    options = {"sequence": "00", "modality": "lidar", "poses": "poses_estimated/00_ORB.txt"}
+    dataset = open_dataset(data("kitti_odometry"), **options)
     return [frame_of(dataset, index) for index in range(6)]
 
 
@@ -143,9 +142,7 @@ def test_reset_begins_a_new_world(street: list[Frame]) -> None:
 def drive(street: list[Frame], count: int) -> list[Frame]:
     """Scans stamped at their beginning, of a sensor that goes and turns while it spins, faster and faster."""
     truths = [pose_of(frame) for frame in street]
-    cloud = np.vstack(
-        [se3.apply(T, f.points) for T, f in zip(truths, street, strict=True) if f.points is not None]
-    )
+    cloud = np.vstack([se3.apply(T, f.points) for T, f in zip(truths, street, strict=True)])
     T, slots = truths[0], 180
     rng = np.random.default_rng(5)
     made = []

@@ -2,6 +2,7 @@
 """Pose graphs: the laws of an optimum, an independent solver, and loops that are wrong."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -78,9 +79,7 @@ def test_names_of_nodes_and_the_order_of_edges_mean_nothing():
     nodes, edges = drifting(truth, np.random.default_rng(5))
     edges.append(loop(truth, 1, 24))
     renamed = {1000 - 7 * key: T for key, T in nodes.items()}
-    again = [
-        PoseGraphEdge(1000 - 7 * e.start, 1000 - 7 * e.end, e.T_start_end, e.information) for e in edges[::-1]
-    ]
+    again = [replace(e, start=1000 - 7 * e.start, end=1000 - 7 * e.end) for e in edges[::-1]]
     one, two = optimise(nodes, edges), optimise(renamed, again)
     np.testing.assert_allclose(stacked(one.nodes), stacked(two.nodes), atol=1e-6)
 

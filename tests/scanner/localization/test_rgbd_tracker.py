@@ -223,9 +223,8 @@ def test_anchors_and_quality(room):
         if pose.starts_anchor:
             assert pose.anchor not in anchors
             anchors[pose.anchor] = pose.T_world_camera
-        np.testing.assert_allclose(
-            anchors[pose.anchor] @ pose.T_anchor_camera, pose.T_world_camera, atol=1e-12
-        )
+        T = anchors[pose.anchor] @ pose.T_anchor_camera
+        np.testing.assert_allclose(T, pose.T_world_camera, atol=1e-12)
         assert pose.timestamp_ns == frame.timestamp_ns
         assert 0.9 < pose.quality <= 1
     assert list(anchors) == list(range(len(anchors)))
