@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Clients of a scripted server or of none, and keyframes for them."""
 
+import time
+
 from keyframes_and_servers import wall
 from scripted_server import ScriptedServer
 
@@ -17,4 +19,4 @@ def joined(server: ScriptedServer, **settings: object) -> Client:
 
 def send_all(client: Client, numbers: range) -> list[int]:
     """Send these walls; the numbers of those that the client took."""
-    return [i for i in numbers if client.send(wall(i)) is not None]
+    return [i for i in numbers if client.send(wall(i, captured_ns=time.monotonic_ns())) is not None]

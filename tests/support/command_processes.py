@@ -16,6 +16,7 @@ from weakref import WeakKeyDictionary
 
 COMMAND = [sys.executable, "-m", "tsfusion"]
 DEADLINE = 120.0  # seconds: a cold kernel compilation on a slow machine
+Here = Callable[..., "subprocess.CompletedProcess[str]"]  # of the fixture `here`
 
 
 def environment() -> dict[str, str]:
@@ -30,6 +31,14 @@ def tsfusion(
     return subprocess.run(
         [*COMMAND, *map(str, arguments)], capture_output=True, text=True, timeout=timeout, env=environment(),
         check=False, stdin=subprocess.DEVNULL, **more,
+    )  # fmt: skip
+
+
+def python(program: str, *arguments: object, **more: Any) -> "subprocess.CompletedProcess[str]":
+    """Run Python code in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-c", program, *map(str, arguments)], text=True, check=False,
+        **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "timeout": DEADLINE, **more},
     )  # fmt: skip
 
 
