@@ -4,14 +4,15 @@
 import errno
 import logging
 import os
+import shutil
 import time
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import small_disk
+from failures import raising, refuse
 
 from tsfusion import journal
 from tsfusion.core import durable_files
@@ -26,15 +27,14 @@ def fill(log: Journal, count: int, first: int = 1, size: int = 1000) -> list[Pos
     return [log.append([b"head", bytes(size)], session=SESSION, seq=first + i) for i in range(count)]
 
 
+def write(folder: Path, count: int, segment_bytes: int = BIG) -> None:
+    log = Journal(folder, segment_bytes)
+    fill(log, count)
+    log.close()
+
+
 def seqs(folder: Path) -> list[int]:
     return [found.seq for found in Journal(folder, BIG).found]
-
-
-def refuse(code: int) -> Callable[..., Any]:
-    def refused(*_arguments: object, **_more: object) -> Any:
-        raise OSError(code, os.strerror(code))
-
-    return refused
 
 
 # --- a full disk ---
@@ -130,7 +130,9 @@ def test_a_disk_that_refuses_is_an_error_and_not_the_end(
         patched.setattr(os, "fdatasync", refuse(code))
         with pytest.raises(JournalError, match=os.strerror(code)):
             fill(log, 1, first=3)
-    fill(log, 1, first=4)
+    assert seqs(tmp_path) == [1, 2]  # a later scan would take the third for the one that comes now
+    (position,) = fill(log, 1, first=4)
+    assert journal.read(tmp_path, position).seq == 4
     log.close()
     assert seqs(tmp_path) == [1, 2, 4]
 
@@ -139,11 +141,8 @@ def test_an_interrupted_append_leaves_nothing_behind(tmp_path: Path, monkeypatch
     log = Journal(tmp_path, BIG)
     fill(log, 1)
 
-    def interrupted(_: int) -> None:
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patched:
-        patched.setattr(os, "fdatasync", interrupted)
+        patched.setattr(os, "fdatasync", raising(KeyboardInterrupt()))
         with pytest.raises(KeyboardInterrupt):
             fill(log, 1, first=2)
     fill(log, 1, first=3)
@@ -152,9 +151,7 @@ def test_an_interrupted_append_leaves_nothing_behind(tmp_path: Path, monkeypatch
 
 
 def test_a_read_only_folder_is_read_and_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = Journal(tmp_path, BIG)
-    fill(log, 2)
-    log.close()
+    write(tmp_path, 2)
     real = Path.open
 
     def read_only(path: Path, mode: str = "r", **more: Any) -> Any:
@@ -168,6 +165,42 @@ def test_a_read_only_folder_is_read_and_not_written(tmp_path: Path, monkeypatch:
     with pytest.raises(JournalError, match="Read-only file system"):
         fill(log, 1, first=3)
     log.close()
+
+
+def test_a_disk_that_stays_full_leaves_no_heap_of_segments(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = Journal(tmp_path, BIG)
+    monkeypatch.setattr(os, "fdatasync", refuse(errno.ENOSPC))
+    for _ in range(20):
+        with pytest.raises(JournalError):
+            fill(log, 1)
+    assert len(journal.segments(tmp_path)) <= 1
+    monkeypatch.undo()
+    (position,) = fill(log, 1)
+    assert journal.read(tmp_path, position).seq == 1
+    log.close()
+
+
+def test_a_segment_that_cannot_be_closed_does_not_take_its_last_keyframe_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = Journal(tmp_path, 1)  # each keyframe fills a segment
+    with monkeypatch.context() as patched:
+        patched.setattr(Journal, "rotate", refuse(errno.ENOSPC))
+        fill(log, 1)
+    fill(log, 1, first=2)
+    log.close()
+    assert [found.position.segment for found in Journal(tmp_path, BIG).found] == [1, 2]
+    assert seqs(tmp_path) == [1, 2]
+
+
+def test_a_journal_whose_folder_vanishes_is_a_clear_error(tmp_path: Path) -> None:
+    log = Journal(tmp_path / "journal", 1)
+    fill(log, 1)
+    shutil.rmtree(tmp_path / "journal")
+    with pytest.raises(JournalError, match="No such file"):
+        fill(log, 1, first=2)
 
 
 # --- what outlasts a power cut ---
@@ -241,9 +274,7 @@ def test_the_oldest_segments_go_and_no_other(tmp_path: Path) -> None:
 def test_a_segment_that_cannot_be_deleted_is_passed_over(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    log = Journal(tmp_path, 4000)
-    fill(log, 10)
-    log.close()
+    write(tmp_path, 10, 4000)
     log = Journal(tmp_path, 4000)
     segment_path(tmp_path, 1).unlink()
     segment_path(tmp_path, 1).mkdir()
@@ -256,10 +287,8 @@ def test_a_segment_that_cannot_be_deleted_is_passed_over(
 
 
 def test_foreign_files_are_left_alone(tmp_path: Path) -> None:
-    log = Journal(tmp_path, BIG)
-    fill(log, 2)
-    log.close()
-    for name in (
+    write(tmp_path, 2)
+    for name in [
         "lock",
         "notes.mcap",
         "7.mcap",
@@ -267,7 +296,7 @@ def test_foreign_files_are_left_alone(tmp_path: Path) -> None:
         "٣٣٣٣٣٣.mcap",
         "000009.mcap.bak",
         ".000005.mcap",
-    ):
+    ]:
         (tmp_path / name).write_bytes(b"not ours")
     (tmp_path / "000004").mkdir()
     log = Journal(tmp_path, BIG)
@@ -277,9 +306,7 @@ def test_foreign_files_are_left_alone(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", [b"", mcap_layout.MAGIC, mcap_layout.OPENING, mcap_layout.OPENING[:20]])
 def test_a_segment_that_was_just_begun_holds_nothing(tmp_path: Path, content: bytes) -> None:
-    log = Journal(tmp_path, BIG)
-    fill(log, 2)
-    log.close()
+    write(tmp_path, 2)
     segment_path(tmp_path, 2).write_bytes(content)
     log = Journal(tmp_path, BIG)
     assert ([found.seq for found in log.found], log.damaged) == ([1, 2], 0)
@@ -289,9 +316,7 @@ def test_a_segment_that_was_just_begun_holds_nothing(tmp_path: Path, content: by
 
 
 def test_a_segment_of_rubbish_costs_itself_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    log = Journal(tmp_path, 4000)
-    fill(log, 12)
-    log.close()
+    write(tmp_path, 12, 4000)
     per_segment = Counter(found.position.segment for found in Journal(tmp_path, BIG).found)
     segment_path(tmp_path, 2).write_bytes(os.urandom(9000))
     log = Journal(tmp_path, BIG)
@@ -308,9 +333,7 @@ def test_a_segment_that_cannot_be_read_is_not_passed_over(
     tmp_path: Path, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its keyframes may be there at the next start, when those behind them are in the map."""
-    log = Journal(tmp_path, 4000)
-    fill(log, 12)
-    log.close()
+    write(tmp_path, 12, 4000)
     before = Journal(tmp_path, BIG).found
     readable = sum(found.position.segment != 2 for found in before)
     bad, aside = segment_path(tmp_path, 2), tmp_path / "aside"

@@ -173,6 +173,8 @@ def test_after_a_torn_write_at_any_byte_the_journal_goes_on(tmp_path: Path) -> N
         log = Journal(tmp_path, BIG, sync=False)
         assert [found.seq for found in log.found] == [1, 2, 3]
         assert log.damaged == 0
+        with pytest.raises(JournalError, match="no whole keyframe"):
+            journal.read(tmp_path, segment.places[-1])
         fill(log, 1, first=4)
         log.close()
         again = Journal(tmp_path, BIG, sync=False)
