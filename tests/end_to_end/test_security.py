@@ -133,18 +133,6 @@ def _pair(own: ClientKeys) -> tuple[str, str]:
     return own.public, own.secret
 
 
-def test_a_client_that_is_turned_away_says_why_and_keeps_its_keyframes(
-    site: Site, server: Server, tmp_path: Path
-) -> None:
-    with site.client(server, "stranger", tmp_path) as client:
-        client.send(wall(1))
-        with pytest.raises(NotAllowed, match="tsfusion keys allow"):
-            client.connect(timeout=10)
-        with pytest.raises(FlushTimeout, match="does not know this client"):
-            client.flush(timeout=1)
-        assert client.stats.waiting == 1
-
-
 def test_anothers_session_is_not_to_be_had(site: Site, server: Server) -> None:
     """The cart is allowed, and knows the robot's session: it can neither add to it, nor have it refused."""
     with site.client(server, "robot") as client:

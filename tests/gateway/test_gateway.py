@@ -72,8 +72,6 @@ def fusing(line: str) -> str:
 
 
 _CRASHES_ON_2 = fusing("if message.index == 2: sys.exit(7)")
-_DIES = "sys.exit(9)"
-_FAILS = "say(fuser_messages.Failed('config', 'no such setting')); link.recv()"
 _CANNOT_COME_BACK = """
     import pathlib
     mark = pathlib.Path(begin.folder) / "once"
@@ -194,15 +192,22 @@ def test_a_fuser_that_hangs_at_a_keyframe_is_replaced(start: Start) -> None:
     assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (2, {"crash": 1}, 4)
 
 
-def test_a_fuser_that_cannot_start_is_one_clear_error(start: Start) -> None:
-    gateway = start(_DIES)
-    with pytest.raises(MapError, match="ended with status 9 before it was ready"):
-        stepped(gateway, lambda: gateway.maps.warm)
-
-
-def test_why_the_map_cannot_be_opened_is_passed_on(start: Start) -> None:
-    gateway = start(_FAILS)
-    with pytest.raises(InvalidConfig, match="no such setting"):
+@pytest.mark.parametrize(
+    ("body", "error", "message"),
+    [
+        ("sys.exit(9)", MapError, "ended with status 9 before it was ready"),
+        (
+            "say(fuser_messages.Failed('config', 'no such setting')); link.recv()",
+            InvalidConfig,
+            "no such setting",
+        ),
+    ],
+)
+def test_why_a_fuser_cannot_start_is_one_clear_error(
+    start: Start, body: str, error: type[Exception], message: str
+) -> None:
+    gateway = start(body)
+    with pytest.raises(error, match=message):
         stepped(gateway, lambda: gateway.maps.warm)
 
 

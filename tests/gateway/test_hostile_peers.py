@@ -16,8 +16,7 @@ from keyframes_and_servers import DEADLINE, Server, connected, until, wall
 
 from tsfusion import Client
 from tsfusion.core import config
-from tsfusion.core.errors import InvalidConfig, JournalError, ServerUnreachable, TransportError
-from tsfusion.delivery.spool import Spool
+from tsfusion.core.errors import InvalidConfig, ServerUnreachable, TransportError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.fuser_queries import FuserQueries
 from tsfusion.gateway.ports import Ports
@@ -220,11 +219,6 @@ def test_the_last_port_has_no_next_one() -> None:
 def test_a_patience_of_ages_is_no_error(shared: Server) -> None:
     reply, _ = request(shared.control, Command(name="ping"), timeout=1e300)
     assert reply.name == "ping"
-
-
-def test_a_state_folder_that_cannot_be_named(tmp_path: Path) -> None:
-    with pytest.raises(JournalError, match="cannot write the spool folder"):
-        Spool(f"{tmp_path}/a\0b", 1 << 20)
 
 
 def test_a_port_that_speaks_something_else(shared: Server) -> None:

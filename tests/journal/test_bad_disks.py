@@ -7,11 +7,11 @@ import os
 import shutil
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-import small_disk
 from failures import raising, refuse
 
 from tsfusion import journal
@@ -40,35 +40,28 @@ def seqs(folder: Path) -> list[int]:
 # --- a full disk ---
 
 
-def test_a_disk_that_really_fills_up_loses_nothing_and_takes_more_when_there_is_room(tmp_path: Path) -> None:
-    code = """
-import sys
-from pathlib import Path
-from tsfusion.core.errors import JournalError
-from tsfusion.journal import Journal
-folder = Path(sys.argv[1]) / "journal"
-ballast = folder.parent / "ballast"
-ballast.write_bytes(bytes(400_000))
-log = Journal(folder, 200_000)
-written, refused = [], 0
-for seq in range(1, 100):
-    try:
-        log.append([b"head", bytes(30_000)], session=bytes(16), seq=seq)
-        written.append(seq)
-    except JournalError as error:
-        assert "No space left on device" in str(error), error
-        refused += 1
-        if refused == 10:
-            ballast.unlink()
-log.close()
-again = Journal(folder, 200_000)
-assert [found.seq for found in again.found] == written, (again.found, written)
-assert again.damaged == 0
-print(len(written), refused)
-"""
-    written, refused = map(int, small_disk.run(tmp_path / "disk", "1m", code).split())
-    assert refused > 10
-    assert written > 20
+def test_a_disk_that_really_fills_up_loses_nothing_and_takes_more_when_there_is_room(
+    small_disk: Callable[[int], Path],
+) -> None:
+    disk = small_disk(1)
+    ballast = disk / "ballast"
+    ballast.write_bytes(bytes(400_000))
+    log = Journal(disk / "journal", 200_000)
+    written, refused = [], []
+    for seq in range(1, 100):
+        try:
+            fill(log, 1, first=seq, size=30_000)
+            written.append(seq)
+        except JournalError as error:
+            refused.append(str(error))
+            if len(refused) == 10:
+                ballast.unlink()
+    log.close()
+    again = Journal(disk / "journal", 200_000)
+    assert ([found.seq for found in again.found], again.damaged) == (written, 0)
+    assert len(refused) > 10
+    assert all("No space left on device" in why for why in refused)
+    assert len(written) > 20
 
 
 def test_append_stops_before_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
