@@ -83,9 +83,16 @@ def test_closed_segments_open_in_mcap_tools(tmp_path: Path) -> None:
     assert [message.sequence for _, _, message in messages] == [1, 2, 3, 4]
 
 
-@pytest.mark.parametrize(("at", "value"), [(500, 4), (5, 255)], ids=["a bit", "the length"])
+@pytest.mark.parametrize(
+    ("at", "value", "message"),
+    [
+        (500, 4, "keyframe 3 of session 00000000 is damaged"),
+        (5, 255, "nothing can be read here; 1 keyframes are lost"),
+    ],
+    ids=["a bit", "the length"],
+)
 def test_damage_costs_one_record_and_is_logged(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, at: int, value: int
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, at: int, value: int, message: str
 ) -> None:
     positions = write(tmp_path, 5)
     path = segment_path(tmp_path, 1)
@@ -95,7 +102,7 @@ def test_damage_costs_one_record_and_is_logged(
     log = Journal(tmp_path, BIG)
     assert [found.seq for found in log.found] == [1, 2, 4, 5]
     assert log.damaged == 1
-    assert f"byte {positions[2].offset}: keyframe 3 of session 00000000 is damaged" in caplog.text
+    assert f"byte {positions[2].offset}: {message}" in caplog.text
     with pytest.raises(JournalError):
         journal.read(tmp_path, positions[2])
 
