@@ -19,33 +19,10 @@ from keyframes_and_servers import VOLUME, pose, serving, until, wall
 
 import tsfusion
 from tsfusion import VolumeConfig
-from tsfusion.core.errors import (
-    CheckpointError,
-    DamagedCheckpoint,
-    InvalidConfig,
-    JournalError,
-    MapError,
-    MapFull,
-    TsfusionError,
-)
-from tsfusion.fuser import messages as fuser_messages
+from tsfusion.core import errors
+from tsfusion.fuser import messages
 from tsfusion.fuser.fuser import Fuser
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
-from tsfusion.fuser.messages import (
-    Begin,
-    Done,
-    Failed,
-    Finish,
-    Fuse,
-    FuserQuery,
-    FuserStatus,
-    Meshed,
-    Publish,
-    Save,
-    Saved,
-    SessionProgress,
-    ToGateway,
-)
 from tsfusion.journal import Journal, Position
 from tsfusion.journal.state_folder import MAP_FILE, PREVIOUS_FILE
 from tsfusion.wire import codec, corrections
@@ -57,24 +34,24 @@ class Link:
     """Takes what the fuser sends."""
 
     def __init__(self) -> None:
-        self.sent: list[tuple[ToGateway, list[Any]]] = []
+        self.sent: list[tuple[messages.ToGateway, list[Any]]] = []
 
     def send_multipart(self, frames: list[Any], copy: bool) -> None:
         assert not copy
-        self.sent.append((fuser_messages.to_gateway.decode(frames[0]), frames[1:]))
+        self.sent.append((messages.to_gateway.decode(frames[0]), frames[1:]))
 
     def last(self) -> Any:
         return self.sent[-1][0]
 
-    def done(self) -> Done:
-        return [message for message, _ in self.sent if isinstance(message, Done)][-1]
+    def done(self) -> messages.Done:
+        return [message for message, _ in self.sent if isinstance(message, messages.Done)][-1]
 
 
 SESSION = bytes(16)
 
 
-def order(index: int, position: Position, skip: str | None = None) -> Fuse:
-    return Fuse(index, position, SESSION, index + 1, "robot", skip)
+def order(index: int, position: Position, skip: str | None = None) -> messages.Fuse:
+    return messages.Fuse(index, position, SESSION, index + 1, "robot", skip)
 
 
 def fill(state: Path, count: int) -> list[Position]:
@@ -94,7 +71,7 @@ def opened(state: Path, volume: VolumeConfig = VOLUME, **settings: Any) -> tuple
     working = state / "working"
     working.write_bytes(bytes(8))
     usual = {"mesh_interval": 0.0, "checkpoint_every": 0, "keep_previous": False, "memory_bytes": 1 << 40}
-    begin = Begin(str(state), volume, working=str(working), **{**usual, **settings})
+    begin = messages.Begin(str(state), volume, working=str(working), **{**usual, **settings})
     return Fuser(link, begin), link  # type: ignore[arg-type]
 
 
@@ -104,8 +81,8 @@ def opened_with_one(state: Path) -> tuple[Position, Fuser, Link]:
     return position, *opened(state)
 
 
-def status(fuser: Fuser, link: Link) -> FuserStatus:
-    fuser.handle(FuserQuery(1, Command(name="status")))
+def status(fuser: Fuser, link: Link) -> messages.FuserStatus:
+    fuser.handle(messages.FuserQuery(1, Command(name="status")))
     answer = link.last()
     assert answer.status is not None
     return msgspec.structs.replace(answer.status, peak_rss_bytes=0)  # of this whole process
@@ -123,20 +100,20 @@ def test_keyframes_are_fused_meshed_and_checkpointed(tmp_path: Path) -> None:
     assert fuser.mesh_due(idle=True)
     fuser.mesh()
     assert (link.last().count, link.sent[-1][1]) == (3, [])
-    fuser.handle(Finish())
+    fuser.handle(messages.Finish())
     assert fuser.exit_status == 0
     again, link_again = opened(tmp_path)
-    assert again.ready().done == {SESSION: SessionProgress(3, "robot")}
+    assert again.ready().done == {SESSION: messages.SessionProgress(3, "robot")}
     assert status(again, link_again) == status(fuser, link)
 
 
 def test_watchers_get_the_triangles(tmp_path: Path) -> None:
     position, fuser, link = opened_with_one(tmp_path)
-    fuser.handle(Publish(True))
+    fuser.handle(messages.Publish(True))
     fuser.handle(order(0, position))
     fuser.mesh()
     meshed, frames = link.sent[-1]
-    assert isinstance(meshed, Meshed)
+    assert isinstance(meshed, messages.Meshed)
     assert meshed.layout is not None
     assert [memoryview(frame).nbytes % 3 for frame in frames] == [0] * 5
 
@@ -146,7 +123,7 @@ def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
 ) -> None:
     monkeypatch.setattr("tsfusion.fuser.fuser._REFINED_AT_ONCE", 10)
     position, fuser, link = opened_with_one(tmp_path)
-    fuser.handle(Publish(True))
+    fuser.handle(messages.Publish(True))
     fuser.handle(order(0, position))
     fuser.mesh()
     before = len(link.sent)
@@ -159,7 +136,7 @@ def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
     cells = np.concatenate([np.frombuffer(frames[0], np.int32).reshape(-1, 3) for _, frames in refined])
     assert len(np.unique(cells, axis=0)) == len(cells)
     fuser.mesh()
-    fuser.handle(Publish(False))
+    fuser.handle(messages.Publish(False))
     assert not fuser.refine_due
 
 
@@ -205,7 +182,7 @@ def saved(state: Path) -> Path:
 def test_a_map_of_other_settings_is_one_clear_error(tmp_path: Path) -> None:
     saved(tmp_path)
     with pytest.raises(
-        InvalidConfig, match=r"was made with voxel_size = 0\.04, got 0\.05: use another"
+        errors.InvalidConfig, match=r"was made with voxel_size = 0\.04, got 0\.05: use another"
     ) as raised:
         opened(tmp_path, VolumeConfig(voxel_size=0.05))
     assert "remove" not in str(raised.value)  # the journal may not go back to the start
@@ -241,16 +218,16 @@ def test_a_checkpoint_that_cannot_be_read_now_stays(
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, "open", refused)
-        with pytest.raises(CheckpointError, match=os.strerror(code)):
+        with pytest.raises(errors.CheckpointError, match=os.strerror(code)):
             opened(tmp_path)
-    assert opened(tmp_path)[0].ready().done == {SESSION: SessionProgress(1, "")}
+    assert opened(tmp_path)[0].ready().done == {SESSION: messages.SessionProgress(1, "")}
 
 
 def test_a_checkpoint_without_memory_for_it_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = saved(tmp_path)
 
     monkeypatch.setattr("tsfusion.tsdf.volume.Volume.load", raising(MemoryError()))
-    with pytest.raises(CheckpointError, match="does not fit"):
+    with pytest.raises(errors.CheckpointError, match="does not fit"):
         opened(tmp_path)
     assert path.exists()
 
@@ -268,16 +245,16 @@ def test_a_checkpoint_on_request_keeps_the_one_before(tmp_path: Path) -> None:
     """The journal forgets what both hold, so a damaged one is made good by the other."""
     positions = fill(tmp_path, 3)
     fuser, link = opened(tmp_path, keep_previous=True)
-    fuser.handle(Save())
-    assert link.last() == Saved(written=False)
+    fuser.handle(messages.Save())
+    assert link.last() == messages.Saved(written=False)
     for index in (0, 1):
         fuser.handle(order(index, positions[index]))
-        fuser.handle(Save())
-        assert link.last() == Saved(written=True)
+        fuser.handle(messages.Save())
+        assert link.last() == messages.Saved(written=True)
     assert (tmp_path / PREVIOUS_FILE).exists()
     (tmp_path / MAP_FILE).write_bytes(b"")
     again, _ = opened(tmp_path, keep_previous=True)
-    assert again.ready().done == {SESSION: SessionProgress(1, "robot")}
+    assert again.ready().done == {SESSION: messages.SessionProgress(1, "robot")}
 
 
 @pytest.mark.parametrize("keep_previous", [False, True])
@@ -289,7 +266,7 @@ def test_a_checkpoint_that_fails_leaves_the_old_ones(
     folder.mkdir()
     written = MapCheckpoints(folder, VOLUME, keep_previous=keep_previous)
     for seq in (1, 2):
-        written.done = {SESSION: SessionProgress(seq, "robot")}
+        written.done = {SESSION: messages.SessionProgress(seq, "robot")}
         assert written.save()
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert sorted(before) == ([PREVIOUS_FILE] if keep_previous else []) + [MAP_FILE]
@@ -305,7 +282,9 @@ def test_a_checkpoint_that_fails_leaves_the_old_ones(
 
 def test_a_map_of_many_sessions_comes_back(tmp_path: Path) -> None:
     written = MapCheckpoints(tmp_path, VOLUME, keep_previous=False)
-    written.done = {number.to_bytes(16): SessionProgress(number, "robot") for number in range(1, 40_001)}
+    written.done = {
+        number.to_bytes(16): messages.SessionProgress(number, "robot") for number in range(1, 40_001)
+    }
     assert written.save()
     assert opened(tmp_path)[0].ready().done == written.done
 
@@ -351,7 +330,7 @@ def test_no_memory_for_a_keyframe_is_no_crash(tmp_path: Path, monkeypatch: pytes
 def test_no_question_ends_the_fuser(tmp_path: Path, min_weight: float) -> None:
     position, fuser, link = opened_with_one(tmp_path)
     fuser.handle(order(0, position))
-    fuser.handle(FuserQuery(1, Command(name="mesh", min_weight=min_weight)))
+    fuser.handle(messages.FuserQuery(1, Command(name="mesh", min_weight=min_weight)))
     assert "min_weight must be" in link.last().error
 
 
@@ -389,17 +368,17 @@ def test_a_process_at_work_ends_with_the_one_that_started_it() -> None:
 @pytest.mark.parametrize(
     ("error", "kind", "raised"),
     [
-        (InvalidConfig("of other settings"), "config", InvalidConfig),
-        (DamagedCheckpoint("cut short"), "checkpoint", CheckpointError),
-        (MapFull("too many blocks"), "map", MapError),
-        (JournalError("cannot read"), "other", TsfusionError),
+        (errors.InvalidConfig("of other settings"), "config", errors.InvalidConfig),
+        (errors.DamagedCheckpoint("cut short"), "checkpoint", errors.CheckpointError),
+        (errors.MapFull("too many blocks"), "map", errors.MapError),
+        (errors.JournalError("cannot read"), "other", errors.TsfusionError),
     ],
 )
 def test_the_kind_of_a_failure_reaches_the_gateway(
-    error: TsfusionError, kind: str, raised: type[TsfusionError]
+    error: errors.TsfusionError, kind: str, raised: type[errors.TsfusionError]
 ) -> None:
-    sent = fuser_messages.to_gateway.decode(fuser_messages.encode(Failed.of(error)))
-    assert isinstance(sent, Failed)
+    sent = messages.to_gateway.decode(messages.encode(messages.Failed.of(error)))
+    assert isinstance(sent, messages.Failed)
     again = sent.error()
     assert (sent.kind, type(again), str(again)) == (kind, raised, str(error))
 

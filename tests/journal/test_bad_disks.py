@@ -281,15 +281,8 @@ def test_a_segment_that_cannot_be_deleted_is_passed_over(
 
 def test_foreign_files_are_left_alone(tmp_path: Path) -> None:
     write(tmp_path, 2)
-    for name in [
-        "lock",
-        "notes.mcap",
-        "7.mcap",
-        "0000001.mcap",
-        "٣٣٣٣٣٣.mcap",
-        "000009.mcap.bak",
-        ".000005.mcap",
-    ]:
+    numbered = ("7.mcap", "0000001.mcap", "٣٣٣٣٣٣.mcap", "000009.mcap.bak", ".000005.mcap")
+    for name in ("lock", "notes.mcap", *numbered):
         (tmp_path / name).write_bytes(b"not ours")
     (tmp_path / "000004").mkdir()
     log = Journal(tmp_path, BIG)

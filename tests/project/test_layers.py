@@ -32,14 +32,8 @@ MAY_REACH_TAICHI = (
 )
 TAICHI_FREE = ("fuser.messages",)
 LIGHT = (
-    "client",
-    "server",
-    "scanner.scanner",
-    "wire.codec",
-    "journal",
-    "journal.recording",
-    "datasets",
-    "cli",
+    *("client", "server", "scanner.scanner", "wire.codec"),
+    *("journal", "journal.recording", "datasets", "cli"),
 )
 
 
