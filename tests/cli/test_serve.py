@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import pytest
 import trimesh
+from clients_and_spools import deliver
 from command_processes import end, read_until, server, started, tsfusion
 from small_recordings import first_views
 
@@ -20,10 +21,7 @@ VOXEL = 0.08
 def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
     with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, process):
         with Client(address, spool=tmp_path / "spool") as client:
-            for keyframe in first_views(2):
-                client.send(keyframe)
-            client.flush(timeout=30)
-            client.wait_fused(timeout=30)
+            deliver(client, first_views(2))
         status = json.loads(tsfusion("status", "--connect", address, "--json").stdout)["maps"]["default"]
         assert (status["keyframes_durable"], status["keyframes_fused"]) == (2, 2)
         assert status["blocks"] > 10
@@ -75,10 +73,7 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("server") / "state"
     with server(folder, "--voxel-size", VOXEL) as (address, process):
         with Client(address) as client:
-            for keyframe in first_views(6):
-                client.send(keyframe)
-            client.flush(timeout=30)
-            client.wait_fused(timeout=30)
+            deliver(client, first_views(6))
         assert end(process) == 0
     return folder
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import zmq
-from clients_and_spools import NOBODY, QUICK, send_all
+from clients_and_spools import NOBODY, QUICK, deliver, send_all
 from command_processes import alive
 from keyframes_and_servers import DEADLINE, Server, connected, map_hash, serving, until, wall
 
@@ -68,10 +68,7 @@ def test_a_map_that_outgrows_its_memory_refuses_keyframes_and_lives(tmp_path: Pa
         serving(tmp_path, fine, fuser_memory_bytes=1 << 28) as server,
         Client(server.address, policy="spool_all") as client,
     ):
-        for i in range(8):
-            client.send(room[i])
-        client.flush(timeout=DEADLINE)
-        client.wait_fused(timeout=DEADLINE)
+        deliver(client, (room[i] for i in range(8)))
         health = fetch_health(server.address).maps["default"]
         assert 0 < client.stats.rejected["memory"] == health.rejected["memory"] == health.quarantined < 8
         assert health.fuser_restarts == 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the fuser does with each message, in this process; its link is a list. And its own process."""
+"""What the fuser does with each message, in this process with a list for a link; and how its own process logs."""
 
 import errno
 import json
@@ -382,6 +382,8 @@ def test_the_kind_of_a_failure_reaches_the_gateway(
     again = sent.error()
     assert (sent.kind, type(again), str(again)) == (kind, raised, str(error))
 
+
+# --- log lines of the process ---
 
 _CODE = """
 import logging, sys

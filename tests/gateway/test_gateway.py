@@ -14,10 +14,11 @@ from typing import Any
 
 import pytest
 import zmq
+from clients_and_spools import deliver
 from failures import refuse
-from keyframes_and_servers import DEADLINE, Server, map_hash, serving, until
+from keyframes_and_servers import map_hash, serving, until
 
-from tsfusion import Client, Keyframe, VolumeConfig, journal
+from tsfusion import Client, VolumeConfig, journal
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.datasets import open_dataset
@@ -304,15 +305,6 @@ def test_orders_that_find_no_room_are_given_again(tmp_path: Path, monkeypatch: p
 # --- real scans ---
 
 
-def by_socket(server: Server, keyframes: list[Keyframe]) -> str:
-    with Client(server.address) as client:
-        for keyframe in keyframes:
-            client.send(keyframe)
-        client.flush(timeout=DEADLINE)
-        client.wait_fused(timeout=DEADLINE)
-    return fetch_status(server.address).map_hash
-
-
 @pytest.mark.parametrize(
     ("name", "options", "volume"),
     [
@@ -330,6 +322,7 @@ def test_a_real_scan_makes_the_same_map_by_file_and_by_socket(
 ) -> None:
     dataset = open_dataset(data(name), **options)
     keyframes = [dataset[i] for i in range(0, min(len(dataset), 40), 8)]
-    with serving(tmp_path, volume) as server:
-        assert by_socket(server, keyframes) == map_hash(keyframes, volume)
+    with serving(tmp_path, volume) as server, Client(server.address) as client:
+        deliver(client, keyframes)
+        assert fetch_status(server.address).map_hash == map_hash(keyframes, volume)
         assert server.terminate() == 0
