@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A client's connections: cut, made anew, turned away by their keys, and what it says of that."""
+"""A client's connections: cut, made anew, turned away by their keys, what it says of that, and their states."""
 
 import time
 from collections.abc import Iterator
@@ -155,6 +155,8 @@ def test_keys_of_no_use_are_clear_errors(keyed: ScriptedServer, tmp_path: Path, 
     with pytest.raises(InvalidConfig, match="others can read the secret key"):
         Client(keyed.address, key=robot.file, server_key=robot.public)
 
+
+# --- states ---
 
 STATES: list[LinkState] = [
     LinkState(),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the fuser does with each message, in this process with a list for a link; and how its own process logs."""
+"""What the fuser does with each message, in this process with a list for a link; log lines of its own."""
 
 import errno
 import json
