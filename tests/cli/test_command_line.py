@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_processes import Here, python, tsfusion
+from small_recordings import seven_scenes
 
 from tsfusion import __version__
 from tsfusion.cli import options
@@ -28,13 +29,11 @@ VERBS = [
 
 def scene(folder: Path, *, pose: str | None = None, depth: bytes | None = None) -> Path:
     """A one-frame dataset in the 7-Scenes layout."""
-    import cv2
-
-    folder.mkdir()
-    image = np.full((48, 64), 1500, np.uint16)
-    depth = cv2.imencode(".png", image)[1].tobytes() if depth is None else depth
-    (folder / "frame-000000.depth.png").write_bytes(depth)
-    (folder / "frame-000000.pose.txt").write_text(pose or "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    seven_scenes(folder, 1, (48, 64))
+    if pose is not None:
+        (folder / "frame-000000.pose.txt").write_text(pose)
+    if depth is not None:
+        (folder / "frame-000000.depth.png").write_bytes(depth)
     return folder
 
 
