@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A client's connections: cut, made anew, turned away by their keys, what it says of that; states of the link."""
+"""A client's connections: cut, made anew, turned away by their keys; and the states of its link."""
 
 import time
 from collections.abc import Iterator
