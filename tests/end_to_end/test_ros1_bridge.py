@@ -119,7 +119,12 @@ def test_a_lost_camera_is_said_to_be_lost(ros: dict[str, str]) -> None:
             process(PYTHON, BRIDGE, "--feed", feed.address, "--connect", *words, environment=ros)
         )
         stack.enter_context(process(PYTHON, TALKER, environment=ros))
-        until(lambda: isinstance(feed.track(at(0)), Lost) and feed.received)
+
+        def heard() -> bool:
+            assert isinstance(feed.track(at(0)), Lost)
+            return bool(feed.received)
+
+        until(heard)
         assert not feed.dropped
 
 
