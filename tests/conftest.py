@@ -8,9 +8,12 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from command_processes import Here
 
+from tsfusion.cli import main
 from tsfusion.core import logs
 from tsfusion.core.errors import MissingDependency
 
@@ -85,6 +88,37 @@ def data() -> Callable[[str], Path]:
         return folder
 
     return find
+
+
+@pytest.fixture
+def here(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Here]:
+    """Run a command line in this process, in an empty folder: quicker where no real process is needed."""
+    monkeypatch.chdir(tmp_path)
+    for name in [name for name in os.environ if name.startswith("TSFUSION_")]:
+        monkeypatch.delenv(name)
+    handler = signal.getsignal(signal.SIGTERM)
+
+    def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
+        words = [str(argument) for argument in arguments]
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+        printed = capsys.readouterr()
+        assert isinstance(ended.value.code, int)
+        return subprocess.CompletedProcess(words, ended.value.code, printed.out, printed.err)
+
+    yield run
+    signal.signal(signal.SIGTERM, handler)
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """One server for the tests of a module that leave it as it was or do not care what it holds."""
+    from keyframes_and_servers import serving
+
+    with serving(tmp_path_factory.mktemp("shared")) as server:
+        yield server
 
 
 @pytest.fixture

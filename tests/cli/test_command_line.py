@@ -2,27 +2,23 @@
 """The `tsfusion` command as a person or a script meets it: output, exit status, and what is left behind."""
 
 import json
-import os
 import signal
 import socket
 import subprocess
-import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from command_processes import tsfusion
+from command_processes import Here, python, tsfusion
+from small_recordings import seven_scenes
 
 from tsfusion import __version__
-from tsfusion.cli import main
+from tsfusion.cli import options
 from tsfusion.core import config
 from tsfusion.core.config import Config
 from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.datasets import Dataset
-
-Here = Callable[..., "subprocess.CompletedProcess[str]"]
 
 NOBODY = "tcp://127.0.0.1:9"  # the discard port: nobody listens there, and nobody may without being root
 VERBS = [
@@ -33,38 +29,12 @@ VERBS = [
 
 def scene(folder: Path, *, pose: str | None = None, depth: bytes | None = None) -> Path:
     """A one-frame dataset in the 7-Scenes layout."""
-    import cv2
-    import numpy as np
-
-    folder.mkdir()
-    image = np.full((48, 64), 1500, np.uint16)
-    (folder / "frame-000000.depth.png").write_bytes(
-        cv2.imencode(".png", image)[1].tobytes() if depth is None else depth
-    )
-    (folder / "frame-000000.pose.txt").write_text(pose or "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    seven_scenes(folder, 1, (48, 64))
+    if pose is not None:
+        (folder / "frame-000000.pose.txt").write_text(pose)
+    if depth is not None:
+        (folder / "frame-000000.depth.png").write_bytes(depth)
     return folder
-
-
-@pytest.fixture
-def here(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Here]:
-    """Run a command line in this process, in an empty folder: quicker where no real process is needed."""
-    monkeypatch.chdir(tmp_path)
-    for name in [name for name in os.environ if name.startswith("TSFUSION_")]:
-        monkeypatch.delenv(name)
-    handler = signal.getsignal(signal.SIGTERM)
-
-    def run(*arguments: object) -> "subprocess.CompletedProcess[str]":
-        words = [str(argument) for argument in arguments]
-        with pytest.raises(SystemExit) as exit_status:
-            main(words)
-        said = capsys.readouterr()
-        assert isinstance(exit_status.value.code, int)
-        return subprocess.CompletedProcess(words, exit_status.value.code, said.out, said.err)
-
-    yield run
-    signal.signal(signal.SIGTERM, handler)
 
 
 def one_line(done: "subprocess.CompletedProcess[str]", *, status: int = 1) -> str:
@@ -94,14 +64,6 @@ def test_every_verb_has_help(here: Here, verb: str) -> None:
     done = here(verb, "--help")
     assert done.returncode == 0
     assert "Usage" in done.stdout
-
-
-def test_help_loads_little() -> None:
-    program = (
-        "import sys, tsfusion.cli; "
-        "sys.exit(', '.join({'numpy', 'zmq', 'cv2', 'msgspec', 'taichi', 'trimesh'} & set(sys.modules)) or 0)"
-    )
-    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
 
 
 def test_config_dump_is_read_back(here: Here, tmp_path: Path) -> None:
@@ -207,14 +169,9 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     monkeypatch.setattr("tsfusion.wire.queries._PING_TIMEOUT", 0.2)
     done = here(*arguments)
     assert words in one_line(done)
-    left = {path.name for path in tmp_path.rglob("*")} - {
-        "tsfusion-state",
-        "maps",
-        "default",
-        "journal",
-        "lock",
-        "fuser.lock",
-    }
+    left = {path.name for path in tmp_path.rglob("*")}.difference(
+        ("tsfusion-state", "maps", "default", "journal", "lock", "fuser.lock")
+    )
     assert left == {"empty", "file", "garbage.tsf"}
     assert (tmp_path / "file").read_text() == "here first"
 
@@ -354,9 +311,7 @@ def test_ctrl_c_while_modules_load_is_no_traceback() -> None:
         "builtins.__import__ = interrupted\n"
         "main(['--version'])\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
-    )
+    done = python(program)
     assert done.returncode == -signal.SIGINT
     assert done.stderr == ""
 
@@ -372,9 +327,7 @@ def test_ctrl_c_while_modules_load_is_no_traceback() -> None:
     ],
 )
 def test_map_flags_become_settings(flags: dict[str, object], expected: dict[str, object]) -> None:
-    from tsfusion.cli.options import configuration
-
-    volume = configuration(None, **flags).volume
+    volume = options.configuration(None, **flags).volume
     assert {name: getattr(volume, name) for name in expected} == expected
 
 
@@ -387,18 +340,14 @@ def test_map_flags_become_settings(flags: dict[str, object], expected: dict[str,
     ],
 )
 def test_a_bad_band_is_explained(flags: dict[str, object], message: str) -> None:
-    from tsfusion.cli.options import configuration
-
     with pytest.raises(InvalidConfig, match=message):
-        configuration(None, **flags)
+        options.configuration(None, **flags)
 
 
 @pytest.mark.parametrize("verb", ["serve", "replay", "demo", "mesh"])
 def test_every_verb_that_fuses_takes_the_map_flags(verb: str) -> None:
-    from tsfusion.cli.options import MAP_OPTIONS
-
     shown = tsfusion(verb, "--help").stdout
-    for option in MAP_OPTIONS.values():
+    for option in options.MAP_OPTIONS.values():
         assert option.__metadata__[0].default.partition("/")[0] in shown
 
 
@@ -418,7 +367,5 @@ def test_a_wrong_option_of_a_dataset(here: Here, given: str, words: str) -> None
 
 
 def test_options_of_a_dataset() -> None:
-    from tsfusion.cli import options
-
     parsed = options.dataset_options(["noise=maybe", "seed=3", "color=false", "poses=a=b"])
     assert parsed == {"noise": "maybe", "seed": 3, "color": False, "poses": "a=b"}

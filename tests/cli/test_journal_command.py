@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_processes import end, started, tsfusion
+from command_processes import Here, end, started, tsfusion
 from keyframes_and_servers import pose, wall
 from mcap.reader import make_reader
 
 from tsfusion import journal
-from tsfusion.cli import main
 from tsfusion.core.errors import JournalError
 from tsfusion.geometry import se3
 from tsfusion.journal import Journal, segment_path
@@ -63,16 +62,12 @@ def leave_open(folder: Path) -> None:
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Exit status, stdout and stderr of a `tsfusion journal` line, in this process."""
-    handler = signal.getsignal(signal.SIGTERM)
+def run(here: Here) -> Run:
+    """Exit status, stdout and stderr of a `tsfusion journal` line."""
 
     def verb(*arguments: object) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as status:
-            main(["journal", *map(str, arguments)])
-        signal.signal(signal.SIGTERM, handler)
-        said = capsys.readouterr()
-        return int(status.value.code or 0), said.out, said.err
+        done = here("journal", *arguments)
+        return done.returncode, done.stdout, done.stderr
 
     return verb
 
@@ -187,20 +182,9 @@ def test_info_says_it_to_a_person(state: Path, run: Run) -> None:
     leave_open(folder)
     status, out, _ = run("info", state)
     assert status == 0
-    for text in (
-        "4, ",
-        "1 keyframe lost",
-        "closed",
-        "open",
-        "damaged",
-        "anna",
-        "bob",
-        "1…2",
-        "2001-09-09",
-        "quarantine",
-    ):
+    figures = ("4, ", "1 keyframe lost", "1…2", "2001-09-09")
+    for text in (*figures, "closed", "open", "damaged", "torn", "anna", "bob", "quarantine"):
         assert text in out, text
-    assert "torn" in out
 
 
 # --- verify ---
@@ -228,12 +212,7 @@ def test_each_damaged_place_is_named(state: Path, run: Run) -> None:
     verdict = json.loads(out)
     assert (status, verdict["intact"], verdict["lost"]) == (1, False, 1)
     (found,) = verdict["problems"]
-    assert (found["kind"], found["segment"], found["offset"], found["lost"]) == (
-        "damage",
-        "000001.mcap",
-        offset,
-        1,
-    )
+    assert {"kind": "damage", "segment": "000001.mcap", "offset": offset, "lost": 1}.items() <= found.items()
     status, out, _ = run("verify", state)
     assert status == 1
     assert f"damage  000001.mcap, byte {offset}: keyframe 1 of session" in out
@@ -305,12 +284,8 @@ def test_what_is_whole_is_saved_in_order_into_closed_segments(state: Path, tmp_p
     assert sorted(one["kind"] for one in done["problems"]) == ["damage", "torn"]
     saved = [one for path in find_journal(tmp_path / "saved").files() for one in journal.records(path)]
     for old, new in zip(whole, saved, strict=True):
-        assert (old.session, old.seq, old.client, old.logged_ns) == (
-            new.session,
-            new.seq,
-            new.client,
-            new.logged_ns,
-        )
+        for field in ("session", "seq", "client", "logged_ns"):
+            assert getattr(old, field) == getattr(new, field)
         assert [bytes(frame) for frame in old.frames] == [bytes(frame) for frame in new.frames]
     for path in find_journal(tmp_path / "saved").files():
         with path.open("rb") as file:

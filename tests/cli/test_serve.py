@@ -1,31 +1,27 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion serve` as users run it: processes, sockets and files."""
+"""`tsfusion serve` and `tsfusion mesh` as users run them: processes, sockets and files."""
 
 import json
+import shutil
 import signal
 from pathlib import Path
 
+import cv2
 import pytest
+import trimesh
+from clients_and_spools import deliver
 from command_processes import end, read_until, server, started, tsfusion
+from small_recordings import first_views
 
-from tsfusion import Client, FlushTimeout, Keyframe, Volume
-from tsfusion.datasets import Synthetic
+from tsfusion import Client, FlushTimeout, Volume
 
 VOXEL = 0.08
-
-
-def room(count: int) -> list[Keyframe]:
-    """The first keyframes of the synthetic room of 40."""
-    return [Synthetic("room", count=40)[index] for index in range(count)]
 
 
 def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
     with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, process):
         with Client(address, spool=tmp_path / "spool") as client:
-            for keyframe in room(2):
-                client.send(keyframe)
-            client.flush(timeout=30)
-            client.wait_fused(timeout=30)
+            deliver(client, first_views(2))
         status = json.loads(tsfusion("status", "--connect", address, "--json").stdout)["maps"]["default"]
         assert (status["keyframes_durable"], status["keyframes_fused"]) == (2, 2)
         assert status["blocks"] > 10
@@ -50,7 +46,7 @@ def test_a_server_that_fell_silent_is_not_called_slow(tmp_path: Path) -> None:
         client.connect()
         process.send_signal(signal.SIGSTOP)
         try:
-            client.send(room(1)[0])
+            client.send(first_views(1)[0])
             heard = r"nothing was heard from the server at tcp://\S+ for \d+\.\d s; they stay in .*spool"
             with pytest.raises(FlushTimeout, match=heard):
                 client.flush(timeout=1.5)
@@ -69,3 +65,43 @@ def test_ready_line_is_for_people_too(tmp_path: Path) -> None:
     finally:
         status = end(process, signal.SIGINT)
     assert status == 0
+
+
+@pytest.fixture(scope="module")
+def state(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The state folder of a server that fused six keyframes and ended well."""
+    folder = tmp_path_factory.mktemp("server") / "state"
+    with server(folder, "--voxel-size", VOXEL) as (address, process):
+        with Client(address) as client:
+            deliver(client, first_views(6))
+        assert end(process) == 0
+    return folder
+
+
+@pytest.mark.slow
+def test_mesh_of_map_state_and_journal_agree(state: Path, tmp_path: Path) -> None:
+    vertices = set()
+    for index, source in enumerate(
+        ([state / "maps/default/map.tsf"], [state], [state / "maps/default/journal", "--voxel-size", VOXEL])
+    ):
+        done = tsfusion("mesh", source[0], tmp_path / f"{index}.ply", *source[1:], "--json")
+        assert done.returncode == 0, done.stderr
+        vertices.add(json.loads(done.stdout)["vertices"])
+        vertices.add(len(trimesh.load(tmp_path / f"{index}.ply", process=False).vertices))
+    assert len(vertices) == 1
+    assert vertices.pop() > 100
+
+
+@pytest.mark.slow
+def test_mesh_fuses_what_the_checkpoint_missed(state: Path, tmp_path: Path) -> None:
+    """A state folder whose map is older than its journal, as a killed server leaves it."""
+    shutil.copytree(state / "maps/default/journal", tmp_path / "state/maps/default/journal")
+    volume = Volume(voxel_size=VOXEL)
+    volume.integrate(first_views(1)[0])
+    volume.save(tmp_path / "state/maps/default/map.tsf")
+    done = tsfusion("mesh", tmp_path / "state", tmp_path / "a.glb", "--preview", tmp_path / "a.png")
+    assert done.returncode == 0, done.stderr
+    for keyframe in first_views(6)[1:]:
+        volume.integrate(keyframe)
+    assert f"{len(volume.extract_mesh().vertices):,}".replace(",", "\u202f") in done.stdout
+    assert cv2.imread(str(tmp_path / "a.png")).std() > 5

@@ -7,19 +7,17 @@ import pty
 import re
 import signal
 import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
 import pytest
-from command_processes import COMMAND, DEADLINE, end, environment, read_until, started, tsfusion
+from command_processes import COMMAND, DEADLINE, Here, end, environment, read_until, started, tsfusion
 from fake_server import saying, serving, status
 from health_snapshots import client, health, map_health
 from rich.console import Console
 
-from tsfusion.cli import main
 from tsfusion.cli.health_poll import ServerSnapshot as Seen
 from tsfusion.cli.status_view import MAX_CLIENTS, render
 from tsfusion.core.errors import TransportError
@@ -27,11 +25,11 @@ from tsfusion.wire.health import Health
 from tsfusion.wire.messages import Command, Reply
 
 NOBODY = "tcp://127.0.0.1:9"
-Asking = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
-def screen(snapshot: Seen, width: int = 160) -> str:
-    """The screen, as text."""
+def screen(told: Health | None, width: int = 160, **fields: Any) -> str:
+    """The screen that shows this health, as text."""
+    snapshot = Seen(address="tcp://host:5555", health=told, **fields)
     console = Console(width=width, highlight=False)
     with console.capture() as captured:
         console.print(render(snapshot))
@@ -39,30 +37,17 @@ def screen(snapshot: Seen, width: int = 160) -> str:
 
 
 @pytest.fixture
-def asking(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Asking]:
-    """The command, asking at a control address; in this process, which is quicker."""
-    for name in [name for name in os.environ if name.startswith("TSFUSION_")]:
-        monkeypatch.delenv(name)
-    handler = signal.getsignal(signal.SIGTERM)
-
-    def ask(control: str, *more: object) -> "subprocess.CompletedProcess[str]":
-        words = ["status", "--connect", NOBODY, "--control", control, *map(str, more)]
-        with pytest.raises(SystemExit) as exit_status:
-            main(words)
-        said = capsys.readouterr()
-        assert isinstance(exit_status.value.code, int)
-        return subprocess.CompletedProcess(words, exit_status.value.code, said.out, said.err)
-
-    yield ask
-    signal.signal(signal.SIGTERM, handler)
+def asking(here: Here) -> Here:
+    """The command, asking at a control address."""
+    return lambda control, *more: here("status", "--connect", NOBODY, "--control", control, *more)
 
 
 def test_a_screen_shows_corrections_where_there_are_any() -> None:
     told = health(client("cart", corrections=3), client("drone"))
-    lines = [line.split() for line in screen(Seen(address="tcp://host:5555", health=told)).splitlines()]
+    lines = [line.split() for line in screen(told).splitlines()]
     assert next(words[-1] for words in lines if words[:1] == ["client"]) == "corrections"
     assert next(words[-1] for words in lines if words[:1] == ["cart"]) == "3"
-    assert "corrections" not in screen(Seen(address="tcp://host:5555", health=health(client("drone"))))
+    assert "corrections" not in screen(health(client("drone")))
 
 
 def test_a_screen_shows_it_all() -> None:
@@ -76,12 +61,9 @@ def test_a_screen_shows_it_all() -> None:
         ready=False, problems=("map yard: the disk is full",), refused={"gap": 3, "header": 1}, duplicates=9,
         maps={"yard": yard, "shed": map_health(state="restarting", last_keyframe_s=None, rejected={})},
     )  # fmt: skip
-    seen = Seen(
-        address="tcp://host:5555", health=told, maps={"yard": status(map="yard")},
-        unavailable={"shed": "the fuser restarts; ask again"},
-    )  # fmt: skip
+    more = {"maps": {"yard": status(map="yard")}, "unavailable": {"shed": "the fuser restarts; ask again"}}
     for width in (80, 160):
-        text = screen(seen, width)
+        text = screen(told, width, **more)
         lines = [" ".join(line.split()) for line in text.splitlines()]
         assert lines[0] == "✗ map yard: the disk is full"
         assert "tcp://host:5555 not ready up 1 h 2 min, gateway 62.9 MB, 9 duplicates" in lines
@@ -96,10 +78,7 @@ def test_a_screen_shows_it_all() -> None:
 
 
 def test_a_server_that_is_well_says_little() -> None:
-    seen = Seen(
-        address="tcp://host:5555", health=health(maps={"default": map_health(rejected={}, quarantined=0)})
-    )
-    text = screen(seen)
+    text = screen(health(maps={"default": map_health(rejected={}, quarantined=0)}))
     assert "ready" in text
     assert not any(word in text for word in ("✗", "refused", "client", "duplicates", "quarantined", "not"))
 
@@ -110,25 +89,23 @@ def test_nothing_that_peers_say_commands_the_terminal() -> None:
         client("x", skipped={evil: 1}, held=evil), problems=(evil,), refused={evil: 1},
         maps={"default": map_health(problem=evil, rejected={evil: 1})},
     )  # fmt: skip
-    text = screen(Seen(address="tcp://host:5555", health=told, unavailable={"default": evil}))
+    text = screen(told, unavailable={"default": evil})
     assert all(line.isprintable() for line in text.splitlines())
     assert text.count("[red]") == 6
 
 
 def test_many_clients_are_cut_short() -> None:
     told = health(*(client(f"robot{i}", heard_s=1000 - i) for i in range(500)))
-    text = screen(Seen(address="tcp://host:5555", health=told))
+    text = screen(told)
     assert "robot499 " in text
     assert "robot0 " not in text
     assert f"and {500 - MAX_CLIENTS} more sessions" in text
-    only = screen(
-        Seen(address="x", health=health(client("a", map="yard"), client("b", map="shed")), only="shed")
-    )
+    only = screen(health(client("a", map="yard"), client("b", map="shed")), only="shed")
     assert "b " in only
     assert "yard" not in only
 
 
-def test_ready_is_0(asking: Asking) -> None:
+def test_ready_is_0(asking: Here) -> None:
     with serving(saying(health(client("cart")))) as (control, asked):
         done = asking(control, "--json")
         assert done.returncode == 0, done.stderr
@@ -150,7 +127,7 @@ def test_ready_is_0(asking: Asking) -> None:
         (health(ready=False, problems=("map yard: the disk is full",)), "✗ map yard: the disk is full"),
     ],
 )
-def test_not_ready_is_3(told: Health, words: str, asking: Asking) -> None:
+def test_not_ready_is_3(told: Health, words: str, asking: Here) -> None:
     with serving(saying(told)) as (control, _):
         done = asking(control)
         assert (done.returncode, done.stderr) == (3, "")
@@ -158,21 +135,21 @@ def test_not_ready_is_3(told: Health, words: str, asking: Asking) -> None:
         assert json.loads(asking(control, "--json").stdout)["exit_status"] == 3
 
 
-def test_nobody_is_1(asking: Asking) -> None:
+def test_nobody_is_1(asking: Here) -> None:
     with serving(lambda command: None) as (control, _):
         done = asking(control, "--timeout", 0.3, "--json")
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == f"tsfusion: no server answered at {control} within 0.3 s\n"
 
 
-def test_one_that_knows_no_health_is_1(asking: Asking) -> None:
+def test_one_that_knows_no_health_is_1(asking: Here) -> None:
     with serving(lambda command: Reply(name="health", status=status())) as (control, _):
         done = asking(control)
     assert done.returncode == 1
     assert "answered without its health" in done.stderr
 
 
-def test_a_fuser_that_restarts_is_said_and_no_failure(asking: Asking) -> None:
+def test_a_fuser_that_restarts_is_said_and_no_failure(asking: Here) -> None:
     with serving(saying(health(), error="the fuser restarts; ask again")) as (control, _):
         done = asking(control, "--json")
         assert done.returncode == 0
@@ -183,7 +160,7 @@ def test_a_fuser_that_restarts_is_said_and_no_failure(asking: Asking) -> None:
         )
 
 
-def test_a_fuser_that_is_stuck_is_said_in_time(asking: Asking) -> None:
+def test_a_fuser_that_is_stuck_is_said_in_time(asking: Here) -> None:
     def answer(command: Command) -> Reply | None:
         return Reply(name="health", health=health()) if command.name == "health" else None
 
@@ -199,7 +176,7 @@ def waiting(fused: int) -> Health:
     )
 
 
-def test_stalled_is_3(asking: Asking) -> None:
+def test_stalled_is_3(asking: Here) -> None:
     with serving(saying(waiting(5))) as (control, asked):
         done = asking(control, "--stall-after", 0.6, "--json")
         assert done.returncode == 3
@@ -210,14 +187,14 @@ def test_stalled_is_3(asking: Asking) -> None:
     assert len([command for command in asked if command.name == "health"]) > 4
 
 
-def test_slow_is_not_stalled(asking: Asking) -> None:
+def test_slow_is_not_stalled(asking: Here) -> None:
     looks = iter(range(1000))
     with serving(saying(lambda: waiting(next(looks) // 3))) as (control, asked):
         assert asking(control, "--stall-after", 60).returncode == 0
     assert len([command for command in asked if command.name == "health"]) == 4
 
 
-def test_one_map_is_judged_by_itself(asking: Asking) -> None:
+def test_one_map_is_judged_by_itself(asking: Here) -> None:
     maps = {"yard": map_health(state="failed", problem="broken"), "shed": map_health()}
     told = health(ready=False, problems=("map yard: broken",), maps=maps)
     with serving(saying(told)) as (control, asked):
@@ -231,7 +208,7 @@ def test_one_map_is_judged_by_itself(asking: Asking) -> None:
         assert told_of["maps"] == {}
 
 
-def test_watching_prints_a_line_each_time_and_ends_with_the_server(asking: Asking) -> None:
+def test_watching_prints_a_line_each_time_and_ends_with_the_server(asking: Here) -> None:
     counts = iter(range(3))
 
     def answer(command: Command) -> Reply | None:
@@ -249,7 +226,7 @@ def test_watching_prints_a_line_each_time_and_ends_with_the_server(asking: Askin
 
 
 @pytest.mark.parametrize("told", [waiting(5), health(ready=False)])
-def test_watching_ends_when_nothing_gets_well(told: Health, asking: Asking) -> None:
+def test_watching_ends_when_nothing_gets_well(told: Health, asking: Here) -> None:
     with serving(saying(told)) as (control, _):
         done = asking(control, "--watch", 0.1, "--stall-after", 0.5)
     assert done.returncode == 3
@@ -317,14 +294,6 @@ def _read_terminal(leader: int, enough: Callable[[str], bool]) -> str:
     return text
 
 
-def test_help_needs_none_of_it() -> None:
-    program = (
-        "import sys, tsfusion.cli.status; "
-        "sys.exit(', '.join({'zmq', 'rich.table', 'msgspec', 'numpy'} & set(sys.modules)) or 0)"
-    )
-    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
-
-
 def test_errors_stay_errors() -> None:
-    seen: Any = Seen(address="tcp://host:5555", error=str(TransportError("no server\x1b[2J answered")))
-    assert screen(seen) == "✗ no server\\x1b[2J answered\n"
+    error = str(TransportError("no server\x1b[2J answered"))
+    assert screen(None, error=error) == "✗ no server\\x1b[2J answered\n"

@@ -3,11 +3,10 @@
 
 import os
 import stat
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from command_processes import python
 
 from tsfusion.core.durable_files import replacing
 
@@ -54,7 +53,7 @@ def test_an_error_leaves_the_old_file_and_no_part(path: Path, error: BaseExcepti
 
 
 def test_a_killed_writer_leaves_the_old_file_and_the_next_one_clears_up(path: Path) -> None:
-    assert subprocess.run([sys.executable, "-c", _KILLED, str(path)], check=False).returncode != 0
+    assert python(_KILLED, path).returncode != 0
     assert path.read_bytes() == b"old"
     assert len(list(path.parent.iterdir())) == 2
     replace(path, b"new")

@@ -4,15 +4,14 @@
 import json
 import logging
 import re
-import subprocess
-import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from command_processes import python
 from hypothesis import given
 from hypothesis import strategies as st
+from keyframes_and_servers import at_once
 
 from tsfusion.core import logs
 
@@ -174,11 +173,7 @@ def test_a_flood_from_many_threads_is_bounded(lines: ReadLines) -> None:
         for i in range(1000):
             log.warning("rubbish %d", i)
 
-    threads = [threading.Thread(target=flood) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    at_once(*[flood] * 4)
     assert len(lines()) == logs.MOST
     for handler in logging.root.handlers:
         if isinstance(handler, logs.Stderr):
@@ -193,9 +188,7 @@ from tsfusion.core import logs
 logs.configure("json", "info")
 raise ValueError("a\\nb")
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
-    )
+    done = python(program)
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
     fields = json.loads(line)
@@ -214,12 +207,5 @@ for _ in range(3):
 print("alive")
 """
     with open("/dev/full", "w") as full:
-        done = subprocess.run(
-            [sys.executable, "-c", program],
-            stdout=subprocess.PIPE,
-            stderr=full,
-            text=True,
-            timeout=60,
-            check=False,
-        )
+        done = python(program, stderr=full)
     assert done.stdout == "alive\n"

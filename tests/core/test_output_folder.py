@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
 """The folder of a run: whole or not there, and no litter beside it."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from command_processes import python
 
 from tsfusion.core.errors import OutputError
 from tsfusion.core.output_folder import building
@@ -61,7 +60,7 @@ def test_the_next_run_clears_what_a_killed_one_left(tmp_path: Path, existing: bo
     out = tmp_path / "out"
     if existing:
         out.mkdir()
-    subprocess.run([sys.executable, "-c", _KILLED, str(out)], check=False, timeout=60)
+    python(_KILLED, out)
     assert [path.read_text() for path in tmp_path.rglob("mesh.ply")] == ["half"]
     with building(out):
         assert not list(tmp_path.rglob("mesh.ply"))

@@ -29,14 +29,8 @@ def call(**options: object) -> tuple[object, ...]:
 
 def test_options_are_converted_to_the_type_of_the_parameter() -> None:
     lens = Intrinsics(1.0, 2.0, 3.0, 4.0)
-    assert call(size=[2, 3], rate=5, place=7, count=None, lens=(1, 2, 3, 4)) == (
-        [2, 3],
-        5.0,
-        "7",
-        1,
-        lens,
-        {},
-    )
+    made = call(size=[2, 3], rate=5, place=7, count=None, lens=(1, 2, 3, 4))
+    assert made == ([2, 3], 5.0, "7", 1, lens, {})
     assert call(place=Path("a"), lens=lens, exposure="long")[2:] == (Path("a"), 1, lens, {"exposure": "long"})
 
 

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""A client's connections: cut, made anew, turned away by their keys, and what it says of that."""
+"""A client's connections: cut, made anew, turned away by their keys; and the states of its link."""
 
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import zmq
 from clients_and_spools import joined, send_all
 from keyframes_and_servers import DEADLINE, until, wall
 from scripted_server import ScriptedServer, scripted
@@ -14,7 +13,9 @@ from scripted_server import ScriptedServer, scripted
 from tsfusion import Client
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, InvalidConfig, NotAllowed, ServerUnreachable
-from tsfusion.wire.curve import ServerKeys
+from tsfusion.delivery.link_state import Kind, LinkState
+from tsfusion.wire import key_folder
+from tsfusion.wire.curve import server_keys
 
 PATIENT = ClientConfig(stall_timeout=1000.0, policy="spool_all")
 
@@ -23,13 +24,12 @@ class Pair:
     """A key in a file, as `tsfusion keys new` makes it."""
 
     def __init__(self, folder: Path, name: str) -> None:
-        public, secret = zmq.curve_keypair()
-        self.public, self.secret = public.decode(), secret.decode()
-        self.file = folder / f"{name}.key_secret"
-        self.file.touch(mode=0o600)
-        self.file.write_text(
-            f'metadata\ncurve\n    public-key = "{self.public}"\n    secret-key = "{self.secret}"\n'
-        )
+        self.public = key_folder.create_pair(folder / name, name).public
+        self.file = folder / name / f"{name}.key_secret"
+
+    def joined(self, server: ScriptedServer) -> Client:
+        assert server.keys is not None
+        return joined(server, key=self.file, server_key=server.keys.public)
 
 
 @pytest.fixture
@@ -39,8 +39,8 @@ def robot(tmp_path: Path) -> Pair:
 
 @pytest.fixture
 def keyed(tmp_path: Path, robot: Pair) -> Iterator[ScriptedServer]:
-    own = Pair(tmp_path, "server")
-    keys = ServerKeys(own.public, own.secret)
+    key_folder.create_pair(tmp_path / "keys", "server")
+    keys = server_keys(tmp_path / "keys")
     with scripted(keys=keys, allowed={robot.public: "robot"}) as server:
         yield server
 
@@ -89,8 +89,7 @@ def test_a_server_with_an_impossible_clock_does_no_harm(shown: int) -> None:
 
 
 def test_a_client_with_keys_delivers(keyed: ScriptedServer, robot: Pair) -> None:
-    assert keyed.keys is not None
-    with joined(keyed, key=robot.file, server_key=keyed.keys.public) as client:
+    with robot.joined(keyed) as client:
         client.connect(DEADLINE)
         send_all(client, range(5))
         client.flush(DEADLINE)
@@ -100,9 +99,8 @@ def test_a_client_with_keys_delivers(keyed: ScriptedServer, robot: Pair) -> None
 def test_an_unknown_key_is_told_and_let_in_when_it_is_known(
     keyed: ScriptedServer, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert keyed.keys is not None
     other = Pair(tmp_path, "other")
-    with joined(keyed, key=other.file, server_key=keyed.keys.public) as client:
+    with other.joined(keyed) as client:
         client.send(wall())
         with pytest.raises(NotAllowed, match=r"does not know this client's key .* run `tsfusion keys allow"):
             client.connect(DEADLINE)  # at once
@@ -116,8 +114,7 @@ def test_an_unknown_key_is_told_and_let_in_when_it_is_known(
 
 
 def test_a_revoked_key_is_told_and_keeps_its_keyframes(keyed: ScriptedServer, robot: Pair) -> None:
-    assert keyed.keys is not None
-    with joined(keyed, key=robot.file, server_key=keyed.keys.public) as client:
+    with robot.joined(keyed) as client:
         client.send(wall())
         client.flush(DEADLINE)
         keyed.allowed.clear()
@@ -141,7 +138,6 @@ def test_the_wrong_server_is_not_talked_to(keyed: ScriptedServer, tmp_path: Path
 def test_one_side_without_keys_is_told_so(keyed: ScriptedServer, robot: Pair) -> None:
     with joined(keyed) as client, pytest.raises(NotAllowed, match="takes only connections with keys"):
         client.connect(DEADLINE)
-    assert keyed.keys is not None
     with (
         scripted() as plain,
         joined(plain, key=robot.file, server_key=keyed.keys.public) as client,
@@ -158,3 +154,55 @@ def test_keys_of_no_use_are_clear_errors(keyed: ScriptedServer, tmp_path: Path, 
     robot.file.chmod(0o644)
     with pytest.raises(InvalidConfig, match="others can read the secret key"):
         Client(keyed.address, key=robot.file, server_key=robot.public)
+
+
+# --- states ---
+
+STATES: list[LinkState] = [
+    LinkState(),
+    LinkState("connecting", "no route"),
+    LinkState("connected"),
+    LinkState("held", "the disk is full"),
+    LinkState("opening", "the map is being opened"),
+    LinkState("refused", "another version"),
+    LinkState("locked_out", "no such key"),
+    LinkState("silent"),
+]
+
+
+@pytest.mark.parametrize("state", STATES, ids=str)
+def test_a_server_that_lets_us_in_and_answers_is_connected(state: LinkState) -> None:
+    assert state.welcomed().answered() == LinkState("connected")
+
+
+@pytest.mark.parametrize("state", STATES, ids=str)
+def test_who_is_refused_stays_so_until_a_welcome(state: LinkState) -> None:
+    for refused in (state.refused("why"), state.locked_out("why")):
+        assert refused.is_refused
+        for next_one in (refused.answered(), refused.held("x"), refused.moved(), refused.silent()):
+            assert next_one == refused
+    assert state.locked_out("why").reachable("why") == LinkState()
+    assert state.refused("why").reachable("another problem") == LinkState("refused", "why")
+
+
+def kinds_after(event: str, *arguments: str) -> list[Kind]:
+    return [getattr(state, event)(*arguments).kind for state in STATES]
+
+
+def test_silence_a_hold_and_progress() -> None:
+    assert kinds_after("silent") == [
+        *("connecting", "connecting", "silent", "silent", "silent", "refused", "locked_out", "silent")
+    ]
+    assert kinds_after("held", "slower") == [*["held"] * 5, "refused", "locked_out", "held"]
+    assert kinds_after("moved") == [
+        *("connecting", "connecting", "connected", "connected", "opening", "refused", "locked_out", "silent")
+    ]
+    assert kinds_after("answered") == [
+        *("connected", "connected", "connected", "held", "opening", "refused", "locked_out", "connected")
+    ]
+
+
+def test_only_connected_and_held_servers_count_as_connected() -> None:
+    assert [state.kind for state in STATES if state.is_connected] == ["connected", "held"]
+    assert LinkState("connecting", "no route").misunderstood("noise").why == "no route"
+    assert LinkState().misunderstood("noise") == LinkState("connecting", "noise")

@@ -21,7 +21,6 @@ from keyframes_and_servers import pose
 from tsfusion import Keyframe
 from tsfusion.core.config import ClientConfig
 from tsfusion.delivery import backpressure, control_session, sender
-from tsfusion.delivery import backpressure as delivery_backpressure
 from tsfusion.delivery.backpressure import Backpressure
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.sender import Sender
@@ -325,7 +324,7 @@ class World:
 
 def play(seed: int, folder: Path, monkeypatch: pytest.MonkeyPatch) -> World:
     clock = Clock()
-    for module in (backpressure, control_session, delivery_backpressure, sender):
+    for module in (backpressure, control_session, sender):
         if hasattr(module, "time"):
             monkeypatch.setattr(module, "time", clock)
     for name in ("os.fdatasync", "os.fsync"):

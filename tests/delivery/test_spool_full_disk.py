@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from clients_and_spools import NOBODY, joined, send_all
+from failures import raising, refuse
 from keyframes_and_servers import DEADLINE, pose, until, wall
 from scripted_server import scripted
 
@@ -173,14 +174,11 @@ def test_a_record_that_cannot_be_taken_back_does_not_pass_for_another(
 ) -> None:
     """The disk fails, and fails again when the journal cuts the failed record off."""
 
-    def fails(*_: Any) -> None:
-        raise OSError(errno.EIO, "Input/output error")
-
     with Client(NOBODY, spool=tmp_path, config=ALL) as client:
         assert client.send(wall(0)) == 1
         with monkeypatch.context() as patch:
-            patch.setattr(os, "fdatasync", fails)
-            patch.setattr(os, "truncate", fails)
+            patch.setattr(os, "fdatasync", refuse(errno.EIO))
+            patch.setattr(os, "truncate", refuse(errno.EIO))
             assert client.send(wall(1)) is None
         assert client.send(wall(2)) == 3
     with scripted() as server, joined(server, spool=tmp_path) as client:
@@ -189,11 +187,8 @@ def test_a_record_that_cannot_be_taken_back_does_not_pass_for_another(
 
 
 def test_a_mistake_of_ours_is_not_blamed_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def wrong(*_: Any, **__: Any) -> None:
-        raise TypeError("a mistake")
-
     with Client(NOBODY, spool=tmp_path) as client:
-        monkeypatch.setattr(journal.Journal, "append", wrong)
+        monkeypatch.setattr(journal.Journal, "append", raising(TypeError("a mistake")))
         with pytest.raises(TypeError, match="a mistake"):
             client.send(wall())
 

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 
 import pytest
 from bad_network import Proxy
+from keyframes_and_servers import until
 
 PATIENCE = 10.0
 
@@ -71,6 +72,23 @@ def connected(proxy: Proxy, port: int = 0) -> Iterator[socket.socket]:
         yield made
 
 
+@contextmanager
+def talking(proxy: Proxy) -> Iterator[socket.socket]:
+    """A connection that something has gone over."""
+    with connected(proxy) as made:
+        assert echoed(made, b"a") == b"a"
+        yield made
+
+
+def silent(link: socket.socket) -> bool:
+    """Nothing comes for a while."""
+    link.settimeout(0.2)
+    with pytest.raises(TimeoutError):
+        link.recv(1)
+    link.settimeout(PATIENCE)
+    return True
+
+
 def echoed(link: socket.socket, content: bytes) -> bytes:
     link.sendall(content)
     return received(link, len(content))
@@ -102,15 +120,14 @@ def test_a_cut_ends_what_is_connected_and_nothing_else(proxy: Proxy) -> None:
 
 
 def test_it_refuses_until_it_does_not(proxy: Proxy) -> None:
-    with connected(proxy) as before:
-        assert echoed(before, b"a") == b"a"
+    with talking(proxy) as before:
         proxy.refuse(True)
         with pytest.raises(ConnectionRefusedError), connected(proxy):
             pass
         assert echoed(before, b"still here") == b"still here"
     proxy.heal()
-    with connected(proxy) as link:
-        assert echoed(link, b"a") == b"a"
+    with talking(proxy):
+        pass
 
 
 def test_nobody_behind_it(proxy: Proxy) -> None:
@@ -133,38 +150,27 @@ def test_it_is_as_slow_as_told(proxy: Proxy) -> None:
 
 
 def test_a_frozen_link_loses_nothing(proxy: Proxy) -> None:
-    with connected(proxy) as link:
-        assert echoed(link, b"a") == b"a"
+    with talking(proxy) as link:
         proxy.freeze(True)
         link.sendall(b"later")
-        link.settimeout(0.2)
-        with pytest.raises(TimeoutError):
-            link.recv(1)
+        assert silent(link)
         proxy.freeze(False)
-        link.settimeout(PATIENCE)
         assert received(link, 5) == b"later"
 
 
 def test_a_muted_server_is_heard_later(proxy: Proxy) -> None:
-    with connected(proxy) as link:
-        assert echoed(link, b"a") == b"a"
+    with talking(proxy) as link:
         proxy.mute(True)
         before = proxy.carried
         link.sendall(b"late")
-        end = time.monotonic() + PATIENCE
-        while proxy.carried < before + len(b"late"):
-            assert time.monotonic() < end
-        link.settimeout(0.2)
-        with pytest.raises(TimeoutError):
-            link.recv(1)
+        until(lambda: proxy.carried >= before + len(b"late"), PATIENCE)
+        assert silent(link)
         proxy.heal()
-        link.settimeout(PATIENCE)
         assert received(link, 4) == b"late"
 
 
 def test_what_is_jammed_comes_after_what_came_later(proxy: Proxy) -> None:
-    with connected(proxy) as link:
-        assert echoed(link, b"a") == b"a"
+    with talking(proxy) as link:
         proxy.jam(True)
         link.sendall(b"late")
         with connected(proxy) as other:
@@ -177,24 +183,18 @@ def test_what_is_swallowed_never_comes(proxy: Proxy) -> None:
     proxy.swallow(True)
     with connected(proxy) as link:
         link.sendall(b"lost")
-        link.settimeout(0.2)
-        with pytest.raises(TimeoutError):
-            link.recv(1)
+        assert silent(link)
         proxy.swallow(False)
-        link.settimeout(PATIENCE)
         with pytest.raises(ConnectionError):
             assert link.recv(1)
-    with connected(proxy) as link:
-        assert echoed(link, b"a") == b"a"
+    with talking(proxy):
+        pass
 
 
 def test_half_closed(proxy: Proxy) -> None:
-    with connected(proxy) as link:
-        assert echoed(link, b"a") == b"a"
+    with talking(proxy) as link:
         before = proxy.carried
         proxy.half_close()
         assert link.recv(1) == b""
         link.sendall(b"still there")
-        end = time.monotonic() + PATIENCE
-        while proxy.carried < before + len(b"still there"):
-            assert time.monotonic() < end
+        until(lambda: proxy.carried >= before + len(b"still there"), PATIENCE)

@@ -15,28 +15,25 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from delivery_verdict import VOXEL_SIZE, verify
-from keyframes_and_servers import DEADLINE, Server, connected, serving, until, wall
+from bad_network import Proxy
+from clients_and_spools import NOBODY, send_all
+from delivery_verdict import verify
+from keyframes_and_servers import DEADLINE, Server, connected, map_hash, serving, until, wall
 from scanner_process import Plan, Report, journals, numbers
 from supervisors import SCANNER
 
-from tsfusion import Client, Volume, journal
+from tsfusion import Client, journal
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, ServerUnreachable, TransportError
 from tsfusion.delivery import control_session, spool
+from tsfusion.journal.state_folder import find_journal
 from tsfusion.wire import codec, messages, sockets
-from tsfusion.wire.queries import fetch_status
+from tsfusion.wire.queries import fetch_health, fetch_status
 from tsfusion.wire.record_header import VERSION
 
 FREEZE = 6.0  # seconds: longer than any timeout of client and server
 SHORT_FREEZE = 3.0  # where the gateway lives, and would have noticed by then
 QUICK = ClientConfig(policy="spool_all", stall_timeout=0.5)
-
-
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    with serving(tmp_path_factory.mktemp("shared")) as server:
-        yield server
 
 
 @contextmanager
@@ -95,13 +92,9 @@ def test_a_frozen_scanner_holds_nobody_up(tmp_path: Path) -> None:
     state, report = tmp_path / "state", tmp_path / "report"
     with serving(state) as server, Client(server.address, config=QUICK) as client:
         plan = Plan(
-            address=server.address,
-            spool=str(tmp_path / "spool"),
-            state=str(state),
-            count=60,
-            rate=30,
+            address=server.address, spool=str(tmp_path / "spool"), state=str(state), count=60, rate=30,
             report=str(report),
-        )
+        )  # fmt: skip
         scanner = subprocess.Popen([sys.executable, str(SCANNER), msgspec.json.encode(plan).decode()])
         until(lambda: fetch_status(server.address).keyframes_durable > 10)
         with frozen(scanner.pid):
@@ -154,9 +147,8 @@ def test_a_copied_spool_is_one_session(tmp_path: Path, monkeypatch: pytest.Monke
     """The keyframes count once; a client with lower numbers learns why they are not taken."""
     monkeypatch.setattr(spool, "_RESTART_SPREAD", 1)  # here: who comes second
     state, spools = tmp_path / "state", [tmp_path / name for name in ("spool", "copy")]
-    with Client("tcp://127.0.0.1:1", spool=spools[0]) as client:
-        for i in range(6):
-            client.send(wall(i))
+    with Client(NOBODY, spool=spools[0]) as client:
+        send_all(client, range(6))
     shutil.copytree(*spools)
     with serving(state) as server:
         with Client(server.address, spool=spools[0], config=QUICK) as first:
@@ -177,7 +169,7 @@ def test_a_copied_spool_is_one_session(tmp_path: Path, monkeypatch: pytest.Monke
 def test_two_that_share_a_session_at_once_spoil_nothing(tmp_path: Path) -> None:
     """Both go on with numbers of their own; lower ones are not taken, which is reported: nothing is lost."""
     state, spools = tmp_path / "state", [tmp_path / name for name in ("spool", "copy")]
-    with Client("tcp://127.0.0.1:1", spool=spools[0]) as client:
+    with Client(NOBODY, spool=spools[0]) as client:
         client.send(wall(0))
     shutil.copytree(*spools)
     with serving(state) as server:
@@ -198,10 +190,7 @@ def test_two_that_share_a_session_at_once_spoil_nothing(tmp_path: Path) -> None:
     assert len(found) == len(set(found)) == status.keyframes_fused
     kept = {number for folder in spools if journal.segments(folder) for number in numbers(folder)}
     assert {*found, *kept} == set(range(41))
-    volume = Volume(voxel_size=VOXEL_SIZE, threads=1)
-    for i in found:
-        volume.integrate(wall(i))
-    assert volume.map_hash() == status.map_hash
+    assert map_hash(map(wall, found)) == status.map_hash
 
 
 # --- another version ---
@@ -221,12 +210,8 @@ def test_another_version_is_named(shared: Server) -> None:
     with connected(sockets.push, shared.address) as push:
         assert push.poll(10_000, 2)
         push.send_multipart(newer)
-        until(
-            lambda: (
-                fetch_status(shared.address).messages_refused.get("version", 0)
-                == before.messages_refused.get("version", 0) + 1
-            )
-        )
+        wanted = before.messages_refused.get("version", 0) + 1
+        until(lambda: fetch_status(shared.address).messages_refused.get("version", 0) == wanted)
     assert fetch_status(shared.address).keyframes_durable == before.keyframes_durable
 
 
@@ -263,12 +248,7 @@ def test_a_clock_that_jumps_changes_nothing(tmp_path: Path, monkeypatch: pytest.
         server.kill()
     with serving(state, code=_JUMPING) as server:
         assert outcome(server, 30, state) == []
-    (folder,) = journals(state)
-    logged = [
-        record.logged_ns
-        for number in journal.segments(folder)
-        for record in journal.records(journal.segment_path(folder, number))
-    ]
+    logged = [record.logged_ns for path in find_journal(state).files() for record in journal.records(path)]
     assert logged != sorted(logged), "the clock has not jumped"
 
 
@@ -278,3 +258,26 @@ def test_status_of_a_frozen_server_is_a_clear_error(shared: Server) -> None:
         pytest.raises(TransportError, match=r"no server answered at tcp://.* within 0\.5 s"),
     ):
         fetch_status(shared.address, timeout=0.5)
+
+
+# --- late ---
+
+
+def test_what_was_sent_again_counts_once(tmp_path: Path) -> None:
+    """The connection hangs; the client opens another, and what hung comes after all."""
+    state = tmp_path / "state"
+    with serving(state) as server, Proxy() as proxy:
+        proxy.target(server.address, server.control)
+        with Client(proxy.address, spool=tmp_path / "spool", config=QUICK) as client:
+            client.send(wall(0))
+            client.flush(timeout=DEADLINE)
+            proxy.jam(True)
+            send_all(client, range(1, 6))
+            client.flush(timeout=DEADLINE)
+            assert fetch_health(server.address).duplicates == 0
+            proxy.jam(False)
+            until(lambda: fetch_health(server.address).duplicates == 5)
+            client.wait_fused(timeout=DEADLINE)
+        status = fetch_status(server.address)
+        assert server.terminate() == 0
+    assert verify(state, 6, status.map_hash) == []

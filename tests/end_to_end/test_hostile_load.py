@@ -30,14 +30,8 @@ def test_memory_that_was_freed_counts_no_more(monkeypatch: pytest.MonkeyPatch) -
     assert MemoryGuard(800).excess(uncounted=0) == 0
 
 
-WITHOUT_KEYS = (
-    "lies",
-    "tiny",
-    "unfinished",
-    "knocking",
-    "half open",
-    "slow loris",
-)  # what gets as far as that
+# What gets as far as that.
+WITHOUT_KEYS = ("lies", "tiny", "unfinished", "knocking", "half open", "slow loris")
 
 
 @pytest.mark.parametrize("seconds", [0.3, pytest.param(3.0, marks=pytest.mark.nightly)])

@@ -5,14 +5,14 @@ import os
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_processes import end
+from command_processes import end, python
+from keyframes_and_servers import until
 from repository import ROOT, SUPPORT
 
 from tsfusion.core.errors import JournalError
@@ -26,7 +26,6 @@ from tsfusion.scanner.localization.pose_feed.feed import PoseFeed
 BRIDGE = ROOT / "contrib" / "ros1_bridge.py"
 TALKER = SUPPORT / "ros1_talker.py"
 PYTHON = "/usr/bin/python3"
-DEADLINE = 60.0  # seconds
 TENTH = 100_000_000
 START = 1_700_000_000 * 1_000_000_000
 
@@ -55,6 +54,11 @@ def process(*command: object, environment: dict[str, str]) -> Iterator["subproce
         end(made)
 
 
+def listens(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
 @pytest.fixture
 def ros(tmp_path: Path) -> Iterator[dict[str, str]]:
     """The environment of nodes that talk to a master of their own."""
@@ -68,13 +72,7 @@ def ros(tmp_path: Path) -> Iterator[dict[str, str]]:
         "ROS_HOME": str(tmp_path / "ros"),
     }
     with process("/usr/bin/rosmaster", "--core", "-p", port, environment=environment):
-        until = time.monotonic() + DEADLINE
-        while True:
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", port)) == 0:
-                    break
-            assert time.monotonic() < until, "no master"
-            time.sleep(0.05)
+        until(lambda: listens(port))
         yield environment
 
 
@@ -121,10 +119,12 @@ def test_a_lost_camera_is_said_to_be_lost(ros: dict[str, str]) -> None:
             process(PYTHON, BRIDGE, "--feed", feed.address, "--connect", *words, environment=ros)
         )
         stack.enter_context(process(PYTHON, TALKER, environment=ros))
-        until = time.monotonic() + DEADLINE
-        while not feed.received:
-            assert time.monotonic() < until
+
+        def heard() -> bool:
             assert isinstance(feed.track(at(0)), Lost)
+            return bool(feed.received)
+
+        until(heard)
         assert not feed.dropped
 
 
@@ -137,10 +137,7 @@ def kept(spool: Path) -> list[Keyframe]:
 def test_keyframes_go_out(ros: dict[str, str], tmp_path: Path) -> None:
     """Under this Python, with the system's ROS behind its packages; there is no server, so that they wait."""
     behind = "import sys, runpy; sys.path.append('/usr/lib/python3/dist-packages'); "
-    probe = subprocess.run(
-        [sys.executable, "-c", behind + "import rospy, tf2_ros"], capture_output=True, check=False
-    )
-    if probe.returncode:
+    if python(behind + "import rospy, tf2_ros").returncode:
         pytest.skip("this Python cannot load the system's rospy")
     run = behind + f"runpy.run_path({str(BRIDGE)!r}, run_name='__main__')"
     with socket.socket() as nobody, ExitStack() as stack:
@@ -153,11 +150,8 @@ def test_keyframes_go_out(ros: dict[str, str], tmp_path: Path) -> None:
             process(sys.executable, "-c", run, *words, *topics, environment=environment)
         )
         stack.enter_context(process(PYTHON, TALKER, "tf", environment=ros))
-        until = time.monotonic() + DEADLINE
-        while len(kept(spool)) < 8:
-            assert time.monotonic() < until, "no keyframes came"
-            assert bridge.poll() is None
-            time.sleep(0.2)
+        until(lambda: len(kept(spool)) >= 8 or bridge.poll() is not None)
+        assert bridge.poll() is None
         assert end(bridge) == 0
         keyframes = kept(spool)
     for keyframe in keyframes:

@@ -1,36 +1,24 @@
 # SPDX-License-Identifier: MIT
 """Servers and clients without file descriptors, without room on the disk, without files they had."""
 
-import errno
-import os
 import resource
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import zmq
+from clients_and_spools import NOBODY, QUICK, deliver, send_all
 from command_processes import alive
-from keyframes_and_servers import DEADLINE, Server, connected, serving, until, wall
+from keyframes_and_servers import DEADLINE, Server, connected, map_hash, serving, until, wall
 
-from tsfusion import Client, Volume, VolumeConfig, journal
+from tsfusion import Client, Volume, VolumeConfig
 from tsfusion.core.config import ClientConfig
-from tsfusion.core.errors import InvalidKeyframe, JournalError, KeyframeRefused
+from tsfusion.core.errors import InvalidKeyframe, KeyframeRefused
 from tsfusion.datasets import Synthetic
 from tsfusion.delivery.spool import Spool
-from tsfusion.journal import Journal
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.messages import Command
 from tsfusion.wire.queries import fetch_health
-
-QUICK = ClientConfig(stall_timeout=0.5)
-
-
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    with serving(tmp_path_factory.mktemp("shared")) as server:
-        yield server
-
 
 # --- scarce file descriptors, a full or vanishing disk ---
 
@@ -56,80 +44,10 @@ def test_a_server_out_of_file_descriptors_lives(tmp_path: Path) -> None:
         assert server.terminate() == 0
 
 
-def seqs(folder: Path) -> list[int]:
-    found = Journal(folder, 1 << 20)
-    found.close()
-    return [record.seq for record in found.found]
-
-
-def test_a_keyframe_the_disk_refused_does_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The number is used again; a later scan that found the first keyframe would take it for the second."""
-    writer = Journal(tmp_path, 1 << 20)
-    writer.append([b"head", b"body"], session=bytes(16), seq=1)
-
-    def full(_: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, "fdatasync", full)
-    with pytest.raises(JournalError, match="No space left on device"):
-        writer.append([b"head", b"body"], session=bytes(16), seq=2)
-    monkeypatch.undo()
-    assert seqs(tmp_path) == [1]
-    writer.append([b"head", b"body"], session=bytes(16), seq=3)
-    writer.close()
-    assert seqs(tmp_path) == [1, 3]
-
-
-def test_a_disk_that_stays_full_leaves_no_heap_of_segments(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    writer = Journal(tmp_path, 1 << 20)
-
-    def full(_: int) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(os, "fdatasync", full)
-    for _ in range(20):
-        with pytest.raises(JournalError):
-            writer.append([b"head", b"body"], session=bytes(16), seq=1)
-    assert len(journal.segments(tmp_path)) <= 1
-    monkeypatch.undo()
-    position = writer.append([b"head", b"body"], session=bytes(16), seq=1)
-    assert journal.read(tmp_path, position).seq == 1
-    writer.close()
-
-
-def test_a_segment_that_cannot_be_closed_does_not_take_its_last_keyframe_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    writer = Journal(tmp_path, 1)  # each keyframe fills a segment
-
-    def full(_: Journal) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Journal, "rotate", full)
-    first = writer.append([b"head", b"body"], session=bytes(16), seq=1)
-    monkeypatch.undo()
-    second = writer.append([b"head", b"body"], session=bytes(16), seq=2)
-    writer.close()
-    assert (first.segment, second.segment) == (1, 2)
-    assert seqs(tmp_path) == [1, 2]
-
-
-def test_a_journal_whose_folder_vanishes_is_a_clear_error(tmp_path: Path) -> None:
-    writer = Journal(tmp_path / "journal", 1)
-    writer.append([b"head", b"body"], session=bytes(16), seq=1)
-    (tmp_path / "journal" / "000001.mcap").unlink()
-    (tmp_path / "journal").rmdir()
-    with pytest.raises(JournalError, match="No such file"):
-        writer.append([b"head", b"body"], session=bytes(16), seq=2)
-
-
 def test_a_client_survives_the_loss_of_its_spool_files(shared: Server, tmp_path: Path) -> None:
     small = ClientConfig(segment_bytes=1 << 16, stall_timeout=0.5, policy="spool_all")
-    with Client("tcp://127.0.0.1:1", spool=tmp_path, config=small) as early:
-        for i in range(40):
-            early.send(wall(i))
+    with Client(NOBODY, spool=tmp_path, config=small) as early:
+        send_all(early, range(40))
     lost = sorted(tmp_path.glob("*.mcap"))[0]
     with Client(shared.address, spool=tmp_path, config=small) as client:
         lost.unlink()
@@ -150,20 +68,15 @@ def test_a_map_that_outgrows_its_memory_refuses_keyframes_and_lives(tmp_path: Pa
         serving(tmp_path, fine, fuser_memory_bytes=1 << 28) as server,
         Client(server.address, policy="spool_all") as client,
     ):
-        for i in range(8):
-            client.send(room[i])
-        client.flush(timeout=DEADLINE)
-        client.wait_fused(timeout=DEADLINE)
+        deliver(client, (room[i] for i in range(8)))
         health = fetch_health(server.address).maps["default"]
         assert 0 < client.stats.rejected["memory"] == health.rejected["memory"] == health.quarantined < 8
         assert health.fuser_restarts == 0
         assert server.terminate() == 0
     saved = Volume.load(tmp_path / "maps/default/map.tsf")
     kept = {int(path.name.split("-")[1]) for path in (tmp_path / "maps/default/quarantine").iterdir()}
-    volume = Volume(fine)
-    for i in set(range(8)) - {seq - 1 for seq in kept}:
-        volume.integrate(room[i])
-    assert volume.map_hash() == saved.map_hash()
+    fitted = [room[i] for i in set(range(8)) - {seq - 1 for seq in kept}]
+    assert map_hash(fitted, fine) == saved.map_hash()
 
 
 # --- keyframes that cannot travel ---

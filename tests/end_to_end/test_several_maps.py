@@ -2,20 +2,21 @@
 """One server, several maps and several scanners: real processes and sockets."""
 
 import contextlib
-import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 import zmq
-from keyframes_and_servers import DEADLINE, Server, connected, serving, until, wall
+from clients_and_spools import send_all
+from failures import raising
+from keyframes_and_servers import DEADLINE, Server, at_once, connected, map_hash, serving, until, wall
 
 import tsfusion
 from tsfusion import Client
 from tsfusion.core import config
-from tsfusion.core import config as core_config
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import JournalError, ServerUnreachable, TransportError
 from tsfusion.gateway import map_registry
@@ -30,17 +31,9 @@ from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_status
 from tsfusion.wire.record_header import Refused, unpack
 
 
-def fused_hash(numbers: range) -> str:
-    volume = tsfusion.Volume(voxel_size=0.04, threads=1)
-    for i in numbers:
-        volume.integrate(wall(i))
-    return volume.map_hash()
-
-
 def scan(address: str, map_name: str, numbers: range) -> None:
     with Client(address, map=map_name, policy="spool_all") as client:
-        for i in numbers:
-            client.send(wall(i, captured_ns=time.monotonic_ns()))
+        send_all(client, numbers)
         client.flush(timeout=DEADLINE)
         client.wait_fused(timeout=DEADLINE)
 
@@ -48,25 +41,15 @@ def scan(address: str, map_name: str, numbers: range) -> None:
 def test_two_scanners_two_maps(tmp_path: Path) -> None:
     with serving(tmp_path) as server:
         numbers = {"default": range(6), "yard-2": range(4, 12)}
-        scanners = [
-            threading.Thread(target=scan, args=(server.address, name, which))
-            for name, which in numbers.items()
-        ]
-        for scanner in scanners:
-            scanner.start()
-        for scanner in scanners:
-            scanner.join(DEADLINE)
+        at_once(*(partial(scan, server.address, name, which) for name, which in numbers.items()))
         for name, which in numbers.items():
             status = fetch_status(server.address, map_name=name)
             assert (status.map, status.keyframes_fused) == (name, len(which))
-            assert status.map_hash == fused_hash(which)
+            assert status.map_hash == map_hash(map(wall, which))
             assert status.delay_bound_ms > 0
         health = fetch_health(server.address)
         assert health.ready
-        assert {name: one.keyframes_fused for name, one in health.maps.items()} == {
-            "default": 6,
-            "yard-2": 8,
-        }
+        assert {name: one.keyframes_fused for name, one in health.maps.items()} == {"default": 6, "yard-2": 8}
         assert {client.map for client in health.clients} == set(numbers)
         assert len(fetch_mesh(server.address, map_name="yard-2", min_weight=0.5).faces) > 100
         with pytest.raises(TransportError, match="no map attic is open"):
@@ -78,7 +61,9 @@ def test_two_scanners_two_maps(tmp_path: Path) -> None:
     assert len(JournalRecording(tmp_path, "yard-2")) == len(JournalRecording(tmp_path / "maps/yard-2")) == 8
     with serving(tmp_path) as server:  # both are taken up again, without anybody asking
         until(lambda: set(fetch_health(server.address).maps) == set(numbers))
-        assert fetch_status(server.address, map_name="yard-2").map_hash == fused_hash(numbers["yard-2"])
+        assert fetch_status(server.address, map_name="yard-2").map_hash == map_hash(
+            map(wall, numbers["yard-2"])
+        )
         assert server.terminate() == 0
 
 
@@ -92,10 +77,7 @@ def test_a_server_opens_only_so_many_maps(tmp_path: Path) -> None:
 def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise JournalError("no room")
-
-    monkeypatch.setattr(map_registry, "HostedMap", fail)
+    monkeypatch.setattr(map_registry, "HostedMap", raising(JournalError("no room")))
     found: Any = MapRegistry(
         zmq.Context.instance(), ServerConfig(state=str(tmp_path)), cast(ClientRoutes, None), Metrics()
     )
@@ -138,7 +120,7 @@ def test_maps_have_settings_of_their_own(tmp_path: Path) -> None:
     path.write_text('[volume]\nvoxel_size = 0.05\n[maps.yard]\nvoxel_size = 0.2\nsensor = "lidar"\n')
     loaded = config.load(path)
     assert loaded.volumes() == {"yard": VolumeConfig(voxel_size=0.2, sensor="lidar")}
-    path.write_text(core_config.to_toml(loaded))
+    path.write_text(config.to_toml(loaded))
     assert config.load(path) == loaded
     path.write_text("[maps.yard]\nvoxel_size = -1.0\n")
     with pytest.raises(tsfusion.InvalidConfig, match=r"\[maps\.yard\]: voxel_size must be > 0, got -1\.0"):
@@ -238,7 +220,7 @@ def test_a_full_disk_with_room_again(small_disk: Callable[[int], Path]) -> None:
         filler.unlink()
         client.wait_fused(timeout=DEADLINE)
         assert fetch_health(server.address).ready
-        assert fetch_status(server.address).map_hash == fused_hash(range(sent))
+        assert fetch_status(server.address).map_hash == map_hash(map(wall, range(sent)))
         assert server.terminate() == 0
 
 
@@ -254,7 +236,7 @@ def test_a_journal_keeps_to_its_limit(tmp_path: Path) -> None:
     with serving(tmp_path, **settings) as server:
         until(lambda: fetch_health(server.address).maps["default"].keyframes_fused == 800)
         scan(server.address, "default", range(800, 810))
-        assert fetch_status(server.address).map_hash == fused_hash(range(810))
+        assert fetch_status(server.address).map_hash == map_hash(map(wall, range(810)))
         assert server.terminate() == 0
 
 

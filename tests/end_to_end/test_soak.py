@@ -7,7 +7,7 @@ import pytest
 from soak_run import run
 
 
-@pytest.mark.parametrize("keyframes", [400, pytest.param(3000, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("keyframes", [800, pytest.param(3000, marks=pytest.mark.nightly)])
 def test_files_and_threads_stay_and_memory_is_flat(tmp_path: Path, keyframes: int) -> None:
     outcome = run(tmp_path, keyframes=keyframes)
     assert not outcome.problems, outcome

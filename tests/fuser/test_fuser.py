@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""What the fuser does with each message, in this process; its link is a list."""
+"""What the fuser does with each message, in this process with a list for a link; log lines of its own."""
 
 import errno
+import json
 import os
 import signal
 import subprocess
@@ -12,21 +13,14 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from command_processes import alive
-from keyframes_and_servers import pose, serving, until, wall
+from command_processes import alive, python
+from failures import raising, refuse
+from keyframes_and_servers import VOLUME, pose, serving, until, wall
 
 import tsfusion
 from tsfusion import VolumeConfig
-from tsfusion.core.errors import (
-    CheckpointError,
-    DamagedCheckpoint,
-    InvalidConfig,
-    JournalError,
-    MapError,
-    MapFull,
-    TsfusionError,
-)
-from tsfusion.fuser import messages as fuser_messages
+from tsfusion.core import errors
+from tsfusion.fuser import messages
 from tsfusion.fuser.fuser import Fuser
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.journal import Journal, Position
@@ -35,39 +29,36 @@ from tsfusion.wire import codec, corrections
 from tsfusion.wire.messages import Command
 from tsfusion.wire.queries import fetch_health
 
-VOLUME = VolumeConfig(voxel_size=0.04, threads=1)
-
 
 class Link:
     """Takes what the fuser sends."""
 
     def __init__(self) -> None:
-        self.sent: list[tuple[fuser_messages.ToGateway, list[Any]]] = []
+        self.sent: list[tuple[messages.ToGateway, list[Any]]] = []
 
     def send_multipart(self, frames: list[Any], copy: bool) -> None:
         assert not copy
-        self.sent.append((fuser_messages.to_gateway.decode(frames[0]), frames[1:]))
+        self.sent.append((messages.to_gateway.decode(frames[0]), frames[1:]))
 
     def last(self) -> Any:
         return self.sent[-1][0]
 
-    def done(self) -> fuser_messages.Done:
-        return [message for message, _ in self.sent if isinstance(message, fuser_messages.Done)][-1]
+    def done(self) -> messages.Done:
+        return [message for message, _ in self.sent if isinstance(message, messages.Done)][-1]
 
 
 SESSION = bytes(16)
 
 
-def order(index: int, position: Position, skip: str | None = None) -> fuser_messages.Fuse:
-    return fuser_messages.Fuse(index, position, SESSION, index + 1, "robot", skip)
+def order(index: int, position: Position, skip: str | None = None) -> messages.Fuse:
+    return messages.Fuse(index, position, SESSION, index + 1, "robot", skip)
 
 
 def fill(state: Path, count: int) -> list[Position]:
     journal = Journal(state / "journal", 1 << 20)
-    session = SESSION
     positions = [
         journal.append(
-            codec.encode(wall(i), session=session, seq=i + 1, jpeg_quality=90), session=session, seq=i + 1
+            codec.encode(wall(i), session=SESSION, seq=i + 1, jpeg_quality=90), session=SESSION, seq=i + 1
         )
         for i in range(count)
     ]
@@ -80,12 +71,18 @@ def opened(state: Path, volume: VolumeConfig = VOLUME, **settings: Any) -> tuple
     working = state / "working"
     working.write_bytes(bytes(8))
     usual = {"mesh_interval": 0.0, "checkpoint_every": 0, "keep_previous": False, "memory_bytes": 1 << 40}
-    begin = fuser_messages.Begin(str(state), volume, working=str(working), **{**usual, **settings})
+    begin = messages.Begin(str(state), volume, working=str(working), **{**usual, **settings})
     return Fuser(link, begin), link  # type: ignore[arg-type]
 
 
-def status(fuser: Fuser, link: Link) -> fuser_messages.FuserStatus:
-    fuser.handle(fuser_messages.FuserQuery(1, Command(name="status")))
+def opened_with_one(state: Path) -> tuple[Position, Fuser, Link]:
+    """A fuser with one journaled keyframe to fuse."""
+    (position,) = fill(state, 1)
+    return position, *opened(state)
+
+
+def status(fuser: Fuser, link: Link) -> messages.FuserStatus:
+    fuser.handle(messages.FuserQuery(1, Command(name="status")))
     answer = link.last()
     assert answer.status is not None
     return msgspec.structs.replace(answer.status, peak_rss_bytes=0)  # of this whole process
@@ -103,21 +100,20 @@ def test_keyframes_are_fused_meshed_and_checkpointed(tmp_path: Path) -> None:
     assert fuser.mesh_due(idle=True)
     fuser.mesh()
     assert (link.last().count, link.sent[-1][1]) == (3, [])
-    fuser.handle(fuser_messages.Finish())
+    fuser.handle(messages.Finish())
     assert fuser.exit_status == 0
     again, link_again = opened(tmp_path)
-    assert again.ready().done == {SESSION: fuser_messages.SessionProgress(3, "robot")}
+    assert again.ready().done == {SESSION: messages.SessionProgress(3, "robot")}
     assert status(again, link_again) == status(fuser, link)
 
 
 def test_watchers_get_the_triangles(tmp_path: Path) -> None:
-    (position,) = fill(tmp_path, 1)
-    fuser, link = opened(tmp_path)
-    fuser.handle(fuser_messages.Publish(True))
+    position, fuser, link = opened_with_one(tmp_path)
+    fuser.handle(messages.Publish(True))
     fuser.handle(order(0, position))
     fuser.mesh()
     meshed, frames = link.sent[-1]
-    assert isinstance(meshed, fuser_messages.Meshed)
+    assert isinstance(meshed, messages.Meshed)
     assert meshed.layout is not None
     assert [memoryview(frame).nbytes % 3 for frame in frames] == [0] * 5
 
@@ -126,9 +122,8 @@ def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tsfusion.fuser.fuser._REFINED_AT_ONCE", 10)
-    (position,) = fill(tmp_path, 1)
-    fuser, link = opened(tmp_path)
-    fuser.handle(fuser_messages.Publish(True))
+    position, fuser, link = opened_with_one(tmp_path)
+    fuser.handle(messages.Publish(True))
     fuser.handle(order(0, position))
     fuser.mesh()
     before = len(link.sent)
@@ -141,7 +136,7 @@ def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
     cells = np.concatenate([np.frombuffer(frames[0], np.int32).reshape(-1, 3) for _, frames in refined])
     assert len(np.unique(cells, axis=0)) == len(cells)
     fuser.mesh()
-    fuser.handle(fuser_messages.Publish(False))
+    fuser.handle(messages.Publish(False))
     assert not fuser.refine_due
 
 
@@ -187,7 +182,7 @@ def saved(state: Path) -> Path:
 def test_a_map_of_other_settings_is_one_clear_error(tmp_path: Path) -> None:
     saved(tmp_path)
     with pytest.raises(
-        InvalidConfig, match=r"was made with voxel_size = 0\.04, got 0\.05: use another"
+        errors.InvalidConfig, match=r"was made with voxel_size = 0\.04, got 0\.05: use another"
     ) as raised:
         opened(tmp_path, VolumeConfig(voxel_size=0.05))
     assert "remove" not in str(raised.value)  # the journal may not go back to the start
@@ -223,19 +218,16 @@ def test_a_checkpoint_that_cannot_be_read_now_stays(
 
     with monkeypatch.context() as patched:
         patched.setattr(Path, "open", refused)
-        with pytest.raises(CheckpointError, match=os.strerror(code)):
+        with pytest.raises(errors.CheckpointError, match=os.strerror(code)):
             opened(tmp_path)
-    assert opened(tmp_path)[0].ready().done == {SESSION: fuser_messages.SessionProgress(1, "")}
+    assert opened(tmp_path)[0].ready().done == {SESSION: messages.SessionProgress(1, "")}
 
 
 def test_a_checkpoint_without_memory_for_it_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = saved(tmp_path)
 
-    def none_left(*_: object, **__: object) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr("tsfusion.tsdf.volume.Volume.load", none_left)
-    with pytest.raises(CheckpointError, match="does not fit"):
+    monkeypatch.setattr("tsfusion.tsdf.volume.Volume.load", raising(MemoryError()))
+    with pytest.raises(errors.CheckpointError, match="does not fit"):
         opened(tmp_path)
     assert path.exists()
 
@@ -253,16 +245,16 @@ def test_a_checkpoint_on_request_keeps_the_one_before(tmp_path: Path) -> None:
     """The journal forgets what both hold, so a damaged one is made good by the other."""
     positions = fill(tmp_path, 3)
     fuser, link = opened(tmp_path, keep_previous=True)
-    fuser.handle(fuser_messages.Save())
-    assert link.last() == fuser_messages.Saved(written=False)
+    fuser.handle(messages.Save())
+    assert link.last() == messages.Saved(written=False)
     for index in (0, 1):
         fuser.handle(order(index, positions[index]))
-        fuser.handle(fuser_messages.Save())
-        assert link.last() == fuser_messages.Saved(written=True)
+        fuser.handle(messages.Save())
+        assert link.last() == messages.Saved(written=True)
     assert (tmp_path / PREVIOUS_FILE).exists()
     (tmp_path / MAP_FILE).write_bytes(b"")
     again, _ = opened(tmp_path, keep_previous=True)
-    assert again.ready().done == {SESSION: fuser_messages.SessionProgress(1, "robot")}
+    assert again.ready().done == {SESSION: messages.SessionProgress(1, "robot")}
 
 
 @pytest.mark.parametrize("keep_previous", [False, True])
@@ -274,16 +266,13 @@ def test_a_checkpoint_that_fails_leaves_the_old_ones(
     folder.mkdir()
     written = MapCheckpoints(folder, VOLUME, keep_previous=keep_previous)
     for seq in (1, 2):
-        written.done = {SESSION: fuser_messages.SessionProgress(seq, "robot")}
+        written.done = {SESSION: messages.SessionProgress(seq, "robot")}
         assert written.save()
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert sorted(before) == ([PREVIOUS_FILE] if keep_previous else []) + [MAP_FILE]
 
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
     with monkeypatch.context() as patched:
-        patched.setattr(os, call, full)
+        patched.setattr(os, call, refuse(errno.ENOSPC))
         assert not written.save()
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     (folder / "map.new.tsf").write_bytes(b"by one that was killed")
@@ -294,20 +283,16 @@ def test_a_checkpoint_that_fails_leaves_the_old_ones(
 def test_a_map_of_many_sessions_comes_back(tmp_path: Path) -> None:
     written = MapCheckpoints(tmp_path, VOLUME, keep_previous=False)
     written.done = {
-        number.to_bytes(16): fuser_messages.SessionProgress(number, "robot") for number in range(1, 40_001)
+        number.to_bytes(16): messages.SessionProgress(number, "robot") for number in range(1, 40_001)
     }
     assert written.save()
     assert opened(tmp_path)[0].ready().done == written.done
 
 
 def test_what_it_works_at_shows_from_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (position,) = fill(tmp_path, 1)
-    fuser, link = opened(tmp_path)
+    position, fuser, link = opened_with_one(tmp_path)
 
-    def decoder_bug(_: object) -> None:
-        raise RuntimeError("a bug")
-
-    monkeypatch.setattr(codec, "decode", decoder_bug)
+    monkeypatch.setattr(codec, "decode", raising(RuntimeError("a bug")))
     with pytest.raises(RuntimeError):
         fuser.handle(order(0, position))
     assert (tmp_path / "working").read_bytes() == bytes(8)
@@ -321,13 +306,9 @@ def test_what_it_works_at_shows_from_outside(tmp_path: Path, monkeypatch: pytest
 def test_a_record_that_cannot_be_read_now_is_left_to_another_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
 ) -> None:
-    (position,) = fill(tmp_path, 1)
-    fuser, link = opened(tmp_path)
+    position, fuser, link = opened_with_one(tmp_path)
 
-    def refused(*_: object) -> bytes:
-        raise OSError(code, os.strerror(code))
-
-    monkeypatch.setattr(os, "pread", refused)
+    monkeypatch.setattr(os, "pread", refuse(code))
     fuser.handle(order(0, position))
     assert (fuser.exit_status, link.sent, fuser.ready().done) == (1, [], {})
     assert (tmp_path / "working").read_bytes() == bytes(8)  # it was at this one
@@ -338,23 +319,18 @@ def test_a_record_that_cannot_be_read_now_is_left_to_another_process(
 
 
 def test_no_memory_for_a_keyframe_is_no_crash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (position,) = fill(tmp_path, 1)
-    fuser, link = opened(tmp_path)
+    position, fuser, link = opened_with_one(tmp_path)
 
-    def too_large(_: object) -> None:
-        raise MemoryError("no room for 9 GB")
-
-    monkeypatch.setattr(codec, "decode", too_large)
+    monkeypatch.setattr(codec, "decode", raising(MemoryError("no room for 9 GB")))
     fuser.handle(order(0, position))
     assert (link.last().reason, link.last().message) == ("memory", "no memory to fuse it: no room for 9 GB")
 
 
 @pytest.mark.parametrize("min_weight", [float("nan"), float("inf"), 1e308, 1e20, -1.0])
 def test_no_question_ends_the_fuser(tmp_path: Path, min_weight: float) -> None:
-    (position,) = fill(tmp_path, 1)
-    fuser, link = opened(tmp_path)
+    position, fuser, link = opened_with_one(tmp_path)
     fuser.handle(order(0, position))
-    fuser.handle(fuser_messages.FuserQuery(1, Command(name="mesh", min_weight=min_weight)))
+    fuser.handle(messages.FuserQuery(1, Command(name="mesh", min_weight=min_weight)))
     assert "min_weight must be" in link.last().error
 
 
@@ -392,16 +368,46 @@ def test_a_process_at_work_ends_with_the_one_that_started_it() -> None:
 @pytest.mark.parametrize(
     ("error", "kind", "raised"),
     [
-        (InvalidConfig("of other settings"), "config", InvalidConfig),
-        (DamagedCheckpoint("cut short"), "checkpoint", CheckpointError),
-        (MapFull("too many blocks"), "map", MapError),
-        (JournalError("cannot read"), "other", TsfusionError),
+        (errors.InvalidConfig("of other settings"), "config", errors.InvalidConfig),
+        (errors.DamagedCheckpoint("cut short"), "checkpoint", errors.CheckpointError),
+        (errors.MapFull("too many blocks"), "map", errors.MapError),
+        (errors.JournalError("cannot read"), "other", errors.TsfusionError),
     ],
 )
 def test_the_kind_of_a_failure_reaches_the_gateway(
-    error: TsfusionError, kind: str, raised: type[TsfusionError]
+    error: errors.TsfusionError, kind: str, raised: type[errors.TsfusionError]
 ) -> None:
-    sent = fuser_messages.to_gateway.decode(fuser_messages.encode(fuser_messages.Failed.of(error)))
-    assert isinstance(sent, fuser_messages.Failed)
+    sent = messages.to_gateway.decode(messages.encode(messages.Failed.of(error)))
+    assert isinstance(sent, messages.Failed)
     again = sent.error()
     assert (sent.kind, type(again), str(again)) == (kind, raised, str(error))
+
+
+# --- log lines of the process ---
+
+_CODE = """
+import logging, sys
+from tsfusion.fuser import __main__ as process, fuser, map_checkpoints
+
+def run(endpoint):
+    for module in (fuser, map_checkpoints):
+        module.log.info("a line")
+        module.log.error("an error")
+    assert not hasattr(process, "log")  # it would be called __main__, outside tsfusion's own loggers
+    return 0
+
+process.run = run
+sys.argv = ["", "ipc://nowhere", "json", sys.argv[1], "yard"]
+sys.exit(process.main())
+"""
+
+
+@pytest.mark.parametrize(("level", "shown"), [("info", ["a line", "an error"]), ("error", ["an error"])])
+def test_a_fusers_own_lines_obey_log_level(level: str, shown: list[str]) -> None:
+    done = python(_CODE, level)
+    assert done.returncode == 0, done.stderr
+    lines = [json.loads(line) for line in done.stderr.splitlines()]
+    for name in ("tsfusion.fuser.fuser", "tsfusion.fuser.map_checkpoints"):
+        assert [line["message"] for line in lines if line["logger"] == name] == shown
+    assert {(line["process"], line["map"]) for line in lines} == {("fuser", "yard")}
+    assert len(lines) == 2 * len(shown)

@@ -1,26 +1,36 @@
 # SPDX-License-Identifier: MIT
-"""Routes to the clients that are connected: bounded, and shared fairly."""
+"""Routes to the clients that are connected, and topics of viewers: bounded, and shared fairly."""
 
 from typing import cast
 
 import pytest
 
 from tsfusion.gateway.client_routes import ClientRoutes
-from tsfusion.gateway.ports import Ports
+from tsfusion.gateway.ports import Ports, Subscriptions
 from tsfusion.gateway.sessions import Sessions
 from tsfusion.wire.messages import Ping
 
 SESSION = bytes(range(16))
 
 
+def key_of(number: int) -> bytes:
+    return number.to_bytes(16, "big")
+
+
+def flood(routes: ClientRoutes, count: int, client: str = "", **more: bool) -> None:
+    """Greetings of so many sessions; `{}` in the client's name stands for one of forty."""
+    for number in range(count):
+        routes.connect(key_of(number), "default", b"2", client.format(number % 40), **more)
+
+
 def test_strangers_do_not_grow_the_sessions() -> None:
     sessions, routes = Sessions(), ClientRoutes(cast(Ports, None))
     for i in range(3000):
-        routes.connect(i.to_bytes(16, "big"), "default", b"id")
-        assert sessions.admit(i.to_bytes(16, "big"), 1, 0) == "next"
+        routes.connect(key_of(i), "default", b"id")
+        assert sessions.admit(key_of(i), 1, 0) == "next"
     assert len(sessions) == 0
-    assert routes.get((0).to_bytes(16, "big")) is None
-    assert routes.get((2999).to_bytes(16, "big")) is not None
+    assert routes.get(key_of(0)) is None
+    assert routes.get(key_of(2999)) is not None
 
 
 def test_a_live_session_is_not_taken_over() -> None:
@@ -35,15 +45,10 @@ def test_a_live_session_is_not_taken_over() -> None:
     assert len(list(routes)) == 1
 
 
-def key_of(number: int) -> bytes:
-    return number.to_bytes(16, "big")
-
-
 def test_a_flood_of_greetings_pushes_out_those_of_its_own_name_only() -> None:
     routes = ClientRoutes(cast(Ports, None))
     routes.connect(SESSION, "default", b"1", "cart")
-    for number in range(3000):
-        routes.connect(key_of(number), "default", b"2", "robot")
+    flood(routes, 3000, "robot")
     assert routes.get(SESSION) is not None
     assert sum(route.client == "robot" for route in routes) == 64
 
@@ -51,8 +56,7 @@ def test_a_flood_of_greetings_pushes_out_those_of_its_own_name_only() -> None:
 def test_many_names_share_the_routes_fairly() -> None:
     routes = ClientRoutes(cast(Ports, None))
     routes.connect(SESSION, "default", b"1", "cart")
-    for number in range(6000):
-        routes.connect(key_of(number), "default", b"2", f"robot{number % 40}")
+    flood(routes, 6000, "robot{}")
     assert routes.get(SESSION) is not None
     assert len(list(routes)) == 1024
 
@@ -62,16 +66,24 @@ def test_who_scans_is_not_pushed_out_by_who_only_greets() -> None:
     routes.connect(SESSION, "default", b"1")
     routes.mark_alive(SESSION, "", scans=True)
     routes.connect(b"known".ljust(16), "default", b"1", scans=True)
-    for number in range(3000):
-        routes.connect(key_of(number), "default", b"2")
+    flood(routes, 3000)
     assert routes.get(SESSION) is not None
     assert routes.get(b"known".ljust(16)) is not None
 
 
+def test_strangers_do_not_push_out_a_client_that_is_heard() -> None:
+    routes = ClientRoutes(cast(Ports, None))
+    client = routes.connect(b"client", "default", b"1")
+    for number in range(3000):
+        routes.connect(key_of(number), "default", b"2")
+        if number % 500 == 0:
+            routes.mark_alive(b"client", "")
+    assert routes.get(b"client") is client
+
+
 def test_who_scanned_once_shuts_nobody_out() -> None:
     routes = ClientRoutes(cast(Ports, None))
-    for number in range(2000):
-        routes.connect(key_of(number), "default", b"2", scans=True)
+    flood(routes, 2000, scans=True)
     route = routes.connect(SESSION, "default", b"1")
     assert routes.get(SESSION) is route
     assert len(list(routes)) == 1024
@@ -84,3 +96,24 @@ def test_a_clock_that_cannot_be_is_not_believed(clock: tuple[int, int]) -> None:
     assert (route.offset_ns, route.bound_ns, route.waiting) == (7, 3, 2)
     route.update(Ping(SESSION, 1, *clock, waiting=4))
     assert (route.offset_ns, route.bound_ns, route.waiting) == (None, 0, 4)
+
+
+def test_only_what_can_be_a_maps_topic_is_remembered() -> None:
+    topics = Subscriptions()
+    for good in (b"", b"me", b"mesh/", b"mesh/y", b"mesh/yard", b"mesh/yard/", b"mesh/attic/"):
+        assert topics.add(good, ["yard"])
+    for bad in (b"x", b"mesh/Yard", b"mesh/yard/x", b"mesh//", b"mesh/" + b"a" * 33, b"mesh/\n", b"mesh/a\n"):
+        assert not topics.add(bad, ["yard"])
+    assert len(topics) == 7
+
+
+def test_topics_are_few_and_those_of_open_maps_have_room() -> None:
+    topics = Subscriptions()
+    taken = [topics.add(f"mesh/map{i}/".encode(), ["yard"]) for i in range(1000)]
+    assert taken.count(True) == len(topics) == 256
+    assert not topics.watched("yard")
+    assert topics.add(b"mesh/yard/", ["yard"])
+    assert topics.watched("yard")
+    topics.discard(b"mesh/yard/")
+    assert not topics.watched("yard")
+    assert topics.watched("map1")

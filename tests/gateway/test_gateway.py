@@ -14,10 +14,11 @@ from typing import Any
 
 import pytest
 import zmq
-from keyframes_and_servers import DEADLINE, Server, serving, until
+from clients_and_spools import deliver
+from failures import refuse
+from keyframes_and_servers import map_hash, serving, until
 
-import tsfusion
-from tsfusion import Client, Keyframe, VolumeConfig, journal
+from tsfusion import Client, VolumeConfig, journal
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.datasets import open_dataset
@@ -27,7 +28,7 @@ from tsfusion.gateway.access_control import AccessControl
 from tsfusion.gateway.gateway import Gateway
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Ports
-from tsfusion.journal import Journal, state_folder
+from tsfusion.journal import Journal, Position, state_folder
 from tsfusion.wire.health import MapHealth
 from tsfusion.wire.queries import fetch_status
 
@@ -72,8 +73,6 @@ def fusing(line: str) -> str:
 
 
 _CRASHES_ON_2 = fusing("if message.index == 2: sys.exit(7)")
-_DIES = "sys.exit(9)"
-_FAILS = "say(fuser_messages.Failed('config', 'no such setting')); link.recv()"
 _CANNOT_COME_BACK = """
     import pathlib
     mark = pathlib.Path(begin.folder) / "once"
@@ -84,8 +83,24 @@ _CANNOT_COME_BACK = """
     link.recv()
     sys.exit(7)
 """
+_SLOW = """
+    if isinstance(message, fuser_messages.Begin):
+        say(fuser_messages.Ready({}))
+        time.sleep(1)
+    if isinstance(message, fuser_messages.Fuse):
+        say(fuser_messages.Done(message.index, 1, 2))
+    if isinstance(message, fuser_messages.Publish):
+        time.sleep(0.0001)
+    if isinstance(message, fuser_messages.Finish):
+        sys.exit(0)
+"""
 
 Start = Callable[..., Gateway]
+
+
+def fuser_running(body: str) -> tuple[str, ...]:
+    """The command of a fuser that runs these lines on each message."""
+    return sys.executable, "-c", _FAKE.replace("{body}", body)
 
 
 @pytest.fixture
@@ -94,8 +109,7 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
     with ExitStack() as stack:
 
         def begin(body: str, **settings: Any) -> Gateway:
-            command = (sys.executable, "-c", _FAKE.replace("{body}", body))
-            monkeypatch.setattr(fuser_process, "COMMAND", command)
+            monkeypatch.setattr(fuser_process, "COMMAND", fuser_running(body))
             monkeypatch.setattr(fuser_supervisor, "_END_DEADLINE", 0.1)
             writer = Journal(state_folder.map_folder(tmp_path, "default") / "journal", 1 << 20)
             for i in range(5):
@@ -123,6 +137,11 @@ def stepped(gateway: Gateway, reached: Callable[[], bool]) -> None:
     until(step)
 
 
+def drained(gateway: Gateway) -> Gateway:
+    stepped(gateway, lambda: gateway.maps.drained)
+    return gateway
+
+
 def default(gateway: Gateway) -> MapHealth:
     return gateway.health().maps["default"]
 
@@ -130,9 +149,7 @@ def default(gateway: Gateway) -> MapHealth:
 def test_a_keyframe_that_kills_the_fuser_twice_is_quarantined(
     start: Start, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    gateway = start(_CRASHES_ON_2)
-    stepped(gateway, lambda: gateway.maps.drained)
-    health = default(gateway)
+    health = default(drained(start(_CRASHES_ON_2)))
     assert (health.fuser_restarts, health.rejected, health.quarantined) == (2, {"crash": 1}, 1)
     assert (health.keyframes_fused, health.keyframes_durable) == (4, 5)
     said = caplog.records[-1]
@@ -156,9 +173,7 @@ def test_a_fuser_that_is_killed_is_not_the_keyframes_fault(start: Start, tmp_pat
                     os.kill(os.getpid(), 9)
         """.strip()
     )
-    gateway = start(body)
-    stepped(gateway, lambda: gateway.maps.drained)
-    health = default(gateway)
+    health = default(drained(start(body)))
     assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (3, {}, 5)
 
 
@@ -169,27 +184,31 @@ def test_a_death_between_keyframes_is_nobodys_fault(start: Start, tmp_path: Path
             open({str(died)!r}, "w").close()
             sys.exit(3)
 """
-    gateway = start(body)
-    stepped(gateway, lambda: gateway.maps.drained)
+    gateway = drained(start(body))
     assert default(gateway).rejected == {}
 
 
 def test_a_fuser_that_hangs_at_a_keyframe_is_replaced(start: Start) -> None:
-    gateway = start(fusing("if message.index == 1: time.sleep(3600)"), fuser_timeout=0.3)
-    stepped(gateway, lambda: gateway.maps.drained)
-    health = default(gateway)
+    health = default(drained(start(fusing("if message.index == 1: time.sleep(3600)"), fuser_timeout=0.3)))
     assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (2, {"crash": 1}, 4)
 
 
-def test_a_fuser_that_cannot_start_is_one_clear_error(start: Start) -> None:
-    gateway = start(_DIES)
-    with pytest.raises(MapError, match="ended with status 9 before it was ready"):
-        stepped(gateway, lambda: gateway.maps.warm)
-
-
-def test_why_the_map_cannot_be_opened_is_passed_on(start: Start) -> None:
-    gateway = start(_FAILS)
-    with pytest.raises(InvalidConfig, match="no such setting"):
+@pytest.mark.parametrize(
+    ("body", "error", "message"),
+    [
+        ("sys.exit(9)", MapError, "ended with status 9 before it was ready"),
+        (
+            "say(fuser_messages.Failed('config', 'no such setting')); link.recv()",
+            InvalidConfig,
+            "no such setting",
+        ),
+    ],
+)
+def test_why_a_fuser_cannot_start_is_one_clear_error(
+    start: Start, body: str, error: type[Exception], message: str
+) -> None:
+    gateway = start(body)
+    with pytest.raises(error, match=message):
         stepped(gateway, lambda: gateway.maps.warm)
 
 
@@ -203,17 +222,13 @@ def test_a_fuser_that_does_not_come_back_is_tried_ever_more_rarely(
     assert default(gateway).fuser_restarts >= 2
     assert "its fuser process ended" in default(gateway).problem
     assert not gateway.health().ready
-    monkeypatch.setattr(
-        fuser_process, "COMMAND", (sys.executable, "-c", _FAKE.replace("{body}", fusing("pass")))
-    )
-    stepped(gateway, lambda: gateway.maps.drained)
+    monkeypatch.setattr(fuser_process, "COMMAND", fuser_running(fusing("pass")))
+    drained(gateway)
     assert default(gateway).problem == ""
 
 
 def test_poison_costs_two_deaths_each(start: Start) -> None:
-    gateway = start(fusing("if message.index in (1, 2, 3): sys.exit(7)"))
-    stepped(gateway, lambda: gateway.maps.drained)
-    health = default(gateway)
+    health = default(drained(start(fusing("if message.index in (1, 2, 3): sys.exit(7)"))))
     assert (health.fuser_restarts, health.rejected, health.quarantined) == (6, {"crash": 3}, 3)
 
 
@@ -221,14 +236,11 @@ def test_no_room_for_a_new_fuser_is_waited_out(start: Start, monkeypatch: pytest
     gateway = start(_CRASHES_ON_2)
     real = subprocess.Popen
 
-    def refused(*_: object, **__: object) -> None:
-        raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
-
-    monkeypatch.setattr(subprocess, "Popen", refused)
+    monkeypatch.setattr(subprocess, "Popen", refuse(errno.EAGAIN))
     stepped(gateway, lambda: "cannot be started" in default(gateway).problem)
     gateway.step()
     monkeypatch.setattr(subprocess, "Popen", real)
-    stepped(gateway, lambda: gateway.maps.drained)
+    drained(gateway)
     assert default(gateway).problem == ""
 
 
@@ -240,7 +252,7 @@ def test_a_vanished_scratch_folder_is_made_anew(
     gateway = start(_CRASHES_ON_2)
     stepped(gateway, lambda: gateway.maps.warm)
     shutil.rmtree(next((tmp_path / "scratch").iterdir()))
-    stepped(gateway, lambda: gateway.maps.drained)
+    drained(gateway)
 
 
 def test_the_last_words_of_a_dead_fuser_are_not_heard(start: Start) -> None:
@@ -260,23 +272,37 @@ def test_the_last_words_of_a_dead_fuser_are_not_heard(start: Start) -> None:
         late.close(linger=0)
 
 
+def test_orders_that_find_no_room_are_given_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fuser_process, "COMMAND", fuser_running(_SLOW))
+    context: zmq.Context[Any] = zmq.Context()
+    server = ServerConfig(state=str(tmp_path))
+    link = fuser_supervisor.FuserSupervisor(context, tmp_path, server, VolumeConfig())
+    try:
+
+        def heard() -> bool:
+            link.receive()
+            return link.ready
+
+        until(heard)
+        while link.send(fuser_messages.Publish(True)):
+            pass
+        order = fuser_messages.Fuse(0, Position(1, 8), bytes(16), 1)
+        assert not link.fuse(order)
+        assert list(link.in_flight) == []
+        until(lambda: link.fuse(order))
+        assert list(link.in_flight) == [0]
+        link.finish()
+        while link.send(fuser_messages.Publish(True)):
+            pass
+        until(lambda: link.receive() is not None)
+        until(lambda: link.ended() or link.finish() is not None)
+        assert link.finished_well
+    finally:
+        link.close()
+        context.term()
+
+
 # --- real scans ---
-
-
-def by_file(volume: VolumeConfig, keyframes: list[Keyframe]) -> str:
-    fused = tsfusion.Volume(volume)
-    for keyframe in keyframes:
-        fused.integrate(keyframe)
-    return fused.map_hash()
-
-
-def by_socket(server: Server, keyframes: list[Keyframe]) -> str:
-    with Client(server.address) as client:
-        for keyframe in keyframes:
-            client.send(keyframe)
-        client.flush(timeout=DEADLINE)
-        client.wait_fused(timeout=DEADLINE)
-    return fetch_status(server.address).map_hash
 
 
 @pytest.mark.parametrize(
@@ -296,6 +322,7 @@ def test_a_real_scan_makes_the_same_map_by_file_and_by_socket(
 ) -> None:
     dataset = open_dataset(data(name), **options)
     keyframes = [dataset[i] for i in range(0, min(len(dataset), 40), 8)]
-    with serving(tmp_path, volume) as server:
-        assert by_socket(server, keyframes) == by_file(volume, keyframes)
+    with serving(tmp_path, volume) as server, Client(server.address) as client:
+        deliver(client, keyframes)
+        assert fetch_status(server.address).map_hash == map_hash(keyframes, volume)
         assert server.terminate() == 0

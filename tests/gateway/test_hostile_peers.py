@@ -2,43 +2,28 @@
 """What goes wrong around a server: strangers, full disks, missing files. Its other clients do not notice."""
 
 import os
-import sys
-import threading
 import time
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
+import fake_server
 import msgspec
 import pytest
 import zmq
-from keyframes_and_servers import DEADLINE, Server, connected, serving, until, wall
+from clients_and_spools import NOBODY
+from keyframes_and_servers import DEADLINE, Server, connected, until, wall
 
-from tsfusion import Client, VolumeConfig
+from tsfusion import Client
 from tsfusion.core import config
-from tsfusion.core.config import ServerConfig
-from tsfusion.core.errors import InvalidConfig, JournalError, ServerUnreachable, TransportError
-from tsfusion.delivery.spool import Spool
+from tsfusion.core.errors import InvalidConfig, ServerUnreachable, TransportError
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.gateway import fuser_process
-from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.fuser_queries import FuserQueries
-from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.ports import Ports
-from tsfusion.journal import Position
 from tsfusion.wire import codec, health, messages, queries, sockets
 from tsfusion.wire.messages import Command
 from tsfusion.wire.queries import fetch_mesh, fetch_status, request
 from tsfusion.wire.record_header import Refused, pack, unpack
-
-
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    with serving(tmp_path_factory.mktemp("shared")) as server:
-        yield server
-
 
 # --- strangers ---
 
@@ -62,16 +47,6 @@ def test_a_stranger_cannot_unsubscribe_a_viewer(shared: Server) -> None:
             viewer.recv_multipart()
         client.send(wall(2))
         assert viewer.poll(10_000)
-
-
-def test_strangers_do_not_push_out_a_client_that_is_heard() -> None:
-    routes = ClientRoutes(cast(Ports, None))
-    client = routes.connect(b"client", "default", b"1")
-    for number in range(3000):
-        routes.connect(number.to_bytes(16, "big"), "default", b"2")
-        if number % 500 == 0:
-            routes.mark_alive(b"client", "")
-    assert routes.get(b"client") is client
 
 
 def test_a_client_goes_on_after_a_flood_of_greetings(shared: Server) -> None:
@@ -224,59 +199,6 @@ def test_meshes_that_nobody_reads_are_few() -> None:
     assert not asking.ask(b"6")
 
 
-# --- orders to a fuser that has no room for them ---
-
-_SLOW = """
-import sys, time, zmq
-from tsfusion.fuser import messages as fuser_messages
-from tsfusion.wire import sockets
-
-link = sockets.pair(zmq.Context())
-link.connect(sys.argv[1])
-link.send(fuser_messages.encode(fuser_messages.Started()))
-while True:
-    message = fuser_messages.to_fuser.decode(link.recv())
-    if isinstance(message, fuser_messages.Begin):
-        link.send(fuser_messages.encode(fuser_messages.Ready({})))
-        time.sleep(1)
-    if isinstance(message, fuser_messages.Fuse):
-        link.send(fuser_messages.encode(fuser_messages.Done(message.index, 1, 2)))
-    if isinstance(message, fuser_messages.Publish):
-        time.sleep(0.0001)
-    if isinstance(message, fuser_messages.Finish):
-        sys.exit(0)
-"""
-
-
-def test_orders_that_find_no_room_are_given_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fuser_process, "COMMAND", (sys.executable, "-c", _SLOW))
-    context: zmq.Context[Any] = zmq.Context()
-    link = FuserSupervisor(context, tmp_path, ServerConfig(state=str(tmp_path)), VolumeConfig())
-    try:
-
-        def heard() -> bool:
-            link.receive()
-            return link.ready
-
-        until(heard)
-        while link.send(fuser_messages.Publish(True)):
-            pass
-        order = fuser_messages.Fuse(0, Position(1, 8), bytes(16), 1)
-        assert not link.fuse(order)
-        assert list(link.in_flight) == []
-        until(lambda: link.fuse(order))
-        assert list(link.in_flight) == [0]
-        link.finish()
-        while link.send(fuser_messages.Publish(True)):
-            pass
-        until(lambda: link.receive() is not None)
-        until(lambda: link.ended() or link.finish() is not None)
-        assert link.finished_well
-    finally:
-        link.close()
-        context.term()
-
-
 # --- settings and addresses ---
 
 
@@ -285,14 +207,6 @@ def test_a_configuration_that_is_not_text_is_one_clear_error(tmp_path: Path) -> 
     path.write_bytes(b"\xff\xfe[[[")
     with pytest.raises(InvalidConfig, match="is not TOML: "):
         config.load(path)
-
-
-@pytest.mark.parametrize(
-    "address", ["tcp://a b:5555", "tcp://127.0.0.1:5555?x", "tcp://u@127.0.0.1:5", "tcp://\0:5"]
-)
-def test_an_address_that_is_none_is_refused(address: str) -> None:
-    with pytest.raises(InvalidConfig, match="an address looks like"):
-        sockets.parse_address(address)
 
 
 def test_the_last_port_has_no_next_one() -> None:
@@ -307,55 +221,28 @@ def test_a_patience_of_ages_is_no_error(shared: Server) -> None:
     assert reply.name == "ping"
 
 
-def test_a_state_folder_that_cannot_be_named(tmp_path: Path) -> None:
-    with pytest.raises(JournalError, match="cannot write the spool folder"):
-        Spool(f"{tmp_path}/a\0b", 1 << 20)
-
-
 def test_a_port_that_speaks_something_else(shared: Server) -> None:
     with pytest.raises(TransportError, match="no server answered"):
         request(shared.publish, Command(name="ping"), timeout=0.3)
 
 
-@contextmanager
-def answering(*answers: bytes) -> Iterator[str]:
-    """The data address of a control socket that answers one after the other so, the last for ever."""
-    left = list(answers)
-    context: zmq.Context[Any] = zmq.Context()
-    router = sockets.router(context)
-    port = router.bind_to_random_port("tcp://127.0.0.1")
-    stop = threading.Event()
-
-    def answer_all() -> None:
-        while not stop.is_set():
-            if router.poll(20):
-                router.send_multipart([router.recv_multipart()[0], left.pop(0) if len(left) > 1 else left[0]])
-
-    thread = threading.Thread(target=answer_all)
-    thread.start()
-    try:
-        yield f"tcp://127.0.0.1:{port - 1}"
-    finally:
-        stop.set()
-        thread.join()
-        router.close()
-        context.term()
-
-
 def test_who_answers_with_nonsense_is_named(caplog: pytest.LogCaptureFixture) -> None:
-    with answering(b"nonsense") as address:
+    with fake_server.serving(lambda _: b"nonsense") as (control, _):
         with pytest.raises(TransportError, match=r"what answers at tcp://.* is no tsfusion server"):
-            fetch_status(address)
-        with Client(address) as client, pytest.raises(ServerUnreachable, match="is no tsfusion server"):
+            fetch_status(NOBODY, control=control)
+        with (
+            Client(NOBODY, control=control) as client,
+            pytest.raises(ServerUnreachable, match="is no tsfusion server"),
+        ):
             client.connect(timeout=0.5)
     assert caplog.text == ""
 
 
 def test_a_mesh_is_asked_for_again_when_the_server_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(queries, "_AGAIN_INTERVAL", 0.01)
-    again = messages.encode(messages.Reply(name="mesh", error="busy", retry=True))
-    settled = messages.encode(messages.Reply(name="mesh", error="no room; do not ask again"))
-    with answering(again, again, settled) as address, pytest.raises(TransportError, match="no room"):
-        fetch_mesh(address, timeout=5.0)
-    with answering(again) as address, pytest.raises(TransportError, match="busy"):
-        fetch_mesh(address, timeout=0.3)
+    again = messages.Reply(name="mesh", error="busy", retry=True)
+    settled = messages.Reply(name="mesh", error="no room; do not ask again")
+    replies = iter([again, again, settled])
+    for answer, error, timeout in ((lambda _: next(replies), "no room", 5.0), (lambda _: again, "busy", 0.3)):
+        with fake_server.serving(answer) as (control, _), pytest.raises(TransportError, match=error):
+            fetch_mesh(NOBODY, control=control, timeout=timeout)

@@ -1,7 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""The index of journaled keyframes: filled by recovery, shortened by retention."""
+"""Journaled keyframes: admitted to their sessions, indexed, handed to the fuser in turn, and their delays."""
 
+from typing import cast
+
+import pytest
+
+from tsfusion.fuser.messages import Fuse
+from tsfusion.gateway.fuser_backlog import FuserBacklog
+from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.keyframe_index import KeyframeIndex
+from tsfusion.gateway.keyframe_outcomes import DelayStatistics
 from tsfusion.gateway.sessions import Sessions
 from tsfusion.journal import Position, RecordEntry
 from tsfusion.wire.keyframe_times import Stamps
@@ -59,3 +67,79 @@ def test_the_index_keeps_stamps() -> None:
     index.set_fused(0, 8, 9)
     assert index[0].stamps == Stamps(1, 6, 7, 8, 9, 0)
     assert index[0].captured_ns == 5
+
+
+def test_each_keyframe_is_admitted_once_and_in_order() -> None:
+    sessions = Sessions()
+    assert sessions.admit(SESSION, 1, 0) == "next"
+    sessions.open(SESSION).durable = 5
+    assert [sessions.admit(SESSION, seq, seq - 1) for seq in (5, 6, 7)] == ["duplicate", "next", "gap"]
+    assert sessions.admit(SESSION, 9, 5) == sessions.admit(SESSION, 9, 0) == "next"  # 6 to 8 were dropped
+    assert sessions.admit(SESSION, 9, 6) == "gap"
+
+
+def test_sessions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tsfusion.gateway.sessions._MAX_SESSIONS", 2)
+    sessions = Sessions()
+    for key in (SESSION, bytes(16)):
+        assert sessions.room_for(key)
+        sessions.open(key)
+    assert not sessions.room_for(b"s" * 16)
+    assert sessions.room_for(SESSION)
+
+
+class Fuser:
+    """Takes a number of keyframes."""
+
+    def __init__(self, wanted: int) -> None:
+        self.wanted = wanted
+        self.orders: list[Fuse] = []
+
+    @property
+    def wants_work(self) -> bool:
+        return len(self.orders) < self.wanted
+
+    def fuse(self, order: Fuse) -> bool:
+        self.orders.append(order)
+        return True
+
+
+def handed_out(backlog: FuserBacklog, wanted: int) -> list[tuple[str, int]]:
+    fuser = Fuser(wanted)
+    backlog.hand_out(cast(FuserSupervisor, fuser))
+    return [(order.client, order.seq) for order in fuser.orders]
+
+
+def test_each_client_gets_its_turn() -> None:
+    """One that floods holds nobody up; each session keeps its order."""
+    sessions, index = Sessions(), KeyframeIndex()
+    backlog = FuserBacklog(index, sessions)
+    flood, more, small = (sessions.open(bytes([i]) * 16, client) for i, client in enumerate("aab"))
+    for seq in range(1, 7):
+        for session in (flood, more):
+            index.add(Position(1, seq), session, seq)
+            backlog.add(session)
+    for seq in (1, 2):
+        index.add(Position(2, seq), small, seq)
+        backlog.add(small)
+    assert (backlog.keyframes, backlog.corrections) == (14, 0)
+    assert handed_out(backlog, 4) == [("a", 1), ("b", 1), ("a", 1), ("b", 2)]
+    assert len(handed_out(backlog, 100)) == 10
+    assert handed_out(backlog, 100) == []
+
+
+def test_delays_are_published_with_their_bound() -> None:
+    delays = DelayStatistics()
+    assert (delays.summary().count, delays.bound_ms) == (0, 0.0)
+    for delay_ns, bound_ns in ((5_000_000, 100_000), (7_000_000, 300_000)):
+        delays.add(delay_ns, bound_ns)
+    assert (delays.summary().mean, delays.bound_ms) == (6.0, 0.3)
+
+
+def test_a_delay_that_cannot_be_does_not_count() -> None:
+    delays = DelayStatistics()
+    day = 86_400 * 10**9
+    assert [delays.add(delay, 1000) for delay in (-1000, day, -1001, day + 1, -(1 << 62))] == [
+        *(True, True, False, False, False)
+    ]
+    assert delays.summary().count == 2

@@ -4,6 +4,7 @@
 import errno
 import logging
 import os
+import shutil
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import small_disk
+from failures import raising, refuse
 
 from tsfusion import journal
 from tsfusion.core import durable_files
@@ -26,49 +27,41 @@ def fill(log: Journal, count: int, first: int = 1, size: int = 1000) -> list[Pos
     return [log.append([b"head", bytes(size)], session=SESSION, seq=first + i) for i in range(count)]
 
 
+def write(folder: Path, count: int, segment_bytes: int = BIG) -> None:
+    log = Journal(folder, segment_bytes)
+    fill(log, count)
+    log.close()
+
+
 def seqs(folder: Path) -> list[int]:
     return [found.seq for found in Journal(folder, BIG).found]
-
-
-def refuse(code: int) -> Callable[..., Any]:
-    def refused(*_arguments: object, **_more: object) -> Any:
-        raise OSError(code, os.strerror(code))
-
-    return refused
 
 
 # --- a full disk ---
 
 
-def test_a_disk_that_really_fills_up_loses_nothing_and_takes_more_when_there_is_room(tmp_path: Path) -> None:
-    code = """
-import sys
-from pathlib import Path
-from tsfusion.core.errors import JournalError
-from tsfusion.journal import Journal
-folder = Path(sys.argv[1]) / "journal"
-ballast = folder.parent / "ballast"
-ballast.write_bytes(bytes(400_000))
-log = Journal(folder, 200_000)
-written, refused = [], 0
-for seq in range(1, 100):
-    try:
-        log.append([b"head", bytes(30_000)], session=bytes(16), seq=seq)
-        written.append(seq)
-    except JournalError as error:
-        assert "No space left on device" in str(error), error
-        refused += 1
-        if refused == 10:
-            ballast.unlink()
-log.close()
-again = Journal(folder, 200_000)
-assert [found.seq for found in again.found] == written, (again.found, written)
-assert again.damaged == 0
-print(len(written), refused)
-"""
-    written, refused = map(int, small_disk.run(tmp_path / "disk", "1m", code).split())
-    assert refused > 10
-    assert written > 20
+def test_a_disk_that_really_fills_up_loses_nothing_and_takes_more_when_there_is_room(
+    small_disk: Callable[[int], Path],
+) -> None:
+    disk = small_disk(1)
+    ballast = disk / "ballast"
+    ballast.write_bytes(bytes(400_000))
+    log = Journal(disk / "journal", 200_000)
+    written, refused = [], []
+    for seq in range(1, 100):
+        try:
+            fill(log, 1, first=seq, size=30_000)
+            written.append(seq)
+        except JournalError as error:
+            refused.append(str(error))
+            if len(refused) == 10:
+                ballast.unlink()
+    log.close()
+    again = Journal(disk / "journal", 200_000)
+    assert ([found.seq for found in again.found], again.damaged) == (written, 0)
+    assert len(refused) > 10
+    assert all("No space left on device" in why for why in refused)
+    assert len(written) > 20
 
 
 def test_append_stops_before_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,7 +123,9 @@ def test_a_disk_that_refuses_is_an_error_and_not_the_end(
         patched.setattr(os, "fdatasync", refuse(code))
         with pytest.raises(JournalError, match=os.strerror(code)):
             fill(log, 1, first=3)
-    fill(log, 1, first=4)
+    assert seqs(tmp_path) == [1, 2]  # a later scan would take the third for the one that comes now
+    (position,) = fill(log, 1, first=4)
+    assert journal.read(tmp_path, position).seq == 4
     log.close()
     assert seqs(tmp_path) == [1, 2, 4]
 
@@ -139,11 +134,8 @@ def test_an_interrupted_append_leaves_nothing_behind(tmp_path: Path, monkeypatch
     log = Journal(tmp_path, BIG)
     fill(log, 1)
 
-    def interrupted(_: int) -> None:
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patched:
-        patched.setattr(os, "fdatasync", interrupted)
+        patched.setattr(os, "fdatasync", raising(KeyboardInterrupt()))
         with pytest.raises(KeyboardInterrupt):
             fill(log, 1, first=2)
     fill(log, 1, first=3)
@@ -152,9 +144,7 @@ def test_an_interrupted_append_leaves_nothing_behind(tmp_path: Path, monkeypatch
 
 
 def test_a_read_only_folder_is_read_and_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = Journal(tmp_path, BIG)
-    fill(log, 2)
-    log.close()
+    write(tmp_path, 2)
     real = Path.open
 
     def read_only(path: Path, mode: str = "r", **more: Any) -> Any:
@@ -168,6 +158,42 @@ def test_a_read_only_folder_is_read_and_not_written(tmp_path: Path, monkeypatch:
     with pytest.raises(JournalError, match="Read-only file system"):
         fill(log, 1, first=3)
     log.close()
+
+
+def test_a_disk_that_stays_full_leaves_no_heap_of_segments(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = Journal(tmp_path, BIG)
+    monkeypatch.setattr(os, "fdatasync", refuse(errno.ENOSPC))
+    for _ in range(20):
+        with pytest.raises(JournalError):
+            fill(log, 1)
+    assert len(journal.segments(tmp_path)) <= 1
+    monkeypatch.undo()
+    (position,) = fill(log, 1)
+    assert journal.read(tmp_path, position).seq == 1
+    log.close()
+
+
+def test_a_segment_that_cannot_be_closed_does_not_take_its_last_keyframe_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = Journal(tmp_path, 1)  # each keyframe fills a segment
+    with monkeypatch.context() as patched:
+        patched.setattr(Journal, "rotate", refuse(errno.ENOSPC))
+        fill(log, 1)
+    fill(log, 1, first=2)
+    log.close()
+    assert [found.position.segment for found in Journal(tmp_path, BIG).found] == [1, 2]
+    assert seqs(tmp_path) == [1, 2]
+
+
+def test_a_journal_whose_folder_vanishes_is_a_clear_error(tmp_path: Path) -> None:
+    log = Journal(tmp_path / "journal", 1)
+    fill(log, 1)
+    shutil.rmtree(tmp_path / "journal")
+    with pytest.raises(JournalError, match="No such file"):
+        fill(log, 1, first=2)
 
 
 # --- what outlasts a power cut ---
@@ -241,9 +267,7 @@ def test_the_oldest_segments_go_and_no_other(tmp_path: Path) -> None:
 def test_a_segment_that_cannot_be_deleted_is_passed_over(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    log = Journal(tmp_path, 4000)
-    fill(log, 10)
-    log.close()
+    write(tmp_path, 10, 4000)
     log = Journal(tmp_path, 4000)
     segment_path(tmp_path, 1).unlink()
     segment_path(tmp_path, 1).mkdir()
@@ -256,18 +280,9 @@ def test_a_segment_that_cannot_be_deleted_is_passed_over(
 
 
 def test_foreign_files_are_left_alone(tmp_path: Path) -> None:
-    log = Journal(tmp_path, BIG)
-    fill(log, 2)
-    log.close()
-    for name in (
-        "lock",
-        "notes.mcap",
-        "7.mcap",
-        "0000001.mcap",
-        "٣٣٣٣٣٣.mcap",
-        "000009.mcap.bak",
-        ".000005.mcap",
-    ):
+    write(tmp_path, 2)
+    numbered = ("7.mcap", "0000001.mcap", "٣٣٣٣٣٣.mcap", "000009.mcap.bak", ".000005.mcap")
+    for name in ("lock", "notes.mcap", *numbered):
         (tmp_path / name).write_bytes(b"not ours")
     (tmp_path / "000004").mkdir()
     log = Journal(tmp_path, BIG)
@@ -277,9 +292,7 @@ def test_foreign_files_are_left_alone(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", [b"", mcap_layout.MAGIC, mcap_layout.OPENING, mcap_layout.OPENING[:20]])
 def test_a_segment_that_was_just_begun_holds_nothing(tmp_path: Path, content: bytes) -> None:
-    log = Journal(tmp_path, BIG)
-    fill(log, 2)
-    log.close()
+    write(tmp_path, 2)
     segment_path(tmp_path, 2).write_bytes(content)
     log = Journal(tmp_path, BIG)
     assert ([found.seq for found in log.found], log.damaged) == ([1, 2], 0)
@@ -289,9 +302,7 @@ def test_a_segment_that_was_just_begun_holds_nothing(tmp_path: Path, content: by
 
 
 def test_a_segment_of_rubbish_costs_itself_alone(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    log = Journal(tmp_path, 4000)
-    fill(log, 12)
-    log.close()
+    write(tmp_path, 12, 4000)
     per_segment = Counter(found.position.segment for found in Journal(tmp_path, BIG).found)
     segment_path(tmp_path, 2).write_bytes(os.urandom(9000))
     log = Journal(tmp_path, BIG)
@@ -308,9 +319,7 @@ def test_a_segment_that_cannot_be_read_is_not_passed_over(
     tmp_path: Path, what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its keyframes may be there at the next start, when those behind them are in the map."""
-    log = Journal(tmp_path, 4000)
-    fill(log, 12)
-    log.close()
+    write(tmp_path, 12, 4000)
     before = Journal(tmp_path, BIG).found
     readable = sum(found.position.segment != 2 for found in before)
     bad, aside = segment_path(tmp_path, 2), tmp_path / "aside"

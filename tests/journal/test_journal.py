@@ -15,7 +15,8 @@ from mcap.reader import make_reader
 from tsfusion import journal
 from tsfusion.core.errors import JournalError
 from tsfusion.delivery.spool import Spool
-from tsfusion.journal import Journal, Position, segment_path
+from tsfusion.journal import Journal, Position, quarantine, segment_path
+from tsfusion.journal.quarantine import Quarantine
 from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec
 
@@ -82,44 +83,28 @@ def test_closed_segments_open_in_mcap_tools(tmp_path: Path) -> None:
     assert [message.sequence for _, _, message in messages] == [1, 2, 3, 4]
 
 
-@pytest.mark.parametrize("kept", [0.0, 0.3, 0.99])
-def test_a_torn_tail_costs_only_itself(tmp_path: Path, kept: float) -> None:
-    last = write(tmp_path, 4)[-1]
-    path = segment_path(tmp_path, 1)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: last.offset + int(kept * 1000)])
-    log = Journal(tmp_path, BIG)
-    assert [found.seq for found in log.found] == [1, 2, 3]
-    assert log.damaged == 0
-    with pytest.raises(JournalError, match="no whole keyframe"):
-        journal.read(tmp_path, last)
-
-
-def test_a_flipped_bit_costs_one_record_and_is_logged(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(
+    ("at", "value", "message"),
+    [
+        (500, 4, "keyframe 3 of session 00000000 is damaged"),
+        (5, 255, "nothing can be read here; 1 keyframes are lost"),
+    ],
+    ids=["a bit", "the length"],
+)
+def test_damage_costs_one_record_and_is_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, at: int, value: int, message: str
 ) -> None:
     positions = write(tmp_path, 5)
     path = segment_path(tmp_path, 1)
     stored = bytearray(path.read_bytes())
-    stored[positions[2].offset + 500] ^= 4
+    stored[positions[2].offset + at] ^= value
     path.write_bytes(stored)
     log = Journal(tmp_path, BIG)
     assert [found.seq for found in log.found] == [1, 2, 4, 5]
     assert log.damaged == 1
-    assert f"byte {positions[2].offset}: keyframe 3 of session 00000000 is damaged" in caplog.text
+    assert f"byte {positions[2].offset}: {message}" in caplog.text
     with pytest.raises(JournalError):
         journal.read(tmp_path, positions[2])
-
-
-def test_a_damaged_length_costs_one_record_and_is_logged(tmp_path: Path) -> None:
-    positions = write(tmp_path, 5)
-    path = segment_path(tmp_path, 1)
-    stored = bytearray(path.read_bytes())
-    stored[positions[2].offset + 5] = 255
-    path.write_bytes(stored)
-    log = Journal(tmp_path, BIG)
-    assert [found.seq for found in log.found] == [1, 2, 4, 5]
-    assert log.damaged == 1
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -160,22 +145,6 @@ def test_an_unwritable_folder_is_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(JournalError, match=r"cannot create the journal .*file"):
         Journal(tmp_path / "file", BIG)
-
-
-def test_a_full_disk_is_an_error_and_not_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = Journal(tmp_path, BIG)
-    fill(log, 2)
-
-    def full(_descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(os, "fdatasync", full)
-        with pytest.raises(JournalError, match="No space left"):
-            fill(log, 1, first=3)
-    position = log.append([b"head", b"x"], session=SESSION, seq=3)
-    assert bytes(journal.read(tmp_path, position).frames[1]) == b"x"
-    log.close()
 
 
 # --- recordings ---
@@ -265,3 +234,59 @@ def test_an_entry_in_the_middle_can_be_removed(tmp_path: Path) -> None:
     spool.remove(1)
     assert [entry.seq for entry in spool.waiting] == [1, 3]
     spool.close()
+
+
+def test_the_quarantine_keeps_to_its_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(quarantine, "_MAX_FILES", 5)
+
+    def keep(kept: Quarantine, seq: int, size: int = 100) -> Path:
+        path = kept.keep([bytes(size)], session=SESSION, seq=seq, reason="crc")
+        assert path is not None
+        os.utime(path, ns=(seq, seq))
+        return path
+
+    def seqs() -> list[int]:
+        return sorted(int(path.name.split("-")[1]) for path in tmp_path.glob("*.mcap"))
+
+    kept = Quarantine(tmp_path, 1 << 20)
+    for seq in range(1, 9):
+        keep(kept, seq)
+    assert (len(kept), seqs()) == (5, [4, 5, 6, 7, 8])
+    keep(kept, 4)  # again: now it is the newest
+    os.utime(keep(kept, 4), ns=(9, 9))
+    assert len(kept) == 5
+    kept = Quarantine(tmp_path, 1 << 20)  # as a new process finds it
+    assert len(kept) == 5
+    keep(kept, 10)
+    assert seqs() == [4, 6, 7, 8, 10]
+    keep(kept, 11, (1 << 20) - 1000)
+    assert seqs()[-1] == 11
+    keep(kept, 12, 2 << 20)  # the newest stays, whatever its size
+    assert (len(kept), seqs()) == (1, [12])
+
+
+def test_the_quarantine_does_not_look_at_every_file_for_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = Quarantine(tmp_path, 1 << 20)
+    monkeypatch.setattr(Path, "glob", None)
+    assert kept.keep([b"x"], session=SESSION, seq=1, reason="crc") is not None
+    assert len(kept) == 1
+
+
+def test_a_folder_of_quarantined_keyframes_opens_like_a_journal(tmp_path: Path) -> None:
+    kept = Quarantine(tmp_path, 1 << 20)
+    for seq in (2, 10, 9):
+        frames = codec.encode(wall(seq), session=SESSION, seq=seq, jpeg_quality=90)
+        kept.keep(frames, session=SESSION, seq=seq, reason="crc")
+    found = [keyframe.timestamp_ns - 10**9 for keyframe in JournalRecording(tmp_path)]
+    assert found == [2, 9, 10]
+
+
+@pytest.mark.parametrize("reason", ["../../x", "a/b", "", "no\nsense", "x" * 300])
+def test_no_reason_leads_out_of_the_folder(tmp_path: Path, reason: str) -> None:
+    """A scanner's come from a server."""
+    kept = Quarantine(tmp_path / "refused", 1 << 20).keep([b"x"], session=SESSION, seq=1, reason=reason)
+    assert kept is not None
+    assert list(tmp_path.rglob("*.mcap")) == [kept]
+    assert quarantine.quarantined_files(tmp_path / "refused") == [kept]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from failures import raising
 from keyframes_and_servers import CAMERA, pose, wall
 from mcap.reader import make_reader
 
@@ -40,13 +41,9 @@ def journal_of(folder: Path, scans: dict[str, list[Keyframe]]) -> JournalPlace:
     return JournalPlace(folder / "journal")
 
 
-def silent(_done: int, _total: int) -> None:
-    pass
-
-
 def exported(folder: Path, scans: dict[str, list[Keyframe]]) -> tuple[Export, Read]:
     """Export, and read back with rosbags: (time, message) by topic."""
-    done = export(journal_of(folder, scans), folder / "out.mcap", silent)
+    done = export(journal_of(folder, scans), folder / "out.mcap", lambda *_: None)
     found: Read = {}
     with rosbags_highlevel.AnyReader([folder / "out.mcap"]) as reader:
         for connection, stamp, raw in reader.messages():
@@ -152,11 +149,8 @@ def test_a_lidar_recording_comes_out_bit_for_bit(data: Data, tmp_path: Path) -> 
         assert [(field.name, field.offset, field.datatype) for field in message.fields] == [
             ("x", 0, 7), ("y", 4, 7), ("z", 8, 7),
         ]  # fmt: skip
-        assert (message.width, message.height, message.row_step) == (
-            len(keyframe.points),
-            1,
-            len(message.data),
-        )
+        shape = (len(keyframe.points), 1, len(message.data))
+        assert (message.width, message.height, message.row_step) == shape
         assert np.array_equal(message.data.view("<f4").reshape(-1, 3), keyframe.points)
     check_places(found, "scanner", keyframes)
 
@@ -220,7 +214,7 @@ def test_depth_is_millimetres_or_metres(depth: np.ndarray, scale: float, expecte
 
 
 def test_mcap_s_own_reader_takes_the_file(tmp_path: Path) -> None:
-    export(journal_of(tmp_path, {"a": [wall(0), cloud(1)]}), tmp_path / "out.mcap", silent)
+    export(journal_of(tmp_path, {"a": [wall(0), cloud(1)]}), tmp_path / "out.mcap", lambda *_: None)
     with (tmp_path / "out.mcap").open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
@@ -249,7 +243,7 @@ def test_sessions_have_names_of_their_own(tmp_path: Path) -> None:
         log.append(frames, session=session, seq=1, client=client)
         log.append(frames, session=session, seq=1, client=client)  # a second time
     log.close()
-    done = export(JournalPlace(tmp_path / "journal"), tmp_path / "out.mcap", silent)
+    done = export(JournalPlace(tmp_path / "journal"), tmp_path / "out.mcap", lambda *_: None)
     assert done.keyframes == 5
     named = {topic.split("/")[1] for topic in done.messages} - {"tf"}
     assert named == {"arm_7", "arm_7_2", "scanner", "scanner_2", "scanner_7up"}
@@ -265,7 +259,7 @@ def test_damaged_keyframes_are_left_out_and_named(tmp_path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[second.position.offset + 500] ^= 1
     path.write_bytes(content)
-    done = export(place, tmp_path / "out.mcap", silent)
+    done = export(place, tmp_path / "out.mcap", lambda *_: None)
     assert (done.keyframes, done.lost) == (2, 1)
     assert [(one.offset, one.kind) for one in done.problems] == [(second.position.offset, "damage")]
 
@@ -278,11 +272,8 @@ def small(tmp_path: Path) -> JournalPlace:
 def test_nothing_half_written_is_left(small: JournalPlace, tmp_path: Path) -> None:
     before = sorted(tmp_path.iterdir())
 
-    def interrupted(_done: int, _total: int) -> None:
-        raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        export(small, tmp_path / "out.mcap", interrupted)
+        export(small, tmp_path / "out.mcap", raising(KeyboardInterrupt()))
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -296,9 +287,9 @@ def test_places_that_cannot_be_written_are_named(small: JournalPlace, tmp_path: 
         (small.path / "out.mcap", "in the journal that is read"),
     ):
         with pytest.raises(OutputError, match=message):
-            export(small, out, silent)
+            export(small, out, lambda *_: None)
     with pytest.raises(OutputError, match="in the journal that is read"):
-        export(JournalPlace(segment), segment, silent)
+        export(JournalPlace(segment), segment, lambda *_: None)
     assert segment.read_bytes() == content
     assert read(small.path, next(records(segment)).position).seq == 1
 
@@ -306,7 +297,7 @@ def test_places_that_cannot_be_written_are_named(small: JournalPlace, tmp_path: 
 def test_an_empty_journal_is_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / "journal").mkdir()
     with pytest.raises(JournalError, match="no keyframes in"):
-        export(JournalPlace(tmp_path / "journal"), tmp_path / "out.mcap", silent)
+        export(JournalPlace(tmp_path / "journal"), tmp_path / "out.mcap", lambda *_: None)
     assert not (tmp_path / "out.mcap").exists()
 
 
@@ -322,4 +313,4 @@ def test_without_rosbags_the_error_names_the_command(
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(MissingDependency, match=r"pip install 'tsfusion\[ros\]'"):
-        export(small, tmp_path / "out.mcap", silent)
+        export(small, tmp_path / "out.mcap", lambda *_: None)

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The engine of whole runs: when the next keyframe may go, and how long a run waits for the map."""
+"""The engine of whole runs: when the next keyframe may go, and how long a run waits for map and server."""
 
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any, cast
 
 import pytest
@@ -9,7 +12,7 @@ from tsfusion.client import Client, ClientStats
 from tsfusion.core.errors import FlushTimeout, TransportError
 from tsfusion.pipelines import engine
 from tsfusion.pipelines.engine import Engine
-from tsfusion.pipelines.target_server import Target
+from tsfusion.pipelines.target_server import ServerChild, Target
 
 
 class Run:
@@ -79,3 +82,18 @@ def test_missing_stamps_do_not_cost_the_run() -> None:
     run = Run(stats(5, 5))
     run.engine.wait_meshed(late)
     run.engine.wait_acknowledged(late)
+
+
+@pytest.mark.parametrize(
+    ("log", "reason"),
+    [
+        ("tsfusion: INFO: the map is open\n", "status 3; was it killed?"),
+        ("tsfusion: the disk is full\ntsfusion: INFO: the fuser ended\n", "status 3: the disk is full"),
+    ],
+)
+def test_a_server_that_ended_names_its_error(tmp_path: Path, log: str, reason: str) -> None:
+    (tmp_path / "server.log").write_text(log)
+    with subprocess.Popen([sys.executable, "-c", "raise SystemExit(3)"], text=True) as process:
+        process.wait(60)
+        with pytest.raises(TransportError, match="the server ended with " + reason.replace("?", r"\?")):
+            ServerChild(process, tmp_path / "server.log").check()

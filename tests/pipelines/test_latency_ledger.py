@@ -17,18 +17,10 @@ MS = 1_000_000
 def record(seq: int, delay_ms: int, *, captured_ms: int = 1000) -> KeyframeTimes:
     """Stages of 1, 2, 3 and 4 ms, then fusing until `delay_ms`, then 5 ms to the mesh."""
     at = (captured_ms + 250 * seq) * MS
-    return KeyframeTimes(
-        seq=seq,
-        timestamp_ns=7,
-        captured_ns=at,
-        sent_ns=at + 1 * MS,
-        received_ns=at + 3 * MS,
-        durable_ns=at + 6 * MS,
-        fuse_start_ns=at + 10 * MS,
-        fused_ns=at + delay_ms * MS,
-        meshed_ns=at + (delay_ms + 5) * MS,
-        clock_bound_ns=40_000,
-    )
+    names = ("sent_ns", "received_ns", "durable_ns", "fuse_start_ns", "fused_ns", "meshed_ns")
+    after_ms = (1, 3, 6, 10, delay_ms, delay_ms + 5)
+    stamps = {name: at + ms * MS for name, ms in zip(names, after_ms, strict=True)}
+    return KeyframeTimes(seq=seq, timestamp_ns=7, captured_ns=at, clock_bound_ns=40_000, **stamps)
 
 
 def test_summary() -> None:

@@ -12,16 +12,8 @@ import trimesh
 from tsfusion.core.errors import OutputError
 from tsfusion.datasets import Synthetic
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.pipelines.mesh_preview import (
-    BACKGROUND,
-    PreviewCamera,
-    choose_camera,
-    draw,
-    height_colors,
-    render,
-    sensor_up,
-    up_direction,
-)
+from tsfusion.pipelines import mesh_preview
+from tsfusion.pipelines.mesh_preview import PreviewCamera, choose_camera, draw, sensor_up
 
 
 def from_trimesh(shape: trimesh.Trimesh, colors: np.ndarray | None = None) -> Mesh:
@@ -53,7 +45,7 @@ def test_depth_of_a_sphere() -> None:
     T[2, 3] = -4.0
     image = draw(sphere, PreviewCamera(T, fov=math.radians(60)), 201, 151)
     assert image[75, 100, 3] == pytest.approx(3.0, abs=2e-3)
-    assert (image[0, 0] == (*np.float32(BACKGROUND), 0)).all()
+    assert (image[0, 0] == (*np.float32(mesh_preview.BACKGROUND), 0)).all()
     # The silhouette of a unit sphere at 4 m: tan of its angular radius is 1/sqrt(15).
     focal = 100.5 / math.tan(math.radians(30))
     seen = np.count_nonzero(image[..., 3])
@@ -117,7 +109,7 @@ def test_up_comes_from_the_poses_and_is_refined_by_the_floor() -> None:
     turned[:3, :3] = tilt
     poses = [turned @ look((0, 0, 1), (math.cos(a), math.sin(a), 0)) @ nod for a in np.linspace(0, 2, 9)]
     ups = [sensor_up(pose, "kinect") for pose in poses]
-    assert up_direction(tilted, ups) == pytest.approx(tilt @ (0, 0, 1), abs=1e-3)
+    assert mesh_preview.up_direction(tilted, ups) == pytest.approx(tilt @ (0, 0, 1), abs=1e-3)
 
 
 def test_a_lidar_stands_upright_too() -> None:
@@ -130,7 +122,7 @@ def test_a_lidar_stands_upright_too() -> None:
 def test_without_colour_height_is_shown() -> None:
     """From below to above the ramp gets lighter; grey everywhere is no colour either."""
     room = box_room()
-    ramp = height_colors(room.vertices, np.array((0.0, 0.0, 1.0))).astype(int).sum(axis=1)
+    ramp = mesh_preview.height_colors(room.vertices, np.array((0.0, 0.0, 1.0))).astype(int).sum(axis=1)
     low = room.vertices[:, 2] < 1
     assert ramp[low].max() < ramp[~low].min()
     grey = Mesh(room.vertices, room.faces, room.normals, np.full_like(room.vertices, 160, np.uint8))
@@ -155,13 +147,13 @@ def test_chosen_camera_looks_into_the_room_from_outside() -> None:
 
 
 def test_render_writes_the_whole_file_or_none(tmp_path) -> None:
-    path = render(box_room(), tmp_path / "room.png", width=96, height=60)
+    path = mesh_preview.render(box_room(), tmp_path / "room.png", width=96, height=60)
     assert cv2.imread(str(path)).shape == (60, 96, 3)
     empty = np.zeros((0, 3), np.float32)
     with pytest.raises(OutputError, match="no triangles"):
-        render(Mesh(empty, np.zeros((0, 3), np.int32), empty), tmp_path / "empty.png")
+        mesh_preview.render(Mesh(empty, np.zeros((0, 3), np.int32), empty), tmp_path / "empty.png")
     with pytest.raises(OutputError, match="cannot write"):
-        render(box_room(), tmp_path / "missing" / "room.png", width=96, height=60)
+        mesh_preview.render(box_room(), tmp_path / "missing" / "room.png", width=96, height=60)
     assert [entry.name for entry in tmp_path.iterdir()] == ["room.png"]
 
 

@@ -14,18 +14,14 @@ import numpy as np
 import pytest
 import trimesh
 from command_processes import alive, descendants, end, eventually, read_until, started, tsfusion
+from keyframes_and_servers import map_hash
+from small_recordings import first_views
 
-from tsfusion import Keyframe, Volume, VolumeConfig
+from tsfusion import VolumeConfig
 from tsfusion.core.output_folder import building
-from tsfusion.datasets import Synthetic
 
 RESULTS = {"mesh.ply", "mesh.glb", "preview.png", "delay.csv", "delay.png", "run.json"}
 VOXEL = 0.08
-
-
-def room(count: int) -> list[Keyframe]:
-    """The first keyframes of the synthetic room of 40."""
-    return [Synthetic("room", count=40)[index] for index in range(count)]
 
 
 @pytest.fixture(scope="module")
@@ -66,11 +62,8 @@ def test_replay_leaves_everything(run_folder: Path) -> None:
 
 
 def test_replay_over_sockets_is_the_map_of_the_library(run_folder: Path) -> None:
-    volume = Volume(voxel_size=VOXEL, threads=1)
-    for keyframe in reversed(room(6)):
-        volume.integrate(keyframe)
     run = json.loads((run_folder / "out" / "run.json").read_text())
-    assert run["map_hash"] == volume.map_hash()
+    assert run["map_hash"] == map_hash(reversed(first_views(6)), VolumeConfig(voxel_size=VOXEL, threads=1))
 
 
 @pytest.mark.slow

@@ -7,14 +7,15 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from command_processes import end, environment, eventually, read_until, server, started, tsfusion
+from clients_and_spools import NOBODY
+from command_processes import end, environment, eventually, python, read_until, server, started, tsfusion
 from small_recordings import seven_scenes
 
 from tsfusion import open_dataset
@@ -27,6 +28,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.journal.recording import JournalRecording
 from tsfusion.pipelines import engine
 from tsfusion.pipelines import scan as pipelines_scan
+from tsfusion.pipelines.scan_results import ScanSummary
 from tsfusion.scanner.sources.source import LiveSource
 from tsfusion.wire.queries import fetch_status
 
@@ -104,10 +106,7 @@ def test_without_taichi_to_a_server_elsewhere(walk: Path, tmp_path: Path) -> Non
     with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, process):
         command = ["scan", "--source", walk, "--connect", address, "--map", "hall",
                    "--spool", tmp_path / "spool", "--out", tmp_path / "out", "--json"]  # fmt: skip
-        done = subprocess.run(
-            [sys.executable, "-c", BARE, *map(str, command)], capture_output=True, text=True, timeout=120,
-            env=environment(), check=False,
-        )  # fmt: skip
+        done = python(BARE, *command, env=environment())
         run = figures(done)
         assert run["keyframes_durable"] == run["keyframes_sent"] >= 3
         assert run["left"] == 0
@@ -127,8 +126,8 @@ def test_without_taichi_to_a_server_elsewhere(walk: Path, tmp_path: Path) -> Non
 
 
 def test_ctrl_c_without_a_server_keeps_all_for_the_next_scan(walk: Path, tmp_path: Path) -> None:
-    spool, nobody = tmp_path / "spool", "tcp://127.0.0.1:9"
-    command = ["scan", "--source", SOURCE, "--rate", "3", "--connect", nobody, "--spool", spool]
+    spool = tmp_path / "spool"
+    command = ["scan", "--source", SOURCE, "--rate", "3", "--connect", NOBODY, "--spool", spool]
     process = subprocess.Popen(
         [sys.executable, "-c", IMPATIENT, *command, "--out", tmp_path / "out"],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment(),
@@ -185,7 +184,7 @@ def test_a_recording_that_breaks_off_keeps_what_came_before(tmp_path: Path) -> N
         (["--source", SOURCE, "--localizer", "gps"], 1, "localizer must be one of auto, rgbd"),
         (["--source", SOURCE, "--localizer", "lidar"], 1, "points"),
         (["--source", SOURCE, "--spool", "spool"], 1, "--spool has no effect without --connect"),
-        (["--source", SOURCE, "--connect", "tcp://127.0.0.1:9", "--voxel-size", "1"], 1, "tsfusion serve"),
+        (["--source", SOURCE, "--connect", NOBODY, "--voxel-size", "1"], 1, "tsfusion serve"),
         (["--source", "realsense", "--rate", "2"], 1, "--rate is for recordings"),
         (["--source", SOURCE, "--calibration", "a.yaml"], 1, "--calibration is for a live camera"),
         (["--source", "folder:nowhere"], 1, "nowhere"),
@@ -223,10 +222,7 @@ def test_the_client_is_light() -> None:
         "import resource, tsfusion.client; used = resource.getrusage(resource.RUSAGE_SELF);"
         "from tsfusion.core import process; print(used.ru_utime + used.ru_stime, process.peak_rss_bytes())"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-    )  # fmt: skip
+    done = python(program, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
     _, rss = map(float, done.stdout.split())
     assert rss < 100e6
 
@@ -265,6 +261,19 @@ class Frames(LiveSource):
         return iter(self._frames)
 
 
+@pytest.fixture
+def scanned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., ScanSummary]:
+    """Scan in this process for a server that does not answer, and do not wait for it."""
+    monkeypatch.setattr(engine, "LINGER", 0.2)
+    usual = {"config": ScanConfig(), "volume": VolumeConfig(), "progress": Quiet()}
+
+    def scan(source: Frames, out: str = "out", **settings: Any) -> ScanSummary:
+        spool = tmp_path / "spool"
+        return pipelines_scan.scan(source, tmp_path / out, connect=NOBODY, spool=spool, **usual | settings)
+
+    return scan
+
+
 def unposed(count: int) -> list[Frame]:
     """The room's first frames, without their poses."""
     room = open_dataset(SOURCE, count=150)
@@ -276,50 +285,35 @@ def unposed(count: int) -> list[Frame]:
 
 @pytest.mark.parametrize(("count", "gap_ns", "taken"), [(1, 0, 1), (3, 0, 3), (3, 3 * 10**9, 2)])
 def test_a_live_sources_first_frame_is_taken_unless_it_is_old(
-    count: int, gap_ns: int, taken: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    count: int, gap_ns: int, taken: int, scanned: Callable[..., ScanSummary]
 ) -> None:
-    monkeypatch.setattr(engine, "LINGER", 0.2)
     first, *others = unposed(count)
     later = [dataclasses.replace(frame, timestamp_ns=frame.timestamp_ns + gap_ns) for frame in others]
-    result = pipelines_scan.scan(
-        Frames([first, *later], live=True), tmp_path / "out", config=ScanConfig(), volume=VolumeConfig(),
-        connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Quiet(),
-    )  # fmt: skip
+    result = scanned(Frames([first, *later], live=True))
     assert (result.frames, result.frames_tracked) == (taken, taken)
 
 
 def test_what_waits_for_the_map_is_of_another_world(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    scanned: Callable[..., ScanSummary], caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(engine, "LINGER", 0.2)
     for left in (1, 2):
         assert "of an earlier scan" not in caplog.text
-        result = pipelines_scan.scan(
-            Frames(unposed(1)), tmp_path / "out", config=ScanConfig(), volume=VolumeConfig(),
-            connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Quiet(),
-        )  # fmt: skip
+        result = scanned(Frames(unposed(1)))
         assert result.left == left
     assert "of an earlier scan wait for the map default" in caplog.text
 
 
 def test_a_frame_that_cannot_be_followed_keeps_what_came_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scanned: Callable[..., ScanSummary], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(engine, "LINGER", 0.2)
     points = Frame(sensor="lidar", points=np.ones((9, 3), np.float32), timestamp_ns=10**9)
     with pytest.raises(InvalidKeyframe, match="needs a depth"):
-        pipelines_scan.scan(
-            Frames([*unposed(4), points]), tmp_path / "out", config=ScanConfig(loop_closure=False),
-            volume=VolumeConfig(), connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Quiet(),
-        )  # fmt: skip
+        scanned(Frames([*unposed(4), points]), config=ScanConfig(loop_closure=False))
     run = json.loads((tmp_path / "out" / "run.json").read_text())
     assert (run["frames_tracked"], run["complete"]) == (4, False)
     assert len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) == 4
     with pytest.raises(InvalidConfig, match="rgbd follows depth images, and this source gives points"):
-        pipelines_scan.scan(
-            Frames([points]), tmp_path / "none", config=ScanConfig(localizer="rgbd"),
-            volume=VolumeConfig(), connect="tcp://127.0.0.1:9", spool=tmp_path / "spool", progress=Quiet(),
-        )  # fmt: skip
+        scanned(Frames([points]), "none", config=ScanConfig(localizer="rgbd"))
     assert not (tmp_path / "none").exists()
 
 
@@ -347,17 +341,10 @@ def test_a_map_without_a_surface_keeps_the_trajectory(walk: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("live", [True, False])
-def test_only_what_cannot_wait_is_thinned_out(
-    live: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_what_cannot_wait_is_thinned_out(live: bool, scanned: Callable[..., ScanSummary]) -> None:
     """Also where nobody knows how many frames there will be, as in a folder or a camera's recording."""
-    monkeypatch.setattr(engine, "LINGER", 0.2)
     source = Frames(unposed(6), live=live)
     source.length = None
-    result = pipelines_scan.scan(
-        source, tmp_path / "out", config=ScanConfig(distance=1e-6), volume=VolumeConfig(),
-        client=ClientConfig(backlog=1), connect="tcp://127.0.0.1:9", spool=tmp_path / "spool",
-        progress=Quiet(),
-    )  # fmt: skip
+    result = scanned(source, config=ScanConfig(distance=1e-6), client=ClientConfig(backlog=1))
     assert bool(result.keyframes_rejected.get("thinned")) == live
     assert live or result.left == 6

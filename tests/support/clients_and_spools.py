@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Clients of a scripted server or of none, and keyframes for them."""
 
-from keyframes_and_servers import wall
+import time
+from collections.abc import Iterable
+
+from keyframes_and_servers import DEADLINE, wall
 from scripted_server import ScriptedServer
 
-from tsfusion import Client
+from tsfusion import Client, Keyframe
 from tsfusion.core.config import ClientConfig
 
 NOBODY = "tcp://127.0.0.1:1"
@@ -17,4 +20,12 @@ def joined(server: ScriptedServer, **settings: object) -> Client:
 
 def send_all(client: Client, numbers: range) -> list[int]:
     """Send these walls; the numbers of those that the client took."""
-    return [i for i in numbers if client.send(wall(i)) is not None]
+    return [i for i in numbers if client.send(wall(i, captured_ns=time.monotonic_ns())) is not None]
+
+
+def deliver(client: Client, keyframes: Iterable[Keyframe]) -> None:
+    """Send these, and wait until the map has them."""
+    for keyframe in keyframes:
+        client.send(keyframe)
+    client.flush(DEADLINE)
+    client.wait_fused(DEADLINE)

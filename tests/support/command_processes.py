@@ -16,6 +16,7 @@ from weakref import WeakKeyDictionary
 
 COMMAND = [sys.executable, "-m", "tsfusion"]
 DEADLINE = 120.0  # seconds: a cold kernel compilation on a slow machine
+Here = Callable[..., "subprocess.CompletedProcess[str]"]  # of the fixture `here`
 
 
 def environment() -> dict[str, str]:
@@ -33,12 +34,11 @@ def tsfusion(
     )  # fmt: skip
 
 
-def python(
-    code: str, *arguments: object, timeout: float = DEADLINE, check: bool = False, **more: Any
-) -> "subprocess.CompletedProcess[str]":
-    """Run a program in another Python to its end."""
-    command = [sys.executable, "-c", code, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=check, **more)
+def python(program: str, *arguments: object, **more: Any) -> "subprocess.CompletedProcess[str]":
+    """Run Python code in a process of its own, to its end."""
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "timeout": DEADLINE, "check": False}
+    command = [sys.executable, "-c", program, *map(str, arguments)]
+    return subprocess.run(command, text=True, **{**options, **more})
 
 
 def started(*arguments: object) -> "subprocess.Popen[str]":

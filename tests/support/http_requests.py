@@ -22,10 +22,14 @@ def get(
         connection.close()
 
 
+def connection(address: str) -> socket.socket:
+    host, _, port = address.rpartition(":")
+    return socket.create_connection((host.strip("[]"), int(port)), timeout=DEADLINE)
+
+
 def raw(address: str, sent: bytes) -> bytes:
     """Read until the other end closes."""
-    host, _, port = address.rpartition(":")
-    with socket.create_connection((host, int(port)), timeout=DEADLINE) as link:
+    with connection(address) as link:
         link.sendall(sent)
         answer = b""
         with suppress(ConnectionResetError):

@@ -5,8 +5,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +26,7 @@ from tsfusion.wire.curve import ClientKeys, client_keys
 DEADLINE = 60.0
 CAMERA = Intrinsics(40.0, 40.0, 31.5, 23.5)
 SHAPE = (48, 64)
+VOLUME = VolumeConfig(voxel_size=0.04, threads=1)
 NUMBERED_NS = 10**9  # `timestamp_ns` of `wall(0)`; that of `wall(i)` is i more
 _SERVE = """
 import sys, msgspec
@@ -56,6 +58,16 @@ def wall(i: int = 0, **fields: Any) -> Keyframe:
     return Keyframe(depth=depth, color=color, intrinsics=CAMERA, **given)
 
 
+def map_hash(keyframes: Iterable[Keyframe], config: VolumeConfig = VOLUME) -> str:
+    """Hash of the map of these keyframes, fused in this process."""
+    from tsfusion import Volume
+
+    volume = Volume(config)
+    for keyframe in keyframes:
+        volume.integrate(keyframe)
+    return volume.map_hash()
+
+
 def journaled_corrections(state: Path, map_name: str = "default") -> list[Correction]:
     """The corrections in a map's journal, in its order."""
     folder = state_folder.map_folder(state, map_name) / state_folder.JOURNAL_FOLDER
@@ -75,6 +87,15 @@ def until(reached: Callable[[], bool], deadline: float = DEADLINE) -> None:
     while not reached():
         assert time.monotonic() < end, "deadline"
         time.sleep(0.005)
+
+
+def at_once(*calls: Callable[[], object]) -> None:
+    """Call them in a thread each, and wait until all have ended."""
+    threads = [threading.Thread(target=call) for call in calls]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
 
 
 class Secured(NamedTuple):
@@ -120,8 +141,9 @@ class Server:
         code: str = "",
         **settings: Any,
     ) -> None:
+        self.state = state
         config = ServerConfig(**{"listen": "tcp://127.0.0.1:0", "state": str(state), **settings})
-        volume = volume or VolumeConfig(voxel_size=0.04, threads=1)
+        volume = volume or VOLUME
         arguments = [msgspec.json.encode(one).decode() for one in (config, volume)]
         self._words = tempfile.TemporaryFile("w+")  # noqa: SIM115  a pipe that nobody reads would fill up
         self.process = subprocess.Popen(
@@ -187,10 +209,12 @@ def serving(state: Path, volume: VolumeConfig | None = None, **settings: Any) ->
 
 
 @contextmanager
-def connected(kind: Callable[..., sockets.AnySocket], address: str) -> Iterator[sockets.AnySocket]:
+def connected(
+    kind: Callable[..., sockets.AnySocket], address: str, keys: ClientKeys | None = None
+) -> Iterator[sockets.AnySocket]:
     """Connect a socket of this kind, and close it afterwards."""
     context: zmq.Context[Any] = zmq.Context()
-    made = kind(context)
+    made = kind(context, keys=keys) if keys else kind(context)
     try:
         made.connect(address)
         yield made

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from tsfusion import Keyframe
 from tsfusion.core.errors import DatasetError
 
 P0 = "700 0 40 0 0 700 24 0 0 0 1 0"
@@ -18,6 +19,13 @@ TR = "0 -1 0 0.1 0 0 -1 0.2 1 0 0 0.3"
 POSE = "1 0 0 0.5\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
 ROW = POSE.replace("\n", " ")
 Change = Callable[[Path], object]  # of a recording in a folder
+
+
+def first_views(count: int) -> list[Keyframe]:
+    """The first keyframes of the synthetic room of 40."""
+    from tsfusion.datasets import Synthetic
+
+    return [Synthetic("room", count=40)[index] for index in range(count)]
 
 
 def seven_scenes(root: Path, count: int = 3, shape: tuple[int, int] = (6, 8)) -> Path:

@@ -15,7 +15,7 @@ import pytest
 import small_disk
 from formula_scenes import sphere_views, volume_of
 
-from tsfusion import Volume
+from tsfusion import Volume, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, WeightOverflow
 from tsfusion.tsdf import checkpoint
 
@@ -168,33 +168,24 @@ def test_a_failed_save_keeps_the_old_file(
     assert Volume.load(path).map_hash() == volume.map_hash()
 
 
-def test_a_disk_that_really_fills_up_keeps_the_old_file(tmp_path: Path) -> None:
-    code = """
-import sys
-from pathlib import Path
-import numpy as np
-from tsfusion.tsdf import checkpoint
-from tsfusion.tsdf.checkpoint import CheckpointHeader
-from tsfusion.core.config import VolumeConfig
-from tsfusion.core.errors import CheckpointError
-folder = Path(sys.argv[1])
-def save(blocks):
-    keys = np.arange(blocks, dtype=np.int64)
-    sums = np.random.default_rng(0).integers(0, 1 << 40, (blocks, 512))
-    header = CheckpointHeader(config=VolumeConfig(), keyframes=blocks, map_hash="", layers=["sums"], meta={})
-    checkpoint.write(folder / "map.tsf", header, keys, keys, {"sums": sums})
-save(100)
-before = (folder / "map.tsf").read_bytes()
-try:
-    save(2000)
-except CheckpointError as error:
-    assert "No space left on device" in str(error), error
-    assert (folder / "map.tsf").read_bytes() == before
-    assert [path.name for path in folder.iterdir()] == ["map.tsf"]
-save(120)
-print(checkpoint.read(folder / "map.tsf")[0].keyframes)
-"""
-    assert small_disk.run(tmp_path / "disk", "2m", code) == "120\n"
+def test_a_disk_that_really_fills_up_keeps_the_old_file(small_disk: Callable[[int], Path]) -> None:
+    path = small_disk(2) / "map.tsf"
+
+    def save(blocks: int) -> None:
+        keys = np.arange(blocks, dtype=np.int64)
+        sums = np.random.default_rng(0).integers(0, 1 << 40, (blocks, 512))
+        known = {"config": VolumeConfig(), "map_hash": "", "layers": ["sums"], "meta": {}}
+        header = checkpoint.CheckpointHeader(keyframes=blocks, **known)
+        checkpoint.write(path, header, keys, keys, {"sums": sums})
+
+    save(100)
+    before = path.read_bytes()
+    with pytest.raises(CheckpointError, match="No space left on device"):
+        save(2000)
+    assert path.read_bytes() == before
+    assert [path] == list(path.parent.iterdir())
+    save(120)
+    assert checkpoint.read(path)[0].keyframes == 120
 
 
 def test_a_loaded_map_knows_how_full_its_voxels_are(tmp_path: Path) -> None:

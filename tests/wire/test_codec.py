@@ -67,14 +67,8 @@ def keyframes() -> dict[str, Keyframe]:
 
 EXACT = ("depth", "disparity", "points", "origins", "confidence", "T_world_camera")
 SAME = (
-    "depth_scale",
-    "disparity_scale",
-    "baseline_fx",
-    "intrinsics",
-    "sensor",
-    "timestamp_ns",
-    "captured_ns",
-    "kind",
+    *("depth_scale", "disparity_scale", "baseline_fx", "intrinsics"),
+    *("sensor", "timestamp_ns", "captured_ns", "kind"),
 )
 
 

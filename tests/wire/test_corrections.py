@@ -47,12 +47,8 @@ def test_corrections_survive_the_wire_to_the_bit(count: int) -> None:
     assert is_correction(frames[0])
     header = codec.check(frames)
     assert isinstance(header, CorrectionHeader)
-    assert (header.session, header.seq, header.previous, header.map) == (
-        SESSION,
-        count + 9,
-        count + 8,
-        "yard",
-    )
+    numbers = (header.session, header.seq, header.previous)
+    assert (numbers, header.map) == ((SESSION, count + 9, count + 8), "yard")
     assert sent.removed.tolist() == [count + 1, count + 3]
     assert same(decoded(frames), sent)
     assert same(decoded([stamp(frames[0], previous=2, sent_ns=3), frames[1]]), sent)

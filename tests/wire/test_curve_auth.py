@@ -5,7 +5,7 @@ import os
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from typing import Any
 
 import pytest
@@ -113,15 +113,10 @@ class Door:
         self._thread.join()
 
 
-@contextmanager
 def door(
     keys: ServerKeys | None = SERVER, allowed: dict[str, str] | None = None, *, guarded: bool = True
-) -> Iterator[Door]:
-    made = Door(keys, {ROBOT.public: "robot1"} if allowed is None else allowed, guarded=guarded)
-    try:
-        yield made
-    finally:
-        made.close()
+) -> "closing[Door]":
+    return closing(Door(keys, {ROBOT.public: "robot1"} if allowed is None else allowed, guarded=guarded))
 
 
 class Caller:
@@ -146,26 +141,6 @@ class Caller:
         self._context.term()
 
 
-@contextmanager
-def calling(
-    kind: Callable[..., sockets.AnySocket], address: str, keys: ClientKeys | None
-) -> Iterator[Caller]:
-    made = Caller(kind, address, keys)
-    try:
-        yield made
-    finally:
-        made.close()
-
-
-@contextmanager
-def lying(address: str, keys: ClientKeys, **more: Any) -> Iterator[Peer]:
-    made = Peer(address, keys, **more)
-    try:
-        yield made
-    finally:
-        made.close()
-
-
 def ask(at: Door, keys: ClientKeys | None, timeout: float = 5.0) -> messages.Reply:
     return request(at.addresses.control, Command(name="ping"), timeout=timeout, keys=keys)[0]
 
@@ -175,15 +150,15 @@ def ask(at: Door, keys: ClientKeys | None, timeout: float = 5.0) -> messages.Rep
 
 def test_an_allowed_key_is_the_sender_of_every_part() -> None:
     with door() as at:
-        with calling(sockets.push, at.addresses.data, ROBOT) as robot:
+        with closing(Caller(sockets.push, at.addresses.data, ROBOT)) as robot:
             until(lambda: robot.heard() == "")
             robot.socket.send_multipart([b"head", b"depth" * 1000, b"color" * 1000])
             until(lambda: bool(at.keyframes))
-        with calling(sockets.dealer, at.addresses.control, ROBOT) as robot:
+        with closing(Caller(sockets.dealer, at.addresses.control, ROBOT)) as robot:
             until(lambda: robot.heard() == "")
             robot.socket.send(b"hello")
             until(lambda: bool(at.control))
-        with calling(sockets.subscriber, at.addresses.publish, ROBOT) as robot:
+        with closing(Caller(sockets.subscriber, at.addresses.publish, ROBOT)) as robot:
             until(lambda: bool(at.subscriptions))
         for frames, senders in (*at.keyframes, *at.control):
             assert senders == [ROBOT.public] * len(frames)
@@ -222,7 +197,7 @@ def test_who_is_not_let_in_is_told_why(
 ) -> None:
     with door() as at:
         address = at.addresses.data if kind is sockets.push else at.addresses.control
-        with calling(kind, address, keys) as stranger:
+        with closing(Caller(kind, address, keys)) as stranger:
             until(lambda: words in (stranger.heard() or ""))
             with pytest.raises(zmq.Again):
                 stranger.socket.send(b"hello", zmq.NOBLOCK)
@@ -233,7 +208,10 @@ def test_who_is_not_let_in_is_told_why(
 
 
 def test_keys_for_a_server_without_are_told_so() -> None:
-    with door(None, guarded=False) as at, calling(sockets.dealer, at.addresses.control, ROBOT) as robot:
+    with (
+        door(None, guarded=False) as at,
+        closing(Caller(sockets.dealer, at.addresses.control, ROBOT)) as robot,
+    ):
         until(lambda: "was started without" in (robot.heard() or ""))
         assert robot.monitor.gave_up
         assert not at.control
@@ -260,7 +238,7 @@ def test_other_ways_in_are_closed(mechanism: str) -> None:
 
 def test_without_a_handler_nobody_gets_in() -> None:
     """libzmq alone would let in whoever has any key at all."""
-    with door(guarded=False) as at, calling(sockets.dealer, at.addresses.control, ROBOT) as robot:
+    with door(guarded=False) as at, closing(Caller(sockets.dealer, at.addresses.control, ROBOT)) as robot:
         until(lambda: bool(robot.heard()))
         assert not robot.monitor.connected
         assert not at.control
@@ -282,7 +260,7 @@ def test_a_revoked_key_stays_out_and_the_log_says_so(caplog: pytest.LogCaptureFi
 def test_a_key_allowed_later_gets_in() -> None:
     """Not by libzmq's own reconnecting: it never tries again after a refusal."""
     with door(allowed={}) as at:
-        with calling(sockets.dealer, at.addresses.control, ROBOT) as robot:
+        with closing(Caller(sockets.dealer, at.addresses.control, ROBOT)) as robot:
             until(lambda: bool(robot.heard()))
             at.allowed[ROBOT.public] = "robot1"
             assert robot.monitor.gave_up
@@ -295,8 +273,8 @@ def test_a_key_allowed_later_gets_in() -> None:
 def test_a_revocation_cuts_who_is_connected_and_nobody_else() -> None:
     with (
         door(allowed={ROBOT.public: "a", STRANGER.public: "b"}) as at,
-        calling(sockets.dealer, at.addresses.control, ROBOT) as revoked,
-        calling(sockets.dealer, at.addresses.control, STRANGER) as other,
+        closing(Caller(sockets.dealer, at.addresses.control, ROBOT)) as revoked,
+        closing(Caller(sockets.dealer, at.addresses.control, STRANGER)) as other,
     ):
         until(lambda: (revoked.heard(), other.heard()) == ("", ""))
         del at.allowed[ROBOT.public]
@@ -313,7 +291,7 @@ def test_a_revocation_cuts_who_is_connected_and_nobody_else() -> None:
 
 
 def test_connections_come_back_every_time() -> None:
-    with door() as at, calling(sockets.dealer, at.addresses.control, ROBOT) as robot:
+    with door() as at, closing(Caller(sockets.dealer, at.addresses.control, ROBOT)) as robot:
         for turn in range(5):
             until(lambda: robot.heard() == "" and robot.monitor.connected)
             assert robot.monitor.lost == turn
@@ -346,12 +324,12 @@ def null_greeting() -> bytes:
 def test_nobody_can_speak_for_another() -> None:
     with door(allowed={ROBOT.public: "a", STRANGER.public: "b"}) as at:
         claims = {name: STRANGER.public.encode() for name in (b"User-Id", b"user-id", b"X-User-Id")}
-        with lying(at.addresses.data, ROBOT, claims=claims) as liar:
+        with closing(Peer(at.addresses.data, ROBOT, claims=claims)) as liar:
             assert liar.taken
             liar.send(b"hello")
             until(lambda: bool(at.keyframes))
         assert at.keyframes == [([b"hello"], [ROBOT.public])]
-        with lying(at.addresses.data, STRANGER, claims={}, poses_as=ROBOT.public) as liar:
+        with closing(Peer(at.addresses.data, STRANGER, claims={}, poses_as=ROBOT.public)) as liar:
             assert not liar.taken
         assert len(at.keyframes) == 1
 
@@ -568,7 +546,7 @@ def test_garbled_words_end_the_connection_for_good() -> None:
     words = null_greeting() + b"\x04" + bytes([len(ready)]) + ready
     with (
         answering(words, to=b"READY", then=nonsense) as address,
-        calling(sockets.dealer, address, None) as caller,
+        closing(Caller(sockets.dealer, address, None)) as caller,
     ):
         until(lambda: caller.heard() is not None and caller.monitor.gave_up)
         assert caller.monitor.lost == 1

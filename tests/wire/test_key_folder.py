@@ -1,23 +1,23 @@
 # SPDX-License-Identifier: MIT
 """Keys: the command, the files and who may read them, and the list that a server follows."""
 
+import errno
 import json
 import logging
 import os
-import signal
 import stat
 import string
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import zmq
 import zmq.auth
-from command_processes import tsfusion
+from command_processes import Here, tsfusion
+from failures import refuse
 
-from tsfusion.cli import main
 from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.wire import curve, key_folder
 from tsfusion.wire.curve import client_keys
@@ -46,22 +46,23 @@ def server(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
+def one(server: Path) -> str:
+    """A key that the server allows, as robot1."""
+    made = key()
+    key_folder.allow(server, "robot1", made)
+    return made
+
+
+@pytest.fixture
+def run(here: Here) -> Run:
     """Run `tsfusion keys …` in an empty folder; its output, or its error."""
-    monkeypatch.chdir(tmp_path)
-    for name in [name for name in os.environ if name.startswith("TSFUSION_")]:
-        monkeypatch.delenv(name)
-    handler = signal.getsignal(signal.SIGTERM)
 
     def command(*words: object, status: int = 0) -> str:
-        with pytest.raises(SystemExit) as ended:
-            main(["keys", *map(str, words)])
-        said = capsys.readouterr()
-        assert ended.value.code == status, said
-        return said.err if status else said.out
+        done = here("keys", *words)
+        assert done.returncode == status, done
+        return done.stderr if status else done.stdout
 
-    yield command
-    signal.signal(signal.SIGTERM, handler)
+    return command
 
 
 # --- the command ---
@@ -137,9 +138,7 @@ def test_a_name_keeps_its_place_when_its_key_changes(server: Path) -> None:
     assert key_folder.read_allow_list(server).revoked == {new: "robot1"}
 
 
-def test_the_same_key_has_one_name(server: Path) -> None:
-    one = key()
-    key_folder.allow(server, "robot1", one)
+def test_the_same_key_has_one_name(server: Path, one: str) -> None:
     with pytest.raises(InvalidConfig, match=r"allowed under the name robot1 already; .* revoke robot1"):
         key_folder.allow(server, "robot2", one)
     key_folder.revoke(server, "robot1")
@@ -252,10 +251,7 @@ def test_a_failed_write_changes_nothing(server: Path, monkeypatch: pytest.Monkey
     key_folder.allow(server, "robot1", key())
     before = (server / key_folder.ALLOWED).read_bytes()
 
-    def full(handle: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", refuse(errno.ENOSPC))
     with pytest.raises(OutputError, match="No space left"):
         key_folder.allow(server, "robot2", key())
     with pytest.raises(OutputError, match="No space left"):
@@ -338,9 +334,7 @@ def test_the_list_is_read_again_only_when_it_changes(server: Path, monkeypatch: 
     assert allowed.rejection_reason(one) == "revoked"
 
 
-def test_a_key_under_another_name_is_another_client(server: Path) -> None:
-    one = key()
-    key_folder.allow(server, "robot1", one)
+def test_a_key_under_another_name_is_another_client(server: Path, one: str) -> None:
     allowed = AllowList(server)
     key_folder.revoke(server, "robot1")
     key_folder.allow(server, "robot2", one)
@@ -360,10 +354,8 @@ def test_a_key_under_another_name_is_another_client(server: Path) -> None:
     ],
 )
 def test_a_list_that_cannot_be_read_lets_nobody_in(
-    server: Path, content: bytes | None, caplog: pytest.LogCaptureFixture
+    server: Path, one: str, content: bytes | None, caplog: pytest.LogCaptureFixture
 ) -> None:
-    one = key()
-    key_folder.allow(server, "robot1", one)
     allowed = AllowList(server)
     good = (server / key_folder.ALLOWED).read_bytes()
     caplog.clear()
@@ -385,9 +377,7 @@ def test_a_list_that_cannot_be_read_lets_nobody_in(
     assert (allowed.name_of(one), allowed.problem) == ("robot1", "")
 
 
-def test_a_list_that_others_can_change_lets_nobody_in(server: Path) -> None:
-    one = key()
-    key_folder.allow(server, "robot1", one)
+def test_a_list_that_others_can_change_lets_nobody_in(server: Path, one: str) -> None:
     allowed = AllowList(server)
     (server / key_folder.ALLOWED).chmod(0o666)
     assert allowed.refresh()
@@ -398,10 +388,8 @@ def test_a_list_that_others_can_change_lets_nobody_in(server: Path) -> None:
 
 
 def test_a_stale_list_is_tried_again_though_its_file_is_the_same(
-    server: Path, monkeypatch: pytest.MonkeyPatch
+    server: Path, one: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one = key()
-    key_folder.allow(server, "robot1", one)
     server.chmod(0o777)
     allowed = AllowList(server)
     assert "others can change the folder" in allowed.problem

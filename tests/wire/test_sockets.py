@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Addresses, and the sockets that listen at them."""
+"""Addresses, the sockets that listen at them, and questions that nobody answers."""
 
 import socket
 from typing import Any
@@ -7,8 +7,10 @@ from typing import Any
 import pytest
 import zmq
 
-from tsfusion.core.errors import InvalidConfig, TransportError
+from tsfusion.core.errors import InvalidConfig, ServerUnreachable, TransportError
 from tsfusion.wire import sockets
+from tsfusion.wire.messages import Command
+from tsfusion.wire.queries import request
 from tsfusion.wire.sockets import control_address
 
 
@@ -23,11 +25,14 @@ def test_the_control_socket_is_the_next_port_unless_told() -> None:
     [
         *("", "127.0.0.1:5555", "tcp://127.0.0.1", "tcp://:5555", "udp://127.0.0.1:5"),
         *("tcp://127.0.0.1:99999", "tcp://127.0.0.1:5555/x", "tcp://host:port"),
+        *("tcp://a b:5555", "tcp://127.0.0.1:5555?x", "tcp://u@127.0.0.1:5", "tcp://\0:5"),
     ],
 )
 def test_a_malformed_address_is_one_clear_error(address: str) -> None:
     with pytest.raises(InvalidConfig, match="an address looks like"):
         control_address(address)
+    with pytest.raises(InvalidConfig, match="an address looks like"):
+        sockets.parse_address(address)
 
 
 @pytest.mark.parametrize("address", ["tcp://0.0.0.0:5555", "tcp://*:5555", "tcp://192.168.1.4:5555"])
@@ -63,3 +68,11 @@ def test_a_taken_port_is_one_clear_error() -> None:
         address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
         with pytest.raises(TransportError, match=f"cannot listen on {address}: Address already in use"):
             sockets.check_free(address)
+
+
+def test_a_dead_server_is_one_clear_error() -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{unused.getsockname()[1]}"
+        with pytest.raises(ServerUnreachable, match=f"no server answered at {address} within 0.2 s"):
+            request(address, Command(name="status"), timeout=0.2)
