@@ -24,7 +24,7 @@ app = typer.Typer(
     `--key tsfusion-keys/robot1.key_secret --server-key KEY`, with the key that step 1 printed.
 
     A secret key never leaves the machine that made it.
-    """,
+    """
 )
 Dir = Annotated[
     Path,

@@ -42,8 +42,7 @@ def replay(
     rate: Rate = None,
     max_keyframes: Limit = None,
     start: Annotated[
-        int,
-        typer.Option(metavar="N", min=0, rich_help_panel=_DATASET, help="Skip so many at the start."),
+        int, typer.Option(metavar="N", min=0, rich_help_panel=_DATASET, help="Skip so many at the start.")
     ] = 0,
     stride: Annotated[
         int, typer.Option(metavar="N", min=1, rich_help_panel=_DATASET, help="Take every N-th keyframe only.")
@@ -54,8 +53,7 @@ def replay(
     unpack: options.Unpack = False,
     option: options.DatasetOptions = None,
     state: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Keep journal and map of the run's server here."),
+        Path | None, typer.Option(metavar="DIR", help="Keep journal and map of the run's server here.")
     ] = None,
     check_: Annotated[
         bool, typer.Option("--check/--no-check", help="Warn when the dataset's poses and depth disagree.")
@@ -142,13 +140,9 @@ def _warn_of_disagreement(dataset: "Dataset") -> None:
 def demo(
     *,
     out: Out = Path("out"),
-    world: Annotated[
-        str,
-        typer.Option(metavar="NAME", help="room, or street (stereo, 0.1 m)."),
-    ] = "room",
+    world: Annotated[str, typer.Option(metavar="NAME", help="room, or street (stereo, 0.1 m).")] = "room",
     count: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=1, help="Keyframes; default 90, in the street 40."),
+        int | None, typer.Option(metavar="N", min=1, help="Keyframes; default 90, in the street 40.")
     ] = None,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Random seed of the sensor's noise.")] = 0,
     rate: Annotated[

@@ -25,15 +25,12 @@ def status(
     server_key: options.ServerKey = None,
     map_: Annotated[str | None, typer.Option("--map", metavar="NAME", help="Only this map.")] = None,
     watch: Annotated[
-        float | None,
-        typer.Option(metavar="SECONDS", min=0.1, help="Ask again every so many seconds."),
+        float | None, typer.Option(metavar="SECONDS", min=0.1, help="Ask again every so many seconds.")
     ] = None,
     stall_after: Annotated[
         float,
         typer.Option(
-            metavar="SECONDS",
-            min=0.1,
-            help="Stalled: keyframes wait, and none is fused for so long.",
+            metavar="SECONDS", min=0.1, help="Stalled: keyframes wait, and none is fused for so long."
         ),
     ] = 10.0,
     timeout: Annotated[

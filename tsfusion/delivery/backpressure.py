@@ -65,10 +65,7 @@ class Backpressure:
             JournalError: as `put`.
         """
         frames = corrections.encode(
-            correction,
-            session=self._outbox.session,
-            seq=self._outbox.next_seq,
-            map_name=self._config.map,
+            correction, session=self._outbox.session, seq=self._outbox.next_seq, map_name=self._config.map
         )
         return self._store(frames, None)
 

@@ -37,12 +37,7 @@ class Sender:
     """Owns the sockets; `run` is the thread's body."""
 
     def __init__(
-        self,
-        address: str,
-        control: str,
-        outbox: Outbox,
-        config: ClientConfig,
-        keys: ClientKeys | None = None,
+        self, address: str, control: str, outbox: Outbox, config: ClientConfig, keys: ClientKeys | None = None
     ) -> None:
         self._data_address = address
         self._control_address = control
@@ -115,11 +110,7 @@ class Sender:
         polled = [(source, zmq.POLLIN) for source in sources]
         if self._blocked:
             polled.append((self._data.socket, zmq.POLLOUT))
-        others = (
-            self._read_due if self._unread else 0.0,
-            self._control.due,
-            self._data.due,
-        )
+        others = (self._read_due if self._unread else 0.0, self._control.due, self._data.due)
         due = min([self._control_session.due, *filter(None, others)])
         zmq.zmq_poll(polled, max(int((due - now) * 1000), 1))
         with suppress(BlockingIOError):

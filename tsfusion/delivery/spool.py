@@ -84,11 +84,7 @@ class Spool:
     """
 
     def __init__(
-        self,
-        folder: str | os.PathLike[str] | None,
-        segment_bytes: int,
-        *,
-        map_name: str = DEFAULT_MAP,
+        self, folder: str | os.PathLike[str] | None, segment_bytes: int, *, map_name: str = DEFAULT_MAP
     ) -> None:
         self.temporary = folder is None
         self.map_name = map_name

@@ -112,10 +112,7 @@ class Gateway:
         """The handler of each socket's messages; none while the sockets are made anew."""
         if self.ports.problem:
             return {}
-        handlers: Handlers = {
-            self.ports.control: self._on_control,
-            self.ports.viewers: self._on_subscription,
-        }
+        handlers: Handlers = {self.ports.control: self._on_control, self.ports.viewers: self._on_subscription}
         if self._accepting:
             handlers[self.ports.keyframes] = self._intake.handle
         elif self._stopped:

@@ -17,13 +17,7 @@ from tsfusion.datasets.dataset import Frames, keep_posed, nearest_in_time, requi
 from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.messages import MILLIMETRES
 from tsfusion.datasets.rosbag.poses import PoseFinder, pose_streams
-from tsfusion.datasets.rosbag.reader import (
-    ENDINGS,
-    BagRecording,
-    Message,
-    MessageLocation,
-    recording,
-)
+from tsfusion.datasets.rosbag.reader import ENDINGS, BagRecording, Message, MessageLocation, recording
 from tsfusion.datasets.rosbag.topics import Modality, TopicChooser, recorded_scale
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.frame import Frame
