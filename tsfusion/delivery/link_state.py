@@ -28,14 +28,10 @@ Kind = Literal["connecting", "connected", "held", "opening", "refused", "locked_
 
 
 class LinkState(Struct, frozen=True):
-    """One state of the link; each method gives the next one after an event.
-
-    Attributes:
-        why: for a person, why nothing is taken; empty = nothing is known against it.
-    """
+    """One state of the link; each method gives the next one after an event."""
 
     kind: Kind = "connecting"
-    why: str = ""
+    why: str = ""  # for a person, why nothing is taken; empty = nothing is known against it
 
     @property
     def is_connected(self) -> bool:

@@ -50,17 +50,11 @@ class Waiting(Struct, frozen=True, gc=False):
 
 
 class Segment(Struct):
-    """One file of the spool.
+    """One file of the spool."""
 
-    Attributes:
-        nbytes: its size on the disk.
-        waiting: records in it that wait.
-        withdrawn: numbers of the records in it that left the spool unsent or refused.
-    """
-
-    nbytes: int = 0
-    waiting: int = 0
-    withdrawn: list[int] = []
+    nbytes: int = 0  # on the disk
+    waiting: int = 0  # records in it that wait
+    withdrawn: list[int] = []  # numbers of the records in it that left the spool unsent or refused
 
 
 class Spool:

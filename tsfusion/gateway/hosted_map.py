@@ -258,14 +258,10 @@ def _warn_of_old_corrections(folder: Path) -> None:
 
 
 class DiskPause:
-    """The time after the disk refused a keyframe, in which no other is tried.
-
-    Attributes:
-        problem: why no keyframe is taken; empty = they are.
-    """
+    """The time after the disk refused a keyframe, in which no other is tried."""
 
     def __init__(self, journal: Journal, min_free_bytes: int, map_name: str) -> None:
-        self.problem = ""
+        self.problem = ""  # why no keyframe is taken; empty = they are
         self._journal = journal
         self._min_free_bytes = min_free_bytes
         self._map = map_name

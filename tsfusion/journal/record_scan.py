@@ -28,18 +28,13 @@ _HEAD_SHAPE = re.compile(rb"(?s)\x06(?=.{5}\0{3}.{16}.{5}\0{3}.{4}\0{4}.{5}\0{3}
 
 
 class Damage(Struct, frozen=True):
-    """A stretch of a segment that is not as it was written.
-
-    Attributes:
-        lost: lower bound of the keyframes that it destroyed; 0 = only parts that readers do not need.
-        torn: the end of the last write, cut off before it was acknowledged: no keyframe is lost.
-    """
+    """A stretch of a segment that is not as it was written."""
 
     position: Position
     nbytes: int
-    lost: int
+    lost: int  # lower bound of the keyframes that it destroyed; 0 = only parts that readers do not need
     what: str
-    torn: bool = False
+    torn: bool = False  # the end of the last write, cut off before it was acknowledged: no keyframe is lost
 
 
 def scan_records(path: Path) -> Iterator[Record | Damage]:

@@ -27,18 +27,12 @@ _NO_TURN = 1e-6
 
 
 class ImageTopic(NamedTuple):
-    """A topic of images.
-
-    Attributes:
-        base: the topic without its transport.
-        first: its first message that can be decoded.
-        size: height and width.
-    """
+    """A topic of images."""
 
     stream: Stream
-    base: str
-    first: Any
-    size: tuple[int, int]
+    base: str  # the topic without its transport
+    first: Any  # its first message that can be decoded
+    size: tuple[int, int]  # height and width
     frame: str
 
     @property

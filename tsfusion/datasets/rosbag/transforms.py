@@ -142,14 +142,10 @@ class Transforms:
 
 
 class TransformTrack(NamedTuple):
-    """Poses of one frame in another.
-
-    Attributes:
-        body: the frame whose pose it is; empty = the topic does not name it.
-    """
+    """Poses of one frame in another."""
 
     world: str
-    body: str
+    body: str  # the frame whose pose it is; empty = the topic does not name it
     trajectory: Trajectory
 
 

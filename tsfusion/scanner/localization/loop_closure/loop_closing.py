@@ -32,21 +32,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(kw_only=True)
 class LoopCounts:
-    """Counts since the last `reset`.
+    """Counts since the last `reset`."""
 
-    Attributes:
-        keyframes: tracking keyframes.
-        checks: places compared.
-        verified: comparisons that found the same place.
-        closed: loops accepted.
-        optimisations: of the pose graph.
-    """
-
-    keyframes: int = 0
-    checks: int = 0
-    verified: int = 0
-    closed: int = 0
-    optimisations: int = 0
+    keyframes: int = 0  # tracking keyframes
+    checks: int = 0  # places compared
+    verified: int = 0  # comparisons that found the same place
+    closed: int = 0  # loops accepted
+    optimisations: int = 0  # of the pose graph
 
 
 class LoopClosing:

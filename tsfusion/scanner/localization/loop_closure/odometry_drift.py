@@ -31,18 +31,13 @@ class OdometryChain:
 
     The covariance of a stretch is a difference of two sums in the world's axes: it costs the same over ten
     keyframes and over ten thousand.
-
-    Attributes:
-        poses: keyframe → (4, 4) T_world_camera by odometry.
-        ways: keyframe → metres and radians along the path since the first.
-        edges: from each to the next, for the pose graph.
     """
 
     def __init__(self, drift: OdometryDrift) -> None:
         self._drift = drift
-        self.poses: dict[int, se3.Transform] = {}
-        self.edges: list[PoseGraphEdge] = []
-        self.ways: dict[int, float] = {}
+        self.poses: dict[int, se3.Transform] = {}  # keyframe → (4, 4) T_world_camera by odometry
+        self.edges: list[PoseGraphEdge] = []  # from each to the next, for the pose graph
+        self.ways: dict[int, float] = {}  # keyframe → metres and radians along the path since the first
         self._sums: dict[int, se3.Matrix6] = {}  # (6, 6), world axes
 
     def add(self, number: int, T_world_camera: se3.Transform) -> None:

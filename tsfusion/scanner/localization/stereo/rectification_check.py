@@ -57,14 +57,10 @@ class RectificationCheck:
 
 
 class RectificationMonitor:
-    """Collect errors of pairs and motions, and warn once of each problem.
-
-    Attributes:
-        check: result so far; None until there were enough pairs.
-    """
+    """Collect errors of pairs and motions, and warn once of each problem."""
 
     def __init__(self) -> None:
-        self.check: RectificationCheck | None = None
+        self.check: RectificationCheck | None = None  # result so far; None until there were enough pairs
         self._left: list[Pixels] = []
         self._right: list[Pixels] = []
         self._offsets: list[float] = []

@@ -49,19 +49,12 @@ class StereoCamera:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Motion found by `refine`.
+    """Motion found by `refine`."""
 
-    Attributes:
-        T_old_new: (4, 4) pose of the second camera in the axes of the first.
-        agree: (n,) bool, points whose errors their uncertainties explain.
-        offset: pixels to add to every disparity; 0 unless it was estimated.
-        offset_sigma: pixels, standard deviation of the offset.
-    """
-
-    T_old_new: se3.Transform
-    agree: NDArray[np.bool_]
-    offset: float
-    offset_sigma: float
+    T_old_new: se3.Transform  # (4, 4) pose of the second camera in the axes of the first
+    agree: NDArray[np.bool_]  # (n,) bool, points whose errors their uncertainties explain
+    offset: float  # pixels to add to every disparity; 0 unless it was estimated
+    offset_sigma: float  # pixels, standard deviation of the offset
 
 
 def refine(
