@@ -102,7 +102,7 @@ class Client:
             TransportError: after `close`, also when that happens while this waits.
         """
         while True:
-            self._await_turn()
+            self._outbox.wait(lambda: not self._pressure.must_wait, None, self._check_running)
             with self._sending:
                 self._check_running()
                 if self._pressure.must_wait:  # another thread took the turn
@@ -244,9 +244,6 @@ class Client:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-    def _await_turn(self) -> None:
-        self._outbox.wait(lambda: not self._pressure.must_wait, None, self._check_running)
 
     def _check_running(self) -> None:
         if self._closed:

@@ -18,6 +18,7 @@ from msgspec import Struct
 
 from tsfusion import journal
 from tsfusion.core.config import DEFAULT_MAP
+from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.delivery.tombstones import Tombstones
@@ -105,7 +106,10 @@ class Spool:
         self.session = sessions.pop()
         self._tombstones = Tombstones(self.folder, self.session)
         self._compact_at = 2 * self._tombstones.written + _MANY_TOMBSTONES
-        self._segments = {number: Segment(self._size(number)) for number in journal.segments(self.folder)}
+        self._segments = {
+            number: Segment(size_of(journal.segment_path(self.folder, number)))
+            for number in journal.segments(self.folder)
+        }
         self.waiting: deque[Waiting] = deque()
         for record in found:
             segment = self._segments[record.position.segment]
@@ -127,12 +131,6 @@ class Spool:
                 f"{self.folder} holds {len(self.waiting)} keyframes for the map {left_for}, not for "
                 f"{map_name}: send them first (a client with map={left_for!r}), or use another spool folder"
             )
-
-    def _size(self, number: int) -> int:
-        try:
-            return journal.segment_path(self.folder, number).stat().st_size
-        except OSError:
-            return 0
 
     def _left_for(self) -> str | None:
         """The map of what a dead scanner left: that of the first record that can be read."""

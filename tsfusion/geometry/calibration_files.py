@@ -65,20 +65,25 @@ def rig_of_camera_info(left: Camera, right: Camera, R: Any, P: Any) -> StereoRig
     return StereoRig(left, right, T)
 
 
+def read_text(path: Path, content: str) -> str:
+    """Read a text file, with or without a byte order mark; DatasetError says that `content` was expected."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise DatasetError(f"{path} is missing; expected {content}") from error
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{path} is not a text file; expected {content}") from error
+    except OSError as error:
+        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
+
+
 def read_tree(path: Path) -> Tree:
     """Read a YAML, JSON or XML file as nested dictionaries and lists; numbers become floats.
 
     Raises:
         DatasetError: the file cannot be read or parsed.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise DatasetError(f"{path} is missing; expected {EXPECTED}") from error
-    except UnicodeDecodeError as error:
-        raise DatasetError(f"{path} is not a text file; expected {EXPECTED}") from error
-    except OSError as error:
-        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
+    text = read_text(path, EXPECTED)
     if _is_too_large(text):
         raise DatasetError(f"{path} is far too large or too deep for a calibration; expected {EXPECTED}")
     try:

@@ -8,6 +8,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from tsfusion.core.config import MAP_NAME
+from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import JournalError
 from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.quarantine import quarantined_files
@@ -108,7 +109,7 @@ class JournalPlace(Struct, frozen=True):
 
     def steps(self, watch: Watcher = lambda _done, _all: None) -> Iterator[tuple[Path, Record | Damage]]:
         """Records and damaged places, each with its file; a file that cannot be read is a damaged place."""
-        files = [(path, _size(path)) for path in self.files()]
+        files = [(path, size_of(path)) for path in self.files()]
         total, before = sum(size for _, size in files), 0
         for path, size in files:
             try:
@@ -165,10 +166,3 @@ def _of_map(folder: Path) -> JournalPlace:
 
 def _is_map(folder: Path) -> bool:
     return (folder / QUARANTINE_FOLDER).is_dir()
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError:
-        return 0
