@@ -140,7 +140,7 @@ class ServerWatcher:
         missing = self._only if self._only and not selected else ""
         return ServerSnapshot(
             address=self._address, health=health, stalled=stalled, missing=missing, only=self._only
-        )  # fmt: skip
+        )
 
     def _with_maps(self, snapshot: ServerSnapshot, health: Health, *, always: bool) -> ServerSnapshot:
         deadline = time.monotonic() + self._timeout

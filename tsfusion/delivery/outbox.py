@@ -60,24 +60,17 @@ class ClientStats(Struct, frozen=True):
 
 
 class Outbox:
-    """The spool, the fate of what passed through it, and the state of the link. For any thread.
-
-    Attributes:
-        link_state: how client and server stand with each other; replaced whole, by the sending thread alone.
-        session: 16 bytes that name the spool's session.
-        spool_folder: where the spool is.
-        is_temporary: the spool goes away when it is closed.
-        state: of the spool, as in `ClientStats`; set by the one thread that writes to it.
-    """
+    """The spool, the fate of what passed through it, and the state of the link. For any thread."""
 
     def __init__(self, spool: Spool) -> None:
         self._changed = threading.Condition()
         self._spool = spool
+        # How client and server stand with each other; replaced whole, by the sending thread alone
         self.link_state = LinkState()
-        self.session = spool.session
+        self.session = spool.session  # 16 bytes
         self.spool_folder = spool.folder
-        self.is_temporary = spool.temporary
-        self.state = "ok"
+        self.is_temporary = spool.temporary  # goes away when it is closed
+        self.state = "ok"  # of the spool, as in `ClientStats`; set by the one thread that writes to it
         self._outstanding = 0  # of the oldest in the spool, so many are on their way
         self._unfused: deque[int] = deque()  # durable, and not answered by the map
         self._unmeshed: deque[int] = deque(maxlen=_MOST_REMEMBERED)

@@ -36,16 +36,11 @@ class PendingQuery(Struct, frozen=True):
 
 
 class LastMesh(Struct, frozen=True):
-    """The last mesh of a map that was made on request.
-
-    Attributes:
-        nbytes: its size.
-        asked_at, rest_until: `time.monotonic()`; between them a map that gets keyframes makes no other.
-    """
+    """The last mesh of a map that was made on request."""
 
     nbytes: int
-    asked_at: float
-    rest_until: float
+    asked_at: float  # `time.monotonic()`
+    rest_until: float  # until then a map that gets keyframes makes no other
 
 
 class FuserQueries:

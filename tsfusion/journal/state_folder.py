@@ -73,14 +73,10 @@ Watcher = Callable[[int, int], None]  # bytes read, bytes of all
 
 
 class JournalPlace(Struct, frozen=True):
-    """A journal on the disk.
+    """A journal on the disk."""
 
-    Attributes:
-        path: a folder of segments, or one segment file.
-        quarantine: folder of the keyframes that could not be fused; None = the journal is no map's.
-    """
-
-    path: Path
+    path: Path  # a folder of segments, or one segment file
+    # Folder of the keyframes that could not be fused; None = the journal is no map's
     quarantine: Path | None = None
 
     def files(self) -> list[Path]:

@@ -43,19 +43,11 @@ class MapResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `run.json` of a scan holds.
-
-    Attributes:
-        complete: whether the source was read to its end: false after a failure, and for a recording after
-            Ctrl-C.
-        left: keyframes still in the spool at the end.
-        link: why the server took nothing at the end; empty = it did.
-        seconds: from the first frame until the last keyframe was fused (or acknowledged, elsewhere).
-        tracking_cpu_ms: CPU milliseconds of the localizer a frame.
-    """
+    """What `run.json` of a scan holds."""
 
     source: str
     localizer: str
+    # Whether the source was read to its end: false after a failure, and for a recording after Ctrl-C
     complete: bool
     frames: int
     frames_tracked: int
@@ -65,10 +57,10 @@ class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
     keyframes_fused: int
     keyframes_rejected: dict[str, int]
     keyframes_by_rule: dict[str, int]
-    left: int
-    link: str
-    seconds: float
-    tracking_cpu_ms: float
+    left: int  # keyframes still in the spool at the end
+    link: str  # why the server took nothing at the end; empty = it did
+    seconds: float  # from the first frame until the last keyframe was fused (or acknowledged, elsewhere)
+    tracking_cpu_ms: float  # CPU milliseconds of the localizer a frame
     maps: list[MapResult]
     delay_ms: Spread
     peak_rss_bytes: dict[str, int]

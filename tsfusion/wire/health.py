@@ -20,33 +20,25 @@ MapState = Literal["opening", "idle", "busy", "restarting", "failed"]
 
 
 class MapHealth(Struct, frozen=True, kw_only=True):
-    """Health of one map, as far as the gateway knows it without asking the fuser.
-
-    Attributes:
-        problem: reason why keyframes are not accepted or not fused; empty = they are.
-        waiting: number of keyframes that are durable, but not yet fused or rejected.
-        rejected: number of journaled keyframes that could not be fused, by reason.
-        quarantined: number of keyframes kept aside for inspection.
-        last_keyframe_s: seconds since the last keyframe was journaled; None = none since the server began.
-        delay_bound_ms: error bound of the delays (half the best round trip of the worst client).
-    """
+    """Health of one map, as far as the gateway knows it without asking the fuser."""
 
     state: MapState
-    problem: str
+    problem: str  # reason why keyframes are not accepted or not fused; empty = they are
     keyframes_durable: int
     keyframes_fused: int
-    waiting: int
-    rejected: dict[str, int]
-    quarantined: int
+    waiting: int  # number of keyframes that are durable, but not yet fused or rejected
+    rejected: dict[str, int]  # number of journaled keyframes that could not be fused, by reason
+    quarantined: int  # number of keyframes kept aside for inspection
     sessions: int
     journal_bytes: int
     journal_damaged: int  # records the recovery scan could not read
     fuser_restarts: int
     blocks: int
     map_bytes: int
+    # Seconds since the last keyframe was journaled; None = none since the server began
     last_keyframe_s: float | None
     delay_ms: Spread
-    delay_bound_ms: float
+    delay_bound_ms: float  # error bound of the delays (half the best round trip of the worst client)
     corrections: int = 0  # records of corrected poses: in the journal at the start, and journaled since
 
 

@@ -55,16 +55,11 @@ _UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
 
 
 class Cloud(NamedTuple):
-    """Points of one sweep.
+    """Points of one sweep."""
 
-    Attributes:
-        points: (N, 3) float32 metres; NaN where there was no return.
-        color: (N, 3) uint8 BGR.
-        times_s: (N,) float32 seconds from the header's stamp; None = all at once, or unknown.
-    """
-
-    points: NDArray[np.float32]
-    color: NDArray[np.uint8] | None
+    points: NDArray[np.float32]  # (N, 3) float32 metres; NaN where there was no return
+    color: NDArray[np.uint8] | None  # (N, 3) uint8 BGR
+    # (N,) float32 seconds from the header's stamp; None = all at once, or unknown
     times_s: NDArray[np.float32] | None
 
 

@@ -47,26 +47,17 @@ class ColorCamera(NamedTuple):
 
 
 class ChosenTopics(NamedTuple):
-    """The topics of one sensor.
-
-    Attributes:
-        main: depth images, left images or point clouds.
-        other: colour images of the depth, or right images; None = none.
-        frame: of `main`; empty = its messages name none.
-        size: height and width of an image of `main`.
-        view, rig: the camera of depth images, or those of a pair.
-        color_camera: the camera of `other`, where its images have to be registered to the depth.
-    """
+    """The topics of one sensor."""
 
     modality: Modality
-    main: Stream
-    other: Stream | None
+    main: Stream  # depth images, left images or point clouds
+    other: Stream | None  # colour images of the depth, or right images; None = none
     sensor: str
-    frame: str
-    size: tuple[int, int]
-    view: CameraView | None = None
-    rig: CameraRig | None = None
-    color_camera: ColorCamera | None = None
+    frame: str  # of `main`; empty = its messages name none
+    size: tuple[int, int]  # height and width of an image of `main`
+    view: CameraView | None = None  # the camera of depth images
+    rig: CameraRig | None = None  # the cameras of a pair
+    color_camera: ColorCamera | None = None  # of `other`, where its images are registered to the depth
 
     def check_size(self, stream: Stream, size: tuple[int, ...]) -> None:
         """Raise DatasetError for an image of a stream whose size is not that of the stream's first one."""

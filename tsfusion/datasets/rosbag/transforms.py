@@ -150,14 +150,10 @@ class TransformTrack(NamedTuple):
 
 
 class PoseTopic:
-    """Poses of one topic, collected message by message.
-
-    Attributes:
-        world, body: frames that the first message names; an empty body = it names none.
-    """
+    """Poses of one topic, collected message by message."""
 
     def __init__(self) -> None:
-        self.world, self.body = "", ""
+        self.world, self.body = "", ""  # frames that the first message names; an empty body = it names none
         self._samples, self._began = PoseSamples(), False
 
     def add(self, message: Any, kind: str) -> None:

@@ -21,15 +21,11 @@ _CHUNK = 1 << 16  # points measured at once
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Solids and the sensor's path.
-
-    Attributes:
-        solids: (m, 11) float64, metres.
-        paths: `paths[name](index, count)` → (4, 4) T_world_camera, OpenCV axes; the first is the usual one.
-    """
+    """Solids and the sensor's path."""
 
     name: str
-    solids: Solids
+    solids: Solids  # (m, 11) float64, metres
+    # `paths[name](index, count)` → (4, 4) T_world_camera, OpenCV axes; the first is the usual one
     paths: dict[str, Callable[[int, int], NDArray[np.float64]]]
 
     def distance(self, points: NDArray[np.floating]) -> NDArray[np.float64]:

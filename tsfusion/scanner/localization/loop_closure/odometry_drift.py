@@ -11,19 +11,13 @@ from tsfusion.scanner.localization.loop_closure.pose_graph import PoseGraphEdge
 
 @dataclass(frozen=True, kw_only=True)
 class OdometryDrift:
-    """Standard deviations of odometry over a way; a radian of turning counts as a metre of way.
+    """Standard deviations of odometry over a way; a radian of turning counts as a metre of way."""
 
-    Attributes:
-        translation, rotation: metres and radians after one metre; they grow with the root of the way.
-        translation_bias, rotation_bias: systematic error, metres and radians a metre.
-        floor: metres (and a third of it in radians) of each single step.
-    """
-
-    translation: float = 0.02
-    rotation: float = 0.01
-    translation_bias: float = 0.01
-    rotation_bias: float = 0.002
-    floor: float = 0.002
+    translation: float = 0.02  # metres after one metre; grows with the root of the way
+    rotation: float = 0.01  # radians, likewise
+    translation_bias: float = 0.01  # systematic error, metres a metre
+    rotation_bias: float = 0.002  # radians a metre
+    floor: float = 0.002  # metres (and a third of it in radians) of each single step
 
 
 class OdometryChain:
