@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How the client and its server stand with each other: every state, and every way from one to another.
+"""State of the link between client and server: every state, and every way from one to another.
 
     connecting   nobody has answered yet, or a server has let us in and its first answer is awaited
     connected    the server answers, and takes what is sent

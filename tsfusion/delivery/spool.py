@@ -67,13 +67,6 @@ class Spool:
         folder: None = a temporary folder, deleted at `close` with all that is in it.
         map_name: the map that new records are for.
 
-    Attributes:
-        waiting: the records, oldest first.
-        waiting_bytes: the bytes of their messages.
-        used_bytes: of the disk; records that have left the queue but share a file with others count.
-        next_seq: the number of the next record.
-        left: the last number that an earlier scanner is known to have used; 0 = there was none.
-
     Raises:
         JournalError: when the folder cannot be used, another scanner uses it, or it waits for another map.
     """
@@ -110,7 +103,7 @@ class Spool:
             number: Segment(size_of(journal.segment_path(self.folder, number)))
             for number in journal.segments(self.folder)
         }
-        self.waiting: deque[Waiting] = deque()
+        self.waiting: deque[Waiting] = deque()  # oldest first
         for record in found:
             segment = self._segments[record.position.segment]
             if record.seq in self._tombstones.numbers:
@@ -121,9 +114,10 @@ class Spool:
                 self.waiting.append(Waiting(*place, record.is_correction))
         self.waiting_bytes = sum(entry.nbytes for entry in self.waiting)
         last = max([record.seq for record in found] + [*self._tombstones.numbers], default=0)
-        self.left = last
+        self.left = last  # the last number that an earlier scanner used; 0 = there was none
         self.next_seq = last + _RESTART_GAP + secrets.randbelow(_RESTART_SPREAD) if last else 1
         self._idle = {number for number, segment in self._segments.items() if not segment.waiting}
+        # On the disk: records that have left the queue but share a file with others count
         self.used_bytes = sum(segment.nbytes for segment in self._segments.values())
         left_for = self._left_for()
         if left_for not in (None, map_name):

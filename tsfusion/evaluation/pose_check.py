@@ -140,7 +140,7 @@ class _Pair:
         return np.asarray(np.linalg.inv(second) @ first, np.float64)
 
     def fit(self, motion: Motion) -> float:
-        """How well the first frame's points lie on the second's surface, 0 to 1; 0 if too few do."""
+        """Fit of the first frame's points to the second's surface, 0 to 1; 0 if too few can be compared."""
         deviation = self.second_view.deviation(se3.apply(motion, self.first_view.points))
         compared = np.isfinite(deviation)
         if compared.mean() < MIN_COMPARED:

@@ -123,7 +123,7 @@ SCALES: tuple[tuple[float, str], ...] = (
 
 
 def scale_text(factor: float) -> str:
-    """What is wrong where translations must be multiplied by a factor, and what to do."""
+    """Description of the mistake where translations must be multiplied by a factor, and what to do."""
     known = dict(SCALES)
     if factor in known:
         return f"poses and depth disagree: {known[factor]}"

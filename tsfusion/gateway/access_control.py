@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Who may connect: keys and the allow-list, checked when a connection is made and again at every message."""
+"""Keys and allow-list: checked when a connection is made, and again at every message."""
 
 import logging
 import time

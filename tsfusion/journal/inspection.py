@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a journal holds, and whether all of it is as it was written."""
+"""Contents of a journal, and the check that all of it is as it was written."""
 
 import math
 from array import array
@@ -249,7 +249,7 @@ def _missing(files: list[Path]) -> Iterator[Problem]:
 
 
 class _Checks:
-    """What can be wrong with a record whose CRC is right."""
+    """Checks of a record whose CRC is right."""
 
     def __init__(self) -> None:
         self._last: dict[bytes, int] = {}

@@ -152,7 +152,7 @@ class _Scan:
     # --- between records ---
 
     def _damage(self, at: int) -> Damage:
-        """What is wrong at a place where a record should start, and how far it reaches."""
+        """The damage at a place where a record should start, and how far it reaches."""
         raw = self._source.read(at, mcap_layout.HEAD_BYTES, self._end)
         head = mcap_layout.parse_head(raw)
         end = at + head.nbytes if head is not None else None

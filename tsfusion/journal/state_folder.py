@@ -80,7 +80,7 @@ class JournalPlace(Struct, frozen=True):
     quarantine: Path | None = None
 
     def files(self) -> list[Path]:
-        """Its segments, oldest first; of a quarantine its files.
+        """List the segments, oldest first; of a quarantine the files.
 
         Raises:
             JournalError: when the folder cannot be listed.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What `run.json` of a replay holds."""
+"""Figures of a replay, and the contents of its `run.json`."""
 
 from typing import Any, Protocol, runtime_checkable
 
@@ -35,7 +35,7 @@ class Accuracy(msgspec.Struct, frozen=True):
 
 
 class ReplaySummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `run.json` of a replay holds."""
+    """Contents of `run.json` of a replay."""
 
     dataset: str
     keyframes_sent: int

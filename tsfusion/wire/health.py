@@ -43,28 +43,19 @@ class MapHealth(Struct, frozen=True, kw_only=True):
 
 
 class ClientHealth(Struct, frozen=True, kw_only=True):
-    """Health of one session that sent a message since the server began.
+    """Health of one session that sent a message since the server began."""
 
-    Attributes:
-        client: name that its key is allowed under; empty without keys.
-        session: first 8 hexadecimal digits of its number.
-        heard_s: seconds since its last message.
-        waiting, skipped: as in its last Ping.
-        held: reason why no keyframe of it is accepted now; empty = they are.
-        corrections: corrections of its session in the journal.
-    """
-
-    client: str
-    session: str
+    client: str  # name that its key is allowed under; empty without keys
+    session: str  # first 8 hexadecimal digits of its number
     map: str
-    heard_s: float
+    heard_s: float  # seconds since its last message
     durable: int
     fused: int
     received_bytes: int
-    waiting: int
+    waiting: int  # this and `skipped` as in its last Ping
     skipped: dict[str, int]
-    held: str
-    corrections: int = 0
+    held: str  # reason why no keyframe of it is accepted now; empty = they are
+    corrections: int = 0  # in the journal
 
 
 class Health(Struct, frozen=True, kw_only=True):

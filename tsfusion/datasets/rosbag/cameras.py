@@ -128,7 +128,7 @@ class Cameras:
         return next(iter(found.values())) if len(found) == 1 else None
 
     def view(self, images: ImageTopic) -> CameraView:
-        """How some images become those of a pinhole camera.
+        """Find how some images become those of a pinhole camera.
 
         Raises:
             DatasetError: the camera is missing, not calibrated, of another size, or of an unknown lens.
@@ -151,7 +151,7 @@ class Cameras:
         return None if stream is None or not _is_beside(stream.topic, images.base) else self.view(images)
 
     def rig(self, left: ImageTopic, right: ImageTopic) -> CameraRig:
-        """How a pair's images become those of two equal cameras whose rows match; raises as `view` does."""
+        """Find how a pair's images become those of two equal cameras with matching rows; raises as `view`."""
         cameras = [self._checked(one) for one in (left, right)]
         shift = cameras[0].P[0, 3] - cameras[1].P[0, 3]
         if not shift > 0:

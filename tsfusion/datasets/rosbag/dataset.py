@@ -207,7 +207,7 @@ class Bag(Frames):
         self._others = [self._others[i] for i in chosen]
 
     def _register(self, poses: PoseFinder) -> Registration | None:
-        """What brings the colour of a camera of its own onto the depth; else such colour is left out."""
+        """Registration that brings the colour of a separate camera onto the depth; None = it is left out."""
         chosen = self._chosen
         if chosen.color_camera is None or chosen.view is None or not len(self):
             return None

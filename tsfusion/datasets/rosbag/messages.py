@@ -76,7 +76,7 @@ class CameraInfo(NamedTuple):
 
 
 def encoding(message: Any) -> str:
-    """How the pixels of an Image or CompressedImage are meant: a ROS encoding."""
+    """Encoding of the pixels of an Image or CompressedImage, by ROS's name."""
     if hasattr(message, "encoding"):
         return str(message.encoding)
     return str(message.format).split(";")[0].strip()

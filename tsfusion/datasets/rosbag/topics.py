@@ -259,7 +259,7 @@ def recorded_scale(recording: BagRecording, depth: Stream) -> float | None:
 
 
 def _closeness(color: ImageTopic, depth: ImageTopic) -> tuple[object, ...]:
-    """How likely colour images belong to the depth images: by frame, name and rectification."""
+    """Rank of colour images as those of the depth images: by frame, name and rectification."""
     return (
         color.frame == depth.frame,
         bool(re.search(r"colou?r|rgb", color.base)),

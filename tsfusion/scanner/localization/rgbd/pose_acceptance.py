@@ -22,7 +22,7 @@ MAX_UNCERTAINTY = 0.01  # metres
 
 @dataclass(frozen=True)
 class PoseEvidence:
-    """How well a frame agrees with a keyframe at the pose found."""
+    """Agreement of a frame with a keyframe at the pose found."""
 
     overlap: float  # share of the frame's points that fall onto planes of the keyframe
     agreeing: float  # share of these points that lie on their planes
