@@ -99,7 +99,7 @@ def _print(snapshot: "ServerSnapshot", *, json: bool, line: bool) -> None:
     if not json:
         typer.echo(_text(render(snapshot)))
     elif line:
-        output.as_json_line(snapshot.as_json())
+        output.as_json(snapshot.as_json(), indent=None)
     else:
         output.as_json(snapshot.as_json())
     sys.stdout.flush()

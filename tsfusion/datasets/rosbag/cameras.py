@@ -14,6 +14,7 @@ from tsfusion.datasets.readers import checked_intrinsics, intrinsics_of
 from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.messages import CAMERA, CameraInfo
 from tsfusion.datasets.rosbag.reader import BagRecording, Message, Stream, frame_id
+from tsfusion.geometry import se3
 from tsfusion.geometry.calibration import Camera as Lens
 from tsfusion.geometry.calibration import Rectifier, StereoRig, Undistorter
 from tsfusion.geometry.keyframe import Intrinsics
@@ -206,7 +207,5 @@ def _turn(camera: CameraInfo) -> float:
 def _right_of(left: CameraInfo, right: CameraInfo) -> NDArray[np.float64]:
     """(4, 4) T_right_left: both turn by their `R` into rectified cameras, which stand side by side."""
     R_left, R_right = (one.R if one.R.any() else np.eye(3) for one in (left, right))
-    T = np.eye(4)
-    T[:3, :3] = R_right.T @ R_left
-    T[:3, 3] = R_right.T @ np.array([right.P[0, 3] / right.P[0, 0] - left.P[0, 3] / left.P[0, 0], 0, 0])
-    return T
+    t = R_right.T @ np.array([right.P[0, 3] / right.P[0, 0] - left.P[0, 3] / left.P[0, 0], 0, 0])
+    return se3.transform(R_right.T @ R_left, t)

@@ -10,9 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.geometry import se3
+
 Solids = NDArray[np.float64]  # (m, 11): kind, centre xyz, half sizes xyz, cos yaw, sin yaw, material, variant
 
-# As in kernels/synthetic.py, which cannot be imported without Taichi; a test compares them.
+# As in kernels/synthetic_raycast.py, which cannot be imported without Taichi; a test compares them.
 ROOM, BOX, SPHERE, CYLINDER, GROUND = range(5)
 INTERIOR, WOOD, MARBLE, STRIPES, ROAD, PAVEMENT, FACADE, PAINT, METAL, BARK, LEAVES, GLASS, PLAIN = range(13)
 
@@ -105,10 +107,7 @@ def look_at(position: NDArray[np.float64], target: NDArray[np.float64]) -> NDArr
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    T[:3, 3] = position
-    return T
+    return se3.transform(np.stack([right, np.cross(forward, right), forward], axis=1), position)
 
 
 def _circle(index: int, count: int) -> NDArray[np.float64]:
