@@ -3,7 +3,7 @@
 
 import pytest
 
-from tsfusion.delivery.link_state import Kind, LinkState
+from tsfusion.delivery.link_state import LinkKind, LinkState
 
 STATES: list[LinkState] = [
     LinkState(),
@@ -32,7 +32,7 @@ def test_who_is_refused_stays_so_until_a_welcome(state: LinkState) -> None:
     assert state.refused("why").reachable("another problem") == LinkState("refused", "why")
 
 
-def kinds_after(event: str, *arguments: str) -> list[Kind]:
+def kinds_after(event: str, *arguments: str) -> list[LinkKind]:
     return [getattr(state, event)(*arguments).kind for state in STATES]
 
 

@@ -13,7 +13,7 @@ from tsfusion.cli import options
 from tsfusion.cli.output import size
 
 if TYPE_CHECKING:
-    from tsfusion.journal.inspection import JournalInfo, Problem, SessionInfo, Verdict
+    from tsfusion.journal.inspection import JournalInfo, JournalVerdict, Problem, SessionInfo
     from tsfusion.journal.recovery import Recovery
     from tsfusion.journal.ros2_export import Export
     from tsfusion.journal.state_folder import JournalPlace, Watcher
@@ -175,7 +175,7 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def _records(found: "Recovery | Verdict") -> str:
+def _records(found: "Recovery | JournalVerdict") -> str:
     keyframes = _count(found.keyframes, "keyframe")
     return keyframes + (f" and {_count(found.corrections, 'correction')}" if found.corrections else "")
 
@@ -229,7 +229,7 @@ def _clock(stamp_ns: int) -> str:
     return moment.strftime("%Y-%m-%d %H:%M:%SZ")
 
 
-def _describe_verdict(verdict: "Verdict") -> str:
+def _describe_verdict(verdict: "JournalVerdict") -> str:
     read = f"{_records(verdict)} in {_count(verdict.segments, 'segment')}"
     judged = "intact" if verdict.intact else f"damaged; {_loss(verdict.lost)}"
     return "\n".join(

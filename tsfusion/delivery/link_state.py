@@ -24,13 +24,13 @@ from typing import Literal
 
 from msgspec import Struct
 
-Kind = Literal["connecting", "connected", "held", "opening", "refused", "locked_out", "silent"]
+LinkKind = Literal["connecting", "connected", "held", "opening", "refused", "locked_out", "silent"]
 
 
 class LinkState(Struct, frozen=True):
     """One state of the link; each method gives the next one after an event."""
 
-    kind: Kind = "connecting"
+    kind: LinkKind = "connecting"
     why: str = ""  # for a person, why nothing is taken; empty = nothing is known against it
 
     @property

@@ -8,7 +8,7 @@ from typing import Literal
 from msgspec import Struct, field
 
 _MAX_SESSIONS = 100_000  # of a map; each takes some 60 bytes of every checkpoint, for ever
-Verdict = Literal["next", "duplicate", "gap"]
+SeqOrder = Literal["next", "duplicate", "gap"]
 
 
 class Session(Struct, eq=False):
@@ -64,7 +64,7 @@ class Sessions:
             self._all.append(session)
         return session
 
-    def admit(self, key: bytes, seq: int, previous: int) -> Verdict:
+    def admit(self, key: bytes, seq: int, previous: int) -> SeqOrder:
         """Whether keyframe `seq` may be journaled, when the client has none between `previous` and it.
 
         Keyframes are taken in order only, so one number a session is enough to know every keyframe that ever

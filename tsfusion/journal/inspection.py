@@ -87,7 +87,7 @@ class JournalInfo(Struct, kw_only=True):
     quarantined: list[dict[str, Any]]  # name, bytes
 
 
-class Verdict(Struct, kw_only=True):
+class JournalVerdict(Struct, kw_only=True):
     """Whether a journal is whole. `lost`: keyframes that cannot be had any more, at least."""
 
     path: str
@@ -211,7 +211,7 @@ def problem(path: Path, damage: Damage) -> Problem:
     return Problem(kind, path.name, damage.position.offset, damage.nbytes, damage.lost, damage.what)
 
 
-def verify(place: JournalPlace, watch: Watcher) -> Verdict:
+def verify(place: JournalPlace, watch: Watcher) -> JournalVerdict:
     """Read and decode every record.
 
     Raises:
@@ -228,7 +228,7 @@ def verify(place: JournalPlace, watch: Watcher) -> Verdict:
             keyframes += not step.is_correction
             corrections += step.is_correction
             problems += checks.of(path, step)
-    return Verdict(
+    return JournalVerdict(
         path=str(place.path),
         intact=not any(one.kind == "damage" for one in problems),
         keyframes=keyframes,

@@ -61,7 +61,7 @@ class _Edge(NamedTuple):
         return self.trajectory.at(stamp, max_gap_ns=max_gap_ns)
 
 
-class Transforms:
+class TransformTree:
     """The tree of frames in /tf and /tf_static, each transform over time.
 
     A frame has one parent: of several, the one named most often.

@@ -48,7 +48,7 @@ class StereoCamera:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class StereoMotion:
     """Motion found by `refine`."""
 
     T_old_new: se3.Transform  # (4, 4) pose of the second camera in the axes of the first
@@ -65,7 +65,7 @@ def refine(
     rig: StereoCamera,
     *,
     with_offset: bool = False,
-) -> Motion | None:
+) -> StereoMotion | None:
     """Refine a motion by Gauss-Newton; None when the points do not determine it.
 
     Args:
@@ -96,7 +96,7 @@ def refine(
         if np.abs(step).max() < 1e-6:
             break
     sigma = PIXEL_SIGMA * float(np.sqrt(np.linalg.inv(H)[-1, -1])) if with_offset else 0.0
-    return Motion(se3.inverse(T_new_old), deviation < MAX_DEVIATION, offset, sigma)
+    return StereoMotion(se3.inverse(T_new_old), deviation < MAX_DEVIATION, offset, sigma)
 
 
 def _normal_equations(
