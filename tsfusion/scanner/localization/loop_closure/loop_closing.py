@@ -77,9 +77,7 @@ class LoopClosing:
         self._optimisation_due = False
         self._optimised_at = 0  # keyframes then
         self._lost = 0  # frames, since the last that was not
-        self._T_world_tracker: se3.Transform = np.eye(
-            4
-        )  # the tracker's world began anew where it was found again
+        self._T_world_tracker: se3.Transform = np.eye(4)  # another where the tracker was restarted
 
     def track(self, frame: Frame) -> Pose | Lost:
         """Track with the wrapped localizer; when it is lost, search for a known place to go on from."""
