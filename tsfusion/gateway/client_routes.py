@@ -22,7 +22,7 @@ _LARGEST_BOUND_NS = 3600 * 10**9
 class ClientRoute(Struct, eq=False):
     """A client that is connected."""
 
-    session: bytes  # 16 of them
+    session: bytes  # 16 bytes
     map: str  # that its keyframes go into
     identity: bytes  # of its connection to the control socket
     client: str = ""  # the name its key is allowed under; empty = no keys

@@ -31,7 +31,8 @@ class SegmentFile:
         self.path = path
         self._file = path.open("rb", buffering=0)
         self.size = os.fstat(self._file.fileno()).st_size
-        self.failed = self.answered = False  # whether the disk could not read some part; has read any part
+        self.failed = False  # the disk could not read some part that was asked for
+        self.answered = False  # the disk has read some part
 
     def __enter__(self) -> "SegmentFile":
         return self
