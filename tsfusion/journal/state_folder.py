@@ -134,7 +134,7 @@ def find_journal(path: Path, map_name: str | None = None) -> JournalPlace:
     path = resolve_map(path, map_name)
     if (path / JOURNAL_FOLDER).is_dir():
         return _of_map(path)
-    if path.name == JOURNAL_FOLDER and _is_map(path.parent):
+    if path.name == JOURNAL_FOLDER and (path.parent / QUARANTINE_FOLDER).is_dir():
         return _of_map(path.parent)
     if path.is_dir():
         return JournalPlace(path)
@@ -158,7 +158,3 @@ def is_journal(path: Path) -> bool:
 
 def _of_map(folder: Path) -> JournalPlace:
     return JournalPlace(folder / JOURNAL_FOLDER, folder / QUARANTINE_FOLDER)
-
-
-def _is_map(folder: Path) -> bool:
-    return (folder / QUARANTINE_FOLDER).is_dir()

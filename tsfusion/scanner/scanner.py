@@ -179,12 +179,9 @@ class Scanner:
         if self._lost_since is None:
             self._lost_since = frame.timestamp_ns
         seconds = (frame.timestamp_ns - self._lost_since) / 1e9
-        if self._state == "lost" and seconds >= self._config.patience and self._may_begin_submap:
+        may_begin = not self._localizer.absolute and len(self.submaps) != self._most
+        if self._state == "lost" and seconds >= self._config.patience and may_begin:
             self._begin_submap(seconds)
-
-    @property
-    def _may_begin_submap(self) -> bool:
-        return not self._localizer.absolute and len(self.submaps) != self._most
 
     def _begin_submap(self, seconds: float) -> None:
         name = next(name for name in map(self._name, count(2)) if name not in self._taken)

@@ -23,7 +23,6 @@ from tsfusion.geometry.keyframe import Intrinsics
 log = logging.getLogger(__name__)
 
 Modality = Literal["depth", "stereo", "lidar"]
-OPTIONS = ("depth_topic", "color_topic", "info_topic", "points_topic", "left_topic", "right_topic")
 _OF_MODALITY: dict[Modality, tuple[str, ...]] = {
     "depth": ("depth_topic", "color_topic"),
     "stereo": ("left_topic", "right_topic"),
@@ -71,7 +70,7 @@ class TopicChooser:
     """Chooses among the topics of one recording.
 
     Args:
-        given: topics by the names of `OPTIONS`; None = find it.
+        given: topics as `depth_topic`, `color_topic`, `info_topic`, …, as `Bag` names them; None = find it.
         intrinsics: of all images, instead of a CameraInfo's.
         rectified: whether images have been rectified already; None = by the topic's name.
     """
