@@ -140,8 +140,8 @@ class Client:
         correction = corrections.checked(poses, T_map_odometry=T_map_odometry, removed=removed)
         with self._sending:
             self._check_running()
-            self._outbox.check_taken(correction.seqs)
-            self._outbox.check_taken(correction.removed)
+            self._outbox.check_known(correction.seqs)
+            self._outbox.check_known(correction.removed)
             seq = self._pressure.put_correction(correction)
         if seq is not None:
             self._sender.wake()

@@ -196,7 +196,7 @@ class Outbox:
             while self.behind > backlog and self.drop_oldest(newest):
                 pass
 
-    def check_taken(self, seqs: NDArray[np.int64]) -> None:
+    def check_known(self, seqs: NDArray[np.int64]) -> None:
         """Raise InvalidKeyframe unless each is the number of a record of this session, now or before."""
         with self._changed:
             known = (seqs <= self._spool.left) | ((seqs > self._used_before) & (seqs < self._spool.next_seq))

@@ -141,7 +141,7 @@ class Gateway:
         if now < self._next_snapshot:
             return
         self._next_snapshot = now + _SNAPSHOT_INTERVAL
-        logs.tell_left_out()
+        logs.log_left_out()
         self._metrics.health = self.health()
 
     # --- maps ---

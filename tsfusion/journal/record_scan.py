@@ -98,7 +98,7 @@ class _Scan:
         return Damage(Position(self._number, at), nbytes, lost, what, torn)
 
     def _behind(self, end: int, index: bytes) -> int:
-        """Where the next record starts. A damaged index is met there, as a place without a record."""
+        """Offset of the next record. A damaged index is met there, as a place without a record."""
         return end + len(index) if self._source.read(end, len(index), self._end) == index else end
 
     def _is_end_of_data(self, at: int) -> bool:
@@ -188,7 +188,7 @@ class _Scan:
         return not rest and not self._source.failed
 
     def _search(self, start: int) -> int | None:
-        """Where the next whole record starts, at or behind `start`."""
+        """Offset of the next whole record, at or behind `start`."""
         if self._next is not None:
             begun, found = self._next
             if begun <= start and (found is None or start <= found):

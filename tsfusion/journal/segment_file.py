@@ -103,7 +103,7 @@ def read_segment_end(source: SegmentFile) -> SegmentEnd:
 
 
 def _summary(source: SegmentFile, footer_at: int) -> tuple[int, bytes] | None:
-    """Where the summary starts, and its bytes; None unless its CRC agrees."""
+    """Offset of the summary, and its bytes; None unless its CRC agrees."""
     footer = source.read(footer_at, _FOOTER.size)
     opcode, length, start, _, crc32 = _FOOTER.unpack(footer)
     if (opcode, length) != (Opcode.FOOTER, _FOOTER.size - _RECORD.size):

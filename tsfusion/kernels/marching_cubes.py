@@ -220,7 +220,7 @@ def emit_faces(
     triangle_starts: ti.types.ndarray(dtype=ti.i32, ndim=2),
     faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
-    """Each cell's triangles, as the numbers of the vertices on its edges."""
+    """Triangles of each cell, as the numbers of the vertices on its edges."""
     for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN

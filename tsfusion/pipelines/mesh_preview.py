@@ -25,7 +25,7 @@ _NEAR = 0.05  # metres
 
 @dataclass(frozen=True, eq=False)
 class PreviewCamera:
-    """Where a picture is taken from."""
+    """Camera of a picture."""
 
     T_world_camera: NDArray[np.float64]  # (4, 4) float64, OpenCV axes (x right, y down, z forward)
     fov: float = math.radians(50)  # horizontal field of view, radians

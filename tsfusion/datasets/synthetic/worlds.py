@@ -117,7 +117,7 @@ def _circle(index: int, count: int) -> NDArray[np.float64]:
 
 
 def _tour(index: int, count: int) -> NDArray[np.float64]:
-    """All of the room in three rounds: the things, the foot of the walls, their upper part."""
+    """Path through the whole room in three rounds: the things, the foot of the walls, their upper part."""
     first, second = 2 * count // 5, 7 * count // 10
     start, end = next(part for part in ((0, first), (first, second), (second, count)) if index < part[1])
     angle = 2.5 + 2 * np.pi * (index - start) / (end - start)
@@ -132,7 +132,7 @@ def _tour(index: int, count: int) -> NDArray[np.float64]:
 
 
 def _handheld(index: int, _count: int) -> NDArray[np.float64]:
-    """As a person walks round with a camera, ten frames a second: 0.4 m/s and 20 to 40 degrees/s."""
+    """Path of a person who walks round with a camera, ten frames a second: 0.4 m/s, 20 to 40 degrees/s."""
     t = index * 0.1
     angle = 2.5 + 0.4 * t + 0.12 * np.sin(0.9 * t)
     radius = 0.9 + 0.15 * np.sin(0.7 * t + 1)
