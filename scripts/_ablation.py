@@ -57,7 +57,7 @@ DRIFT = ("default", "off", "paper", "ray")
 
 @dataclass(frozen=True)
 class Setup:
-    """What is fused: a scene seen with a noise from a path."""
+    """Scene, noise and path of the keyframes that are fused."""
 
     question: str
     scene: str
@@ -124,7 +124,7 @@ def _setups() -> Iterator[tuple[Setup, tuple[str, ...]]]:
 
 @dataclass
 class Material:
-    """What a row works on."""
+    """Input of a row."""
 
     fused: list[Keyframe]
     sensor: str

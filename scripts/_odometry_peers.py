@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What people use today to follow an RGB-D camera: Open3D's and OpenCV's odometry, frame to frame."""
+"""Common odometry of RGB-D cameras to compare with: Open3D's and OpenCV's, frame to frame."""
 
 from abc import ABC, abstractmethod
 from importlib import import_module
@@ -40,7 +40,7 @@ class FrameToFrame(ABC):
 
     @abstractmethod
     def prepare(self, frame: Frame) -> Any:
-        """What a frame becomes for the library."""
+        """Convert a frame for the library."""
 
     @abstractmethod
     def motion(self, last: Any, now: Any, frame: Frame) -> NDArray[np.float64] | None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the ablation's rows become: a file of JSON lines, Markdown tables and plots."""
+"""Report of the ablation's rows: a file of JSON lines, Markdown tables and plots."""
 
 import json
 from collections.abc import Callable, Iterable
@@ -50,7 +50,7 @@ COLUMNS = (
 
 
 class Question(NamedTuple):
-    """What a group of rows answers, the figures that answer it, and which of them is plotted."""
+    """Question that a group of rows answers, the figures that answer it, and which of them is plotted."""
 
     title: str
     plot: str
@@ -227,7 +227,7 @@ def _cell(row: dict[str, Any] | None, figures: tuple[Column, ...], best: float |
 
 
 def _provenance(rows: list[dict[str, Any]]) -> str:
-    """Which versions the rows were measured with."""
+    """Versions that the rows were measured with."""
     commits = ", ".join(_distinct(row["commit"] for row in rows))
     versions = {name: number for row in rows for name, number in row["versions"].items()}
     packages = ", ".join(f"{name} {number}" for name, number in versions.items())

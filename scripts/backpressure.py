@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What each policy does when the sensor is faster than the server, and the link is down for a while.
+"""Behaviour of each policy when the sensor is faster than the server, and the link is down for a while.
 
     python scripts/backpressure.py --seconds 120 --rate 10 --server 6.25 --outage 10
 

@@ -261,7 +261,7 @@ def timed_mesh(extract: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def figures(seconds: NDArray[np.float64]) -> dict[str, float]:
-    """Of (2, n) CPU and wall seconds."""
+    """Median and p95 of (2, n) CPU and wall seconds."""
     milliseconds = seconds * 1e3
     median, p95 = np.median(milliseconds, axis=1), np.percentile(milliseconds, 95, axis=1)
     return {

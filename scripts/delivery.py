@@ -126,7 +126,7 @@ class _Side:
             client.wait_fused(PATIENCE)
 
     def result(self) -> dict[str, Any]:
-        """Of all that was sent."""
+        """Figures over all keyframes sent."""
         health = fetch_health(self.server.address, keys=self.keys.keys).maps["default"]
         p50, p95, p99 = np.percentile(self.durable_ms, (50, 95, 99))
         return {

@@ -102,7 +102,7 @@ class Client:
             TransportError: after `close`, also when that happens while this waits.
         """
         while True:
-            self._await_turn()
+            self._outbox.wait(lambda: not self._pressure.must_wait, None, self._check_running)
             with self._sending:
                 self._check_running()
                 if self._pressure.must_wait:  # another thread took the turn
@@ -140,8 +140,8 @@ class Client:
         correction = corrections.checked(poses, T_map_odometry=T_map_odometry, removed=removed)
         with self._sending:
             self._check_running()
-            self._outbox.check_taken(correction.seqs)
-            self._outbox.check_taken(correction.removed)
+            self._outbox.check_known(correction.seqs)
+            self._outbox.check_known(correction.removed)
             seq = self._pressure.put_correction(correction)
         if seq is not None:
             self._sender.wake()
@@ -244,9 +244,6 @@ class Client:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-    def _await_turn(self) -> None:
-        self._outbox.wait(lambda: not self._pressure.must_wait, None, self._check_running)
 
     def _check_running(self) -> None:
         if self._closed:

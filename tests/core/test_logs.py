@@ -156,11 +156,11 @@ def test_left_out_lines_are_counted_though_nothing_follows(lines: ReadLines) -> 
     handler._limiter = logs.Limiter(2, 10.0, lambda: now[0])
     for i in range(5):
         log.warning("rubbish %d", i, extra=logs.about(seq=i))
-    logs.tell_left_out()
+    logs.log_left_out()
     assert len(lines()) == 2
     now[0] += 10.0
-    logs.tell_left_out()
-    logs.tell_left_out()
+    logs.log_left_out()
+    logs.log_left_out()
     (line,) = lines()
     assert json.loads(line)["message"] == "3 more like this were left out in 10 s: rubbish 4"
     assert json.loads(line).keys() == LINE

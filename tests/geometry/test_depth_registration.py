@@ -91,18 +91,13 @@ def test_colour_of_depth_is_the_scenes(registration: Registration) -> None:
     depth = render(DEPTH, np.eye(4))
     got = registration.color_of_depth(paint(COLOR, T_COLOR_DEPTH), depth)
     expected = paint(DEPTH, np.eye(4))
-    visible = registration.visible(depth)
     wrong = np.abs(got.astype(int) - expected).max(axis=-1) > 6
-    assert 0.85 < visible.mean() < 0.98
-    assert wrong[visible].mean() < 0.01  # pixels at the ball's rim
-    hidden = ~visible[30:-30, 30:-30]
-    assert wrong[30:-30, 30:-30][hidden].mean() > 0.5  # has the ball's colour
+    assert 0.01 < wrong[30:-30, 30:-30].mean() < 0.03  # what the ball hides has its colour
 
 
 def test_pixels_without_depth_stay_without(registration: Registration) -> None:
     nothing = np.zeros(SIZE, np.float32)
     assert not registration.depth_of_color(nothing).any()
-    assert not registration.visible(nothing).any()
     assert registration.color_of_depth(paint(COLOR, T_COLOR_DEPTH), nothing).shape == (*SIZE, 3)
 
 
@@ -111,7 +106,6 @@ def test_what_lies_behind_the_colour_camera_is_not_drawn() -> None:
     forward[2, 3] = -2.0  # the colour camera stands two metres further
     registration = Registration(DEPTH, COLOR, forward, SIZE)
     assert not registration.depth_of_color(np.full(SIZE, 1.5, np.float32)).any()
-    assert not registration.visible(np.full(SIZE, 1.5, np.float32)).any()
 
 
 def test_wrong_sizes_and_poses_are_named(registration: Registration) -> None:

@@ -19,17 +19,14 @@ _FORMATS = "TUM, KITTI or Redwood .log."
 def ate(
     estimate: Annotated[Path, typer.Argument(metavar="ESTIMATE", help=f"A trajectory file: {_FORMATS}")],
     reference: Annotated[
-        Path,
-        typer.Argument(metavar="REFERENCE", help="The true one: such a file, or a dataset with poses."),
+        Path, typer.Argument(metavar="REFERENCE", help="The true one: such a file, or a dataset with poses.")
     ],
     *,
     max_difference: Annotated[
-        float,
-        typer.Option(metavar="SECONDS", min=0.0, help="Largest time between two matching poses."),
+        float, typer.Option(metavar="SECONDS", min=0.0, help="Largest time between two matching poses.")
     ] = 0.01,
     align: Annotated[
-        bool,
-        typer.Option("--align/--no-align", help="First move the estimate onto the truth (rigidly)."),
+        bool, typer.Option("--align/--no-align", help="First move the estimate onto the truth (rigidly).")
     ] = True,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Draw the trajectory, coloured by its error.")

@@ -41,20 +41,13 @@ _EXTRAS = {
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check.
+    """Result of one check."""
 
-    Attributes:
-        name: what was checked.
-        found: its version or state, or what is wrong with it.
-        advice: what to do; empty = nothing.
-        optional: a part that is not installed, and need not be.
-    """
-
-    name: str
+    name: str  # what was checked
     ok: bool
-    found: str
-    advice: str = ""
-    optional: bool = False
+    found: str  # its version or state, or what is wrong with it
+    advice: str = ""  # what to do; empty = nothing
+    optional: bool = False  # a part that is not installed, and need not be
 
 
 def doctor(

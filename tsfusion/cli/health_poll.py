@@ -17,27 +17,16 @@ _MIN_TIMEOUT = 0.2  # seconds for a fuser's answer
 
 
 class ServerSnapshot(Struct, frozen=True, kw_only=True):
-    """State of a server at one moment.
+    """State of a server at one moment."""
 
-    Attributes:
-        address: of the server, for a person.
-        health: the gateway's answer; None = it did not answer.
-        error: why it did not answer.
-        maps: map → status of its fuser, where that answered.
-        unavailable: map → why its fuser's status is not known.
-        stalled: map → seconds for which keyframes have waited there and none was fused.
-        missing: the map that was asked for and is not open; empty = it is, or none was asked for.
-        only: the map that was asked for; empty = all.
-    """
-
-    address: str
-    health: Health | None = None
-    error: str = ""
-    maps: dict[str, Status] = {}
-    unavailable: dict[str, str] = {}
-    stalled: dict[str, float] = {}
-    missing: str = ""
-    only: str = ""
+    address: str  # of the server, for a person
+    health: Health | None = None  # the gateway's answer; None = it did not answer
+    error: str = ""  # why it did not answer
+    maps: dict[str, Status] = {}  # map → status of its fuser, where that answered
+    unavailable: dict[str, str] = {}  # map → why its fuser's status is not known
+    stalled: dict[str, float] = {}  # map → seconds for which keyframes have waited there and none was fused
+    missing: str = ""  # the map that was asked for and is not open; empty = it is, or none was asked for
+    only: str = ""  # the map that was asked for; empty = all
 
     @property
     def problems(self) -> list[str]:
@@ -151,7 +140,7 @@ class ServerWatcher:
         missing = self._only if self._only and not selected else ""
         return ServerSnapshot(
             address=self._address, health=health, stalled=stalled, missing=missing, only=self._only
-        )  # fmt: skip
+        )
 
     def _with_maps(self, snapshot: ServerSnapshot, health: Health, *, always: bool) -> ServerSnapshot:
         deadline = time.monotonic() + self._timeout

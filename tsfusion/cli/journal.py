@@ -2,18 +2,23 @@
 """`tsfusion journal`: describe a journal, check it, save its whole keyframes, export it to other tools."""
 
 import datetime
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
 from tsfusion.cli import options
+from tsfusion.cli.output import size
 
 if TYPE_CHECKING:
-    from tsfusion.journal.inspection import JournalInfo, Problem, SessionInfo, Verdict
+    from tsfusion.journal.inspection import JournalInfo, JournalVerdict, Problem, SessionInfo
     from tsfusion.journal.recovery import Recovery
-    from tsfusion.journal.state_folder import JournalPlace
+    from tsfusion.journal.ros2_export import Export
+    from tsfusion.journal.state_folder import JournalPlace, Watcher
 
+_Result = TypeVar("_Result")
 _MOST_LINES = 20  # printed of one kind; --json has all
 
 app = typer.Typer(
@@ -46,16 +51,9 @@ def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
 
     Exit status 0 also for a damaged journal; `verify` has another for it.
     """
-    from tsfusion.cli import output, progress
     from tsfusion.journal.inspection import summarize
 
-    place = _find(path, map_)
-    with progress.reading(f"reading {place.path}", quiet=json) as watch:
-        found = summarize(place, watch)
-    if json:
-        output.as_json(found)
-    else:
-        typer.echo(_describe_info(found))
+    _run("reading", path, map_, summarize, _describe_info, json=json)
 
 
 @app.command()
@@ -67,17 +65,9 @@ def verify(path: Where, map_: Map = None, json: options.Json = False) -> None:
     write; it was never acknowledged, and its scanner sends it again. `note`:
     unusual, but nothing is wrong with the keyframes.
     """
-    from tsfusion.cli import output, progress
     from tsfusion.journal.inspection import verify as check
 
-    place = _find(path, map_)
-    with progress.reading(f"checking {place.path}", quiet=json) as watch:
-        verdict = check(place, watch)
-    if json:
-        output.as_json(verdict)
-    else:
-        typer.echo(_describe_verdict(verdict))
-    if not verdict.intact:
+    if not _run("checking", path, map_, check, _describe_verdict, json=json).intact:
         raise typer.Exit(1)
 
 
@@ -101,23 +91,13 @@ def recover(
     Exit status 1: OUT is there, but some keyframes could not be saved; the
     damaged places are named.
     """
-    from tsfusion.cli import output, progress
     from tsfusion.core.config import ServerConfig
     from tsfusion.journal.recovery import recover as save
 
-    place = _find(path, map_)
-    with progress.reading(f"saving {place.path}", quiet=json) as watch:
-        done = save(place, out, ServerConfig().segment_bytes, watch)
-    if json:
-        output.as_json(done)
-    else:
-        typer.echo(
-            f"{out}: {_records(done)} in {_count(done.segments, 'segment')}, {output.size(done.nbytes)}"
-        )
-        if done.copies:
-            typer.echo(f"{_count(done.copies, 'record')} stood there twice and is saved once")
-        typer.echo("\n".join([*_problem_lines(done.problems), _loss(done.lost)]))
-    if done.lost:
+    def work(place: "JournalPlace", watch: "Watcher") -> "Recovery":
+        return save(place, out, ServerConfig().segment_bytes, watch)
+
+    if _run("saving", path, map_, work, partial(_describe_recovery, out), json=json).lost:
         raise typer.Exit(1)
 
 
@@ -146,33 +126,56 @@ def export(
 
     Exit status 1: OUT is there, but without the damaged keyframes.
     """
-    from tsfusion.cli import output, progress
     from tsfusion.journal.ros2_export import export as write
 
-    place = _find(path, map_)
-    with progress.reading(f"exporting {place.path}", quiet=json) as watch:
-        done = write(place, out, watch)
-    if json:
-        output.as_json(done)
-    else:
-        typer.echo(f"{out}: {_count(done.keyframes, 'keyframe')}, {output.size(done.nbytes)}")
-        typer.echo("\n".join(f"  {topic}  {count}" for topic, count in done.messages.items()))
-        typer.echo("\n".join([*_problem_lines(done.problems), _loss(done.lost)]))
-    if done.lost:
+    def work(place: "JournalPlace", watch: "Watcher") -> "Export":
+        return write(place, out, watch)
+
+    if _run("exporting", path, map_, work, partial(_describe_export, out), json=json).lost:
         raise typer.Exit(1)
 
 
-def _find(path: Path, map_name: str | None) -> "JournalPlace":
+def _run(
+    doing: str,
+    path: Path,
+    map_name: str | None,
+    work: Callable[["JournalPlace", "Watcher"], _Result],
+    describe: Callable[[_Result], str],
+    *,
+    json: bool,
+) -> _Result:
+    """Do one verb's work on a journal, with progress on stderr, and print its result."""
+    from tsfusion.cli import output, progress
     from tsfusion.journal.state_folder import find_journal
 
-    return find_journal(path, map_name)
+    place = find_journal(path, map_name)
+    with progress.reading(f"{doing} {place.path}", quiet=json) as watch:
+        result = work(place, watch)
+    if json:
+        output.as_json(result)
+    else:
+        typer.echo(describe(result))
+    return result
+
+
+def _describe_recovery(out: Path, done: "Recovery") -> str:
+    lines = [f"{out}: {_records(done)} in {_count(done.segments, 'segment')}, {size(done.nbytes)}"]
+    if done.copies:
+        lines.append(f"{_count(done.copies, 'record')} stood there twice and is saved once")
+    return "\n".join([*lines, *_problem_lines(done.problems), _loss(done.lost)])
+
+
+def _describe_export(out: Path, done: "Export") -> str:
+    head = f"{out}: {_count(done.keyframes, 'keyframe')}, {size(done.nbytes)}"
+    topics = [f"  {topic}  {count}" for topic, count in done.messages.items()]
+    return "\n".join([head, *topics, *_problem_lines(done.problems), _loss(done.lost)])
 
 
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def _records(found: "Recovery | Verdict") -> str:
+def _records(found: "Recovery | JournalVerdict") -> str:
     keyframes = _count(found.keyframes, "keyframe")
     return keyframes + (f" and {_count(found.corrections, 'correction')}" if found.corrections else "")
 
@@ -182,8 +185,6 @@ def _loss(lost: int) -> str:
 
 
 def _describe_info(found: "JournalInfo") -> str:
-    from tsfusion.cli.output import size
-
     lines = [
         f"journal    {found.path}",
         f"keyframes  {found.keyframes}, {size(found.nbytes)}",
@@ -228,9 +229,7 @@ def _clock(stamp_ns: int) -> str:
     return moment.strftime("%Y-%m-%d %H:%M:%SZ")
 
 
-def _describe_verdict(verdict: "Verdict") -> str:
-    from tsfusion.cli.output import size
-
+def _describe_verdict(verdict: "JournalVerdict") -> str:
     read = f"{_records(verdict)} in {_count(verdict.segments, 'segment')}"
     judged = "intact" if verdict.intact else f"damaged; {_loss(verdict.lost)}"
     return "\n".join(

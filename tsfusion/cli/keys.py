@@ -24,7 +24,7 @@ app = typer.Typer(
     `--key tsfusion-keys/robot1.key_secret --server-key KEY`, with the key that step 1 printed.
 
     A secret key never leaves the machine that made it.
-    """,
+    """
 )
 Dir = Annotated[
     Path,
@@ -52,10 +52,8 @@ def new(
     made = key_folder.create_pair(folder, name, force=force)
     typer.echo(f"public key of {name}: {made.public}")
     if name == curve.SERVER:
-        place, at = (
-            shlex.quote(str(folder)),
-            "" if folder == _FOLDER else f" --dir {shlex.quote(str(folder))}",
-        )
+        place = shlex.quote(str(folder))
+        at = "" if folder == _FOLDER else f" --dir {place}"
         typer.echo(
             f"next, for each scanner: tsfusion keys allow NAME KEY{at}\n"
             f"then: tsfusion serve --keys {place} --listen tcp://0.0.0.0:5555\n"

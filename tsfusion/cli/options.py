@@ -77,8 +77,7 @@ Key = Annotated[
     _option("--key", "FILE", "This client's secret key, of `tsfusion keys new`, for a server with keys."),
 ]
 ServerKey = Annotated[
-    str | None,
-    _option("--server-key", "FILE|KEY", "That server's public key: a file, or the 40 characters."),
+    str | None, _option("--server-key", "FILE|KEY", "That server's public key: a file, or the 40 characters.")
 ]
 DatasetOptions = Annotated[
     list[str] | None,

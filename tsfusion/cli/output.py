@@ -4,18 +4,14 @@
 import json
 from typing import Any
 
-import msgspec
 import typer
 
 
-def as_json(value: Any) -> None:
-    """Print a struct or dict as indented JSON on stdout."""
-    typer.echo(json.dumps(msgspec.to_builtins(value), indent=2, ensure_ascii=False))
+def as_json(value: Any, *, indent: int | None = 2) -> None:
+    """Print a struct or dict as JSON on stdout; on one line where `indent` is None."""
+    from msgspec import to_builtins
 
-
-def as_json_line(value: Any) -> None:
-    """Print a struct or dict as one line of JSON on stdout."""
-    typer.echo(json.dumps(msgspec.to_builtins(value), ensure_ascii=False))
+    typer.echo(json.dumps(to_builtins(value), indent=indent, ensure_ascii=False))
 
 
 def grouped(number: float) -> str:

@@ -42,8 +42,7 @@ def replay(
     rate: Rate = None,
     max_keyframes: Limit = None,
     start: Annotated[
-        int,
-        typer.Option(metavar="N", min=0, rich_help_panel=_DATASET, help="Skip so many at the start."),
+        int, typer.Option(metavar="N", min=0, rich_help_panel=_DATASET, help="Skip so many at the start.")
     ] = 0,
     stride: Annotated[
         int, typer.Option(metavar="N", min=1, rich_help_panel=_DATASET, help="Take every N-th keyframe only.")
@@ -54,8 +53,7 @@ def replay(
     unpack: options.Unpack = False,
     option: options.DatasetOptions = None,
     state: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Keep journal and map of the run's server here."),
+        Path | None, typer.Option(metavar="DIR", help="Keep journal and map of the run's server here.")
     ] = None,
     check_: Annotated[
         bool, typer.Option("--check/--no-check", help="Warn when the dataset's poses and depth disagree.")
@@ -69,6 +67,7 @@ def replay(
 
     from tsfusion.core.config import override
     from tsfusion.datasets import select
+    from tsfusion.evaluation import pose_check
 
     # Any server makes a mesh with another `min_weight`.
     own = {*options.MAP_OPTIONS, "state"} - {"min_weight"}
@@ -77,15 +76,15 @@ def replay(
         path, unpack=unpack, sequence=sequence, modality=modality, poses=poses,
         **options.dataset_options(option),
     )  # fmt: skip
-    chosen = options.configuration(
-        config, preset={"sensor": dataset.sensor}, **settings,
-    )  # fmt: skip
+    chosen = options.configuration(config, preset={"sensor": dataset.sensor}, **settings)
     if start or stride > 1 or max_keyframes is not None:
         dataset = select(dataset, start=start, stride=stride, limit=max_keyframes)
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count} frames {reason}", err=True)
     if check_ and not _is_synthetic(path):
-        _warn_of_disagreement(dataset)
+        report = pose_check.check(dataset)
+        if report.verdict == "disagree":
+            typer.echo(f"warning: {report.text}", err=True)
     server = None
     if state is not None:  # only this machine reaches the run's own server; its errors are shown here
         server = override(chosen.server, listen="tcp://127.0.0.1:0", state=str(state))
@@ -129,26 +128,13 @@ def _is_synthetic(path: Path) -> bool:
     return str(path).startswith("synthetic:")
 
 
-def _warn_of_disagreement(dataset: "Dataset") -> None:
-    """Print a line on stderr when poses and depth disagree."""
-    from tsfusion.evaluation import pose_check
-
-    report = pose_check.check(dataset)
-    if report.verdict == "disagree":
-        typer.echo(f"warning: {report.text}", err=True)
-
-
 @options.takes_map_settings
 def demo(
     *,
     out: Out = Path("out"),
-    world: Annotated[
-        str,
-        typer.Option(metavar="NAME", help="room, or street (stereo, 0.1 m)."),
-    ] = "room",
+    world: Annotated[str, typer.Option(metavar="NAME", help="room, or street (stereo, 0.1 m).")] = "room",
     count: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=1, help="Keyframes; default 90, in the street 40."),
+        int | None, typer.Option(metavar="N", min=1, help="Keyframes; default 90, in the street 40.")
     ] = None,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Random seed of the sensor's noise.")] = 0,
     rate: Annotated[
@@ -162,19 +148,14 @@ def demo(
     **settings: Any,
 ) -> None:
     """Scan a synthetic world whose surface is known, and measure how far the mesh is from it."""
-    chosen = options.configuration(
-        config, preset=_STREET if world == "street" else None, **settings,
-    )  # fmt: skip
+    chosen = options.configuration(config, preset=_STREET if world == "street" else None, **settings)
     from tsfusion.datasets import Synthetic
 
     path, usual_count, usual_rate = ("tour", 90, 6.0) if world == "room" else (None, 40, 4.0)
-    dataset = Synthetic(
-        world, sensor=chosen.volume.sensor, count=count or usual_count, seed=seed, path=path
-    )  # fmt: skip
+    dataset = Synthetic(world, sensor=chosen.volume.sensor, count=count or usual_count, seed=seed, path=path)
     _run(
         dataset, out, json=json, volume=chosen.volume, client=options.client_settings(chosen),
-        rate=rate or usual_rate,
-        min_weight=settings["min_weight"],
+        rate=rate or usual_rate, min_weight=settings["min_weight"],
     )  # fmt: skip
 
 

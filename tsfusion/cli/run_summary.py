@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a replay or a scan prints at its end: the run in a few lines."""
+"""Summary of a replay or a scan, printed at its end: the run in a few lines."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any

@@ -66,18 +66,13 @@ def scan(
     calibration: Annotated[
         Path | None,
         _option(
-            _SOURCE,
-            "FILE",
-            "Of a live camera: Kalibr, OpenCV, ROS or EuRoC (a file, or a folder of two).",
+            _SOURCE, "FILE", "Of a live camera: Kalibr, OpenCV, ROS or EuRoC (a file, or a folder of two)."
         ),
     ] = None,
     rate: Annotated[
         float | None,
         _option(
-            _SOURCE,
-            "HZ",
-            "Frames a second of a recording; default: as fast as they are taken.",
-            min=1e-3,
+            _SOURCE, "HZ", "Frames a second of a recording; default: as fast as they are taken.", min=1e-3
         ),
     ] = None,
     max_frames: Annotated[int | None, _option(_SOURCE, "N", "Stop after so many frames.", min=1)] = None,

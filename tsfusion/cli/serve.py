@@ -77,12 +77,11 @@ def _announce(addresses: "Addresses", state: str, seconds: float, json: bool) ->
     if json:
         from tsfusion.cli import output
 
-        output.as_json_line(
-            {
-                "ready": True, "listen": addresses.data, "control": addresses.control,
-                "publish": addresses.publish, "state": state, "seconds": round(seconds, 3),
-            }
-        )  # fmt: skip
+        fields = {
+            "ready": True, "listen": addresses.data, "control": addresses.control,
+            "publish": addresses.publish, "state": state, "seconds": round(seconds, 3),
+        }  # fmt: skip
+        output.as_json(fields, indent=None)
     else:
         typer.echo(
             f"ready in {seconds:.1f} s: keyframes {addresses.data}, control {addresses.control}, "

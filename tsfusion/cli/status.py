@@ -25,15 +25,12 @@ def status(
     server_key: options.ServerKey = None,
     map_: Annotated[str | None, typer.Option("--map", metavar="NAME", help="Only this map.")] = None,
     watch: Annotated[
-        float | None,
-        typer.Option(metavar="SECONDS", min=0.1, help="Ask again every so many seconds."),
+        float | None, typer.Option(metavar="SECONDS", min=0.1, help="Ask again every so many seconds.")
     ] = None,
     stall_after: Annotated[
         float,
         typer.Option(
-            metavar="SECONDS",
-            min=0.1,
-            help="Stalled: keyframes wait, and none is fused for so long.",
+            metavar="SECONDS", min=0.1, help="Stalled: keyframes wait, and none is fused for so long."
         ),
     ] = 10.0,
     timeout: Annotated[
@@ -102,7 +99,7 @@ def _print(snapshot: "ServerSnapshot", *, json: bool, line: bool) -> None:
     if not json:
         typer.echo(_text(render(snapshot)))
     elif line:
-        output.as_json_line(snapshot.as_json())
+        output.as_json(snapshot.as_json(), indent=None)
     else:
         output.as_json(snapshot.as_json())
     sys.stdout.flush()

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""What every wing stands on: settings, errors, durable files, locks, processes, logs."""
+"""Base of every wing: settings, errors, durable files, locks, processes, logs."""

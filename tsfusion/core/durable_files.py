@@ -108,6 +108,14 @@ def check_private_folder(folder: Path) -> None:
         )
 
 
+def size_of(path: Path) -> int:
+    """Size of a file, bytes; 0 where there is none that can be looked at."""
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
 def others_can_write(mode: int) -> bool:
     """Whether a file or folder of this mode can be changed by others than its owner."""
     return bool(mode & _OTHERS_WRITE)

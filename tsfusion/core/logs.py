@@ -63,11 +63,11 @@ def about(
     return {"about": {key: value for key, value in given.items() if value not in (None, "")}}
 
 
-def tell_left_out() -> None:
+def log_left_out() -> None:
     """Log how many lines were left out, once their period is over. Call it about once a second."""
     for handler in logging.root.handlers:
         if isinstance(handler, Stderr):
-            handler.tell_left_out()
+            handler.log_left_out()
 
 
 def printable(text: str, most: int = MESSAGE_CHARACTERS) -> str:
@@ -142,7 +142,7 @@ class Stderr(_Handler):
         if self._limiter.allows(record):
             super().emit(record)
 
-    def tell_left_out(self) -> None:
+    def log_left_out(self) -> None:
         """Write the summaries of `Limiter.finished_periods`."""
         with self.lock:  # type: ignore[union-attr]
             self._write(self._limiter.finished_periods())

@@ -12,9 +12,7 @@ import msgspec
 
 from tsfusion.core.errors import TsfusionError
 
-_TYPES = {
-    bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path",
-}  # fmt: skip
+_TYPES = {bool: "true or false", int: "a whole number", float: "a number", str: "text", Path: "a path"}
 _T = TypeVar("_T")
 
 

@@ -18,11 +18,7 @@ log = logging.getLogger(__name__)
 
 
 class Watchdog:
-    """The link to the service manager that started this process, if one did.
-
-    Attributes:
-        interval: seconds within which `pet` has to be called (WatchdogSec); None = no watchdog.
-    """
+    """The link to the service manager that started this process, if one did."""
 
     def __init__(
         self, environment: Mapping[str, str] = os.environ, clock: Callable[[], float] = time.monotonic
@@ -30,6 +26,7 @@ class Watchdog:
         self._clock = clock
         self._socket: socket.socket | None = None
         self._status = ""
+        # Seconds within which `pet` has to be called (WatchdogSec); None = no watchdog
         self.interval: float | None = None
         path = environment.get("NOTIFY_SOCKET", "")
         if not path.startswith(("/", "@")):

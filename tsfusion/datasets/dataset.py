@@ -96,7 +96,7 @@ class Frames(ABC):
 
 
 class Selection(Frames):
-    """Some keyframes of another dataset; `select` makes one.
+    """Selected keyframes of another dataset; `select` makes one.
 
     Has the other's `distance` where it has one: the measure of a world whose surface is known.
     """

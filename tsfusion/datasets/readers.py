@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidKeyframe
+from tsfusion.geometry.calibration_files import read_text
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics
 
 
@@ -18,15 +19,8 @@ def read_lines(path: Path, content: str) -> list[tuple[int, str]]:
 
     Copes with CRLF and a byte order mark.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise DatasetError(f"{path} is missing; expected {content}") from error
-    except UnicodeDecodeError as error:
-        raise DatasetError(f"{path} is not a text file; expected {content}") from error
-    except OSError as error:
-        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
-    numbered = ((number, line.strip()) for number, line in enumerate(text.splitlines(), 1))
+    lines = read_text(path, content).splitlines()
+    numbered = ((number, line.strip()) for number, line in enumerate(lines, 1))
     return [(number, line) for number, line in numbered if line and not line.startswith("#")]
 
 

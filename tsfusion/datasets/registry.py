@@ -54,16 +54,11 @@ class Layout(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Result of `find`.
+    """Result of `find`."""
 
-    Attributes:
-        path: the folder or file to open: the given one, or the only dataset in it.
-        also: names of less specific layouts that fit too.
-    """
-
-    path: Path
+    path: Path  # the folder or file to open: the given one, or the only dataset in it
     layout: Layout
-    also: tuple[str, ...]
+    also: tuple[str, ...]  # names of less specific layouts that fit too
 
     def open(self, **options: Any) -> Dataset:
         """Open the dataset; options that are None are left out.

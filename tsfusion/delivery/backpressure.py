@@ -65,10 +65,7 @@ class Backpressure:
             JournalError: as `put`.
         """
         frames = corrections.encode(
-            correction,
-            session=self._outbox.session,
-            seq=self._outbox.next_seq,
-            map_name=self._config.map,
+            correction, session=self._outbox.session, seq=self._outbox.next_seq, map_name=self._config.map
         )
         return self._store(frames, None)
 
@@ -78,11 +75,8 @@ class Backpressure:
         self._thinned_in_a_row = self._thinned_in_a_row + 1 if thinned_out else 0
         return thinned_out
 
+    @process.uninterrupted()  # Ctrl-C would leave half a record, and hide what follows it
     def _store(self, frames: list[bytes], keyframe: Keyframe | None) -> int | None:
-        with process.uninterrupted():  # Ctrl-C would leave half a record, and hide what follows it
-            return self._write(frames, keyframe)
-
-    def _write(self, frames: list[bytes], keyframe: Keyframe | None) -> int | None:
         outbox, nbytes = self._outbox, sum(map(len, frames))
         if reason := self._why_full(nbytes):
             outbox.skip(reason, is_correction=keyframe is None)

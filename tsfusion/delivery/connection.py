@@ -18,10 +18,6 @@ class Connection:
 
     Args:
         make: `sockets.push` or `sockets.dealer`.
-
-    Attributes:
-        socket: the present one.
-        problem: why there is no connection; empty = there is one, or nothing is known.
     """
 
     def __init__(
@@ -31,7 +27,7 @@ class Connection:
         address: str,
         keys: ClientKeys | None,
     ) -> None:
-        self.problem = ""
+        self.problem = ""  # why there is no connection; empty = there is one, or nothing is known
         self._context = context
         self._make = make
         self._address = address

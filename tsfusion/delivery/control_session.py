@@ -31,12 +31,6 @@ class ControlSession:
     Args:
         send: sends a message, or drops it when it cannot leave at once: it is sent again when due.
         address: of the control socket, for messages to people.
-
-    Attributes:
-        welcome: the server's terms; None = it has not let us in (yet).
-        clock: the server's against ours.
-        last_heard: time of the last message of the server, `time.monotonic()`; 0 = never.
-        last_moved: when something last left the spool, or was sent while nothing was on its way.
     """
 
     def __init__(
@@ -48,9 +42,10 @@ class ControlSession:
         address: str,
         map_name: str,
     ) -> None:
-        self.welcome: messages.Welcome | None = None
+        self.welcome: messages.Welcome | None = None  # the server's terms; None = it has not let us in (yet)
         self.clock = ClockOffset()
-        self.last_heard = self.last_moved = 0.0
+        self.last_heard = 0.0  # time of the server's last message, `time.monotonic()`; 0 = never
+        self.last_moved = 0.0  # when something last left the spool, or was sent while nothing was on its way
         self._outbox = outbox
         self._refused = refused
         self._send = send

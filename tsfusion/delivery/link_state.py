@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How the client and its server stand with each other: every state, and every way from one to another.
+"""State of the link between client and server: every state, and every way from one to another.
 
     connecting   nobody has answered yet, or a server has let us in and its first answer is awaited
     connected    the server answers, and takes what is sent
@@ -24,18 +24,14 @@ from typing import Literal
 
 from msgspec import Struct
 
-Kind = Literal["connecting", "connected", "held", "opening", "refused", "locked_out", "silent"]
+LinkKind = Literal["connecting", "connected", "held", "opening", "refused", "locked_out", "silent"]
 
 
 class LinkState(Struct, frozen=True):
-    """One state of the link; each method gives the next one after an event.
+    """One state of the link; each method gives the next one after an event."""
 
-    Attributes:
-        why: for a person, why nothing is taken; empty = nothing is known against it.
-    """
-
-    kind: Kind = "connecting"
-    why: str = ""
+    kind: LinkKind = "connecting"
+    why: str = ""  # for a person, why nothing is taken; empty = nothing is known against it
 
     @property
     def is_connected(self) -> bool:

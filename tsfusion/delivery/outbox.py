@@ -60,24 +60,17 @@ class ClientStats(Struct, frozen=True):
 
 
 class Outbox:
-    """The spool, the fate of what passed through it, and the state of the link. For any thread.
-
-    Attributes:
-        link_state: how client and server stand with each other; replaced whole, by the sending thread alone.
-        session: 16 bytes that name the spool's session.
-        spool_folder: where the spool is.
-        is_temporary: the spool goes away when it is closed.
-        state: of the spool, as in `ClientStats`; set by the one thread that writes to it.
-    """
+    """The spool, the fate of what passed through it, and the state of the link. For any thread."""
 
     def __init__(self, spool: Spool) -> None:
         self._changed = threading.Condition()
         self._spool = spool
+        # How client and server stand with each other; replaced whole, by the sending thread alone
         self.link_state = LinkState()
-        self.session = spool.session
+        self.session = spool.session  # 16 bytes
         self.spool_folder = spool.folder
-        self.is_temporary = spool.temporary
-        self.state = "ok"
+        self.is_temporary = spool.temporary  # goes away when it is closed
+        self.state = "ok"  # of the spool, as in `ClientStats`; set by the one thread that writes to it
         self._outstanding = 0  # of the oldest in the spool, so many are on their way
         self._unfused: deque[int] = deque()  # durable, and not answered by the map
         self._unmeshed: deque[int] = deque(maxlen=_MOST_REMEMBERED)
@@ -178,35 +171,32 @@ class Outbox:
         with self._changed:
             self._spool.tidy()
 
-    def drop_oldest(self) -> bool:
-        """Take the oldest keyframe that was never sent out of the spool; False = there is none.
+    def drop_oldest(self, newest: int | None = None) -> bool:
+        """Take the oldest keyframe that was never sent out of the spool; False = there is none but `newest`.
 
-        One that was sent may be in the server's journal by now, though nothing was heard of it: it stays.
+        One that was sent may be in the server's journal by now, though no answer came: it stays.
         Corrections stay, too.
         """
         with self._changed:
-            return self._drop_oldest()
+            sent = max(self._perhaps_sent, self._claimed)
+            for place, entry in enumerate(self._spool.waiting):
+                if entry.seq > sent and not entry.is_correction:
+                    if entry.seq == newest:
+                        return False
+                    self._spool.remove(place)
+                    self._times.remove(entry.seq)
+                    self._skipped["dropped"] += 1
+                    self._changed.notify_all()
+                    return True
+        return False
 
     def drop_to(self, backlog: int, newest: int) -> None:
         """Drop the oldest until no more than `backlog` are behind; the keyframe `newest` stays."""
         with self._changed:
-            while self.behind > backlog and self._drop_oldest(newest):
+            while self.behind > backlog and self.drop_oldest(newest):
                 pass
 
-    def _drop_oldest(self, newest: int | None = None) -> bool:
-        sent = max(self._perhaps_sent, self._claimed)
-        for place, entry in enumerate(self._spool.waiting):
-            if entry.seq > sent and not entry.is_correction:
-                if entry.seq == newest:
-                    return False
-                self._spool.remove(place)
-                self._times.remove(entry.seq)
-                self._skipped["dropped"] += 1
-                self._changed.notify_all()
-                return True
-        return False
-
-    def check_taken(self, seqs: NDArray[np.int64]) -> None:
+    def check_known(self, seqs: NDArray[np.int64]) -> None:
         """Raise InvalidKeyframe unless each is the number of a record of this session, now or before."""
         with self._changed:
             known = (seqs <= self._spool.left) | ((seqs > self._used_before) & (seqs < self._spool.next_seq))
@@ -314,7 +304,12 @@ class Outbox:
             self._durable += len(dropped) - corrections
             self._unfused.extend(dropped)
             while self._unfused and self._unfused[0] <= fused:
-                self._note_fused(self._unfused.popleft())
+                seq = self._unfused.popleft()
+                if seq in self._corrections:
+                    self._corrections.remove(seq)
+                else:
+                    self._fused += seq not in self._rejected_seqs
+                self._unmeshed.append(seq)
             for one in stamps:
                 if one.seq not in self._rejected_seqs:
                     self._times.stamp(one, offset_ns, bound_ns)
@@ -322,13 +317,6 @@ class Outbox:
                     self.note_meshed(one.seq)
             self._changed.notify_all()
             return bool(dropped)
-
-    def _note_fused(self, seq: int) -> None:
-        if seq in self._corrections:
-            self._corrections.remove(seq)
-        else:
-            self._fused += seq not in self._rejected_seqs
-        self._unmeshed.append(seq)
 
     def note_meshed(self, seq: int) -> None:
         """Note that the mesh shows everything up to `seq`."""

@@ -37,12 +37,7 @@ class Sender:
     """Owns the sockets; `run` is the thread's body."""
 
     def __init__(
-        self,
-        address: str,
-        control: str,
-        outbox: Outbox,
-        config: ClientConfig,
-        keys: ClientKeys | None = None,
+        self, address: str, control: str, outbox: Outbox, config: ClientConfig, keys: ClientKeys | None = None
     ) -> None:
         self._data_address = address
         self._control_address = control
@@ -106,20 +101,12 @@ class Sender:
         self._wait(now)
 
     def _wait(self, now: float) -> None:
-        sources: list[Any] = [
-            self._control.socket,
-            self._control.events,
-            self._data.events,
-            self._woken.fileno(),
-        ]
+        control, data = self._control, self._data
+        sources: list[Any] = [control.socket, control.events, data.events, self._woken.fileno()]
         polled = [(source, zmq.POLLIN) for source in sources]
         if self._blocked:
-            polled.append((self._data.socket, zmq.POLLOUT))
-        others = (
-            self._read_due if self._unread else 0.0,
-            self._control.due,
-            self._data.due,
-        )
+            polled.append((data.socket, zmq.POLLOUT))
+        others = (self._read_due if self._unread else 0.0, control.due, data.due)
         due = min([self._control_session.due, *filter(None, others)])
         zmq.zmq_poll(polled, max(int((due - now) * 1000), 1))
         with suppress(BlockingIOError):
@@ -174,20 +161,17 @@ class Sender:
         try:
             frames = self._outbox.read(entry)
         except JournalError as error:
-            self._on_unread(entry, error, now)
-            return None
+            self._unread += 1
+            if error.errno in _SCARCE or (error.errno == errno.EIO and self._unread < _MAX_READS):
+                level = logging.WARNING if self._unread == 1 else logging.DEBUG
+                log.log(level, "%s; it is tried again", error)
+                self._read_due = now + _READ_INTERVAL
+                self._outbox.unclaim()
+                return None
+            self._refused.give_up(entry, "spool", str(error), readable=False)
+            frames = None
         self._unread = 0
         return frames
-
-    def _on_unread(self, entry: Waiting, error: JournalError, now: float) -> None:
-        self._unread += 1
-        if error.errno in _SCARCE or (error.errno == errno.EIO and self._unread < _MAX_READS):
-            log.log(logging.WARNING if self._unread == 1 else logging.DEBUG, "%s; it is tried again", error)
-            self._read_due = now + _READ_INTERVAL
-            self._outbox.unclaim()
-            return
-        self._unread = 0
-        self._refused.give_up(entry, "spool", str(error), readable=False)
 
     def _send(self, entry: Waiting, previous: int, frames: list[memoryview]) -> None:
         sent_ns = time.monotonic_ns()

@@ -18,6 +18,7 @@ from msgspec import Struct
 
 from tsfusion import journal
 from tsfusion.core.config import DEFAULT_MAP
+from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.delivery.tombstones import Tombstones
@@ -50,17 +51,11 @@ class Waiting(Struct, frozen=True, gc=False):
 
 
 class Segment(Struct):
-    """One file of the spool.
+    """One file of the spool."""
 
-    Attributes:
-        nbytes: its size on the disk.
-        waiting: records in it that wait.
-        withdrawn: numbers of the records in it that left the spool unsent or refused.
-    """
-
-    nbytes: int = 0
-    waiting: int = 0
-    withdrawn: list[int] = []
+    nbytes: int = 0  # on the disk
+    waiting: int = 0  # records in it that wait
+    withdrawn: list[int] = []  # numbers of the records in it that left the spool unsent or refused
 
 
 class Spool:
@@ -72,23 +67,12 @@ class Spool:
         folder: None = a temporary folder, deleted at `close` with all that is in it.
         map_name: the map that new records are for.
 
-    Attributes:
-        waiting: the records, oldest first.
-        waiting_bytes: the bytes of their messages.
-        used_bytes: of the disk; records that have left the queue but share a file with others count.
-        next_seq: the number of the next record.
-        left: the last number that an earlier scanner is known to have used; 0 = there was none.
-
     Raises:
         JournalError: when the folder cannot be used, another scanner uses it, or it waits for another map.
     """
 
     def __init__(
-        self,
-        folder: str | os.PathLike[str] | None,
-        segment_bytes: int,
-        *,
-        map_name: str = DEFAULT_MAP,
+        self, folder: str | os.PathLike[str] | None, segment_bytes: int, *, map_name: str = DEFAULT_MAP
     ) -> None:
         self.temporary = folder is None
         self.map_name = map_name
@@ -115,8 +99,11 @@ class Spool:
         self.session = sessions.pop()
         self._tombstones = Tombstones(self.folder, self.session)
         self._compact_at = 2 * self._tombstones.written + _MANY_TOMBSTONES
-        self._segments = {number: Segment(self._size(number)) for number in journal.segments(self.folder)}
-        self.waiting: deque[Waiting] = deque()
+        self._segments = {
+            number: Segment(size_of(journal.segment_path(self.folder, number)))
+            for number in journal.segments(self.folder)
+        }
+        self.waiting: deque[Waiting] = deque()  # oldest first
         for record in found:
             segment = self._segments[record.position.segment]
             if record.seq in self._tombstones.numbers:
@@ -127,9 +114,10 @@ class Spool:
                 self.waiting.append(Waiting(*place, record.is_correction))
         self.waiting_bytes = sum(entry.nbytes for entry in self.waiting)
         last = max([record.seq for record in found] + [*self._tombstones.numbers], default=0)
-        self.left = last
+        self.left = last  # the last number that an earlier scanner used; 0 = there was none
         self.next_seq = last + _RESTART_GAP + secrets.randbelow(_RESTART_SPREAD) if last else 1
         self._idle = {number for number, segment in self._segments.items() if not segment.waiting}
+        # On the disk: records that have left the queue but share a file with others count
         self.used_bytes = sum(segment.nbytes for segment in self._segments.values())
         left_for = self._left_for()
         if left_for not in (None, map_name):
@@ -137,12 +125,6 @@ class Spool:
                 f"{self.folder} holds {len(self.waiting)} keyframes for the map {left_for}, not for "
                 f"{map_name}: send them first (a client with map={left_for!r}), or use another spool folder"
             )
-
-    def _size(self, number: int) -> int:
-        try:
-            return journal.segment_path(self.folder, number).stat().st_size
-        except OSError:
-            return 0
 
     def _left_for(self) -> str | None:
         """The map of what a dead scanner left: that of the first record that can be read."""

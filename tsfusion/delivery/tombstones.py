@@ -20,18 +20,13 @@ log = logging.getLogger(__name__)
 
 
 class Tombstones:
-    """A file of numbers, behind the session they belong to. A disk that refuses is passed over.
-
-    Attributes:
-        numbers: those in the file at the start.
-        written: count of the numbers in the file.
-    """
+    """A file of numbers, behind the session they belong to. A disk that refuses is passed over."""
 
     def __init__(self, folder: Path, session: bytes) -> None:
         self._path = folder / NAME
         self._session = session
-        self.numbers = self._read()
-        self.written = len(self.numbers)
+        self.numbers = self._read()  # those in the file at the start
+        self.written = len(self.numbers)  # count of the numbers in the file
 
     def _read(self) -> set[int]:
         try:

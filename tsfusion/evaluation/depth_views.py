@@ -29,15 +29,10 @@ EXACT_KD_TREE = 4  # FLANN_INDEX_KDTREE_SINGLE
 
 
 class DepthView(Protocol):
-    """The surface that a frame measured.
+    """The surface that a frame measured."""
 
-    Attributes:
-        points: (n, 3) float64, a part of the measured points, in the sensor's axes, metres.
-        range_m: their median distance along the axis (of a scan: from the sensor).
-    """
-
-    points: NDArray[np.float64]
-    range_m: float
+    points: NDArray[np.float64]  # (n, 3) float64, a part of the measured points, in the sensor's axes, metres
+    range_m: float  # their median distance along the axis (of a scan: from the sensor)
 
     def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n,) distance of (n, 3) points from the measured surface, in units of the tolerance.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How well the mesh of a scan predicts frames that were not fused, at the poses of the same scan."""
+"""Test of a scan's mesh on frames that were not fused, at the poses of the same scan."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -23,14 +23,10 @@ _COLUMN = 4.0  # metres: the side of the columns of points that are measured tog
 
 
 class KnownSurface(Protocol):
-    """A surface whose place is known, and the part of it that cameras saw.
+    """A surface whose place is known, and the part of it that cameras saw."""
 
-    Attributes:
-        seen: (n, 3) float64 metres, evenly spread points of the part that was seen.
-        edges: (m, 2, 3) float64 metres, segments where it bends sharply; empty where they are not known.
-    """
-
-    seen: NDArray[np.float64]
+    seen: NDArray[np.float64]  # (n, 3) float64 metres, evenly spread points of the part that was seen
+    # (m, 2, 3) float64 metres, segments where it bends sharply; empty where they are not known
     edges: NDArray[np.float64]
 
     def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -56,30 +56,19 @@ _UNEXPLAINED = (
 
 @dataclass(frozen=True)
 class PoseCheckReport:
-    """Result of `check`.
+    """Result of `check`."""
 
-    Attributes:
-        verdict: `disagree` only when it is sure.
-        text: one or two sentences: what is wrong and what to do.
-        mistake: what is wrong: a name in `MISTAKES`, `scale`, `time`, `unexplained`; None when they agree.
-        alternatives: other mistakes whose correction fits as well.
-        factor: for `scale`, what translations must be multiplied by.
-        shift: for `time`, frames later whose pose each frame should have.
-        pairs: number of pairs of frames compared.
-        fit: 0 to 1, how well the pairs fit as given; 1 = far within the sensors' tolerance.
-        best_fit: the fit after small corrections.
-        tried: the fit after the correction of each mistake, by its name.
-    """
-
-    verdict: Verdict
-    text: str
+    verdict: Verdict  # `disagree` only when it is sure
+    text: str  # one or two sentences: what is wrong and what to do
+    # What is wrong: a name in `MISTAKES`, `scale`, `time`, `unexplained`; None when they agree
     mistake: str | None = None
-    alternatives: tuple[str, ...] = ()
-    factor: float | None = None
-    shift: float | None = None
-    pairs: int = 0
-    fit: float | None = None
-    best_fit: float | None = None
+    alternatives: tuple[str, ...] = ()  # other mistakes whose correction fits as well
+    factor: float | None = None  # for `scale`, what translations must be multiplied by
+    shift: float | None = None  # for `time`, frames later whose pose each frame should have
+    pairs: int = 0  # number of pairs of frames compared
+    fit: float | None = None  # 0 to 1, how well the pairs fit as given; 1 = far within the sensors' tolerance
+    best_fit: float | None = None  # the fit after small corrections
+    # The fit after the correction of each mistake, by its name
     tried: dict[str, float] = field(default_factory=dict)
 
 
@@ -151,7 +140,7 @@ class _Pair:
         return np.asarray(np.linalg.inv(second) @ first, np.float64)
 
     def fit(self, motion: Motion) -> float:
-        """How well the first frame's points lie on the second's surface, 0 to 1; 0 if too few do."""
+        """Fit of the first frame's points to the second's surface, 0 to 1; 0 if too few can be compared."""
         deviation = self.second_view.deviation(se3.apply(motion, self.first_view.points))
         compared = np.isfinite(deviation)
         if compared.mean() < MIN_COMPARED:

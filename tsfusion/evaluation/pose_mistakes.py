@@ -105,7 +105,7 @@ MISTAKES: tuple[Mistake, ...] = (
         "the rotations are transposed (conjugate quaternions), the translations are right: transpose them",
         _conjugated,
     ),
-)  # fmt: skip
+)
 
 # Factors that correct the translations; dividing the depth by them would do as well.
 SCALES: tuple[tuple[float, str], ...] = (
@@ -119,11 +119,11 @@ SCALES: tuple[tuple[float, str], ...] = (
     (10.0, "depth is ten times too large: its unit is 0.1 mm where 1 mm was taken"),
     (100.0, "the translations are 100 times too small, or depth is in centimetres where metres were taken"),
     (1000.0, "depth is 1000 times too large (millimetres taken for metres), or the translations too small"),
-)  # fmt: skip
+)
 
 
 def scale_text(factor: float) -> str:
-    """What is wrong where translations must be multiplied by a factor, and what to do."""
+    """Description of the mistake where translations must be multiplied by a factor, and what to do."""
     known = dict(SCALES)
     if factor in known:
         return f"poses and depth disagree: {known[factor]}"

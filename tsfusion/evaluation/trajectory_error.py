@@ -11,6 +11,7 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, nearest_in_time, pose_of
 from tsfusion.datasets.readers import read_lines
 from tsfusion.datasets.trajectory_files import read_kitti, read_log, read_tum
+from tsfusion.geometry import se3
 from tsfusion.geometry.trajectory import rigid
 
 Poses = NDArray[np.float64]  # (n, 4, 4) T_world_camera
@@ -53,9 +54,7 @@ def umeyama(
     R = U @ np.diag(sign) @ Vt
     variance = float((centered**2).sum() / len(source))
     scale = float((S * sign).sum() / variance) if with_scale and variance > 0 else 1.0
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, mean_target - scale * R @ mean_source
-    return T, scale
+    return se3.transform(R, mean_target - scale * R @ mean_source), scale
 
 
 def absolute_error(estimate: Poses, reference: Poses, *, align: bool = True) -> TrajectoryError:

@@ -42,11 +42,7 @@ log = logging.getLogger(__name__)
 
 
 class Fuser:
-    """One map, and the work for each message of the gateway.
-
-    Attributes:
-        exit_status: of the process, which has to end; None = it goes on.
-    """
+    """One map, and the work for each message of the gateway."""
 
     def __init__(self, link: sockets.AnySocket, begin: fuser_messages.Begin) -> None:
         self._link = link
@@ -61,7 +57,7 @@ class Fuser:
         self._current = CurrentKeyframe(begin.working)
         self._memory_limit = process.data_bytes() + _TAICHI_RESERVES + begin.memory_bytes
         process.limit_memory(self._memory_limit)
-        self.exit_status: int | None = None
+        self.exit_status: int | None = None  # of the process, which has to end; None = it goes on
         self._map = MapCheckpoints(self._folder, begin.volume, keep_previous=begin.keep_previous)
         self._volume = self._map.volume
         self._volume.warm_up()

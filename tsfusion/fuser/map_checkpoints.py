@@ -30,11 +30,6 @@ class MapCheckpoints:
     Args:
         keep_previous: whether to keep the checkpoint before the last, too: the journal may be cut.
 
-    Attributes:
-        volume: the map, at first as it was in the last checkpoint.
-        done: session → how far the map is with it.
-        rejected: reason → number of keyframes that the map could not take.
-
     Raises:
         InvalidConfig: when the map was made with other settings.
         CheckpointError: when it is not a server's, cannot be read now or is of another version. A damaged
@@ -49,8 +44,9 @@ class MapCheckpoints:
         with suppress(OSError):  # left by a process that was killed
             self._new.unlink()
         self._keep_previous = keep_previous
-        self.done: dict[bytes, SessionProgress] = {}
-        self.rejected: dict[str, int] = {}
+        self.done: dict[bytes, SessionProgress] = {}  # session → how far the map is with it
+        self.rejected: dict[str, int] = {}  # reason → number of keyframes that the map could not take
+        # The map, at first as it was in the last checkpoint
         self.volume = _resume(self._path, config) or _resume(self._previous, config) or Volume(config)
         if meta := self.volume.meta:
             self.done = {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Who may connect: keys and the allow-list, checked when a connection is made and again at every message."""
+"""Keys and allow-list: checked when a connection is made, and again at every message."""
 
 import logging
 import time
@@ -24,16 +24,12 @@ class AccessControl:
     Args:
         folder: the folder that `tsfusion keys` made; None = no keys.
 
-    Attributes:
-        keys: the server's own pair, for its sockets; None without a folder.
-        poll: the sockets to poll before `step`.
-
     Raises:
         InvalidConfig: when the folder has no usable keys or allow-list.
     """
 
     def __init__(self, context: "zmq.Context[Any]", folder: str | None) -> None:
-        self.keys: ServerKeys | None = None
+        self.keys: ServerKeys | None = None  # the server's own pair, for its sockets; None without a folder
         self._allowed: AllowList | None = None
         self._zap: ZapHandler | None = None
         self._revoked = False
@@ -43,7 +39,7 @@ class AccessControl:
             if self._allowed.problem:  # an error at the start; later, nobody is let in
                 raise InvalidConfig(self._allowed.problem)
             self._zap = ZapHandler(context, self._allowed.name_of, self._allowed.rejection_reason)
-        self.poll = [] if self._zap is None else [self._zap.socket]
+        self.poll = [] if self._zap is None else [self._zap.socket]  # the sockets to poll before `step`
 
     @property
     def problem(self) -> str:
@@ -94,15 +90,12 @@ class ZapHandler:
     Args:
         allow: the client's name by its public key (40 characters); None = it may not connect.
         why_not: a word for the reason, for the log and for `refused`.
-
-    Attributes:
-        refused: connections that were turned away, by reason.
     """
 
     def __init__(
         self, context: "zmq.Context[Any]", allow: Allow, why_not: Callable[[str], str] = lambda _: "unknown"
     ) -> None:
-        self.refused: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()  # connections that were turned away, by reason
         self._allow = allow
         self._why_not = why_not
         self._logged: set[tuple[str, str]] = set()

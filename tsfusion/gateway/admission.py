@@ -11,14 +11,10 @@ from tsfusion.gateway.sessions import Sessions
 
 
 class Admission:
-    """The checks that every socket of a server makes, and their counter.
-
-    Attributes:
-        refused: messages that were not taken, by reason.
-    """
+    """The checks that every socket of a server makes, and their counter."""
 
     def __init__(self, access: AccessControl, routes: ClientRoutes) -> None:
-        self.refused: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()  # messages that were not taken, by reason
         self._access = access
         self._routes = routes
 

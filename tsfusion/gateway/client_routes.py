@@ -20,32 +20,20 @@ _LARGEST_BOUND_NS = 3600 * 10**9
 
 
 class ClientRoute(Struct, eq=False):
-    """A client that is connected.
+    """A client that is connected."""
 
-    Attributes:
-        session: 16 bytes.
-        map: the map that its keyframes go into.
-        identity: its connection to the control socket.
-        client: the name its key is allowed under; empty = no keys.
-        offset_ns: server clock minus client clock, as the client measured it; right to within `bound_ns`.
-        waiting, skipped: figures of its last Ping.
-        scans: whether a keyframe of the session is in the journal.
-        last_message: `time.monotonic()`.
-        held_until: `time.monotonic()`; until then its keyframes are turned away, for `hold_reason`.
-    """
-
-    session: bytes
-    map: str
-    identity: bytes
-    client: str = ""
-    offset_ns: int | None = None
-    bound_ns: int = 0
-    waiting: int = 0
+    session: bytes  # 16 bytes
+    map: str  # that its keyframes go into
+    identity: bytes  # of its connection to the control socket
+    client: str = ""  # the name its key is allowed under; empty = no keys
+    offset_ns: int | None = None  # server clock minus client clock, as the client measured it
+    bound_ns: int = 0  # how wrong that may be
+    waiting: int = 0  # this and `skipped`: figures of its last Ping
     skipped: dict[str, int] = field(default_factory=dict)
     received_bytes: int = 0
-    scans: bool = False
-    last_message: float = 0.0
-    held_until: float = 0.0
+    scans: bool = False  # whether a keyframe of the session is in the journal
+    last_message: float = 0.0  # `time.monotonic()`, as the next
+    held_until: float = 0.0  # until then its keyframes are turned away, for `hold_reason`
     hold_reason: str = ""
 
     @property

@@ -11,11 +11,7 @@ from tsfusion.gateway.sessions import Session, Sessions
 
 
 class FuserBacklog:
-    """Hands out records of each client in turn, and of each session of a client in turn.
-
-    Attributes:
-        keyframes, corrections: how many of them are not answered.
-    """
+    """Hand out records of each client in turn, and of each session of a client in turn."""
 
     def __init__(self, index: KeyframeIndex, sessions: Sessions) -> None:
         self._index = index
@@ -29,6 +25,7 @@ class FuserBacklog:
         return not self.keyframes and not self.corrections
 
     def _count(self) -> None:
+        """Count the keyframes and corrections that are not answered."""
         waiting = [session.entries[session.handed :] for session in self._sessions]
         self.corrections = sum(map(self._index.corrections, waiting))
         self.keyframes = sum(map(len, waiting)) - self.corrections

@@ -25,10 +25,6 @@ class FuserProcess:
     Args:
         name: of the map, for the log lines.
 
-    Attributes:
-        working_file: see `fuser.messages.Begin`.
-        socket: the gateway's end.
-
     Raises:
         OSError, zmq.ZMQError: when the system cannot start it.
     """
@@ -37,8 +33,8 @@ class FuserProcess:
         self, context: "zmq.Context[Any]", name: str, log_format: LogFormat, log_level: LogLevel
     ) -> None:
         self._scratch = Path(tempfile.mkdtemp(prefix="tsfusion-"))  # a socket's path has to be short
-        self.working_file = self._scratch / fuser_messages.WORKING_FILE
-        self.socket = sockets.pair(context)
+        self.working_file = self._scratch / fuser_messages.WORKING_FILE  # see `fuser.messages.Begin`
+        self.socket = sockets.pair(context)  # the gateway's end
         try:
             self.clear_current_keyframe()
             endpoint = f"ipc://{self._scratch}/0"

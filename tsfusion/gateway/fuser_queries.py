@@ -27,31 +27,20 @@ _RESTARTS = "the fuser restarts"
 
 
 class PendingQuery(Struct, frozen=True):
-    """A command that a fuser has not answered yet.
+    """A command that a fuser has not answered yet."""
 
-    Attributes:
-        identity: the connection that sent it.
-        owner: the client, or without keys the connection: each may have one mesh under way.
-        asked_at: `time.monotonic()`.
-    """
-
-    identity: bytes
-    owner: bytes
+    identity: bytes  # the connection that sent it
+    owner: bytes  # the client, or without keys the connection: each may have one mesh under way
     command: messages.Command
-    asked_at: float
+    asked_at: float  # `time.monotonic()`
 
 
 class LastMesh(Struct, frozen=True):
-    """The last mesh of a map that was made on request.
-
-    Attributes:
-        nbytes: its size.
-        asked_at, rest_until: `time.monotonic()`; between them a map that gets keyframes makes no other.
-    """
+    """The last mesh of a map that was made on request."""
 
     nbytes: int
-    asked_at: float
-    rest_until: float
+    asked_at: float  # `time.monotonic()`
+    rest_until: float  # until then a map that gets keyframes makes no other
 
 
 class FuserQueries:

@@ -36,15 +36,7 @@ _BETWEEN_KEYFRAMES = 10  # times `fuser_timeout` for a mesh or a checkpoint, whi
 
 
 class FuserSupervisor:
-    """One fuser process after another, all at work on the same map.
-
-    Attributes:
-        ready: whether the process has opened the map and compiled the kernels.
-        in_flight: indices of the keyframes that it has not answered, oldest first.
-        finishing: whether `finish` was called.
-        restarts: how often a new process had to take over.
-        failed: why no process stays alive; empty = one does. It is tried again, ever more rarely.
-    """
+    """One fuser process after another, all at work on the same map."""
 
     def __init__(
         self, context: "zmq.Context[Any]", folder: Path, server: ServerConfig, volume: VolumeConfig
@@ -65,7 +57,7 @@ class FuserSupervisor:
         self._blame: dict[int, int] = {}  # index of a keyframe → weight of the deaths at it
         self.finishing = self._finish_sent = False
         self.restarts = 0
-        self.failed = ""
+        self.failed = ""  # why no process stays alive; empty = one does; tried again, ever more rarely
         self._was_ready = False
         try:
             self._start()
@@ -76,11 +68,11 @@ class FuserSupervisor:
         self._process = FuserProcess(
             self._context, self._map, self._server.log_format, self._server.log_level
         )
-        self.ready = False
+        self.ready = False  # it has opened the map and compiled the kernels
         self._restart_at = 0.0
         self._last_message = self._ready_since = time.monotonic()
         self._oom_kills = process.oom_kills()
-        self.in_flight: deque[int] = deque()
+        self.in_flight: deque[int] = deque()  # indices that it has not answered, oldest first
 
     @property
     def socket(self) -> sockets.AnySocket:

@@ -41,13 +41,7 @@ Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
 
 class Gateway:
-    """One server's state between clients, journals and fusers. Call `step` again and again.
-
-    Attributes:
-        ports: the sockets.
-        maps: the open maps.
-        epoch: a new one tells clients that the messages under way are lost.
-    """
+    """One server's state between clients, journals and fusers. Call `step` again and again."""
 
     def __init__(
         self,
@@ -76,7 +70,7 @@ class Gateway:
         self._new_epoch()
 
     def _new_epoch(self) -> None:
-        self.epoch = f"{time.monotonic_ns():x}"
+        self.epoch = f"{time.monotonic_ns():x}"  # tells clients that the messages under way are lost
 
     def accept(self) -> None:
         """Begin to take keyframes."""
@@ -112,10 +106,7 @@ class Gateway:
         """The handler of each socket's messages; none while the sockets are made anew."""
         if self.ports.problem:
             return {}
-        handlers: Handlers = {
-            self.ports.control: self._on_control,
-            self.ports.viewers: self._on_subscription,
-        }
+        handlers: Handlers = {self.ports.control: self._on_control, self.ports.viewers: self._on_subscription}
         if self._accepting:
             handlers[self.ports.keyframes] = self._intake.handle
         elif self._stopped:
@@ -150,7 +141,7 @@ class Gateway:
         if now < self._next_snapshot:
             return
         self._next_snapshot = now + _SNAPSHOT_INTERVAL
-        logs.tell_left_out()
+        logs.log_left_out()
         self._metrics.health = self.health()
 
     # --- maps ---
@@ -190,15 +181,12 @@ class Gateway:
             self._refused["control"] += 1
             log.debug("%s", error)
             return
-        self._on_message(identity.bytes, message, client)
-
-    def _on_message(self, identity: bytes, message: messages.ToServer, client: str) -> None:
         if isinstance(message, messages.Command):
-            self._on_command(identity, message, client)
+            self._on_command(identity.bytes, message, client)
         elif isinstance(message, messages.Hello):
-            self._on_hello(identity, message, client)
+            self._on_hello(identity.bytes, message, client)
         else:
-            self._on_ping(identity, message, client)
+            self._on_ping(identity.bytes, message, client)
 
     def _on_hello(self, identity: bytes, hello: messages.Hello, client: str) -> None:
         if denied := self._denial(identity, hello, client):

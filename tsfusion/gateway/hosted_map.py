@@ -35,14 +35,7 @@ ForPeople = tuple[fuser_messages.Meshed | fuser_messages.FuserReply, Sequence[zm
 
 
 class HostedMap:
-    """An open map. Call `step` again and again, and `accept` for each keyframe.
-
-    Attributes:
-        folder: in the state folder.
-        disk: why keyframes are not taken now, and for how long.
-        outcomes: what the map has, by its fuser's answers.
-        warm: whether the fuser has been ready once: from then on it is known what the map has.
-    """
+    """An open map. Call `step` again and again, and `accept` for each keyframe."""
 
     def __init__(
         self,
@@ -57,7 +50,7 @@ class HostedMap:
         self.name = name
         self.folder = state_folder.map_folder(server.state, name)
         self.sessions = Sessions()
-        self.warm = False
+        self.warm = False  # the fuser has been ready once: from then on it is known what the map has
         self._metrics = metrics
         self._last_keyframe: float | None = None  # time.monotonic()
         self._loss = ""
@@ -121,6 +114,7 @@ class HostedMap:
         session = self.sessions.open(header.session, client)
         session.durable = header.seq
         durable_ns = time.monotonic_ns()
+        is_correction = isinstance(header, CorrectionHeader)
         self._index.add(
             position,
             session,
@@ -128,17 +122,16 @@ class HostedMap:
             captured_ns=0 if isinstance(header, CorrectionHeader) else header.captured_ns,
             received_ns=received_ns,
             durable_ns=durable_ns,
-            is_correction=isinstance(header, CorrectionHeader),
+            is_correction=is_correction,
         )
-        self._backlog.add(session, is_correction=isinstance(header, CorrectionHeader))
-        if isinstance(header, CorrectionHeader):
+        self._backlog.add(session, is_correction=is_correction)
+        if is_correction:
             self._corrections += 1
         else:
             self._last_keyframe = durable_ns / 1e9
             self._metrics.observe(self.name, "journal", (durable_ns - received_ns) / 1e9)
-        self.outcomes.acknowledge(
-            header.session, [keyframe_times.Stamps(header.seq, received_ns, durable_ns)]
-        )
+        stamps = keyframe_times.Stamps(header.seq, received_ns, durable_ns)
+        self.outcomes.acknowledge(header.session, [stamps])
 
     # --- fuser ---
 
@@ -258,14 +251,10 @@ def _warn_of_old_corrections(folder: Path) -> None:
 
 
 class DiskPause:
-    """The time after the disk refused a keyframe, in which no other is tried.
-
-    Attributes:
-        problem: why no keyframe is taken; empty = they are.
-    """
+    """The time after the disk refused a keyframe, in which no other is tried."""
 
     def __init__(self, journal: Journal, min_free_bytes: int, map_name: str) -> None:
-        self.problem = ""
+        self.problem = ""  # why no keyframe is taken; empty = they are
         self._journal = journal
         self._min_free_bytes = min_free_bytes
         self._map = map_name

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where each journaled record of a map lies, whose it is, and when it was received, durable and fused."""
+"""Index of a map's journal: place, session and time stamps of each record."""
 
 from array import array
 from bisect import bisect_left, bisect_right

@@ -30,16 +30,12 @@ _LONGEST_HOLD = 10.0
 
 
 class KeyframeIntake:
-    """The way from the data socket into the journals.
-
-    Attributes:
-        duplicates: messages with records that were journaled before.
-    """
+    """The way from the data socket into the journals."""
 
     def __init__(
         self, server: ServerConfig, maps: MapRegistry, admission: Admission, routes: ClientRoutes
     ) -> None:
-        self.duplicates = 0
+        self.duplicates = 0  # messages with records that were journaled before
         self._server = server
         self._maps = maps
         self._admission = admission

@@ -26,15 +26,7 @@ log = logging.getLogger(__name__)
 
 
 class KeyframeOutcomes:
-    """The outcomes of one map's keyframes, over all its fuser processes.
-
-    Attributes:
-        fused: keyframes in the map.
-        rejected: keyframes that the map could not take, by reason.
-        unmeshed: indices of keyframes that the present fuser answered and has not meshed, oldest first.
-        blocks, map_bytes: the size of the map, at the fuser's last message about it.
-        delays: capture to fused.
-    """
+    """The outcomes of one map's keyframes, over all its fuser processes."""
 
     def __init__(
         self,
@@ -47,10 +39,10 @@ class KeyframeOutcomes:
         journal: Path,
         quarantine: Quarantine,
     ) -> None:
-        self.fused = 0
-        self.rejected: Counter[str] = Counter()
-        self.unmeshed: deque[int] = deque()
-        self.blocks = self.map_bytes = 0
+        self.fused = 0  # keyframes in the map
+        self.rejected: Counter[str] = Counter()  # by reason
+        self.unmeshed: deque[int] = deque()  # indices; answered by the present fuser, oldest first
+        self.blocks = self.map_bytes = 0  # at the fuser's last message about them
         self.delays = DelayStatistics()
         self._name = name
         self._index = index

@@ -44,9 +44,6 @@ class MetricsPage:
         address: HOST:PORT on this machine; port 0 = a random one.
         pages: path → function that makes its answer, called in the thread.
 
-    Attributes:
-        address: HOST:PORT with the real port.
-
     Raises:
         InvalidConfig: when others than this machine could reach it.
         TransportError: when the port is taken.
@@ -55,7 +52,7 @@ class MetricsPage:
     def __init__(self, address: str, pages: Mapping[str, Callable[[], HttpResponse]]) -> None:
         self._pages = pages
         self._listener = _listen(address)
-        self.address = _text(*self._listener.getsockname()[:2])
+        self.address = _text(*self._listener.getsockname()[:2])  # HOST:PORT with the real port
         self._open: dict[asyncio.Task[None], asyncio.StreamWriter] = {}  # the oldest first
         self._loop = asyncio.new_event_loop()
         self._ending = asyncio.Event()

@@ -22,11 +22,7 @@ Handler: TypeAlias = Callable[[list[zmq.Frame]], None]
 
 
 class Ports:
-    """The sockets: keyframes in, control both ways, mesh updates out.
-
-    Attributes:
-        problem: why nobody can connect; empty = clients can.
-    """
+    """The sockets: keyframes in, control both ways, mesh updates out."""
 
     def __init__(
         self, context: "zmq.Context[Any]", server: ServerConfig, keys: ServerKeys | None = None
@@ -36,7 +32,7 @@ class Ports:
         self._keys = keys
         self._addresses: Addresses | None = None
         self._next_bind = 0.0
-        self.problem = ""
+        self.problem = ""  # why nobody can connect; empty = clients can
         self._open()
 
     def _open(self) -> None:

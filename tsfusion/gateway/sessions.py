@@ -8,33 +8,22 @@ from typing import Literal
 from msgspec import Struct, field
 
 _MAX_SESSIONS = 100_000  # of a map; each takes some 60 bytes of every checkpoint, for ever
-Verdict = Literal["next", "duplicate", "gap"]
+SeqOrder = Literal["next", "duplicate", "gap"]
 
 
 class Session(Struct, eq=False):
-    """One client's stream of keyframes.
+    """One client's stream of keyframes."""
 
-    Attributes:
-        key: 16 bytes that the client drew.
-        number: position in `Sessions`.
-        client: the name that the owner's key is allowed under; empty = it came without keys.
-        durable: the highest seq that is journaled.
-        fused: the highest seq that the map has taken or rejected.
-        in_map: the same for the present fuser: one that takes over begins at the checkpoint again.
-        entries: the indices of its keyframes that are not forgotten.
-        handed: how many of these the fuser was given.
-        corrections: records of corrected poses that came.
-    """
-
-    key: bytes
-    number: int
-    client: str = ""
-    durable: int = 0
-    fused: int = 0
-    in_map: int = 0
+    key: bytes  # 16 bytes that the client drew
+    number: int  # position in `Sessions`
+    client: str = ""  # the name that the owner's key is allowed under; empty = it came without keys
+    durable: int = 0  # the highest seq that is journaled
+    fused: int = 0  # the highest seq that the map has taken or rejected
+    in_map: int = 0  # the same for the present fuser: one that takes over begins at the checkpoint again
+    # Indices of its keyframes that are not forgotten
     entries: "array[int]" = field(default_factory=lambda: array("q"))
-    handed: int = 0
-    corrections: int = 0
+    handed: int = 0  # how many of these the fuser was given
+    corrections: int = 0  # records of corrected poses that came
 
     @property
     def owner(self) -> str:
@@ -75,7 +64,7 @@ class Sessions:
             self._all.append(session)
         return session
 
-    def admit(self, key: bytes, seq: int, previous: int) -> Verdict:
+    def admit(self, key: bytes, seq: int, previous: int) -> SeqOrder:
         """Whether keyframe `seq` may be journaled, when the client has none between `previous` and it.
 
         Keyframes are taken in order only, so one number a session is enough to know every keyframe that ever

@@ -38,19 +38,14 @@ _MAX_RESIDUAL = 1e-10  # on the unit plane
 class Camera:
     """Calibrated camera with a lens model.
 
-    Attributes:
-        intrinsics: pixels.
-        size: (height, width) of its images.
-        model: lens model.
-        distortion: radtan: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]]; equidistant: k1 k2 k3 k4.
-
     Raises:
         InvalidConfig: naming what is wrong.
     """
 
-    intrinsics: Intrinsics
-    size: Size
-    model: Model = "pinhole"
+    intrinsics: Intrinsics  # pixels
+    size: Size  # (height, width) of its images
+    model: Model = "pinhole"  # lens model
+    # radtan: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]]; equidistant: k1 k2 k3 k4
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:

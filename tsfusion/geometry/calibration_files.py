@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig
 from tsfusion.geometry.calibration import Camera, Size, StereoRig
-from tsfusion.geometry.se3 import inverse
+from tsfusion.geometry.se3 import inverse, transform
 
 EXPECTED = (
     "Kalibr's camchain.yaml, EuRoC's sensor.yaml, ROS camera_info, or OpenCV's matrices M1 D1 M2 D2 R T"
@@ -59,10 +59,20 @@ def rig_of_camera_info(left: Camera, right: Camera, R: Any, P: Any) -> StereoRig
     """Make a rig of two ROS CameraInfo messages; `R` and `P` are (left, right) pairs of their `r` and `p`."""
     R_left, R_right = (np.asarray(each, dtype=np.float64).reshape(3, 3) for each in R)
     P_right = np.asarray(P[1], dtype=np.float64).reshape(3, 4)
-    T = np.eye(4)
-    T[:3, :3] = R_right.T @ R_left
-    T[:3, 3] = R_right.T @ (P_right[:, 3] / P_right[0, 0])
-    return StereoRig(left, right, T)
+    t = R_right.T @ (P_right[:, 3] / P_right[0, 0])
+    return StereoRig(left, right, transform(R_right.T @ R_left, t))
+
+
+def read_text(path: Path, content: str) -> str:
+    """Read a text file, with or without a byte order mark; DatasetError says that `content` was expected."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise DatasetError(f"{path} is missing; expected {content}") from error
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{path} is not a text file; expected {content}") from error
+    except OSError as error:
+        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
 
 
 def read_tree(path: Path) -> Tree:
@@ -71,14 +81,7 @@ def read_tree(path: Path) -> Tree:
     Raises:
         DatasetError: the file cannot be read or parsed.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise DatasetError(f"{path} is missing; expected {EXPECTED}") from error
-    except UnicodeDecodeError as error:
-        raise DatasetError(f"{path} is not a text file; expected {EXPECTED}") from error
-    except OSError as error:
-        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
+    text = read_text(path, EXPECTED)
     if _is_too_large(text):
         raise DatasetError(f"{path} is far too large or too deep for a calibration; expected {EXPECTED}")
     try:
@@ -183,8 +186,7 @@ def _opencv_rig(tree: Tree, size: Size | None) -> StereoRig:
         for K, D in zip(names["K"], names["D"], strict=True)
     )
     if "R" in tree and "T" in tree:
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = _numbers(tree["R"]).reshape(3, 3), _numbers(tree["T"])
+        T = transform(_numbers(tree["R"]).reshape(3, 3), _numbers(tree["T"]))
         return StereoRig(left, right, T)
     R, P = ([_numbers(tree[name]) for name in names[key]] for key in "RP")
     return rig_of_camera_info(left, right, R, P)

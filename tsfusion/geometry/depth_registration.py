@@ -11,7 +11,6 @@ from tsfusion.geometry.keyframe import Intrinsics, check_pose
 Size = tuple[int, int]  # height, width
 _FAR = np.float32(65.535)  # metres: assumed depth of pixels without depth
 _OVERLAP = 1.2  # width at which a depth pixel is drawn, in pixels: no gaps on slanted surfaces
-_OCCLUDED = np.float32(1.03)  # times the depth that the colour camera sees: points farther away are hidden
 
 
 class Registration:
@@ -51,24 +50,12 @@ class Registration:
         """Colour of every depth pixel: (H, W, 3) uint8 of the depth's size.
 
         A pixel without depth (0) gets the colour far away there; one outside of the colour image, the colour
-        of its border; one hidden from the colour camera, the colour of what hides it (see `visible`).
+        of its border; one hidden from the colour camera, the colour of what hides it.
         """
         u, v, _ = self._pixels(np.where(depth_m > 0, depth_m, _FAR))
         if color.shape[:2] != self.color_size:
             raise InvalidConfig(f"color must be of size {self.color_size}, got {color.shape[:2]}")
         seen: NDArray[np.uint8] = cv2.remap(color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return seen
-
-    def visible(self, depth_m: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Whether pixels have depth and the colour camera sees their points: (H, W)."""
-        u, v, z = self._pixels(np.where(depth_m > 0, depth_m, _FAR))
-        height, width = self.color_size
-        column, row = np.rint(u), np.rint(v)
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (depth_m > 0) & (z > 0)
-        nearest = self.depth_of_color(depth_m)
-        seen = np.zeros(self.size, bool)
-        at = row[inside].astype(np.intp), column[inside].astype(np.intp)
-        seen[inside] = z[inside] <= nearest[at] * _OCCLUDED
         return seen
 
     def depth_of_color(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -14,7 +14,7 @@ from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.geometry.stereo_matching import UNITS, Matcher
 
-Kind = Literal["depth", "disparity", "points", "pair"]
+FrameKind = Literal["depth", "disparity", "points", "pair"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,7 +53,7 @@ class Frame:
     color: NDArray[np.uint8] | None = None
     confidence: NDArray[np.uint8] | None = None
     intrinsics: Intrinsics | None = None
-    kind: Kind = field(init=False)
+    kind: FrameKind = field(init=False)
 
     def __post_init__(self) -> None:
         put = object.__setattr__  # the dataclass is frozen for everyone else

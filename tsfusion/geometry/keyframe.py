@@ -40,10 +40,7 @@ class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
     def scaled(self, factor: float) -> "Intrinsics":
         """Intrinsics of the image resized by `factor` (pixel centres at integers)."""
         return Intrinsics(
-            self.fx * factor,
-            self.fy * factor,
-            (self.cx + 0.5) * factor - 0.5,
-            (self.cy + 0.5) * factor - 0.5,
+            self.fx * factor, self.fy * factor, (self.cx + 0.5) * factor - 0.5, (self.cy + 0.5) * factor - 0.5
         )
 
 

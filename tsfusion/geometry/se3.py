@@ -8,7 +8,7 @@ every function takes `(…, 4, 4)` or `(…, 6)` and keeps the `…`.
 """
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Transform = NDArray[np.float64]  # (…, 4, 4)
 Twist = NDArray[np.float64]  # (…, 6)
@@ -62,6 +62,13 @@ def rotation_vector(R: NDArray[np.float64]) -> NDArray[np.float64]:
         way = np.where((longest * axis[obtuse]).sum(axis=1) < 0, -1, 1)
         phi[obtuse] = longest * (way * angle[obtuse] / _length(longest))[:, None]
     return phi
+
+
+def transform(R: ArrayLike, t: ArrayLike) -> Transform:
+    """Make one (4, 4) transform of a (3, 3) rotation and a (3,) translation."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return T
 
 
 def inverse(T: Transform) -> Transform:

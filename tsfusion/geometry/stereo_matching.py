@@ -22,20 +22,14 @@ class Matcher:
     OpenCV's 3-way mode ignores `disp12MaxDiff`, so the pair is matched both ways and compared here: on
     KITTI 06 this takes disagreements of more than 2 px between frames from 5.7 % to 2.9 %. Both images are
     widened by the search range first, which keeps the image's left edge.
-
-    Attributes:
-        search: range of disparities, pixels, a multiple of 16; None = a twelfth of the width, at least 32.
-        block: side of the compared blocks, pixels, odd.
-        uniqueness: percent by which the best match must beat the second.
-        agreement: largest difference of the two directions' disparities, pixels.
-        speckle: smallest connected region kept, pixels.
     """
 
+    # Range of disparities, pixels, a multiple of 16; None = a twelfth of the width, at least 32
     search: int | None = None
-    block: int = 5
-    uniqueness: int = 10
-    agreement: float = 1.0
-    speckle: int = 200
+    block: int = 5  # side of the compared blocks, pixels, odd
+    uniqueness: int = 10  # percent by which the best match must beat the second
+    agreement: float = 1.0  # largest difference of the two directions' disparities, pixels
+    speckle: int = 200  # smallest connected region kept, pixels
 
     def __call__(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.uint16]:
         search = self.search or max(32, -(-left.shape[1] // (12 * 16)) * 16)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.geometry.se3 import Transform
+from tsfusion.geometry.se3 import Transform, transform
 
 _EXACT_NS = 1_000_000  # nanoseconds within which a pose is taken as it is
 
@@ -61,14 +61,12 @@ def slerp(q0: NDArray[np.float64], q1: NDArray[np.float64], share: float) -> NDA
 def rigid(quaternion: NDArray[np.float64], translation: NDArray[np.float64]) -> Transform:
     """Make a (4, 4) transform of a unit quaternion (x y z w) and a translation."""
     x, y, z, w = quaternion
-    T = np.eye(4)
-    T[:3, :3] = [
+    R = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    T[:3, 3] = translation
-    return T
+    return transform(R, translation)
 
 
 def quaternion(R: NDArray[np.float64]) -> NDArray[np.float64]:

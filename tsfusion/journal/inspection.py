@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a journal holds, and whether all of it is as it was written."""
+"""Contents of a journal, and the check that all of it is as it was written."""
 
 import math
 from array import array
@@ -87,7 +87,7 @@ class JournalInfo(Struct, kw_only=True):
     quarantined: list[dict[str, Any]]  # name, bytes
 
 
-class Verdict(Struct, kw_only=True):
+class JournalVerdict(Struct, kw_only=True):
     """Whether a journal is whole. `lost`: keyframes that cannot be had any more, at least."""
 
     path: str
@@ -211,7 +211,7 @@ def problem(path: Path, damage: Damage) -> Problem:
     return Problem(kind, path.name, damage.position.offset, damage.nbytes, damage.lost, damage.what)
 
 
-def verify(place: JournalPlace, watch: Watcher) -> Verdict:
+def verify(place: JournalPlace, watch: Watcher) -> JournalVerdict:
     """Read and decode every record.
 
     Raises:
@@ -228,7 +228,7 @@ def verify(place: JournalPlace, watch: Watcher) -> Verdict:
             keyframes += not step.is_correction
             corrections += step.is_correction
             problems += checks.of(path, step)
-    return Verdict(
+    return JournalVerdict(
         path=str(place.path),
         intact=not any(one.kind == "damage" for one in problems),
         keyframes=keyframes,
@@ -249,7 +249,7 @@ def _missing(files: list[Path]) -> Iterator[Problem]:
 
 
 class _Checks:
-    """What can be wrong with a record whose CRC is right."""
+    """Checks of a record whose CRC is right."""
 
     def __init__(self) -> None:
         self._last: dict[bytes, int] = {}

@@ -54,7 +54,7 @@ INDEX_START = struct.pack("<BQHI", Opcode.MESSAGE_INDEX, INDEX_BYTES - _LENGTH_B
 
 
 class Position(Struct, frozen=True, order=True, array_like=True):
-    """Where a record starts: the segment's number and the byte in it. Positions sort in journal order."""
+    """Start of a record: the segment's number and the byte in it. Positions sort in journal order."""
 
     segment: int
     offset: int

@@ -28,18 +28,13 @@ _HEAD_SHAPE = re.compile(rb"(?s)\x06(?=.{5}\0{3}.{16}.{5}\0{3}.{4}\0{4}.{5}\0{3}
 
 
 class Damage(Struct, frozen=True):
-    """A stretch of a segment that is not as it was written.
-
-    Attributes:
-        lost: lower bound of the keyframes that it destroyed; 0 = only parts that readers do not need.
-        torn: the end of the last write, cut off before it was acknowledged: no keyframe is lost.
-    """
+    """A stretch of a segment that is not as it was written."""
 
     position: Position
     nbytes: int
-    lost: int
+    lost: int  # lower bound of the keyframes that it destroyed; 0 = only parts that readers do not need
     what: str
-    torn: bool = False
+    torn: bool = False  # the end of the last write, cut off before it was acknowledged: no keyframe is lost
 
 
 def scan_records(path: Path) -> Iterator[Record | Damage]:
@@ -103,7 +98,7 @@ class _Scan:
         return Damage(Position(self._number, at), nbytes, lost, what, torn)
 
     def _behind(self, end: int, index: bytes) -> int:
-        """Where the next record starts. A damaged index is met there, as a place without a record."""
+        """Offset of the next record. A damaged index is met there, as a place without a record."""
         return end + len(index) if self._source.read(end, len(index), self._end) == index else end
 
     def _is_end_of_data(self, at: int) -> bool:
@@ -157,7 +152,7 @@ class _Scan:
     # --- between records ---
 
     def _damage(self, at: int) -> Damage:
-        """What is wrong at a place where a record should start, and how far it reaches."""
+        """The damage at a place where a record should start, and how far it reaches."""
         raw = self._source.read(at, mcap_layout.HEAD_BYTES, self._end)
         head = mcap_layout.parse_head(raw)
         end = at + head.nbytes if head is not None else None
@@ -193,7 +188,7 @@ class _Scan:
         return not rest and not self._source.failed
 
     def _search(self, start: int) -> int | None:
-        """Where the next whole record starts, at or behind `start`."""
+        """Offset of the next whole record, at or behind `start`."""
         if self._next is not None:
             begun, found = self._next
             if begun <= start and (found is None or start <= found):

@@ -119,14 +119,14 @@ class _Exporter:
                 self._problems.append(problem(path, step))
             elif not step.is_correction and (step.session, step.seq) not in self._seen:
                 self._seen.add((step.session, step.seq))
-                self._take(path, step)
+                self._add(path, step)
         for path, record in self._held.values():
             self._write(path, record)
         if not self._keyframes:
             raise JournalError(f"no keyframes in {place.path}")
         self._bag.finish()
 
-    def _take(self, path: Path, record: Record) -> None:
+    def _add(self, path: Path, record: Record) -> None:
         """Write a keyframe, once it is known whether its session has a sensor's clock.
 
         A first keyframe at time 0 may come from a clock that started with it, or from a sensor without one.

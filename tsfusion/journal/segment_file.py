@@ -23,10 +23,6 @@ log = logging.getLogger(__name__)
 class SegmentFile:
     """A segment file at its present length: bytes that a writer adds later are not seen.
 
-    Attributes:
-        failed: whether the disk could not read some part that was asked for.
-        answered: whether the disk has read any part.
-
     Raises:
         OSError: as `open` does.
     """
@@ -35,7 +31,8 @@ class SegmentFile:
         self.path = path
         self._file = path.open("rb", buffering=0)
         self.size = os.fstat(self._file.fileno()).st_size
-        self.failed = self.answered = False
+        self.failed = False  # the disk could not read some part that was asked for
+        self.answered = False  # the disk has read some part
 
     def __enter__(self) -> "SegmentFile":
         return self
@@ -83,17 +80,12 @@ _MAX_SUMMARY_BYTES = 1 << 28
 
 
 class SegmentEnd(Struct, frozen=True):
-    """The index at the end of a segment.
+    """The index at the end of a segment."""
 
-    Attributes:
-        state: `whole`; `open` = never closed, or cut off within the index; `broken` = closed, then damaged.
-        data_end: offset at which the last record ends.
-        keyframes: number of keyframes in the segment when it was closed.
-    """
-
+    # `whole`; `open` = never closed, or cut off within the index; `broken` = closed, then damaged
     state: Literal["whole", "broken", "open"]
-    data_end: int | None = None
-    keyframes: int | None = None
+    data_end: int | None = None  # offset at which the last record ends
+    keyframes: int | None = None  # number of keyframes in the segment when it was closed
 
 
 def read_segment_end(source: SegmentFile) -> SegmentEnd:
@@ -111,7 +103,7 @@ def read_segment_end(source: SegmentFile) -> SegmentEnd:
 
 
 def _summary(source: SegmentFile, footer_at: int) -> tuple[int, bytes] | None:
-    """Where the summary starts, and its bytes; None unless its CRC agrees."""
+    """Offset of the summary, and its bytes; None unless its CRC agrees."""
     footer = source.read(footer_at, _FOOTER.size)
     opcode, length, start, _, crc32 = _FOOTER.unpack(footer)
     if (opcode, length) != (Opcode.FOOTER, _FOOTER.size - _RECORD.size):

@@ -8,6 +8,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from tsfusion.core.config import MAP_NAME
+from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import JournalError
 from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.quarantine import quarantined_files
@@ -72,18 +73,14 @@ Watcher = Callable[[int, int], None]  # bytes read, bytes of all
 
 
 class JournalPlace(Struct, frozen=True):
-    """A journal on the disk.
+    """A journal on the disk."""
 
-    Attributes:
-        path: a folder of segments, or one segment file.
-        quarantine: folder of the keyframes that could not be fused; None = the journal is no map's.
-    """
-
-    path: Path
+    path: Path  # a folder of segments, or one segment file
+    # Folder of the keyframes that could not be fused; None = the journal is no map's
     quarantine: Path | None = None
 
     def files(self) -> list[Path]:
-        """Its segments, oldest first; of a quarantine its files.
+        """List the segments, oldest first; of a quarantine the files.
 
         Raises:
             JournalError: when the folder cannot be listed.
@@ -108,7 +105,7 @@ class JournalPlace(Struct, frozen=True):
 
     def steps(self, watch: Watcher = lambda _done, _all: None) -> Iterator[tuple[Path, Record | Damage]]:
         """Records and damaged places, each with its file; a file that cannot be read is a damaged place."""
-        files = [(path, _size(path)) for path in self.files()]
+        files = [(path, size_of(path)) for path in self.files()]
         total, before = sum(size for _, size in files), 0
         for path, size in files:
             try:
@@ -137,7 +134,7 @@ def find_journal(path: Path, map_name: str | None = None) -> JournalPlace:
     path = resolve_map(path, map_name)
     if (path / JOURNAL_FOLDER).is_dir():
         return _of_map(path)
-    if path.name == JOURNAL_FOLDER and _is_map(path.parent):
+    if path.name == JOURNAL_FOLDER and (path.parent / QUARANTINE_FOLDER).is_dir():
         return _of_map(path.parent)
     if path.is_dir():
         return JournalPlace(path)
@@ -161,14 +158,3 @@ def is_journal(path: Path) -> bool:
 
 def _of_map(folder: Path) -> JournalPlace:
     return JournalPlace(folder / JOURNAL_FOLDER, folder / QUARANTINE_FOLDER)
-
-
-def _is_map(folder: Path) -> bool:
-    return (folder / QUARANTINE_FOLDER).is_dir()
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError:
-        return 0

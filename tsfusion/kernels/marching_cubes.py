@@ -21,7 +21,7 @@ vec3f = ti.types.vector(3, ti.f32)
 
 @ti.func
 def neighbour_of(p):
-    """Which of the 27 blocks around (13 = itself) holds the voxel with block-relative coordinates p."""
+    """Number of the block, of the 27 around (13 = itself), that holds the voxel at block-relative p."""
     return ((p[0] >> 3) + 1) * 9 + ((p[1] >> 3) + 1) * 3 + (p[2] >> 3) + 1
 
 
@@ -220,7 +220,7 @@ def emit_faces(
     triangle_starts: ti.types.ndarray(dtype=ti.i32, ndim=2),
     faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
 ):
-    """Each cell's triangles, as the numbers of the vertices on its edges."""
+    """Triangles of each cell, as the numbers of the vertices on its edges."""
     for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             band = run // RUN

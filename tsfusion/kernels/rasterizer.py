@@ -20,7 +20,7 @@ def corner(vertices: ti.types.ndarray(), i):
 
 @ti.func
 def cut(a, b, near):
-    """Where the edge from a (in front of the near plane) to b (behind it) meets the plane."""
+    """Point where the edge from a (in front of the near plane) to b (behind it) meets the plane."""
     t = (near - a.z) / (b.z - a.z)
     return tm.vec3(a.x + t * (b.x - a.x), a.y + t * (b.y - a.y), near)
 

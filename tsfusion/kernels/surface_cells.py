@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which cells the surface crosses and which voxel edges carry a vertex, 64 voxels at a time.
+"""Masks of the cells that the surface crosses and of the voxel edges with a vertex, 64 voxels at a time.
 
 A block's voxels are eight planes of bits, one an x; bit 8·y + z of a plane is voxel (x, y, z). Whether
 cells are crossed is then a matter of shifting and combining planes of the block and of its neighbours.

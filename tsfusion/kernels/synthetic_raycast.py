@@ -65,7 +65,7 @@ def may_meet(solids: ti.template(), s, o, d):
 
 @ti.func
 def solid_ray(solids: ti.template(), s, o_world, d_world):
-    """Where the ray first meets solid `s` from outside, in units of `d_world`'s length; 1e9 = never."""
+    """Distance at which the ray enters solid `s`, in units of `d_world`'s length; 1e9 = never."""
     kind = ti.i32(solids[s, 0])
     cosine, sine = solids[s, 7], solids[s, 8]
     o = to_local(o_world - vec3(solids[s, 1], solids[s, 2], solids[s, 3]), cosine, sine)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a replay and a scan have in common: the pace of sending, the wait for the map, and progress.
+"""Steps that replay and scan share: the pace of sending, the wait for the map, and progress.
 
 A replay has its poses already and sends every keyframe; a scan finds poses and chooses among frames. From the
 client on they are the same: each hands keyframes to the clients of one `Target` and asks this engine when the

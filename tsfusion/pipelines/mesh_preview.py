@@ -25,17 +25,11 @@ _NEAR = 0.05  # metres
 
 @dataclass(frozen=True, eq=False)
 class PreviewCamera:
-    """Where a picture is taken from.
+    """Camera of a picture."""
 
-    Attributes:
-        T_world_camera: (4, 4) float64, OpenCV axes (x right, y down, z forward).
-        fov: horizontal field of view, radians.
-        near: metres in front of the eye where drawing starts.
-    """
-
-    T_world_camera: NDArray[np.float64]
-    fov: float = math.radians(50)
-    near: float = _NEAR
+    T_world_camera: NDArray[np.float64]  # (4, 4) float64, OpenCV axes (x right, y down, z forward)
+    fov: float = math.radians(50)  # horizontal field of view, radians
+    near: float = _NEAR  # metres in front of the eye where drawing starts
 
 
 def render(

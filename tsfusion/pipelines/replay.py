@@ -88,7 +88,7 @@ def replay(
 
 
 def _keyframes(dataset: Dataset, first: Keyframe, running: Engine, rate: float | None) -> Iterator[Keyframe]:
-    """Each keyframe at its time; a sensor that was late does not catch up."""
+    """Yield each keyframe at its time; a sensor that was late does not catch up."""
     due = time.monotonic()
     yield first
     for index in range(1, len(dataset)):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What `run.json` of a replay holds."""
+"""Figures of a replay, and the contents of its `run.json`."""
 
 from typing import Any, Protocol, runtime_checkable
 
@@ -16,7 +16,7 @@ from tsfusion.wire.keyframe_times import Spread
 
 
 @runtime_checkable
-class KnownSurface(Protocol):
+class DatasetWithSurface(Protocol):
     """A dataset of a world whose surface is known."""
 
     def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -35,7 +35,7 @@ class Accuracy(msgspec.Struct, frozen=True):
 
 
 class ReplaySummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `run.json` of a replay holds."""
+    """Contents of `run.json` of a replay."""
 
     dataset: str
     keyframes_sent: int
@@ -91,7 +91,7 @@ def summarise(
         stages_ms=delays.stages_ms,
         clock_bound_ms=delays.clock_bound_ms,
         mesh={"vertices": len(mesh.vertices), "triangles": len(mesh.faces)},
-        accuracy=measure(dataset, mesh) if isinstance(dataset, KnownSurface) else None,
+        accuracy=measure(dataset, mesh) if isinstance(dataset, DatasetWithSurface) else None,
         peak_rss_bytes={**server_rss(status), "client": peak_rss_bytes},
         config={**status.config, "rate": rate},
         versions=run_files.versions(),
@@ -104,7 +104,7 @@ def server_rss(status: Status) -> dict[str, int]:
     return {"server": gateway + fuser, "gateway": gateway, "fuser": fuser}
 
 
-def measure(surface: KnownSurface, mesh: Mesh) -> Accuracy:
+def measure(surface: DatasetWithSurface, mesh: Mesh) -> Accuracy:
     """Distance from the mesh's vertices to the known surface."""
     error_mm = 1000 * np.abs(surface.distance(mesh.vertices.astype(np.float64)))
     p50, p95 = np.percentile(error_mm, (50, 95))

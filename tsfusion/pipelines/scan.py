@@ -94,7 +94,7 @@ def scan(
             pace = running.wait_turn if own and not source.live else running.check
             progress.stage(f"scanning {source.name}")
             started = time.monotonic()
-            _take(scanner, _timely(source, first, frames, config.patience), pace, failure)
+            _run_scanner(scanner, _timely(source, first, frames, config.patience), pace, failure)
             peak = process.peak_rss_bytes()
             if not any(submap.located for submap in scanner.submaps):
                 raise failure[0] if failure else _not_localised(scanner)
@@ -138,7 +138,7 @@ def _until_failure(frames: Iterator[Frame], failure: list[Exception]) -> Iterato
 
 
 def _timely(source: Source, first: Frame, frames: Iterator[Frame], patience: float) -> Iterator[Frame]:
-    """All frames; but for a live source's first if it grew old while the server started."""
+    """Yield all frames, but not the first of a live source if it grew old while the server started."""
     if not source.live:
         yield dataclasses.replace(first, captured_ns=time.monotonic_ns())
     else:
@@ -150,10 +150,10 @@ def _timely(source: Source, first: Frame, frames: Iterator[Frame], patience: flo
     yield from frames
 
 
-def _take(
+def _run_scanner(
     scanner: Scanner, frames: Iterator[Frame], pace: Callable[[], object], failure: list[Exception]
 ) -> None:
-    """Take the frames; an error ends the scan, but what was localised before is not thrown away."""
+    """Run the scanner; an error ends the scan, but what was localised before is not thrown away."""
 
     def watch(_: Scanner) -> None:
         pace()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a scan leaves: the trajectories, and what `run.json` of a scan holds."""
+"""Results of a scan: the trajectories, and the contents of `run.json`."""
 
 from pathlib import Path
 from typing import Any
@@ -20,42 +20,25 @@ from tsfusion.wire.keyframe_times import KeyframeTimes, Spread
 
 
 class MapResult(msgspec.Struct, frozen=True, kw_only=True):
-    """One submap in figures.
-
-    Attributes:
-        frames: that have a pose.
-        keyframes: of them, sent to the map.
-        loops: closed by loop closure.
-        trajectory_error: of the poses as they were tracked, against the source's own; None = it has none.
-        corrected_error: the same after loop closure; None = there were no corrections.
-        blocks, map_hash, mesh: of the own server's map; 0 and empty with a server elsewhere.
-    """
+    """One submap in figures. With a server elsewhere, nothing is known of the map itself."""
 
     name: str
-    frames: int
-    keyframes: int
-    loops: int
-    trajectory_error: TrajectoryError | None
-    corrected_error: TrajectoryError | None
+    frames: int  # that have a pose
+    keyframes: int  # of them, sent to the map
+    loops: int  # closed by loop closure
+    trajectory_error: TrajectoryError | None  # as tracked, against the source's own poses; None = it has none
+    corrected_error: TrajectoryError | None  # after loop closure; None = there were no corrections
     map_hash: str = ""
     blocks: int = 0
     mesh: dict[str, int] = {}
 
 
 class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """What `run.json` of a scan holds.
-
-    Attributes:
-        complete: whether the source was read to its end: false after a failure, and for a recording after
-            Ctrl-C.
-        left: keyframes still in the spool at the end.
-        link: why the server took nothing at the end; empty = it did.
-        seconds: from the first frame until the last keyframe was fused (or acknowledged, elsewhere).
-        tracking_cpu_ms: CPU milliseconds of the localizer a frame.
-    """
+    """Contents of `run.json` of a scan."""
 
     source: str
     localizer: str
+    # Whether the source was read to its end: false after a failure, and for a recording after Ctrl-C
     complete: bool
     frames: int
     frames_tracked: int
@@ -65,10 +48,10 @@ class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
     keyframes_fused: int
     keyframes_rejected: dict[str, int]
     keyframes_by_rule: dict[str, int]
-    left: int
-    link: str
-    seconds: float
-    tracking_cpu_ms: float
+    left: int  # keyframes still in the spool at the end
+    link: str  # why the server took nothing at the end; empty = it did
+    seconds: float  # from the first frame until the last keyframe was fused (or acknowledged, elsewhere)
+    tracking_cpu_ms: float  # CPU milliseconds of the localizer a frame
     maps: list[MapResult]
     delay_ms: Spread
     peak_rss_bytes: dict[str, int]

@@ -32,20 +32,14 @@ MAPS = 16  # that a run's own server may have open: its default one, and one for
 
 
 class ServerChild:
-    """A running `tsfusion serve`, ready for keyframes.
-
-    Attributes:
-        listen: its data address.
-        control: its control address.
-        start_seconds: from its start until it was ready.
-    """
+    """A running `tsfusion serve`, ready for keyframes."""
 
     def __init__(self, process: subprocess.Popen[str], log: Path) -> None:
         self._process = process
         self._log = log
         self.listen = ""
         self.control = ""
-        self.start_seconds = 0.0
+        self.start_seconds = 0.0  # from its start until it was ready
 
     def wait_ready(self) -> None:
         """Read the line that says the server is ready; raise TransportError when it ends or stays silent."""
@@ -129,19 +123,12 @@ def _start(settings: Path, stderr: IO[str]) -> subprocess.Popen[str]:
 
 @dataclass(frozen=True)
 class Target:
-    """The server that a run sends to.
+    """The server that a run sends to."""
 
-    Attributes:
-        link: settings of the connection: the server's addresses, and the map to scan into.
-        keys: of the connection; None = it has none.
-        spools: folder that holds one spool a map.
-        child: the server started for this run; None = the server runs elsewhere.
-    """
-
-    link: ClientConfig
-    keys: ClientKeys | None
-    spools: Path
-    child: ServerChild | None
+    link: ClientConfig  # settings of the connection: the server's addresses, and the map to scan into
+    keys: ClientKeys | None  # of the connection; None = it has none
+    spools: Path  # folder that holds one spool a map
+    child: ServerChild | None  # the server started for this run; None = the server runs elsewhere
     _clients: ExitStack
 
     def client(self, map_name: str, *, policy: Policy | None = None) -> Client:

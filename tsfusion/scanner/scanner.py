@@ -29,21 +29,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(eq=False)
 class Submap:
-    """Frames tracked in one world, between two losses.
+    """Frames tracked in one world, between two losses."""
 
-    Attributes:
-        name: name of its map.
-        client: client that sends its keyframes.
-        located: its frames with a pose, in order.
-        corrections: the newest from loop closure; None = there were none.
-        corrected_seq: number of the last keyframe that the last sent correction names.
-    """
-
-    name: str
+    name: str  # of its map
     client: Client
-    located: TrackedTrajectory = field(default_factory=TrackedTrajectory)
-    corrections: PoseCorrections | None = None
-    corrected_seq: int = 0
+    located: TrackedTrajectory = field(default_factory=TrackedTrajectory)  # its frames with a pose, in order
+    corrections: PoseCorrections | None = None  # the newest from loop closure; None = there were none
+    corrected_seq: int = 0  # number of the last keyframe that the last sent correction names
 
     def correct(self) -> None:
         """Hand the corrected poses of all keyframes to the client."""
@@ -57,29 +49,20 @@ class Submap:
 
 
 class ScanState(msgspec.Struct, frozen=True, kw_only=True):
-    """Progress of a scan.
-
-    Attributes:
-        why: reason of the last loss; empty while tracking.
-        selected: number of keyframes by the rule that selected them.
-        loops: number of closed loops over all submaps.
-        stats: sums over all clients.
-        link: why the server takes no keyframes at the moment; empty when it does.
-        keyframe_delay_ms: from capture to fusion, of the newest fused keyframe; None = none yet.
-    """
+    """Progress of a scan."""
 
     state: State
-    why: str
+    why: str  # reason of the last loss; empty while tracking
     frames: int
     tracked: int
     lost: int
     submap: str
     submaps: int
-    selected: dict[str, int]
-    loops: int
-    stats: ClientStats
-    link: str
-    keyframe_delay_ms: float | None
+    selected: dict[str, int]  # number of keyframes by the rule that selected them
+    loops: int  # number of closed loops over all submaps
+    stats: ClientStats  # sums over all clients
+    link: str  # why the server takes no keyframes at the moment; empty when it does
+    keyframe_delay_ms: float | None  # from capture to fusion, of the newest fused keyframe; None = none yet
 
 
 class Scanner:
@@ -196,12 +179,9 @@ class Scanner:
         if self._lost_since is None:
             self._lost_since = frame.timestamp_ns
         seconds = (frame.timestamp_ns - self._lost_since) / 1e9
-        if self._state == "lost" and seconds >= self._config.patience and self._may_begin_submap:
+        may_begin = not self._localizer.absolute and len(self.submaps) != self._most
+        if self._state == "lost" and seconds >= self._config.patience and may_begin:
             self._begin_submap(seconds)
-
-    @property
-    def _may_begin_submap(self) -> bool:
-        return not self._localizer.absolute and len(self.submaps) != self._most
 
     def _begin_submap(self, seconds: float) -> None:
         name = next(name for name in map(self._name, count(2)) if name not in self._taken)

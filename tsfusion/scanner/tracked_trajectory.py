@@ -75,7 +75,7 @@ class TrackedTrajectory:
         return np.flatnonzero(self._columns[:, 3] != _NONE), _matrices(references)
 
     def _corrected(self, corrections: PoseCorrections | None, chosen: NDArray[np.int64]) -> Poses:
-        pairs = self._pairs[chosen]
+        pairs = np.array(self._poses).reshape(-1, 2, 3, 4)[chosen]
         poses = _matrices(pairs[:, 0])
         if corrections is None:
             return poses
@@ -90,10 +90,6 @@ class TrackedTrajectory:
     @property
     def _columns(self) -> NDArray[np.int64]:
         return np.array(self._numbers, dtype=np.int64).reshape(-1, _COLUMNS)
-
-    @property
-    def _pairs(self) -> NDArray[np.float64]:
-        return np.array(self._poses).reshape(-1, 2, 3, 4)
 
 
 def _bytes(T: Transform) -> bytes:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tsfusion.kernels import block_hash
 from tsfusion.kernels.integrate import CUBE, WEIGHT_MASK
+from tsfusion.tsdf.checkpoint import LAYER_DTYPES
 from tsfusion.tsdf.growing_array import GrowingArray
 
 _FIRST_CAPACITY = 1024
@@ -39,9 +40,8 @@ class BlockStore:
             GrowingArray((), np.int32, _FIRST_CAPACITY) for _ in range(3)
         )
         present = {"sums": True, "color_rgn": color, "color_b": color, "correction": corrected}
-        dtypes = {"sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "correction": np.float32}
         self._layers = {
-            name: GrowingArray((CUBE,), dtypes[name], _FIRST_CAPACITY if there else 1)
+            name: GrowingArray((CUBE,), LAYER_DTYPES[name], _FIRST_CAPACITY if there else 1)
             for name, there in present.items()
         }
         self._present = [name for name, there in present.items() if there]

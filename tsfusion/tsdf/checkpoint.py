@@ -26,7 +26,7 @@ from tsfusion.core.errors import CheckpointError, DamagedCheckpoint
 MAGIC = b"TSFMAP1\n"
 CHUNK = 1024  # blocks
 CUBE = 512  # voxels a block
-DTYPES = {"sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "correction": np.float32}
+LAYER_DTYPES = {"sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "correction": np.float32}
 
 
 class CheckpointHeader(msgspec.Struct, kw_only=True):
@@ -56,9 +56,15 @@ def write(
         CheckpointError: when the file cannot be written.
     """
     header.blocks = len(keys)
+    digest = hashlib.blake2b(MAGIC, digest_size=16)
     try:
         with durable_files.replacing(path) as file:
-            _write_body(file, header, keys, slots, layers)
+            file.write(MAGIC)
+            for payload in _payloads(header, keys, slots, layers):
+                for part in (struct.pack("<I", len(payload)), payload):
+                    digest.update(part)
+                    file.write(part)
+            file.write(digest.digest())
     except OSError as error:
         raise CheckpointError(f"cannot write the map {path}: {error.strerror}") from error
     return path
@@ -77,7 +83,7 @@ def read(path: Path) -> tuple[CheckpointHeader, NDArray[np.int64], dict[str, NDA
             _check_digest(file, path)
             header = _read_header(file, path)
             keys = np.empty(header.blocks, np.int64)
-            layers = {name: np.empty((header.blocks, CUBE), DTYPES[name]) for name in header.layers}
+            layers = {name: np.empty((header.blocks, CUBE), LAYER_DTYPES[name]) for name in header.layers}
             for first, chunk in _read_chunks(file, path, header):
                 count, at = min(CHUNK, header.blocks - first), 0
                 for target in (keys, *layers.values()):
@@ -98,30 +104,13 @@ def verify(path: Path, header: CheckpointHeader, map_hash: str) -> None:
         raise DamagedCheckpoint(f"{path} says its map hash is {header.map_hash}, but it loads as {map_hash}")
 
 
-def _write_body(
-    file: BinaryIO,
-    header: CheckpointHeader,
-    keys: NDArray[np.int64],
-    slots: NDArray[np.int64],
-    layers: dict[str, NDArray[Any]],
-) -> None:
-    digest = hashlib.blake2b(MAGIC, digest_size=16)
-    file.write(MAGIC)
-    compressor = zstandard.ZstdCompressor(level=1)
-    for payload in _payloads(header, keys, slots, layers, compressor):
-        for part in (struct.pack("<I", len(payload)), payload):
-            digest.update(part)
-            file.write(part)
-    file.write(digest.digest())
-
-
 def _payloads(
     header: CheckpointHeader,
     keys: NDArray[np.int64],
     slots: NDArray[np.int64],
     layers: dict[str, NDArray[Any]],
-    compressor: zstandard.ZstdCompressor,
 ) -> Iterator[bytes]:
+    compressor = zstandard.ZstdCompressor(level=1)
     yield msgspec.msgpack.encode(header)
     for i in range(0, len(keys), CHUNK):
         chunk = slots[i : i + CHUNK]
@@ -146,7 +135,7 @@ def _read_header(file: BinaryIO, path: Path) -> CheckpointHeader:
         raise CheckpointError(f"{path} is of another version: {error}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise DamagedCheckpoint(f"{path} is malformed: {error}") from error
-    if not set(header.layers) <= set(DTYPES):
+    if not set(header.layers) <= set(LAYER_DTYPES):
         raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
     if not 0 <= header.blocks <= header.config.max_blocks:
         raise DamagedCheckpoint(f"{path} is malformed: it claims {header.blocks} blocks")
@@ -154,7 +143,7 @@ def _read_header(file: BinaryIO, path: Path) -> CheckpointHeader:
 
 
 def _read_chunks(file: BinaryIO, path: Path, header: CheckpointHeader) -> Iterator[tuple[int, bytes]]:
-    per_block = 8 + sum(CUBE * np.dtype(DTYPES[name]).itemsize for name in header.layers)
+    per_block = 8 + sum(CUBE * np.dtype(LAYER_DTYPES[name]).itemsize for name in header.layers)
     for first in range(0, header.blocks, CHUNK):
         size = min(CHUNK, header.blocks - first) * per_block
         (length,) = struct.unpack("<I", _read_exactly(file, 4, path))

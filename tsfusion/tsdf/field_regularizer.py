@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Plans the field regulariser: which blocks, how many iterations. `kernels/field_smoothing.py` solves.
+"""Plan of the field regulariser: blocks and iterations. `kernels/field_smoothing.py` solves.
 
 A view of the map's sums: no order of keyframes or threads can show. Blocks are solved with a halo of their
 neighbours, so that some blocks' values are nearly those of the whole map (docs/method.md says how nearly).
@@ -134,7 +134,7 @@ class _Level:
 
 
 class _Batch:
-    """Some blocks and their halo, as lists of cells."""
+    """Blocks and their halo, as lists of cells."""
 
     def __init__(
         self, wanted: NDArray[np.int64], store: BlockStore, min_weight: float, settings: FieldSettings

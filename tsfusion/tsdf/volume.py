@@ -19,13 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import process
-from tsfusion.core.config import (
-    VIEW_SETTINGS,
-    Surface,
-    VolumeConfig,
-    make_settings,
-    override,
-)
+from tsfusion.core.config import VIEW_SETTINGS, Surface, VolumeConfig, make_settings, override
 from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.mesh import Mesh

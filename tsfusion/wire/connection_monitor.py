@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Why a client's connection is not made, in words for a person.
+"""Reasons why a client's connection is not made, in words for a person.
 
 libzmq's `send` succeeds while the other side turns the connection away, so its events are watched instead.
 Measured with libzmq 4.3.5:

@@ -20,59 +20,42 @@ MapState = Literal["opening", "idle", "busy", "restarting", "failed"]
 
 
 class MapHealth(Struct, frozen=True, kw_only=True):
-    """Health of one map, as far as the gateway knows it without asking the fuser.
-
-    Attributes:
-        problem: reason why keyframes are not accepted or not fused; empty = they are.
-        waiting: number of keyframes that are durable, but not yet fused or rejected.
-        rejected: number of journaled keyframes that could not be fused, by reason.
-        quarantined: number of keyframes kept aside for inspection.
-        last_keyframe_s: seconds since the last keyframe was journaled; None = none since the server began.
-        delay_bound_ms: error bound of the delays (half the best round trip of the worst client).
-    """
+    """Health of one map, as far as the gateway knows it without asking the fuser."""
 
     state: MapState
-    problem: str
+    problem: str  # reason why keyframes are not accepted or not fused; empty = they are
     keyframes_durable: int
     keyframes_fused: int
-    waiting: int
-    rejected: dict[str, int]
-    quarantined: int
+    waiting: int  # number of keyframes that are durable, but not yet fused or rejected
+    rejected: dict[str, int]  # number of journaled keyframes that could not be fused, by reason
+    quarantined: int  # number of keyframes kept aside for inspection
     sessions: int
     journal_bytes: int
     journal_damaged: int  # records the recovery scan could not read
     fuser_restarts: int
     blocks: int
     map_bytes: int
+    # Seconds since the last keyframe was journaled; None = none since the server began
     last_keyframe_s: float | None
     delay_ms: Spread
-    delay_bound_ms: float
+    delay_bound_ms: float  # error bound of the delays (half the best round trip of the worst client)
     corrections: int = 0  # records of corrected poses: in the journal at the start, and journaled since
 
 
 class ClientHealth(Struct, frozen=True, kw_only=True):
-    """Health of one session that sent a message since the server began.
+    """Health of one session that sent a message since the server began."""
 
-    Attributes:
-        client: name that its key is allowed under; empty without keys.
-        session: first 8 hexadecimal digits of its number.
-        heard_s: seconds since its last message.
-        waiting, skipped: as in its last Ping.
-        held: reason why no keyframe of it is accepted now; empty = they are.
-        corrections: corrections of its session in the journal.
-    """
-
-    client: str
-    session: str
+    client: str  # name that its key is allowed under; empty without keys
+    session: str  # first 8 hexadecimal digits of its number
     map: str
-    heard_s: float
+    heard_s: float  # seconds since its last message
     durable: int
     fused: int
     received_bytes: int
-    waiting: int
+    waiting: int  # this and `skipped` as in its last Ping
     skipped: dict[str, int]
-    held: str
-    corrections: int = 0
+    held: str  # reason why no keyframe of it is accepted now; empty = they are
+    corrections: int = 0  # in the journal
 
 
 class Health(Struct, frozen=True, kw_only=True):

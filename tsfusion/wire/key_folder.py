@@ -175,14 +175,10 @@ def check_name(name: str) -> None:
 
 
 class AllowList:
-    """Names and keys of the clients that may connect, as in the file now; nobody while it cannot be read.
-
-    Attributes:
-        problem: reason why the file cannot be read; empty = it can.
-    """
+    """Names and keys of the clients that may connect, as in the file now; nobody while it cannot be read."""
 
     def __init__(self, folder: Folder) -> None:
-        self.problem = ""
+        self.problem = ""  # reason why the file cannot be read; empty = it can
         self._folder = Path(folder).expanduser()
         self._path = self._folder / ALLOWED
         self._seen: tuple[int, ...] | None = ()  # the file's stamp when it was read; None = there was none

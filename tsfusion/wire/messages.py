@@ -130,16 +130,11 @@ class Command(Struct, frozen=True, tag="command", kw_only=True):
 
 
 class Reply(Struct, frozen=True, tag="reply", kw_only=True):
-    """The answer to a Command; arrays of a mesh follow as raw frames.
-
-    Attributes:
-        error: why there is no answer, for a person.
-        retry: whether the same command may be answered soon, though it is not now.
-    """
+    """The answer to a Command; arrays of a mesh follow as raw frames."""
 
     name: str
-    error: str | None = None
-    retry: bool = False
+    error: str | None = None  # why there is no answer, for a person
+    retry: bool = False  # whether the same command may be answered soon, though it is not now
     health: "Health | None" = None
     status: "Status | None" = None
     mesh: "MeshLayout | None" = None

@@ -24,17 +24,12 @@ _PING_TIMEOUT = 5.0  # seconds; the gateway is never busy: without an answer for
 
 
 class CommandRefused(TransportError):
-    """The server answered that it cannot do what a command asks.
-
-    Attributes:
-        reason: the server's words, without its address.
-        retry: whether the same command may succeed soon.
-    """
+    """The server answered that it cannot do what a command asks."""
 
     def __init__(self, address: str, reason: str, *, retry: bool = False) -> None:
         super().__init__(f"the server at {address}: {reason}")
-        self.reason = reason
-        self.retry = retry
+        self.reason = reason  # the server's words, without its address
+        self.retry = retry  # whether the same command may succeed soon
 
 
 def fetch_health(

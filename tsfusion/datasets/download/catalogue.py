@@ -22,18 +22,12 @@ _CORBS = "http://corbs.dfki.uni-kl.de/suppfiles/ElectricalCabinet/E1"
 
 
 class File(NamedTuple):
-    """A file to download.
-
-    Attributes:
-        name: of the file on this disk and at a mirror.
-        checksum: `sha256:…` or `md5:…`; None = unknown.
-        into: subfolder that an archive is unpacked to.
-    """
+    """A file to download."""
 
     url: str
-    name: str
-    checksum: str | None = None
-    into: str = ""
+    name: str  # of the file on this disk and at a mirror
+    checksum: str | None = None  # `sha256:…` or `md5:…`; None = unknown
+    into: str = ""  # subfolder that an archive is unpacked to
 
 
 class PublicRecording(NamedTuple):

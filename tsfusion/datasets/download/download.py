@@ -20,18 +20,13 @@ ENDING = ".sha256"
 
 
 class CheckedFile(NamedTuple):
-    """A downloaded file of a recording.
-
-    Attributes:
-        sha256: of the file on the disk.
-        known: whether a checksum was known to compare with; otherwise this one was written beside the file.
-        fetched: whether it was downloaded by this call.
-    """
+    """A downloaded file of a recording."""
 
     path: Path
-    sha256: str
+    sha256: str  # of the file on the disk
+    # Whether a checksum was known to compare with; otherwise this one was written beside the file
     known: bool
-    fetched: bool
+    fetched: bool  # whether it was downloaded by this call
 
 
 class FetchedRecording(NamedTuple):

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from tsfusion.core import durable_files, folder_lock
+from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import DatasetError, OutputError
 
 Watcher = Callable[[int, int], None]  # bytes there, bytes of all (0 = unknown)
@@ -36,7 +37,7 @@ def download(url: str, part: Path, watch: Watcher) -> None:
     """
     if not url.startswith(("https://", "http://")):
         raise DatasetError(f"cannot download {url}: only https and http are fetched")
-    fruitless, cause, most = 0, "the connection was cut", _nbytes(part)
+    fruitless, cause, most = 0, "the connection was cut", size_of(part)
     while fruitless < _GIVE_UP_AFTER:
         try:
             if _request(url, part, watch):
@@ -52,18 +53,18 @@ def download(url: str, part: Path, watch: Watcher) -> None:
             raise DatasetError(f"cannot download {url}: no host can have that name") from error
         except (OSError, http.client.HTTPException) as error:
             cause = str(getattr(error, "reason", error)) or type(error).__name__
-        fruitless = 0 if _nbytes(part) > most else fruitless + 1  # a part that began again is no progress
-        most = max(most, _nbytes(part))
+        fruitless = 0 if size_of(part) > most else fruitless + 1  # a part that began again is no progress
+        most = max(most, size_of(part))
         if fruitless < _GIVE_UP_AFTER:
             time.sleep(_PAUSE_S * fruitless)
     raise DatasetError(
-        f"cannot download {url}: {cause} ({_nbytes(part)} bytes stay in {part}; the same command goes on)"
+        f"cannot download {url}: {cause} ({size_of(part)} bytes stay in {part}; the same command goes on)"
     )
 
 
 def _request(url: str, part: Path, watch: Watcher) -> bool:
     """Send one request; True if the file is complete then."""
-    start, validator = _nbytes(part), _validator(part)
+    start, validator = size_of(part), _validator(part)
     headers = {"User-Agent": f"tsfusion/{version('tsfusion')}", "Accept-Encoding": "identity"}
     if start and validator:
         headers |= {"Range": f"bytes={start}-", "If-Range": validator}
@@ -88,7 +89,7 @@ def _request(url: str, part: Path, watch: Watcher) -> bool:
         total = at + int(length) if length.isdigit() else 0
         _require_room(part, total - at)
         _copy(response, part, at, total, watch)
-    return not total or _nbytes(part) == total
+    return not total or size_of(part) == total
 
 
 def _copy(response: Any, part: Path, at: int, total: int, watch: Watcher) -> None:
@@ -156,13 +157,6 @@ def _remove_part(part: Path) -> None:
     for path in (part, _validator_file(part)):
         with suppress(OSError):
             path.unlink(missing_ok=True)
-
-
-def _nbytes(part: Path) -> int:
-    try:
-        return part.stat().st_size
-    except OSError:
-        return 0
 
 
 def _require_room(part: Path, more: int) -> None:

@@ -17,7 +17,7 @@ from tsfusion.datasets.formats.kitti import KITTIFrames, files_by_frame, read_ca
 from tsfusion.datasets.readers import intrinsics_of, read_color, read_numbers
 from tsfusion.datasets.trajectory_files import checked_pose
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.se3 import Transform, inverse
+from tsfusion.geometry.se3 import Transform, inverse, transform
 
 EXPECTED = "DATE/DATE_drive_NNNN_sync/{image_00..03,velodyne_points,oxts}/data and DATE/calib_*.txt"
 _CAMERAS = {"grey": ("00", "01"), "color": ("02", "03")}
@@ -171,17 +171,13 @@ def _imu_poses(place: Path, *, required: bool) -> dict[int, Transform]:
         scale = np.cos(np.radians(packet.lat)) if scale is None else scale
         R, t = pose_from_oxts_packet(packet, scale)
         origin = t if origin is None else origin
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, t - origin
-        poses[number] = T
+        poses[number] = transform(R, t - origin)
     return poses
 
 
 def _rigid(path: Path) -> Transform:
     found = read_calibration(path, {"R": 9, "T": 3})
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = found["R"].reshape(3, 3), found["T"]
-    return checked_pose(T, path)
+    return checked_pose(transform(found["R"].reshape(3, 3), found["T"]), path)
 
 
 def _read_times(path: Path, frames: list[int]) -> NDArray[np.int64] | None:

@@ -118,13 +118,7 @@ class Nerfstudio(Frames):
             undistorter = self._undistorter(fitted)
             intrinsics, depth = undistorter.intrinsics, undistorter.depth(depth)
             color = None if color is None else undistorter.image(color)
-        return self._posed_frame(
-            index,
-            depth=depth,
-            depth_scale=scale,
-            color=color,
-            intrinsics=intrinsics,
-        )
+        return self._posed_frame(index, depth=depth, depth_scale=scale, color=color, intrinsics=intrinsics)
 
     def _undistorter(self, camera: Camera) -> Undistorter:
         if camera not in self._undistorters:

@@ -120,7 +120,9 @@ class Redwood(DepthImages):
             path, trajectory = _root_of(path) or path.parent, trajectory or path.absolute()
         root = require_folder(path, "Redwood")
         files = images(_depth_folder(root), REDWOOD_EXPECTED)
-        log = _log(root) if trajectory is None else _trajectory_file(root, trajectory)
+        log = _log(root) if trajectory is None else Path(trajectory)
+        if log is not None and not log.is_file():
+            log = root / log
         if log is None and posed:
             raise DatasetError(f"{root} has no trajectory; expected {REDWOOD_EXPECTED}; {SCAN}")
         skipped: dict[str, int] = {}
@@ -169,10 +171,6 @@ def _log(root: Path) -> Path | None:
     known = [root / name for name in _LOGS if (root / name).is_file()]
     named = [path for pattern in _LOG_NAMES for path in sorted(root.glob(pattern)) if path.is_file()]
     return next((path for path in [*known, *named] if not path.name.startswith(".")), None)
-
-
-def _trajectory_file(root: Path, trajectory: str | Path) -> Path:
-    return Path(trajectory) if Path(trajectory).is_file() else root / trajectory
 
 
 def _open3d_intrinsics(root: Path) -> Intrinsics:

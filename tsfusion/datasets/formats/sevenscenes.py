@@ -90,11 +90,7 @@ class SevenScenes(Frames):
             registration = _registration(self.intrinsics, depth.shape)
             color = registration.color_of_depth(color, depth * np.float32(0.001))
         return self._posed_frame(
-            index,
-            depth=depth,
-            depth_scale=0.001,
-            color=color,
-            intrinsics=self.intrinsics,
+            index, depth=depth, depth_scale=0.001, color=color, intrinsics=self.intrinsics
         )
 
 

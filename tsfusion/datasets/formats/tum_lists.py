@@ -15,19 +15,13 @@ ASSOCIATIONS = ("associations.txt", "association.txt", "associated.txt")
 
 
 class ImageList(NamedTuple):
-    """Images of a recording in time order.
+    """Images of a recording in time order."""
 
-    Attributes:
-        timestamps_ns: nanoseconds of each depth image.
-        depth: files of the depth images.
-        color: as many files, None where none is near in time; empty where the recording has no colour.
-        windows: whether the paths were Windows paths.
-    """
-
-    timestamps_ns: list[int]
-    depth: list[Path]
+    timestamps_ns: list[int]  # nanoseconds of each depth image
+    depth: list[Path]  # files of the depth images
+    # As many files, None where none is near in time; empty where the recording has no colour
     color: list[Path | None]
-    windows: bool
+    windows: bool  # whether the paths were Windows paths
 
 
 def read_recording(root: Path, *, max_difference_ns: int) -> ImageList:

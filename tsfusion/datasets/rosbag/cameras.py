@@ -14,6 +14,7 @@ from tsfusion.datasets.readers import checked_intrinsics, intrinsics_of
 from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.messages import CAMERA, CameraInfo
 from tsfusion.datasets.rosbag.reader import BagRecording, Message, Stream, frame_id
+from tsfusion.geometry import se3
 from tsfusion.geometry.calibration import Camera as Lens
 from tsfusion.geometry.calibration import Rectifier, StereoRig, Undistorter
 from tsfusion.geometry.keyframe import Intrinsics
@@ -27,18 +28,12 @@ _NO_TURN = 1e-6
 
 
 class ImageTopic(NamedTuple):
-    """A topic of images.
-
-    Attributes:
-        base: the topic without its transport.
-        first: its first message that can be decoded.
-        size: height and width.
-    """
+    """A topic of images."""
 
     stream: Stream
-    base: str
-    first: Any
-    size: tuple[int, int]
+    base: str  # the topic without its transport
+    first: Any  # its first message that can be decoded
+    size: tuple[int, int]  # height and width
     frame: str
 
     @property
@@ -134,7 +129,7 @@ class Cameras:
         return next(iter(found.values())) if len(found) == 1 else None
 
     def view(self, images: ImageTopic) -> CameraView:
-        """How some images become those of a pinhole camera.
+        """Find how some images become those of a pinhole camera.
 
         Raises:
             DatasetError: the camera is missing, not calibrated, of another size, or of an unknown lens.
@@ -157,7 +152,7 @@ class Cameras:
         return None if stream is None or not _is_beside(stream.topic, images.base) else self.view(images)
 
     def rig(self, left: ImageTopic, right: ImageTopic) -> CameraRig:
-        """How a pair's images become those of two equal cameras whose rows match; raises as `view` does."""
+        """Find how a pair's images become those of two equal cameras with matching rows; raises as `view`."""
         cameras = [self._checked(one) for one in (left, right)]
         shift = cameras[0].P[0, 3] - cameras[1].P[0, 3]
         if not shift > 0:
@@ -212,7 +207,5 @@ def _turn(camera: CameraInfo) -> float:
 def _right_of(left: CameraInfo, right: CameraInfo) -> NDArray[np.float64]:
     """(4, 4) T_right_left: both turn by their `R` into rectified cameras, which stand side by side."""
     R_left, R_right = (one.R if one.R.any() else np.eye(3) for one in (left, right))
-    T = np.eye(4)
-    T[:3, :3] = R_right.T @ R_left
-    T[:3, 3] = R_right.T @ np.array([right.P[0, 3] / right.P[0, 0] - left.P[0, 3] / left.P[0, 0], 0, 0])
-    return T
+    t = R_right.T @ np.array([right.P[0, 3] / right.P[0, 0] - left.P[0, 3] / left.P[0, 0], 0, 0])
+    return se3.transform(R_right.T @ R_left, t)

@@ -17,13 +17,7 @@ from tsfusion.datasets.dataset import Frames, keep_posed, nearest_in_time, requi
 from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.messages import MILLIMETRES
 from tsfusion.datasets.rosbag.poses import PoseFinder, pose_streams
-from tsfusion.datasets.rosbag.reader import (
-    ENDINGS,
-    BagRecording,
-    Message,
-    MessageLocation,
-    recording,
-)
+from tsfusion.datasets.rosbag.reader import ENDINGS, BagRecording, Message, MessageLocation, recording
 from tsfusion.datasets.rosbag.topics import Modality, TopicChooser, recorded_scale
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.frame import Frame
@@ -145,7 +139,9 @@ class Bag(Frames):
     def _index(self, poses: PoseFinder) -> tuple[dict[int, MessageLocation], dict[int, MessageLocation]]:
         """Locations by time of the main and the other messages, from one pass over the recording."""
         chosen = self._chosen
-        used = [chosen.main] + ([chosen.other] if chosen.other and self._with_other else [])
+        used = [chosen.main]
+        if chosen.other and (self._with_color or chosen.modality == "stereo"):
+            used.append(chosen.other)
         check = _CHECKS.get(chosen.main.kind)
         locations: dict[str, list[MessageLocation]] = {one.topic: [] for one in used}
         broken: Counter[str] = Counter()
@@ -166,14 +162,11 @@ class Bag(Frames):
         for topic, count in broken.items():
             if count:
                 self.skipped[f"of {topic} that are broken"] = count
-        found = [_by_time(locations[one.topic]) for one in used]
+        # Messages by their header's stamp, or by the recorder's clock where a header says nothing
+        found = [{each.stamp_ns or each.log_ns: each for each in locations[one.topic]} for one in used]
         if repeated := len(locations[chosen.main.topic]) - len(found[0]):
             self.skipped[f"of {chosen.main.topic} with another's time"] = repeated
         return found[0], found[1] if len(found) > 1 else {}
-
-    @property
-    def _with_other(self) -> bool:
-        return self._with_color or self._chosen.modality == "stereo"
 
     def _pair(
         self, mains: dict[int, MessageLocation], others: dict[int, MessageLocation], max_difference_ns: int
@@ -213,7 +206,7 @@ class Bag(Frames):
         self._others = [self._others[i] for i in chosen]
 
     def _register(self, poses: PoseFinder) -> Registration | None:
-        """What brings the colour of a camera of its own onto the depth; else such colour is left out."""
+        """Registration that brings the colour of a separate camera onto the depth; None = it is left out."""
         chosen = self._chosen
         if chosen.color_camera is None or chosen.view is None or not len(self):
             return None
@@ -312,8 +305,3 @@ def _recording_path(path: Path) -> Path:
     several = sorted(str(child) for child in path.glob("*.*") if child.suffix in ENDINGS)
     holds = f"holds {len(several)} files ({', '.join(several[:8])})" if several else "holds no ROS recording"
     raise DatasetError(f"{path} {holds}; expected {EXPECTED}")
-
-
-def _by_time(locations: list[MessageLocation]) -> dict[int, MessageLocation]:
-    """Messages by their header's stamp, or by the recorder's clock where a header says nothing."""
-    return {one.stamp_ns or one.log_ns: one for one in locations}

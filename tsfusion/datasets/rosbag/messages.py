@@ -55,16 +55,11 @@ _UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
 
 
 class Cloud(NamedTuple):
-    """Points of one sweep.
+    """Points of one sweep."""
 
-    Attributes:
-        points: (N, 3) float32 metres; NaN where there was no return.
-        color: (N, 3) uint8 BGR.
-        times_s: (N,) float32 seconds from the header's stamp; None = all at once, or unknown.
-    """
-
-    points: NDArray[np.float32]
-    color: NDArray[np.uint8] | None
+    points: NDArray[np.float32]  # (N, 3) float32 metres; NaN where there was no return
+    color: NDArray[np.uint8] | None  # (N, 3) uint8 BGR
+    # (N,) float32 seconds from the header's stamp; None = all at once, or unknown
     times_s: NDArray[np.float32] | None
 
 
@@ -81,7 +76,7 @@ class CameraInfo(NamedTuple):
 
 
 def encoding(message: Any) -> str:
-    """How the pixels of an Image or CompressedImage are meant: a ROS encoding."""
+    """Encoding of the pixels of an Image or CompressedImage, by ROS's name."""
     if hasattr(message, "encoding"):
         return str(message.encoding)
     return str(message.format).split(";")[0].strip()

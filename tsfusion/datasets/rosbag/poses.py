@@ -15,8 +15,8 @@ from tsfusion.datasets.rosbag.transforms import (
     POSE_KINDS,
     TF,
     PoseTopic,
-    Transforms,
     TransformTrack,
+    TransformTree,
 )
 from tsfusion.geometry.se3 import Transform
 
@@ -63,7 +63,7 @@ class PoseFinder:
         self._path, self._frame, self._topic_named = path, frame, topic_named
         self._world, self._body = world_frame, body_frame
         self._max_gap_ns = round(max_gap_s * 1e9)
-        self._transforms = Transforms(self._max_gap_ns)
+        self._transforms = TransformTree(self._max_gap_ns)
         self._pose_topics: dict[Stream, PoseTopic] = {}
 
     def add(self, message: Message) -> None:

@@ -46,15 +46,11 @@ class MessageLocation(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message that was read.
-
-    Attributes:
-        content: the fields, by ROS's names.
-    """
+    """A message that was read."""
 
     stream: Stream
     location: MessageLocation
-    content: Any
+    content: Any  # the fields, by ROS's names
 
 
 def recording(path: Path) -> Path | None:

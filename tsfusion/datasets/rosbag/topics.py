@@ -23,7 +23,6 @@ from tsfusion.geometry.keyframe import Intrinsics
 log = logging.getLogger(__name__)
 
 Modality = Literal["depth", "stereo", "lidar"]
-OPTIONS = ("depth_topic", "color_topic", "info_topic", "points_topic", "left_topic", "right_topic")
 _OF_MODALITY: dict[Modality, tuple[str, ...]] = {
     "depth": ("depth_topic", "color_topic"),
     "stereo": ("left_topic", "right_topic"),
@@ -47,26 +46,17 @@ class ColorCamera(NamedTuple):
 
 
 class ChosenTopics(NamedTuple):
-    """The topics of one sensor.
-
-    Attributes:
-        main: depth images, left images or point clouds.
-        other: colour images of the depth, or right images; None = none.
-        frame: of `main`; empty = its messages name none.
-        size: height and width of an image of `main`.
-        view, rig: the camera of depth images, or those of a pair.
-        color_camera: the camera of `other`, where its images have to be registered to the depth.
-    """
+    """The topics of one sensor."""
 
     modality: Modality
-    main: Stream
-    other: Stream | None
+    main: Stream  # depth images, left images or point clouds
+    other: Stream | None  # colour images of the depth, or right images; None = none
     sensor: str
-    frame: str
-    size: tuple[int, int]
-    view: CameraView | None = None
-    rig: CameraRig | None = None
-    color_camera: ColorCamera | None = None
+    frame: str  # of `main`; empty = its messages name none
+    size: tuple[int, int]  # height and width of an image of `main`
+    view: CameraView | None = None  # the camera of depth images
+    rig: CameraRig | None = None  # the cameras of a pair
+    color_camera: ColorCamera | None = None  # of `other`, where its images are registered to the depth
 
     def check_size(self, stream: Stream, size: tuple[int, ...]) -> None:
         """Raise DatasetError for an image of a stream whose size is not that of the stream's first one."""
@@ -80,7 +70,7 @@ class TopicChooser:
     """Chooses among the topics of one recording.
 
     Args:
-        given: topics by the names of `OPTIONS`; None = find it.
+        given: topics as `depth_topic`, `color_topic`, `info_topic`, …, as `Bag` names them; None = find it.
         intrinsics: of all images, instead of a CameraInfo's.
         rectified: whether images have been rectified already; None = by the topic's name.
     """
@@ -268,7 +258,7 @@ def recorded_scale(recording: BagRecording, depth: Stream) -> float | None:
 
 
 def _closeness(color: ImageTopic, depth: ImageTopic) -> tuple[object, ...]:
-    """How likely colour images belong to the depth images: by frame, name and rectification."""
+    """Rank of colour images as those of the depth images: by frame, name and rectification."""
     return (
         color.frame == depth.frame,
         bool(re.search(r"colou?r|rgb", color.base)),

@@ -61,7 +61,7 @@ class _Edge(NamedTuple):
         return self.trajectory.at(stamp, max_gap_ns=max_gap_ns)
 
 
-class Transforms:
+class TransformTree:
     """The tree of frames in /tf and /tf_static, each transform over time.
 
     A frame has one parent: of several, the one named most often.
@@ -142,26 +142,18 @@ class Transforms:
 
 
 class TransformTrack(NamedTuple):
-    """Poses of one frame in another.
-
-    Attributes:
-        body: the frame whose pose it is; empty = the topic does not name it.
-    """
+    """Poses of one frame in another."""
 
     world: str
-    body: str
+    body: str  # the frame whose pose it is; empty = the topic does not name it
     trajectory: Trajectory
 
 
 class PoseTopic:
-    """Poses of one topic, collected message by message.
-
-    Attributes:
-        world, body: frames that the first message names; an empty body = it names none.
-    """
+    """Poses of one topic, collected message by message."""
 
     def __init__(self) -> None:
-        self.world, self.body = "", ""
+        self.world, self.body = "", ""  # frames that the first message names; an empty body = it names none
         self._samples, self._began = PoseSamples(), False
 
     def add(self, message: Any, kind: str) -> None:

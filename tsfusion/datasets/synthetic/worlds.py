@@ -10,9 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.geometry import se3
+
 Solids = NDArray[np.float64]  # (m, 11): kind, centre xyz, half sizes xyz, cos yaw, sin yaw, material, variant
 
-# As in kernels/synthetic.py, which cannot be imported without Taichi; a test compares them.
+# As in kernels/synthetic_raycast.py, which cannot be imported without Taichi; a test compares them.
 ROOM, BOX, SPHERE, CYLINDER, GROUND = range(5)
 INTERIOR, WOOD, MARBLE, STRIPES, ROAD, PAVEMENT, FACADE, PAINT, METAL, BARK, LEAVES, GLASS, PLAIN = range(13)
 
@@ -21,15 +23,11 @@ _CHUNK = 1 << 16  # points measured at once
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Solids and the sensor's path.
-
-    Attributes:
-        solids: (m, 11) float64, metres.
-        paths: `paths[name](index, count)` → (4, 4) T_world_camera, OpenCV axes; the first is the usual one.
-    """
+    """Solids and the sensor's path."""
 
     name: str
-    solids: Solids
+    solids: Solids  # (m, 11) float64, metres
+    # `paths[name](index, count)` → (4, 4) T_world_camera, OpenCV axes; the first is the usual one
     paths: dict[str, Callable[[int, int], NDArray[np.float64]]]
 
     def distance(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -109,10 +107,7 @@ def look_at(position: NDArray[np.float64], target: NDArray[np.float64]) -> NDArr
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    T[:3, 3] = position
-    return T
+    return se3.transform(np.stack([right, np.cross(forward, right), forward], axis=1), position)
 
 
 def _circle(index: int, count: int) -> NDArray[np.float64]:
@@ -122,7 +117,7 @@ def _circle(index: int, count: int) -> NDArray[np.float64]:
 
 
 def _tour(index: int, count: int) -> NDArray[np.float64]:
-    """All of the room in three rounds: the things, the foot of the walls, their upper part."""
+    """Path through the whole room in three rounds: the things, the foot of the walls, their upper part."""
     first, second = 2 * count // 5, 7 * count // 10
     start, end = next(part for part in ((0, first), (first, second), (second, count)) if index < part[1])
     angle = 2.5 + 2 * np.pi * (index - start) / (end - start)
@@ -137,7 +132,7 @@ def _tour(index: int, count: int) -> NDArray[np.float64]:
 
 
 def _handheld(index: int, _count: int) -> NDArray[np.float64]:
-    """As a person walks round with a camera, ten frames a second: 0.4 m/s and 20 to 40 degrees/s."""
+    """Path of a person who walks round with a camera, ten frames a second: 0.4 m/s, 20 to 40 degrees/s."""
     t = index * 0.1
     angle = 2.5 + 0.4 * t + 0.12 * np.sin(0.9 * t)
     radius = 0.9 + 0.15 * np.sin(0.7 * t + 1)

@@ -106,9 +106,7 @@ def resection(
     inliers = np.zeros(len(points), bool)
     inliers[chosen.ravel()] = True
     rvec, tvec = cv2.solvePnPRefineLM(points3[inliers], pixels2[inliers], intrinsics.matrix, None, rvec, tvec)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(rvec)[0], tvec.ravel()
-    return se3.inverse(T), inliers
+    return se3.inverse(se3.transform(cv2.Rodrigues(rvec)[0], tvec.ravel())), inliers
 
 
 def bilinear(image: NDArray[np.floating], pixels: Pixels) -> NDArray[np.float32]:

@@ -12,15 +12,12 @@ from tsfusion.scanner.localization.localizer import Pose
 class TrackingKeyframes:
     """Make every pose relative to the last tracking keyframe; begin a new one when the sensor has moved away.
 
-    Attributes:
-        distance: metres to the next keyframe; may be changed at any time.
-
     Args:
         angle: degrees to the next keyframe.
     """
 
     def __init__(self, *, distance: float = 0.5, angle: float = 10.0) -> None:
-        self.distance = distance
+        self.distance = distance  # metres to the next keyframe; may be changed at any time
         self._angle = math.radians(angle)
         self._number = -1
         self._T_world_anchor: se3.Transform | None = None

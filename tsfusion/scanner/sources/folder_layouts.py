@@ -15,8 +15,8 @@ from tsfusion.datasets.formats.image_folders import read_open3d_camera
 from tsfusion.datasets.readers import decode_image, read_intrinsics, read_numbers
 from tsfusion.geometry.keyframe import Intrinsics
 
-Kind = Literal["depth", "pair", "points"]
-Key = tuple[tuple[int, Decimal, str], ...]
+LayoutKind = Literal["depth", "pair", "points"]
+SortKey = tuple[tuple[int, Decimal, str], ...]
 
 EXPECTED = (
     "depth/NAME.png with color/, rgb/, image/ or images/NAME.png|jpg; frame-*.depth.png with "
@@ -38,7 +38,7 @@ _NANOSECONDS = 19  # digits of a time of this century
 class FolderLayout:
     """Folder and pattern of a frame's first and second file; the pattern's group is the frame's name."""
 
-    kind: Kind
+    kind: LayoutKind
     first: tuple[Path, re.Pattern[str]]
     second: tuple[Path, re.Pattern[str]] | None = None
 
@@ -69,7 +69,7 @@ def layout_of(root: Path) -> FolderLayout | None:
     return None
 
 
-def order(name: str) -> Key:
+def order(name: str) -> SortKey:
     """Sort key of names by their numbers: 9 before 10, 1.25 before 1.5."""
     parts = re.findall(r"([0-9]+(?:\.[0-9]+)?)|([^0-9]+)", name)
     return tuple((0, Decimal(number), "") if number else (1, Decimal(0), text) for number, text in parts)

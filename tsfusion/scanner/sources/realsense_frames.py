@@ -19,13 +19,9 @@ _QUEUE = 4  # framesets a syncer keeps; the oldest goes first
 
 
 class RealSenseStream(Protocol):
-    """Stream of framesets.
+    """Stream of framesets."""
 
-    Attributes:
-        device: `pyrealsense2.device`.
-    """
-
-    device: Any
+    device: Any  # `pyrealsense2.device`
 
     def wait(self, milliseconds: int) -> Any:
         """Wait for the next frameset; None if there is none in time."""

@@ -160,15 +160,11 @@ class VideoPicture:
 
 
 class CameraThread:
-    """Thread that keeps a camera's newest picture, so that none grows old in the driver's queue.
-
-    Attributes:
-        dropped: number of pictures replaced by a newer one.
-        ended: whether the camera has stopped.
-    """
+    """Thread that keeps a camera's newest picture, so that none grows old in the driver's queue."""
 
     def __init__(self, capture: Any) -> None:
-        self.dropped, self.ended = 0, False
+        self.dropped = 0  # pictures replaced by a newer one
+        self.ended = False  # the camera has stopped
         self._capture = capture
         self._newest: VideoPicture | None = None
         self._changed, self._closed = threading.Condition(), False

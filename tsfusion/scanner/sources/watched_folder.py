@@ -84,7 +84,7 @@ class WatchedFolder(LiveSource):
         self._depth_scale, self._idle, self._deadline, self._poll = depth_scale, idle, deadline, poll
         self._opened_ns, self._stamp = time.time_ns(), 0
         self._handled: set[str] = set()  # names of first files
-        self._last: folder_layouts.Key = ()
+        self._last: folder_layouts.SortKey = ()
         self._colored: bool | None = None  # whether frames come with colour; None = not known yet
         self._camera: Any = None  # Intrinsics, an Undistorter, or a PairRectifier
         self._begun: Any = None  # state of the incomplete frame's files

@@ -20,17 +20,11 @@ MATCH_SIGMA = 5.0  # pixels of error of a match at 640 of width: colour and dept
 
 @dataclass(frozen=True, kw_only=True)
 class Agreement:
-    """Shares of one place's depth pixels projected into the other, the worse of both directions.
+    """Shares of one place's depth pixels projected into the other, the worse of both directions."""
 
-    Attributes:
-        overlap: share of the pixels with depth that fall on a pixel with depth.
-        agree: share of these where the depth is the expected one.
-        through: share of these where the other camera saw farther, through the surface.
-    """
-
-    overlap: float
-    agree: float
-    through: float
+    overlap: float  # share of the pixels with depth that fall on a pixel with depth
+    agree: float  # share of these where the depth is the expected one
+    through: float  # share of these where the other camera saw farther, through the surface
 
 
 def agreement(old: PlaceView, new: PlaceView, T_old_new: se3.Transform) -> Agreement:

@@ -32,21 +32,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(kw_only=True)
 class LoopCounts:
-    """Counts since the last `reset`.
+    """Counts since the last `reset`."""
 
-    Attributes:
-        keyframes: tracking keyframes.
-        checks: places compared.
-        verified: comparisons that found the same place.
-        closed: loops accepted.
-        optimisations: of the pose graph.
-    """
-
-    keyframes: int = 0
-    checks: int = 0
-    verified: int = 0
-    closed: int = 0
-    optimisations: int = 0
+    keyframes: int = 0  # tracking keyframes
+    checks: int = 0  # places compared
+    verified: int = 0  # comparisons that found the same place
+    closed: int = 0  # loops accepted
+    optimisations: int = 0  # of the pose graph
 
 
 class LoopClosing:
@@ -85,9 +77,7 @@ class LoopClosing:
         self._optimisation_due = False
         self._optimised_at = 0  # keyframes then
         self._lost = 0  # frames, since the last that was not
-        self._T_world_tracker: se3.Transform = np.eye(
-            4
-        )  # the tracker's world began anew where it was found again
+        self._T_world_tracker: se3.Transform = np.eye(4)  # another where the tracker was restarted
 
     def track(self, frame: Frame) -> Pose | Lost:
         """Track with the wrapped localizer; when it is lost, search for a known place to go on from."""

@@ -122,7 +122,9 @@ class LoopConsensus:
 
     def _supported(self, loop: Loop) -> list[Loop]:
         """The loop, with the waiting ones that agree with it, once they are enough."""
-        if self.accepted and any(self._near(loop, other) for other in self.accepted):
+        if any(
+            self._age(other, loop) <= SUPPORT_WINDOW and self._agree(other, loop) for other in self.accepted
+        ):
             self._accept([loop])
             return [loop]
         self._waiting = [w for w in self._waiting if self._age(w, loop) <= SUPPORT_WINDOW]
@@ -145,9 +147,6 @@ class LoopConsensus:
     def _count_ends(self) -> None:
         ways = self._chain.ways
         self._ends = np.array([(ways[loop.old], ways[loop.new]) for loop in self.accepted]).reshape(-1, 2)
-
-    def _near(self, loop: Loop, other: Loop) -> bool:
-        return self._age(other, loop) <= SUPPORT_WINDOW and self._agree(other, loop)
 
     def _age(self, earlier: Loop, later: Loop) -> int:
         return abs(later.new - earlier.new)

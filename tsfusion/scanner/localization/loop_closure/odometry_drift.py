@@ -11,19 +11,13 @@ from tsfusion.scanner.localization.loop_closure.pose_graph import PoseGraphEdge
 
 @dataclass(frozen=True, kw_only=True)
 class OdometryDrift:
-    """Standard deviations of odometry over a way; a radian of turning counts as a metre of way.
+    """Standard deviations of odometry over a way; a radian of turning counts as a metre of way."""
 
-    Attributes:
-        translation, rotation: metres and radians after one metre; they grow with the root of the way.
-        translation_bias, rotation_bias: systematic error, metres and radians a metre.
-        floor: metres (and a third of it in radians) of each single step.
-    """
-
-    translation: float = 0.02
-    rotation: float = 0.01
-    translation_bias: float = 0.01
-    rotation_bias: float = 0.002
-    floor: float = 0.002
+    translation: float = 0.02  # metres after one metre; grows with the root of the way
+    rotation: float = 0.01  # radians, likewise
+    translation_bias: float = 0.01  # systematic error, metres a metre
+    rotation_bias: float = 0.002  # radians a metre
+    floor: float = 0.002  # metres (and a third of it in radians) of each single step
 
 
 class OdometryChain:
@@ -31,18 +25,13 @@ class OdometryChain:
 
     The covariance of a stretch is a difference of two sums in the world's axes: it costs the same over ten
     keyframes and over ten thousand.
-
-    Attributes:
-        poses: keyframe → (4, 4) T_world_camera by odometry.
-        ways: keyframe → metres and radians along the path since the first.
-        edges: from each to the next, for the pose graph.
     """
 
     def __init__(self, drift: OdometryDrift) -> None:
         self._drift = drift
-        self.poses: dict[int, se3.Transform] = {}
-        self.edges: list[PoseGraphEdge] = []
-        self.ways: dict[int, float] = {}
+        self.poses: dict[int, se3.Transform] = {}  # keyframe → (4, 4) T_world_camera by odometry
+        self.edges: list[PoseGraphEdge] = []  # from each to the next, for the pose graph
+        self.ways: dict[int, float] = {}  # keyframe → metres and radians along the path since the first
         self._sums: dict[int, se3.Matrix6] = {}  # (6, 6), world axes
 
     def add(self, number: int, T_world_camera: se3.Transform) -> None:

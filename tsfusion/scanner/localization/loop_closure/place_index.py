@@ -24,29 +24,17 @@ _MAX_COMMON = 0.3  # share of the places beyond which a key tells nothing
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlaceView:
-    """Features and small depth image of a keyframe: 36 KB with 500 features.
+    """Features and small depth image of a keyframe: 36 KB with 500 features."""
 
-    Attributes:
-        descriptors: (n, 32) uint8, ORB (Rublee et al. 2011).
-        pixels: (n, 2) float32.
-        points: (n, 3) float32 in the camera's axes, metres; NaN where there is no depth.
-        depth_mm: (h, w) uint16 millimetres, 0 = none: medians over blocks of the image.
-        intrinsics: camera of `pixels`.
-        small: camera of `depth_mm`.
-        size: width and height of the image, pixels.
-        noise: metres of depth error at one metre; it grows with the square.
-        measured: whether a depth camera measured the depth, rather than a stereo matcher.
-    """
-
-    descriptors: NDArray[np.uint8]
-    pixels: NDArray[np.float32]
-    points: NDArray[np.float32]
-    depth_mm: NDArray[np.uint16]
-    intrinsics: Intrinsics
-    small: Intrinsics
-    size: tuple[int, int]
-    noise: float
-    measured: bool
+    descriptors: NDArray[np.uint8]  # (n, 32) uint8, ORB (Rublee et al. 2011)
+    pixels: NDArray[np.float32]  # (n, 2) float32
+    points: NDArray[np.float32]  # (n, 3) float32 in the camera's axes, metres; NaN where there is no depth
+    depth_mm: NDArray[np.uint16]  # (h, w) uint16 millimetres, 0 = none: medians over blocks of the image
+    intrinsics: Intrinsics  # camera of `pixels`
+    small: Intrinsics  # camera of `depth_mm`
+    size: tuple[int, int]  # width and height of the image, pixels
+    noise: float  # metres of depth error at one metre; it grows with the square
+    measured: bool  # whether a depth camera measured the depth, rather than a stereo matcher
 
 
 def place_view(frame: Frame, depth_m: NDArray[np.float32]) -> PlaceView | None:

@@ -28,21 +28,14 @@ MIN_OVERLAP = 0.2  # share of the pixels with depth
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LoopCheck:
-    """Result of comparing two views.
+    """Result of comparing two views."""
 
-    Attributes:
-        T_old_new: (4, 4) pose of the new camera in the old one's axes; None = none was found.
-        refused: reason not to take them for the same place; None = they are the same.
-        inliers: number of matches that agree with the pose.
-        sigma: standard deviation of the pose, metres.
-        depths: agreement of the dense depths; None = not compared.
-    """
-
+    # (4, 4) pose of the new camera in the old one's axes; None = none was found
     T_old_new: se3.Transform | None = None
-    refused: str | None = None
-    inliers: int = 0
-    sigma: float = 0.0
-    depths: Agreement | None = None
+    refused: str | None = None  # reason not to take them for the same place; None = they are the same
+    inliers: int = 0  # number of matches that agree with the pose
+    sigma: float = 0.0  # standard deviation of the pose, metres
+    depths: Agreement | None = None  # agreement of the dense depths; None = not compared
 
 
 def check(old: PlaceView, new: PlaceView) -> LoopCheck:

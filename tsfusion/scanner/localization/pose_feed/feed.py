@@ -45,10 +45,6 @@ class PoseFeed:
         time_offset_s: seconds to add to a frame's stamp before its pose is looked up.
         wait_s: seconds a frame waits for the pose after it.
 
-    Attributes:
-        received: number of valid messages.
-        dropped: number of malformed messages, by reason.
-
     Raises:
         InvalidConfig: for a malformed address, or one open to other machines.
         TransportError: when it cannot be bound.
@@ -59,8 +55,8 @@ class PoseFeed:
     def __init__(
         self, address: str, *, max_gap_s: float, time_offset_s: float = 0.0, wait_s: float = WAIT
     ) -> None:
-        self.received = 0
-        self.dropped: Counter[str] = Counter()
+        self.received = 0  # number of valid messages
+        self.dropped: Counter[str] = Counter()  # number of malformed messages, by reason
         self._max_gap_ns, self._offset_ns = round(max_gap_s * _NS), round(time_offset_s * _NS)
         self._wait = wait_s
         self._socket = _FeedSocket(address)

@@ -29,25 +29,15 @@ _CELL = 8  # blocks a side, over which errors are averaged
 
 @dataclass(frozen=True, eq=False)
 class PlaneImage:
-    """Planes fitted to the blocks of one depth image, in its camera's axes.
+    """Planes fitted to the blocks of one depth image, in its camera's axes."""
 
-    Attributes:
-        intrinsics: those of the image of blocks.
-        shape: rows and columns of blocks.
-        points: (3, n) float32 metres, the blocks' centres.
-        sigma: (n,) float32 metres, standard deviation of a depth camera at these depths.
-        index: (n,) number of the point's block, row by row.
-        planes: (4, rows·columns) float32: unit normal and offset, normal · p = offset > 0; 0 = no plane.
-        roughness: deviation of the blocks from the planes fitted around them, as a share of `sigma`.
-    """
-
-    intrinsics: Intrinsics
-    shape: tuple[int, int]
-    points: Floats
-    sigma: Floats
-    index: NDArray[np.intp]
-    planes: Floats
-    roughness: float
+    intrinsics: Intrinsics  # those of the image of blocks
+    shape: tuple[int, int]  # rows and columns of blocks
+    points: Floats  # (3, n) float32 metres, the blocks' centres
+    sigma: Floats  # (n,) float32 metres, standard deviation of a depth camera at these depths
+    index: NDArray[np.intp]  # (n,) number of the point's block, row by row
+    planes: Floats  # (4, rows·columns) float32: unit normal and offset, normal · p = offset > 0; 0 = no plane
+    roughness: float  # deviation of the blocks from the planes fitted around them, as a share of `sigma`
 
     @property
     def covered(self) -> float:
@@ -140,23 +130,14 @@ def _normals(inverse: Floats, valid: NDArray[np.bool_], K: Intrinsics) -> tuple[
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Points of one image paired with the planes of another whose blocks they project onto.
+    """Points of one image paired with the planes of another whose blocks they project onto."""
 
-    Attributes:
-        moved: (3, m) float32 metres, the points in the other camera's axes.
-        normals: (3, m) float32, of the planes.
-        distance: (m,) float32 metres from the planes, signed.
-        sigma: (m,) float32 metres, standard deviation of the points' depth.
-        chosen: (m,) indices of the points.
-        block: (m,) numbers of the other image's blocks.
-    """
-
-    moved: Floats
-    normals: Floats
-    distance: Floats
-    sigma: Floats
-    chosen: NDArray[np.intp]
-    block: NDArray[np.intp]
+    moved: Floats  # (3, m) float32 metres, the points in the other camera's axes
+    normals: Floats  # (3, m) float32, of the planes
+    distance: Floats  # (m,) float32 metres from the planes, signed
+    sigma: Floats  # (m,) float32 metres, standard deviation of the points' depth
+    chosen: NDArray[np.intp]  # (m,) indices of the points
+    block: NDArray[np.intp]  # (m,) numbers of the other image's blocks
 
 
 def match(

@@ -22,21 +22,13 @@ MAX_UNCERTAINTY = 0.01  # metres
 
 @dataclass(frozen=True)
 class PoseEvidence:
-    """How well a frame agrees with a keyframe at the pose found.
+    """Agreement of a frame with a keyframe at the pose found."""
 
-    Attributes:
-        overlap: share of the frame's points that fall onto planes of the keyframe.
-        agreeing: share of these points that lie on their planes.
-        likeness: -1 to 1, correlation of the grey patterns there; None = no image, or no pattern.
-        corners: number of corners that agree.
-        uncertainty: metres; deviation of the pose in its worst direction, rotations taken at the surface.
-    """
-
-    overlap: float
-    agreeing: float
-    likeness: float | None
-    corners: int
-    uncertainty: float
+    overlap: float  # share of the frame's points that fall onto planes of the keyframe
+    agreeing: float  # share of these points that lie on their planes
+    likeness: float | None  # -1 to 1, correlation of the grey patterns there; None = no image, or no pattern
+    corners: int  # number of corners that agree
+    uncertainty: float  # metres; deviation of the pose in its worst direction, rotations taken at the surface
 
     def doubt(self, *, strict: bool) -> str | None:
         """Reason to reject the pose; None = it is accepted.

@@ -28,36 +28,22 @@ ROUNDS = ((4, 15, 0.3), (2, 6, 0.05), (1, 3, 0.03))  # blocks between points, it
 
 @dataclass(frozen=True, eq=False)
 class AlignmentTarget:
-    """A tracking keyframe that the new frame is aligned to.
+    """A tracking keyframe that the new frame is aligned to."""
 
-    Attributes:
-        T_target_anchor: (4, 4), known.
-        surface: its planes.
-        points: (n, 3) metres, its corners in its camera's axes.
-        pixels: (n, 2), these corners in the new image.
-    """
-
-    T_target_anchor: se3.Transform
+    T_target_anchor: se3.Transform  # (4, 4), known
     surface: point_to_plane.PlaneImage
-    points: NDArray[np.float64]
-    pixels: NDArray[np.float32]
+    points: NDArray[np.float64]  # (n, 3) metres, its corners in its camera's axes
+    pixels: NDArray[np.float32]  # (n, 2), these corners in the new image
 
 
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
-    """The pose found and the information about it, as (6, 6) matrices for a twist from the left.
+    """The pose found and the information about it, as (6, 6) matrices for a twist from the left."""
 
-    Attributes:
-        T_anchor_camera: (4, 4).
-        planes: information from the distances to planes.
-        spurious: the part of it that noise in the planes' normals alone would give.
-        corners: information from the reprojection of corners.
-    """
-
-    T_anchor_camera: se3.Transform
-    planes: se3.Matrix6
-    spurious: se3.Matrix6
-    corners: se3.Matrix6
+    T_anchor_camera: se3.Transform  # (4, 4)
+    planes: se3.Matrix6  # information from the distances to planes
+    spurious: se3.Matrix6  # the part of it that noise in the planes' normals alone would give
+    corners: se3.Matrix6  # information from the reprojection of corners
 
 
 def solve(

@@ -26,18 +26,12 @@ HALF_CONTRAST = 8.0  # grey levels
 
 @dataclass(frozen=True, eq=False)
 class RGBDFrame:
-    """Grey image and planes of one frame.
-
-    Attributes:
-        shape: (H, W) of the image.
-        gray: (H, W) uint8; None = depth alone.
-        surface: planes of the depth image.
-    """
+    """Grey image and planes of one frame."""
 
     intrinsics: Intrinsics
-    shape: tuple[int, ...]
-    gray: Gray | None
-    surface: point_to_plane.PlaneImage
+    shape: tuple[int, ...]  # (H, W) of the image
+    gray: Gray | None  # (H, W) uint8; None = depth alone
+    surface: point_to_plane.PlaneImage  # planes of the depth image
 
     @classmethod
     def of(cls, frame: Frame) -> "RGBDFrame":
@@ -100,20 +94,13 @@ class RGBDFrame:
 
 @dataclass(frozen=True, eq=False)
 class TrackingKeyframe:
-    """A frame with a pose, which later frames are aligned to.
+    """A frame with a pose, which later frames are aligned to."""
 
-    Attributes:
-        number: its number as an anchor.
-        T_world_camera: (4, 4).
-        corners: (n, 2) pixels.
-        points: (n, 3) metres, the corners in the camera's axes.
-    """
-
-    number: int
-    T_world_camera: se3.Transform
+    number: int  # its number as an anchor
+    T_world_camera: se3.Transform  # (4, 4)
     frame: RGBDFrame
-    corners: features.Pixels
-    points: NDArray[np.float64]
+    corners: features.Pixels  # (n, 2) pixels
+    points: NDArray[np.float64]  # (n, 3) metres, the corners in the camera's axes
 
     @classmethod
     def of(cls, frame: RGBDFrame, number: int, T_world_camera: se3.Transform) -> "TrackingKeyframe":

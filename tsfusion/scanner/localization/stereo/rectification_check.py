@@ -28,27 +28,17 @@ MIN_SWAP, MIN_SWAPPED_SHARE = 2.0, 0.7  # pixels to the wrong side, and share of
 
 @dataclass(frozen=True, kw_only=True)
 class RectificationCheck:
-    """Rectification errors found in the first pairs.
+    """Rectification errors found in the first pairs."""
 
-    Attributes:
-        pairs: number of pairs compared.
-        matches: number of corners compared.
-        rows_px: rows by which the right image's points lie lower than the left's, at the image's centre.
-        roll_deg: clockwise turn of the right image against the left one, seen along the view.
-        stretch: factor of the right image's height against the left's.
-        worst_rows_px: the largest row error of these three within the image.
-        disparity_px: pixels by which every disparity is too high; None = not known yet (too little motion).
-        problems: texts for the user, each with what to do; empty = nothing was found.
-    """
-
-    pairs: int
-    matches: int
-    rows_px: float
-    roll_deg: float
-    stretch: float
-    worst_rows_px: float
+    pairs: int  # number of pairs compared
+    matches: int  # number of corners compared
+    rows_px: float  # rows by which the right image's points lie lower than the left's, at the image's centre
+    roll_deg: float  # clockwise turn of the right image against the left one, seen along the view
+    stretch: float  # factor of the right image's height against the left's
+    worst_rows_px: float  # the largest row error of these three within the image
+    # Pixels by which every disparity is too high; None = not known yet (too little motion)
     disparity_px: float | None
-    problems: tuple[str, ...]
+    problems: tuple[str, ...]  # texts for the user, each with what to do; empty = nothing was found
 
     @property
     def ok(self) -> bool:
@@ -57,14 +47,10 @@ class RectificationCheck:
 
 
 class RectificationMonitor:
-    """Collect errors of pairs and motions, and warn once of each problem.
-
-    Attributes:
-        check: result so far; None until there were enough pairs.
-    """
+    """Collect errors of pairs and motions, and warn once of each problem."""
 
     def __init__(self) -> None:
-        self.check: RectificationCheck | None = None
+        self.check: RectificationCheck | None = None  # result so far; None until there were enough pairs
         self._left: list[Pixels] = []
         self._right: list[Pixels] = []
         self._offsets: list[float] = []

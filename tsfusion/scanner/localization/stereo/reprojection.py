@@ -48,20 +48,13 @@ class StereoCamera:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
-    """Motion found by `refine`.
+class StereoMotion:
+    """Motion found by `refine`."""
 
-    Attributes:
-        T_old_new: (4, 4) pose of the second camera in the axes of the first.
-        agree: (n,) bool, points whose errors their uncertainties explain.
-        offset: pixels to add to every disparity; 0 unless it was estimated.
-        offset_sigma: pixels, standard deviation of the offset.
-    """
-
-    T_old_new: se3.Transform
-    agree: NDArray[np.bool_]
-    offset: float
-    offset_sigma: float
+    T_old_new: se3.Transform  # (4, 4) pose of the second camera in the axes of the first
+    agree: NDArray[np.bool_]  # (n,) bool, points whose errors their uncertainties explain
+    offset: float  # pixels to add to every disparity; 0 unless it was estimated
+    offset_sigma: float  # pixels, standard deviation of the offset
 
 
 def refine(
@@ -72,7 +65,7 @@ def refine(
     rig: StereoCamera,
     *,
     with_offset: bool = False,
-) -> Motion | None:
+) -> StereoMotion | None:
     """Refine a motion by Gauss-Newton; None when the points do not determine it.
 
     Args:
@@ -103,7 +96,7 @@ def refine(
         if np.abs(step).max() < 1e-6:
             break
     sigma = PIXEL_SIGMA * float(np.sqrt(np.linalg.inv(H)[-1, -1])) if with_offset else 0.0
-    return Motion(se3.inverse(T_new_old), deviation < MAX_DEVIATION, offset, sigma)
+    return StereoMotion(se3.inverse(T_new_old), deviation < MAX_DEVIATION, offset, sigma)
 
 
 def _normal_equations(

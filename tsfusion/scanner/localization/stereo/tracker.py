@@ -165,11 +165,7 @@ class StereoLocalizer(Localizer):
         self._rectification.add_pair(pixels[found], other[found], right.shape)
 
     def _check_disparity(
-        self,
-        T: se3.Transform,
-        reference: _Reference,
-        followed: NDArray[np.bool_],
-        new: features.Pixels,
+        self, T: se3.Transform, reference: _Reference, followed: NDArray[np.bool_], new: features.Pixels
     ) -> None:
         if not self._rectification.wants_motion:
             return
