@@ -13,7 +13,7 @@ from scripted_server import ScriptedServer, scripted
 from tsfusion import Client
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, InvalidConfig, NotAllowed, ServerUnreachable
-from tsfusion.delivery.link_state import Kind, LinkState
+from tsfusion.delivery.link_state import LinkKind, LinkState
 from tsfusion.wire import key_folder
 from tsfusion.wire.curve import server_keys
 
@@ -185,7 +185,7 @@ def test_who_is_refused_stays_so_until_a_welcome(state: LinkState) -> None:
     assert state.refused("why").reachable("another problem") == LinkState("refused", "why")
 
 
-def kinds_after(event: str, *arguments: str) -> list[Kind]:
+def kinds_after(event: str, *arguments: str) -> list[LinkKind]:
     return [getattr(state, event)(*arguments).kind for state in STATES]
 
 

@@ -38,7 +38,7 @@ def python(program: str, *arguments: object, **more: Any) -> "subprocess.Complet
     """Run Python code in a process of its own, to its end."""
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "timeout": DEADLINE, "check": False}
     command = [sys.executable, "-c", program, *map(str, arguments)]
-    return subprocess.run(command, text=True, **{**options, **more})
+    return subprocess.run(command, text=True, **{**options, **more})  # noqa: PLW1510
 
 
 def started(*arguments: object) -> "subprocess.Popen[str]":

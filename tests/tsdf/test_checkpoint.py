@@ -12,7 +12,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-import small_disk
 from formula_scenes import sphere_views, volume_of
 
 from tsfusion import Volume, VolumeConfig

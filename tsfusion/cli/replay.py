@@ -67,7 +67,6 @@ def replay(
 
     from tsfusion.core.config import override
     from tsfusion.datasets import select
-    from tsfusion.evaluation import pose_check
 
     # Any server makes a mesh with another `min_weight`.
     own = {*options.MAP_OPTIONS, "state"} - {"min_weight"}
@@ -82,9 +81,7 @@ def replay(
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count} frames {reason}", err=True)
     if check_ and not _is_synthetic(path):
-        report = pose_check.check(dataset)
-        if report.verdict == "disagree":
-            typer.echo(f"warning: {report.text}", err=True)
+        _warn_of_disagreement(dataset)
     server = None
     if state is not None:  # only this machine reaches the run's own server; its errors are shown here
         server = override(chosen.server, listen="tcp://127.0.0.1:0", state=str(state))
@@ -126,6 +123,15 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
 def _is_synthetic(path: Path) -> bool:
     """Whether it is a synthetic dataset: what there is to say of one would have to be rendered first."""
     return str(path).startswith("synthetic:")
+
+
+def _warn_of_disagreement(dataset: "Dataset") -> None:
+    """Print a line on stderr when poses and depth disagree."""
+    from tsfusion.evaluation import pose_check
+
+    report = pose_check.check(dataset)
+    if report.verdict == "disagree":
+        typer.echo(f"warning: {report.text}", err=True)
 
 
 @options.takes_map_settings
