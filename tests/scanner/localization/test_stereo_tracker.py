@@ -244,7 +244,8 @@ def euroc(folder: Path, *, rectify: bool) -> list[Frame]:
         images = [grey(Path(str(path).replace("cam0", f"cam{k}"))) for k in (0, 1)]
         if rectify:
             images = [cv2.remap(image, *maps[k], cv2.INTER_LINEAR) for k, image in enumerate(images)]
-        pairs.append(Frame("stereo", left=images[0], right=images[1], intrinsics=K, baseline_fx=-P1[0, 3]))
+        left, right = images
+        pairs.append(Frame(sensor="stereo", left=left, right=right, intrinsics=K, baseline_fx=-P1[0, 3]))
     return pairs * 3
 
 
