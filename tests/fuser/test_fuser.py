@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the fuser does with each message, in this process with a list for a link; log lines of its own."""
+"""The fuser's answer to each message, in this process with a list for a link; its own log lines."""
 
 import errno
 import json

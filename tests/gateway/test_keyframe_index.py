@@ -111,7 +111,7 @@ def handed_out(backlog: FuserBacklog, wanted: int) -> list[tuple[str, int]]:
 
 
 def test_each_client_gets_its_turn() -> None:
-    """One that floods holds nobody up; each session keeps its order."""
+    """A client that floods holds no other up; each session keeps its order."""
     sessions, index = Sessions(), KeyframeIndex()
     backlog = FuserBacklog(index, sessions)
     flood, more, small = (sessions.open(bytes([i]) * 16, client) for i, client in enumerate("aab"))

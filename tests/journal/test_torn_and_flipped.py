@@ -51,7 +51,7 @@ class Segment:
         self.ends = [place.offset + head.nbytes for place, head in zip(self.places, raw, strict=True) if head]
 
     def read(self, content: bytes) -> tuple[list[Position], list[Damage]]:
-        """What a scan of altered bytes finds; fails unless each record is one that was written."""
+        """Records that a scan of altered bytes finds; fails unless each is one that was written."""
         self.path.write_bytes(content)
         found, damages = [], []
         for step in scan_records(self.path):

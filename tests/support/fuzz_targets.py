@@ -271,7 +271,7 @@ def _correction_seeds() -> list[bytes]:
 
 
 def _run_correction(header: CorrectionHeader, frames: list[bytes]) -> str:
-    """What passes the door is as good as what a client would send."""
+    """Check that an accepted message is as good as one that a client would send."""
     one = corrections.unpack(header, frames[1])
     poses = dict(zip(one.seqs.tolist(), one.poses, strict=True))
     again = corrections.checked(poses, T_map_odometry=one.T_map_odometry, removed=one.removed.tolist())

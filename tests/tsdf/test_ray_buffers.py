@@ -95,7 +95,7 @@ def expected_rays(
 
 
 def close(found: NDArray[np.int32], expected: list[NDArray[np.int32]]) -> None:
-    """The same rays in the same order, but for the last bits of rounded floats."""
+    """Compare rays in order, up to the last bits of rounded floats."""
     wanted = np.array(expected, np.int64)
     assert found.shape == wanted.shape
     ends = [ray_ends(rays.astype(np.float64)) for rays in (found, wanted)]

@@ -22,7 +22,7 @@ SESSION = bytes(range(16))
 
 
 def some(count: int, seed: int = 0, first: int = 1) -> dict[int, np.ndarray]:
-    """That many poses that are anything but round."""
+    """Draw so many poses without round numbers."""
     rng = np.random.default_rng(seed)
     return {first + i: se3.exp(rng.normal(size=6)) for i in range(count)}
 

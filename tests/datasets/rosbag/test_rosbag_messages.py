@@ -18,7 +18,7 @@ WITH_ALPHA = np.dstack([BGR, np.full(SHAPE, 9, np.uint8)])
 
 
 def of_color(folder: Path, stored: np.ndarray, encoding: str, **options: Any) -> Any:
-    """What a colour image beside a depth image is read as."""
+    """Pixel layout in which a colour image beside a depth image is read."""
 
     def write(bag: BagWriter) -> None:
         bag.image(DEPTH, wall().measurement, "16UC1", T0)
