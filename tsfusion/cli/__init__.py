@@ -26,6 +26,7 @@ from tsfusion.cli import (
     scan,
     serve,
     status,
+    verbs,
 )
 from tsfusion.core.errors import TsfusionError
 
@@ -34,26 +35,53 @@ TERMINATED = 128 + signal.SIGTERM
 # Typer's own click or the real one, by version: both name it so.
 _UsageError: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
+START, OWN, SERVER, SETUP = "Start here", "Recordings and results", "Server", "This installation"
+
 app = typer.Typer(
     name="tsfusion",
+    cls=verbs.Group,
     help="Depth sensors in, one exact 3-D map out.",
-    add_completion=False,
+    epilog=(
+        "Every flag can be set by an environment variable: --voxel-size by TSFUSION_VOXEL_SIZE, and so on. "
+        "Every setting stands in the file that `tsfusion config dump` writes."
+    ),
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command()(replay.demo)
-app.command()(replay.replay)
-app.command()(scan.scan)
-app.command()(check.check)
-app.command()(serve.serve)
-app.command()(mesh.mesh)
-app.command()(status.status)
-app.command()(ate.ate)
-app.command()(doctor.doctor)
-app.command()(download.download)
-app.add_typer(keys.app, name="keys")
-app.add_typer(journal.app, name="journal")
-app.add_typer(config.app, name="config")
-app.add_typer(datasets.app, name="datasets")
+verbs.verb(app, "tsfusion demo", "tsfusion demo --world street --rate 2", panel=START)(replay.demo)
+verbs.verb(
+    app, "tsfusion scan my-recording --voxel-size 0.02",
+    "tsfusion scan realsense --connect tcp://server:5555 --map yard", panel=START,
+)(scan.scan)  # fmt: skip
+verbs.verb(
+    app, "tsfusion replay my-recording --voxel-size 0.02",
+    "tsfusion replay kitchen.bag --trajectory slam.txt", panel=START,
+)(replay.replay)  # fmt: skip
+verbs.verb(
+    app, "tsfusion check my-recording", "tsfusion check my-recording --trajectory slam.txt", panel=OWN
+)(check.check)
+verbs.verb(
+    app, "tsfusion mesh out/latest/map.tsf room.glb", "tsfusion mesh tcp://server:5555 yard.ply --map yard",
+    panel=OWN,
+)(mesh.mesh)  # fmt: skip
+verbs.verb(
+    app, "tsfusion ate out/latest/trajectory.txt groundtruth.txt",
+    "tsfusion ate estimate.txt my-recording --plot error.png", panel=OWN,
+)(ate.ate)  # fmt: skip
+app.add_typer(datasets.app, name="datasets", rich_help_panel=OWN)
+verbs.verb(app, "tsfusion download", "tsfusion download tum-fr1-xyz --to datasets", panel=OWN)(
+    download.download
+)
+verbs.verb(
+    app, "tsfusion serve --state my-maps --voxel-size 0.02",
+    "tsfusion serve --listen tcp://0.0.0.0:5555 --keys tsfusion-keys --state my-maps", panel=SERVER,
+)(serve.serve)  # fmt: skip
+verbs.verb(
+    app, "tsfusion status --watch 1", "tsfusion status --connect tcp://server:5555 --json", panel=SERVER
+)(status.status)
+app.add_typer(journal.app, name="journal", rich_help_panel=SERVER)
+app.add_typer(keys.app, name="keys", rich_help_panel=SERVER)
+verbs.verb(app, "tsfusion doctor", "tsfusion doctor /mnt/maps", panel=SETUP)(doctor.doctor)
+app.add_typer(config.app, name="config", rich_help_panel=SETUP)
 
 
 @app.callback(invoke_without_command=True)

@@ -34,7 +34,7 @@ def ate(
     option: options.DatasetOptions = None,
     json: options.Json = False,
 ) -> None:
-    """Print the absolute trajectory error (ATE): how far an estimated trajectory is from the true one."""
+    """Print the absolute trajectory error (ATE): an estimate against the truth."""
     from tsfusion.cli import output
     from tsfusion.core.output_folder import check_writable
     from tsfusion.evaluation import trajectory_error

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tsfusion.cli import options, replay
+from tsfusion.cli import options, replay, verbs
 
 
 def check(
@@ -15,12 +15,13 @@ def check(
         Path, typer.Argument(metavar="PATH", help="A dataset or a journal, as `tsfusion replay` takes it.")
     ],
     *,
+    trajectory: options.Trajectory = None,
     sequence: options.Sequence = None,
     modality: options.Modality = None,
-    poses: options.Poses = None,
-    unpack: options.Unpack = False,
     option: options.DatasetOptions = None,
+    unpack: options.Unpack = False,
     json: options.Json = False,
+    help_all: verbs.HelpAll = None,
 ) -> None:
     """Check that a dataset's poses and depth agree, and say what is wrong if not.
 
@@ -30,7 +31,7 @@ def check(
     from tsfusion.evaluation import pose_check
 
     dataset = replay.open_recording(
-        path, unpack=unpack, sequence=sequence, modality=modality, poses=poses,
+        path, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
         **options.dataset_options(option),
     )  # fmt: skip
     report = pose_check.check(dataset)

@@ -3,9 +3,9 @@
 
 import typer
 
-from tsfusion.cli import options
+from tsfusion.cli import options, verbs
 
-app = typer.Typer(help="The settings and their defaults.")
+app = typer.Typer(cls=verbs.Group, help="The settings and their defaults.")
 
 
 @app.callback()
@@ -13,7 +13,7 @@ def _group() -> None:
     """Keep `dump` a verb of its own while it is the only one."""
 
 
-@app.command()
+@verbs.verb(app, "tsfusion config dump > tsfusion.toml", "tsfusion config dump --config tsfusion.toml --json")
 def dump(config: options.ConfigFile = None, json: options.Json = False) -> None:
     """Print every setting as commented TOML: the defaults, or with --config those of FILE."""
     from tsfusion.core import config as settings

@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
-from tsfusion.cli import options
+from tsfusion.cli import options, verbs
 
 _DEPTH = 4  # folders below PATH
 
 
-class _ListByDefault(TyperGroup):
+class _ListByDefault(verbs.Group):
     """`tsfusion datasets [PATH]` is `tsfusion datasets list [PATH]`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -30,7 +29,7 @@ def _group() -> None:
     """Keep `list` a verb of its own while it is the only one."""
 
 
-@app.command("list")
+@verbs.verb(app, "tsfusion datasets", "tsfusion datasets ~/recordings", name="list")
 def list_(
     path: Annotated[
         Path | None, typer.Argument(metavar="PATH", help="Look for datasets in and under it.")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from tsfusion.cli import options
+from tsfusion.cli import options, verbs
 from tsfusion.cli.output import size
 
 if TYPE_CHECKING:
@@ -22,8 +22,9 @@ _Result = TypeVar("_Result")
 _MOST_LINES = 20  # printed of one kind; --json has all
 
 app = typer.Typer(
-    help="Describe a journal, check it, save its whole keyframes, export it to other tools. "
-    "None of this changes a journal, and all of it works while a server runs."
+    cls=verbs.Group,
+    help="Describe a journal, check it, save its whole keyframes, export it to other tools.\n\n"
+    "None of this changes a journal, and all of it works while a server runs.",
 )
 
 Where = Annotated[
@@ -38,7 +39,7 @@ Map = Annotated[
 ]
 
 
-@app.command()
+@verbs.verb(app, "tsfusion journal info my-maps", "tsfusion journal info my-maps --map yard --json")
 def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
     """Describe what a journal holds: segments, sessions, keyframes, damage, quarantine.
 
@@ -56,7 +57,7 @@ def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
     _run("reading", path, map_, summarize, _describe_info, json=json)
 
 
-@app.command()
+@verbs.verb(app, "tsfusion journal verify my-maps", "tsfusion journal verify tsfusion-spool/default")
 def verify(path: Where, map_: Map = None, json: options.Json = False) -> None:
     """Read and decode every keyframe; exit status 1 when anything is damaged.
 
@@ -71,7 +72,9 @@ def verify(path: Where, map_: Map = None, json: options.Json = False) -> None:
         raise typer.Exit(1)
 
 
-@app.command()
+@verbs.verb(
+    app, "tsfusion journal recover my-maps saved", "tsfusion journal recover my-maps/maps/yard saved-yard"
+)
 def recover(
     path: Where,
     out: Annotated[
@@ -101,7 +104,11 @@ def recover(
         raise typer.Exit(1)
 
 
-@app.command()
+@verbs.verb(
+    app,
+    "tsfusion journal export my-maps yard.mcap --map yard",
+    "tsfusion journal export tsfusion-spool/default waiting.mcap",
+)
 def export(
     path: Where,
     out: Annotated[

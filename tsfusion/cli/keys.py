@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
-from tsfusion.cli import options
+from tsfusion.cli import options, verbs
 
 app = typer.Typer(
+    cls=verbs.Group,
     help="""Make keys, and choose who may connect to a server.
 
     Three steps let a scanner in, and nobody else:
@@ -24,7 +25,7 @@ app = typer.Typer(
     `--key tsfusion-keys/robot1.key_secret --server-key KEY`, with the key that step 1 printed.
 
     A secret key never leaves the machine that made it.
-    """
+    """,
 )
 Dir = Annotated[
     Path,
@@ -36,7 +37,7 @@ Name = Annotated[str, typer.Argument(metavar="NAME", help="1 to 32 letters, digi
 _FOLDER = Path("tsfusion-keys")
 
 
-@app.command()
+@verbs.verb(app, "tsfusion keys new server", "tsfusion keys new robot1 --dir robot-keys")
 def new(
     name: Name,
     *,
@@ -63,7 +64,7 @@ def new(
         typer.echo(f"next, on the server: tsfusion keys allow {name} {shlex.quote(made.public)}")
 
 
-@app.command()
+@verbs.verb(app, "tsfusion keys allow robot1 robot1.key", "tsfusion keys allow robot1 -- '-40 characters-'")
 def allow(
     name: Name,
     key: Annotated[
@@ -85,7 +86,7 @@ def allow(
         typer.echo(f"its earlier key no longer may: {earlier}")
 
 
-@app.command()
+@verbs.verb(app, "tsfusion keys revoke robot1", "tsfusion keys revoke robot1 --dir /etc/tsfusion/keys")
 def revoke(name: Name, *, folder: Dir = _FOLDER) -> None:
     """Keep a scanner out; a running server closes its connections at once."""
     from tsfusion.wire import key_folder
@@ -94,7 +95,7 @@ def revoke(name: Name, *, folder: Dir = _FOLDER) -> None:
     typer.echo(f"{name} may no longer connect: {key}")
 
 
-@app.command("list")
+@verbs.verb(app, "tsfusion keys list", "tsfusion keys list --json", name="list")
 def list_(*, folder: Dir = _FOLDER, json: options.Json = False) -> None:
     """List the folder's own public keys, and on a server who is allowed and who was revoked."""
     from tsfusion.wire import key_folder

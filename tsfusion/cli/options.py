@@ -13,41 +13,47 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tsfusion.cli import verbs
+
 if TYPE_CHECKING:
-    from tsfusion.core.config import ClientConfig, Config
+    from tsfusion.core.config import ClientConfig, Config, ServerConfig
 
 
-def _option(flag: str, metavar: str | None, help_: str, *, panel: str | None = None) -> Any:
-    """A flag that the environment variable `TSFUSION_FLAG` sets too."""
-    variable = "TSFUSION_" + flag.partition("/")[0].strip("-").replace("-", "_").upper()
-    return typer.Option(flag, metavar=metavar, envvar=variable, rich_help_panel=panel, help=help_)
+def option(
+    flag: str, metavar: str | None, help_: str, *, panel: str | None = None, rare: bool = False, **more: Any
+) -> Any:
+    """A flag; a rare one is shown by `--help-all` alone."""
+    return typer.Option(flag, metavar=metavar, rich_help_panel=panel, help=help_, hidden=rare, **more)
 
 
-_map_option = functools.partial(_option, panel="Map")
+_map_option = functools.partial(option, panel="Map")
 
 # By name: a setting of the `volume` table, or one that `configuration` turns into some.
 MAP_OPTIONS: dict[str, Any] = {
     "voxel_size": Annotated[float | None, _map_option("--voxel-size", "METRES", "Edge of a voxel.")],
     "sensor": Annotated[str | None, _map_option(
-        "--sensor", "NAME", "Noise model and presets: kinect, tof, realsense, stereo, lidar or scanner.")],
-    "regularizer": Annotated[str | None, _map_option(
-        "--regularizer", "MODE", "Smoothing along rays: off, paper or ray; default: the sensor's.")],
-    "surface": Annotated[str | None, _map_option(
-        "--surface", "MODE", "Surface to mesh: raw, normal or field (smoothed); default: the sensor's.")],
-    "lambda_": Annotated[float | None, _map_option(
-        "--lambda", "NUMBER", "Smoothing along rays and of the field; default: the sensor's.")],
-    "truncation": Annotated[float | None, _map_option(
-        "--truncation", "VOXELS", "Half-width of every ray's band, instead of 3 sigma of its noise.")],
-    "support": Annotated[str | None, _map_option(
-        "--support", "LEAST:MOST", "Bounds of that half-width, such as 3:6; default: the sensor's.")],
+        "--sensor", "NAME", "kinect, tof, realsense, stereo, lidar, scanner.",
+        autocompletion=lambda: ["kinect", "tof", "realsense", "stereo", "lidar", "scanner"])],
     "max_range": Annotated[float | None, _map_option(
-        "--max-range", "METRES", "Leave out measurements farther away; default: the sensor's.")],
+        "--max-range", "METRES", "Leave out measurements farther away.")],
     "min_weight": Annotated[float | None, _map_option(
-        "--min-weight", "SAMPLES", "Full-confidence samples that mesh a voxel; default: the sensor's.")],
+        "--min-weight", "COUNT", "Full-confidence samples that mesh a voxel.")],
     "space_carving": Annotated[bool | None, _map_option(
-        "--space-carving/--no-space-carving", None, "Let rays clear what they pass: slower, no ghosts.")],
+        "--space-carving/--no-space-carving", None, "Let rays clear what they pass: no ghosts.")],
+    "regularizer": Annotated[str | None, _map_option(
+        "--regularizer", "MODE", "Smoothing along rays: off, paper or ray.", rare=True)],
+    "surface": Annotated[str | None, _map_option(
+        "--surface", "MODE", "Surface to mesh: raw, normal or field (smoothed).", rare=True)],
+    "lambda_": Annotated[float | None, _map_option(
+        "--lambda", "NUMBER", "Smoothing along rays and of the field.", rare=True)],
+    "truncation": Annotated[float | None, _map_option(
+        "--truncation", "VOXELS", "Half-width of every ray's band, instead of 3 sigma of its noise.",
+        rare=True)],
+    "support": Annotated[str | None, _map_option(
+        "--support", "LEAST:MOST", "Bounds of that half-width, such as 3:6.", rare=True)],
     "threads": Annotated[int | None, _map_option(
-        "--threads", "N", "Threads of the kernels; default: all cores. Results do not depend on it.")],
+        "--threads", "N", "Threads of the kernels; default: all cores. Results do not depend on it.",
+        rare=True)],
 }  # fmt: skip
 VIEW_OPTIONS = ("min_weight", "surface", "lambda_", "threads")  # these change nothing that is stored
 
@@ -56,7 +62,7 @@ def takes_map_settings(verb: Callable[..., Any], also: dict[str, Any] | None = N
     """Let Typer see every one of `MAP_OPTIONS` and `also` as a flag of a verb that ends with `**settings`."""
     signature = inspect.signature(verb)
     own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-    added = {**(also or {}), **MAP_OPTIONS}
+    added = {**(also or {}), **MAP_OPTIONS, "help_all": verbs.HelpAll}
     shared = [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=option)
         for name, option in added.items()
@@ -66,40 +72,50 @@ def takes_map_settings(verb: Callable[..., Any], also: dict[str, Any] | None = N
     return verb
 
 
-ConfigFile = Annotated[Path | None, _option("--config", "FILE", "TOML; `tsfusion config dump` writes one.")]
-Connect = Annotated[str | None, _option("--connect", "ADDRESS", "A running server's address.")]
-Control = Annotated[
-    str | None, _option("--control", "ADDRESS", "Its control address; else the port after the other.")
+ConfigFile = Annotated[Path | None, option("--config", "FILE", "TOML; `tsfusion config dump` writes one.")]
+Out = Annotated[
+    Path | None,
+    option("--out", "DIR", "Folder for the results; default: out/DATE_TIME, and out/latest."),
 ]
-Map = Annotated[str | None, _option("--map", "NAME", "Which of a server's maps; else default.")]
+Overwrite = Annotated[
+    bool, option("--overwrite", None, "Replace the results that --out holds already.", rare=True)
+]
+State = Annotated[Path | None, option("--state", "DIR", "Keep journal and map of the run's own server here.")]
+Connect = Annotated[
+    str | None, option("--connect", "ADDRESS", "Send to this server instead of one of the run's own.")
+]
+Control = Annotated[
+    str | None,
+    option("--control", "ADDRESS", "Its control address; else the port after the other.", rare=True),
+]
+Map = Annotated[str | None, option("--map", "NAME", "Which of the server's maps; else default.")]
 Key = Annotated[
     str | None,
-    _option("--key", "FILE", "This client's secret key, of `tsfusion keys new`, for a server with keys."),
+    option("--key", "FILE", "This client's secret key, for a server with keys (`tsfusion keys`).", rare=True),
 ]
 ServerKey = Annotated[
-    str | None, _option("--server-key", "FILE|KEY", "That server's public key: a file, or the 40 characters.")
+    str | None,
+    option("--server-key", "FILE|KEY", "That server's public key: a file, or the 40 characters.", rare=True),
 ]
+Json = Annotated[bool, option("--json", None, "Print JSON for a program to read.")]
+
+_rare_option = functools.partial(option, panel="Source", rare=True)
+
+MaxFrames = Annotated[int | None, option("--max-frames", "N", "Stop after so many.", min=1)]
+Start = Annotated[int, _rare_option("--start", "N", "Skip so many at the start.", min=0)]
+Stride = Annotated[int, _rare_option("--stride", "N", "Take every N-th only.", min=1)]
+Rate = Annotated[
+    float | None,
+    _rare_option("--rate", "HZ", "So many a second; default: as fast as they are taken.", min=1e-3),
+]
+Trajectory = Annotated[Path | None, option("--trajectory", "FILE", "Poses instead of the recording's own.")]
+Sequence = Annotated[str | None, _rare_option("--sequence", "NN", "KITTI: which sequence.")]
+Modality = Annotated[str | None, _rare_option("--modality", "KIND", "KITTI: stereo or lidar.")]
 DatasetOptions = Annotated[
     list[str] | None,
-    typer.Option(
-        "--option", metavar="KEY=VALUE", rich_help_panel="Dataset",
-        help="A setting of the dataset's class, such as depth_topic=/camera/depth; may be repeated.",
-    ),
-]  # fmt: skip
-
-
-def _dataset_option(flag: str, metavar: str | None, help_: str) -> Any:
-    return typer.Option(flag, metavar=metavar, rich_help_panel="Dataset", help=help_)
-
-
-Sequence = Annotated[str | None, _dataset_option("--sequence", "NN", "KITTI: which sequence.")]
-Modality = Annotated[str | None, _dataset_option("--modality", "KIND", "KITTI: stereo or lidar.")]
-Poses = Annotated[
-    Path | None,
-    _dataset_option("--poses", "FILE", "KITTI, TUM, Redwood: poses to use instead of the dataset's own."),
+    option("--option", "KEY=VALUE", "A setting of the layout, such as depth_topic=/depth."),
 ]
-Unpack = Annotated[bool, _dataset_option("--unpack", None, "Unpack an archive beside itself.")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON for a program to read.")]
+Unpack = Annotated[bool, _rare_option("--unpack", None, "Unpack an archive beside itself.")]
 
 
 def refuse(context: typer.Context, names: Collection[str], reason: str) -> None:
@@ -169,6 +185,20 @@ def client_settings(config: "Config", connect: str | None = None, **flags: str |
 
     client = override(config.client, **flags)
     return client if connect is not None else replace(client, key=None, server_key=None)
+
+
+def own_server(config: "Config", state: Path | None) -> "ServerConfig | None":
+    """Settings of a run's own server that keeps its journals and maps; None = they are thrown away."""
+    if state is None:
+        return None
+    from msgspec.structs import replace
+
+    from tsfusion.core.config import override
+    from tsfusion.pipelines.target_server import MAPS
+
+    server = override(config.server, listen="tcp://127.0.0.1:0", state=str(state))
+    # Only this machine reaches it; its errors are shown here.
+    return replace(server, keys=None, metrics=None, log_format="text", max_maps=max(MAPS, server.max_maps))
 
 
 def check_target_flags(

@@ -11,87 +11,64 @@ from tsfusion.cli import options
 if TYPE_CHECKING:
     from tsfusion.datasets import Dataset
 
-_DATASET = "Dataset"
 _STREET = {"sensor": "stereo", "voxel_size": 0.1}  # a Kinect does not work in daylight
-Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
-Rate = Annotated[
-    float | None,
-    typer.Option(
-        "--rate", metavar="HZ", min=1e-3, help="Keyframes per second; default: as fast as they are fused."
-    ),
-]
-Limit = Annotated[
-    int | None,
-    typer.Option("--max-keyframes", metavar="N", min=1, rich_help_panel=_DATASET, help="Stop after so many."),
-]
 
 
 @options.takes_map_settings
 def replay(
     context: typer.Context,
     path: Annotated[
-        Path, typer.Argument(metavar="PATH", help="A dataset; `tsfusion datasets` names the layouts.")
+        Path, typer.Argument(metavar="PATH", help="A recording; `tsfusion datasets` names the layouts.")
     ],
     *,
-    out: Out = Path("out"),
+    out: options.Out = None,
+    overwrite: options.Overwrite = False,
+    state: options.State = None,
     connect: options.Connect = None,
-    control: options.Control = None,
     map_: options.Map = None,
+    control: options.Control = None,
     key: options.Key = None,
     server_key: options.ServerKey = None,
-    rate: Rate = None,
-    max_keyframes: Limit = None,
-    start: Annotated[
-        int, typer.Option(metavar="N", min=0, rich_help_panel=_DATASET, help="Skip so many at the start.")
-    ] = 0,
-    stride: Annotated[
-        int, typer.Option(metavar="N", min=1, rich_help_panel=_DATASET, help="Take every N-th keyframe only.")
-    ] = 1,
+    trajectory: options.Trajectory = None,
+    rate: options.Rate = None,
+    max_frames: options.MaxFrames = None,
+    start: options.Start = 0,
+    stride: options.Stride = 1,
     sequence: options.Sequence = None,
     modality: options.Modality = None,
-    poses: options.Poses = None,
-    unpack: options.Unpack = False,
     option: options.DatasetOptions = None,
-    state: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Keep journal and map of the run's server here.")
-    ] = None,
+    unpack: options.Unpack = False,
     check_: Annotated[
-        bool, typer.Option("--check/--no-check", help="Warn when the dataset's poses and depth disagree.")
+        bool, options.option("--check/--no-check", None, "Warn when poses and depth disagree.", rare=True)
     ] = True,
     config: options.ConfigFile = None,
     json: options.Json = False,
     **settings: Any,
 ) -> None:
-    """Send a recorded dataset or a journal to a server, and write mesh, picture and figures."""
-    from msgspec.structs import replace
-
-    from tsfusion.core.config import override
+    """Fuse a recording that has poses, or a journal: mesh, picture and figures."""
     from tsfusion.datasets import select
 
     # Any server makes a mesh with another `min_weight`.
     own = {*options.MAP_OPTIONS, "state"} - {"min_weight"}
     options.check_target_flags(context, connect, own=own, remote=())
     dataset = open_recording(
-        path, unpack=unpack, sequence=sequence, modality=modality, poses=poses,
+        path, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
         **options.dataset_options(option),
     )  # fmt: skip
     chosen = options.configuration(config, preset={"sensor": dataset.sensor}, **settings)
-    if start or stride > 1 or max_keyframes is not None:
-        dataset = select(dataset, start=start, stride=stride, limit=max_keyframes)
+    if start or stride > 1 or max_frames is not None:
+        dataset = select(dataset, start=start, stride=stride, limit=max_frames)
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count} frames {reason}", err=True)
     if check_ and not _is_synthetic(path):
         _warn_of_disagreement(dataset)
-    server = None
-    if state is not None:  # only this machine reaches the run's own server; its errors are shown here
-        server = override(chosen.server, listen="tcp://127.0.0.1:0", state=str(state))
-        server = replace(server, keys=None, metrics=None, log_format="text")
     client = options.client_settings(
         chosen, connect, control=control, map=map_, key=key, server_key=server_key
     )
     _run(
-        dataset, out, json=json, volume=chosen.volume, server=server, client=client, connect=connect,
-        rate=rate, min_weight=settings["min_weight"],
+        dataset, out, overwrite=overwrite, json=json, volume=chosen.volume,
+        server=options.own_server(chosen, state), client=client, connect=connect, rate=rate,
+        min_weight=settings["min_weight"],
     )  # fmt: skip
 
 
@@ -137,7 +114,8 @@ def _warn_of_disagreement(dataset: "Dataset") -> None:
 @options.takes_map_settings
 def demo(
     *,
-    out: Out = Path("out"),
+    out: options.Out = None,
+    overwrite: options.Overwrite = False,
     world: Annotated[str, typer.Option(metavar="NAME", help="room, or street (stereo, 0.1 m).")] = "room",
     count: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="Keyframes; default 90, in the street 40.")
@@ -153,19 +131,19 @@ def demo(
     json: options.Json = False,
     **settings: Any,
 ) -> None:
-    """Scan a synthetic world whose surface is known, and measure how far the mesh is from it."""
+    """Scan a synthetic world, and measure how far the mesh is from its true surface."""
     chosen = options.configuration(config, preset=_STREET if world == "street" else None, **settings)
     from tsfusion.datasets import Synthetic
 
     path, usual_count, usual_rate = ("tour", 90, 6.0) if world == "room" else (None, 40, 4.0)
     dataset = Synthetic(world, sensor=chosen.volume.sensor, count=count or usual_count, seed=seed, path=path)
     _run(
-        dataset, out, json=json, volume=chosen.volume, client=options.client_settings(chosen),
-        rate=rate or usual_rate, min_weight=settings["min_weight"],
+        dataset, out, overwrite=overwrite, json=json, volume=chosen.volume,
+        client=options.client_settings(chosen), rate=rate or usual_rate, min_weight=settings["min_weight"],
     )  # fmt: skip
 
 
-def _run(dataset: "Dataset", out: Path, *, json: bool, **settings: Any) -> None:
+def _run(dataset: "Dataset", out: Path | None, *, json: bool, **settings: Any) -> None:
     from tsfusion.cli import output, progress, run_summary
     from tsfusion.pipelines.replay import replay as run
 
@@ -174,4 +152,4 @@ def _run(dataset: "Dataset", out: Path, *, json: bool, **settings: Any) -> None:
     if json:
         output.as_json(result)
     else:
-        run_summary.print_replay(result, out)
+        run_summary.print_replay(result)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tsfusion.pipelines.scan_results import MapResult, ScanSummary
 
 
-def print_replay(run: "ReplaySummary", out: Path) -> None:
+def print_replay(run: "ReplaySummary") -> None:
     """Print a replay in a few lines."""
     delay = run.delay_ms
     lines = [
@@ -33,11 +33,11 @@ def print_replay(run: "ReplaySummary", out: Path) -> None:
             f"accuracy   mean {error.mean_mm:.2f} mm, p50 {error.p50_mm:.2f}, p95 {error.p95_mm:.2f} mm "
             "from the known surface"
         )
-    lines.append(f"results    {out}/: mesh.ply mesh.glb preview.png delay.csv delay.png run.json")
+    lines.append(f"results    {run.folder}/: mesh.ply mesh.glb preview.png delay.csv delay.png run.json")
     typer.echo("\n".join(lines))
 
 
-def print_scan(result: "ScanSummary", out: Path, spool: Path, connect: str | None) -> None:
+def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
     """Print a scan in a few lines.
 
     Args:
@@ -66,7 +66,7 @@ def print_scan(result: "ScanSummary", out: Path, spool: Path, connect: str | Non
             f"spool      {result.left} keyframes are not acknowledged{why}: the next scan with "
             f"--spool {spool} sends them"
         )
-    lines.append(f"results    {out}/")
+    lines.append(f"results    {result.folder}/")
     if connect is not None and result.keyframes_durable:
         lines.append(
             f"mesh       tsfusion mesh {connect} {result.maps[0].name}.glb --map {result.maps[0].name}"

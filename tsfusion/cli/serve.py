@@ -47,7 +47,7 @@ def serve(
     until_eof: Annotated[bool, typer.Option("--until-eof", hidden=True)] = False,
     **settings: Any,
 ) -> int:
-    """Fuse keyframes that scanners send; SIGTERM or Ctrl-C saves the map and ends the server.
+    """Fuse keyframes that scanners send; Ctrl-C or SIGTERM saves the maps and ends.
 
     A line with `ready` is printed once keyframes may come: every kernel is compiled by then.
     """

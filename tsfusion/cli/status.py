@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from tsfusion.cli import options
+from tsfusion.cli import options, verbs
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -37,6 +37,7 @@ def status(
         float, typer.Option(metavar="SECONDS", min=0.1, help="How long to wait for an answer.")
     ] = 5.0,
     json: options.Json = False,
+    help_all: verbs.HelpAll = None,
 ) -> int:
     """Ask a running server how it is: its maps, its clients, and what is wrong.
 

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: MIT
 """The output folder of a run: complete, or not there."""
 
+import itertools
 import os
 import secrets
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,6 +15,11 @@ from tsfusion.core import folder_lock
 from tsfusion.core.errors import OutputError
 
 RECORD = "run.json"
+DEFAULT = "out"
+LATEST = "latest"  # link to the newest folder in `DEFAULT`
+
+_PARTIAL = ".partial-"
+_IDLE_S = 60.0  # a work folder may be younger than its lock
 
 
 @contextmanager
@@ -29,9 +36,51 @@ def building(out: str | os.PathLike[str]) -> Iterator[Path]:
     out = Path(out).expanduser().absolute()
     if os.path.exists(out) and not out.is_dir():
         raise OutputError(f"cannot write to {out}: it is not a folder")
-    with _parents(out), _workplace(out) as work:
-        yield work
-        _move(work, out)
+    prefix = f".{out.name}.partial-"
+    with _parents(out):
+        for place in (out, out.parent):
+            _sweep(place, prefix)
+        work = (out if out.is_dir() else out.parent) / (prefix + secrets.token_hex(4))
+        with _workplace(work, out):
+            yield work
+            _move(work, out)
+
+
+@contextmanager
+def results(out: str | os.PathLike[str] | None, *, overwrite: bool = False) -> Iterator[tuple[Path, Path]]:
+    """The folder of a run: its temporary one, as `building` has it, and the one that this becomes.
+
+    Args:
+        out: None = a new folder `out/DATE_TIME`; the link `out/latest` names it afterwards.
+        overwrite: whether `out` may hold files, of which those of the same name are replaced.
+
+    Raises:
+        OutputError: at once, when `out` cannot be written, or holds files that may not be replaced.
+    """
+    if out is None:
+        root = Path(DEFAULT)
+        with _parents(root.absolute() / LATEST):
+            _sweep(root, _PARTIAL, idle_s=_IDLE_S)
+            work, folder = _claim(root, time.strftime("%Y-%m-%d_%H-%M-%S"))
+            with _workplace(work, folder):
+                yield work, folder
+                _move(work, folder)
+        _point(root / LATEST, folder.name)
+        return
+    if not overwrite and _holds_files(Path(out).expanduser()):
+        raise OutputError(
+            f"{out} holds files already: name a new folder, or add --overwrite to replace those of "
+            "the same name"
+        )
+    with building(out) as work:
+        yield work, Path(out)
+
+
+def _holds_files(folder: Path) -> bool:
+    """Whether there is more in a folder than what a killed run left."""
+    with suppress(OSError):
+        return any(not path.name.startswith(".") for path in folder.iterdir())
+    return False
 
 
 @contextmanager
@@ -52,14 +101,10 @@ def _parents(out: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _workplace(out: Path) -> Iterator[Path]:
-    """A folder on the file system of `out`, locked while the block runs: inside `out` if that exists."""
-    prefix = f".{out.name}.partial-"
-    for place in (out, out.parent):
-        _sweep(place, prefix)
-    work = (out if out.is_dir() else out.parent) / (prefix + secrets.token_hex(4))
+def _workplace(work: Path, out: Path) -> Iterator[Path]:
+    """The folder `work`, locked while the block runs and removed afterwards."""
     try:
-        work.mkdir()
+        work.mkdir(exist_ok=True)
         lock = folder_lock.hold(work)
     except OSError as error:
         raise OutputError(f"cannot write to {out}: {error.strerror}") from error
@@ -70,13 +115,41 @@ def _workplace(out: Path) -> Iterator[Path]:
         lock.close()
 
 
-def _sweep(place: Path, prefix: str) -> None:
-    """Remove the work folders whose owner is dead."""
+def _sweep(place: Path, prefix: str, *, idle_s: float = 0.0) -> None:
+    """Remove the work folders whose owner is dead, and that nobody changed for so long."""
     with suppress(OSError):
         for path in [path for path in place.iterdir() if path.name.startswith(prefix)]:
             # another run is at work there, or the folder is not ours to remove
             with suppress(OSError), folder_lock.hold(path):
-                shutil.rmtree(path, ignore_errors=True)
+                if time.time() - path.stat().st_mtime >= idle_s:
+                    shutil.rmtree(path, ignore_errors=True)
+
+
+def _claim(root: Path, stamp: str) -> tuple[Path, Path]:
+    """Make the work folder of the first free name: it, and the folder that it becomes."""
+    for count in itertools.count(1):
+        out = root / (stamp if count == 1 else f"{stamp}-{count}")
+        work = root / f"{_PARTIAL}{out.name}"
+        try:
+            if not out.exists():
+                work.mkdir()
+                return work, out
+        except FileExistsError:  # of a run that started in the same second
+            continue
+        except OSError as error:
+            raise OutputError(f"cannot write to {out}: {error.strerror}") from error
+    raise AssertionError("the count has no end")
+
+
+def _point(link: Path, name: str) -> None:
+    """Let a link name the newest folder; where links are not possible, there is none."""
+    new = link.with_name(f"{_PARTIAL}{secrets.token_hex(4)}")
+    try:
+        new.symlink_to(name)
+        new.replace(link)
+    except OSError:
+        with suppress(OSError):
+            new.unlink(missing_ok=True)
 
 
 def _move(work: Path, out: Path) -> None:

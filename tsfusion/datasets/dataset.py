@@ -14,7 +14,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Keyframe
 
 NOMINAL_NS = 33_333_333  # between frames of a recording without times: thirty a second
-SCAN = "`tsfusion scan --source PATH` finds poses by itself"
+SCAN = "`tsfusion scan PATH` finds poses by itself"
 _T = TypeVar("_T")
 
 

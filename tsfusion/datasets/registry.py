@@ -137,7 +137,7 @@ def find(path: str | Path, *, unpack: bool = False) -> Found:
 
 
 def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) -> Dataset:
-    """Call a layout's opener; it may lack the option `posed`, and call the option `poses` `trajectory`.
+    """Call a layout's opener; it may lack the option `posed`; `poses` and `trajectory` are one.
 
     Raises:
         DatasetError: an option that it does not take, or of the wrong type.
@@ -145,8 +145,9 @@ def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) 
     options = dict(options)
     if not plugins.takes(opener, "posed"):
         options.pop("posed", None)
-    if not plugins.takes(opener, "poses") and plugins.takes(opener, "trajectory") and "poses" in options:
-        options["trajectory"] = options.pop("poses")
+    for given, known in (("poses", "trajectory"), ("trajectory", "poses")):
+        if given in options and not plugins.takes(opener, given) and plugins.takes(opener, known):
+            options[known] = options.pop(given)
     return plugins.call(opener, options, name=f"a {name} dataset", error=DatasetError)
 
 

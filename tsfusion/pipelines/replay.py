@@ -10,7 +10,7 @@ from tsfusion.client import ClientStats
 from tsfusion.core import process
 from tsfusion.core.config import ClientConfig, ServerConfig, VolumeConfig
 from tsfusion.core.errors import OutputError
-from tsfusion.core.output_folder import building
+from tsfusion.core.output_folder import results
 from tsfusion.datasets import Dataset
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.pipelines import engine, mesh_preview, replay_results, run_files, target_server
@@ -20,8 +20,9 @@ from tsfusion.pipelines.replay_results import ReplaySummary
 
 def replay(
     dataset: Dataset,
-    out: str | os.PathLike[str],
+    out: str | os.PathLike[str] | None,
     *,
+    overwrite: bool = False,
     volume: VolumeConfig,
     progress: Progress,
     server: ServerConfig | None = None,
@@ -32,10 +33,12 @@ def replay(
 ) -> ReplaySummary:
     """Send every keyframe of `dataset` to a server and leave the results in the folder `out`.
 
-    `mesh.ply`, `mesh.glb`, `preview.png`, `delay.csv`, `delay.png` and `run.json` appear together when all of
-    it went well, and not at all otherwise.
+    `mesh.ply`, `mesh.glb`, `preview.png`, `delay.csv`, `delay.png` and `run.json`, with a server of its own
+    also `map.tsf`, appear together when all of it went well, and not at all otherwise.
 
     Args:
+        out: None = a new folder `out/DATE_TIME`; see `output_folder.results`.
+        overwrite: whether `out` may hold files, of which those of the same name are replaced.
         volume: the map of the own server; a server at `connect` has its own.
         server: settings of the own server; None = a free port, and a state folder that is thrown away.
         connect: data address of a running server; None starts one for this run.
@@ -47,7 +50,7 @@ def replay(
         TransportError: the server cannot be reached, ended, or stopped fusing.
         DatasetError: a keyframe cannot be read.
     """
-    with building(out) as work:
+    with results(out, overwrite=overwrite) as (work, folder):
         first = dataset[0]  # a dataset that cannot be read is an error before a server starts
         progress.stage(engine.STARTING if connect is None else f"connecting to {connect}")
         with target_server.opened(
@@ -74,11 +77,12 @@ def replay(
             peak = process.peak_rss_bytes()  # of sending: drawing the result is not the scanner's work
             progress.stage("writing the results")
             running.wait_meshed([sender])
+            target.keep_map(target.link.map, work / run_files.MAP)
             status, mesh = run_files.write_map(work, target, target.link.map, ups, min_weight=min_weight)
         if not len(mesh.faces):
             raise OutputError(run_files.no_surface(sender.stats))
         result = replay_results.summarise(
-            dataset, sender, mesh, status,
+            dataset, sender, mesh, status, folder=folder,
             seconds=seconds, rate=rate, peak_rss_bytes=peak,
             server_start_seconds=target.child.start_seconds if target.child else None,
         )  # fmt: skip

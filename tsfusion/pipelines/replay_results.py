@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Figures of a replay, and the contents of its `run.json`."""
 
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import msgspec
@@ -38,6 +39,7 @@ class ReplaySummary(msgspec.Struct, frozen=True, kw_only=True):
     """Contents of `run.json` of a replay."""
 
     dataset: str
+    folder: str  # where this file was written
     keyframes_sent: int
     keyframes_fused: int
     keyframes_rejected: dict[str, int]
@@ -62,6 +64,7 @@ def summarise(
     mesh: Mesh,
     status: Status,
     *,
+    folder: Path,
     seconds: float,
     rate: float | None,
     peak_rss_bytes: int,
@@ -71,6 +74,7 @@ def summarise(
 
     Args:
         mesh, status: of the map that the keyframes went into.
+        folder: of the results.
         seconds: from the first keyframe handed over to the last one fused.
         rate: keyframes a second that were asked for; None = as fast as they are fused.
         peak_rss_bytes: of the sending process.
@@ -79,6 +83,7 @@ def summarise(
     stats, delays = sender.stats, latency_ledger.summarise(sender.records)
     return ReplaySummary(
         dataset=dataset.name,
+        folder=str(folder),
         keyframes_sent=stats.sent,
         keyframes_fused=stats.fused,
         keyframes_rejected={**stats.skipped, **stats.refused, **stats.rejected},

@@ -18,6 +18,8 @@ from tsfusion.pipelines.target_server import Target
 from tsfusion.wire.health import Status
 from tsfusion.wire.keyframe_times import KeyframeTimes
 
+MAP = "map.tsf"
+
 
 def write_map(
     work: Path,

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from tsfusion.client import Client, ClientStats
 from tsfusion.core import process
-from tsfusion.core.config import ClientConfig, ScanConfig, VolumeConfig
+from tsfusion.core.config import ClientConfig, ScanConfig, ServerConfig, VolumeConfig
 from tsfusion.core.errors import DatasetError, OutputError, SourceError, TransportError, TsfusionError
-from tsfusion.core.output_folder import building
+from tsfusion.core.output_folder import results
 from tsfusion.geometry.frame import Frame
 from tsfusion.pipelines import engine, mesh_preview, run_files, scan_results, target_server
 from tsfusion.pipelines.engine import Engine, Progress
@@ -31,12 +31,14 @@ log = logging.getLogger(__name__)
 
 def scan(
     source: Source,
-    out: str | os.PathLike[str],
+    out: str | os.PathLike[str] | None,
     *,
+    overwrite: bool = False,
     config: ScanConfig,
     volume: VolumeConfig,
     progress: Progress,
     client: ClientConfig | None = None,
+    server: ServerConfig | None = None,
     connect: str | None = None,
     spool: str | os.PathLike[str] = "tsfusion-spool",
     min_weight: float | None = None,
@@ -44,11 +46,14 @@ def scan(
     """Take a source's frames to its end, or until it is closed, and leave the results in the folder `out`.
 
     `trajectory.txt`, `keyframes.txt` (and `trajectory-corrected.txt` where loops were closed), `delay.csv`,
-    `delay.png` and `run.json`; with a server of its own also `mesh.ply`, `mesh.glb` and `preview.png`. A
-    second submap's have `-2` before the ending, and so on.
+    `delay.png` and `run.json`; with a server of its own also `mesh.ply`, `mesh.glb`, `preview.png` and
+    `map.tsf`. A second submap's have `-2` before the ending, and so on.
 
     Args:
+        out: None = a new folder `out/DATE_TIME`; see `output_folder.results`.
+        overwrite: whether `out` may hold files, of which those of the same name are replaced.
         volume: the map of the own server; a server at `connect` has its own.
+        server: settings of the own server; None = a free port, and a state folder that is thrown away.
         connect: data address of a running server; None starts one for this scan.
         spool: with `connect`, the folder where keyframes wait until they are acknowledged.
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
@@ -63,7 +68,7 @@ def scan(
     """
     failure: list[Exception] = []
     own = connect is None
-    with building(out) as work, ExitStack() as stack:
+    with results(out, overwrite=overwrite) as (work, folder), ExitStack() as stack:
         frames = _until_failure(iter(source), failure)
         first = next(frames, None)
         if first is None:
@@ -73,7 +78,7 @@ def scan(
         if own:
             progress.stage(engine.STARTING)
         with target_server.opened(
-            connect, work / ".scratch", volume=volume, client=client, spools=Path(spool)
+            connect, work / ".scratch", volume=volume, client=client, server=server, spools=Path(spool)
         ) as target:
             if not own and not localizer.absolute:
                 _warn_if_map_is_in_use(target)
@@ -119,7 +124,7 @@ def scan(
             records = scan_results.records(scanner.submaps)
             run_files.write_ledger(work, records)
             result = scan_results.summarise(
-                source, scanner, maps, records,
+                source, scanner, maps, records, folder=folder,
                 localizer=registry.localizer_name(config, first), complete=complete, seconds=seconds,
                 peak_rss_bytes=peak, config=config, volume=volume if own else None,
             )  # fmt: skip
@@ -210,6 +215,7 @@ def _write(
     scan_results.write_trajectory(work, submap, suffix)
     if target.child is None:
         return scan_results.describe(submap, None)
+    target.keep_map(submap.name, work / f"map{suffix}.tsf")
     ups = [mesh_preview.sensor_up(T, sensor) for T in submap.located.poses()]
     in_map = run_files.write_map(work, target, submap.name, ups, suffix=suffix, min_weight=min_weight)
     return scan_results.describe(submap, in_map)

@@ -37,6 +37,7 @@ class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
     """Contents of `run.json` of a scan."""
 
     source: str
+    folder: str  # where this file was written
     localizer: str
     # Whether the source was read to its end: false after a failure, and for a recording after Ctrl-C
     complete: bool
@@ -103,6 +104,7 @@ def summarise(
     maps: list[MapResult],
     times: list[KeyframeTimes],
     *,
+    folder: Path,
     localizer: str,
     complete: bool,
     seconds: float,
@@ -116,6 +118,7 @@ def summarise(
     settings = {"scan": config} if volume is None else {"scan": config, "volume": volume}
     return ScanSummary(
         source=source.name,
+        folder=str(folder),
         localizer=localizer,
         complete=complete and state.frames >= (source.length or 0),
         frames=state.frames,

@@ -2,6 +2,7 @@
 """The server that a run sends its keyframes to: one started for this run, or one that runs elsewhere."""
 
 import json
+import logging
 import os
 import re
 import select
@@ -21,6 +22,7 @@ from tsfusion.core import config
 from tsfusion.core.config import ClientConfig, Config, Policy, ServerConfig, VolumeConfig, override
 from tsfusion.core.errors import TransportError
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.journal import state_folder
 from tsfusion.wire.curve import ClientKeys, client_keys
 from tsfusion.wire.health import Status
 from tsfusion.wire.queries import fetch_mesh, fetch_status
@@ -28,6 +30,7 @@ from tsfusion.wire.queries import fetch_mesh, fetch_status
 START_DEADLINE = 180.0  # seconds; a cold kernel compilation on a slow machine
 STOP_DEADLINE = 60.0  # seconds; draining and the checkpoint
 _ROUTINE = re.compile("tsfusion: (DEBUG|INFO|WARNING): ")  # lines of a server's log that are no error
+log = logging.getLogger(__name__)
 MAPS = 16  # that a run's own server may have open: its default one, and one for each submap
 
 
@@ -130,6 +133,7 @@ class Target:
     spools: Path  # folder that holds one spool a map
     child: ServerChild | None  # the server started for this run; None = the server runs elsewhere
     _clients: ExitStack
+    _kept: dict[str, Path]  # maps of the server started for this run, and the files that they become
 
     def client(self, map_name: str, *, policy: Policy | None = None) -> Client:
         """A client that sends to a map; closed with the target.
@@ -141,6 +145,11 @@ class Target:
         client = Client(link.address, spool=self.spools / map_name, control=link.control, config=link)
         self._clients.callback(client.close)
         return client
+
+    def keep_map(self, map_name: str, path: Path) -> None:
+        """Write a map to a file when the server started for this run has stopped."""
+        if self.child is not None:
+            self._kept[map_name] = path
 
     def check(self) -> None:
         """Raise TransportError when the server started for this run has ended."""
@@ -183,15 +192,28 @@ def opened(
     """
     scratch.mkdir()
     link, child = client or ClientConfig(), None
+    kept: dict[str, Path] = {}
+    state = Path(server.state) if server else scratch / "state"
     with ExitStack() as stack:
         if connect is None:
-            server = server or ServerConfig(
-                listen="tcp://127.0.0.1:0", state=str(scratch / "state"), max_maps=MAPS
-            )
+            server = server or ServerConfig(listen="tcp://127.0.0.1:0", state=str(state), max_maps=MAPS)
             child = stack.enter_context(serving(server, volume, scratch))
             link, spools = override(link, address=child.listen, control=child.control), None
         else:
             link = override(link, address=connect)
         keys = client_keys(link.key, link.server_key)
-        yield Target(link, keys, spools or scratch / "spool", child, stack)
+        yield Target(link, keys, spools or scratch / "spool", child, stack, kept)
+    for name, path in kept.items():
+        _copy_map(state_folder.map_folder(state, name) / state_folder.MAP_FILE, path)
     shutil.rmtree(scratch)
+
+
+def _copy_map(saved: Path, path: Path) -> None:
+    """Put a stopped server's map under another name too: the file is replaced, never changed."""
+    try:
+        os.link(saved, path)
+    except OSError:  # another file system, or one without links
+        try:
+            shutil.copyfile(saved, path)
+        except OSError as error:
+            log.warning("the map could not be kept in %s: %s", path.name, error.strerror)

@@ -142,7 +142,7 @@ def _trajectory(root: Path, given: str | Path | None, *, posed: bool) -> Path | 
     if not found and posed:
         raise DatasetError(
             f"{root / 'groundtruth.txt'} is missing; expected `timestamp tx ty tz qx qy qz qw` a line "
-            f"(one elsewhere: --poses FILE, in Python trajectory=FILE); {SCAN}"
+            f"(one elsewhere: --trajectory FILE, in Python trajectory=FILE); {SCAN}"
         )
     return found[0] if found else None
 

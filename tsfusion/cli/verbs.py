@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: MIT
+"""What every verb has in common: short help, examples, environment variables, renamed flags."""
+
+from collections.abc import Callable
+from typing import Annotated, Any, TypeVar
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+PREFIX = "TSFUSION_"
+RENAMED = {"--max-keyframes": "--max-frames", "--poses": "--trajectory"}  # understood until version 0.3
+
+_Verb = TypeVar("_Verb", bound=Callable[..., Any])
+
+
+class _ShortHelp:
+    """Help without the type of switches, and with the names of environment variables left out."""
+
+    def get_params(self, ctx: Any) -> Any:
+        params = super().get_params(ctx)  # type: ignore[misc]
+        for param in params:
+            if param.param_type_name == "option":
+                param.show_envvar = False
+                param.metavar = "" if param.is_flag else param.metavar
+        return params
+
+
+class Group(_ShortHelp, TyperGroup):
+    """A command that has verbs."""
+
+
+class Verb(_ShortHelp, TyperCommand):
+    """A verb; each of its flags `--some-flag` can be set by the variable `TSFUSION_SOME_FLAG` too."""
+
+    def get_params(self, ctx: Any) -> Any:
+        params = super().get_params(ctx)
+        for param in params:
+            if param.param_type_name == "option" and not param.is_eager and param.help and not param.envvar:
+                param.envvar = variable(param.opts[0])
+        return params
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        return super().parse_args(ctx, [new for old in args for new in _renamed(old)])
+
+
+def variable(flag: str) -> str:
+    """The environment variable of a flag."""
+    return PREFIX + flag.strip("-").replace("-", "_").upper()
+
+
+def examples(*lines: str) -> str:
+    """The end of a verb's help."""
+    return "\n".join(["Examples:", *(f"$ {line}" for line in lines)])
+
+
+def verb(
+    app: typer.Typer, *lines: str, panel: str | None = None, name: str | None = None
+) -> Callable[[_Verb], _Verb]:
+    """Decorate a function that becomes a verb of `app`.
+
+    Args:
+        lines: two examples.
+        panel: title under which the verb is listed.
+    """
+    return app.command(name, cls=Verb, rich_help_panel=panel, epilog=examples(*lines))
+
+
+def _show_all(context: typer.Context, wanted: bool) -> None:
+    if not wanted:
+        return
+    for param in context.command.params:
+        if getattr(param, "help", None):
+            param.hidden = False  # type: ignore[attr-defined]
+    typer.echo(context.get_help())
+    raise typer.Exit
+
+
+# Flag of the verbs with rare flags: those that are hidden and have a help text.
+HelpAll = Annotated[
+    bool | None,
+    typer.Option("--help-all", is_eager=True, callback=_show_all, help="Show the rare flags, too, and exit."),
+]
+
+
+def _renamed(word: str) -> list[str]:
+    """A word of the command line, with the flag's name of today; `scan --source X` is `scan X`."""
+    flag, equals, value = word.partition("=")
+    if flag == "--source":
+        return [value] if equals else []
+    return [RENAMED.get(flag, flag) + equals + value]
