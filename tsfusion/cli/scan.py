@@ -75,7 +75,7 @@ def scan(
         options.option(
             "--spool",
             "DIR",
-            "With --connect: where keyframes wait until the server has them; the next scan sends what is left.",
+            "With --connect: where keyframes wait until the server has them; the next scan sends the rest.",
             rare=True,
         ),
     ] = Path("tsfusion-spool"),
@@ -95,7 +95,7 @@ def scan(
     json: options.Json = False,
     **settings: Any,
 ) -> None:
-    """Localise a sensor, choose keyframes and fuse them; Ctrl-C ends the scan and keeps its results."""
+    """Localise a sensor and fuse its keyframes; Ctrl-C ends the scan and keeps its results."""
     options.check_target_flags(context, connect, own={*options.MAP_OPTIONS, "state"}, remote={"spool"})
     from tsfusion.cli import output, progress, run_summary
     from tsfusion.pipelines.scan import scan as run
