@@ -224,7 +224,7 @@ def _meshes() -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="tsfusion-localization-") as folder:
         for name in ("rgbd", "given"):
             command = [
-                sys.executable, "-m", "tsfusion", "scan", "--source", str(DATA / KITCHEN),
+                sys.executable, "-m", "tsfusion", "scan", str(DATA / KITCHEN),
                 "--localizer", name, "--voxel-size", "0.02", "--out", str(Path(folder) / name), "--json",
             ]  # fmt: skip
             subprocess.run(command, check=True, capture_output=True, timeout=600)

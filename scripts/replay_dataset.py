@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """Replay a recorded dataset through the whole path: the same as `tsfusion replay`.
 
-python scripts/replay_dataset.py PATH --voxel-size 0.02 --out out
+python scripts/replay_dataset.py PATH --voxel-size 0.02
 """
 
 import sys

@@ -346,7 +346,7 @@ def test_a_bad_band_is_explained(flags: dict[str, object], message: str) -> None
 
 @pytest.mark.parametrize("verb", ["serve", "replay", "demo", "mesh"])
 def test_every_verb_that_fuses_takes_the_map_flags(verb: str) -> None:
-    shown = tsfusion(verb, "--help").stdout
+    shown = tsfusion(verb, "--help-all").stdout
     for option in options.MAP_OPTIONS.values():
         assert option.__metadata__[0].default.partition("/")[0] in shown
 
@@ -362,7 +362,7 @@ def test_every_verb_that_fuses_takes_the_map_flags(verb: str) -> None:
     ],
 )
 def test_a_wrong_option_of_a_dataset(here: Here, given: str, words: str) -> None:
-    for verb in (["replay", "synthetic:room"], ["scan", "--source", "synthetic:room"]):
+    for verb in (["replay", "synthetic:room"], ["scan", "synthetic:room"]):
         assert words in one_line(here(*verb, "--option", given))
 
 

@@ -30,7 +30,7 @@ def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
         done = tsfusion("mesh", address, tmp_path / "live.obj", "--min-weight", 0.5)
         assert done.returncode == 0, done.stderr
         done = tsfusion(
-            "replay", "synthetic:room", "--start", 2, "--max-keyframes", 1, "--connect", address,
+            "replay", "synthetic:room", "--start", 2, "--max-frames", 1, "--connect", address,
             "--out", tmp_path / "more", "--json",
         )  # fmt: skip
         assert json.loads(done.stdout)["keyframes_fused"] == 1, done.stderr

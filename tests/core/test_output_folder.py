@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: MIT
 """The folder of a run: whole or not there, and no litter beside it."""
 
+import errno
+import os
+import time
 from pathlib import Path
 
 import pytest
 from command_processes import python
 
 from tsfusion.core.errors import OutputError
-from tsfusion.core.output_folder import building
+from tsfusion.core.output_folder import building, results
 
 _KILLED = """
 import os, signal, sys
-from tsfusion.core.output_folder import building
+from tsfusion.core.output_folder import building, results
 with building(sys.argv[1]) as work:
     (work / "mesh.ply").write_text("half")
     os.kill(os.getpid(), signal.SIGKILL)
@@ -74,3 +77,82 @@ def test_a_run_that_is_at_work_is_left_alone(tmp_path: Path) -> None:
             (second / "b.txt").write_text("second")
         assert (first / "a.txt").exists()
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"a.txt", "b.txt"}
+
+
+@pytest.fixture
+def at_noon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty working folder; every run starts in the same second."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tsfusion.core.output_folder.time.strftime", lambda _: "2026-11-22_12-00-00")
+    return tmp_path / "out"
+
+
+def run(text: str, out: str | None = None, *, overwrite: bool = False) -> Path:
+    """A run that leaves one file."""
+    with results(out, overwrite=overwrite) as (work, folder):
+        (work / "run.json").write_text(text)
+    return folder
+
+
+def test_every_run_has_a_folder_of_its_own(at_noon: Path) -> None:
+    assert [str(run(text)) for text in "ab"] == ["out/2026-11-22_12-00-00", "out/2026-11-22_12-00-00-2"]
+    assert (at_noon / "2026-11-22_12-00-00" / "run.json").read_text() == "a"
+    assert (at_noon / "latest" / "run.json").read_text() == "b"
+    assert os.readlink(at_noon / "latest") == "2026-11-22_12-00-00-2"
+    assert len(list(at_noon.iterdir())) == 3
+
+
+def test_runs_of_one_second_do_not_meet(at_noon: Path) -> None:
+    with results(None) as (first, one):
+        (first / "run.json").write_text("a")
+        with results(None) as (second, two):
+            (second / "run.json").write_text("b")
+    assert [(folder / "run.json").read_text() for folder in (one, two)] == ["a", "b"]
+    assert len(list(at_noon.iterdir())) == 3
+
+
+def test_a_run_that_fails_leaves_no_dated_folder(at_noon: Path) -> None:
+    with pytest.raises(IsADirectoryError), results(None) as (work, _):
+        work.write_text("")
+    assert not at_noon.exists()
+    run("a")
+    with pytest.raises(IsADirectoryError), results(None) as (work, _):
+        work.write_text("")
+    assert (at_noon / "latest" / "run.json").read_text() == "a"
+    assert len(list(at_noon.iterdir())) == 2
+
+
+def test_an_old_half_of_a_run_is_cleared_up(at_noon: Path) -> None:
+    for name, age in (("old", 3600), ("new", 0)):
+        (at_noon / f".partial-{name}").mkdir(parents=True)
+        os.utime(at_noon / f".partial-{name}", (time.time() - age,) * 2)
+    run("a")
+    assert {path.name for path in at_noon.iterdir()} == {".partial-new", "2026-11-22_12-00-00", "latest"}
+
+
+def test_without_links_there_is_the_folder_alone(at_noon: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(Path, "symlink_to", refuse)
+    assert (run("a") / "run.json").read_text() == "a"
+    assert len(list(at_noon.iterdir())) == 1
+
+
+def test_a_folder_called_latest_is_left_alone(at_noon: Path) -> None:
+    (at_noon / "latest").mkdir(parents=True)
+    (at_noon / "latest" / "mine").touch()
+    run("a")
+    assert {path.name for path in at_noon.iterdir()} == {"2026-11-22_12-00-00", "latest"}
+    assert (at_noon / "latest" / "mine").exists()
+
+
+def test_a_named_folder_is_not_overwritten_silently(at_noon: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    assert run("a", "empty") == Path("empty")
+    with pytest.raises(OutputError, match=r"empty holds files already \(run.json\): .* --overwrite"):
+        run("b", "empty")
+    assert (tmp_path / "empty" / "run.json").read_text() == "a"
+    run("b", "empty", overwrite=True)
+    assert (tmp_path / "empty" / "run.json").read_text() == "b"
+    assert not at_noon.exists()

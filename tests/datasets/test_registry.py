@@ -62,7 +62,7 @@ def test_a_recording_without_poses_is_there_for_a_scan(tmp_path, layout):
     assert (len(dataset), dataset.skipped) == (3, {})
     assert all(dataset.frame(index).T_world_camera is None for index in range(3))
     assert describe(dataset).endswith(", no poses")
-    with pytest.raises(DatasetError, match=r"frame 2 of .* has no pose; `tsfusion scan --source PATH` finds"):
+    with pytest.raises(DatasetError, match=r"frame 2 of .* has no pose; `tsfusion scan PATH` finds"):
         dataset[2]
     one_line(lambda: open_dataset(root), "pose|trajectory|groundtruth")
 

@@ -17,10 +17,10 @@ from command_processes import alive, descendants, end, eventually, read_until, s
 from keyframes_and_servers import map_hash
 from small_recordings import first_views
 
-from tsfusion import VolumeConfig
+from tsfusion import Volume, VolumeConfig
 from tsfusion.core.output_folder import building
 
-RESULTS = {"mesh.ply", "mesh.glb", "preview.png", "delay.csv", "delay.png", "run.json"}
+RESULTS = {"mesh.ply", "mesh.glb", "preview.png", "delay.csv", "delay.png", "run.json", "map.tsf"}
 VOXEL = 0.08
 
 
@@ -31,8 +31,8 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "out").mkdir()
     (folder / "out" / "notes.txt").write_text("mine")
     done = tsfusion(
-        "replay", "synthetic:room", "--max-keyframes", 6, "--voxel-size", VOXEL, "--state", folder / "state",
-        "--rate", 10, "--out", folder / "out", "--json",
+        "replay", "synthetic:room", "--max-frames", 6, "--voxel-size", VOXEL, "--state", folder / "state",
+        "--rate", 10, "--out", folder / "out", "--overwrite", "--json",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     (folder / "stdout.json").write_text(done.stdout)
@@ -54,6 +54,7 @@ def test_replay_leaves_everything(run_folder: Path) -> None:
     assert {"tsfusion", "python", "taichi"} <= set(run["versions"])
     mesh = trimesh.load(out / "mesh.ply", process=False)
     assert (len(mesh.vertices), len(mesh.faces)) == (run["mesh"]["vertices"], run["mesh"]["triangles"])
+    assert Volume.load(out / "map.tsf").map_hash() == run["map_hash"]
     assert cv2.imread(str(out / "preview.png")).std() > 5
     with (out / "delay.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -139,7 +140,7 @@ def test_a_replay_whose_server_dies_says_so(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_replay_without_a_surface_says_so(tmp_path: Path) -> None:
     done = tsfusion(
-        "replay", "synthetic:room", "--max-keyframes", 1, "--min-weight", 1000, "--out", tmp_path / "out"
+        "replay", "synthetic:room", "--max-frames", 1, "--min-weight", 1000, "--out", tmp_path / "out"
     )
     assert done.returncode == 1
     assert "tsfusion: the map has no surface to write: 1 of 1 keyframes fused" in done.stderr
@@ -161,7 +162,7 @@ def test_demo(tmp_path: Path) -> None:
 @pytest.mark.parametrize("count", [40, pytest.param(125, marks=pytest.mark.nightly)])
 def test_red_kitchen(data, tmp_path: Path, count: int) -> None:
     done = tsfusion(
-        "replay", data("7scenes/redkitchen"), "--max-keyframes", count, "--voxel-size", 0.02, "--rate", 4,
+        "replay", data("7scenes/redkitchen"), "--max-frames", count, "--voxel-size", 0.02, "--rate", 4,
         "--out", tmp_path, "--json", timeout=300,
     )  # fmt: skip
     run = json.loads(done.stdout)

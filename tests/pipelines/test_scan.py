@@ -18,7 +18,7 @@ from clients_and_spools import NOBODY
 from command_processes import end, environment, eventually, python, read_until, server, started, tsfusion
 from small_recordings import seven_scenes
 
-from tsfusion import open_dataset
+from tsfusion import Volume, open_dataset
 from tsfusion.cli.progress import Quiet
 from tsfusion.core.config import ClientConfig, ScanConfig, VolumeConfig
 from tsfusion.core.errors import InvalidConfig, InvalidKeyframe
@@ -82,10 +82,11 @@ def scan(*arguments: object) -> "subprocess.CompletedProcess[str]":
 
 def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    run = figures(scan("--source", walk, "--localizer", "rgbd", "--out", out, "--json"))
+    state = tmp_path / "state"
+    run = figures(scan(walk, "--localizer", "rgbd", "--out", out, "--state", state, "--json"))
     assert {path.name for path in out.iterdir()} == {
         "mesh.ply", "mesh.glb", "preview.png", "delay.csv", "delay.png", "run.json", "trajectory.txt",
-        "keyframes.txt",
+        "keyframes.txt", "map.tsf",
     }  # fmt: skip
     assert run == json.loads((out / "run.json").read_text())
     assert (run["frames"], run["frames_tracked"], run["complete"], run["left"]) == (12, 12, True, 0)
@@ -93,18 +94,20 @@ def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, tmp_path: Path) -
     assert run["keyframes_sent"] == run["keyframes_fused"] == sum(run["keyframes_by_rule"].values()) >= 3
     (found,) = run["maps"]
     assert found["mesh"]["triangles"] > 1000
+    assert Volume.load(out / "map.tsf").map_hash() == found["map_hash"]
+    assert len(JournalRecording(state)) == run["keyframes_sent"]
     assert found["trajectory_error"]["rmse"] < 0.005
     assert len(read_tum(out / "trajectory.txt").timestamps_ns) == 12
     assert len(read_tum(out / "keyframes.txt").timestamps_ns) == run["keyframes_sent"]
     assert cv2.imread(str(out / "preview.png")).std() > 5
-    shown = scan("--source", walk, "--localizer", "given", "--out", tmp_path / "given")
+    shown = scan(walk, "--localizer", "given", "--out", tmp_path / "given")
     assert "12/12 localised by given" in shown.stdout
     assert "rmse" in shown.stdout
 
 
 def test_without_taichi_to_a_server_elsewhere(walk: Path, tmp_path: Path) -> None:
     with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, process):
-        command = ["scan", "--source", walk, "--connect", address, "--map", "hall",
+        command = ["scan", walk, "--connect", address, "--map", "hall",
                    "--spool", tmp_path / "spool", "--out", tmp_path / "out", "--json"]  # fmt: skip
         done = python(BARE, *command, env=environment())
         run = figures(done)
@@ -116,8 +119,8 @@ def test_without_taichi_to_a_server_elsewhere(walk: Path, tmp_path: Path) -> Non
         assert eventually(lambda: fetch_status(address, map_name="hall").keyframes_fused == sent)
         kept = read_tum(tmp_path / "out" / "keyframes.txt")
         again = tsfusion(
-            "scan", "--source", walk, "--connect", address, "--map", "hall", "--max-frames", 1,
-            "--spool", tmp_path / "spool", "--out", tmp_path / "out",
+            "scan", walk, "--connect", address, "--map", "hall", "--max-frames", 1,
+            "--spool", tmp_path / "spool", "--out", tmp_path / "out", "--overwrite",
         )  # fmt: skip
         assert "give it a map of its own (--map NAME)" in again.stderr
         assert end(process) == 0
@@ -127,7 +130,7 @@ def test_without_taichi_to_a_server_elsewhere(walk: Path, tmp_path: Path) -> Non
 
 def test_ctrl_c_without_a_server_keeps_all_for_the_next_scan(walk: Path, tmp_path: Path) -> None:
     spool = tmp_path / "spool"
-    command = ["scan", "--source", SOURCE, "--rate", "3", "--connect", NOBODY, "--spool", spool]
+    command = ["scan", SOURCE, "--rate", "3", "--connect", NOBODY, "--spool", spool]
     process = subprocess.Popen(
         [sys.executable, "-c", IMPATIENT, *command, "--out", tmp_path / "out"],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment(),
@@ -143,7 +146,7 @@ def test_ctrl_c_without_a_server_keeps_all_for_the_next_scan(walk: Path, tmp_pat
     with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, _):
         more = figures(
             tsfusion(
-                "scan", "--source", walk, "--max-frames", 3, "--connect", address, "--map", "walk",
+                "scan", walk, "--max-frames", 3, "--connect", address, "--map", "walk",
                 "--spool", spool, "--out", tmp_path / "more", "--json",
             )
         )  # fmt: skip
@@ -152,7 +155,7 @@ def test_ctrl_c_without_a_server_keeps_all_for_the_next_scan(walk: Path, tmp_pat
 
 
 def test_ctrl_c_ends_a_scan_with_its_results(tmp_path: Path) -> None:
-    process = started("scan", "--source", SOURCE, "--rate", 4, "--voxel-size", 0.1, "--out", tmp_path / "out")
+    process = started("scan", SOURCE, "--rate", 4, "--voxel-size", 0.1, "--out", tmp_path / "out")
     read_until(process, "frames ")
     read_until(process, "frames ")
     process.send_signal(signal.SIGINT)
@@ -168,7 +171,7 @@ def test_ctrl_c_ends_a_scan_with_its_results(tmp_path: Path) -> None:
 
 def test_a_recording_that_breaks_off_keeps_what_came_before(tmp_path: Path) -> None:
     folder = recording(tmp_path / "broken", broken=7)
-    done = scan("--source", folder, "--out", tmp_path / "out")
+    done = scan(folder, "--out", tmp_path / "out")
     assert done.returncode == 1
     assert "cannot be decoded" in done.stderr.splitlines()[-1]
     run = json.loads((tmp_path / "out" / "run.json").read_text())
@@ -179,16 +182,16 @@ def test_a_recording_that_breaks_off_keeps_what_came_before(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("arguments", "status", "words"),
     [
-        (["--source", "nowhere"], 1, "nowhere does not exist"),
-        (["--source", SOURCE, "--localizer", "trajectory"], 1, "needs --trajectory FILE"),
-        (["--source", SOURCE, "--localizer", "gps"], 1, "localizer must be one of auto, rgbd"),
-        (["--source", SOURCE, "--localizer", "lidar"], 1, "points"),
-        (["--source", SOURCE, "--spool", "spool"], 1, "--spool has no effect without --connect"),
-        (["--source", SOURCE, "--connect", NOBODY, "--voxel-size", "1"], 1, "tsfusion serve"),
-        (["--source", "realsense", "--rate", "2"], 1, "--rate is for recordings"),
-        (["--source", SOURCE, "--calibration", "a.yaml"], 1, "--calibration is for a live camera"),
-        (["--source", "folder:nowhere"], 1, "nowhere"),
-        ([], 2, "--source"),
+        (["nowhere"], 1, "nowhere does not exist"),
+        ([SOURCE, "--localizer", "trajectory"], 1, "needs --trajectory FILE"),
+        ([SOURCE, "--localizer", "gps"], 1, "localizer must be one of auto, rgbd"),
+        ([SOURCE, "--localizer", "lidar"], 1, "points"),
+        ([SOURCE, "--spool", "spool"], 1, "--spool has no effect without --connect"),
+        ([SOURCE, "--connect", NOBODY, "--voxel-size", "1"], 1, "tsfusion serve"),
+        (["realsense", "--rate", "2"], 1, "--rate is for recordings"),
+        ([SOURCE, "--calibration", "a.yaml"], 1, "--calibration is for a live camera"),
+        (["folder:nowhere"], 1, "nowhere"),
+        ([], 2, "Missing argument 'PATH|SOURCE'"),
     ],
 )
 def test_what_cannot_be_scanned_is_one_clear_line(
@@ -203,14 +206,10 @@ def test_what_cannot_be_scanned_is_one_clear_line(
 
 def test_a_sensor_that_is_never_localised(tmp_path: Path) -> None:
     seven_scenes(tmp_path / "flat", 4, (48, 64))  # no texture, nothing near enough to be seen
-    done = scan(
-        "--source", tmp_path / "flat", "--trajectory", tmp_path / "none.txt", "--out", tmp_path / "out"
-    )
+    done = scan(tmp_path / "flat", "--trajectory", tmp_path / "none.txt", "--out", tmp_path / "out")
     assert done.returncode == 1
     (tmp_path / "late.txt").write_text("5000 0 0 0 0 0 0 1\n5001 0 0 0 0 0 0 1\n")
-    done = scan(
-        "--source", tmp_path / "flat", "--trajectory", tmp_path / "late.txt", "--out", tmp_path / "out"
-    )
+    done = scan(tmp_path / "flat", "--trajectory", tmp_path / "late.txt", "--out", tmp_path / "out")
     assert done.returncode == 1
     assert "was not localised in any of 4 frames" in done.stderr
     assert not (tmp_path / "out").exists()
@@ -236,7 +235,7 @@ def test_a_mesh_with_poses_of_its_own_is_as_good_as_with_the_true_ones(
     for name in ("rgbd", "given"):
         run = figures(
             tsfusion(
-                "scan", "--source", kitchen, "--localizer", name, "--voxel-size", 0.02,
+                "scan", kitchen, "--localizer", name, "--voxel-size", 0.02,
                 "--max-frames", count, "--out", tmp_path / name, "--json", timeout=400,
             )
         )  # fmt: skip
@@ -265,7 +264,7 @@ class Frames(LiveSource):
 def scanned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., ScanSummary]:
     """Scan in this process for a server that does not answer, and do not wait for it."""
     monkeypatch.setattr(engine, "LINGER", 0.2)
-    usual = {"config": ScanConfig(), "volume": VolumeConfig(), "progress": Quiet()}
+    usual = {"config": ScanConfig(), "volume": VolumeConfig(), "progress": Quiet(), "overwrite": True}
 
     def scan(source: Frames, out: str = "out", **settings: Any) -> ScanSummary:
         spool = tmp_path / "spool"
@@ -323,7 +322,7 @@ def test_keyframes_that_are_refused_do_not_cost_the_results(walk: Path, tmp_path
     with server(tmp_path / "state", "--config", settings) as (address, _):
         run = figures(
             tsfusion(
-                "scan", "--source", walk, "--localizer", "given", "--connect", address,
+                "scan", walk, "--localizer", "given", "--connect", address,
                 "--spool", tmp_path / "spool", "--out", tmp_path / "out", "--json",
             )
         )  # fmt: skip
@@ -333,7 +332,7 @@ def test_keyframes_that_are_refused_do_not_cost_the_results(walk: Path, tmp_path
 
 
 def test_a_map_without_a_surface_keeps_the_trajectory(walk: Path, tmp_path: Path) -> None:
-    done = scan("--source", walk, "--max-frames", 2, "--min-weight", 1000, "--out", tmp_path / "out")
+    done = scan(walk, "--max-frames", 2, "--min-weight", 1000, "--out", tmp_path / "out")
     assert done.returncode == 1
     assert "the map has no surface to write: 1 of 1 keyframes fused" in done.stderr.splitlines()[-1]
     assert len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) == 2

@@ -107,7 +107,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, _terminated)
     try:
-        code = app(arguments, standalone_mode=False)
+        code = app(arguments, prog_name="tsfusion", standalone_mode=False)
     except TsfusionError as error:
         _fail(str(error), 1)
     except _UsageError as error:

@@ -33,7 +33,7 @@ def print_replay(run: "ReplaySummary") -> None:
             f"accuracy   mean {error.mean_mm:.2f} mm, p50 {error.p50_mm:.2f}, p95 {error.p95_mm:.2f} mm "
             "from the known surface"
         )
-    lines.append(f"results    {run.folder}/: mesh.ply mesh.glb preview.png delay.csv delay.png run.json")
+    lines.append(_results(run.folder))
     typer.echo("\n".join(lines))
 
 
@@ -66,12 +66,17 @@ def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
             f"spool      {result.left} keyframes are not acknowledged{why}: the next scan with "
             f"--spool {spool} sends them"
         )
-    lines.append(f"results    {result.folder}/")
+    lines.append(_results(result.folder))
     if connect is not None and result.keyframes_durable:
         lines.append(
             f"mesh       tsfusion mesh {connect} {result.maps[0].name}.glb --map {result.maps[0].name}"
         )
     typer.echo("\n".join(lines))
+
+
+def _results(folder: str) -> str:
+    files = sorted(path.name for path in Path(folder).iterdir() if path.is_file())
+    return f"results    {folder}/: {' '.join(files)}"
 
 
 def _map_lines(found: "MapResult") -> list[str]:

@@ -34,8 +34,7 @@ def building(out: str | os.PathLike[str]) -> Iterator[Path]:
         OutputError: at once, when `out` cannot be written.
     """
     out = Path(out).expanduser().absolute()
-    if os.path.exists(out) and not out.is_dir():
-        raise OutputError(f"cannot write to {out}: it is not a folder")
+    _check_folder(out)
     prefix = f".{out.name}.partial-"
     with _parents(out):
         for place in (out, out.parent):
@@ -58,29 +57,35 @@ def results(out: str | os.PathLike[str] | None, *, overwrite: bool = False) -> I
         OutputError: at once, when `out` cannot be written, or holds files that may not be replaced.
     """
     if out is None:
-        root = Path(DEFAULT)
-        with _parents(root.absolute() / LATEST):
+        root = Path(DEFAULT).absolute()
+        _check_folder(root)
+        with _parents(root / LATEST):
             _sweep(root, _PARTIAL, idle_s=_IDLE_S)
             work, folder = _claim(root, time.strftime("%Y-%m-%d_%H-%M-%S"))
             with _workplace(work, folder):
-                yield work, folder
+                yield work, Path(DEFAULT, folder.name)
                 _move(work, folder)
         _point(root / LATEST, folder.name)
         return
-    if not overwrite and _holds_files(Path(out).expanduser()):
+    if not overwrite and (held := _visible(Path(out).expanduser())):
         raise OutputError(
-            f"{out} holds files already: name a new folder, or add --overwrite to replace those of "
-            "the same name"
+            f"{out} holds files already ({', '.join(held[:3])}): name a new folder, or add --overwrite to "
+            "replace those of the same name"
         )
     with building(out) as work:
         yield work, Path(out)
 
 
-def _holds_files(folder: Path) -> bool:
-    """Whether there is more in a folder than what a killed run left."""
+def _check_folder(out: Path) -> None:
+    if os.path.exists(out) and not out.is_dir():
+        raise OutputError(f"cannot write to {out}: it is not a folder")
+
+
+def _visible(folder: Path) -> list[str]:
+    """Names in a folder, without what a killed run left."""
     with suppress(OSError):
-        return any(not path.name.startswith(".") for path in folder.iterdir())
-    return False
+        return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    return []
 
 
 @contextmanager
@@ -143,7 +148,7 @@ def _claim(root: Path, stamp: str) -> tuple[Path, Path]:
 
 def _point(link: Path, name: str) -> None:
     """Let a link name the newest folder; where links are not possible, there is none."""
-    new = link.with_name(f"{_PARTIAL}{secrets.token_hex(4)}")
+    new = link.with_name(f".{link.name}-{secrets.token_hex(4)}")
     try:
         new.symlink_to(name)
         new.replace(link)

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: MIT
+"""What the verbs have in common: help on one screen, examples that run, variables, completion."""
+
+import shlex
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from command_processes import Here, environment
+
+from tsfusion import cli
+from tsfusion.cli import verbs
+from tsfusion.core.errors import OutputError
+from tsfusion.datasets import Dataset
+
+WIDTH, MOST_LINES = 100, 40
+
+
+def commands(command: Any, *names: str) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Every command with its words: () is `tsfusion` itself."""
+    yield names, command
+    for name, below in getattr(command, "commands", {}).items():
+        yield from commands(below, *names, name)
+
+
+COMMANDS = dict(commands(typer.main.get_command(cli.app)))
+VERBS = [words for words, command in COMMANDS.items() if not hasattr(command, "commands")]
+
+
+@pytest.fixture
+def wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", str(WIDTH))
+
+
+@pytest.mark.usefixtures("wide")
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_help_fits_a_screen(here: Here, words: tuple[str, ...]) -> None:
+    done = here(*words, "--help")
+    lines = done.stdout.rstrip().splitlines()
+    assert (done.returncode, done.stderr) == (0, "")
+    assert len(lines) <= MOST_LINES
+    assert all(len(line) <= WIDTH for line in lines)
+    assert f"Usage: {' '.join(('tsfusion', *words))}" in done.stdout
+    assert "<bool>" not in done.stdout
+    assert "env var" not in done.stdout
+    assert "TSFUSION_" not in done.stdout or not words
+    if words in VERBS:
+        assert [line.split()[:2] for line in lines[-3:]] == [["Examples:"], *[["$", "tsfusion"]] * 2]
+
+
+@pytest.mark.parametrize("words", VERBS, ids=" ".join)
+def test_examples_are_commands(words: tuple[str, ...]) -> None:
+    command = COMMANDS[words]
+    for line in command.epilog.splitlines()[1:]:
+        typed = shlex.split(line.partition(" > ")[0].removeprefix("$ tsfusion "))
+        given = typed[len(words) :] if typed[: len(words)] == list(words) else typed[len(words) - 1 :]
+        command.make_context(words[-1], given)
+
+
+@pytest.mark.usefixtures("wide")
+@pytest.mark.parametrize("verb", ["demo", "scan", "replay", "check", "mesh", "serve"])
+def test_rare_flags_are_shown_on_request(here: Here, verb: str) -> None:
+    few, all_ = here(verb, "--help").stdout, here(verb, "--help-all").stdout
+    rare = {param.opts[0] for param in COMMANDS[verb,].params if param.hidden and param.help}
+    assert rare
+    assert not [flag for flag in rare if f"{flag} " in few]
+    assert not [flag for flag in rare if f"{flag} " not in all_]
+    assert "--until-eof" not in all_
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What `replay` asks of the pipeline, which is not run."""
+    found: dict[str, Any] = {}
+
+    def record(dataset: Dataset, out: Path | None, **settings: Any) -> None:
+        found.update(settings, dataset=dataset, out=out)
+        raise OutputError("recorded")
+
+    monkeypatch.setattr("tsfusion.pipelines.replay.replay", record)
+    return found
+
+
+def test_every_flag_has_a_variable(
+    here: Here, asked: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"MAX_FRAMES": "3", "VOXEL_SIZE": "0.5", "OUT": "there", "NO_SUCH_FLAG": "1"}.items():
+        monkeypatch.setenv(f"{verbs.PREFIX}{name}", value)
+    here("replay", "synthetic:room")
+    assert (len(asked["dataset"]), asked["volume"].voxel_size, asked["out"]) == (3, 0.5, Path("there"))
+    here("replay", "synthetic:room", "--max-frames", 2)
+    assert len(asked["dataset"]) == 2
+
+
+def test_earlier_names_are_understood(here: Here, asked: dict[str, Any]) -> None:
+    here("replay", "synthetic:room", "--max-keyframes", 3)
+    assert len(asked["dataset"]) == 3
+    here("replay", "synthetic:room", "--max-keyframes=2")
+    assert len(asked["dataset"]) == 2
+    done = here("replay", "synthetic:room", "--poses", "a.txt")
+    assert "a synthetic dataset takes no `trajectory`" in done.stderr
+    for words in (["--source", "nowhere"], ["--source=nowhere"]):
+        assert "nowhere does not exist" in here("scan", *words).stderr
+
+
+def test_a_missing_source_is_named(here: Here) -> None:
+    assert "Missing argument 'PATH|SOURCE'" in here("scan").stderr
+
+
+SHELL = """
+tsfusion --install-completion >&2
+. "$HOME/.bashrc"
+complete_words() {
+    COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMPREPLY=()
+    _tsfusion_completion tsfusion; echo "${COMPREPLY[*]}"
+}
+complete_words tsfusion re
+complete_words tsfusion replay --voxel
+complete_words tsfusion scan --sensor re
+complete_words tsfusion journal ver
+"""
+
+
+def test_bash_completes_verbs_flags_and_values(tmp_path: Path) -> None:
+    program = tmp_path / "tsfusion"
+    program.write_text(f"#!{sys.executable}\nfrom tsfusion.__main__ import main\nmain()\n")
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    (tmp_path / "script.sh").write_text(SHELL)
+    env = environment()
+    done = subprocess.run(
+        ["bash", tmp_path / "script.sh"], capture_output=True, text=True, timeout=60, check=False,
+        env={**env, "HOME": str(tmp_path), "PATH": f"{tmp_path}:{env['PATH']}"}, stdin=subprocess.DEVNULL,
+    )  # fmt: skip
+    assert done.stdout.splitlines() == ["replay", "--voxel-size", "realsense", "verify"], done.stderr
