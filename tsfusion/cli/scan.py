@@ -100,13 +100,14 @@ def scan(
     from tsfusion.cli import output, progress, run_summary
     from tsfusion.pipelines.scan import scan as run
 
-    recording = {
-        "unpack": unpack, "sequence": sequence, "modality": modality, **options.dataset_options(option),
-    }  # fmt: skip
     opened = _open(
-        context, source, recording, calibration=calibration, rate=rate,
+        context, source, options.dataset_options(option), calibration=calibration, rate=rate,
+        recording={"unpack": unpack, "sequence": sequence, "modality": modality},
         part={"start": start, "stride": stride, "limit": max_frames},
     )  # fmt: skip
+    if waits_for := getattr(opened, "waits_for", str)():
+        poses = settings["trajectory"] or settings["feed"] or "found from the frames"
+        typer.echo(f"{waits_for}; poses: {poses}", err=True)
     with opened, _ended_by_signals(opened), progress.shown(quiet=json) as display:
         chosen = options.configuration(config, preset={"sensor": opened.sensor}, **settings)
         client = options.client_settings(
@@ -126,23 +127,24 @@ def scan(
 def _open(
     context: typer.Context,
     spec: str,
-    recording: dict[str, Any],
+    given: dict[str, Any],
     *,
     calibration: Path | None,
     rate: float | None,
+    recording: dict[str, Any],
     part: dict[str, Any],
 ) -> "Source":
-    """The source of that name; of a recording, the part that is asked for."""
+    """The source of that name with the options `given`; of a recording, the part that is asked for."""
     from tsfusion.scanner.sources.recorded import LimitedSource
     from tsfusion.scanner.sources.registry import is_live, open_source
 
     if is_live(spec):
         options.refuse(
             context,
-            ("sequence", "modality", "option", "unpack", "rate", "start", "stride"),
+            ("sequence", "modality", "unpack", "rate", "start", "stride"),
             "is for recordings, and this source is live: leave it out",
         )
-        live = open_source(spec, calibration=calibration)
+        live = open_source(spec, calibration=calibration, **given)
         return live if part["limit"] is None else LimitedSource(live, part["limit"])
     options.refuse(context, ("calibration",), "is for a live camera, and this is a recording: leave it out")
     from tsfusion.cli.replay import open_recording
@@ -156,7 +158,7 @@ def _open(
             f"{spec} does not exist; expected a dataset, synthetic:room, synthetic:street, or live: "
             "realsense, camera:0, folder:PATH (docs/sources.md)"
         )
-    dataset = open_recording(path, **recording, posed=False)
+    dataset = open_recording(path, **{**recording, **given}, posed=False)
     return RecordedSource(select(dataset, **part), rate=rate)
 
 

@@ -80,7 +80,7 @@ def scan(
         with target_server.opened(
             connect, work / ".scratch", volume=volume, client=client, server=server, spools=Path(spool)
         ) as target:
-            if not own and not localizer.absolute:
+            if not localizer.absolute and (server is not None or not own):
                 _warn_if_map_is_in_use(target)
             # A recording waits, so nothing of it is left out; what a live source gives is thinned out.
             open_client = partial(target.client, policy=None if source.live else "spool_all")

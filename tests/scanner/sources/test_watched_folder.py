@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from command_processes import python
+from command_processes import Here, python
 from numpy.typing import NDArray
 from repository import ROOT
 from small_recordings import claim_size
@@ -427,3 +427,29 @@ def test_a_source_of_another_package(tmp_path: Path, monkeypatch: pytest.MonkeyP
         open_source("broken")
     with pytest.raises(InvalidConfig, match=r"folder:PATH, broken, oak, got 'kinect'"):
         open_source("kinect")
+
+
+def test_it_says_what_it_waits_for(tmp_path: Path) -> None:
+    root = tmp_path / "in"
+    root.mkdir()
+    said = WatchedFolder(root, idle=10).waits_for()
+    assert "no frames yet; waits for depth/NAME.png with color/, rgb/" in said
+    assert "and for a camera: camera-intrinsics.txt, K.txt" in said
+    assert said.endswith(
+        "after 10 s without a new frame, when a file DONE or .end appears there, or with Ctrl-C"
+    )
+    for number in range(3):
+        rgbd(root, number)
+    camera(root)
+    said = WatchedFolder(root).waits_for()
+    assert "in: 3 frames are there; waits for more: depth/NAME.png with color/NAME.png|jpg; ends when" in said
+
+
+def test_the_command_says_what_it_waits_for(here: Here, tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    done = here("scan", "folder:in", "--option", "idle=0.1", "--max-frames", 3)
+    assert done.returncode == 1
+    first, last = done.stderr.splitlines()
+    assert first.startswith("in: no frames yet; waits for depth/NAME.png")
+    assert first.endswith("poses: found from the frames")
+    assert "gave no frames" in last

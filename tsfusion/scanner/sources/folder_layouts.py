@@ -36,9 +36,13 @@ _NANOSECONDS = 19  # digits of a time of this century
 
 @dataclass(frozen=True)
 class FolderLayout:
-    """Folder and pattern of a frame's first and second file; the pattern's group is the frame's name."""
+    """Folder and pattern of a frame's first and second file; the pattern's group is the frame's name.
+
+    `files` are those of a frame in words.
+    """
 
     kind: LayoutKind
+    files: str
     first: tuple[Path, re.Pattern[str]]
     second: tuple[Path, re.Pattern[str]] | None = None
 
@@ -56,16 +60,23 @@ def layout_of(root: Path) -> FolderLayout | None:
     """Recognise the layout of the files so far; None = unknown."""
     if (root / "depth").is_dir():
         color = next((root / name for name in COLOR if (root / name).is_dir()), root / COLOR[0])
-        return FolderLayout("depth", (root / "depth", _PNG), (color, _ANY_IMAGE))
+        return FolderLayout(
+            "depth", f"depth/NAME.png with {color.name}/NAME.png|jpg", (root / "depth", _PNG),
+            (color, _ANY_IMAGE),
+        )  # fmt: skip
     if (root / "left").is_dir() and (root / "right").is_dir():
-        return FolderLayout("pair", (root / "left", _ANY_IMAGE), (root / "right", _ANY_IMAGE))
+        return FolderLayout(
+            "pair", "left/ and right/NAME.png|jpg", (root / "left", _ANY_IMAGE), (root / "right", _ANY_IMAGE)
+        )
     if (root / "velodyne").is_dir():
-        return FolderLayout("points", (root / "velodyne", _SCAN))
+        return FolderLayout("points", "velodyne/NAME.bin", (root / "velodyne", _SCAN))
     names = [path.name for path in root.iterdir()]
     if any(_FLAT_DEPTH.fullmatch(name) for name in names):
-        return FolderLayout("depth", (root, _FLAT_DEPTH), (root, _FLAT_COLOR))
+        return FolderLayout(
+            "depth", "frame-*.depth.png with frame-*.color.png|jpg", (root, _FLAT_DEPTH), (root, _FLAT_COLOR)
+        )
     if any(_SCAN.fullmatch(name) for name in names):
-        return FolderLayout("points", (root, _SCAN))
+        return FolderLayout("points", "NAME.bin", (root, _SCAN))
     return None
 
 

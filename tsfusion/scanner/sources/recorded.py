@@ -56,6 +56,10 @@ class LimitedSource(LiveSource):
         """Yield the source's frames, up to the limit."""
         return islice(iter(self._source), self._limit)
 
+    def waits_for(self) -> str:
+        """What the source needs and what ends it."""
+        return self._source.waits_for() if isinstance(self._source, LiveSource) else ""
+
     def close(self) -> None:
         """Close the source."""
         self._source.close()

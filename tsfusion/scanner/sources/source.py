@@ -89,6 +89,10 @@ class LiveSource(ABC):
     def __iter__(self) -> Iterator[Frame]:
         """Yield each frame as soon as it arrives."""
 
+    def waits_for(self) -> str:
+        """What it needs and what ends it, for a person; empty = nothing to say."""
+        return ""
+
     def close(self) -> None:
         """End the iteration; may be called twice."""
         self._closed.set()

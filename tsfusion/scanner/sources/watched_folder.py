@@ -90,6 +90,33 @@ class WatchedFolder(LiveSource):
         self._begun: Any = None  # state of the incomplete frame's files
         self._since = time.monotonic()  # when something last changed
 
+    def waits_for(self) -> str:
+        """What is there, what the next frame needs, and what ends the source, for a person."""
+        there = len(self._list())
+        if self._layout is None:
+            wanted = f"no frames yet; waits for {folder_layouts.EXPECTED}"
+        elif there:
+            wanted = f"{there} frames are there; waits for more: {self._layout.files}"
+        else:
+            wanted = f"no frames yet; waits for {self._layout.files}"
+        if self._needs_camera():
+            wanted += f", and for a camera: {', '.join(folder_layouts.CAMERAS)} or --calibration FILE"
+        ends = f"when a file {' or '.join(END_MARKERS)} appears there, or with Ctrl-C"
+        if self._idle is not None:
+            ends = f"after {self._idle:g} s without a new frame, {ends}"
+        return f"{self._root}: {wanted}; ends {ends}"
+
+    def _needs_camera(self) -> bool:
+        """Whether the folder holds no camera yet, and none was given."""
+        if self._intrinsics is not None or self._calibration is not None:
+            return False
+        if self._layout is not None and self._layout.kind == "points":
+            return False
+        try:
+            return folder_layouts.camera_of(self._root) is None
+        except DatasetError:  # it may be half written
+            return False
+
     def __iter__(self) -> Iterator[Frame]:
         self._since = time.monotonic()
         while not self._closed.is_set():
