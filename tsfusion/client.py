@@ -28,7 +28,7 @@ from tsfusion.delivery.backpressure import Backpressure
 from tsfusion.delivery.outbox import ClientStats, Outbox
 from tsfusion.delivery.sender import Sender
 from tsfusion.delivery.spool import Spool
-from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.keyframe import Keyframe, keyframe_of
 from tsfusion.wire import corrections, sockets
 from tsfusion.wire.curve import client_keys
 from tsfusion.wire.keyframe_times import KeyframeTimes
@@ -96,6 +96,8 @@ class Client:
     def send(self, keyframe: Keyframe) -> int | None:
         """Put a keyframe into the spool; its number there, None when it is skipped (`stats.skipped`).
 
+        A dict of a keyframe's fields, or an object with such attributes, will do.
+
         Never waits for the network, unless the policy is `block`; never fails because of the disk.
 
         Raises:
@@ -107,7 +109,7 @@ class Client:
                 self._check_running()
                 if self._pressure.must_wait:  # another thread took the turn
                     continue
-                seq = self._pressure.put(keyframe)
+                seq = self._pressure.put(keyframe_of(keyframe))
             if seq is not None:
                 self._sender.wake()
             return seq

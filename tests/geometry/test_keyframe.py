@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Keyframes: what one must be, and the message when it is not."""
 
+import inspect
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 
 from tsfusion import Intrinsics, Keyframe
 from tsfusion.core.errors import InvalidKeyframe
-from tsfusion.geometry.keyframe import check_pose
+from tsfusion.geometry.keyframe import check_pose, keyframe_of
 
 CAMERA = Intrinsics(500.0, 500.0, 320.0, 240.0)
 DEPTH = np.ones((4, 5), np.uint16)
@@ -116,3 +118,51 @@ def test_scaled_intrinsics_project_to_scaled_pixels() -> None:
     u = 500.0 * 0.2 + 320.0
     assert half.fx * 0.2 + half.cx == pytest.approx((u + 0.5) * 0.5 - 0.5)
     assert CAMERA.matrix[0, 0] == 500.0
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (
+            {"T_camera_world": np.eye(4)},
+            r"no T_camera_world: write .*np.linalg.inv\(T_camera_world\)",
+        ),
+        ({"extrinsic": np.eye(4)}, r"T_world_camera=np.linalg.inv\(extrinsic\)"),
+        (
+            {"pose": np.eye(4)},
+            "no pose: write T_world_camera, which takes a point of the camera to",
+        ),
+        ({"K": CAMERA}, "no K: write intrinsics"),
+        ({"rgb": DEPTH}, "BGR"),
+        ({"deph": DEPTH}, "no deph: did you mean depth"),
+        ({"flavour": 1}, "a keyframe has no flavour$"),
+        ({"depth": DEPTH, "depth_scale": 1000}, "metres per unit .* at most 1, got 1000; .* write 1/1000"),
+        ({"depth": DEPTH, "intrinsics": CAMERA.matrix.T}, r"as the matrix .* got array\(\[\[500"),
+    ],
+)
+def test_names_of_other_libraries_are_answered(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(InvalidKeyframe, match=message) as raised:
+        Keyframe(**{"T_world_camera": np.eye(4), "intrinsics": CAMERA, **fields})
+    assert "\n" not in str(raised.value)
+
+
+def test_fields_are_given_by_name() -> None:
+    with pytest.raises(InvalidKeyframe, match="given by name: Keyframe"):
+        Keyframe(DEPTH, CAMERA, np.eye(4))
+    assert "T_world_camera" in inspect.signature(Keyframe).parameters
+
+
+@pytest.mark.parametrize("given", [CAMERA.matrix, CAMERA.matrix.tolist(), (500, 500, 320, 240)], ids=str)
+def test_a_camera_matrix_will_do(given: Any) -> None:
+    assert Keyframe(depth=DEPTH, intrinsics=given, T_world_camera=np.eye(4)).intrinsics == CAMERA
+
+
+def test_a_keyframe_of_a_mapping_or_an_object() -> None:
+    fields = {"depth": DEPTH, "intrinsics": CAMERA, "T_world_camera": np.eye(4), "timestamp_ns": 7}
+    kept = Keyframe(**fields)
+    assert keyframe_of(kept) is kept
+    for given in (fields, SimpleNamespace(**fields, weight=3)):
+        made = keyframe_of(given)
+        assert (made.timestamp_ns, made.intrinsics) == (7, CAMERA)
+    with pytest.raises(InvalidKeyframe, match="got ndarray; by name: depth="):
+        keyframe_of(DEPTH)

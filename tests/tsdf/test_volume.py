@@ -13,7 +13,7 @@ from formula_scenes import CAMERA, SHAPE, plane_keyframe, sphere_views, volume_o
 from numpy.typing import NDArray
 
 from tsfusion import Keyframe, Volume
-from tsfusion.core.errors import InvalidConfig, MapError, MapFull, WeightOverflow
+from tsfusion.core.errors import InvalidConfig, InvalidKeyframe, MapError, MapFull, WeightOverflow
 from tsfusion.kernels.integrate import QUANTA_PER_VOXEL
 from tsfusion.tsdf.block_store import cells_of, unpack_keys
 
@@ -364,3 +364,37 @@ def test_points_in_any_order_of_keyframes_and_two_sensors() -> None:
     a = volume_of([*VIEWS[:2], *keyframes])
     b = volume_of([*keyframes[::-1], *VIEWS[1::-1]])
     assert a.map_hash() == b.map_hash()
+
+
+def test_a_number_is_the_voxel_size() -> None:
+    assert Volume(0.25).config == Volume(voxel_size=0.25).config
+    assert Volume(np.float32(0.25), color=False).config.voxel_size == 0.25
+
+
+def test_a_keyframe_may_be_given_by_its_fields() -> None:
+    keyframe = plane_keyframe()
+    fields = {name: getattr(keyframe, name) for name in ("depth", "depth_scale", "T_world_camera")}
+    fields["intrinsics"] = keyframe.intrinsics.matrix
+    volume, named = Volume(0.05), Volume(0.05)
+    volume.integrate(keyframe)
+    named.integrate(**fields)
+    assert named.map_hash() == volume.map_hash()
+    named.retract(fields)
+    assert named.map_hash() == Volume(0.05).map_hash()
+
+
+def test_habits_of_other_libraries_are_answered() -> None:
+    volume, points, T = Volume(0.05), np.ones((4, 3)), np.eye(4)
+    with pytest.raises(InvalidConfig, match="sdf_trunc: write min_support=N, max_support=N with N"):
+        Volume(0.05, sdf_trunc=0.1)
+    with pytest.raises(InvalidConfig, match="by name, such as space_carving=True; for sdf_trunc: write"):
+        Volume(0.05, 0.1, True)
+    with pytest.raises(InvalidConfig, match="unknown setting voxl_size: did you mean voxel_size"):
+        Volume(voxl_size=0.05)
+    with pytest.raises(InvalidKeyframe, match=r"got ndarray, ndarray; by name: .* in the sensor's frame"):
+        volume.integrate(points, T)
+    with pytest.raises(InvalidKeyframe, match=r"no extrinsic: write T_world_camera, its inverse"):
+        volume.integrate(points=points, extrinsic=T)
+    with pytest.raises(AttributeError, match=r"no extract_triangle_mesh: write extract_mesh\(\)"):
+        volume.extract_triangle_mesh()
+    assert volume.keyframes == 0

@@ -17,6 +17,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
+from tsfusion.core import other_names
 from tsfusion.core.errors import InvalidConfig
 
 if sys.version_info >= (3, 11):
@@ -285,7 +286,11 @@ def _message(struct: type[Struct], settings: dict[str, Any], problem: str) -> st
     problem, _, place = problem.partition(" - at `$.")
     *tables, key = place.rstrip("`").split(".")
     if unknown := re.search(r"unknown field `(.+)`", problem):
-        return f"unknown setting {'.'.join(filter(None, (place.rstrip('`'), unknown[1])))}"
+        where = place.rstrip("`")
+        for table in filter(None, where.split(".")):
+            struct = struct.__annotations__[table]
+        hint = other_names.instead(unknown[1], other_names.SETTINGS, struct.__struct_fields__)
+        return f"unknown setting {'.'.join(filter(None, (where, unknown[1])))}{hint}"
     wanted = re.match(
         r"Expected `(\w+)[^`]*`(?: ([<>]=? \S+?)(?:\.0)?)?(?:,|$)|Invalid enum|.* matching regex", problem
     )

@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Keyframes: measurements of any sensor with a pose, checked once at construction."""
 
-from dataclasses import dataclass, field
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core import other_names
 from tsfusion.core.errors import InvalidKeyframe
 
+_T = TypeVar("_T")
 Kind = Literal["depth", "disparity", "points"]
 
 MAX_IMAGE_SIDE = 8192
@@ -44,6 +48,27 @@ class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
         )
 
 
+def _explains_names(cls: type[_T]) -> type[_T]:
+    """Let the error of a wrong field say what it is called here."""
+    made = cls.__init__
+
+    @functools.wraps(made)
+    def checked(self: _T, *values: Any, **given: Any) -> None:
+        known = cls.__dataclass_fields__  # type: ignore[attr-defined]
+        for name in [name for name in given if name not in known]:
+            hint = other_names.instead(name, other_names.KEYFRAME, known)
+            raise InvalidKeyframe(f"a keyframe has no {name}{hint}")
+        if values:
+            raise InvalidKeyframe(
+                "a keyframe's fields are given by name: Keyframe(depth=…, intrinsics=…, T_world_camera=…)"
+            )
+        made(self, **given)
+
+    cls.__init__ = checked  # type: ignore[method-assign, assignment]
+    return cls
+
+
+@_explains_names
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Keyframe:
     """One measurement with a pose. Give exactly one of `depth`, `disparity` and `points`.
@@ -66,7 +91,7 @@ class Keyframe:
             frame's origin. For scanners whose rays do not meet in one point.
         color: (H, W, 3) uint8 BGR, registered to the depth image, or (N, 3) uint8 BGR for points.
         confidence: (H, W) or (N,) uint8; 255 = full weight, 0 = do not use.
-        intrinsics: pinhole camera; required for depth and disparity.
+        intrinsics: pinhole camera, or its (3, 3) matrix; required for depth and disparity.
         sensor: name of the sensor model that sets noise and support (`kinect`, `stereo`, `lidar`, …);
             None = the volume's own.
         timestamp_ns: the sensor's clock.
@@ -142,6 +167,11 @@ class Keyframe:
         depth = _array("depth", self.depth, (np.uint16, np.float32), (None, None))
         object.__setattr__(self, "depth", depth)
         object.__setattr__(self, "depth_scale", _positive("depth_scale", self.depth_scale))
+        if self.depth_scale > 1:
+            raise InvalidKeyframe(
+                f"depth_scale must be metres per unit (0.001 of millimetres), at most 1, got "
+                f"{self.depth_scale:g}; for units per metre, as in Open3D, write 1/{self.depth_scale:g}"
+            )
         self._check_camera()
 
     def _check_disparity(self) -> None:
@@ -176,12 +206,49 @@ class Keyframe:
             raise InvalidKeyframe(
                 f"{self.kind} must be at most {MAX_IMAGE_SIDE} pixels a side, got {self.shape}"
             )
-        if not isinstance(self.intrinsics, Intrinsics):
+        intrinsics = _intrinsics(self.intrinsics)
+        if intrinsics is None:
             raise InvalidKeyframe(
-                f"intrinsics must be given with {self.kind} as Intrinsics(fx, fy, cx, cy), "
-                f"got {self.intrinsics!r}"
+                f"intrinsics must be given with {self.kind} as Intrinsics(fx, fy, cx, cy), or as the matrix "
+                f"[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {' '.join(repr(self.intrinsics).split())}"
             )
-        object.__setattr__(self, "intrinsics", check_intrinsics(self.intrinsics))
+        object.__setattr__(self, "intrinsics", check_intrinsics(intrinsics))
+
+
+def keyframe_of(value: Any) -> Keyframe:
+    """A keyframe as it is, or made of a mapping of its fields or of an object with such attributes.
+
+    Raises:
+        InvalidKeyframe: when it is none of these, or a field is not what it must be.
+    """
+    if isinstance(value, Keyframe):
+        return value
+    if isinstance(value, Mapping):
+        return Keyframe(**value)
+    if not hasattr(value, "T_world_camera"):
+        raise InvalidKeyframe(
+            f"expected a Keyframe, a dict of its fields or an object with such attributes, got "
+            f"{', '.join(type(one).__name__ for one in (value if isinstance(value, tuple) else (value,)))}; "
+            "by name: depth=…, intrinsics=…, T_world_camera=… (np.linalg.inv of Open3D's extrinsic), or "
+            "points=… in the sensor's frame (VDBFusion's are in the world's), T_world_camera=…"
+        )
+    names = [each.name for each in fields(Keyframe) if each.init and hasattr(value, each.name)]
+    return Keyframe(**{name: getattr(value, name) for name in names})
+
+
+def _intrinsics(value: Any) -> Intrinsics | None:
+    """Intrinsics as they are, of a camera matrix, or of four numbers; None = neither."""
+    if isinstance(value, Intrinsics) or value is None:
+        return value
+    try:
+        numbers = np.asarray(getattr(value, "intrinsic_matrix", value), dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    if numbers.shape == (4,):
+        return Intrinsics(*numbers.tolist())
+    if numbers.shape != (3, 3) or (numbers.flat[[1, 3, 6, 7]] != 0).any() or numbers[2, 2] != 1:
+        return None
+    return Intrinsics(*numbers.flat[[0, 4, 2, 5]].tolist())
 
 
 def check_intrinsics(intrinsics: Intrinsics) -> Intrinsics:

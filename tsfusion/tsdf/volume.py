@@ -12,16 +12,16 @@ import os
 import struct
 from functools import partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core import process
+from tsfusion.core import other_names, process
 from tsfusion.core.config import VIEW_SETTINGS, Surface, VolumeConfig, make_settings, override
 from tsfusion.core.errors import InvalidConfig, MapError
-from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.keyframe import Keyframe, keyframe_of
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.kernels import integrate, runtime
 from tsfusion.kernels.integrate import CUBE
@@ -60,16 +60,23 @@ class VolumeStats(msgspec.Struct, frozen=True):
 class Volume:
     """A sparse volume that keyframes are added to, and exactly removed from.
 
-    Give a `VolumeConfig` or its fields: `Volume(voxel_size=0.02, sensor="kinect", regularizer="ray")`.
+    Give a `VolumeConfig`, or the edge of a voxel in metres and other fields by name:
+    `Volume(0.02, sensor="kinect", regularizer="ray")`.
     Use it from one thread (Taichi's). `threads` counts for the first volume of a process: Taichi starts once.
 
     Raises:
         InvalidConfig: for an unknown setting or a value out of range.
     """
 
-    def __init__(self, config: VolumeConfig | None = None, **settings: Any) -> None:
-        if config is None:
-            config = make_settings(VolumeConfig, settings)
+    def __init__(self, config: VolumeConfig | float | None = None, *others: object, **settings: Any) -> None:
+        if others:  # VDBFusion's: sdf_trunc, space_carving
+            hint = other_names.instead("sdf_trunc", other_names.SETTINGS, ())
+            raise InvalidConfig(
+                f"settings are given by name, such as space_carving=True; for sdf_trunc{hint}"
+            )
+        if not isinstance(config, VolumeConfig):
+            edge = {} if config is None else {"voxel_size": config}
+            config = make_settings(VolumeConfig, {**edge, **settings})
         elif settings:
             config = override(config, **settings)
         model = config.model()
@@ -94,17 +101,29 @@ class Volume:
         self._mesh_buffers = MeshBuffers()
         self._integrator = Integrator(self._store, self._ray_buffers, config)
 
-    def integrate(self, keyframe: Keyframe) -> IntegrateStats:
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Say what stands for a name of other libraries."""
+            hint = other_names.instead(name, other_names.VOLUME, dir(type(self)))
+            raise AttributeError(f"Volume has no {name}{hint}")
+
+    def integrate(self, keyframe: Keyframe | None = None, *others: object, **fields: Any) -> IntegrateStats:
         """Add a keyframe. On an error the map is as it was.
 
+        Args:
+            keyframe: also a dict of a keyframe's fields, or an object with such attributes.
+            fields: a keyframe's fields instead: `integrate(points=…, T_world_camera=…)`.
+
         Raises:
+            InvalidKeyframe: what is given is no keyframe.
             MapFull: the keyframe or the map would exceed its limit of blocks.
             WeightOverflow: a voxel has taken as many votes as its integers hold.
         """
-        return self._apply(keyframe, +1)
+        return self._apply(_keyframe(keyframe, others, fields), +1)
 
-    def retract(self, keyframe: Keyframe) -> IntegrateStats:
-        """Remove a keyframe that was integrated: the sums get back the bytes they had without it.
+    def retract(self, keyframe: Keyframe | None = None, *others: object, **fields: Any) -> IntegrateStats:
+        """Remove a keyframe, given as to `integrate`: the sums get back the bytes they had without it.
 
         Smoothed values cannot be un-smoothed: in the blocks it touched they fall back to the raw ones.
 
@@ -112,7 +131,7 @@ class Volume:
             MapError: the map cannot hold this keyframe: a voxel of it has fewer votes than would be taken
                 away. A keyframe never integrated goes unnoticed where others left votes enough.
         """
-        return self._apply(keyframe, -1)
+        return self._apply(_keyframe(keyframe, others, fields), -1)
 
     def take_dirty(self) -> NDArray[np.int32]:
         """Coordinates of the blocks changed since the last call: (n, 3) int32, in units of 8 voxels."""
@@ -287,3 +306,10 @@ class Volume:
         if surface == "normal":
             return partial(field_regularizer.along_normals, smoothness=self.model.smoothness)
         return values_of
+
+
+def _keyframe(keyframe: Any, others: tuple[object, ...], fields: dict[str, Any]) -> Keyframe:
+    """The keyframe of a call; other values by position are those of another library."""
+    if others:
+        return keyframe_of((keyframe, *others))
+    return keyframe_of(fields if keyframe is None and fields else keyframe)
