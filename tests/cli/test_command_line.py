@@ -69,6 +69,7 @@ def test_every_verb_has_help(here: Here, verb: str) -> None:
 def test_config_dump_is_read_back(here: Here, tmp_path: Path) -> None:
     text = here("config", "dump").stdout
     assert "voxel_size = 0.02  # > 0; metres" in text
+    assert "TSFUSION_VOXEL_SIZE is --voxel-size" in text.splitlines()[0]
     assert "of each fuser; None = three quarters" in text  # whose line the formatter has broken
     (tmp_path / "a.toml").write_text(text)
     assert config.load(tmp_path / "a.toml") == Config()

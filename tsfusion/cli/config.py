@@ -24,4 +24,6 @@ def dump(config: options.ConfigFile = None, json: options.Json = False) -> None:
 
         output.as_json(loaded)
     else:
+        variable = verbs.variable("--voxel-size")
+        typer.echo(f"# Flags beat variables ({variable} is --voxel-size), and these beat this file.")
         typer.echo(settings.to_toml(loaded), nl=False)

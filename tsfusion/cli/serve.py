@@ -21,8 +21,7 @@ log = logging.getLogger(__name__)
 
 
 def _flag(flag: str, metavar: str, help_: str) -> Any:
-    variable = "TSFUSION_" + flag.strip("-").replace("-", "_").upper()
-    return Annotated[str | None, typer.Option(flag, metavar=metavar, envvar=variable, help=help_)]
+    return Annotated[str | None, options.option(flag, metavar, help_)]
 
 
 # By name: settings of the `server` table.
