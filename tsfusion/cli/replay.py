@@ -42,7 +42,7 @@ def replay(
         bool, options.option("--check/--no-check", None, "Warn when poses and depth disagree.", rare=True)
     ] = True,
     config: options.ConfigFile = None,
-    json: options.Json = False,
+    json: options.RunJson = False,
     **settings: Any,
 ) -> None:
     """Fuse a recording that has poses, or a journal: mesh, picture and figures."""
@@ -128,7 +128,7 @@ def demo(
         ),
     ] = None,
     config: options.ConfigFile = None,
-    json: options.Json = False,
+    json: options.RunJson = False,
     **settings: Any,
 ) -> None:
     """Scan a synthetic world, and measure how far the mesh is from its true surface."""

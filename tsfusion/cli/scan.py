@@ -92,7 +92,7 @@ def scan(
     option: options.DatasetOptions = None,
     unpack: options.Unpack = False,
     config: options.ConfigFile = None,
-    json: options.Json = False,
+    json: options.RunJson = False,
     **settings: Any,
 ) -> None:
     """Localise a sensor and fuse its keyframes; Ctrl-C ends the scan and keeps its results."""
