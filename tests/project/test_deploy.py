@@ -46,10 +46,11 @@ def settings(section: str) -> dict[str, list[str]]:
 
 @cache
 def help_of(*verb: str) -> str:
-    """The help of a verb, wide enough that nothing is cut."""
+    """The whole help of a verb, wide enough that nothing is cut."""
     text, handler = io.StringIO(), signal.getsignal(signal.SIGTERM)
-    with patch.dict(os.environ, {"COLUMNS": "400"}), redirect_stdout(text), pytest.raises(SystemExit):
-        main([*verb, "--help"])
+    for flag in ("--help-all", "--help"):  # of a verb with rare flags; of any
+        with patch.dict(os.environ, {"COLUMNS": "400"}), redirect_stdout(text), pytest.raises(SystemExit):
+            main([*verb, flag])
     signal.signal(signal.SIGTERM, handler)
     return text.getvalue()
 
@@ -109,7 +110,8 @@ def test_the_container_file_names_what_there_is() -> None:
         assert all((ROOT / source).exists() for source in rest.split()[:-1]), rest
     assert [rest for step, rest in steps if step == "USER"][-1] not in ("root", "0")
     for variable in re.findall(r"\b(TSFUSION_\w+)=", CONTAINERFILE):
-        assert f"[env var: {variable}]" in help_of("serve")
+        flag = variable.removeprefix("TSFUSION_").lower().replace("_", "-")
+        assert f"--{flag} " in help_of("serve")
     (check,) = re.findall(r"CMD \[(.*\"status\".*)\]", CONTAINERFILE)
     check_command([word.strip(' "') for word in check.split(",")])
 

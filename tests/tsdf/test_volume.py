@@ -372,7 +372,7 @@ def test_a_number_is_the_voxel_size() -> None:
 
 
 def test_a_keyframe_may_be_given_by_its_fields() -> None:
-    keyframe = plane_keyframe()
+    keyframe = VIEWS[0]
     fields = {name: getattr(keyframe, name) for name in ("depth", "depth_scale", "T_world_camera")}
     fields["intrinsics"] = keyframe.intrinsics.matrix
     volume, named = Volume(0.05), Volume(0.05)
