@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Layouts of watched folders: the files of a frame, whether they are complete, and the camera."""
+"""Layouts of watched folders: the files of a frame, and whether they are complete."""
 
 import re
 from dataclasses import dataclass
@@ -11,9 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.formats.image_folders import read_open3d_camera
-from tsfusion.datasets.readers import decode_image, read_intrinsics, read_numbers
-from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.datasets.readers import decode_image, read_numbers
 
 LayoutKind = Literal["depth", "pair", "points"]
 SortKey = tuple[tuple[int, Decimal, str], ...]
@@ -22,7 +20,6 @@ EXPECTED = (
     "depth/NAME.png with color/, rgb/, image/ or images/NAME.png|jpg; frame-*.depth.png with "
     "frame-*.color.png|jpg; left/ and right/NAME.png|jpg; NAME.bin, there or in velodyne/"
 )
-CAMERAS = ("camera-intrinsics.txt", "K.txt", "camera_intrinsic.json", "camera_intrinsics.json")
 COLOR = ("color", "rgb", "image", "images")
 
 _NOT_MEASURED = 65535  # 7-Scenes' value for pixels without depth
@@ -114,20 +111,6 @@ def depth_of(image: NDArray[Any]) -> NDArray[Any]:
     if image.dtype == np.uint16:
         image[image == _NOT_MEASURED] = 0
     return image
-
-
-def camera_of(root: Path) -> Intrinsics | None:
-    """Read the intrinsics (`CAMERAS`) from the folder or its parent; None = not there (yet).
-
-    Raises:
-        DatasetError: the file is malformed or incomplete.
-    """
-    for place in (root, root.parent):
-        for name in CAMERAS:
-            path = place / name
-            if path.is_file():
-                return read_open3d_camera(path) if path.suffix == ".json" else read_intrinsics(path)
-    return None
 
 
 def baseline_of(root: Path) -> float | None:

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError
-from tsfusion.geometry.calibration import Undistorter
-from tsfusion.geometry.calibration_files import read_camera
+from tsfusion.datasets.cameras import RecordedCamera, UnknownCamera, described, find_camera
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources import folder_layouts, stereo_pairs
@@ -42,7 +42,7 @@ class WatchedFolder(LiveSource):
 
     Args:
         path: an existing folder; its layout and its camera may be written later.
-        intrinsics: default from the folder or its parent (`folder_layouts.CAMERAS`).
+        intrinsics: default from a file of the camera in the folder or its parent (`cameras.FILES`).
         calibration: a camera's file instead; for left/ and right/ a stereo camera's, as
             `stereo_pairs.read_rectifier` reads it, by default from the folder; without one the images are
             taken as rectified, with intrinsics and `baseline.txt`.
@@ -86,7 +86,7 @@ class WatchedFolder(LiveSource):
         self._handled: set[str] = set()  # names of first files
         self._last: folder_layouts.SortKey = ()
         self._colored: bool | None = None  # whether frames come with colour; None = not known yet
-        self._camera: Any = None  # Intrinsics, an Undistorter, or a PairRectifier
+        self._camera: Any = None  # a RecordedCamera or a PairRectifier
         self._begun: Any = None  # state of the incomplete frame's files
         self._since = time.monotonic()  # when something last changed
 
@@ -232,44 +232,48 @@ class WatchedFolder(LiveSource):
 
     def _undistorted(self, depth: NDArray[Any], color: Any) -> tuple[NDArray[Any], Any, Intrinsics]:
         """Undistort depth and colour by the calibration; also return the intrinsics."""
+        if depth.shape != self._camera.size:
+            raise InvalidKeyframe(f"depth has shape {depth.shape}, others {self._camera.size}")
         if color is not None and color.ndim == 2:
             color = cv2.cvtColor(color, cv2.COLOR_GRAY2BGR)
-        if not isinstance(self._camera, Undistorter):
-            return depth, color, self._camera
-        color = None if color is None else self._camera.image(color)
+        color = None if color is None else self._camera.color(color)
         return self._camera.depth(depth), color, self._camera.intrinsics
 
-    def _find_camera(self, kind: str, image: NDArray[Any], *, final: bool) -> bool:
+    def _find_camera(self, kind: str, image: NDArray[np.generic], *, final: bool) -> bool:
         """Read the camera, for which the size of an image is needed; return whether it is there."""
         try:
             self._camera = self._pairs(image) if kind == "pair" else self._one_camera(image)
+        except UnknownCamera as error:
+            if final:
+                need = " (of a stereo camera FILE, or intrinsics and baseline.txt)" if kind == "pair" else ""
+                raise SourceError(f"{error}{need}") from error
         except DatasetError as error:  # it may be half written
             if final or self._calibration is not None:
                 raise SourceError(str(error)) from error
-        if self._camera is None and final:
-            need = " and baseline.txt, or a stereo camera's calibration" if kind == "pair" else ""
-            raise SourceError(
-                f"{self._root} has no camera: expected one of {', '.join(folder_layouts.CAMERAS)} in it"
-                f"{need} (or --calibration FILE)"
-            )
         return self._camera is not None
 
-    def _one_camera(self, image: NDArray[Any]) -> Intrinsics | Undistorter | None:
-        if self._calibration is None:
-            return self._intrinsics or folder_layouts.camera_of(self._root)
-        camera = read_camera(Path(self._calibration).expanduser(), size=(image.shape[0], image.shape[1]))
-        return camera.intrinsics if camera.model == "pinhole" else Undistorter(camera)
+    def _one_camera(self, image: NDArray[np.generic]) -> RecordedCamera:
+        found = find_camera(
+            self._root, image.shape, intrinsics=self._intrinsics, calibration=self._calibration,
+            places=(self._root, self._root.absolute().parent),
+        )  # fmt: skip
+        self.camera = str(found)
+        return found
 
-    def _pairs(self, image: NDArray[Any]) -> stereo_pairs.PairRectifier | None:
+    def _pairs(self, image: NDArray[np.generic]) -> stereo_pairs.PairRectifier:
         size = image.shape[0], image.shape[1]
         there = any(all((self._root / name).is_file() for name in names) for names in stereo_pairs.FILE_PAIRS)
         if self._calibration is not None or there:
-            return stereo_pairs.read_rectifier(self._calibration or self._root, size=size)
-        intrinsics = self._intrinsics or folder_layouts.camera_of(self._root)
+            rectifier = stereo_pairs.read_rectifier(self._calibration or self._root, size=size)
+            self.camera = f"{described(rectifier.intrinsics, size)}, rectified by its calibration"
+            return rectifier
+        camera = self._one_camera(image)
         baseline = self._baseline or folder_layouts.baseline_of(self._root)
-        if intrinsics is None or baseline is None:
-            return None
-        return stereo_pairs.AlreadyRectified(intrinsics, baseline, size)
+        if baseline is None:
+            raise UnknownCamera(f"{self._root} has no baseline.txt (metres) of the rectified pairs")
+        if camera.undistorter is not None:
+            raise DatasetError(f"{self._root}: pairs need a stereo camera's --calibration, got {camera}")
+        return stereo_pairs.AlreadyRectified(camera.intrinsics, baseline, size)
 
     def _stamps(self, name: str, first: Path) -> tuple[int, int]:
         """`timestamp_ns`, which always grows, and `captured_ns`."""
