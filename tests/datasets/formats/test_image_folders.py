@@ -120,7 +120,7 @@ def test_scannet_frames_that_the_tracker_lost_have_no_pose(tmp_path):
     [
         (
             put("intrinsic/intrinsic_depth.txt", None),
-            "intrinsic_color.txt is of the colour",
+            "of these 160×120 images is not known",
         ),
         (put("intrinsic/intrinsic_depth.txt", "1 0 0\n"), r"depth\.txt: 3 numbers; expected"),
         (put("pose/7.txt", "1 0 0 0\n"), r"pose/7\.txt must hold 4 rows of 4 numbers, got 1"),

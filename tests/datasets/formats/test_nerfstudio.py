@@ -118,7 +118,7 @@ def test_distorted_captures_are_undistorted(tmp_path, lens):
          r"frame 1: transform_matrix: T_world_camera must"),
         (lambda c: c["frames"][1].update(depth_file_path="gone.png"), r"gone\.png is missing"),
         (lambda c: c["frames"][1].update(depth_file_path="gone.npy"), r"gone\.npy is missing"),
-        (lambda c: c["frames"][1].update(depth_file_path="images/00000.png"), r"must hold one 16-bit channel or floats"),
+        (lambda c: c["frames"][1].update(depth_file_path="images/00000.png"), r"must hold one 16"),
         (lambda c: c.update(frames=[]), r"has no list of frames"),
         (lambda c: c.update(w=10**400), r"frame 0: w must be a number"),
         (lambda c: [c.pop("fl_x"), c.update(camera_angle_x=0)], r"camera_angle_x must be radians"),
