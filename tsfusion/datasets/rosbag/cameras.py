@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig
 from tsfusion.datasets.cameras import given_camera
-from tsfusion.datasets.readers import intrinsics_of
+from tsfusion.datasets.readers import checked_intrinsics, intrinsics_of
 from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.messages import CAMERA, CameraInfo
 from tsfusion.datasets.rosbag.reader import BagRecording, Message, Stream, frame_id
@@ -188,9 +188,16 @@ class Cameras:
             )
         plain = all(np.abs(one.D).max(initial=0) < _UNDISTORTED and _turn(one) < _NO_TURN for one in cameras)
         if plain or (self._is_rectified(left) and self._is_rectified(right)):
-            source = self._source(left) if self._intrinsics is None else "as given"
-            intrinsics = self._intrinsics or self._pinhole(left, cameras[0].P)
-            return CameraRig(intrinsics, float(shift), None, source)
+            recorded = self._pinhole(left, cameras[0].P)
+            if self._intrinsics is None:
+                return CameraRig(recorded, float(shift), None, self._source(left))
+            given = checked_intrinsics(self._intrinsics, "intrinsics")
+            return CameraRig(given, float(shift) * given.fx / recorded.fx, None, "as given")
+        if self._intrinsics is not None:
+            raise DatasetError(
+                f"{self._recording.path}: pairs that are not rectified need the --calibration of both, not "
+                "--intrinsics (rectified=True says that these images are)"
+            )
         lenses = [self._lens(one, camera) for one, camera in zip((left, right), cameras, strict=True)]
         rectifier = Rectifier(StereoRig(lenses[0], lenses[1], _right_of(*cameras)))
         return CameraRig(rectifier.intrinsics, rectifier.baseline_fx, rectifier, self._source(left))
