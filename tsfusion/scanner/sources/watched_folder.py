@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError
-from tsfusion.datasets.cameras import RecordedCamera, UnknownCamera, described, find_camera
+from tsfusion.datasets.cameras import (
+    FILES,
+    RecordedCamera,
+    UnknownCamera,
+    camera_files,
+    described,
+    find_camera,
+)
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources import folder_layouts, stereo_pairs
@@ -77,6 +84,7 @@ class WatchedFolder(LiveSource):
         if calibration is not None and not Path(calibration).expanduser().exists():
             raise SourceError(f"calibration: {calibration} does not exist")
         self._root, self._layout = root, folder_layouts.layout_of(root)
+        self._places = (root, root.absolute().parent)  # where a file of the camera may lie
         super().__init__(f"folder {root.name}", "kinect")
         self._sensor = sensor
         self._name_sensor()
@@ -100,7 +108,7 @@ class WatchedFolder(LiveSource):
         else:
             wanted = f"no frames yet; waits for {self._layout.files}"
         if self._needs_camera():
-            wanted += f", and for a camera: {', '.join(folder_layouts.CAMERAS)} or --calibration FILE"
+            wanted += f", and for a camera: {FILES}, or --intrinsics or --calibration"
         ends = f"when a file {' or '.join(END_MARKERS)} appears there, or with Ctrl-C"
         if self._idle is not None:
             ends = f"after {self._idle:g} s without a new frame, {ends}"
@@ -113,7 +121,7 @@ class WatchedFolder(LiveSource):
         if self._layout is not None and self._layout.kind == "points":
             return False
         try:
-            return folder_layouts.camera_of(self._root) is None
+            return not any(camera_files(place) for place in self._places)
         except DatasetError:  # it may be half written
             return False
 
@@ -255,7 +263,7 @@ class WatchedFolder(LiveSource):
     def _one_camera(self, image: NDArray[np.generic]) -> RecordedCamera:
         found = find_camera(
             self._root, image.shape, intrinsics=self._intrinsics, calibration=self._calibration,
-            places=(self._root, self._root.absolute().parent),
+            places=self._places,
         )  # fmt: skip
         self.camera = str(found)
         return found
