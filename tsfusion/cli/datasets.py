@@ -46,7 +46,7 @@ def list_(
     for row in rows:
         typer.echo(_line(**row))
     if not rows:
-        typer.echo(f"no datasets in or under {path}", err=True)
+        typer.echo(f"no datasets that can be opened in or under {path}", err=True)
 
 
 def _line(

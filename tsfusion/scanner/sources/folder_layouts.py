@@ -17,14 +17,15 @@ LayoutKind = Literal["depth", "pair", "points"]
 SortKey = tuple[tuple[int, Decimal, str], ...]
 
 EXPECTED = (
-    "depth/NAME.png with color/, rgb/, image/ or images/NAME.png|jpg; frame-*.depth.png with "
+    "depth/NAME.png|tiff|exr|npy with color/, rgb/, image/ or images/NAME.png|jpg; frame-*.depth.png with "
     "frame-*.color.png|jpg; left/ and right/NAME.png|jpg; NAME.bin, there or in velodyne/"
 )
 COLOR = ("color", "rgb", "image", "images")
 
 _NOT_MEASURED = 65535  # 7-Scenes' value for pixels without depth
 _IMAGES = r"\.(?:png|jpe?g)"
-_ANY_IMAGE, _PNG, _SCAN = (re.compile(rf"([^.].*){ending}") for ending in (_IMAGES, r"\.png", r"\.bin"))
+_ENDINGS = (_IMAGES, r"\.(?:png|tiff?|exr|npy)", r"\.bin")
+_ANY_IMAGE, _DEPTH, _SCAN = (re.compile(rf"([^.].*){ending}") for ending in _ENDINGS)
 _FLAT_DEPTH, _FLAT_COLOR = re.compile(r"(frame-.+)\.depth\.png"), re.compile(rf"(frame-.+)\.color{_IMAGES}")
 _PNG_END, _JPEG_END = b"\0\0\0\0IEND\xaeB`\x82", b"\xff\xd9"
 _POINT = 16  # bytes: x, y, z and intensity in float32
@@ -58,7 +59,7 @@ def layout_of(root: Path) -> FolderLayout | None:
     if (root / "depth").is_dir():
         color = next((root / name for name in COLOR if (root / name).is_dir()), root / COLOR[0])
         return FolderLayout(
-            "depth", f"depth/NAME.png with {color.name}/NAME.png|jpg", (root / "depth", _PNG),
+            "depth", f"depth/NAME.png|tiff|exr|npy with {color.name}/NAME.png|jpg", (root / "depth", _DEPTH),
             (color, _ANY_IMAGE),
         )  # fmt: skip
     if (root / "left").is_dir() and (root / "right").is_dir():

@@ -21,6 +21,7 @@ from tsfusion.datasets.cameras import (
     described,
     find_camera,
 )
+from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources import folder_layouts, stereo_pairs
@@ -54,7 +55,7 @@ class WatchedFolder(LiveSource):
             `stereo_pairs.read_rectifier` reads it, by default from the folder; without one the images are
             taken as rectified, with intrinsics and `baseline.txt`.
         baseline: metres, of rectified images in left/ and right/.
-        depth_scale: metres per unit.
+        depth_scale: metres per unit; default 0.001, and 1 for floats.
         idle: seconds; None = wait for ever.
         deadline: seconds to wait for an incomplete frame or a missing camera.
         poll: seconds between two listings of the folder, at least.
@@ -72,7 +73,7 @@ class WatchedFolder(LiveSource):
         intrinsics: Intrinsics | None = None,
         calibration: str | Path | None = None,
         baseline: float | None = None,
-        depth_scale: float = 0.001,
+        depth_scale: float | None = None,
         idle: float | None = None,
         deadline: float = 5.0,
         poll: float = 0.05,
@@ -89,7 +90,8 @@ class WatchedFolder(LiveSource):
         self._sensor = sensor
         self._name_sensor()
         self._intrinsics, self._calibration, self._baseline = intrinsics, calibration, baseline
-        self._depth_scale, self._idle, self._deadline, self._poll = depth_scale, idle, deadline, poll
+        self._depth_scale, self._float_scale = depth_scale or 0.001, depth_scale or 1.0
+        self._idle, self._deadline, self._poll = idle, deadline, poll
         self._opened_ns, self._stamp = time.time_ns(), 0
         self._handled: set[str] = set()  # names of first files
         self._last: folder_layouts.SortKey = ()
@@ -194,7 +196,9 @@ class WatchedFolder(LiveSource):
                     folder_layouts.whole_scan(first) if max(waited, written) > _SETTLED_S or final else None
                 ]
             else:
-                images = [_image(first, kind)] + ([] if second is None else [_image(second, "pair")])
+                settled = final or max(waited, time.time() - first.stat().st_mtime) > _SETTLED_S
+                images = [_depth(first, settled=settled) if kind == "depth" else _image(first, kind)]
+                images += [] if second is None else [_image(second, "pair")]
         except OSError:  # deleted meanwhile
             images = [None]
         if any(image is None for image in images):
@@ -242,6 +246,12 @@ class WatchedFolder(LiveSource):
         """Undistort depth and colour by the calibration; also return the intrinsics."""
         if depth.shape != self._camera.size:
             raise InvalidKeyframe(f"depth has shape {depth.shape}, others {self._camera.size}")
+        if depth.dtype == np.float32:
+            depth = depth * np.float32(self._float_scale)
+            try:
+                check_metres(depth, self._root)
+            except DatasetError as error:  # so it is with all of them
+                raise SourceError(str(error)) from error
         if color is not None and color.ndim == 2:
             color = cv2.cvtColor(color, cv2.COLOR_GRAY2BGR)
         color = None if color is None else self._camera.color(color)
@@ -297,6 +307,16 @@ class WatchedFolder(LiveSource):
 
 def _image(path: Path, kind: str) -> NDArray[Any] | None:
     return folder_layouts.whole_image(path, cv2.IMREAD_UNCHANGED if kind == "depth" else cv2.IMREAD_ANYCOLOR)
+
+
+def _depth(path: Path, *, settled: bool) -> NDArray[Any] | None:
+    """Depth of any kind; None while it is incomplete, or if it is damaged."""
+    if path.suffix == ".png":
+        return _image(path, "depth")
+    try:
+        return read_depth(path) if settled else None  # these kinds have no mark at their end
+    except DatasetError:
+        return None
 
 
 def _state(path: Path | None) -> tuple[int, int] | None:
