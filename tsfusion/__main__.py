@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The `tsfusion` command's door, also for `python -m tsfusion`."""
 
+import os
 import signal
 from typing import NoReturn
 
@@ -9,6 +10,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     """Run a command line (default: this process's) and exit; Ctrl-C while modules load ends it silently."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # its errors are told once, in our own words
     from tsfusion import cli
 
     cli.main(arguments)

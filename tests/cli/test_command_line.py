@@ -86,7 +86,14 @@ def test_datasets_list(here: Here, tmp_path: Path) -> None:
     scene(tmp_path / "kitchen")
     found = json.loads(here("datasets", "list", tmp_path, "--json").stdout)
     assert found == [
-        {"path": str(tmp_path), "name": "7-Scenes kitchen", "sensor": "kinect", "keyframes": 1, "posed": True}
+        {
+            "path": str(tmp_path),
+            "name": "7-Scenes kitchen",
+            "sensor": "kinect",
+            "keyframes": 1,
+            "posed": True,
+            "camera": "fx 5 fy 5 cx 4 cy 3, 64×48, from camera-intrinsics.txt",
+        }
     ]
     assert "kinect  1 keyframes" in here("datasets", "list", tmp_path).stdout
     layouts = json.loads(here("datasets", "list", "--json").stdout)

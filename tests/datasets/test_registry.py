@@ -29,6 +29,7 @@ def tum(root: Path) -> Path:
             write(root / name / f"{frame}.png", pixels)
             lines.append(f"{frame / 30:.4f} {name}/{frame}.png\n")
         (root / f"{name}.txt").write_text("".join(lines))
+    (root / "K.txt").write_text("525 0 319.5\n0 525 239.5\n0 0 1\n")
     return root
 
 
@@ -61,7 +62,7 @@ def test_a_recording_without_poses_is_there_for_a_scan(tmp_path, layout):
     assert isinstance(dataset, Dataset)
     assert (len(dataset), dataset.skipped) == (3, {})
     assert all(dataset.frame(index).T_world_camera is None for index in range(3))
-    assert describe(dataset).endswith(", no poses")
+    assert ", no poses; camera fx " in describe(dataset)
     with pytest.raises(DatasetError, match=r"frame 2 of .* has no pose; `tsfusion scan PATH` finds"):
         dataset[2]
     one_line(lambda: open_dataset(root), "pose|trajectory|groundtruth")
@@ -72,7 +73,8 @@ def test_some_poses_are_given_where_they_are_known(tmp_path):
     (tmp_path / "frame-000002.pose.txt").unlink()
     dataset = open_dataset(tmp_path, posed=False)
     assert [dataset.pose(index) is None for index in range(-4, 0)] == [False, False, True, False]
-    assert describe(dataset) == f"7-Scenes {tmp_path.name}, 4 RGB-D frames 8×6, poses for 3"
+    said = f"7-Scenes {tmp_path.name}, 4 RGB-D frames 8×6, poses for 3"
+    assert describe(dataset) == f"{said}; camera fx 5 fy 5 cx 4 cy 3, 8×6, from camera-intrinsics.txt"
     every_second = select(dataset, stride=2)
     assert [pose_of(every_second, index) is None for index in range(2)] == [False, True]
     assert isinstance(every_second, Selection)
@@ -98,7 +100,8 @@ def test_kitti_poses_may_end_early(tmp_path):
         assert [dataset.pose(index) is None for index in range(4)] == [False, False, False, True]
         assert dataset.frame(3).T_world_camera is None
     pairs = open_dataset(root, posed=False)
-    assert describe(pairs) == "KITTI 06 stereo, 4 stereo pairs 160×48 at 10 Hz, poses for 3"
+    said = "KITTI 06 stereo, 4 stereo pairs 160×48 at 10 Hz, poses for 3"
+    assert describe(pairs) == f"{said}; camera fx 700 fy 700 cx 40 cy 24, 160×48, from calib.txt"
 
 
 def test_worlds_have_all_poses(tmp_path):
@@ -214,7 +217,7 @@ def test_what_macos_puts_beside_files_is_no_recording(tmp_path):
 def test_an_image_that_claims_to_be_huge_is_named(tmp_path, side):
     root = redwood(tmp_path, [0], [0])
     claim_size(root / "depth" / "00000.png", side)
-    with pytest.raises(DatasetError, match=r"00000\.png cannot be decoded; expected a 16-bit depth image"):
+    with pytest.raises(DatasetError, match=r"00000\.png cannot be decoded; expected a depth image"):
         open_dataset(root)[0]
 
 
@@ -233,15 +236,19 @@ def test_the_command_lists_layouts_and_datasets(tmp_path):
     rows = dict(line.split("  ", 1) for line in listed.stdout.splitlines())
     assert list(rows) == [*(layout.name for layout in layouts()), "synthetic"]
     scannet(tmp_path / "a" / "scene0000_00")
-    expected = f"{tmp_path}/a  ScanNet scene0000_00  kinect  4 keyframes\n"
+    camera = "camera fx 146.25 fy 146.25 cx 79.5 cy 59.5, 160×120, from intrinsic/intrinsic_depth.txt"
+    expected = f"{tmp_path}/a  ScanNet scene0000_00  kinect  4 keyframes  {camera}\n"
     found = tsfusion("datasets", tmp_path)
     assert (found.returncode, found.stdout, found.stderr) == (0, expected, "")
     rows = json.loads(tsfusion("datasets", tmp_path, "--json").stdout)
     assert rows[0]["name"] == "ScanNet scene0000_00"
     tum(tmp_path / "b" / "rgbd")
     found = tsfusion("datasets", tmp_path / "b")
-    assert found.stdout.endswith("  TUM rgbd  kinect  3 frames without poses, for `tsfusion scan`\n")
+    assert "  TUM rgbd  kinect  3 frames without poses, for `tsfusion scan`  camera fx 525" in found.stdout
     assert found.returncode == 0
+    (tmp_path / "b" / "rgbd" / "K.txt").unlink()
+    found = tsfusion("datasets", tmp_path / "b")
+    assert "the camera of these 640×480 images is not known" in found.stderr
 
 
 def test_replay_says_what_it_found(tmp_path):
@@ -250,7 +257,7 @@ def test_replay_says_what_it_found(tmp_path):
     done = tsfusion("replay", tmp_path / "scan.zip", "--unpack", "--sensor", "sonar")
     assert done.returncode == 1
     first, second = done.stderr.splitlines()
-    assert first == "found: ScanNet scene0000_00, 3 RGB-D frames 160×120, all with poses"
+    assert first.startswith("found: ScanNet scene0000_00, 3 RGB-D frames 160×120, all with poses; camera fx")
     assert "sonar" in second
     assert (tmp_path / "scan" / "scene0000_00").is_dir()
 
@@ -279,4 +286,4 @@ def test_a_broken_camera_file_is_one_clear_line(tmp_path, content):
     replica(tmp_path / "replica")
     (tmp_path / "replica" / "cam_params.json").write_text(content)
     for place in ("redwood", "replica"):
-        one_line(lambda place=place: open_dataset(tmp_path / place), r"\.json must ")
+        one_line(lambda place=place: open_dataset(tmp_path / place), r"(intrinsic|params)\.json")

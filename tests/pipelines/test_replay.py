@@ -46,6 +46,7 @@ def test_replay_leaves_everything(run_folder: Path) -> None:
     run = json.loads((out / "run.json").read_text())
     assert run == json.loads((run_folder / "stdout.json").read_text())
     assert (run["keyframes_sent"], run["keyframes_fused"], run["keyframes_rejected"]) == (6, 6, {})
+    assert run["camera"].endswith(", 320×240, from its frames")
     assert set(run["delay_ms"]) >= {"mean", "p50", "p95", "p99", "max"}
     assert 0 < run["delay_ms"]["mean"] <= run["delay_ms"]["max"]
     assert "delay_slope_ms_per_keyframe" in run

@@ -91,6 +91,7 @@ def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, tmp_path: Path) -
     assert run == json.loads((out / "run.json").read_text())
     assert (run["frames"], run["frames_tracked"], run["complete"], run["left"]) == (12, 12, True, 0)
     assert run["localizer"] == "rgbd"
+    assert run["camera"] == "fx 292.5 fy 292.5 cx 159.5 cy 119.5, 320×240, from camera-intrinsics.txt"
     assert run["keyframes_sent"] == run["keyframes_fused"] == sum(run["keyframes_by_rule"].values()) >= 3
     (found,) = run["maps"]
     assert found["mesh"]["triangles"] > 1000
@@ -189,7 +190,7 @@ def test_a_recording_that_breaks_off_keeps_what_came_before(tmp_path: Path) -> N
         ([SOURCE, "--spool", "spool"], 1, "--spool has no effect without --connect"),
         ([SOURCE, "--connect", NOBODY, "--voxel-size", "1"], 1, "tsfusion serve"),
         (["realsense", "--rate", "2"], 1, "--rate is for recordings"),
-        ([SOURCE, "--calibration", "a.yaml"], 1, "--calibration is for a live camera"),
+        ([SOURCE, "--calibration", "a.yaml"], 1, "of a camera: leave out --calibration"),
         (["folder:nowhere"], 1, "nowhere"),
         ([], 2, "Missing argument 'PATH|SOURCE'"),
     ],

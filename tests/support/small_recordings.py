@@ -18,6 +18,7 @@ P1 = "700 0 40 -350 0 700 24 0 0 0 1 0"
 TR = "0 -1 0 0.1 0 0 -1 0.2 1 0 0 0.3"
 POSE = "1 0 0 0.5\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
 ROW = POSE.replace("\n", " ")
+CAMERA = "5 0 4\n0 5 3\n0 0 1\n"  # of images of 8×6
 Change = Callable[[Path], object]  # of a recording in a folder
 
 
@@ -36,6 +37,7 @@ def seven_scenes(root: Path, count: int = 3, shape: tuple[int, int] = (6, 8)) ->
         cv2.imwrite(f"{stem}.depth.png", np.full(shape, 100 + frame, np.uint16))
         cv2.imwrite(f"{stem}.color.png", np.full((*shape, 3), 10 * frame, np.uint8))
         Path(f"{stem}.pose.txt").write_text(POSE)
+    (root / "camera-intrinsics.txt").write_text(CAMERA)
     return root
 
 
@@ -65,7 +67,7 @@ def hololens(root: Path, count: int = 3) -> Path:
     for frame in range(count):
         cv2.imwrite(str(root / "depth" / f"{frame:05d}.png"), np.full((6, 8), 7 + frame, np.uint16))
         cv2.imwrite(str(root / "images" / f"{frame:05d}.png"), np.zeros((6, 8, 3), np.uint8))
-    (root / "K.txt").write_text("5 0 4\n0 5 3\n0 0 1\n")
+    (root / "K.txt").write_text(CAMERA)
     (root / "poses.txt").write_text((ROW + "\n") * count)
     return root
 
@@ -76,6 +78,7 @@ def redwood(root: Path, stems: list[int], poses: list[int]) -> Path:
         (root / name).mkdir(parents=True)
         for stem in stems:
             cv2.imwrite(str(root / name / f"{stem:05d}.png"), pixels)
+    (root / "camera-intrinsics.txt").write_text(CAMERA)
     text = (f"{i} {i} {i + 1}\n" + POSE.replace("0.5", str(i)) for i in poses)
     (root / "trajectory.log").write_text("".join(text))
     return root

@@ -18,6 +18,8 @@ def check(
     trajectory: options.Trajectory = None,
     sequence: options.Sequence = None,
     modality: options.Modality = None,
+    calibration: options.Calibration = None,
+    intrinsics: options.Intrinsics = None,
     option: options.DatasetOptions = None,
     unpack: options.Unpack = False,
     json: options.Json = False,
@@ -28,15 +30,16 @@ def check(
     Exit status 1 when they disagree.
     """
     from tsfusion.cli import output
+    from tsfusion.datasets.cameras import camera_line
     from tsfusion.evaluation import pose_check
 
     dataset = replay.open_recording(
         path, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
-        **options.dataset_options(option),
+        **options.camera(intrinsics, calibration) | options.dataset_options(option),
     )  # fmt: skip
     report = pose_check.check(dataset)
     if json:
-        output.as_json({"name": dataset.name, **asdict(report)})
+        output.as_json({"name": dataset.name, "camera": camera_line(dataset), **asdict(report)})
     else:
         typer.echo(f"{dataset.name}: {report.text}")
         if report.fit is not None:

@@ -46,7 +46,7 @@ def list_(
     for row in rows:
         typer.echo(_line(**row))
     if not rows:
-        typer.echo(f"no datasets in or under {path}", err=True)
+        typer.echo(f"no datasets that can be opened in or under {path}", err=True)
 
 
 def _line(
@@ -57,11 +57,13 @@ def _line(
     sensor: str = "",
     keyframes: int = 0,
     posed: bool = True,
+    camera: str = "",
 ) -> str:
     if not path:
         return f"{name:<16}  {description}"
     what = "keyframes" if posed else "frames without poses, for `tsfusion scan`"
-    return f"{path}  {name}  {sensor}  {keyframes} {what}"
+    seen = f"  camera {camera}" if camera else ""
+    return f"{path}  {name}  {sensor}  {keyframes} {what}{seen}"
 
 
 def _layouts() -> list[dict[str, Any]]:
@@ -80,6 +82,7 @@ def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
     """
     from tsfusion.core.errors import DatasetError, MissingDependency
     from tsfusion.datasets import open_dataset
+    from tsfusion.datasets.cameras import UnknownCamera, camera_line
 
     for posed in (True, False):
         try:
@@ -87,11 +90,14 @@ def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
         except MissingDependency as error:
             typer.echo(f"{path}: {error}", err=True)
             return
+        except UnknownCamera as error:
+            typer.echo(str(error), err=True)
+            return
         except DatasetError:
             continue
         yield {
             "path": str(path), "name": dataset.name, "sensor": dataset.sensor,
-            "keyframes": len(dataset), "posed": posed,
+            "keyframes": len(dataset), "posed": posed, "camera": camera_line(dataset),
         }  # fmt: skip
         return
     if not path.is_dir():

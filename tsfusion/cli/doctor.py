@@ -35,6 +35,7 @@ _EXTRAS = {
     "lidar": ("kiss-icp", "LiDAR odometry"),
     "realsense": ("pyrealsense2", "RealSense cameras"),
     "ros": ("rosbags", "ROS recordings"),
+    "exr": ("OpenEXR", "depth in EXR files"),
     "download": ("pooch", "public recordings"),
 }
 

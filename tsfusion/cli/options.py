@@ -116,6 +116,12 @@ DatasetOptions = Annotated[
     list[str] | None,
     option("--option", "KEY=VALUE", "A setting of the layout, such as depth_topic=/depth."),
 ]
+Calibration = Annotated[
+    Path | None, option("--calibration", "FILE", "The camera's file, instead of the recording's own.")
+]
+Intrinsics = Annotated[
+    str | None, option("--intrinsics", "FX,FY,CX,CY", "The camera in pixels, instead of the recording's own.")
+]
 Unpack = Annotated[bool, _rare_option("--unpack", None, "Unpack an archive beside itself.")]
 
 
@@ -176,6 +182,28 @@ def dataset_options(given: list[str] | None) -> dict[str, Any]:
         except ValueError:
             found[key] = value
     return found
+
+
+def camera(intrinsics: str | None, calibration: Path | None) -> dict[str, Any]:
+    """The camera's options of a dataset or a live source; None = not given.
+
+    Raises:
+        InvalidConfig: not four numbers, or both given.
+    """
+    from tsfusion.core.errors import InvalidConfig, InvalidKeyframe
+    from tsfusion.geometry.keyframe import Intrinsics, check_intrinsics
+
+    if intrinsics is None:
+        return {"intrinsics": None, "calibration": calibration}
+    if calibration is not None:
+        raise InvalidConfig("--intrinsics and --calibration exclude each other: give one of them")
+    try:
+        numbers = [float(word) for word in intrinsics.replace(",", " ").split()]
+        return {"intrinsics": check_intrinsics(Intrinsics(*numbers)), "calibration": None}
+    except (ValueError, TypeError, InvalidKeyframe) as error:
+        raise InvalidConfig(
+            f"--intrinsics must be fx,fy,cx,cy in pixels, such as 585,585,320,240, got {intrinsics!r}"
+        ) from error
 
 
 def client_settings(config: "Config", connect: str | None = None, **flags: str | None) -> "ClientConfig":

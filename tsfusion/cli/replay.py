@@ -36,6 +36,8 @@ def replay(
     stride: options.Stride = 1,
     sequence: options.Sequence = None,
     modality: options.Modality = None,
+    calibration: options.Calibration = None,
+    intrinsics: options.Intrinsics = None,
     option: options.DatasetOptions = None,
     unpack: options.Unpack = False,
     check_: Annotated[
@@ -53,7 +55,7 @@ def replay(
     options.check_target_flags(context, connect, own=own, remote=())
     dataset = open_recording(
         path, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
-        **options.dataset_options(option),
+        **options.camera(intrinsics, calibration) | options.dataset_options(option),
     )  # fmt: skip
     chosen = options.configuration(config, preset={"sensor": dataset.sensor}, **settings)
     if start or stride > 1 or max_frames is not None:

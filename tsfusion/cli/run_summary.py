@@ -27,6 +27,8 @@ def print_replay(run: "ReplaySummary") -> None:
     ]
     if run.keyframes_rejected:
         lines.insert(1, f"rejected   {counted(run.keyframes_rejected)}")
+    if run.camera:
+        lines.insert(0, f"camera     {run.camera}")
     if run.accuracy is not None:
         error = run.accuracy
         lines.append(
@@ -54,6 +56,8 @@ def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
         if delay.count
         else "delay      not known: nothing was fused yet",
     ]
+    if result.camera:
+        lines.insert(0, f"camera     {result.camera}")
     if result.frames_skipped:
         lines.append(f"left out   {counted(result.frames_skipped)}")
     if result.keyframes_rejected:

@@ -79,10 +79,8 @@ def scan(
             rare=True,
         ),
     ] = Path("tsfusion-spool"),
-    calibration: Annotated[
-        Path | None,
-        options.option("--calibration", "FILE", "Of a live camera: Kalibr, OpenCV, ROS or EuRoC."),
-    ] = None,
+    calibration: options.Calibration = None,
+    intrinsics: options.Intrinsics = None,
     rate: options.Rate = None,
     max_frames: options.MaxFrames = None,
     start: options.Start = 0,
@@ -101,7 +99,8 @@ def scan(
     from tsfusion.pipelines.scan import scan as run
 
     opened = _open(
-        context, source, options.dataset_options(option), calibration=calibration, rate=rate,
+        context, source, options.dataset_options(option),
+        camera=options.camera(intrinsics, calibration), rate=rate,
         recording={"unpack": unpack, "sequence": sequence, "modality": modality},
         part={"start": start, "stride": stride, "limit": max_frames},
     )  # fmt: skip
@@ -129,7 +128,7 @@ def _open(
     spec: str,
     given: dict[str, Any],
     *,
-    calibration: Path | None,
+    camera: dict[str, Any],
     rate: float | None,
     recording: dict[str, Any],
     part: dict[str, Any],
@@ -144,9 +143,8 @@ def _open(
             ("sequence", "modality", "unpack", "rate", "start", "stride"),
             "is for recordings, and this source is live: leave it out",
         )
-        live = open_source(spec, calibration=calibration, **given)
+        live = open_source(spec, **camera | given)
         return live if part["limit"] is None else LimitedSource(live, part["limit"])
-    options.refuse(context, ("calibration",), "is for a live camera, and this is a recording: leave it out")
     from tsfusion.cli.replay import open_recording
     from tsfusion.core.errors import DatasetError
     from tsfusion.datasets import select
@@ -158,7 +156,7 @@ def _open(
             f"{spec} does not exist; expected a dataset, synthetic:room, synthetic:street, or live: "
             "realsense, camera:0, folder:PATH (docs/sources.md)"
         )
-    dataset = open_recording(path, **{**recording, **given}, posed=False)
+    dataset = open_recording(path, **recording | camera | given, posed=False)
     return RecordedSource(select(dataset, **part), rate=rate)
 
 

@@ -48,6 +48,7 @@ class Frames(ABC):
 
     name: str
     sensor: str
+    camera: Any = None  # `cameras.RecordedCamera` of depth images; None = points
     timestamps_ns: NDArray[np.int64] | None = None
     skipped: dict[str, int]
     _poses: Sequence[NDArray[np.float64] | None] = ()
@@ -106,6 +107,7 @@ class Selection(Frames):
     def __init__(self, dataset: Dataset, indices: Sequence[int]) -> None:
         self.name, self.sensor, self.skipped = dataset.name, dataset.sensor, dataset.skipped
         self._dataset, self._indices = dataset, list(indices)
+        self.camera = getattr(dataset, "camera", None)
         if hasattr(dataset, "distance"):
             self.distance = dataset.distance
         if dataset.timestamps_ns is not None:

@@ -2,6 +2,7 @@
 """Text tables, images and camera matrices from files; each error is one DatasetError that names the file."""
 
 import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,10 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import DatasetError, InvalidKeyframe
 from tsfusion.geometry.calibration_files import read_text
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_PIXEL_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"eXIf", b"IDAT", b"IEND")
+_HEADER = 13  # bytes of IHDR
 
 
 def read_lines(path: Path, content: str) -> list[tuple[int, str]]:
@@ -62,13 +67,14 @@ def read_image(path: Path, what: str, flags: int = cv2.IMREAD_UNCHANGED) -> NDAr
 def decode_image(content: NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
     """Decode an image file's bytes as OpenCV's `flags` say; None where that fails, or it is far too large.
 
-    OpenCV believes a PNG of a few bytes that claims gigabytes of pixels, and raises beyond that.
+    OpenCV believes a PNG of a few bytes that claims gigabytes of pixels, and raises beyond that. libpng
+    prints what it does not like: a PNG is checked here first, and freed of what is not needed for its pixels.
     """
-    head = content[:24].tobytes()
-    if head[1:4] == b"PNG" and any(
-        side > MAX_IMAGE_SIDE for side in struct.unpack(">2I", head[16:].ljust(8))
-    ):
-        return None
+    if content[:8].tobytes() == _PNG:
+        pixels = _png_of_pixels(content.tobytes())
+        if pixels is None:
+            return None
+        content = np.frombuffer(pixels, np.uint8)
     try:
         image: NDArray[Any] | None = cv2.imdecode(content, flags) if len(content) else None
     except cv2.error:
@@ -76,17 +82,22 @@ def decode_image(content: NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
     return image
 
 
-def read_depth(path: Path, *, invalid: int | None = None) -> NDArray[np.uint16]:
-    """(H, W) uint16 depth; pixels equal to `invalid` become 0."""
-    depth = read_image(path, "a 16-bit depth image")
-    if depth.dtype != np.uint16 or depth.ndim != 2:
-        raise DatasetError(
-            f"{path} must hold one 16-bit channel, got shape {depth.shape} of {depth.dtype} "
-            "(was it saved again as 8 bits?)"
-        )
-    if invalid is not None:
-        depth[depth == invalid] = 0
-    return depth
+def _png_of_pixels(content: bytes) -> bytes | None:
+    """A PNG without the chunks that do not change its pixels; None where it is damaged or far too large."""
+    kept, place = [_PNG], len(_PNG)
+    while place < len(content):
+        length, name = struct.unpack(">I4s", content[place : place + 8].ljust(8, b"\0"))
+        chunk = content[place : place + 12 + length]
+        if len(chunk) < 12 + length or zlib.crc32(chunk[4:-4]) != int.from_bytes(chunk[-4:], "big"):
+            return None
+        if name == b"IHDR" and (length != _HEADER or max(struct.unpack(">2I", chunk[8:16])) > MAX_IMAGE_SIDE):
+            return None
+        if name in _PIXEL_CHUNKS:
+            kept.append(chunk)
+        if name == b"IEND":
+            return b"".join(kept)
+        place += len(chunk)
+    return None
 
 
 def read_color(path: Path, shape: tuple[int, ...] | None) -> NDArray[np.uint8]:
@@ -98,14 +109,6 @@ def read_color(path: Path, shape: tuple[int, ...] | None) -> NDArray[np.uint8]:
             "expected equal sizes"
         )
     return color
-
-
-def read_intrinsics(path: Path) -> Intrinsics:
-    """A 3×3 camera matrix in a text file."""
-    K = read_numbers(path, "a 3×3 camera matrix", columns=3)
-    if K.shape != (3, 3) or K[1, 0] or abs(K[2] - (0, 0, 1)).max() > 1e-9:
-        raise DatasetError(f"{path} must hold a 3×3 camera matrix ending in 0 0 1, got {K.tolist()}")
-    return intrinsics_of(K, path)
 
 
 def intrinsics_of(K: NDArray[np.float64], source: object) -> Intrinsics:

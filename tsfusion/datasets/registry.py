@@ -145,6 +145,9 @@ def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) 
     options = dict(options)
     if not plugins.takes(opener, "posed"):
         options.pop("posed", None)
+    for camera in ("intrinsics", "calibration"):
+        if options.get(camera) is not None and not plugins.takes(opener, camera):
+            raise DatasetError(f"a {name} dataset comes with what it needs of a camera: leave out --{camera}")
     for given, known in (("poses", "trajectory"), ("trajectory", "poses")):
         if given in options and not plugins.takes(opener, given) and plugins.takes(opener, known):
             options[known] = options.pop(given)
@@ -152,7 +155,8 @@ def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) 
 
 
 def describe(dataset: Dataset) -> str:
-    """One line: number and kind of frames, size, rate, how many have a pose. Reads one frame."""
+    """One line: number and kind of frames, size, rate, how many have a pose, the camera. Reads one frame."""
+    from tsfusion.datasets.cameras import camera_line
     from tsfusion.datasets.dataset import frame_of, pose_of
 
     first = frame_of(dataset, 0)
@@ -167,7 +171,9 @@ def describe(dataset: Dataset) -> str:
     poses = "no poses" if not posed else "all with poses" if posed == len(dataset) else f"poses for {posed}"
     uncolored = getattr(dataset, "uncolored", 0)
     color = f", {uncolored} without colour in time" if uncolored else ""
-    return f"{dataset.name}, {len(dataset)} {kind}{size}{rate}, {poses}{color}"
+    camera = camera_line(dataset, first)
+    seen = f"; camera {camera}" if camera else ""
+    return f"{dataset.name}, {len(dataset)} {kind}{size}{rate}, {poses}{color}{seen}"
 
 
 def _unpacked(path: Path, *, unpack: bool) -> Path:

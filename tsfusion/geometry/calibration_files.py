@@ -2,10 +2,12 @@
 """Reading of calibration files.
 
 Kalibr's camchain (`cam0`, `cam1`), EuRoC's sensor.yaml, ROS camera_info (which OpenCV's calibration sample
-writes too) and OpenCV's stereo files (M1 D1 M2 D2 R T, or LEFT.K … RIGHT.P as ORB-SLAM has them). YAML,
-JSON and XML are parsed by OpenCV's FileStorage.
+writes too), one camera of Open3D, RealSense, Replica or ORB-SLAM, a matrix or `fx fy cx cy` in a text file,
+and OpenCV's stereo files (M1 D1 M2 D2 R T, or LEFT.K … RIGHT.P as ORB-SLAM has them). YAML and XML are parsed
+by OpenCV's FileStorage.
 """
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -21,12 +23,25 @@ from tsfusion.geometry.se3 import inverse, transform
 EXPECTED = (
     "Kalibr's camchain.yaml, EuRoC's sensor.yaml, ROS camera_info, or OpenCV's matrices M1 D1 M2 D2 R T"
 )
+EXPECTED_CAMERA = (
+    "Kalibr's, EuRoC's, ROS's, OpenCV's, Open3D's or RealSense's file of a camera; or in a .txt its 3×3 "
+    "matrix, or fx fy cx cy"
+)
+_PARTS = ("cam0", "camera", "intrinsic", "intrinsics", "depth")  # where files with more have the camera
+_MATRICES = ("camera_matrix", "cameraMatrix", "intrinsic_matrix", "camera_intrinsics", "K", "k", "mtx")
+_COEFFICIENTS = (
+    "distortion_coefficients", "distortion_coeffs", "distCoeffs", "dist_coeffs", "coeffs", "distortion",
+    "dist", "D", "d",
+)  # fmt: skip
+_NAMED_COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+_SIZES = (("image_width", "image_height"), ("width", "height"), ("w", "h"), ("cols", "rows"))
+_ORB_SLAM = ("Camera.", "Camera1.")  # in front of its names
 _MAX_TEXT, _MAX_DEPTH, _MAX_INDENTATION = 1 << 20, 64, 256  # characters, brackets or tags, spaces
 Tree = dict[str, Any]
 
 
 def read_camera(path: str | Path, *, size: Size | None = None) -> Camera:
-    """Read the camera of a file (of a Kalibr chain: `cam0`).
+    """Read the camera of a file (of a Kalibr chain: `cam0`); `.txt` is a matrix, or `fx fy cx cy` and more.
 
     Args:
         size: (height, width) for a file without one.
@@ -36,9 +51,11 @@ def read_camera(path: str | Path, *, size: Size | None = None) -> Camera:
     """
     path = Path(path)
     try:
+        if path.suffix.lower() in (".txt", ""):
+            return _camera_in_text(read_text(path, EXPECTED_CAMERA), size)
         return _camera(read_tree(path), size)[0]
     except (InvalidConfig, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise _malformed([path], error) from error
+        raise _malformed([path], error, EXPECTED_CAMERA) from error
 
 
 def read_rig(*paths: str | Path, size: Size | None = None) -> StereoRig:
@@ -84,6 +101,9 @@ def read_tree(path: Path) -> Tree:
     text = read_text(path, EXPECTED)
     if _is_too_large(text):
         raise DatasetError(f"{path} is far too large or too deep for a calibration; expected {EXPECTED}")
+    tree = _json(text)
+    if isinstance(tree, dict) and tree:
+        return tree
     try:
         storage = cv2.FileStorage(_for_opencv(text), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         tree = _plain(storage.root())
@@ -94,6 +114,14 @@ def read_tree(path: Path) -> Tree:
     if not isinstance(tree, dict) or not tree:
         raise DatasetError(f"{path} holds no named values; expected {EXPECTED}")
     return tree
+
+
+def _json(text: str) -> Any:
+    """The values of a JSON file; None for one that is none (OpenCV's YAML may look like it)."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
 
 
 def _is_too_large(text: str) -> bool:
@@ -128,22 +156,96 @@ def _plain(node: Any) -> Any:
 
 def _camera(tree: Tree, size: Size | None) -> tuple[Camera, Tree]:
     """Read the camera; also return its part of the file."""
-    if isinstance(tree.get("cam0"), dict):
-        tree = tree["cam0"]
+    while (part := next((name for name in _PARTS if isinstance(tree.get(name), dict)), None)) is not None:
+        if "data" in tree[part]:  # a matrix of OpenCV's
+            break
+        tree = tree[part]
+    size = _stated_size(tree) or size
     if "intrinsics" in tree:  # Kalibr and EuRoC
         if tree.get("camera_model", "pinhole") != "pinhole":
             raise InvalidConfig(f"camera_model must be pinhole, got {tree['camera_model']}")
-        width, height = tree["resolution"] if "resolution" in tree else _given(size)[::-1]
-        coefficients = tree.get("distortion_coeffs", tree.get("distortion_coefficients", []))
         model = tree.get("distortion_model", "none")
-        return Camera.named(tree["intrinsics"], (height, width), model, coefficients), tree
-    if "camera_matrix" in tree:  # ROS and OpenCV's sample
-        if "image_width" in tree:
-            size = int(tree["image_height"]), int(tree["image_width"])
-        model = tree.get("distortion_model", "fisheye" if tree.get("fisheye_model") else "plumb_bob")
-        coefficients = _numbers(tree.get("distortion_coefficients", []))
-        return Camera.named(_numbers(tree["camera_matrix"]), _given(size), model, coefficients), tree
-    raise InvalidConfig(f"no camera in it, only {', '.join(list(tree)[:8])}")
+        return Camera.named(tree["intrinsics"], _given(size), model, _distortion(tree)), tree
+    matrix = next((name for name in _MATRICES if name in tree), None)
+    prefix = next((prefix for prefix in ("", *_ORB_SLAM) if f"{prefix}fx" in tree), None)
+    if matrix is not None:  # ROS, OpenCV's sample and Open3D
+        K = _matrix(tree[matrix], by_column=matrix == "intrinsic_matrix")
+    elif prefix is not None:  # RealSense, Replica and ORB-SLAM
+        tree = {name.removeprefix(prefix): value for name, value in tree.items()}
+        cx, cy = (tree[f"pp{axis}" if f"pp{axis}" in tree else f"c{axis}"] for axis in "xy")
+        K = np.array([tree["fx"], tree.get("fy", tree["fx"]), cx, cy], dtype=np.float64)
+    else:
+        raise InvalidConfig(f"no camera in it, only {', '.join(list(tree)[:8])}")
+    coefficients = _distortion(tree)
+    if any(coefficients) and "inverse" in str(tree.get("model", "")):
+        raise InvalidConfig(f"model of a lens must not be an inverse one, got {tree['model']}")
+    model = tree.get("distortion_model", "fisheye" if _is_fisheye(tree) else "plumb_bob")
+    return Camera.named(K, _given(size), model if any(coefficients) else "none", coefficients), tree
+
+
+def _stated_size(tree: Tree) -> Size | None:
+    """(height, width) as a camera's file states it."""
+    named = next((tree[name] for name in ("resolution", "imageSize", "image_size") if name in tree), None)
+    if named is not None:
+        return int(named[1]), int(named[0])
+    for width, height in _SIZES:
+        for prefix in ("", *_ORB_SLAM):
+            if prefix + width in tree and prefix + height in tree:
+                return int(tree[prefix + height]), int(tree[prefix + width])
+    return None
+
+
+def _matrix(value: Any, *, by_column: bool) -> NDArray[np.float64]:
+    """A camera matrix of 3×3, 3×4 or 4×4 numbers, or a list of them (`by_column`: column by column).
+
+    Raises:
+        InvalidConfig: of another shape or form.
+    """
+    numbers = _numbers(value)
+    if numbers.size in (12, 16):
+        numbers = numbers.reshape(-1, 4)[:3, :3].ravel()
+    if numbers.size != 9:
+        raise InvalidConfig(f"camera matrix must be 3×3, got {numbers.size} numbers")
+    K = numbers.reshape(3, 3)
+    if by_column and np.ndim(value) == 1 and not K[:2, 2].any():
+        K = K.T
+    if K[1, 0] or np.abs(K[2] - (0, 0, 1)).max() > 1e-9:
+        transposed = not K[:2, 2].any() and K[2, :2].all() and K[2, 2] == 1
+        hint = ": it is transposed" if transposed else ""
+        raise InvalidConfig(f"camera matrix must end with 0 0 1, got {K.tolist()}{hint}")
+    return K
+
+
+def _distortion(tree: Tree) -> tuple[float, ...]:
+    """The coefficients of a lens; none where the file has none."""
+    named = next((tree[name] for name in _COEFFICIENTS if name in tree), None)
+    if named is None:
+        given = [float(tree.get(name, 0)) for name in _NAMED_COEFFICIENTS]
+        count = 8 if any(given[5:]) else 5
+        return tuple(given[: 4 if _is_fisheye(tree) else count])
+    return tuple(map(float, _numbers(named)))
+
+
+def _is_fisheye(tree: Tree) -> bool:
+    return bool(tree.get("fisheye_model")) or "kannala" in str(tree.get("type", "")).lower()
+
+
+def _camera_in_text(text: str, size: Size | None) -> Camera:
+    """`fx: 585` a line; or a matrix, or fx fy cx cy [k1 k2 p1 p2 [k3]] [width height] in any lines."""
+    lines = [line.split("#")[0].strip() for line in text.splitlines()]
+    found = [re.fullmatch(r"([\w.]+)\s*[:=]\s*(\S+)", line) for line in lines]
+    if named := {match[1]: float(match[2]) for match in found if match}:
+        return _camera(named, size)[0]
+    values = _numbers(re.sub(r"[\[\],;()]", " ", " ".join(lines)).split())
+    if not np.isfinite(values).all():
+        raise InvalidConfig("the numbers must be finite")
+    if values.size in (6, 10, 11):
+        size, values = (int(values[-1]), int(values[-2])), values[:-2]
+    if values.size in (12, 16) or (values.size == 9 and (values[8] == 1 or not values[[1, 3]].any())):
+        return Camera.named(_matrix(values, by_column=False), _given(size), "none")
+    if values.size not in (4, 8, 9):
+        raise InvalidConfig(f"{values.size} numbers")
+    return Camera.named(values[:4], _given(size), "plumb_bob", values[4:])
 
 
 def _rig(trees: list[Tree], size: Size | None) -> StereoRig:
@@ -203,7 +305,7 @@ def _given(size: Size | None) -> Size:
     return size
 
 
-def _malformed(paths: list[Path], error: Exception) -> DatasetError:
+def _malformed(paths: list[Path], error: Exception, expected: str = EXPECTED) -> DatasetError:
     files = " and ".join(map(str, paths))
     reason = f"has no {error}" if isinstance(error, KeyError) else f": {error}"
-    return DatasetError(f"{files} {reason}; expected {EXPECTED}".replace(" :", ":"))
+    return DatasetError(f"{files} {reason}; expected {expected}".replace(" :", ":"))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tsfusion.client import Client
 from tsfusion.datasets import Dataset
+from tsfusion.datasets.cameras import camera_line
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.pipelines import latency_ledger, run_files
 from tsfusion.wire.health import Status
@@ -40,6 +41,7 @@ class ReplaySummary(msgspec.Struct, frozen=True, kw_only=True):
 
     dataset: str
     folder: str  # where this file was written
+    camera: str = ""  # intrinsics, image size and where they came from; empty = no images
     keyframes_sent: int
     keyframes_fused: int
     keyframes_rejected: dict[str, int]
@@ -84,6 +86,7 @@ def summarise(
     return ReplaySummary(
         dataset=dataset.name,
         folder=str(folder),
+        camera=camera_line(dataset),
         keyframes_sent=stats.sent,
         keyframes_fused=stats.fused,
         keyframes_rejected={**stats.skipped, **stats.refused, **stats.rejected},

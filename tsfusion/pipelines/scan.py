@@ -15,6 +15,7 @@ from tsfusion.core import process
 from tsfusion.core.config import ClientConfig, ScanConfig, ServerConfig, VolumeConfig
 from tsfusion.core.errors import DatasetError, OutputError, SourceError, TransportError, TsfusionError
 from tsfusion.core.output_folder import results
+from tsfusion.datasets.cameras import described
 from tsfusion.geometry.frame import Frame
 from tsfusion.pipelines import engine, mesh_preview, run_files, scan_results, target_server
 from tsfusion.pipelines.engine import Engine, Progress
@@ -124,7 +125,7 @@ def scan(
             records = scan_results.records(scanner.submaps)
             run_files.write_ledger(work, records)
             result = scan_results.summarise(
-                source, scanner, maps, records, folder=folder,
+                source, scanner, maps, records, folder=folder, camera=_camera(source, first),
                 localizer=registry.localizer_name(config, first), complete=complete, seconds=seconds,
                 peak_rss_bytes=peak, config=config, volume=volume if own else None,
             )  # fmt: skip
@@ -132,6 +133,14 @@ def scan(
     if failure:
         raise failure[0]
     return result
+
+
+def _camera(source: Source, first: Frame) -> str:
+    """The source's camera in one line; empty = it gives points."""
+    own: str = getattr(source, "camera", "")
+    if own or first.intrinsics is None:
+        return own
+    return f"{described(first.intrinsics, first.shape)}, from the source"
 
 
 def _until_failure(frames: Iterator[Frame], failure: list[Exception]) -> Iterator[Frame]:

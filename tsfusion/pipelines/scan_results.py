@@ -38,6 +38,7 @@ class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
 
     source: str
     folder: str  # where this file was written
+    camera: str = ""  # intrinsics, image size and where they came from; empty = no images
     localizer: str
     # Whether the source was read to its end: false after a failure, and for a recording after Ctrl-C
     complete: bool
@@ -105,6 +106,7 @@ def summarise(
     times: list[KeyframeTimes],
     *,
     folder: Path,
+    camera: str,
     localizer: str,
     complete: bool,
     seconds: float,
@@ -119,6 +121,7 @@ def summarise(
     return ScanSummary(
         source=source.name,
         folder=str(folder),
+        camera=camera,
         localizer=localizer,
         complete=complete and state.frames >= (source.length or 0),
         frames=state.frames,

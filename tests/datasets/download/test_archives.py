@@ -126,7 +126,7 @@ def test_a_corbs_archive_is_unpacked_when_asked_to(tmp_path):
     dataset = open_dataset(archive, unpack=True)
     assert dataset.name == "CoRBS D1_pre_registereddata"
     assert (len(dataset), dataset.skipped, dataset.uncolored) == (4, {"without a pose in time": 1}, 1)
-    assert describe(dataset).endswith("all with poses, 1 without colour in time")
+    assert describe(dataset).endswith("published for CoRBS")
     assert float(dataset[1].depth[0, 0] * dataset[1].depth_scale) == pytest.approx(2)
     assert dataset[1].T_world_camera[0, 3] == pytest.approx(1.8)
     assert len(open_dataset(archive)) == 4  # its folder is there now

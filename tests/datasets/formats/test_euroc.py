@@ -58,7 +58,9 @@ def test_euroc_frames_are_pairs_with_stamps(euroc_root):
     assert (frame.kind, frame.shape) == ("pair", (240, 376))
     assert frame.timestamp_ns == rig_recordings.FIRST_NS + 50_000_000
     assert frame.baseline_fx == pytest.approx(dataset.intrinsics.fx * np.linalg.norm((0.06, 0.002, -0.003)))
-    assert describe(dataset).endswith("3 stereo pairs 376×240 at 20 Hz, all with poses")
+    said, camera = describe(dataset).split("; camera ")
+    assert said.endswith("3 stereo pairs 376×240 at 20 Hz, all with poses")
+    assert camera.endswith(", 376×240, from sensor.yaml, rectified")
 
 
 def test_euroc_images_without_their_other_half_are_counted(euroc):

@@ -41,6 +41,8 @@ def test_seven_scenes_masks_the_original_releases_invalid_depth(tmp_path):
 def test_a_scene_is_all_its_sequences(tmp_path):
     seven_scenes(tmp_path / "seq-01", 2)
     seven_scenes(tmp_path / "seq-02", 3)
+    for sequence in ("seq-01", "seq-02"):
+        (tmp_path / sequence / "camera-intrinsics.txt").unlink()
     (tmp_path / "camera-intrinsics.txt").write_text("500 0 4\n0 501 3\n0 0 1\n")
     scene = SevenScenes(tmp_path)
     assert len(scene) == 5
@@ -68,7 +70,7 @@ def test_frames_without_a_pose_are_skipped_and_counted(tmp_path):
         (SECOND_POSE, "1 0 0 0\n" * 3, r"must hold 4 rows of 4 numbers, got 3"),
         (SECOND_POSE, "", r"frame-000001\.pose\.txt is empty; expected a 4×4"),
         (SECOND_POSE, POSE.replace("1 0 0 0.5", "2 0 0 0.5"), r"pose\.txt: T_world_camera must"),
-        ("camera-intrinsics.txt", "1 2\n", r"camera-intrinsics\.txt:1: 2 numbers, expected 3"),
+        ("camera-intrinsics.txt", "1 2\n", r"camera-intrinsics\.txt: 2 numbers; expected .* 3×3 matrix"),
         ("camera-intrinsics.txt", "0 0 4\n0 5 3\n0 0 1\n", r"intrinsics\.txt: intrinsics must be finite"),
         ("frame-000001.depth.png", "", r"frame-000001\.depth\.png cannot be decoded"),
     ],
@@ -82,9 +84,10 @@ def test_depth_saved_as_eight_bits_or_colour_of_another_size_is_refused(tmp_path
     seven_scenes(tmp_path)
     cv2.imwrite(str(tmp_path / "frame-000000.depth.png"), np.ones((6, 8), np.uint8))
     cv2.imwrite(str(tmp_path / "frame-000001.color.png"), np.ones((3, 4, 3), np.uint8))
+    with pytest.raises(DatasetError, match=r"must hold one 16-bit channel or floats, got .* 8 bits"):
+        SevenScenes(tmp_path)
+    cv2.imwrite(str(tmp_path / "frame-000000.depth.png"), np.ones((6, 8), np.uint16))
     dataset = SevenScenes(tmp_path)
-    with pytest.raises(DatasetError, match=r"must hold one 16-bit channel, got .* uint8"):
-        dataset[0]
     with pytest.raises(DatasetError, match="is 4×3, its depth image 8×6; expected equal sizes"):
         dataset[1]
 
@@ -115,8 +118,11 @@ def test_scannet_frames_that_the_tracker_lost_have_no_pose(tmp_path):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        (put("intrinsic/intrinsic_depth.txt", None), r"depth\.txt is missing; expected color/N\.jpg"),
-        (put("intrinsic/intrinsic_depth.txt", "1 0 0\n"), r"must hold a 4×4 or 3×3 camera matrix, got 1×3"),
+        (
+            put("intrinsic/intrinsic_depth.txt", None),
+            "of these 160×120 images is not known",
+        ),
+        (put("intrinsic/intrinsic_depth.txt", "1 0 0\n"), r"depth\.txt: 3 numbers; expected"),
         (put("pose/7.txt", "1 0 0 0\n"), r"pose/7\.txt must hold 4 rows of 4 numbers, got 1"),
         (put("pose/7.txt", matrix(np.eye(4)).replace("1.0", "2.0")), r"pose/7\.txt: T_world_camera must"),
         (put("color/7.jpg", None), r"color/7\.png or \.jpg is missing, but .*depth/7\.png is there"),
@@ -152,13 +158,13 @@ def test_replica_is_read_back(tmp_path):
 
 def test_replica_without_its_camera_file_has_nice_slams_camera(tmp_path):
     root = tmp_path / "room0"
-    write(root / "results" / "depth000003.png", np.full((68, 120), 6554, np.uint16))
+    write(root / "results" / "depth000003.png", np.full((680, 1200), 6554, np.uint16))
     (root / "traj.txt").write_text("\n".join(" ".join(matrix(np.eye(4) * 1.0).split()) for _ in range(4)))
     dataset = Replica(root)
-    assert dataset.intrinsics == Intrinsics(600.0, 600.0, 599.5, 339.5).scaled(0.1)
+    assert dataset.intrinsics == Intrinsics(600.0, 600.0, 599.5, 339.5)
     assert depth_metres(dataset[0])[0, 0] == pytest.approx(1, abs=1e-3)
     assert dataset[0].color is None
-    write(root / "results" / "depth000004.png", np.full((68, 120), 6554, np.uint16))
+    write(root / "results" / "depth000004.png", np.full((680, 1200), 6554, np.uint16))
     assert Replica(root).skipped == {"without a pose": 1}
     assert len(Replica(root, posed=False)) == 2
 
@@ -168,9 +174,15 @@ def test_replica_without_its_camera_file_has_nice_slams_camera(tmp_path):
     [
         (put("room0/traj.txt", None), r"traj\.txt is missing; expected 16 numbers a line; `tsfusion scan"),
         (put("room0/traj.txt", "1 2 3\n"), r"traj\.txt:1: 3 numbers, expected 16"),
-        (put("cam_params.json", "{}"), r"cam_params\.json must hold camera: w, h, fx.*; KeyError: 'camera'"),
+        (
+            put("cam_params.json", "{}"),
+            r"cam_params\.json must hold camera: w, h, fx.*; KeyError|holds no named",
+        ),
         (put("room0/results/frame000001.jpg", None), r"frame000001\.jpg is missing, but .*depth000001\.png"),
-        (put("cam_params.json", None), r"depth000000\.png is 160×120, its camera 1200×680"),
+        (
+            put("cam_params.json", None),
+            r"is not known \(that of NICE-SLAM's Replica is published for 1200×680",
+        ),
     ],
 )
 def test_a_broken_replica_scene_is_one_clear_line(tmp_path, change, match):
@@ -188,7 +200,7 @@ def test_a_broken_replica_scene_is_one_clear_line(tmp_path, change, match):
         (put("poses.txt", (ROW + "\n") * 2), r"poses\.txt has 2 poses for 3 depth images"),
         (put("poses.txt", ROW + "\n" + ROW.replace("0.5", "inf") + "\n" + ROW), r"poses\.txt:2: not finite"),
         (put("images/00001.png", None), r"00001\.png or \.jpg is missing, but .*depth"),
-        (put("K.txt", None), r"K\.txt is missing; expected a 3×3 camera matrix"),
+        (put("K.txt", None), r"is not known: no .*K\.txt.*; give --intrinsics"),
     ],
 )
 def test_a_broken_hololens_folder_is_one_clear_line(tmp_path, change, match):
@@ -212,11 +224,12 @@ def test_redwood_poses_go_by_number_unless_there_are_as_many_images(tmp_path):
 
 def test_redwood_reads_open3d_cameras(tmp_path):
     redwood(tmp_path, [0], [0])
+    (tmp_path / "camera-intrinsics.txt").unlink()
     camera = {"width": 8, "height": 6, "intrinsic_matrix": [9, 0, 0, 0, 8, 0, 4, 3, 1]}
     (tmp_path / "camera_intrinsic.json").write_text(json.dumps(camera))
     assert Redwood(tmp_path).intrinsics == Intrinsics(9, 8, 4, 3)
     (tmp_path / "camera_intrinsic.json").write_text("{}")
-    with pytest.raises(DatasetError, match=r"camera_intrinsic\.json must be an Open3D camera"):
+    with pytest.raises(DatasetError, match=r"camera_intrinsic\.json .*expected"):
         Redwood(tmp_path)
 
 

@@ -180,3 +180,53 @@ def test_binning_and_regions_move_the_camera(tmp_path: Path) -> None:
 def test_cameras_that_do_not_fit_are_refused(tmp_path: Path, info: dict[str, Any], message: str) -> None:
     with pytest.raises(DatasetError, match=message):
         Bag(of_camera(tmp_path, **info), posed=False)
+
+
+# --- cameras that are given, or missing ---
+
+
+def test_depth_without_a_camera_info_needs_a_camera(tmp_path: Path) -> None:
+    with writing(tmp_path, "ros1") as (bag, path):
+        bag.image("/depth/image", wall().measurement, "16UC1", T0, "depth_optical")
+        bag.image("/rgb/image", BGR, "bgr8", T0, OPTICAL)
+        bag.camera_info("/rgb/camera_info", CAMERA, SHAPE, T0)  # of another frame: the colour camera's
+    match = r"no CameraInfo of /depth/image: name one with --option info_topic=TOPIC, or give --intrinsics"
+    with pytest.raises(DatasetError, match=match):
+        Bag(path, posed=False)
+    named = Bag(path, posed=False, info_topic="/rgb/camera_info")
+    assert str(named.camera).endswith("64×48, from /rgb/camera_info")
+    given = Bag(path, posed=False, intrinsics=Intrinsics(39.0, 39.0, 31.0, 23.0))
+    assert str(given.camera) == "fx 39 fy 39 cx 31 cy 23, 64×48, as given"
+    assert given.frame(0).intrinsics == Intrinsics(39.0, 39.0, 31.0, 23.0)
+    with pytest.raises(DatasetError, match="cx 320 lies outside of the images, which are 64×48"):
+        Bag(path, posed=False, intrinsics=Intrinsics(585, 585, 320, 240))
+
+
+def test_a_calibration_beats_the_camera_info(tmp_path: Path) -> None:
+    path, file = of_camera(tmp_path), tmp_path / "lens.yaml"
+    lens = Camera(Intrinsics(38.0, 37.0, 31.0, 24.0), SHAPE, "radtan", (-0.12, 0.03, 0.001, -0.002))
+    file.write_text(
+        "intrinsics: [38, 37, 31, 24]\nresolution: [64, 48]\ndistortion_model: radtan\n"
+        "distortion_coeffs: [-0.12, 0.03, 0.001, -0.002]\n"
+    )
+    dataset = Bag(path, posed=False, calibration=file)
+    assert dataset.frame(0).intrinsics == Undistorter(lens).intrinsics
+    assert str(dataset.camera).endswith(", from the given lens.yaml, undistorted")
+
+
+def test_floats_of_millimetres_are_an_error_until_their_unit_is_given(tmp_path: Path) -> None:
+    millimetres = wall().measurement.astype(np.float32)
+    with writing(tmp_path, "ros1") as (bag, path):
+        bag.image("/camera/depth", millimetres, "32FC1", T0)
+        bag.camera_info("/camera/camera_info", CAMERA, SHAPE, T0)
+    with pytest.raises(DatasetError, match=r"message 0 of /camera/depth has floats: .*: millimetres\?"):
+        Bag(path, posed=False).frame(0)
+    frame = Bag(path, posed=False, depth_scale=0.001).frame(0)
+    np.testing.assert_allclose(frame.depth, millimetres * 0.001)
+
+
+def test_points_take_no_camera(tmp_path: Path) -> None:
+    with writing(tmp_path, "ros1") as (bag, path):
+        bag.cloud("/points", records(), T0)
+    with pytest.raises(DatasetError, match="point clouds have no camera"):
+        Bag(path, posed=False, intrinsics=CAMERA)

@@ -203,6 +203,25 @@ def test_depth_alone(tmp_path: Path) -> None:
     assert source.skipped == {}
 
 
+@pytest.mark.parametrize("ending", ["tiff", "npy"])
+def test_depth_in_floats(tmp_path: Path, ending: str) -> None:
+    """As soon as they are settled; in millimetres they are an error that says so."""
+    camera(tmp_path)
+    (tmp_path / "depth").mkdir()
+    metres = depth(0) * np.float32(0.001)
+    for name, image in (("0", metres), ("1", metres * 1000)):
+        path = tmp_path / "depth" / f"{name}.{ending}"
+        np.save(path, image) if ending == "npy" else cv2.imwrite(str(path), image)
+    with WatchedFolder(tmp_path, deadline=0.2) as source:
+        frames = iter(source)
+        assert (next(frames).depth == metres).all()
+        with pytest.raises(SourceError, match=r"in metres, .*: millimetres\? then .* depth_scale=0\.001"):
+            next(frames)
+    (tmp_path / "depth" / f"0.{ending}").unlink()
+    _, (frame,) = whole(tmp_path, depth_scale=0.001)
+    np.testing.assert_allclose(frame.depth, metres, rtol=1e-6)
+
+
 def test_the_layout_of_7_scenes(data: Callable[[str], Path], tmp_path: Path) -> None:
     recorded = data("7scenes/redkitchen_png/seq-01")
     stems = sorted(path.name[: -len(".depth.png")] for path in recorded.glob("*.depth.png"))[:3]
@@ -292,7 +311,7 @@ def test_without_a_camera_it_says_what_is_missing(tmp_path: Path) -> None:
     rgbd(tmp_path, 0)
     with (
         WatchedFolder(tmp_path, deadline=0.2) as source,
-        pytest.raises(SourceError, match=r"has no camera: .* K\.txt"),
+        pytest.raises(SourceError, match=r"is not known: no .*K\.txt.*; give --intr"),
     ):
         list(source)
     (tmp_path / "K.txt").write_text("1 2 3\n")
@@ -433,7 +452,7 @@ def test_it_says_what_it_waits_for(tmp_path: Path) -> None:
     root = tmp_path / "in"
     root.mkdir()
     said = WatchedFolder(root, idle=10).waits_for()
-    assert "no frames yet; waits for depth/NAME.png with color/, rgb/" in said
+    assert "no frames yet; waits for depth/NAME.png|tiff|exr|npy with color/, rgb/" in said
     assert "and for a camera: camera-intrinsics.txt, K.txt" in said
     assert said.endswith(
         "after 10 s without a new frame, when a file DONE or .end appears there, or with Ctrl-C"
@@ -442,7 +461,7 @@ def test_it_says_what_it_waits_for(tmp_path: Path) -> None:
         rgbd(root, number)
     camera(root)
     said = WatchedFolder(root).waits_for()
-    assert "in: 3 frames are there; waits for more: depth/NAME.png with color/NAME.png|jpg; ends when" in said
+    assert "in: 3 frames are there; waits for more: depth/NAME.png|tiff|exr|npy with color/" in said
 
 
 def test_the_command_says_what_it_waits_for(here: Here, tmp_path: Path) -> None:

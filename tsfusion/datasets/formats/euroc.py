@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
+from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import SCAN, Frames, keep_posed, require_folder, require_frames
 from tsfusion.datasets.readers import read_image, read_lines
 from tsfusion.datasets.trajectory_files import read_euroc
@@ -73,6 +74,7 @@ class EuRoC(Frames):
         require_frames(len(self._pairs), place, EXPECTED, self.skipped)
         self.timestamps_ns = np.array([stamp for stamp, _, _ in self._pairs], dtype=np.int64)
         self.intrinsics, self.baseline_fx = self._rectifier.intrinsics, self._rectifier.baseline_fx
+        self.camera = RecordedCamera(self.intrinsics, self._rectifier.size, "from sensor.yaml, rectified")
         self._with_color = color
 
     def __len__(self) -> int:

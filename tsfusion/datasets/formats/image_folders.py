@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Base of layouts with depth images in one folder and colour images in another."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets import depth_files
+from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import Frames
-from tsfusion.datasets.readers import checked_intrinsics, read_color, read_depth
+from tsfusion.datasets.depth_files import check_metres, read_depth
+from tsfusion.datasets.readers import read_color
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
@@ -24,11 +26,14 @@ class DepthImages(Frames):
     """Frames of one depth image each, with colour and a pose where they are recorded.
 
     Args:
-        depth: files of 16-bit depth.
+        depth: files of 16-bit depth, or of floats.
         color: as many files, None where there is no colour; or an empty list.
         poses: as many (4, 4), None where there is no pose.
-        depth_scale: metres per unit.
+        camera: of the depth images; distortion is removed from depth and colour.
+        depth_scale: metres per unit; None = `usual_scale` for 16 bits, and floats are metres.
     """
+
+    camera: RecordedCamera
 
     def __init__(
         self,
@@ -38,39 +43,53 @@ class DepthImages(Frames):
         depth: Sequence[Path],
         color: Sequence[Path | None],
         poses: Sequence[Transform | None],
-        intrinsics: Intrinsics,
+        camera: RecordedCamera,
         skipped: dict[str, int],
-        depth_scale: float = 0.001,
+        depth_scale: float | None = None,
+        usual_scale: float = 0.001,
         timestamps_ns: NDArray[np.int64] | None = None,
     ) -> None:
-        self.name, self.sensor, self.skipped, self.intrinsics = name, sensor, skipped, intrinsics
-        self.depth_scale, self.timestamps_ns = depth_scale, timestamps_ns
+        self.name, self.sensor, self.skipped, self.camera = name, sensor, skipped, camera
+        self.intrinsics, self.timestamps_ns = camera.intrinsics, timestamps_ns
+        self.depth_scale = usual_scale if depth_scale is None else depth_scale
+        self._float_scale = 1.0 if depth_scale is None else depth_scale
         self._depth, self._color, self._poses = depth, color, poses
-        self._size: tuple[int, ...] = ()
+        self._kind: np.dtype[Any] | None = None  # of the first depth image that was read
 
     def __len__(self) -> int:
         return len(self._depth)
 
     def _frame(self, index: int) -> Frame:
-        depth = read_depth(self._depth[index])
-        self._size = self._size or depth.shape
-        if depth.shape != self._size:
-            raise DatasetError(
-                f"{self._depth[index]} is {depth.shape[1]}×{depth.shape[0]}, others are "
-                f"{self._size[1]}×{self._size[0]}; expected one size, as there is one camera"
-            )
+        depth = self._measured(self._depth[index])
         color = self._color[index] if self._color else None
+        registered = None if color is None else self._registered(color, depth)
         return self._posed_frame(
             index,
             depth=depth,
             depth_scale=self.depth_scale,
-            color=None if color is None else self._registered(color, depth),
+            color=registered,
             intrinsics=self.intrinsics,
         )
 
+    def _measured(self, file: Path) -> NDArray[Any]:
+        """Depth of the pinhole camera: uint16 in `depth_scale`, or float32 metres."""
+        depth, size = read_depth(file), self.camera.size
+        self._kind = self._kind or depth.dtype
+        if depth.shape != size:
+            raise DatasetError(
+                f"{file} is {depth.shape[1]}×{depth.shape[0]}, others are {size[1]}×{size[0]}; "
+                "expected one size, as there is one camera"
+            )
+        if depth.dtype != self._kind:
+            raise DatasetError(f"{file} holds {depth.dtype}, others {self._kind}; expected one kind of depth")
+        if depth.dtype == np.float32:
+            depth *= np.float32(self._float_scale)
+            check_metres(depth, file)
+        return self.camera.depth(depth)
+
     def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
         """The colour of each depth pixel."""
-        return read_color(color, depth.shape)
+        return np.asarray(self.camera.color(read_color(color, depth.shape)), np.uint8)
 
 
 def resample_for_camera(
@@ -105,21 +124,31 @@ def resample_for_camera(
 
 def images(where: Path, expected: str, pattern: str = "[!.]*") -> list[Path]:
     """The images in a folder, sorted by number if all names are numbers, else by name; no hidden files."""
+    return _files(where, expected, pattern, SUFFIXES)
+
+
+def depth_images(where: Path, expected: str, pattern: str = "[!.]*") -> list[Path]:
+    """The files of depth in a folder, sorted as `images`; raises DatasetError for files of several kinds."""
+    found = _files(where, expected, pattern, depth_files.SUFFIXES)
+    kinds = sorted({path.suffix.lower() for path in found})
+    if len(kinds) > 1:
+        raise DatasetError(
+            f"{where} holds files of {' and '.join(kinds)}; expected depth of one kind: move the others away"
+        )
+    return found
+
+
+def _files(where: Path, expected: str, pattern: str, suffixes: tuple[str, ...]) -> list[Path]:
     if not where.is_dir():
         raise DatasetError(f"{where} is missing; expected {expected}")
-    found = sorted(path for path in where.glob(pattern) if path.suffix.lower() in SUFFIXES)
+    found = sorted(path for path in where.glob(pattern) if path.suffix.lower() in suffixes)
     return sorted(found, key=lambda path: int(path.stem)) if _numbered(found) else found
 
 
-def read_open3d_camera(path: Path) -> Intrinsics:
-    """Intrinsics of Open3D's `camera_intrinsic.json`."""
-    try:
-        K = json.loads(path.read_text(encoding="utf-8"))["intrinsic_matrix"]  # column-major
-        return checked_intrinsics(Intrinsics(float(K[0]), float(K[4]), float(K[6]), float(K[7])), path)
-    except (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
-        raise DatasetError(
-            f"{path} must be an Open3D camera with a 9-number intrinsic_matrix: {error}"
-        ) from error
+def first_size(depth: Sequence[Path]) -> tuple[int, int]:
+    """(height, width) of a recording's first depth image, for which its camera is looked up."""
+    height, width = read_depth(depth[0]).shape
+    return int(height), int(width)
 
 
 def color_images(depth: list[Path], where: Path, expected: str) -> list[Path]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import Frames, keep_posed, require_folder, require_frames
 from tsfusion.datasets.readers import intrinsics_of, read_lines
 from tsfusion.datasets.trajectory_files import checked_pose, nanoseconds, read_kitti
@@ -61,6 +62,11 @@ class KITTIFrames(Frames):
 
     def __len__(self) -> int:
         return len(self._frames)
+
+    def _describe_camera(self, file: str) -> None:
+        if self.intrinsics is not None:
+            size = _read_grey(self._left[self._frames[0]]).shape
+            self.camera = RecordedCamera(self.intrinsics, (size[0], size[1]), f"from {file}")
 
     def _frame(self, index: int) -> Frame:
         number = self._frames[index]
@@ -126,6 +132,7 @@ class KITTI(KITTIFrames):
         self._with_color = color
         if modality == "stereo":
             self.intrinsics, self.baseline_fx = _stereo_camera(calibration, place / "calib.txt")
+            self._describe_camera("calib.txt")
         else:
             T_cam0_velo = checked_pose(calibration["Tr"].reshape(3, 4), f"{place / 'calib.txt'}: Tr")
             T_velo_cam0 = np.linalg.inv(T_cam0_velo)

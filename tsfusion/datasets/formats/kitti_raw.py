@@ -76,6 +76,7 @@ class KITTIRaw(KITTIFrames):
         require_frames(len(self._frames), drive, EXPECTED, self.skipped)
         self._left, self._colored, self._with_color = left, chosen[0] == "02", color
         self.intrinsics, self.baseline_fx = calibration.intrinsics, calibration.baseline_fx
+        self._describe_camera("calib_cam_to_cam.txt")
         times = (
             drive / (f"image_{chosen[0]}" if modality == "stereo" else "velodyne_points") / "timestamps.txt"
         )

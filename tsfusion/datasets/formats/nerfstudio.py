@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
+from tsfusion.datasets.cameras import RecordedCamera, given_camera
 from tsfusion.datasets.dataset import Frames, keep_posed, require_frames
+from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.datasets.formats.image_folders import resample_for_camera
-from tsfusion.datasets.readers import read_color, read_image
+from tsfusion.datasets.readers import read_color
 from tsfusion.geometry.calibration import Camera, Undistorter
 from tsfusion.geometry.frame import Frame
-from tsfusion.geometry.keyframe import check_pose
+from tsfusion.geometry.keyframe import Intrinsics, check_pose
 from tsfusion.geometry.se3 import Transform
 
 EXPECTED = "transforms.json with fl_x, cx, … and frames of file_path, depth_file_path, transform_matrix"
@@ -59,6 +61,7 @@ class Nerfstudio(Frames):
 
     Args:
         path: the folder, or the `.json` file in it.
+        intrinsics, calibration: of the depth images (pixel centres at integers), instead of the file's.
         depth_scale: metres per unit; default the file's `depth_unit_scale_factor` or `integer_depth_scale`,
             else 0.001.
         posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
@@ -71,6 +74,8 @@ class Nerfstudio(Frames):
         self,
         path: str | Path,
         *,
+        intrinsics: Intrinsics | None = None,
+        calibration: str | Path | None = None,
         depth_scale: float | None = None,
         sensor: str = "kinect",
         color: bool = True,
@@ -99,6 +104,8 @@ class Nerfstudio(Frames):
         self._listed, self._poses = keep_posed(listed, poses, posed=posed, skipped=self.skipped)
         require_frames(len(self._listed), file, EXPECTED, self.skipped)
         self._undistorters: dict[Camera, Undistorter] = {}
+        self._given: Camera | None = None  # instead of the file's
+        self.camera = self._camera_of_first(file, intrinsics, calibration)
 
     def __len__(self) -> int:
         return len(self._listed)
@@ -108,7 +115,7 @@ class Nerfstudio(Frames):
         depth, scale = _read_depth(entry.depth, self.depth_scale)
         color = None if entry.color is None else read_color(entry.color, None)
         size = entry.size or (depth if color is None else color).shape[:2]
-        camera = _camera(entry, size)
+        camera = self._given or _camera(entry, size)
         fitted = _resized(camera, depth.shape[:2], entry.where)
         if color is not None and color.shape != (*depth.shape, 3):
             own = _resized(camera, color.shape[:2], entry.where)
@@ -119,6 +126,20 @@ class Nerfstudio(Frames):
             intrinsics, depth = undistorter.intrinsics, undistorter.depth(depth)
             color = None if color is None else undistorter.image(color)
         return self._posed_frame(index, depth=depth, depth_scale=scale, color=color, intrinsics=intrinsics)
+
+    def _camera_of_first(
+        self, file: Path, intrinsics: Intrinsics | None, calibration: str | Path | None
+    ) -> RecordedCamera:
+        """The camera that was given, which is that of all frames; else that of the first frame."""
+        height, width = _read_depth(self._listed[0].depth, self.depth_scale)[0].shape
+        given = given_camera((height, width), intrinsics=intrinsics, calibration=calibration)
+        if given is not None:
+            self._given = given.lens
+            return given
+        first = self.frame(0).intrinsics
+        assert first is not None
+        undistorted = ", undistorted" if self._undistorters else ""
+        return RecordedCamera(first, (height, width), f"from {file.name}{undistorted}")
 
     def _undistorter(self, camera: Camera) -> Undistorter:
         if camera not in self._undistorters:
@@ -239,22 +260,10 @@ def _scale(capture: dict[str, Any], key: str, file: Path) -> float:
 
 
 def _read_depth(path: Path, scale: float) -> tuple[NDArray[Any], float]:
-    """Depth, and metres per unit: of `.npy`, metres."""
-    if path.suffix == ".npy":
-        try:
-            depth = np.array(
-                np.lib.format.open_memmap(path, mode="r")
-            )  # its size is compared with what is there
-        except (OSError, ValueError, EOFError) as error:
-            raise DatasetError(
-                f"{path} cannot be read; expected an (H, W) array of depth ({error})"
-            ) from error
-    else:
-        depth = read_image(path, "a depth image")
-        if depth.dtype == np.uint16 and depth.ndim == 2:
-            return depth, scale
-    if depth.ndim != 2 or depth.dtype.kind not in "fu" or depth.dtype == np.uint8:
-        raise DatasetError(
-            f"{path} must hold one channel of uint16 or floats, got shape {depth.shape} of {depth.dtype}"
-        )
-    return (depth * scale).astype(np.float32), 1.0
+    """Depth, and metres per unit: 1 of floats, which are metres after `scale`."""
+    depth = read_depth(path)
+    if depth.dtype == np.uint16 and path.suffix != ".npy":
+        return depth, scale
+    depth = depth.astype(np.float32) * np.float32(scale)
+    check_metres(depth, path)
+    return depth, 1.0

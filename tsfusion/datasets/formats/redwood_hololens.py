@@ -1,26 +1,39 @@
 # SPDX-License-Identifier: MIT
 """RGB-D folders with one pose file: HoloLens recordings and Redwood / Open3D reconstructions."""
 
+import re
 from pathlib import Path
 
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.cameras import PublishedCamera, find_camera
 from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
 from tsfusion.datasets.formats.image_folders import (
     DepthImages,
     color_images,
-    images,
+    depth_images,
+    first_size,
     poses_by_number,
-    read_open3d_camera,
 )
-from tsfusion.datasets.readers import checked_intrinsics, read_intrinsics
 from tsfusion.datasets.trajectory_files import read_log, read_matrix_rows
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
 HOLOLENS_EXPECTED = "K.txt, poses.txt, depth/*.png and images/*.png"
-REDWOOD_EXPECTED = "depth/*.png, image/, color/ or rgb/, and trajectory.log, odometry.log or *-traj.txt"
-PLAIN_EXPECTED = "depth/*.png and image/, color/ or rgb/, of equal names; without poses, so for a scan only"
-PRIMESENSE = Intrinsics(525.0, 525.0, 319.5, 239.5)  # Open3D's PrimeSenseDefault
+REDWOOD_EXPECTED = (
+    "depth/*.png, .tiff, .exr or .npy, image/, color/ or rgb/, camera-intrinsics.txt or "
+    "camera_intrinsic.json, and trajectory.log, odometry.log or *-traj.txt"
+)
+PLAIN_EXPECTED = (
+    "depth/*.png, .tiff, .exr or .npy and image/, color/ or rgb/, of equal names, and camera-intrinsics.txt "
+    "or camera_intrinsic.json; without poses, so for a scan only"
+)
+# Open3D's PrimeSenseDefault, for the recordings that Redwood and Open3D distribute
+_PRIMESENSE = PublishedCamera("Redwood's recordings", Intrinsics(525.0, 525.0, 319.5, 239.5))
+_REDWOODS_NAMES = re.compile(
+    r"redwood[-_](sample|lounge|bedroom|living_?room\d|office\d)|(lounge|bedroom|sampleredwood)rgbdimages"
+    r"|open3d[-_]rgbd|augmented[-_]icl"
+)
+_REDWOODS_FILES = ("livingroom[12]-traj.txt", "office[12]-traj.txt")
 _LOGS = ("trajectory.log", "scene/trajectory.log", "odometry.log")  # by preference
 _LOG_NAMES = ("*traj*.log", "*-traj.txt")
 _COLOR = ("image", "color", "rgb")
@@ -52,6 +65,7 @@ class HoloLens(DepthImages):
     colour; no timestamps.
 
     Args:
+        intrinsics, calibration: instead of `K.txt`.
         posed: `poses.txt` must be there; else frames come without a pose where it is not.
 
     Raises:
@@ -59,10 +73,17 @@ class HoloLens(DepthImages):
     """
 
     def __init__(
-        self, path: str | Path, *, sensor: str = "tof", color: bool = True, posed: bool = True
+        self,
+        path: str | Path,
+        *,
+        intrinsics: Intrinsics | None = None,
+        calibration: str | Path | None = None,
+        sensor: str = "tof",
+        color: bool = True,
+        posed: bool = True,
     ) -> None:
         root = require_folder(path, "HoloLens")
-        depth = images(root / "depth", HOLOLENS_EXPECTED)
+        depth = depth_images(root / "depth", HOLOLENS_EXPECTED)
         require_frames(len(depth), root / "depth", HOLOLENS_EXPECTED, {})
         poses: list[Transform | None] = [None] * len(depth)
         if posed or (root / "poses.txt").exists():
@@ -78,7 +99,7 @@ class HoloLens(DepthImages):
             depth=depth,
             color=color_images(depth, root / "images", HOLOLENS_EXPECTED) if color else [],
             poses=poses,
-            intrinsics=read_intrinsics(root / "K.txt"),
+            camera=find_camera(root, first_size(depth), intrinsics=intrinsics, calibration=calibration),
             skipped={},
         )
 
@@ -95,9 +116,9 @@ class Redwood(DepthImages):
         path: the folder, or the `.log` in it to take the poses from.
         trajectory: default `trajectory.log`, `scene/trajectory.log`, `odometry.log` or the one file named
             `*traj*.log` or `*-traj.txt`.
-        intrinsics: default `camera_intrinsic.json` or `intrinsic.json` (Open3D's) in the folder, else 525,
-            525, 319.5, 239.5.
-        depth_scale: metres per unit.
+        intrinsics, calibration: default a file of the camera in the folder (`cameras.FILES`); for recordings
+            that Redwood and Open3D distribute, known by their names, at 640×480 else 525, 525, 319.5, 239.5.
+        depth_scale: metres per unit; default 0.001, and 1 for floats.
         posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
 
     Raises:
@@ -110,7 +131,8 @@ class Redwood(DepthImages):
         *,
         trajectory: str | Path | None = None,
         intrinsics: Intrinsics | None = None,
-        depth_scale: float = 0.001,
+        calibration: str | Path | None = None,
+        depth_scale: float | None = None,
         sensor: str = "kinect",
         color: bool = True,
         posed: bool = True,
@@ -119,7 +141,7 @@ class Redwood(DepthImages):
         if path.is_file():
             path, trajectory = _root_of(path) or path.parent, trajectory or path.absolute()
         root = require_folder(path, "Redwood")
-        files = images(_depth_folder(root), REDWOOD_EXPECTED)
+        files = depth_images(_depth_folder(root), REDWOOD_EXPECTED)
         log = _log(root) if trajectory is None else Path(trajectory)
         if log is not None and not log.is_file():
             log = root / log
@@ -130,13 +152,17 @@ class Redwood(DepthImages):
         depth, poses = keep_posed(files, found, posed=posed, skipped=skipped)
         require_frames(len(depth), root, REDWOOD_EXPECTED, skipped)
         where = _color_folder(root)
+        camera = find_camera(
+            root, first_size(depth), intrinsics=intrinsics, calibration=calibration,
+            places=(root, depth[0].parent), published=_PRIMESENSE if _is_redwoods_own(root) else None,
+        )  # fmt: skip
         super().__init__(
             f"Redwood {root.name}",
             sensor=sensor,
             depth=depth,
             color=color_images(depth, where, REDWOOD_EXPECTED) if color and where else [],
             poses=poses,
-            intrinsics=checked_intrinsics(intrinsics or _open3d_intrinsics(root), "intrinsics"),
+            camera=camera,
             skipped=skipped,
             depth_scale=depth_scale,
         )
@@ -173,7 +199,6 @@ def _log(root: Path) -> Path | None:
     return next((path for path in [*known, *named] if not path.name.startswith(".")), None)
 
 
-def _open3d_intrinsics(root: Path) -> Intrinsics:
-    names = ("camera_intrinsic.json", "intrinsic.json")
-    path = next((root / name for name in names if (root / name).exists()), None)
-    return PRIMESENSE if path is None else read_open3d_camera(path)
+def _is_redwoods_own(root: Path) -> bool:
+    names = "/".join(root.resolve().parts[-2:]).lower()
+    return bool(_REDWOODS_NAMES.search(names)) or any(any(root.glob(name)) for name in _REDWOODS_FILES)

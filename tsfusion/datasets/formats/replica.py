@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Replica scenes as NICE-SLAM renders them."""
 
-import json
 from pathlib import Path
 
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.cameras import PublishedCamera, find_camera
 from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
-from tsfusion.datasets.formats.image_folders import DepthImages, images
-from tsfusion.datasets.readers import checked_intrinsics, numbers, read_depth
+from tsfusion.datasets.formats.image_folders import DepthImages, depth_images, first_size, images
+from tsfusion.datasets.readers import numbers
 from tsfusion.datasets.trajectory_files import read_matrix_rows
+from tsfusion.geometry.calibration_files import read_tree
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
 EXPECTED = "traj.txt, results/depthN.png and results/frameN.jpg, with cam_params.json there or one folder up"
-SIZE = (680, 1200)  # height, width
-CAMERA = Intrinsics(600.0, 600.0, 599.5, 339.5)
+_CAMERA = PublishedCamera("NICE-SLAM's Replica", Intrinsics(600.0, 600.0, 599.5, 339.5), (680, 1200))
 DEPTH_SCALE = 1 / 6553.5  # metres per unit
 
 
@@ -31,6 +31,7 @@ class Replica(DepthImages):
     otherwise. Rendered, without noise; no timestamps.
 
     Args:
+        intrinsics, calibration: instead of that camera.
         posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
 
     Raises:
@@ -38,23 +39,38 @@ class Replica(DepthImages):
     """
 
     def __init__(
-        self, path: str | Path, *, sensor: str = "kinect", color: bool = True, posed: bool = True
+        self,
+        path: str | Path,
+        *,
+        intrinsics: Intrinsics | None = None,
+        calibration: str | Path | None = None,
+        sensor: str = "kinect",
+        color: bool = True,
+        posed: bool = True,
     ) -> None:
         root = require_folder(path, "Replica")
         skipped: dict[str, int] = {}
-        files = images(root / "results", EXPECTED, "depth*")
+        files = depth_images(root / "results", EXPECTED, "depth*")
         depth, poses = keep_posed(files, _poses(root, files, posed=posed), posed=posed, skipped=skipped)
         require_frames(len(depth), root / "results", EXPECTED, skipped)
-        intrinsics, size, scale = _camera(root)
+        file = _camera_file(root)
+        usual_scale = _scale(file)
         super().__init__(
             f"Replica {root.name}",
             sensor=sensor,
             depth=depth,
             color=_frames(root, depth) if color else [],
             poses=poses,
-            intrinsics=_scaled_to_depth(intrinsics, size, depth[0]),
+            camera=find_camera(
+                root,
+                first_size(depth),
+                intrinsics=intrinsics,
+                calibration=calibration,
+                files=() if file is None else (file,),
+                published=_CAMERA,
+            ),
             skipped=skipped,
-            depth_scale=scale,
+            usual_scale=usual_scale,
         )
 
 
@@ -83,36 +99,18 @@ def _poses(root: Path, files: list[Path], *, posed: bool) -> list[Transform | No
     return [poses[line] if line < len(poses) else None for line in lines]
 
 
-def _camera(root: Path) -> tuple[Intrinsics, tuple[int, int], float]:
-    """Camera, (height, width) and metres per unit."""
-    path = next(
-        (
-            up / "cam_params.json"
-            for up in (root, root.absolute().parent)
-            if (up / "cam_params.json").exists()
-        ),
-        None,
-    )
+def _camera_file(root: Path) -> Path | None:
+    places = (up / "cam_params.json" for up in (root, root.absolute().parent))
+    return next((path for path in places if path.exists()), None)
+
+
+def _scale(path: Path | None) -> float:
+    """Metres per unit, as `camera.scale` says."""
     if path is None:
-        return CAMERA, SIZE, DEPTH_SCALE
+        return DEPTH_SCALE
     try:
-        camera = json.loads(path.read_text(encoding="utf-8"))["camera"]
-        intrinsics = Intrinsics(*(float(camera[key]) for key in ("fx", "fy", "cx", "cy")))
-        size, scale = (int(camera["h"]), int(camera["w"])), 1 / float(camera["scale"])
-        if min(size) < 1:
-            raise ValueError(f"w and h must be >= 1, got {size[1]} and {size[0]}")
-    except (OSError, ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
+        return 1 / float(read_tree(path)["camera"]["scale"])
+    except (ValueError, LookupError, TypeError, ArithmeticError) as error:
         raise DatasetError(
             f"{path} must hold camera: w, h, fx, fy, cx, cy, scale; {type(error).__name__}: {error}"
         ) from error
-    return checked_intrinsics(intrinsics, path), size, scale
-
-
-def _scaled_to_depth(intrinsics: Intrinsics, size: tuple[int, int], depth: Path) -> Intrinsics:
-    shape = read_depth(depth).shape
-    if shape[0] * size[1] != shape[1] * size[0]:
-        raise DatasetError(
-            f"{depth} is {shape[1]}×{shape[0]}, its camera {size[1]}×{size[0]}; expected that shape, or the "
-            "camera in cam_params.json"
-        )
-    return intrinsics.scaled(shape[1] / size[1])

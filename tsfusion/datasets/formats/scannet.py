@@ -8,8 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.cameras import find_camera
 from tsfusion.datasets.dataset import keep_posed, require_folder, require_frames
-from tsfusion.datasets.formats.image_folders import DepthImages, color_images, images, resample_for_camera
+from tsfusion.datasets.formats.image_folders import (
+    DepthImages,
+    color_images,
+    depth_images,
+    first_size,
+    resample_for_camera,
+)
 from tsfusion.datasets.readers import intrinsics_of, read_color, read_lines, read_numbers
 from tsfusion.datasets.trajectory_files import read_matrix
 from tsfusion.geometry.keyframe import Intrinsics
@@ -20,8 +27,9 @@ _PLACES = ("intrinsic/intrinsic_{}.txt", "intrinsics_{}.txt", "intrinsic_{}.txt"
 
 
 def recognises(path: Path) -> bool:
-    """Whether the folder has `depth/` and the depth camera's 4×4 matrix."""
-    return (path / "depth").is_dir() and _camera_file(path, "depth") is not None
+    """Whether the folder has `depth/` and the depth camera's 4×4 matrix in `intrinsic/` or by `pose/`."""
+    own = (path / "intrinsic").is_dir() or (path / "pose").is_dir()
+    return own and (path / "depth").is_dir() and _camera_file(path, "depth") is not None
 
 
 class ScanNet(DepthImages):
@@ -33,6 +41,7 @@ class ScanNet(DepthImages):
     timestamps (nominally 30 Hz).
 
     Args:
+        intrinsics, calibration: of the depth camera, instead of its file.
         posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
 
     Raises:
@@ -40,29 +49,42 @@ class ScanNet(DepthImages):
     """
 
     def __init__(
-        self, path: str | Path, *, sensor: str = "kinect", color: bool = True, posed: bool = True
+        self,
+        path: str | Path,
+        *,
+        intrinsics: Intrinsics | None = None,
+        calibration: str | Path | None = None,
+        sensor: str = "kinect",
+        color: bool = True,
+        posed: bool = True,
     ) -> None:
         root = require_folder(path, "ScanNet")
         skipped: dict[str, int] = {}
-        files = images(root / "depth", EXPECTED)
+        files = depth_images(root / "depth", EXPECTED)
         depth, poses = keep_posed(
             files, [_pose(root / "pose" / f"{file.stem}.txt") for file in files], posed=posed, skipped=skipped
         )
         require_frames(len(depth), root, EXPECTED, skipped)
-        self.color_intrinsics = _intrinsics(root, "color") if color else None
+        self.color_intrinsics = _color_intrinsics(root) if color else None
         super().__init__(
             f"ScanNet {root.name}",
             sensor=sensor,
             depth=depth,
             color=color_images(depth, root / "color", EXPECTED) if color else [],
             poses=poses,
-            intrinsics=_required(root),
+            camera=find_camera(
+                root,
+                first_size(depth),
+                intrinsics=intrinsics,
+                calibration=calibration,
+                files=filter(None, [_camera_file(root, "depth")]),
+            ),
             skipped=skipped,
         )
 
     def _registered(self, color: Path, depth: NDArray[Any]) -> NDArray[np.uint8]:
         if self.color_intrinsics is None:
-            return read_color(color, depth.shape)
+            return super()._registered(color, depth)
         return resample_for_camera(
             read_color(color, None), self.color_intrinsics, self.intrinsics, depth.shape
         )
@@ -72,21 +94,14 @@ def _camera_file(root: Path, camera: str) -> Path | None:
     return next((root / p.format(camera) for p in _PLACES if (root / p.format(camera)).is_file()), None)
 
 
-def _intrinsics(root: Path, camera: str) -> Intrinsics | None:
-    path = _camera_file(root, camera)
+def _color_intrinsics(root: Path) -> Intrinsics | None:
+    path = _camera_file(root, "color")
     if path is None:
         return None
     K = read_numbers(path, "a 4×4 or 3×3 camera matrix")
     if K.shape not in ((4, 4), (3, 3)):
         raise DatasetError(f"{path} must hold a 4×4 or 3×3 camera matrix, got {K.shape[0]}×{K.shape[1]}")
     return intrinsics_of(K, path)
-
-
-def _required(root: Path) -> Intrinsics:
-    intrinsics = _intrinsics(root, "depth")
-    if intrinsics is None:
-        raise DatasetError(f"{root / _PLACES[0].format('depth')} is missing; expected {EXPECTED}")
-    return intrinsics
 
 
 def _pose(path: Path) -> Transform | None:

@@ -1,26 +1,35 @@
 # SPDX-License-Identifier: MIT
 """Microsoft 7-Scenes, and the 3DMatch data sets that share its layout."""
 
+import re
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.cameras import PublishedCamera, find_camera
 from tsfusion.datasets.dataset import Frames, keep_posed, require_folder, require_frames
-from tsfusion.datasets.readers import checked_intrinsics, read_color, read_depth, read_intrinsics
+from tsfusion.datasets.depth_files import read_depth
+from tsfusion.datasets.readers import read_color
 from tsfusion.datasets.trajectory_files import read_matrix
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
-EXPECTED = "frame-XXXXXX.{depth.png,pose.txt,color.png|jpg}, in the folder or in its seq-XX folders"
+EXPECTED = (
+    "frame-XXXXXX.{depth.png,pose.txt,color.png|jpg}, in the folder or in its seq-XX folders, and "
+    "camera-intrinsics.txt unless it is a scene of 7-Scenes"
+)
 KINECT = Intrinsics(585.0, 585.0, 320.0, 240.0)  # the release's own figure
 # The colour camera is not in the release: measured on RedKitchen by bringing depth edges onto colour edges
 # (mean gradient under them 2.34 times the image's; 1.24 as released).
 KINECT_COLOR = Intrinsics(527.0, 527.0, 320.0, 237.5)
 KINECT_BASELINE = -0.025  # metres, x of the depth camera's origin in the colour camera's axes
+_SCENES = re.compile(r"chess|fire|heads|office|pumpkin|redkitchen(_\w+)?|stairs")
+_RELEASE = re.compile(r"7[-_]?scenes|seven[-_]?scenes", re.IGNORECASE)
+_RELEASED = ("TrainSplit.txt", "TestSplit.txt")  # beside the sequences of every scene
 NOT_MEASURED = 65535  # the original release marks invalid depth so; 0 in re-encoded copies
 
 
@@ -37,11 +46,12 @@ class SevenScenes(Frames):
 
     Args:
         path: the scene's or the sequence's folder.
-        intrinsics: default `camera-intrinsics.txt` beside the frames or up to two folders up,
-            else 585, 585, 320, 240.
+        intrinsics, calibration: default a file of the camera (`cameras.FILES`) beside the frames or up to
+            two folders up; for a scene of 7-Scenes (by its name and `TrainSplit.txt`, or in a folder
+            `7scenes`) at 640×480 else 585, 585, 320, 240.
         color: read colour images.
-        register: move colour onto depth; default: where the depth camera is 7-Scenes' own (3DMatch's colour
-            is registered already).
+        register: move colour onto depth; default: for a scene of 7-Scenes with its own depth camera
+            (3DMatch's colour is registered already).
         posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
 
     Raises:
@@ -53,6 +63,7 @@ class SevenScenes(Frames):
         path: str | Path,
         *,
         intrinsics: Intrinsics | None = None,
+        calibration: str | Path | None = None,
         sensor: str = "kinect",
         color: bool = True,
         register: bool | None = None,
@@ -75,9 +86,14 @@ class SevenScenes(Frames):
         )
         require_frames(len(self._stems), root, EXPECTED, self.skipped)
         self._suffix = _color_suffix(self._stems[0]) if color else None
-        self.intrinsics = _intrinsics(root, self._stems[0].parent) if intrinsics is None else intrinsics
-        checked_intrinsics(self.intrinsics, "intrinsics")
-        self._register = self.intrinsics == KINECT if register is None else register
+        folder, own = self._stems[0].parent, _is_own(root)
+        self.camera = find_camera(
+            root, read_depth(_file(self._stems[0], "depth.png")).shape,
+            intrinsics=intrinsics, calibration=calibration, places=(folder, root, root.absolute().parent),
+            published=PublishedCamera("7-Scenes", KINECT) if own else None,
+        )  # fmt: skip
+        self.intrinsics = self.camera.intrinsics
+        self._register = own and self.intrinsics == KINECT if register is None else register
 
     def __len__(self) -> int:
         return len(self._stems)
@@ -85,10 +101,15 @@ class SevenScenes(Frames):
     def _frame(self, index: int) -> Frame:
         stem = self._stems[index]
         depth = read_depth(_file(stem, "depth.png"), invalid=NOT_MEASURED)
+        if depth.shape != self.camera.size:
+            raise DatasetError(f"{stem}.depth.png has shape {depth.shape}, others {self.camera.size}")
+        depth = self.camera.depth(depth)
         color = None if self._suffix is None else read_color(_file(stem, self._suffix), depth.shape)
         if color is not None and self._register:
             registration = _registration(self.intrinsics, depth.shape)
             color = registration.color_of_depth(color, depth * np.float32(0.001))
+        elif color is not None:
+            color = np.asarray(self.camera.color(color), np.uint8)
         return self._posed_frame(
             index, depth=depth, depth_scale=0.001, color=color, intrinsics=self.intrinsics
         )
@@ -129,8 +150,11 @@ def _color_suffix(stem: Path) -> str | None:
     return None
 
 
-def _intrinsics(root: Path, sequence: Path) -> Intrinsics:
-    for place in (sequence, root, root.parent):
-        if (place / "camera-intrinsics.txt").exists():
-            return read_intrinsics(place / "camera-intrinsics.txt")
-    return KINECT
+def _is_own(root: Path) -> bool:
+    """Whether it is a scene of 7-Scenes, or a sequence of one; their names alone are anybody's."""
+    root = root.resolve()
+    names = root.parts[-3:]
+    scene = next((place for place in (root, root.parent) if _SCENES.fullmatch(place.name)), None)
+    if scene is None:
+        return False
+    return any(map(_RELEASE.search, names)) or any((scene / name).is_file() for name in _RELEASED)

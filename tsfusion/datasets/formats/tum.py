@@ -2,53 +2,52 @@
 """TUM RGB-D recordings, and what shares their layout: CoRBS (pre-registered) and ICL-NUIM."""
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.cameras import PublishedCamera, find_camera
 from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
-from tsfusion.datasets.formats.image_folders import DepthImages
+from tsfusion.datasets.formats.image_folders import DepthImages, first_size
 from tsfusion.datasets.formats.tum_lists import ASSOCIATIONS, read_recording
-from tsfusion.datasets.readers import checked_intrinsics, read_depth, read_intrinsics
 from tsfusion.datasets.trajectory_files import read_tum
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
 EXPECTED = (
-    "groundtruth.txt or *.gt.freiburg, and the images that depth.txt and rgb.txt, or associations.txt, list"
+    "groundtruth.txt or *.gt.freiburg, the images that depth.txt and rgb.txt, or associations.txt, list, and "
+    "camera-intrinsics.txt unless it is a recording of TUM, CoRBS or ICL-NUIM"
 )
 DEPTH_SCALE = 1 / 5000  # metres per unit
-CALIBRATED_SIZE = (480, 640)  # height, width of the cameras below
 
 
-@dataclass(frozen=True)
-class _PublishedCamera:
-    """Camera of a published recording, found by the folder's name."""
+class _Benchmark(NamedTuple):
+    """A benchmark in this layout; its recordings are known by the folder's name."""
 
     name: str
     folder: str  # regular expression, searched in the last two folder names
     intrinsics: Intrinsics
+    source: str
     sensor: str = "kinect"
 
 
-_CORBS = _PublishedCamera(
-    "CoRBS", r"corbs|pre[-_]?registered", Intrinsics(468.60, 468.61, 318.27, 243.99), sensor="tof"
-)
-_ICL = _PublishedCamera(
+_ICL = _Benchmark(
     "ICL-NUIM",
     r"icl[-_]?nuim|(living|office)_room_traj|traj\d\w?_(frei|loop)",
     Intrinsics(481.2, -480.0, 319.5, 239.5),
+    "ICL-NUIM",
 )
-_CAMERAS = (
-    _CORBS,
+_BENCHMARKS = (
+    _Benchmark(
+        "CoRBS", r"corbs|\w\d_pre[-_]?registered", Intrinsics(468.60, 468.61, 318.27, 243.99), "CoRBS", "tof"
+    ),
     _ICL,
-    _PublishedCamera("TUM", r"freiburg1", Intrinsics(517.3, 516.5, 318.6, 255.3)),
-    _PublishedCamera("TUM", r"freiburg2", Intrinsics(520.9, 521.0, 325.1, 249.7)),
-    _PublishedCamera("TUM", r"freiburg3", Intrinsics(535.4, 539.2, 320.1, 247.6)),
+    _Benchmark("TUM", r"freiburg1", Intrinsics(517.3, 516.5, 318.6, 255.3), "TUM freiburg1"),
+    _Benchmark("TUM", r"freiburg2", Intrinsics(520.9, 521.0, 325.1, 249.7), "TUM freiburg2"),
+    _Benchmark("TUM", r"freiburg3", Intrinsics(535.4, 539.2, 320.1, 247.6), "TUM freiburg3"),
 )
-_UNKNOWN = _PublishedCamera("TUM", "", Intrinsics(525.0, 525.0, 319.5, 239.5))  # the benchmark's ROS default
 
 
 def recognises(path: Path) -> bool:
@@ -69,9 +68,9 @@ class TUM(DepthImages):
         path: folder with `depth.txt` or `associations.txt`.
         trajectory: default `groundtruth.txt` in the folder, or in a sibling `*_Trajectory` folder (CoRBS);
             or `*.gt.freiburg` in the folder, or beside it under ICL-NUIM's own name.
-        intrinsics: default `camera-intrinsics.txt` or `K.txt` in the folder; else by the folder's name
-            (freiburg1-3, CoRBS, ICL-NUIM, scaled to the image size); else the benchmark's ROS default.
-        depth_scale: metres per unit.
+        intrinsics, calibration: default a file of the camera in the folder (`cameras.FILES`); else the
+            benchmark's, by the folder's name (freiburg1-3, CoRBS, ICL-NUIM), at 640×480 alone.
+        depth_scale: metres per unit; default 1/5000, and 1 for floats.
         max_difference_s: between a depth image and its colour image, seconds.
         max_gap_s: between the two poses interpolated, seconds; across a longer gap there is no pose.
         time_offset_s: added to an image's stamp before its pose is looked up, seconds.
@@ -87,7 +86,8 @@ class TUM(DepthImages):
         *,
         trajectory: str | Path | None = None,
         intrinsics: Intrinsics | None = None,
-        depth_scale: float = DEPTH_SCALE,
+        calibration: str | Path | None = None,
+        depth_scale: float | None = None,
         max_difference_s: float = 0.02,
         max_gap_s: float = 0.1,
         time_offset_s: float = 0.0,
@@ -97,7 +97,7 @@ class TUM(DepthImages):
     ) -> None:
         root = require_folder(path, "TUM RGB-D")
         listed = read_recording(root, max_difference_ns=round(max_difference_s * 1e9))
-        camera = _published_camera(root, listed.windows)
+        benchmark = _benchmark(root)
         skipped: dict[str, int] = {}
         poses = _poses_at(
             listed.timestamps_ns,
@@ -110,17 +110,21 @@ class TUM(DepthImages):
         )
         require_frames(len(chosen), root, EXPECTED, skipped)
         depth = [listed.depth[i] for i in chosen]
-        if intrinsics is None:
-            intrinsics = _intrinsics(root, camera, read_depth(depth[0]).shape)
+        camera = find_camera(
+            root, first_size(depth), intrinsics=intrinsics, calibration=calibration,
+            places=(root, depth[0].parent),
+            published=benchmark and PublishedCamera(benchmark.source, benchmark.intrinsics),
+        )  # fmt: skip
         super().__init__(
-            f"{camera.name} {root.name}",
-            sensor=sensor or camera.sensor,
+            f"{benchmark.name if benchmark else 'TUM'} {root.name}",
+            sensor=sensor or (benchmark.sensor if benchmark else "kinect"),
             depth=depth,
             color=[listed.color[i] for i in chosen] if color and listed.color else [],
             poses=poses,
-            intrinsics=checked_intrinsics(intrinsics, "intrinsics"),
+            camera=camera,
             skipped=skipped,
             depth_scale=depth_scale,
+            usual_scale=DEPTH_SCALE,
             timestamps_ns=np.array([listed.timestamps_ns[i] for i in chosen], dtype=np.int64),
         )
         self.uncolored = list(self._color).count(None)
@@ -171,24 +175,9 @@ def _icl(root: Path) -> list[Path]:
     return [*sorted(root.glob("[!.]*.gt.freiburg")), root.parent / f"{room}{number[1]}.gt.freiburg"]
 
 
-def _published_camera(root: Path, windows: bool) -> _PublishedCamera:
+def _benchmark(root: Path) -> _Benchmark | None:
     names = "/".join(root.resolve().parts[-2:]).lower()
-    for camera in _CAMERAS:
-        if re.search(camera.folder, names):
-            return camera
-    if any(root.glob("*.gt.*")):
-        return _ICL
-    return _CORBS if windows else _UNKNOWN
-
-
-def _intrinsics(root: Path, camera: _PublishedCamera, shape: tuple[int, ...]) -> Intrinsics:
-    for name in ("camera-intrinsics.txt", "K.txt"):
-        if (root / name).exists():
-            return read_intrinsics(root / name)
-    scale = shape[1] / CALIBRATED_SIZE[1]
-    if shape[0] / CALIBRATED_SIZE[0] != scale:
-        raise DatasetError(
-            f"{root} has depth images of {shape[1]}×{shape[0]}, but the {camera.name} camera is known for "
-            "640×480 only; expected that shape, or a 3×3 matrix in camera-intrinsics.txt"
-        )
-    return camera.intrinsics.scaled(scale)
+    for benchmark in _BENCHMARKS:
+        if re.search(benchmark.folder, names):
+            return benchmark
+    return _ICL if any(root.glob("*.gt.freiburg")) else None

@@ -21,7 +21,6 @@ class ImageList(NamedTuple):
     depth: list[Path]  # files of the depth images
     # As many files, None where none is near in time; empty where the recording has no colour
     color: list[Path | None]
-    windows: bool  # whether the paths were Windows paths
 
 
 def read_recording(root: Path, *, max_difference_ns: int) -> ImageList:
@@ -33,12 +32,12 @@ def read_recording(root: Path, *, max_difference_ns: int) -> ImageList:
     pairs = next((root / name for name in ASSOCIATIONS if (root / name).is_file()), None)
     if pairs is not None and not (root / "depth.txt").exists():
         return _read_pairs(pairs)
-    depth, windows = _read_list(root / "depth.txt")
+    depth = _read_list(root / "depth.txt")
     stamps, files = [stamp for stamp, _ in depth], [path for _, path in depth]
     if not (root / "rgb.txt").exists():
-        return ImageList(stamps, files, [], windows)
-    color = _nearest_images(_read_list(root / "rgb.txt")[0], stamps, max_difference_ns)
-    return ImageList(stamps, files, color, windows)
+        return ImageList(stamps, files, [])
+    color = _nearest_images(_read_list(root / "rgb.txt"), stamps, max_difference_ns)
+    return ImageList(stamps, files, color)
 
 
 def _nearest_images(
@@ -51,37 +50,33 @@ def _nearest_images(
     return [listed[i][1] if ok else None for i, ok in zip(nearest, near, strict=True)]
 
 
-def _read_list(path: Path) -> tuple[list[tuple[int, Path]], bool]:
-    """(timestamp_ns, image) in time order, and whether the paths were Windows paths."""
+def _read_list(path: Path) -> list[tuple[int, Path]]:
+    """(timestamp_ns, image) in time order."""
     content = "`timestamp path` a line"
     images: list[tuple[int, Path]] = []
-    windows = False
     for number, line in read_lines(path, content):
         words = line.split(maxsplit=1)
         if len(words) != 2:
             raise DatasetError(f"{path}:{number}: {line!r}; expected {content}")
-        windows |= "\\" in words[1]
         images.append((nanoseconds(words[0], path, number), _beside(path, words[1])))
     _check(path, [image for _, image in images], content)
-    return sorted(images), windows
+    return sorted(images)
 
 
 def _read_pairs(path: Path) -> ImageList:
     """`stamp path stamp path` (ICL-NUIM, TUM's `associate.py`); `depth` in a path tells which it is."""
     content = "`timestamp depth/… timestamp rgb/…` a line, in either order"
     rows: list[tuple[int, Path, Path]] = []
-    windows = False
     for number, line in read_lines(path, content):
         words = line.split()
         if len(words) != 4 or ("depth" in words[1].lower()) == ("depth" in words[3].lower()):
             raise DatasetError(f"{path}:{number}: {line!r}; expected {content}")
         depth, color = (0, 2) if "depth" in words[1].lower() else (2, 0)
-        windows |= "\\" in line
         stamp = nanoseconds(words[depth], path, number)
         rows.append((stamp, _beside(path, words[depth + 1]), _beside(path, words[color + 1])))
     _check(path, [file for row in rows for file in row[1:]], content)
     rows.sort()
-    return ImageList([row[0] for row in rows], [row[1] for row in rows], [row[2] for row in rows], windows)
+    return ImageList([row[0] for row in rows], [row[1] for row in rows], [row[2] for row in rows])
 
 
 def _beside(path: Path, listed: str) -> Path:

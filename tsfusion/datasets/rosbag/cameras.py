@@ -4,12 +4,14 @@
 import re
 from contextlib import suppress
 from itertools import islice
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig
+from tsfusion.datasets.cameras import given_camera
 from tsfusion.datasets.readers import checked_intrinsics, intrinsics_of
 from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.messages import CAMERA, CameraInfo
@@ -17,11 +19,13 @@ from tsfusion.datasets.rosbag.reader import BagRecording, Message, Stream, frame
 from tsfusion.geometry import se3
 from tsfusion.geometry.calibration import Camera as Lens
 from tsfusion.geometry.calibration import Rectifier, StereoRig, Undistorter
+from tsfusion.geometry.calibration_files import read_rig
 from tsfusion.geometry.keyframe import Intrinsics
 
 _MAX_TRIED = 20  # messages
 _TRANSPORT = re.compile(r"/(compressed|compressedDepth)$")
 RECTIFIED = re.compile(r"rect")
+REGISTERED = re.compile(r"aligned|registered")
 _NO_COLOR = re.compile(r"infra|(^|[/_])ir([/_\d]|$)|fisheye|confidence", re.IGNORECASE)
 _UNDISTORTED = 1e-6  # largest coefficient of a camera without distortion
 _NO_TURN = 1e-6
@@ -71,6 +75,7 @@ class CameraView(NamedTuple):
 
     intrinsics: Intrinsics
     undistorter: Undistorter | None
+    source: str
 
 
 class CameraRig(NamedTuple):
@@ -79,6 +84,7 @@ class CameraRig(NamedTuple):
     intrinsics: Intrinsics
     baseline_fx: float
     rectifier: Rectifier | None
+    source: str
 
 
 class Cameras:
@@ -87,6 +93,7 @@ class Cameras:
     Args:
         info_topic: of all images; None = the one beside or above their topic, or the only one.
         intrinsics: of all images, instead of a CameraInfo's.
+        calibration: a camera's file, or a stereo camera's, instead of a CameraInfo's.
         rectified: whether images have been rectified already; None = by the topic's name.
     """
 
@@ -95,10 +102,11 @@ class Cameras:
         recording: BagRecording,
         info_topic: str | None,
         intrinsics: Intrinsics | None,
+        calibration: str | Path | None,
         rectified: bool | None,
     ) -> None:
         self._recording, self._info_topic = recording, info_topic
-        self._intrinsics, self._rectified = intrinsics, rectified
+        self._intrinsics, self._calibration, self._rectified = intrinsics, calibration, rectified
 
     def find(self, images: ImageTopic) -> CameraInfo | None:
         """The camera of a topic of images; None = there is no CameraInfo."""
@@ -111,7 +119,8 @@ class Cameras:
         found = self.find(images)
         if found is None:
             raise DatasetError(
-                f"{self._recording.path}: no CameraInfo of {images.stream.topic}: name one with info_topic; "
+                f"{self._recording.path}: no CameraInfo of {images.stream.topic}: name one with --option "
+                "info_topic=TOPIC, or give --intrinsics fx,fy,cx,cy or --calibration FILE; "
                 f"{self._recording.listing()}"
             )
         return found
@@ -126,7 +135,13 @@ class Cameras:
                 if name in found:
                     return found[name]
             place = place.rpartition("/")[0]
-        return next(iter(found.values())) if len(found) == 1 else None
+        return next((one for one in found.values() if len(found) == 1 and self._is_of(one, images)), None)
+
+    def _is_of(self, info: Stream, images: ImageTopic) -> bool:
+        """Whether the only CameraInfo may be that of some images: it names no other frame than theirs."""
+        message = self._recording.first(info)
+        frame = "" if message is None else frame_id(message)
+        return not frame or not images.frame or frame == images.frame or bool(REGISTERED.search(images.base))
 
     def view(self, images: ImageTopic) -> CameraView:
         """Find how some images become those of a pinhole camera.
@@ -134,25 +149,37 @@ class Cameras:
         Raises:
             DatasetError: the camera is missing, not calibrated, of another size, or of an unknown lens.
         """
-        if self._intrinsics is not None:
-            return CameraView(checked_intrinsics(self._intrinsics, "intrinsics"), None)
+        given = given_camera(images.size, intrinsics=self._intrinsics, calibration=self._calibration)
+        if given is not None:
+            return CameraView(given.intrinsics, given.undistorter, given.source)
+        return self._recorded_view(images)
+
+    def _recorded_view(self, images: ImageTopic) -> CameraView:
+        """As `view`, by the images' CameraInfo."""
         camera = self._checked(images)
+        source = self._source(images)
         if self._is_rectified(images):
-            return CameraView(self._pinhole(images, camera.P if camera.P[0, 0] else camera.K), None)
+            return CameraView(self._pinhole(images, camera.P if camera.P[0, 0] else camera.K), None, source)
         if np.abs(camera.D).max(initial=0) < _UNDISTORTED:
-            return CameraView(self._pinhole(images, camera.K), None)
+            return CameraView(self._pinhole(images, camera.K), None, source)
         undistorter = Undistorter(self._lens(images, camera))
-        return CameraView(undistorter.intrinsics, undistorter)
+        return CameraView(undistorter.intrinsics, undistorter, source)
+
+    def _source(self, images: ImageTopic) -> str:
+        stream = self._info_stream(images)
+        return "from CameraInfo" if stream is None else f"from {stream.topic}"
 
     def own_view(self, images: ImageTopic) -> CameraView | None:
         """The view of a camera that is not the depth's; None where it has no CameraInfo of its own."""
-        if self._intrinsics is not None or self._info_topic is not None:
+        stream = None if self._info_topic is not None else self._info_stream(images)
+        if stream is None or not _is_beside(stream.topic, images.base):
             return None
-        stream = self._info_stream(images)
-        return None if stream is None or not _is_beside(stream.topic, images.base) else self.view(images)
+        return self._recorded_view(images)
 
     def rig(self, left: ImageTopic, right: ImageTopic) -> CameraRig:
         """Find how a pair's images become those of two equal cameras with matching rows; raises as `view`."""
+        if self._calibration is not None:
+            return self._rig_of_file(left)
         cameras = [self._checked(one) for one in (left, right)]
         shift = cameras[0].P[0, 3] - cameras[1].P[0, 3]
         if not shift > 0:
@@ -161,10 +188,36 @@ class Cameras:
             )
         plain = all(np.abs(one.D).max(initial=0) < _UNDISTORTED and _turn(one) < _NO_TURN for one in cameras)
         if plain or (self._is_rectified(left) and self._is_rectified(right)):
-            return CameraRig(self._intrinsics or self._pinhole(left, cameras[0].P), float(shift), None)
+            recorded = self._pinhole(left, cameras[0].P)
+            if self._intrinsics is None:
+                return CameraRig(recorded, float(shift), None, self._source(left))
+            given = checked_intrinsics(self._intrinsics, "intrinsics")
+            return CameraRig(given, float(shift) * given.fx / recorded.fx, None, "as given")
+        if self._intrinsics is not None:
+            raise DatasetError(
+                f"{self._recording.path}: pairs that are not rectified need the --calibration of both, not "
+                "--intrinsics (rectified=True says that these images are)"
+            )
         lenses = [self._lens(one, camera) for one, camera in zip((left, right), cameras, strict=True)]
         rectifier = Rectifier(StereoRig(lenses[0], lenses[1], _right_of(*cameras)))
-        return CameraRig(rectifier.intrinsics, rectifier.baseline_fx, rectifier)
+        return CameraRig(rectifier.intrinsics, rectifier.baseline_fx, rectifier, self._source(left))
+
+    def _rig_of_file(self, left: ImageTopic) -> CameraRig:
+        """Rectification by a stereo camera's file that was given."""
+        assert self._calibration is not None
+        path = Path(self._calibration).expanduser()
+        try:
+            rectifier = Rectifier(read_rig(path))
+        except InvalidConfig as error:
+            raise DatasetError(f"{path}: {error}") from error
+        if rectifier.size != left.size:
+            raise DatasetError(
+                f"{path} is of images of {rectifier.size[1]}×{rectifier.size[0]}, {left.stream.topic} is "
+                f"{left.size[1]}×{left.size[0]}; expected the calibration of these images"
+            )
+        return CameraRig(
+            rectifier.intrinsics, rectifier.baseline_fx, rectifier, f"from the given {path.name}"
+        )
 
     def _is_rectified(self, images: ImageTopic) -> bool:
         return bool(RECTIFIED.search(images.base)) if self._rectified is None else self._rectified

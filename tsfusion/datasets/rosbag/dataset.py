@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import Frames, keep_posed, nearest_in_time, require_frames
+from tsfusion.datasets.depth_files import check_metres
 from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.messages import MILLIMETRES
 from tsfusion.datasets.rosbag.poses import PoseFinder, pose_streams
@@ -57,8 +59,10 @@ class Bag(Frames):
         pose_topic: default by type, as above.
         world_frame: default the root of the sensor's tree, or the frame of the pose topic.
         body_frame: the frame whose poses the pose topic holds; default its `child_frame_id`, or the sensor's.
-        intrinsics: instead of a CameraInfo's.
-        depth_scale: metres per unit of 16-bit depth; default 0.001 (REP 118), or as a RealSense recorded it.
+        intrinsics, calibration: of the depth camera instead of a CameraInfo's; of a stereo pair the
+            calibration of both cameras.
+        depth_scale: metres per unit; default of 16-bit depth 0.001 (REP 118), or as a RealSense recorded it,
+            and of floats 1.
         rectified: whether the images are rectified, so that `P` is theirs; default where the topic's name
             has `rect`. Others are undistorted or rectified here (colour by its depth's camera).
         max_difference_s: between a depth image and its colour (default 20 ms), or left and right (5 ms).
@@ -86,6 +90,7 @@ class Bag(Frames):
         world_frame: str | None = None,
         body_frame: str | None = None,
         intrinsics: Intrinsics | None = None,
+        calibration: str | Path | None = None,
         depth_scale: float | None = None,
         rectified: bool | None = None,
         max_difference_s: float | None = None,
@@ -109,10 +114,17 @@ class Bag(Frames):
             "left_topic": left_topic,
             "right_topic": right_topic,
         }
-        chosen = TopicChooser(self._recording, topics, intrinsics=intrinsics, rectified=rectified).choose(
-            modality
-        )
+        chosen = TopicChooser(
+            self._recording, topics, intrinsics=intrinsics, calibration=calibration, rectified=rectified
+        ).choose(modality)
         self._chosen = chosen
+        if chosen.view is not None:
+            self.camera = RecordedCamera(
+                chosen.view.intrinsics, chosen.size, chosen.view.source, chosen.view.undistorter
+            )
+        elif chosen.rig is not None:
+            self.camera = RecordedCamera(chosen.rig.intrinsics, chosen.size, chosen.rig.source)
+        self._float_scale = depth_scale or 1.0
         self.name, self.sensor, self.skipped = f"ROS {path.name}", sensor or chosen.sensor, {}
         self._with_color = color
         self.depth_scale = depth_scale or recorded_scale(self._recording, chosen.main) or MILLIMETRES
@@ -255,6 +267,9 @@ class Bag(Frames):
         assert view is not None
         depth = messages.depth(content)
         self._chosen.check_size(self._chosen.main, depth.shape)
+        if depth.dtype == np.float32:
+            depth = depth * np.float32(self._float_scale)
+            check_metres(depth, "has floats")
         color = None if beside is None else messages.color(beside)
         color_view = view if self._chosen.color_camera is None else self._chosen.color_camera.view
         if view.undistorter is not None:

@@ -4,12 +4,14 @@
 import logging
 import re
 from itertools import takewhile
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.rosbag import messages
 from tsfusion.datasets.rosbag.cameras import (
     RECTIFIED,
+    REGISTERED,
     CameraRig,
     Cameras,
     CameraView,
@@ -28,7 +30,6 @@ _OF_MODALITY: dict[Modality, tuple[str, ...]] = {
     "stereo": ("left_topic", "right_topic"),
     "lidar": ("points_topic",),
 }
-_REGISTERED = re.compile(r"aligned|registered")
 _LEFT_OF = (("right", "left"), ("infra2", "infra1"), ("infra_2", "infra_1"), ("cam1", "cam0"),
             ("image_1", "image_0"), ("image_3", "image_2"), ("camera_1", "camera_0"))  # fmt: skip
 _SENSORS = (
@@ -71,7 +72,7 @@ class TopicChooser:
 
     Args:
         given: topics as `depth_topic`, `color_topic`, `info_topic`, …, as `Bag` names them; None = find it.
-        intrinsics: of all images, instead of a CameraInfo's.
+        intrinsics, calibration: of all images, instead of a CameraInfo's.
         rectified: whether images have been rectified already; None = by the topic's name.
     """
 
@@ -81,11 +82,13 @@ class TopicChooser:
         given: dict[str, str | None],
         *,
         intrinsics: Intrinsics | None,
+        calibration: str | Path | None,
         rectified: bool | None,
     ) -> None:
         self._recording, self._given = recording, given
         info = self._named("info_topic", (CAMERA,))
-        self._cameras = Cameras(recording, info and info.topic, intrinsics, rectified)
+        self._cameras = Cameras(recording, info and info.topic, intrinsics, calibration, rectified)
+        self._camera_given = intrinsics is not None or calibration is not None
         self._found: list[ImageTopic] | None = None
 
     def choose(self, modality: Modality | None) -> ChosenTopics:
@@ -141,7 +144,7 @@ class TopicChooser:
     def _depth(self) -> ChosenTopics | None:
         main = self._named_images("depth_topic") or self._only(
             [one for one in self._image_topics() if one.is_depth],
-            lambda one: (bool(_REGISTERED.search(one.base)), bool(RECTIFIED.search(one.base))),
+            lambda one: (bool(REGISTERED.search(one.base)), bool(RECTIFIED.search(one.base))),
             "depth_topic",
         )
         if main is None:
@@ -165,7 +168,7 @@ class TopicChooser:
         best = given or max(found, key=lambda one: _closeness(one, depth), default=None)
         if best is None:
             return None, None
-        fits = best.frame == depth.frame or bool(_REGISTERED.search(depth.base))
+        fits = best.frame == depth.frame or bool(REGISTERED.search(depth.base))
         if fits and best.size == depth.size:
             return best.stream, None
         if (view := self._cameras.own_view(best)) is not None:
@@ -228,6 +231,8 @@ class TopicChooser:
             stream = found[0] if found else None
         if stream is None:
             return None
+        if self._camera_given:
+            raise DatasetError(f"{self._path}: point clouds have no camera: leave out --intrinsics")
         first = self._recording.first(stream)
         if first is None:
             raise self._error(f"no point cloud of {stream.topic} can be read")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Layouts of watched folders: the files of a frame, whether they are complete, and the camera."""
+"""Layouts of watched folders: the files of a frame, and whether they are complete."""
 
 import re
 from dataclasses import dataclass
@@ -11,23 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
-from tsfusion.datasets.formats.image_folders import read_open3d_camera
-from tsfusion.datasets.readers import decode_image, read_intrinsics, read_numbers
-from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.datasets.readers import decode_image, read_numbers
 
 LayoutKind = Literal["depth", "pair", "points"]
 SortKey = tuple[tuple[int, Decimal, str], ...]
 
 EXPECTED = (
-    "depth/NAME.png with color/, rgb/, image/ or images/NAME.png|jpg; frame-*.depth.png with "
+    "depth/NAME.png|tiff|exr|npy with color/, rgb/, image/ or images/NAME.png|jpg; frame-*.depth.png with "
     "frame-*.color.png|jpg; left/ and right/NAME.png|jpg; NAME.bin, there or in velodyne/"
 )
-CAMERAS = ("camera-intrinsics.txt", "K.txt", "camera_intrinsic.json", "camera_intrinsics.json")
 COLOR = ("color", "rgb", "image", "images")
 
 _NOT_MEASURED = 65535  # 7-Scenes' value for pixels without depth
 _IMAGES = r"\.(?:png|jpe?g)"
-_ANY_IMAGE, _PNG, _SCAN = (re.compile(rf"([^.].*){ending}") for ending in (_IMAGES, r"\.png", r"\.bin"))
+_ENDINGS = (_IMAGES, r"\.(?:png|tiff?|exr|npy)", r"\.bin")
+_ANY_IMAGE, _DEPTH, _SCAN = (re.compile(rf"([^.].*){ending}") for ending in _ENDINGS)
 _FLAT_DEPTH, _FLAT_COLOR = re.compile(r"(frame-.+)\.depth\.png"), re.compile(rf"(frame-.+)\.color{_IMAGES}")
 _PNG_END, _JPEG_END = b"\0\0\0\0IEND\xaeB`\x82", b"\xff\xd9"
 _POINT = 16  # bytes: x, y, z and intensity in float32
@@ -61,7 +59,7 @@ def layout_of(root: Path) -> FolderLayout | None:
     if (root / "depth").is_dir():
         color = next((root / name for name in COLOR if (root / name).is_dir()), root / COLOR[0])
         return FolderLayout(
-            "depth", f"depth/NAME.png with {color.name}/NAME.png|jpg", (root / "depth", _PNG),
+            "depth", f"depth/NAME.png|tiff|exr|npy with {color.name}/NAME.png|jpg", (root / "depth", _DEPTH),
             (color, _ANY_IMAGE),
         )  # fmt: skip
     if (root / "left").is_dir() and (root / "right").is_dir():
@@ -114,20 +112,6 @@ def depth_of(image: NDArray[Any]) -> NDArray[Any]:
     if image.dtype == np.uint16:
         image[image == _NOT_MEASURED] = 0
     return image
-
-
-def camera_of(root: Path) -> Intrinsics | None:
-    """Read the intrinsics (`CAMERAS`) from the folder or its parent; None = not there (yet).
-
-    Raises:
-        DatasetError: the file is malformed or incomplete.
-    """
-    for place in (root, root.parent):
-        for name in CAMERAS:
-            path = place / name
-            if path.is_file():
-                return read_open3d_camera(path) if path.suffix == ".json" else read_intrinsics(path)
-    return None
 
 
 def baseline_of(root: Path) -> float | None:

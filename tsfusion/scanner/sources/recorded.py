@@ -26,6 +26,7 @@ class RecordedSource(LiveSource):
         self.skipped = dataset.skipped
         self.length = len(dataset)
         self._dataset, self._rate = dataset, rate
+        self.camera = str(getattr(dataset, "camera", None) or "")
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames with the recording's timestamps, or nominal ones where it has none."""
@@ -51,6 +52,11 @@ class LimitedSource(LiveSource):
         self.live, self.skipped = source.live, source.skipped
         self.length = None if source.length is None else min(source.length, limit)
         self._source, self._limit = source, limit
+
+    @property
+    def camera(self) -> str:  # type: ignore[override]
+        """The source's camera; a folder knows its own with the first frame."""
+        return getattr(self._source, "camera", "")
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield the source's frames, up to the limit."""

@@ -79,6 +79,7 @@ class LiveSource(ABC):
 
     live = True
     length: int | None = None
+    camera = ""  # intrinsics and where they came from, in one line; empty = its frames alone tell
 
     def __init__(self, name: str, sensor: str) -> None:
         self.name, self.sensor = name, sensor

@@ -9,11 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe, SourceError
-from tsfusion.geometry.calibration import Undistorter
-from tsfusion.geometry.calibration_files import read_camera
+from tsfusion.datasets.cameras import (
+    FILES,
+    RecordedCamera,
+    UnknownCamera,
+    camera_files,
+    described,
+    find_camera,
+)
+from tsfusion.datasets.depth_files import check_metres, read_depth
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources import folder_layouts, stereo_pairs
@@ -42,12 +50,12 @@ class WatchedFolder(LiveSource):
 
     Args:
         path: an existing folder; its layout and its camera may be written later.
-        intrinsics: default from the folder or its parent (`folder_layouts.CAMERAS`).
+        intrinsics: default from a file of the camera in the folder or its parent (`cameras.FILES`).
         calibration: a camera's file instead; for left/ and right/ a stereo camera's, as
             `stereo_pairs.read_rectifier` reads it, by default from the folder; without one the images are
             taken as rectified, with intrinsics and `baseline.txt`.
         baseline: metres, of rectified images in left/ and right/.
-        depth_scale: metres per unit.
+        depth_scale: metres per unit; default 0.001, and 1 for floats.
         idle: seconds; None = wait for ever.
         deadline: seconds to wait for an incomplete frame or a missing camera.
         poll: seconds between two listings of the folder, at least.
@@ -65,7 +73,7 @@ class WatchedFolder(LiveSource):
         intrinsics: Intrinsics | None = None,
         calibration: str | Path | None = None,
         baseline: float | None = None,
-        depth_scale: float = 0.001,
+        depth_scale: float | None = None,
         idle: float | None = None,
         deadline: float = 5.0,
         poll: float = 0.05,
@@ -77,16 +85,18 @@ class WatchedFolder(LiveSource):
         if calibration is not None and not Path(calibration).expanduser().exists():
             raise SourceError(f"calibration: {calibration} does not exist")
         self._root, self._layout = root, folder_layouts.layout_of(root)
+        self._places = (root, root.absolute().parent)  # where a file of the camera may lie
         super().__init__(f"folder {root.name}", "kinect")
         self._sensor = sensor
         self._name_sensor()
         self._intrinsics, self._calibration, self._baseline = intrinsics, calibration, baseline
-        self._depth_scale, self._idle, self._deadline, self._poll = depth_scale, idle, deadline, poll
+        self._depth_scale, self._float_scale = depth_scale or 0.001, depth_scale or 1.0
+        self._idle, self._deadline, self._poll = idle, deadline, poll
         self._opened_ns, self._stamp = time.time_ns(), 0
         self._handled: set[str] = set()  # names of first files
         self._last: folder_layouts.SortKey = ()
         self._colored: bool | None = None  # whether frames come with colour; None = not known yet
-        self._camera: Any = None  # Intrinsics, an Undistorter, or a PairRectifier
+        self._camera: Any = None  # a RecordedCamera or a PairRectifier
         self._begun: Any = None  # state of the incomplete frame's files
         self._since = time.monotonic()  # when something last changed
 
@@ -100,7 +110,7 @@ class WatchedFolder(LiveSource):
         else:
             wanted = f"no frames yet; waits for {self._layout.files}"
         if self._needs_camera():
-            wanted += f", and for a camera: {', '.join(folder_layouts.CAMERAS)} or --calibration FILE"
+            wanted += f", and for a camera: {FILES}, or --intrinsics or --calibration"
         ends = f"when a file {' or '.join(END_MARKERS)} appears there, or with Ctrl-C"
         if self._idle is not None:
             ends = f"after {self._idle:g} s without a new frame, {ends}"
@@ -113,7 +123,7 @@ class WatchedFolder(LiveSource):
         if self._layout is not None and self._layout.kind == "points":
             return False
         try:
-            return folder_layouts.camera_of(self._root) is None
+            return not any(camera_files(place) for place in self._places)
         except DatasetError:  # it may be half written
             return False
 
@@ -186,7 +196,9 @@ class WatchedFolder(LiveSource):
                     folder_layouts.whole_scan(first) if max(waited, written) > _SETTLED_S or final else None
                 ]
             else:
-                images = [_image(first, kind)] + ([] if second is None else [_image(second, "pair")])
+                settled = final or max(waited, time.time() - first.stat().st_mtime) > _SETTLED_S
+                images = [_depth(first, settled=settled) if kind == "depth" else _image(first, kind)]
+                images += [] if second is None else [_image(second, "pair")]
         except OSError:  # deleted meanwhile
             images = [None]
         if any(image is None for image in images):
@@ -232,44 +244,54 @@ class WatchedFolder(LiveSource):
 
     def _undistorted(self, depth: NDArray[Any], color: Any) -> tuple[NDArray[Any], Any, Intrinsics]:
         """Undistort depth and colour by the calibration; also return the intrinsics."""
+        if depth.shape != self._camera.size:
+            raise InvalidKeyframe(f"depth has shape {depth.shape}, others {self._camera.size}")
+        if depth.dtype == np.float32:
+            depth = depth * np.float32(self._float_scale)
+            try:
+                check_metres(depth, self._root)
+            except DatasetError as error:  # so it is with all of them
+                raise SourceError(str(error)) from error
         if color is not None and color.ndim == 2:
             color = cv2.cvtColor(color, cv2.COLOR_GRAY2BGR)
-        if not isinstance(self._camera, Undistorter):
-            return depth, color, self._camera
-        color = None if color is None else self._camera.image(color)
+        color = None if color is None else self._camera.color(color)
         return self._camera.depth(depth), color, self._camera.intrinsics
 
-    def _find_camera(self, kind: str, image: NDArray[Any], *, final: bool) -> bool:
+    def _find_camera(self, kind: str, image: NDArray[np.generic], *, final: bool) -> bool:
         """Read the camera, for which the size of an image is needed; return whether it is there."""
         try:
             self._camera = self._pairs(image) if kind == "pair" else self._one_camera(image)
+        except UnknownCamera as error:
+            if final:
+                need = " (of a stereo camera FILE, or intrinsics and baseline.txt)" if kind == "pair" else ""
+                raise SourceError(f"{error}{need}") from error
         except DatasetError as error:  # it may be half written
             if final or self._calibration is not None:
                 raise SourceError(str(error)) from error
-        if self._camera is None and final:
-            need = " and baseline.txt, or a stereo camera's calibration" if kind == "pair" else ""
-            raise SourceError(
-                f"{self._root} has no camera: expected one of {', '.join(folder_layouts.CAMERAS)} in it"
-                f"{need} (or --calibration FILE)"
-            )
         return self._camera is not None
 
-    def _one_camera(self, image: NDArray[Any]) -> Intrinsics | Undistorter | None:
-        if self._calibration is None:
-            return self._intrinsics or folder_layouts.camera_of(self._root)
-        camera = read_camera(Path(self._calibration).expanduser(), size=(image.shape[0], image.shape[1]))
-        return camera.intrinsics if camera.model == "pinhole" else Undistorter(camera)
+    def _one_camera(self, image: NDArray[np.generic]) -> RecordedCamera:
+        found = find_camera(
+            self._root, image.shape, intrinsics=self._intrinsics, calibration=self._calibration,
+            places=self._places,
+        )  # fmt: skip
+        self.camera = str(found)
+        return found
 
-    def _pairs(self, image: NDArray[Any]) -> stereo_pairs.PairRectifier | None:
+    def _pairs(self, image: NDArray[np.generic]) -> stereo_pairs.PairRectifier:
         size = image.shape[0], image.shape[1]
         there = any(all((self._root / name).is_file() for name in names) for names in stereo_pairs.FILE_PAIRS)
         if self._calibration is not None or there:
-            return stereo_pairs.read_rectifier(self._calibration or self._root, size=size)
-        intrinsics = self._intrinsics or folder_layouts.camera_of(self._root)
+            rectifier = stereo_pairs.read_rectifier(self._calibration or self._root, size=size)
+            self.camera = f"{described(rectifier.intrinsics, size)}, rectified by its calibration"
+            return rectifier
+        camera = self._one_camera(image)
         baseline = self._baseline or folder_layouts.baseline_of(self._root)
-        if intrinsics is None or baseline is None:
-            return None
-        return stereo_pairs.AlreadyRectified(intrinsics, baseline, size)
+        if baseline is None:
+            raise UnknownCamera(f"{self._root} has no baseline.txt (metres) of the rectified pairs")
+        if camera.undistorter is not None:
+            raise DatasetError(f"{self._root}: pairs need a stereo camera's --calibration, got {camera}")
+        return stereo_pairs.AlreadyRectified(camera.intrinsics, baseline, size)
 
     def _stamps(self, name: str, first: Path) -> tuple[int, int]:
         """`timestamp_ns`, which always grows, and `captured_ns`."""
@@ -285,6 +307,16 @@ class WatchedFolder(LiveSource):
 
 def _image(path: Path, kind: str) -> NDArray[Any] | None:
     return folder_layouts.whole_image(path, cv2.IMREAD_UNCHANGED if kind == "depth" else cv2.IMREAD_ANYCOLOR)
+
+
+def _depth(path: Path, *, settled: bool) -> NDArray[Any] | None:
+    """Depth of any kind; None while it is incomplete, or if it is damaged."""
+    if path.suffix == ".png":
+        return _image(path, "depth")
+    try:
+        return read_depth(path) if settled else None  # these kinds have no mark at their end
+    except DatasetError:
+        return None
 
 
 def _state(path: Path | None) -> tuple[int, int] | None:

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: MIT
+"""Depth images of every kind, and what is none; nothing of it is printed by OpenCV or libpng."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from small_recordings import one_line, put, redwood
+from written_recordings import check, matrix, millimetres, views, write
+
+from tsfusion.core.errors import DatasetError, MissingDependency
+from tsfusion.datasets import open_dataset
+from tsfusion.datasets.depth_files import check_metres, read_depth
+from tsfusion.evaluation.view_prediction import depth_metres
+
+
+def save(path: Path, depth: np.ndarray) -> None:
+    """Depth in a file of any kind."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".npy":
+        np.save(path, depth)
+    elif path.suffix == ".exr":
+        exr = pytest.importorskip("OpenEXR")
+        kind = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+        name = "RGB" if depth.ndim == 3 else "Z"
+        exr.File(kind, {name: depth.astype(np.float32)}).write(str(path))
+    else:
+        assert cv2.imwrite(str(path), depth)
+
+
+def room(root: Path, suffix: str, units: float | None, *, dtype: type = np.float32) -> Path:
+    """A Redwood-like recording of the room; depth in `units` a metre, None = uint16 millimetres."""
+    log, K = "", views()[0].intrinsics
+    for number, view in enumerate(views()):
+        depth = millimetres(view) if units is None else (depth_metres(view) * units).astype(dtype)
+        save(root / "depth" / f"{number:05d}{suffix}", depth)
+        write(root / "color" / f"{number:05d}.png", view.color)
+        log += f"{number} {number} {number + 1}\n{matrix(view.T_world_camera)}"
+    (root / "trajectory.log").write_text(log)
+    (root / "K.txt").write_text(matrix(K.matrix))
+    return root
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff", ".npy", ".pgm"])
+def test_sixteen_bits_of_any_kind(tmp_path, suffix):
+    check(open_dataset(room(tmp_path, suffix, None)), views())
+
+
+@pytest.mark.parametrize(
+    ("suffix", "dtype"),
+    [(".tiff", np.float32), (".exr", np.float32), (".npy", np.float32), (".npy", np.float64)],
+)
+def test_floats_are_metres(tmp_path, suffix, dtype):
+    dataset = open_dataset(room(tmp_path, suffix, 1.0, dtype=dtype))
+    check(dataset, views(), depth_m=1e-5)
+    assert dataset[0].depth.dtype == np.float32
+
+
+def test_tum_lists_name_floats_too(tmp_path):
+    for name, suffix in (("depth", ".npy"), ("rgb", ".png")):
+        (tmp_path / f"{name}.txt").write_text("".join(f"{n}.0 {name}/{n}{suffix}\n" for n in range(2)))
+    for number, view in enumerate(views(2)):
+        save(tmp_path / "depth" / f"{number}.npy", depth_metres(view))
+        write(tmp_path / "rgb" / f"{number}.png", view.color)
+    (tmp_path / "K.txt").write_text(matrix(views()[0].intrinsics.matrix))
+    dataset = open_dataset(tmp_path, posed=False)
+    np.testing.assert_allclose(dataset.frame(1).depth_m, depth_metres(views()[1]), atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".tiff", ".npy"])
+def test_floats_in_millimetres_are_an_error_until_their_unit_is_given(tmp_path, suffix):
+    root = room(tmp_path, suffix, 1000.0)
+    match = (
+        r"00000\.\w+: depth is expected in metres, .*: millimetres\? then give --option depth_scale=0\.001"
+    )
+    one_line(lambda: open_dataset(root)[0], match)
+    check(open_dataset(root, depth_scale=0.001), views(), depth_m=1e-5)
+    one_line(lambda: open_dataset(root, depth_scale=1e-6)[0], "then give --option depth_scale=1 ")
+
+
+def test_metres_of_a_hall_and_of_a_hand_are_no_mistakes():
+    for metres in (0.02, 0.5, 60.0):
+        check_metres(np.full((48, 64), metres, np.float32), "a file")
+    check_metres(np.full((48, 64), np.nan, np.float32), "a file")
+
+
+def test_depth_of_several_kinds_is_an_error(tmp_path):
+    root = room(tmp_path, ".npy", 1.0)
+    write(root / "depth" / "00000.png", np.zeros((120, 160, 3), np.uint8))  # to look at
+    one_line(lambda: open_dataset(root), r"depth holds files of \.npy and \.png; expected depth of one kind")
+    (root / "depth" / "00000.png").unlink()
+    np.save(root / "depth" / "00001.npy", np.ones((120, 160), np.uint16))
+    dataset = open_dataset(root)
+    assert dataset[0].depth.dtype == np.float32
+    one_line(lambda: dataset[1], r"00001\.npy holds uint16, others float32; expected one kind of depth")
+
+
+@pytest.mark.parametrize(
+    ("image", "match"),
+    [
+        (np.ones((6, 8), np.uint8), r"must hold one 16-bit channel or floats, .* \(was it saved again as 8"),
+        (np.ones((6, 8, 3), np.uint8), r"must hold one 16-bit channel or floats, got .*: a colour image"),
+        (np.ones((6, 8, 3), np.uint16), r"must hold one 16-bit channel or floats, got shape \(6, 8, 3\)"),
+    ],
+)
+def test_what_is_no_depth_is_named(tmp_path, image, match):
+    root = redwood(tmp_path, [0], [0])
+    write(root / "depth" / "00000.png", image)
+    one_line(lambda: open_dataset(root), match)
+
+
+def test_npy_and_grey_floats(tmp_path):
+    depth = np.random.default_rng(0).random((6, 8)).astype(np.float32)
+    save(tmp_path / "grey.npy", np.dstack([depth, depth, depth]))
+    save(tmp_path / "numbers.npy", (depth * 1000).astype(np.int64))
+    np.testing.assert_array_equal(read_depth(tmp_path / "grey.npy"), depth)
+    assert read_depth(tmp_path / "numbers.npy").dtype == np.uint16
+    save(tmp_path / "far.npy", np.full((6, 8), 70_000))
+    one_line(lambda: read_depth(tmp_path / "far.npy"), "must hold one 16-bit channel or floats, .* int64")
+    (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY")
+    one_line(lambda: read_depth(tmp_path / "bad.npy"), r"bad\.npy cannot be read")
+
+
+def test_exr_of_any_writer_and_without_its_package(tmp_path, monkeypatch):
+    pytest.importorskip("OpenEXR")
+    depth = np.random.default_rng(0).random((6, 8)).astype(np.float32)
+    save(tmp_path / "grey.exr", np.dstack([depth, depth, depth]))
+    np.testing.assert_array_equal(read_depth(tmp_path / "grey.exr"), depth)
+    (tmp_path / "bad.exr").write_bytes(b"no image")
+    one_line(lambda: read_depth(tmp_path / "bad.exr"), r"bad\.exr cannot be decoded; expected a depth image")
+    monkeypatch.setitem(__import__("sys").modules, "OpenEXR", None)
+    with pytest.raises(MissingDependency, match=r"pip install 'tsfusion\[exr\]'"):
+        read_depth(tmp_path / "grey.exr")
+
+
+def chunk(name: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+
+
+def test_nothing_is_printed_by_the_libraries_that_decode(tmp_path, capfd):
+    """An ICC profile that libpng does not like, a bit that fell over, a file that ends early."""
+    root = redwood(tmp_path, [0, 1, 2], [0, 1, 2])
+    files = [root / "depth" / f"0000{number}.png" for number in range(3)]
+    whole = files[0].read_bytes()
+    files[0].write_bytes(
+        whole[:33] + chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(b"x" * 50)) + whole[33:]
+    )
+    files[1].write_bytes(whole[:45] + bytes([whole[45] ^ 1]) + whole[46:])
+    files[2].write_bytes(whole[:-20])
+    dataset = open_dataset(root)
+    assert (dataset[0].depth == 1).all()
+    for index in (1, 2):
+        with pytest.raises(DatasetError, match=rf"{index}\.png cannot be decoded; expected a depth"):
+            dataset[index]
+    put("depth/00000.png", whole[:8] + chunk(b"IHDR", b""))(root)
+    one_line(lambda: dataset[0], "cannot be decoded")
+    assert capfd.readouterr() == ("", "")

@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: MIT
+"""The camera of a recording's depth images: as given, from a file of the recording, or as published.
+
+In this order, and never guessed: the camera that a benchmark publishes counts for the benchmark's own
+recordings (by their names) and its own image size alone.
+"""
+
+import os
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError, InvalidConfig
+from tsfusion.datasets.dataset import Dataset, frame_of
+from tsfusion.datasets.readers import checked_intrinsics
+from tsfusion.geometry.calibration import Camera, Size, Undistorter
+from tsfusion.geometry.calibration_files import read_camera
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.keyframe import Intrinsics
+
+FILES = (
+    "camera-intrinsics.txt, K.txt, intrinsics.txt, camera_intrinsic.json, camera.yaml, camera_info.yaml or "
+    "calibration.yaml"
+)
+GIVE = "give --intrinsics fx,fy,cx,cy or --calibration FILE"
+# File names in small letters, without separators
+_FILE = re.compile(
+    r"(?P<before>depth|colou?r|rgb)?(k|intrinsics?(matrix)?|calib(ration)?"
+    r"|cam(era)?0?(intrinsics?|matrix|info|param(eter)?s?|calib(ration)?|primesense)?)(?P<after>depth|colou?r|rgb)?"
+    r"\.(txt|json|ya?ml|xml)|(ost|sensor|camchain.*)\.ya?ml"
+)
+_EQUAL_PX, _EQUAL_SHARE = 0.5, 2e-3  # by which two files of one camera may differ: pixels, and of them
+
+
+class UnknownCamera(DatasetError):
+    """Nothing says what the camera of a recording is."""
+
+
+@dataclass(frozen=True)
+class PublishedCamera:
+    """The camera that a benchmark publishes for its recordings."""
+
+    name: str  # of the benchmark
+    intrinsics: Intrinsics
+    size: Size = (480, 640)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedCamera:
+    """The pinhole camera of a recording's depth images, and where it came from; `str` says both."""
+
+    intrinsics: Intrinsics  # of the images after `depth` and `color`
+    size: Size  # (height, width) of the depth images
+    source: str
+    undistorter: Undistorter | None = None
+
+    def __str__(self) -> str:
+        undistorted = "" if self.undistorter is None else ", undistorted"
+        return f"{described(self.intrinsics, self.size)}, {self.source}{undistorted}"
+
+    @property
+    def lens(self) -> Camera:
+        """The camera before its distortion is removed."""
+        return Camera(self.intrinsics, self.size) if self.undistorter is None else self.undistorter.camera
+
+    def depth(self, depth: NDArray[Any]) -> NDArray[Any]:
+        """Depth without the distortion of the lens: the nearest pixel's, 0 where the camera did not see."""
+        return depth if self.undistorter is None else self.undistorter.depth(depth)
+
+    def color(self, color: NDArray[Any]) -> NDArray[Any]:
+        """The colour of the same pixels."""
+        return color if self.undistorter is None else self.undistorter.image(color)
+
+
+def described(intrinsics: Intrinsics, size: Sequence[int]) -> str:
+    """Intrinsics and image size, such as `fx 585 fy 585 cx 320 cy 240, 640×480`."""
+    numbers = " ".join(f"{name} {getattr(intrinsics, name):.6g}" for name in ("fx", "fy", "cx", "cy"))
+    return f"{numbers}, {size[1]}×{size[0]}"
+
+
+def camera_line(dataset: Dataset, first: Frame | None = None) -> str:
+    """A dataset's camera in one line: its own description, else what its first frame says; empty = none."""
+    camera = getattr(dataset, "camera", None)
+    if isinstance(camera, RecordedCamera):
+        return str(camera)
+    first = frame_of(dataset, 0) if first is None else first
+    return "" if first.intrinsics is None else f"{described(first.intrinsics, first.shape)}, from its frames"
+
+
+def find_camera(
+    root: Path,
+    size: Sequence[int],
+    *,
+    intrinsics: Intrinsics | None = None,
+    calibration: str | Path | None = None,
+    places: Sequence[Path] = (),
+    files: Iterable[Path] = (),
+    published: PublishedCamera | None = None,
+) -> RecordedCamera:
+    """Find the camera of a recording's depth images.
+
+    A calibration of another image size is scaled where the shape is the same.
+
+    Args:
+        root: the recording's folder.
+        size: (height, width) of its depth images.
+        intrinsics: beat everything else.
+        calibration: a camera's file; beats those of the recording.
+        places: folders to look in for files of a camera, the first that has some counts; default `root`.
+        files: the layout's own files of the camera, before any others.
+        published: the benchmark's camera, if this is a recording of it.
+
+    Raises:
+        DatasetError: no camera, two that contradict each other, one of another image size.
+    """
+    height_width = int(size[0]), int(size[1])
+    given = given_camera(height_width, intrinsics=intrinsics, calibration=calibration)
+    if given is not None:
+        return given
+    found = next(filter(None, (camera_files(place) for place in places or (root,))), [])
+    recorded = _consistent([*files] or found, height_width, root)
+    if recorded is not None:
+        return recorded
+    if published is not None and published.size == height_width:
+        return RecordedCamera(published.intrinsics, height_width, f"published for {published.name}")
+    raise UnknownCamera(_unknown(root, height_width, published))
+
+
+def given_camera(
+    size: Size, *, intrinsics: Intrinsics | None, calibration: str | Path | None
+) -> RecordedCamera | None:
+    """The camera that somebody gave; None = nobody did. Raises as `find_camera`."""
+    if intrinsics is not None and calibration is not None:
+        raise DatasetError("intrinsics and calibration exclude each other: give one of them")
+    if intrinsics is not None:
+        checked = checked_intrinsics(intrinsics, "intrinsics")
+        _check_centre(checked, size, "intrinsics")
+        return RecordedCamera(checked, size, "as given")
+    if calibration is None:
+        return None
+    path = Path(calibration).expanduser()
+    return _fitted(read_camera(path, size=size), size, path, f"from the given {path.name}")
+
+
+def camera_files(place: Path) -> list[Path]:
+    """Files of a folder that hold its depth camera, by their names; a depth camera's own before others.
+
+    Raises:
+        DatasetError: there is one of the colour camera alone.
+    """
+    named: dict[str, list[Path]] = {"depth": [], "": [], "color": []}
+    for path in sorted(place.iterdir()) if place.is_dir() else []:
+        match = _FILE.fullmatch((re.sub(r"[-_. ]", "", path.stem) + path.suffix).lower())
+        if match is not None and not path.name.startswith(".") and path.is_file():
+            of = match["before"] or match["after"] or ""
+            named[of if of in ("depth", "") else "color"].append(path)
+    if named["color"] and not named["depth"] and not named[""]:
+        raise DatasetError(
+            f"{named['color'][0]} is of the colour camera, and the depth camera has no file; if depth is "
+            f"registered to colour give --calibration {named['color'][0]}, else the depth camera's "
+            "--intrinsics fx,fy,cx,cy"
+        )
+    return named["depth"] or named[""]
+
+
+def _consistent(files: Sequence[Path], size: Size, root: Path) -> RecordedCamera | None:
+    """The camera of several files: one with a lens's distortion, else the first."""
+    cameras = [(path, read_camera(path, size=size)) for path in files]
+    fitted = [_fitted(camera, size, path, f"from {os.path.relpath(path, root)}") for path, camera in cameras]
+    for (path, camera), other in zip(cameras[1:], cameras, strict=False):
+        if not _agree(camera, other[1], size):
+            pair = (other, (path, camera))
+            both = "; ".join(f"{file} says {described(each.intrinsics, each.size)}" for file, each in pair)
+            raise DatasetError(f"two cameras contradict each other: {both}; remove one file, or {GIVE}")
+    return next((one for one in fitted if one.undistorter is not None), fitted[0] if fitted else None)
+
+
+def _agree(one: Camera, other: Camera, size: Size) -> bool:
+    a, b = (
+        np.array([K.fx, K.fy, K.cx, K.cy])
+        for K in (each.intrinsics.scaled(size[1] / each.size[1]) for each in (one, other))
+    )
+    lenses = one.distortion == other.distortion or not one.distortion or not other.distortion
+    return lenses and bool((abs(a - b) <= _EQUAL_PX + _EQUAL_SHARE * abs(a)).all())
+
+
+def _fitted(camera: Camera, size: Size, path: Path, source: str) -> RecordedCamera:
+    """A file's camera for images of this size."""
+    if camera.size != size:
+        if camera.size[0] * size[1] != camera.size[1] * size[0]:
+            raise DatasetError(
+                f"{path} is the camera of images of {_shape(camera.size)}, but these are {_shape(size)}, of "
+                f"another shape; {GIVE} of these images"
+            )
+        source += f" scaled from {_shape(camera.size)}"
+        intrinsics = camera.intrinsics.scaled(size[1] / camera.size[1])
+        camera = Camera(intrinsics, size, camera.model, camera.distortion)
+    _check_centre(camera.intrinsics, size, path)
+    if camera.model == "pinhole":
+        return RecordedCamera(camera.intrinsics, size, source)
+    try:
+        undistorter = Undistorter(camera)
+    except InvalidConfig as error:
+        raise DatasetError(f"{path}: {error}") from error
+    return RecordedCamera(undistorter.intrinsics, size, source, undistorter)
+
+
+def _check_centre(intrinsics: Intrinsics, size: Size, source: object) -> None:
+    """Raise DatasetError for a principal point outside the images: the camera is of other ones."""
+    for name, side in (("cx", size[1]), ("cy", size[0])):
+        value = getattr(intrinsics, name)
+        if not -0.5 < value < side - 0.5:
+            raise DatasetError(
+                f"{source}: {name} {value:.6g} lies outside of the images, which are {_shape(size)}; "
+                "expected fx fy cx cy in pixels of these images (of another size, or in another order?)"
+            )
+
+
+def _unknown(root: Path, size: Size, published: PublishedCamera | None) -> str:
+    known = ""
+    if published is not None:
+        known = f" (that of {published.name} is published for {_shape(published.size)} alone)"
+    return f"{root}: the camera of these {_shape(size)} images is not known{known}: no {FILES}; {GIVE}"
+
+
+def _shape(size: Size) -> str:
+    return f"{size[1]}×{size[0]}"
