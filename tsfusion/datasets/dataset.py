@@ -50,6 +50,7 @@ class Frames(ABC):
     sensor: str
     timestamps_ns: NDArray[np.int64] | None = None
     skipped: dict[str, int]
+    quaternions: bool = False  # whether rotations were recorded as quaternions; else as matrices
     _poses: Sequence[NDArray[np.float64] | None] = ()
 
     @abstractmethod
@@ -106,6 +107,7 @@ class Selection(Frames):
     def __init__(self, dataset: Dataset, indices: Sequence[int]) -> None:
         self.name, self.sensor, self.skipped = dataset.name, dataset.sensor, dataset.skipped
         self._dataset, self._indices = dataset, list(indices)
+        self.quaternions = getattr(dataset, "quaternions", False)
         if hasattr(dataset, "distance"):
             self.distance = dataset.distance
         if dataset.timestamps_ns is not None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tsfusion.evaluation.fitted_factors import AS_GOOD, FittedFactor, fitted_focal_length, sure_gain, zoomed
+from tsfusion.evaluation.fitted_factors import AS_GOOD, MIN_FOCAL_SIGMA, FittedFactor, sure_gain, zoomed
 from tsfusion.evaluation.frame_pairs import Fits, FramePair, Motion, best_fits_near, fits_of, share_of_best
 from tsfusion.geometry.keyframe import Intrinsics
 
@@ -41,13 +41,27 @@ class CameraMistake:
     text: str
 
 
-def camera_doubt(K: Intrinsics | None, shape: tuple[int, ...]) -> str:
-    """Part of a sentence on a principal point far from the image's centre; empty without."""
+def centre_doubt(K: Intrinsics | None, shape: tuple[int, ...]) -> str | None:
+    """Sentence on a principal point far from the image's centre, with the likely reason; None without."""
     if K is None or not _off_centre(K, shape):
-        return ""
-    place = "outside" if _off_centre(K, shape, OUTSIDE) else "far from the centre of"
+        return None
+    place = "outside" if is_outside(K, shape) else "far from the centre of"
     found = f"the principal point ({K.cx:.5g}, {K.cy:.5g}) lies {place} the {_size(shape)} images: "
     return found + likely_cameras(K, shape)[0].text
+
+
+def is_outside(K: Intrinsics, shape: tuple[int, ...]) -> bool:
+    """Whether the principal point is at the image's border or beyond, which no camera's is."""
+    return _off_centre(K, shape, OUTSIDE)
+
+
+def centre_fits(pairs: Sequence[FramePair], motions: Sequence[Motion], given: Fits) -> bool:
+    """Whether a principal point far from the centre is confirmed: frames fit worse with the likely ones."""
+    view = pairs[0].first_view
+    if view.camera is None:
+        return True
+    likely = [_fits_with(each.camera, pairs, motions) for each in likely_cameras(view.camera, view.shape)]
+    return all(fits.mean() < given.mean() - AS_GOOD for fits in likely)
 
 
 def likely_cameras(K: Intrinsics, shape: tuple[int, ...]) -> list[CameraMistake]:
@@ -102,9 +116,13 @@ def _centred(K: Intrinsics, shape: tuple[int, ...]) -> CameraMistake:
 
 
 def best_camera(
-    pairs: Sequence[FramePair], motions: Sequence[Motion], given: Fits
+    pairs: Sequence[FramePair], motions: Sequence[Motion], given: Fits, focal: FittedFactor | None
 ) -> tuple[float, CameraMistake | None, Fits]:
-    """The camera with which frames surely fit better than as given: gain, camera, fits; or 0 and None."""
+    """The camera with which frames surely fit better than as given: gain, camera, fits; or 0 and None.
+
+    Args:
+        focal: the factor on the focal length that fits best; None where it was not searched for.
+    """
     view = pairs[0].first_view
     K = view.camera
     nothing: tuple[float, CameraMistake | None, Fits] = (0.0, None, given)
@@ -114,9 +132,8 @@ def best_camera(
     for mistake in likely_cameras(K, view.shape):
         fits = _fits_with(mistake.camera, pairs, motions)
         tried.append((sure_gain(fits, given), mistake, fits))
-    if not view.stereo:
-        found = fitted_focal_length(pairs, motions, given, K)
-        tried.append((found.gain, _focal_mistake(K, found), found.fits))
+    if focal is not None:
+        tried.append((focal.gain, _focal_mistake(K, focal), focal.fits))
     most = max(gain for gain, _, _ in tried)
     gain, camera, fits = next(
         each for each in tried if each[0] == most or each[0] > max(0, most - AS_GOOD / 2)
@@ -134,7 +151,7 @@ def _fits_with(camera: Intrinsics, pairs: Sequence[FramePair], motions: Sequence
 
 def _focal_mistake(K: Intrinsics, found: FittedFactor) -> CameraMistake:
     camera = zoomed(K, found.factor)
-    sigma = max(found.sigma, 0.005) * camera.fx
+    sigma = max(found.sigma, MIN_FOCAL_SIGMA) * camera.fx
     wrong = "wide" if found.factor > 1 else "narrow"
     text = (
         f"frames fit best with a focal length of about {camera.fx:.0f} ± {sigma:.0f} px, the camera used "

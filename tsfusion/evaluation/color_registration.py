@@ -161,13 +161,13 @@ def _agreement_by_shift(seen: list[Outlines], scale: float) -> NDArray[np.float3
 
 
 def _place_text(shift: tuple[int, int], scale: float) -> str:
-    parts = []
-    if scale != 1:
-        parts.append(f"as in an image about {abs(1 / scale - 1):.0%} {'larger' if scale < 1 else 'smaller'}")
     sides = ("right of", "left of"), ("below", "above")
-    parts += [
-        f"about {abs(pixels)} px {side[0] if pixels > 0 else side[1]} the depth's"
+    moved = [
+        f"{abs(pixels)} px {side[0] if pixels > 0 else side[1]}"
         for pixels, side in zip(shift, sides, strict=True)
         if pixels
     ]
-    return " and ".join(parts)
+    place = f"about {' and '.join(moved)} the depth's" if moved else "elsewhere than the depth's"
+    if scale == 1:
+        return place
+    return f"{place}, in an image about {abs(1 / scale - 1):.0%} {'larger' if scale < 1 else 'smaller'}"

@@ -27,6 +27,7 @@ AS_GOOD = 0.02  # difference of two fits that counts as none
 MIN_PAIRS = 3
 MIN_SCALE_ERROR = 0.05  # smaller errors are left to the sensors' calibration
 MIN_FOCAL_ERROR = 0.03
+MIN_FOCAL_SIGMA = 0.005  # of the focal length: what pixels and sensors allow
 MIN_SIGMAS = 3.0  # standard errors by which a factor must be off
 MIN_SURE_GAIN = 0.004
 MIN_EXPLAINED = 0.08  # share of the misfit that a factor must explain
@@ -38,7 +39,14 @@ FitsAt = Callable[[float], Fits]  # the fits of all pairs with a factor
 
 @dataclass(frozen=True, eq=False)
 class FittedFactor:
-    """A factor, its standard error (relative), the fits of the pairs with it, and the gain: 0 unless sure."""
+    """A factor that fits best.
+
+    Attributes:
+        factor: where the mean fit of the pairs is highest.
+        sigma: its standard error, relative; infinite where nothing shows it.
+        fits: the fits of the pairs with it.
+        gain: over the fits as given; 0 unless it is sure.
+    """
 
     factor: float
     sigma: float
@@ -67,9 +75,13 @@ def fitted_scale(
 
 
 def fitted_focal_length(
-    pairs: Sequence[FramePair], motions: Sequence[Motion], given: Fits, K: Intrinsics
-) -> FittedFactor:
-    """The factor on `fx` and `fy` that fits best."""
+    pairs: Sequence[FramePair], motions: Sequence[Motion], given: Fits
+) -> FittedFactor | None:
+    """The factor on `fx` and `fy` that fits best; None of a scan, or of stereo, whose depth it scales."""
+    view = pairs[0].first_view
+    K = view.camera
+    if K is None or view.stereo:
+        return None
     return _fitted(
         lambda factor: fits_of([pair.seen_by(zoomed(K, factor)) for pair in pairs], motions),
         WIDEST_FOCAL,
@@ -86,13 +98,14 @@ def zoomed(K: Intrinsics, factor: float) -> Intrinsics:
 
 def sure_gain(fits: Fits, given: Fits) -> float:
     """Mean gain over the pairs that are evidence; 0 unless it is large, or no accident of a few pairs."""
-    evidence = np.maximum(fits, given) >= MIN_FIT
+    evidence = (np.maximum(fits, given) >= MIN_FIT) & (np.minimum(fits, given) > 0)
     if evidence.sum() < MIN_PAIRS or fits[evidence].mean() < MIN_FIT:
         return mean_gain(fits, given)
     gains = (fits - given)[evidence]
-    accident = MIN_GAIN_SIGMAS * gains.std() / np.sqrt(len(gains))
-    least = max(MIN_SURE_GAIN, MIN_EXPLAINED * (1 - given[evidence].mean()), accident)
-    return float(gains.mean()) if gains.mean() > least else mean_gain(fits, given)
+    gain, error = float(gains.mean()), float(gains.std() / np.sqrt(len(gains)))
+    no_accident = gain > MIN_GAIN_SIGMAS * error or (gains > 0).all()
+    enough = gain > max(MIN_SURE_GAIN, MIN_EXPLAINED * float(1 - given[evidence].mean()))
+    return gain if no_accident and enough else mean_gain(fits, given)
 
 
 def _fitted(fits_at: FitsAt, widest: float, steps: int, given: Fits, *, least: float) -> FittedFactor:
@@ -103,8 +116,10 @@ def _fitted(fits_at: FitsAt, widest: float, steps: int, given: Fits, *, least: f
     # A pair that overlaps too little with one factor and not with the next would make the curve jump.
     smooth = (curves.min(axis=0) > 0) & (curves.max(axis=0) >= MIN_FIT)
     log, sigma = _peak_and_error(logs, curves[:, smooth] if smooth.any() else curves)
+    if smooth.sum() < MIN_PAIRS or not logs[0] < log < logs[-1]:
+        sigma = float("inf")
     fits = fits_at(float(np.exp(log)))
-    off = smooth.sum() >= MIN_PAIRS and abs(log) > max(least, MIN_SIGMAS * sigma)
+    off = abs(log) > max(least, MIN_SIGMAS * sigma)
     return FittedFactor(
         float(np.exp(log)), sigma, fits, sure_gain(fits, given) if off else mean_gain(fits, given)
     )

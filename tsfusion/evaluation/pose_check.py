@@ -17,10 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.datasets.dataset import Dataset, pose_of
-from tsfusion.evaluation.camera_check import CameraMistake, best_camera, camera_doubt
+from tsfusion.evaluation.camera_check import (
+    CameraMistake,
+    best_camera,
+    centre_doubt,
+    centre_fits,
+    is_outside,
+    likely_cameras,
+)
 from tsfusion.evaluation.color_registration import misplaced_color
 from tsfusion.evaluation.depth_units import unusable_depth
-from tsfusion.evaluation.fitted_factors import AS_GOOD, FittedFactor, fitted_scale
+from tsfusion.evaluation.fitted_factors import (
+    AS_GOOD,
+    MIN_FOCAL_SIGMA,
+    FittedFactor,
+    fitted_focal_length,
+    fitted_scale,
+)
 from tsfusion.evaluation.frame_pairs import (
     MIN_FIT,
     Fits,
@@ -52,6 +65,7 @@ Verdict = Literal["agree", "disagree", "cannot tell"]
 MIN_LEAD = 0.05  # by which the poses must fit better than the median mistake, or nobody can tell
 MIN_EVIDENCE = 0.2  # share of the pairs that must fit, or nobody can tell
 MIN_UNEXPLAINED_PAIRS = 2  # which small corrections make fit
+MAX_FOCAL_SIGMA = 0.1  # of the focal length, beyond which nobody can tell it
 MIN_SHARE_OF_BEST = 0.8  # fit over the best fit near it: less is a disagreement
 TIME_SHIFT_BELOW = 0.97  # share of the best fit below which shifted times are tried
 MAX_SHIFT = 8  # frames, early or late
@@ -59,7 +73,7 @@ MIN_SHIFT_PAIRS = 2
 MIN_SHIFT_GAIN = 0.05
 MIN_SHIFT_SHARE = 0.7  # of the gain by small corrections
 AS_LIKELY = 0.8  # of the gain by the best explanation: another one is named too
-_DISAGREE = "poses and depth disagree"
+_DISAGREE, _CAMERA = "poses and depth disagree", "camera and depth disagree"
 _UNEXPLAINED = (
     f"{_DISAGREE}, and none of the usual mistakes explains it: small corrections make frames fit "
     "much better than the poses do; the poses may be wrong, of another sensor or body, or badly timed"
@@ -77,6 +91,8 @@ class PoseCheckReport:
     mistake: str | None = None
     alternatives: tuple[str, ...] = ()  # other mistakes whose correction fits as well
     camera: tuple[float, float, float, float] | None = None  # that fits, where it is wrong
+    # Focal length used, the one that fits best and its standard error, pixels; None where nobody can tell
+    focal_px: tuple[float, float, float] | None = None
     color: str | None = None  # how the colour lies off the depth; None where it does not, or nobody can tell
     factor: float | None = None  # for `scale`, what translations must be multiplied by
     shift: float | None = None  # for `time`, frames later whose pose each frame should have
@@ -97,15 +113,38 @@ def check(dataset: Dataset) -> PoseCheckReport:
     """
     wanted = wanted_pairs(len(dataset))
     frames = seen_frames(dataset, wanted)
-    first = next((frame for frame in frames.values() if frame.view is not None), None)
-    report = _of_depth(frames) or _of_fits(dataset, frames, pairs_of(frames, wanted))
-    doubt = "" if first is None or first.view is None else camera_doubt(first.view.camera, first.view.shape)
-    if doubt and report.verdict == "cannot tell":
-        report = replace(report, text=f"{report.text}; {doubt}")
+    pairs = pairs_of(frames, wanted)
+    report = _of_depth(frames) or _of_fits(dataset, frames, pairs)
+    if report.verdict != "disagree":
+        report = _with_doubt(report, frames, pairs)
     color = misplaced_color({index: frame.outlines for index, frame in frames.items()})
     if color is None:
         return report
-    return replace(report, color=color, text=f"{report.text}; {color}")
+    return replace(report, color=color, text=f"{report.text}; but {color}")
+
+
+def _with_doubt(
+    report: PoseCheckReport, frames: Mapping[int, SeenFrame], pairs: list[FramePair]
+) -> PoseCheckReport:
+    """The report with what is odd about the camera, where the frames do not confirm it."""
+    view = next((frame.view for frame in frames.values() if frame.view is not None), None)
+    doubt = None if view is None else centre_doubt(view.camera, view.shape)
+    if doubt is None or view is None or view.camera is None:
+        return report
+    motions = [pair.motion() for pair in pairs]
+    if pairs and centre_fits(pairs, motions, fits_of(pairs, motions)):
+        return report
+    if not is_outside(view.camera, view.shape):
+        return replace(report, text=f"{report.text}; but {doubt}")
+    likely = likely_cameras(view.camera, view.shape)[0]
+    return replace(
+        report,
+        verdict="disagree",
+        text=f"{_CAMERA}: {doubt}",
+        mistake=likely.name,
+        alternatives=(),
+        camera=msgspec.structs.astuple(likely.camera),
+    )
 
 
 def _of_depth(frames: Mapping[int, SeenFrame]) -> PoseCheckReport | None:
@@ -130,6 +169,7 @@ class _Comparison:
     motions: list[Motion]
     given: Fits
     best: Fits
+    focal: FittedFactor | None
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -143,13 +183,15 @@ def _of_fits(dataset: Dataset, frames: Mapping[int, SeenFrame], pairs: list[Fram
         text = f"no two frames with a pose and a measurement ({posed} of {len(frames)} looked at have a pose)"
         return PoseCheckReport("cannot tell", text)
     motions = [pair.motion() for pair in pairs]
+    given = fits_of(pairs, motions)
     seen = _Comparison(
         dataset,
         _content(dataset, next(frame for frame in frames.values() if frame.view is not None)),
         pairs,
         motions,
-        fits_of(pairs, motions),
+        given,
         best_fits_near(pairs, motions),
+        fitted_focal_length(pairs, motions, given),
     )
     corrected = {mistake.name: [pair.motion(mistake.intended) for pair in pairs] for mistake in MISTAKES}
     tried = {name: fits_of(pairs, moved) for name, moved in corrected.items()}
@@ -159,12 +201,21 @@ def _of_fits(dataset: Dataset, frames: Mapping[int, SeenFrame], pairs: list[Fram
         pairs=len(pairs),
         fit=mean_where(seen.given, seen.known),
         best_fit=mean_where(seen.best, seen.known),
+        focal_px=_focal_px(seen),
         tried={
             name: mean_where(fits, np.maximum(fits, seen.given) >= MIN_FIT)
             for name, fits in tried.items()
             if seen.content.holds(name) or name == report.mistake
         },
     )
+
+
+def _focal_px(seen: _Comparison) -> tuple[float, float, float] | None:
+    camera = seen.pairs[0].first_view.camera
+    if camera is None or seen.focal is None or seen.focal.sigma > MAX_FOCAL_SIGMA:
+        return None
+    fitted = camera.fx * seen.focal.factor
+    return round(camera.fx, 1), round(fitted, 1), round(fitted * max(seen.focal.sigma, MIN_FOCAL_SIGMA), 1)
 
 
 def _content(dataset: Dataset, frame: SeenFrame) -> Content:
@@ -184,7 +235,7 @@ def _disagreement(
     gains = {name: mean_gain(fits, given) for name, fits in tried.items()}
     gain = max(gains.values())
     scale = fitted_scale(pairs, seen.motions, given, usual=[factor for factor, _ in SCALES])
-    camera_gain, camera, fits = best_camera(pairs, seen.motions, given)
+    camera_gain, camera, fits = best_camera(pairs, seen.motions, given, seen.focal)
     if camera is not None and camera_gain > max(gain, scale.gain):
         return _camera_report(seen, camera, fits, scale)
     likely = [mistake for mistake in MISTAKES if gains[mistake.name] > gain - AS_GOOD]
@@ -216,7 +267,7 @@ def _camera_report(
     evidence = np.maximum(fits, scale.fits) >= MIN_FIT
     gain, other = ((each - seen.given)[evidence].mean() for each in (fits, scale.fits))
     either = other > AS_LIKELY * gain
-    text = f"camera and depth disagree: {camera.text}"
+    text = f"{_CAMERA}: {camera.text}"
     return PoseCheckReport(
         "disagree",
         text + (f"; or it is the scale: {scale_text(scale.factor, seen.content)}" if either else ""),
