@@ -221,7 +221,7 @@ def test_registered_color_is_no_matter(name: str, data: Data) -> None:
     ("change", "words"),
     [
         (moved(20, 0), "px right of"),
-        (moved(0, -16), "16 px above the depth's"),
+        (moved(0, -16), "px above the depth's"),
         (moved(0, 0, 1.08), "in an image about 9% larger"),
         (moved(0, 0, 0.92), "in an image about 7% smaller"),
     ],

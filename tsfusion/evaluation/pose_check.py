@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.datasets.dataset import Dataset, pose_of
+from tsfusion.datasets.dataset import Dataset
 from tsfusion.evaluation.camera_check import (
     CameraMistake,
     best_camera,
@@ -58,7 +58,7 @@ from tsfusion.evaluation.pose_mistakes import (
     not_ruled_out_text,
     scale_text,
 )
-from tsfusion.geometry.se3 import Transform
+from tsfusion.evaluation.time_shift import time_shift, time_text
 
 Verdict = Literal["agree", "disagree", "cannot tell"]
 
@@ -68,10 +68,6 @@ MIN_UNEXPLAINED_PAIRS = 2  # which small corrections make fit
 MAX_FOCAL_SIGMA = 0.1  # of the focal length, beyond which nobody can tell it
 MIN_SHARE_OF_BEST = 0.8  # fit over the best fit near it: less is a disagreement
 TIME_SHIFT_BELOW = 0.97  # share of the best fit below which shifted times are tried
-MAX_SHIFT = 8  # frames, early or late
-MIN_SHIFT_PAIRS = 2
-MIN_SHIFT_GAIN = 0.05
-MIN_SHIFT_SHARE = 0.7  # of the gain by small corrections
 AS_LIKELY = 0.8  # of the gain by the best explanation: another one is named too
 _DISAGREE, _CAMERA = "poses and depth disagree", "camera and depth disagree"
 _UNEXPLAINED = (
@@ -87,7 +83,8 @@ class PoseCheckReport:
     verdict: Verdict  # `disagree` only when it is sure
     text: str  # one or two sentences: what is wrong and what to do
     # What is wrong: a name in `MISTAKES`, `scale`, `time`, `depth unit`, of the camera (`focal length`,
-    # `image size`, `exchanged centre`, `principal point`, `exchanged focal lengths`) or `unexplained`
+    # `image size`, `exchanged centre`, `principal point`, `exchanged focal lengths`,
+    # `unequal focal lengths`) or `unexplained`; None when they agree
     mistake: str | None = None
     alternatives: tuple[str, ...] = ()  # other mistakes whose correction fits as well
     camera: tuple[float, float, float, float] | None = None  # that fits, where it is wrong
@@ -247,14 +244,17 @@ def _disagreement(
     if scale.gain > 0 and _cannot_improve(
         pairs, [scaled_motion(motion, scale.factor) for motion in seen.motions]
     ):
+        either = camera is not None and _as_likely(fits, scale.fits, given)
         return report(
-            f"{_DISAGREE}: {scale_text(scale.factor, seen.content)}",
+            f"{_DISAGREE}: {scale_text(scale.factor, seen.content)}"
+            + (f"; or it is the camera: {camera.text}" if camera is not None and either else ""),
             "scale",
+            (camera.name,) if camera is not None and either else (),
             factor=round(scale.factor, 4),
         )
     share = share_of_best(given, seen.best)
-    if share < TIME_SHIFT_BELOW and (late := _time_shift(seen)) is not None:
-        return report(_time_text(seen.dataset, late), "time", shift=late)
+    if share < TIME_SHIFT_BELOW and (late := time_shift(seen.dataset, pairs, seen.best)) is not None:
+        return report(f"{_DISAGREE}: {time_text(seen.dataset, late)}", "time", shift=late)
     if share < MIN_SHARE_OF_BEST and seen.known.sum() >= min(MIN_UNEXPLAINED_PAIRS, len(pairs)):
         return report(_UNEXPLAINED, "unexplained")
     return None
@@ -264,9 +264,7 @@ def _camera_report(
     seen: _Comparison, camera: CameraMistake, fits: Fits, scale: FittedFactor
 ) -> PoseCheckReport:
     """The report of a wrong camera; of the scale too where it explains the misfit about as well."""
-    evidence = np.maximum(fits, scale.fits) >= MIN_FIT
-    gain, other = ((each - seen.given)[evidence].mean() for each in (fits, scale.fits))
-    either = other > AS_LIKELY * gain
+    either = _as_likely(scale.fits, fits, seen.given)
     text = f"{_CAMERA}: {camera.text}"
     return PoseCheckReport(
         "disagree",
@@ -276,6 +274,12 @@ def _camera_report(
         factor=round(scale.factor, 4) if either else None,
         camera=msgspec.structs.astuple(camera.camera),
     )
+
+
+def _as_likely(other: Fits, best: Fits, given: Fits) -> bool:
+    """Whether other fits explain what was misfit about as well as the best ones do."""
+    evidence = np.maximum(other, best) >= MIN_FIT
+    return bool((other - given)[evidence].mean() > AS_LIKELY * (best - given)[evidence].mean())
 
 
 def _cannot_improve(pairs: Sequence[FramePair], motions: Sequence[Motion]) -> bool:
@@ -303,51 +307,3 @@ def _agreement(seen: _Comparison, tried: Mapping[str, Fits]) -> PoseCheckReport:
     equally_good = tuple(name for name, gain in gains.items() if gain > -AS_GOOD)
     text = "poses and depth agree" + not_ruled_out_text(equally_good)
     return PoseCheckReport("agree", text, alternatives=equally_good)
-
-
-def _time_shift(seen: _Comparison) -> int | None:
-    """How many frames later the poses fit clearly better; None where no shift does."""
-    pairs, dataset = seen.pairs, seen.dataset
-    gap = next((gap for gap in (4, 1) if any(p.second - p.first == gap for p in pairs)), None)
-    indices = [index for index, pair in enumerate(pairs) if pair.second - pair.first == gap][::2]
-    chosen, reachable = [pairs[index] for index in indices], seen.best[indices]
-    poses: dict[int, Transform | None] = {}
-
-    def pose(index: int) -> Transform | None:
-        if index not in poses:
-            poses[index] = pose_of(dataset, index) if 0 <= index < len(dataset) else None
-        return poses[index]
-
-    def fits(late: int) -> NDArray[np.float64]:
-        moved = [(pose(pair.first + late), pose(pair.second + late)) for pair in chosen]
-        return np.array(
-            [
-                np.nan if first is None or second is None else pair.fit(np.linalg.inv(second) @ first)
-                for pair, (first, second) in zip(chosen, moved, strict=True)
-            ]
-        )
-
-    given, found = fits(0), (0.0, 0)
-    for late in sorted(range(-MAX_SHIFT, MAX_SHIFT + 1), key=abs):
-        moved = fits(late)
-        known = np.isfinite(moved)
-        if known.sum() < MIN_SHIFT_PAIRS or moved[known].mean() < MIN_FIT:
-            continue
-        if (moved > given)[known].all():
-            gain, missing = (float((each - given)[known].mean()) for each in (moved, reachable))
-            if gain > max(MIN_SHIFT_GAIN, MIN_SHIFT_SHARE * missing):
-                found = max(found, (gain, late))
-    return found[1] or None
-
-
-def _time_text(dataset: Dataset, late: int) -> str:
-    shift = f"{abs(late)} frame{'s' if abs(late) > 1 else ''}"
-    stamps = dataset.timestamps_ns
-    if stamps is not None and len(stamps) > 1:
-        shift += f" ({abs(late) * float(np.median(np.diff(stamps))) / 1e6:.0f} ms)"
-    way = (
-        "late: each frame fits the pose of a later one"
-        if late > 0
-        else "early: each frame fits an earlier pose"
-    )
-    return f"{_DISAGREE}: the poses' times are about {shift} {way}; shift their time stamps"
