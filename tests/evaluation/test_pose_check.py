@@ -1,20 +1,18 @@
 # SPDX-License-Identifier: MIT
 """Genuine datasets pass the check; the usual mistakes are named, those that nobody could see are not."""
 
-import dataclasses
 import json
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.corrupted_recordings import FOLDERS, Corrupted, opened
 
 from tsfusion import cli
 from tsfusion.datasets import Dataset, Selection, Synthetic, open_dataset, select
-from tsfusion.datasets.dataset import Frames, frame_of
 from tsfusion.evaluation.pose_check import check
 from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
@@ -26,32 +24,6 @@ Data = Callable[[str], Path]
 MIRROR, OPENGL = np.diag([1.0, -1, 1, 1]), np.diag([1.0, -1, -1, 1])
 BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 OTHER_WORLD = se3.exp(np.array([0.3, 0.1, -0.2, 0.5, -1.2, 0.8]))
-
-
-class Corrupted(Frames):
-    """Another dataset with its poses changed, its frames changed, or poses of `late` frames before."""
-
-    def __init__(
-        self,
-        dataset: Dataset,
-        pose: Callable[[Transform], NDArray[np.float64]] = np.asarray,
-        frame: Callable[[Frame], dict[str, object]] = lambda _: {},
-        late: int = 0,
-    ) -> None:
-        self.name, self.sensor, self.skipped = dataset.name, dataset.sensor, {}
-        self.timestamps_ns = dataset.timestamps_ns
-        self._frame_of = cache(lambda index: frame_of(dataset, index))
-        self._pose, self._change, self._late, self._count = pose, frame, late, len(dataset)
-
-    def __len__(self) -> int:
-        return self._count - abs(self._late)
-
-    def _frame(self, index: int) -> Frame:
-        seen = self._frame_of(index + max(0, self._late))
-        posed = self._frame_of(index + max(0, -self._late))
-        fields = {field.name: getattr(seen, field.name) for field in dataclasses.fields(seen) if field.init}
-        changed = {"T_world_camera": self._pose(posed.T_world_camera), **self._change(seen)}
-        return Frame(**{**fields, **changed})
 
 
 def stretched(factor: float) -> Callable[[Transform], Transform]:
@@ -93,26 +65,12 @@ POSES: dict[str, tuple[Callable[[Transform], NDArray[np.float64]], str]] = {
     "quaternion xyzw": (reordered([1, 2, 3, 0]), "quaternion xyzw"),
     "conjugate": (transposed, "conjugate"),
 }
-FOLDERS = {
-    "7scenes": "7scenes/redkitchen",
-    "hololens": "hololens/000",
-    "redwood": "redwood_livingroom1",
-    "open3d": "open3d_rgbd",
-    "3dmatch": "3dmatch",
-    "icl": "icl_nuim_tum",
-}
 WHOLE = (
     "7scenes",
     "hololens",
     pytest.param("redwood", marks=pytest.mark.nightly),
     pytest.param("open3d", marks=pytest.mark.nightly),
 )
-
-
-@cache
-def opened(place: Path, **options: Any) -> Dataset:
-    """The dataset, each frame read once for all tests."""
-    return Corrupted(open_dataset(place, **options))
 
 
 @cache

@@ -25,9 +25,9 @@ def check(
     json: options.Json = False,
     help_all: verbs.HelpAll = None,
 ) -> None:
-    """Check that a dataset's poses and depth agree, and say what is wrong if not.
+    """Check that a dataset's poses, camera and depth agree, and say what is wrong if not.
 
-    Exit status 1 when they disagree.
+    Exit status 1 when they disagree; 0 when they agree, and when nobody can tell.
     """
     from tsfusion.cli import output
     from tsfusion.datasets.cameras import camera_line
@@ -45,6 +45,9 @@ def check(
         if report.fit is not None:
             typer.echo(f"{report.pairs} pairs of frames; fit as given {report.fit:.2f}, "
                        f"after small corrections {report.best_fit:.2f} (1 = exact)")  # fmt: skip
+            if report.focal_px is not None:
+                used, fitted, sigma = report.focal_px
+                typer.echo(f"focal length {used:.4g} px used, {fitted:.0f} ± {sigma:.0f} fits best")
             for name, fit in sorted(report.tried.items(), key=lambda item: -item[1]):
                 typer.echo(f"  if {name:<16} {fit:.2f}")
     if report.verdict == "disagree":

@@ -41,7 +41,10 @@ def replay(
     option: options.DatasetOptions = None,
     unpack: options.Unpack = False,
     check_: Annotated[
-        bool, options.option("--check/--no-check", None, "Warn when poses and depth disagree.", rare=True)
+        bool,
+        options.option(
+            "--check/--no-check", None, "Warn when poses, camera and depth disagree; status 1.", rare=True
+        ),
     ] = True,
     config: options.ConfigFile = None,
     json: options.RunJson = False,
@@ -62,8 +65,7 @@ def replay(
         dataset = select(dataset, start=start, stride=stride, limit=max_frames)
     for reason, count in dataset.skipped.items():
         typer.echo(f"left out {count} frames {reason}", err=True)
-    if check_ and not _is_synthetic(path):
-        _warn_of_disagreement(dataset)
+    wrong = _warn_of_disagreement(dataset) if check_ and not _is_synthetic(path) else None
     client = options.client_settings(
         chosen, connect, control=control, map=map_, key=key, server_key=server_key
     )
@@ -72,6 +74,9 @@ def replay(
         server=options.own_server(chosen, state), client=client, connect=connect, rate=rate,
         min_weight=settings["min_weight"],
     )  # fmt: skip
+    if wrong is not None:
+        typer.echo(f"the map is likely wrong: {wrong} (--no-check accepts it)", err=True)
+        raise typer.Exit(1)
 
 
 def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dataset":
@@ -104,13 +109,15 @@ def _is_synthetic(path: Path) -> bool:
     return str(path).startswith("synthetic:")
 
 
-def _warn_of_disagreement(dataset: "Dataset") -> None:
-    """Print a line on stderr when poses and depth disagree."""
+def _warn_of_disagreement(dataset: "Dataset") -> str | None:
+    """What is wrong where poses, camera and depth disagree, else None; printed on stderr, as colour is."""
     from tsfusion.evaluation import pose_check
 
     report = pose_check.check(dataset)
-    if report.verdict == "disagree":
-        typer.echo(f"warning: {report.text}", err=True)
+    wrong = report.text if report.verdict == "disagree" else None
+    if wrong is not None or report.color is not None:
+        typer.echo(f"warning: {wrong or report.color}", err=True)
+    return wrong
 
 
 @options.takes_map_settings

@@ -51,6 +51,7 @@ class Frames(ABC):
     camera: Any = None  # `cameras.RecordedCamera` of depth images; None = points
     timestamps_ns: NDArray[np.int64] | None = None
     skipped: dict[str, int]
+    quaternions: bool = False  # whether rotations were recorded as quaternions; else as matrices
     _poses: Sequence[NDArray[np.float64] | None] = ()
 
     @abstractmethod
@@ -108,6 +109,7 @@ class Selection(Frames):
         self.name, self.sensor, self.skipped = dataset.name, dataset.sensor, dataset.skipped
         self._dataset, self._indices = dataset, list(indices)
         self.camera = getattr(dataset, "camera", None)
+        self.quaternions = getattr(dataset, "quaternions", False)
         if hasattr(dataset, "distance"):
             self.distance = dataset.distance
         if dataset.timestamps_ns is not None:

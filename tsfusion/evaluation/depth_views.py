@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The surface that one frame measured, and the deviation of other frames' points from it."""
 
+from copy import copy
 from typing import Any, Protocol
 
 import cv2
@@ -31,14 +32,40 @@ EXACT_KD_TREE = 4  # FLANN_INDEX_KDTREE_SINGLE
 class DepthView(Protocol):
     """The surface that a frame measured."""
 
-    points: NDArray[np.float64]  # (n, 3) float64, a part of the measured points, in the sensor's axes, metres
-    range_m: float  # their median distance along the axis (of a scan: from the sensor)
+    @property
+    def points(self) -> NDArray[np.float64]:
+        """(n, 3) float64, a part of the measured points, in the sensor's axes, metres."""
+        ...
+
+    @property
+    def range_m(self) -> float:
+        """Their median distance along the axis (of a scan: from the sensor)."""
+        ...
+
+    @property
+    def camera(self) -> Intrinsics | None:
+        """Intrinsics of the image; None of a scan."""
+        ...
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(H, W) of the image, (N,) of a scan."""
+        ...
+
+    @property
+    def stereo(self) -> bool:
+        """Whether depth is proportional to the focal length."""
+        ...
 
     def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n,) distance of (n, 3) points from the measured surface, in units of the tolerance.
 
         Infinite where a point is out of view, or nothing was measured.
         """
+        ...
+
+    def seen_by(self, camera: Intrinsics) -> "DepthView":
+        """The surface if another camera had measured it; a scan is the same."""
         ...
 
 
@@ -73,19 +100,43 @@ def _stereo_view(frame: Frame) -> "_ImageView":
     baseline_fx = frame.baseline_fx * scale
     depth = np.zeros(disparity.shape, np.float32)
     np.divide(np.float32(baseline_fx), disparity, out=depth, where=disparity > 1)
-    return _ImageView(depth, frame.intrinsics.scaled(scale), baseline_fx)
+    return _ImageView(depth, frame.intrinsics, frame.baseline_fx, scale)
 
 
 class _ImageView:
-    """Depth of a pinhole camera."""
+    """Depth of a pinhole camera; of a stereo camera, the depth is proportional to its focal length."""
 
-    def __init__(self, depth_m: NDArray[np.float32], K: Intrinsics, baseline_fx: float | None) -> None:
-        self._depth, self._K = depth_m, K
-        self._disparity = 0.0 if baseline_fx is None else DISPARITY_TOLERANCE / baseline_fx
+    def __init__(
+        self,
+        depth_m: NDArray[np.float32],
+        camera: Intrinsics,
+        baseline_fx: float | None,
+        scale: float = 1.0,
+    ) -> None:
+        """Take depth in an image `scale` times the size of the one that `camera` and `baseline_fx` are of."""
+        self._depth, self._baseline_fx, self._scale = depth_m, baseline_fx, scale
+        self.stereo = baseline_fx is not None
+        self.shape = tuple(round(side / scale) for side in depth_m.shape)
         rows, columns = np.nonzero(_without_edges(depth_m))
         chosen = np.linspace(0, len(rows) - 1, min(MAX_POINTS, len(rows))).astype(np.intp)
-        rows, columns = rows[chosen], columns[chosen]
-        z = depth_m[rows, columns].astype(np.float64)
+        self._pixels = rows[chosen], columns[chosen]
+        self._take(camera)
+
+    def seen_by(self, camera: Intrinsics) -> "_ImageView":
+        other = copy(self)
+        if self._baseline_fx is not None:
+            factor = camera.fx * self._scale / self._K.fx
+            other._depth, other._baseline_fx = self._depth * np.float32(factor), self._baseline_fx * factor
+        other._take(camera)
+        return other
+
+    def _take(self, camera: Intrinsics) -> None:
+        self.camera: Intrinsics | None = camera
+        self._K = K = camera if self._scale == 1 else camera.scaled(self._scale)
+        fx_b = self._baseline_fx
+        self._disparity = 0.0 if fx_b is None else DISPARITY_TOLERANCE / (fx_b * self._scale)
+        rows, columns = self._pixels
+        z = self._depth[rows, columns].astype(np.float64)
         self.points = np.stack([(columns - K.cx) / K.fx * z, (rows - K.cy) / K.fy * z, z], axis=1)
         self.range_m = float(np.median(z)) if len(z) else 0.0
 
@@ -115,7 +166,11 @@ def _without_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
 class _ScanView:
     """Points of a LiDAR without the ground, which would fit itself under many wrong motions."""
 
+    camera: Intrinsics | None = None
+    stereo = False
+
     def __init__(self, points: NDArray[np.float32]) -> None:
+        self.shape = (len(points),)
         finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
         distance = np.linalg.norm(finite, axis=1)
         finite = finite[(distance > 1e-6) & (distance < MAX_DISTANCE)]
@@ -125,6 +180,10 @@ class _ScanView:
         self._tree = _kd_tree(kept) if len(kept) else None
         self._box = (kept.min(axis=0), kept.max(axis=0)) if len(kept) else (np.zeros(3), np.zeros(3))
         self.points = _evenly_chosen(kept, MAX_POINTS // 2)
+
+    def seen_by(self, camera: Intrinsics) -> "_ScanView":
+        del camera
+        return self
 
     def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         assert self._tree is not None

@@ -3,6 +3,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,19 +17,55 @@ _CAMERA_BODY = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0,
 
 
 @dataclass(frozen=True)
+class Content:
+    """What a dataset holds, as far as advice depends on it.
+
+    Attributes:
+        measures: what the sensor measures.
+        integer_depth: whether depth is in integers of some unit.
+        quaternions: whether the rotations were read as quaternions; else as matrices.
+        kitti: whether it is of KITTI.
+    """
+
+    measures: Literal["depth", "disparity", "points"] = "depth"
+    integer_depth: bool = True
+    quaternions: bool = False
+    kitti: bool = False
+
+    def holds(self, mistake: str) -> bool:
+        """Whether the dataset holds what a mistake is about."""
+        return self.quaternions or not mistake.startswith("quaternion")
+
+
+@dataclass(frozen=True)
 class Mistake:
     """One way to misread poses.
 
     Attributes:
         name: short, for programs.
-        text: what it is and what to do.
+        text: what it is and what to do, where the measurement is an image.
         intended: the intended pose of a given one, up to the choice of the world's axes; may be a reflection:
             only `inv(intended_j) @ intended_i`, a rigid motion, is used.
+        scan_text: the same where the measurement is of a LiDAR; None = `text`.
+        matrix_text: the same where the rotations are matrices; None = `text`.
+        kitti_text: ending for KITTI.
     """
 
     name: str
     text: str
     intended: Callable[[Transform], NDArray[np.float64]]
+    scan_text: str | None = None
+    matrix_text: str | None = None
+    kitti_text: str = ""
+
+    def text_for(self, content: Content) -> str:
+        """What it is and what to do, in words of what the dataset holds."""
+        text = self.text
+        if self.scan_text is not None and content.measures == "points":
+            text = self.scan_text
+        elif self.matrix_text is not None and not content.quaternions:
+            text = self.matrix_text
+        return text + (self.kitti_text if content.kitti else "")
 
 
 def _reordered_quaternion(order: list[int]) -> Callable[[Transform], Transform]:
@@ -53,30 +90,39 @@ MISTAKES: tuple[Mistake, ...] = (
         "inverse",
         "the poses are world-to-camera; camera-to-world is expected: invert each",
         _inverse,
+        scan_text="the poses are world-to-sensor; sensor-to-world is expected: invert each",
     ),
     Mistake(
         "opengl",
         "the poses are of a camera with OpenGL axes (y up, z back), not OpenCV's (y down, z forward): "
         "multiply each from the right by diag(1, -1, -1, 1)",
         lambda T: np.asarray(T @ _OPENGL),
+        scan_text="the poses are of a body whose y and z axes point the other way than the sensor's (z down, "
+        "not up): multiply each from the right by diag(1, -1, -1, 1)",
     ),
     Mistake(
         "inverse opengl",
         "the poses are world-to-camera and of a camera with OpenGL axes (a view matrix): invert each, then "
         "multiply from the right by diag(1, -1, -1, 1)",
         lambda T: np.asarray(_inverse(T) @ _OPENGL),
+        scan_text="the poses are world-to-sensor and of a body whose y and z axes point the other way than "
+        "the sensor's: invert each, then multiply from the right by diag(1, -1, -1, 1)",
     ),
     Mistake(
         "mirror",
-        "one of depth and poses is mirrored up-down: fy should have the other sign (ICL-NUIM's is negative), "
-        "or the poses are left-handed (Unity)",
+        "one of depth and poses is mirrored up-down: fy should have the other sign, or the poses are "
+        "left-handed (Unity)",
         lambda T: np.asarray(T @ _MIRROR),
+        scan_text="one of points and poses is mirrored: y should have the other sign, or the poses are "
+        "left-handed (Unity)",
     ),
     Mistake(
         "inverse mirror",
         "the poses are world-to-camera and mirrored up-down: invert each; fy should have the other sign, or "
         "they are left-handed (Unity)",
         lambda T: np.asarray(_inverse(T) @ _MIRROR),
+        scan_text="the poses are world-to-sensor and mirrored: invert each; y should have the other sign, or "
+        "they are left-handed (Unity)",
     ),
     Mistake(
         "body axes",
@@ -86,24 +132,32 @@ MISTAKES: tuple[Mistake, ...] = (
     ),
     Mistake(
         "camera axes",
-        "the poses are of a camera with z forward, the measurement of a sensor with x forward and z up: "
-        "multiply each pose from the right by the sensor's pose in the camera (KITTI: Tr)",
+        "a change from camera to body axes was made the wrong way round, or twice: multiply each pose from "
+        "the right by the body's axes in the camera",
         lambda T: np.asarray(T @ _CAMERA_BODY),
+        scan_text="the poses are of a camera with z forward, the measurement of a sensor with x forward and "
+        "z up: multiply each pose from the right by the sensor's pose in the camera",
+        kitti_text=" (Tr)",
     ),
     Mistake(
         "quaternion wxyz",
         "the quaternions are in the order w x y z and were read as x y z w: reorder them",
         _reordered_quaternion([1, 2, 3, 0]),
+        matrix_text="the rotation matrices were made from quaternions in the order w x y z as if it were "
+        "x y z w: make them again",
     ),
     Mistake(
         "quaternion xyzw",
         "the quaternions are in the order x y z w and were read as w x y z: reorder them",
         _reordered_quaternion([3, 0, 1, 2]),
+        matrix_text="the rotation matrices were made from quaternions in the order x y z w as if it were "
+        "w x y z: make them again",
     ),
     Mistake(
         "conjugate",
         "the rotations are transposed (conjugate quaternions), the translations are right: transpose them",
         _conjugated,
+        matrix_text="the rotations are transposed, the translations are right: transpose each 3×3 part",
     ),
 )
 
@@ -122,16 +176,29 @@ SCALES: tuple[tuple[float, str], ...] = (
 )
 
 
-def scale_text(factor: float) -> str:
+_DEPTH_UNITS = (0.1, 0.2, 1000 / 6553.5, 5.0, 6.5535, 10.0)  # factors that integers of another unit explain
+
+
+def scale_text(factor: float, content: Content) -> str:
     """Description of the mistake where translations must be multiplied by a factor, and what to do."""
     known = dict(SCALES)
-    if factor in known:
-        return f"poses and depth disagree: {known[factor]}"
+    units = content.measures == "depth" and content.integer_depth
+    if factor in known and (units or factor not in _DEPTH_UNITS):
+        text = known[factor]
+        return text if content.measures == "depth" else text.replace("depth", _MEASUREMENT[content.measures])
     size = f"{1 / factor:.3g} times too large" if factor < 1 else f"{factor:.3g} times too small"
+    where = {
+        "depth": "the depth scale" if content.integer_depth else "the unit of the depth",
+        "disparity": "the baseline, the intrinsics",
+        "points": "the unit of the points",
+    }[content.measures]
     return (
-        f"poses and depth disagree: the translations are {size} for the depth (no usual unit): check "
-        "the depth scale, the intrinsics and where the poses come from"
+        f"the translations are {size} for the {_MEASUREMENT[content.measures]} (no usual unit): check "
+        f"{where} and where the poses come from"
     )
+
+
+_MEASUREMENT = {"depth": "depth", "disparity": "stereo depth", "points": "range"}
 
 
 def alternatives_text(alternatives: tuple[str, ...]) -> str:

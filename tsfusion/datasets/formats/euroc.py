@@ -48,6 +48,8 @@ class EuRoC(Frames):
         DatasetError: no such folder, no pairs, a malformed line, a calibration that cannot be used.
     """
 
+    quaternions = True
+
     def __init__(
         self,
         path: str | Path,

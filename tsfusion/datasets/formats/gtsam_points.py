@@ -36,6 +36,8 @@ class LidarDump(Frames):
         DatasetError: no such folder, no clouds, a malformed line or file.
     """
 
+    quaternions = True
+
     def __init__(self, path: str | Path, *, sensor: str = "lidar", posed: bool = True) -> None:
         root = require_folder(path, "LiDAR keyframes")
         self.name, self.sensor, self.skipped = f"LiDAR keyframes {root.name}", sensor, {}

@@ -80,6 +80,8 @@ class TUM(DepthImages):
         DatasetError: no such folder, no frames, a listed image is missing, a malformed line.
     """
 
+    quaternions = True
+
     def __init__(
         self,
         path: str | Path,

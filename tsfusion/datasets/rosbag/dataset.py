@@ -75,6 +75,8 @@ class Bag(Frames):
         DatasetError: it cannot be read, or the topics cannot be chosen (the message lists them).
     """
 
+    quaternions = True
+
     def __init__(
         self,
         path: str | Path,

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: MIT
+"""Is it the camera? Poses are right, and the frames fit each other better with another camera's intrinsics.
+
+The points of a frame depend on the intrinsics, and so does where they fall in another frame. With poses that
+are right, frames fit best with the true focal length; it is searched for (of a stereo camera, it looks like
+another scale of the poses). Principal points far from the centre of the image have usual reasons (images of
+another size, numbers exchanged, a matrix transposed), which are tried.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tsfusion.evaluation.fitted_factors import AS_GOOD, MIN_FOCAL_SIGMA, FittedFactor, sure_gain, zoomed
+from tsfusion.evaluation.frame_pairs import Fits, FramePair, Motion, best_fits_near, fits_of, share_of_best
+from tsfusion.geometry.keyframe import Intrinsics
+
+MAX_OFF_CENTRE = 0.1  # of the image's side, from its centre: farther principal points are doubted
+MIN_RESIZED = 1.15  # factor between two sizes of an image below which they are the same
+SAME_FACTOR = 0.1  # difference of the factors of width and height that counts as none
+USUAL_SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 1.5, 2.0, 3.0, 4.0)
+UNEQUAL_FOCAL = 0.03  # difference of fx and fy, of fx, above which they may have been exchanged
+MIN_SHARE_OF_BEST = 0.8  # fit over the best fit near it, with the camera found
+OUTSIDE = 0.45  # of the image's side, from its centre: a principal point there belongs to another image
+GIVE = "check the intrinsics, or give --intrinsics fx,fy,cx,cy or --calibration FILE"
+
+
+@dataclass(frozen=True)
+class CameraMistake:
+    """Intrinsics that may be meant instead of those given.
+
+    Attributes:
+        name: short, for programs.
+        camera: the intrinsics meant.
+        text: what was wrong and what to do.
+    """
+
+    name: str
+    camera: Intrinsics
+    text: str
+
+
+def centre_doubt(K: Intrinsics | None, shape: tuple[int, ...]) -> str | None:
+    """Sentence on a principal point far from the image's centre, with the likely reason; None without."""
+    if K is None or not _off_centre(K, shape):
+        return None
+    place = "outside" if is_outside(K, shape) else "far from the centre of"
+    found = f"the principal point ({K.cx:.5g}, {K.cy:.5g}) lies {place} the {_size(shape)} images: "
+    return found + likely_cameras(K, shape)[0].text
+
+
+def is_outside(K: Intrinsics, shape: tuple[int, ...]) -> bool:
+    """Whether the principal point is at the image's border or beyond, which no camera's is."""
+    return _off_centre(K, shape, OUTSIDE)
+
+
+def centre_fits(pairs: Sequence[FramePair], motions: Sequence[Motion], given: Fits) -> bool:
+    """Whether a principal point far from the centre is confirmed: frames fit worse with the likely ones."""
+    view = pairs[0].first_view
+    if view.camera is None:
+        return True
+    likely = [_fits_with(each.camera, pairs, motions) for each in likely_cameras(view.camera, view.shape)]
+    return all(fits.mean() < given.mean() - AS_GOOD for fits in likely)
+
+
+def likely_cameras(K: Intrinsics, shape: tuple[int, ...]) -> list[CameraMistake]:
+    """The intrinsics that may be meant where the principal point is far from the centre, or fx is not fy."""
+    found: list[CameraMistake | None] = []
+    if _off_centre(K, shape):
+        found += [_of_other_size(K, shape), _exchanged_centre(K, shape), _centred(K, shape)]
+    if abs(abs(K.fy) / K.fx - 1) > UNEQUAL_FOCAL:
+        exchanged = Intrinsics(abs(K.fy), float(np.copysign(K.fx, K.fy)), K.cx, K.cy)
+        text = f"fx and fy are exchanged: give {_flag(exchanged)}"
+        found.append(CameraMistake("exchanged focal lengths", exchanged, text))
+        for focal in (K.fx, abs(K.fy)):
+            square = Intrinsics(focal, float(np.copysign(focal, K.fy)), K.cx, K.cy)
+            text = f"fx and fy differ, but frames fit best with {focal:.5g} for both: give {_flag(square)}"
+            found.append(CameraMistake("unequal focal lengths", square, text))
+    return [mistake for mistake in found if mistake is not None]
+
+
+def _of_other_size(K: Intrinsics, shape: tuple[int, ...]) -> CameraMistake | None:
+    """Intrinsics of a larger or smaller image, brought to this one by the factor that centres them."""
+    if K.cx <= 0 or K.cy <= 0:
+        return None
+    factors = shape[1] / (2 * K.cx + 1), shape[0] / (2 * K.cy + 1)
+    factor = float(np.sqrt(factors[0] * factors[1]))
+    if abs(factors[0] / factors[1] - 1) > SAME_FACTOR or max(factor, 1 / factor) < MIN_RESIZED:
+        return None
+    nearest = min(USUAL_SIZES, key=lambda usual: abs(np.log(usual / factor)))
+    factor = nearest if abs(nearest / factor - 1) < SAME_FACTOR else factor
+    old, meant = _size(tuple(round(side / factor) for side in shape)), K.scaled(factor)
+    text = (
+        f"the intrinsics are of {old} images, these are {_size(shape)}: multiply fx, fy, cx and cy by "
+        f"{factor:.4g}, or give {_flag(meant)}"
+    )
+    return CameraMistake("image size", meant, text)
+
+
+def _exchanged_centre(K: Intrinsics, shape: tuple[int, ...]) -> CameraMistake | None:
+    meant = Intrinsics(K.fx, K.fy, K.cy, K.cx)
+    if _off_centre(meant, shape):
+        return None
+    text = f"cx and cy are exchanged, or of the image turned by 90°: give {_flag(meant)}"
+    return CameraMistake("exchanged centre", meant, text)
+
+
+def _centred(K: Intrinsics, shape: tuple[int, ...]) -> CameraMistake:
+    meant = Intrinsics(K.fx, K.fy, (shape[1] - 1) / 2, (shape[0] - 1) / 2)
+    why = "cx and cy are wrong: frames fit with the centre of the image"
+    if K.cx == 0 and K.cy == 0:
+        why = "cx and cy are 0, as they are read from a camera matrix that is transposed (columns for rows)"
+    text = f"{why}; give {_flag(meant)}, or better the measured ones"
+    return CameraMistake("principal point", meant, text)
+
+
+def best_camera(
+    pairs: Sequence[FramePair], motions: Sequence[Motion], given: Fits, focal: FittedFactor | None
+) -> tuple[float, CameraMistake | None, Fits]:
+    """The camera with which frames surely fit better than as given: gain, camera, fits; or 0 and None.
+
+    Args:
+        focal: the factor on the focal length that fits best; None where it was not searched for.
+    """
+    view = pairs[0].first_view
+    K = view.camera
+    nothing: tuple[float, CameraMistake | None, Fits] = (0.0, None, given)
+    if K is None:
+        return nothing
+    tried = [nothing]
+    for mistake in likely_cameras(K, view.shape):
+        fits = _fits_with(mistake.camera, pairs, motions)
+        tried.append((sure_gain(fits, given), mistake, fits))
+    if focal is not None:
+        tried.append((focal.gain, _focal_mistake(K, focal), focal.fits))
+    most = max(gain for gain, _, _ in tried)
+    gain, camera, fits = next(
+        each for each in tried if each[0] == most or each[0] > max(0, most - AS_GOOD / 2)
+    )
+    if camera is None:
+        return nothing
+    seen = [pair.seen_by(camera.camera) for pair in pairs]
+    explained = share_of_best(fits, best_fits_near(seen, motions)) >= MIN_SHARE_OF_BEST
+    return (gain, camera, fits) if explained else nothing
+
+
+def _fits_with(camera: Intrinsics, pairs: Sequence[FramePair], motions: Sequence[Motion]) -> Fits:
+    return fits_of([pair.seen_by(camera) for pair in pairs], motions)
+
+
+def _focal_mistake(K: Intrinsics, found: FittedFactor) -> CameraMistake:
+    camera = zoomed(K, found.factor)
+    sigma = max(found.sigma, MIN_FOCAL_SIGMA) * camera.fx
+    wrong = "wide" if found.factor > 1 else "narrow"
+    text = (
+        f"frames fit best with a focal length of about {camera.fx:.0f} ± {sigma:.0f} px, the camera used "
+        f"says {K.fx:.4g}: everything comes out {abs(found.factor - 1):.0%} too {wrong}; {GIVE}"
+    )
+    return CameraMistake("focal length", camera, text)
+
+
+def _off_centre(K: Intrinsics, shape: tuple[int, ...], most: float = MAX_OFF_CENTRE) -> bool:
+    height, width = shape[:2]
+    return max(abs((K.cx + 0.5) / width - 0.5), abs((K.cy + 0.5) / height - 0.5)) > most
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return f"{shape[1]}×{shape[0]}"
+
+
+def _flag(K: Intrinsics) -> str:
+    return f"--intrinsics {K.fx:.5g},{K.fy:.5g},{K.cx:.5g},{K.cy:.5g}"

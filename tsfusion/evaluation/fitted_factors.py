@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: MIT
+"""The factors on translations and on the focal length with which frames fit each other best, and how sure."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.evaluation.frame_pairs import (
+    MIN_FIT,
+    Fits,
+    FramePair,
+    Motion,
+    fits_of,
+    mean_gain,
+    scaled_motion,
+)
+from tsfusion.geometry.keyframe import Intrinsics
+
+WIDEST_SCALE = np.log(12)  # logarithm of the largest factor tried beside the usual ones
+SCALE_STEPS = 61
+WIDEST_FOCAL = np.log(2.5)
+FOCAL_STEPS = 37
+FINE_STEPS = 21
+AS_GOOD = 0.02  # difference of two fits that counts as none
+MIN_PAIRS = 3
+MIN_SCALE_ERROR = 0.05  # smaller errors are left to the sensors' calibration
+MIN_FOCAL_ERROR = 0.03
+MIN_FOCAL_SIGMA = 0.005  # of the focal length: what pixels and sensors allow
+MIN_SIGMAS = 3.0  # standard errors by which a factor must be off
+MIN_SURE_GAIN = 0.004
+MIN_EXPLAINED = 0.08  # share of the misfit that a factor must explain
+MIN_GAIN_SIGMAS = 2.0
+
+Logs = NDArray[np.float64]
+FitsAt = Callable[[float], Fits]  # the fits of all pairs with a factor
+
+
+@dataclass(frozen=True, eq=False)
+class FittedFactor:
+    """A factor that fits best.
+
+    Attributes:
+        factor: where the mean fit of the pairs is highest.
+        sigma: its standard error, relative; infinite where nothing shows it.
+        fits: the fits of the pairs with it.
+        gain: over the fits as given; 0 unless it is sure.
+    """
+
+    factor: float
+    sigma: float
+    fits: Fits
+    gain: float
+
+
+def fitted_scale(
+    pairs: Sequence[FramePair], motions: Sequence[Motion], given: Fits, *, usual: Sequence[float]
+) -> FittedFactor:
+    """The factor on translations that fits best: a usual one if it is as good.
+
+    If poses without translations fit as well, nothing shows the scale: the gain is 0.
+    """
+
+    def fits_at(factor: float) -> Fits:
+        return fits_of(pairs, [scaled_motion(motion, factor) for motion in motions])
+
+    best_usual = max(((factor, fits_at(factor)) for factor in usual), key=lambda each: float(each[1].mean()))
+    found = _fitted(fits_at, WIDEST_SCALE, SCALE_STEPS, given, least=MIN_SCALE_ERROR)
+    if best_usual[1].mean() > found.fits.mean() - AS_GOOD:
+        found = FittedFactor(*best_usual[:1], 0.0, best_usual[1], mean_gain(best_usual[1], given))
+    if found.gain > MIN_SURE_GAIN and found.fits.mean() < fits_at(0.0).mean() + min(AS_GOOD, found.gain):
+        return FittedFactor(1.0, 0.0, given, 0.0)
+    return found
+
+
+def fitted_focal_length(
+    pairs: Sequence[FramePair], motions: Sequence[Motion], given: Fits
+) -> FittedFactor | None:
+    """The factor on `fx` and `fy` that fits best; None of a scan, or of stereo, whose depth it scales."""
+    view = pairs[0].first_view
+    K = view.camera
+    if K is None or view.stereo:
+        return None
+    return _fitted(
+        lambda factor: fits_of([pair.seen_by(zoomed(K, factor)) for pair in pairs], motions),
+        WIDEST_FOCAL,
+        FOCAL_STEPS,
+        given,
+        least=MIN_FOCAL_ERROR,
+    )
+
+
+def zoomed(K: Intrinsics, factor: float) -> Intrinsics:
+    """Intrinsics whose focal length is multiplied by a factor."""
+    return Intrinsics(K.fx * factor, K.fy * factor, K.cx, K.cy)
+
+
+def sure_gain(fits: Fits, given: Fits) -> float:
+    """Mean gain over the pairs that are evidence; 0 unless it is large, or no accident of a few pairs."""
+    evidence = (np.maximum(fits, given) >= MIN_FIT) & (np.minimum(fits, given) > 0)
+    if evidence.sum() < MIN_PAIRS or fits[evidence].mean() < MIN_FIT:
+        return mean_gain(fits, given)
+    gains = (fits - given)[evidence]
+    gain, error = float(gains.mean()), float(gains.std() / np.sqrt(len(gains)))
+    no_accident = gain > MIN_GAIN_SIGMAS * error or (gains > 0).all()
+    enough = gain > max(MIN_SURE_GAIN, MIN_EXPLAINED * float(1 - given[evidence].mean()))
+    return gain if no_accident and enough else mean_gain(fits, given)
+
+
+def _fitted(fits_at: FitsAt, widest: float, steps: int, given: Fits, *, least: float) -> FittedFactor:
+    coarse = np.linspace(-widest, widest, steps)
+    peak = coarse[int(np.argmax([fits_at(float(np.exp(log))).mean() for log in coarse]))]
+    logs = peak + np.linspace(-2, 2, FINE_STEPS) * (coarse[1] - coarse[0])
+    curves = np.array([fits_at(float(np.exp(log))) for log in logs])  # (steps, pairs)
+    # A pair that overlaps too little with one factor and not with the next would make the curve jump.
+    smooth = (curves.min(axis=0) > 0) & (curves.max(axis=0) >= MIN_FIT)
+    log, sigma = _peak_and_error(logs, curves[:, smooth] if smooth.any() else curves)
+    if smooth.sum() < MIN_PAIRS or not logs[0] < log < logs[-1]:
+        sigma = float("inf")
+    fits = fits_at(float(np.exp(log)))
+    off = abs(log) > max(least, MIN_SIGMAS * sigma)
+    return FittedFactor(
+        float(np.exp(log)), sigma, fits, sure_gain(fits, given) if off else mean_gain(fits, given)
+    )
+
+
+def _peak_and_error(logs: Logs, curves: NDArray[np.float64]) -> tuple[float, float]:
+    """Where the sum of the pairs' curves is highest, and its standard error by leaving out each pair once."""
+    total, count = curves.sum(axis=1), curves.shape[1]
+    left_out = np.array([_peak(logs, total - curve) for curve in curves.T])
+    error = np.sqrt((count - 1) / count * ((left_out - left_out.mean()) ** 2).sum())
+    return _peak(logs, total), float(error)
+
+
+def _peak(at: Logs, values: NDArray[np.float64]) -> float:
+    """Where a curve is highest, between its samples by a parabola."""
+    top = int(np.argmax(values))
+    if not 0 < top < len(at) - 1:
+        return float(at[top])
+    before, here, after = values[top - 1 : top + 2]
+    bend = before - 2 * here + after
+    return float(at[top] + (at[1] - at[0]) * (0.5 * (before - after) / bend if bend < 0 else 0.0))

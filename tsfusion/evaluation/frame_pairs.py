@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: MIT
+"""Pairs of a dataset's frames, and how well the points of the first lie on the surface of the second."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.datasets.dataset import Dataset, frame_of
+from tsfusion.evaluation.color_registration import Outlines, outlines
+from tsfusion.evaluation.depth_units import DepthUnit, depth_unit
+from tsfusion.evaluation.depth_views import DepthView, depth_view
+from tsfusion.geometry import se3
+from tsfusion.geometry.frame import FrameKind
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.se3 import Transform
+
+Motion = NDArray[np.float64]  # (4, 4), from the first frame of a pair to the second
+Fits = NDArray[np.float64]  # (pairs,), each 0 to 1
+
+FIRST_FRAMES = 5  # spread over the recording, each the first of some pairs
+PAIR_GAPS = (1, 4, 16)  # frames between the two of a pair
+MIN_COMPARED = 0.1  # share of the points that must fall on a measurement, or the fit is 0
+MIN_FIT = 0.5  # below this a pair is no evidence for a pose
+MIN_GAIN = 0.1  # by which a correction must fit better, on average
+MIN_BETTER = 0.7  # share of the pairs that must fit better
+FIRST_STEP = 0.03  # radians, and metres per metre of depth
+STEP_ROUNDS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class SeenFrame:
+    """What the check keeps of one frame.
+
+    Attributes:
+        kind: what the sensor measures.
+        depth: its unit, as far as the measurement shows it.
+        view: the measured surface; None when too little was measured.
+        outlines: edges of depth and image; None without both.
+    """
+
+    kind: FrameKind
+    depth: DepthUnit
+    T_world_camera: Transform | None
+    view: DepthView | None
+    outlines: Outlines | None
+
+
+@dataclass(frozen=True, eq=False)
+class FramePair:
+    """Two frames with a pose and a view each; `first` and `second` are their indices."""
+
+    first: int
+    second: int
+    poses: tuple[Transform, Transform]
+    first_view: DepthView
+    second_view: DepthView
+
+    def motion(self, intended: Callable[[Transform], Motion] = np.asarray) -> Motion:
+        """(4, 4) from the first frame's axes to the second's, by the intended poses."""
+        first, second = (intended(T) for T in self.poses)
+        return np.asarray(np.linalg.inv(second) @ first, np.float64)
+
+    def fit(self, motion: Motion) -> float:
+        """Fit of the first frame's points to the second's surface, 0 to 1; 0 if too few can be compared."""
+        deviation = self.second_view.deviation(se3.apply(motion, self.first_view.points))
+        compared = np.isfinite(deviation)
+        if compared.mean() < MIN_COMPARED:
+            return 0.0
+        return float(np.maximum(0, 1 - deviation[compared] ** 2).mean())
+
+    def seen_by(self, camera: Intrinsics) -> "FramePair":
+        """The pair if another camera had measured it."""
+        first, second = self.first_view.seen_by(camera), self.second_view.seen_by(camera)
+        return replace(self, first_view=first, second_view=second)
+
+
+def wanted_pairs(count: int) -> list[tuple[int, int]]:
+    """Indices of the frames of each pair of a dataset of `count` frames."""
+    last = max(0, count - 1 - min(PAIR_GAPS[-1], count // 2))
+    anchors = sorted({round(index) for index in np.linspace(0, last, FIRST_FRAMES)})
+    return [(first, first + gap) for first in anchors for gap in PAIR_GAPS if first + gap < count]
+
+
+def seen_frames(dataset: Dataset, wanted: Sequence[tuple[int, int]]) -> dict[int, SeenFrame]:
+    """The frames of some pairs by index, each read once.
+
+    Raises:
+        DatasetError: a frame cannot be read.
+    """
+    return {index: _seen(dataset, index) for index in sorted({i for pair in wanted for i in pair} or {0})}
+
+
+def _seen(dataset: Dataset, index: int) -> SeenFrame:
+    frame = frame_of(dataset, index)
+    view = depth_view(frame)
+    return SeenFrame(frame.kind, depth_unit(frame, view), frame.T_world_camera, view, outlines(frame))
+
+
+def pairs_of(frames: dict[int, SeenFrame], wanted: Sequence[tuple[int, int]]) -> list[FramePair]:
+    """The pairs whose frames both have a pose and a view."""
+    pairs = []
+    for i, j in wanted:
+        first, second = frames[i], frames[j]
+        if first.view is None or second.view is None:
+            continue
+        if first.T_world_camera is not None and second.T_world_camera is not None:
+            poses = first.T_world_camera, second.T_world_camera
+            pairs.append(FramePair(i, j, poses, first.view, second.view))
+    return pairs
+
+
+def fits_of(pairs: Sequence[FramePair], motions: Sequence[Motion]) -> Fits:
+    """The fit of each pair after its motion."""
+    return np.array([pair.fit(motion) for pair, motion in zip(pairs, motions, strict=True)])
+
+
+def mean_gain(fits: Fits, given: Fits) -> float:
+    """Mean by which fits are better than those given; 0 unless that is beyond doubt."""
+    evidence = np.maximum(fits, given) >= MIN_FIT
+    if not evidence.any() or fits[evidence].mean() < MIN_FIT or (fits > given)[evidence].mean() < MIN_BETTER:
+        return 0.0
+    gain = float((fits - given)[evidence].mean())
+    return gain if gain > MIN_GAIN else 0.0
+
+
+def mean_where(values: NDArray[np.float64], where: NDArray[np.bool_]) -> float:
+    """Mean of some values to three decimals; 0 without any."""
+    return round(float(values[where].mean()), 3) if where.any() else 0.0
+
+
+def scaled_motion(motion: Motion, factor: float) -> Motion:
+    """A motion whose translation is multiplied by a factor."""
+    stretched: Motion = np.array(motion)
+    stretched[:3, 3] *= factor
+    return stretched
+
+
+def best_fits_near(pairs: Sequence[FramePair], motions: Sequence[Motion]) -> Fits:
+    """The best fit of each pair that small corrections of its motion reach."""
+    return np.array([_best_fit_near(pair, motion) for pair, motion in zip(pairs, motions, strict=True)])
+
+
+def _best_fit_near(pair: FramePair, motion: Motion) -> float:
+    """The best fit that small corrections of a motion reach (hill climbing); 0 where it starts from 0."""
+    best = pair.fit(motion)
+    if best == 0:
+        return 0.0
+    steps = np.array([FIRST_STEP * pair.second_view.range_m] * 3 + [FIRST_STEP] * 3)
+    for _ in range(STEP_ROUNDS):
+        before = best
+        for axis in range(6):
+            for way in (1.0, -1.0):
+                moved = se3.exp(way * steps[axis] * np.eye(6)[axis]) @ motion
+                if (fit := pair.fit(moved)) > best:
+                    motion, best = moved, fit
+                    break
+        if best == before:
+            steps /= 2
+    return best
+
+
+def share_of_best(given: Fits, best: Fits) -> float:
+    """Fit as given over the best fit near it, over the pairs that are evidence; 1 without any."""
+    evidence = best >= MIN_FIT
+    return float(given[evidence].sum() / best[evidence].sum()) if evidence.any() else 1.0
