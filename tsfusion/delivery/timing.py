@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""When each of the last keyframes passed each stage, in memory of one size."""
+"""Times at both ends: of each keyframe at each stage, the rate at which the map takes them, two clocks."""
 
 from collections import deque
 
@@ -63,6 +63,55 @@ class KeyframeTimesTable:
 
     def _has(self, seq: int) -> bool:
         return bool(self._rows[seq % CAPACITY, 0] == seq)
+
+
+_RATE_SECONDS = 30.0  # over which the map's rate is measured
+_FEWEST_TAKEN = 8  # keyframes before there is a rate
+
+
+class TakingRate:
+    """Keyframes a second that the map takes, as far as that was seen.
+
+    Time counts from one answer of the map to the next, and only while keyframes wait for it: what a map that
+    waits could take, nobody knows.
+    """
+
+    def __init__(self) -> None:
+        self._samples: deque[tuple[float, int]] = deque()  # seconds, keyframes taken in them
+        self._seconds = 0.0
+        self._taken = 0
+        self._since: float | None = None  # the map's last answer; None = it had nothing to do since
+
+    def note(self, now: float, taken: int, *, is_more_waiting: bool) -> None:
+        """Note that the map took so many keyframes, and whether others wait."""
+        if self._since is not None:
+            self._samples.append((now - self._since, taken))
+            self._seconds += now - self._since
+            self._taken += taken
+            while self._is_without_oldest_enough():
+                seconds, count = self._samples.popleft()
+                self._seconds -= seconds
+                self._taken -= count
+        self._since = now if is_more_waiting else None
+
+    def _is_without_oldest_enough(self) -> bool:
+        seconds, taken = self._samples[0]
+        return self._seconds - seconds >= _RATE_SECONDS and self._taken - taken >= _FEWEST_TAKEN
+
+    def rest(self) -> None:
+        """Note that no keyframe waits any more, whatever became of the last."""
+        self._since = None
+
+    def forget(self) -> None:
+        """Begin anew: the link was down, and that is not the map's fault."""
+        self._samples.clear()
+        self._seconds, self._taken, self._since = 0.0, 0, None
+
+    @property
+    def per_second(self) -> float | None:
+        """The rate; None = not known."""
+        known = self._taken >= _FEWEST_TAKEN and self._seconds > 0
+        return self._taken / self._seconds if known else None
 
 
 SAMPLES = 16

@@ -22,7 +22,7 @@ OTHERS = "+"  # the label that all names beyond a limit share
 MAX_CLIENTS = 100
 RECENT = 30.0  # seconds; older figures of a session do not count: its client may have ended
 # Why clients leave keyframes out; other reasons, which a client may invent, are counted as "other".
-SKIPPED = frozenset({"thinned", "dropped", "spool", "disk"})
+SKIPPED = frozenset({"thinned", "room", "dropped", "spool", "disk"})
 
 Rows: TypeAlias = Iterable[tuple[tuple[str, ...], float]]
 
