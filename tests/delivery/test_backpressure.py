@@ -106,8 +106,8 @@ def test_thin_waits_until_the_map_is_seconds_behind(
     begin = caplog.records[0]
     assert (begin.levelname, caplog.records[1].levelname) == ("WARNING", "INFO")
     assert re.match(
-        r"keyframes are left out from here on, 1 of 2 is kept: the map is 10 s behind \(6\d keyframes wait, "
-        r"it takes 6\.\d a second, 10\.0 come; catch_up = 10 s\)",
+        r"keyframes are left out from here on, 1 of 2 is kept: the map is 10.* s behind \(6\d keyframes "
+        r"wait, it takes 6\.\d a second, 10\.0 come; catch_up = 10 s\)",
         begin.getMessage(),
     )
     assert re.match(r"every keyframe is kept again; \d+ were left out", caplog.records[1].getMessage())

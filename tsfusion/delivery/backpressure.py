@@ -176,7 +176,7 @@ class Thinning:
             return f"the spool {self._outbox.spool_folder} has room for {room / 1e6:.3g} MB more"
         lag = self._outbox.lag
         return (
-            f"the map is {lag.seconds:.0f} s behind ({lag.keyframes} keyframes wait, it takes "
+            f"the map is {lag.seconds:.3g} s behind ({lag.keyframes} keyframes wait, it takes "
             f"{lag.rate or 0:.1f} a second, {self._arrival_rate():.1f} come; catch_up = {self._catch_up:g} s)"
         )
 

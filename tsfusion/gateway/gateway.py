@@ -184,14 +184,17 @@ class Gateway:
         if isinstance(message, messages.Command):
             self._on_command(identity.bytes, message, client)
         elif isinstance(message, messages.Hello):
-            self._on_hello(identity.bytes, message, client)
+            self._on_hello(identity, message, client)
         else:
             self._on_ping(identity.bytes, message, client)
 
-    def _on_hello(self, identity: bytes, hello: messages.Hello, client: str) -> None:
+    def _on_hello(self, frame: zmq.Frame, hello: messages.Hello, client: str) -> None:
+        identity = frame.bytes
         if denied := self._denial(identity, hello, client):
             self.ports.reply(identity, messages.Denied(hello.session, *denied))
             return
+        if (route := self._routes.get(hello.session)) is not None:
+            route.address = sockets.peer_address(frame)
         durable, fused = self.maps.progress(hello.map, hello.session)
         welcome = messages.Welcome(
             epoch=self.epoch,
@@ -269,8 +272,5 @@ class Gateway:
             refused=dict(self._refused + self._access.refused),
             duplicates=self._intake.duplicates,
             maps=found,
-            clients=tuple(
-                route.health(now, self.maps.progress(*route.place), self.maps.corrections(*route.place))
-                for route in self._routes
-            ),
+            clients=tuple(route.health(now, self.maps.session(*route.place)) for route in self._routes),
         )
