@@ -18,6 +18,7 @@ from tsfusion.core.errors import DecodeError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import fuser_queries
 from tsfusion.gateway.access_control import AccessControl
+from tsfusion.gateway.activity_log import ActivityLog
 from tsfusion.gateway.admission import Admission
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.fuser_queries import FuserQueries
@@ -64,6 +65,7 @@ class Gateway:
         self._subscriptions = Subscriptions()
         self._publishing: dict[str, bool] = {}  # map → whether its fuser was told to send triangles
         self._memory = MemoryGuard(server.memory_bytes)
+        self._activity = ActivityLog()
         self._accepting = self._stopped = False
         self._started = time.monotonic()
         self._next_snapshot = 0.0
@@ -142,7 +144,8 @@ class Gateway:
             return
         self._next_snapshot = now + _SNAPSHOT_INTERVAL
         logs.log_left_out()
-        self._metrics.health = self.health()
+        self._metrics.health = health = self.health()
+        self._activity.note(health)
 
     # --- maps ---
 
