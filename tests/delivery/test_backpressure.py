@@ -279,6 +279,10 @@ def test_the_server_is_told(tmp_path: Path) -> None:
         server.taking = True
         client.flush(DEADLINE)
         assert (client.stats.waiting, client.stats.waiting_bytes) == (0, 0)
+        assert not any(ping.leaving for ping in server.pings)
+        client.close()
+        until(lambda: server.pings[-1].leaving)
+        assert (server.pings[-1].waiting, server.pings[-1].skipped) == (0, {"thinned": 40 - kept})
 
 
 def simulated(*arguments: object) -> dict[str, dict[str, Any]]:
@@ -290,7 +294,7 @@ def simulated(*arguments: object) -> dict[str, dict[str, Any]]:
 
 def test_nothing_is_lost_where_the_map_can_catch_up() -> None:
     """Two restarts of two seconds, and a minute without the link."""
-    for arguments in (("--seconds", 30, "--outage", 2, "--outages", 2), ("--seconds", 200, "--outage", 60)):
+    for arguments in (("--seconds", 30, "--outage", 2, "--outages", 2), ("--seconds", 100, "--outage", 60)):
         row = simulated("--server", 12.5, "--policy", "thin", *arguments)["thin"]
         assert (row["fused_percent"], row["hole_s"]) == (100.0, 0.1)
 

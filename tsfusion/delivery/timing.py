@@ -65,38 +65,26 @@ class KeyframeTimesTable:
         return bool(self._rows[seq % CAPACITY, 0] == seq)
 
 
-_RATE_SECONDS = 30.0  # over which the map's rate is measured
-_FEWEST_TAKEN = 8  # keyframes before there is a rate
+_ANSWERS = 64  # of the map, over which its rate is measured
+_FEWEST_ANSWERS = 8  # before there is a rate
 
 
 class TakingRate:
     """Keyframes a second that the map takes, as far as that was seen.
 
     Time counts from one answer of the map to the next, and only while keyframes wait for it: what a map that
-    waits could take, nobody knows.
+    waits could take, nobody knows. The longest pause does not count: a fuser may have died in it.
     """
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[float, int]] = deque()  # seconds, keyframes taken in them
-        self._seconds = 0.0
-        self._taken = 0
+        self._answers: deque[tuple[float, int]] = deque(maxlen=_ANSWERS)  # seconds, keyframes taken in them
         self._since: float | None = None  # the map's last answer; None = it had nothing to do since
 
     def note(self, now: float, taken: int, *, is_more_waiting: bool) -> None:
         """Note that the map took so many keyframes, and whether others wait."""
         if self._since is not None:
-            self._samples.append((now - self._since, taken))
-            self._seconds += now - self._since
-            self._taken += taken
-            while self._is_without_oldest_enough():
-                seconds, count = self._samples.popleft()
-                self._seconds -= seconds
-                self._taken -= count
+            self._answers.append((now - self._since, taken))
         self._since = now if is_more_waiting else None
-
-    def _is_without_oldest_enough(self) -> bool:
-        seconds, taken = self._samples[0]
-        return self._seconds - seconds >= _RATE_SECONDS and self._taken - taken >= _FEWEST_TAKEN
 
     def rest(self) -> None:
         """Note that no keyframe waits any more, whatever became of the last."""
@@ -104,14 +92,18 @@ class TakingRate:
 
     def forget(self) -> None:
         """Begin anew: the link was down, and that is not the map's fault."""
-        self._samples.clear()
-        self._seconds, self._taken, self._since = 0.0, 0, None
+        self._answers.clear()
+        self._since = None
 
     @property
     def per_second(self) -> float | None:
         """The rate; None = not known."""
-        known = self._taken >= _FEWEST_TAKEN and self._seconds > 0
-        return self._taken / self._seconds if known else None
+        if len(self._answers) < _FEWEST_ANSWERS:
+            return None
+        pause, taken_after = max(self._answers)
+        seconds = sum(each for each, _ in self._answers) - pause
+        taken = sum(each for _, each in self._answers) - taken_after
+        return taken / seconds if seconds > 0 else None
 
 
 SAMPLES = 16
