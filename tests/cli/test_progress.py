@@ -11,6 +11,7 @@ import pytest
 from command_processes import environment
 
 from tsfusion.cli import progress
+from tsfusion.cli.run_summary import explained
 from tsfusion.client import ClientStats
 from tsfusion.scanner.scanner import ScanState
 
@@ -100,3 +101,8 @@ def test_a_terminal_gets_bars_that_go_away() -> None:
     assert "3 of 10" in text
     assert "━" in text
     assert text.rindex("\x1b[2K") > text.rindex("━"), "the table was wiped at the end"
+
+
+def test_a_summary_says_why_keyframes_are_not_in_the_map() -> None:
+    told = explained({"thinned": 22, "MapFull": 3, "spool": 0})
+    assert told == "22 × thinned (the map was too far behind); 3 × MapFull"

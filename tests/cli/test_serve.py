@@ -2,11 +2,13 @@
 """`tsfusion serve` and `tsfusion mesh` as users run them: processes, sockets and files."""
 
 import json
+import re
 import shutil
 import signal
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 import trimesh
 from clients_and_spools import deliver
@@ -20,9 +22,23 @@ VOXEL = 0.08
 
 def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
     with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, process):
-        with Client(address, spool=tmp_path / "spool") as client:
-            deliver(client, first_views(2))
-        status = json.loads(tsfusion("status", "--connect", address, "--json").stdout)["maps"]["default"]
+        first, second = first_views(2)
+        with Client("tcp://127.0.0.1:1", spool=tmp_path / "spool") as client:
+            client.send(first)
+        with Client(address, spool=tmp_path / "spool") as client:  # goes on with numbers far above
+            deliver(client, [second])
+            client.correct({client.records[-1].seq: np.eye(4)})
+            client.flush()
+        came, left = read_until(process, "is connected"), read_until(process, "a client left")
+        assert re.match(
+            r"tsfusion: INFO: a client is connected from 127.0.0.1 \(map default, session \w{8}\)", came
+        )
+        assert re.match(
+            r"tsfusion: INFO: a client left: 2 keyframes received, 2 of them in the map \(map", left
+        )
+        answer = json.loads(tsfusion("status", "--connect", address, "--json").stdout)
+        status, (scanner,) = answer["maps"]["default"], answer["health"]["clients"]
+        assert (scanner["keyframes_durable"], scanner["keyframes_fused"], scanner["state"]) == (2, 2, "gone")
         assert (status["keyframes_durable"], status["keyframes_fused"]) == (2, 2)
         assert status["blocks"] > 10
         assert len(status["map_hash"]) == 32

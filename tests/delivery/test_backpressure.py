@@ -2,60 +2,152 @@
 """Keyframes that come faster than the map takes them: what each policy keeps, skips and tells."""
 
 import json
+import logging
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
-from itertools import pairwise
+from collections.abc import Callable, Iterator
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from clients_and_spools import NOBODY, joined, send_all
 from keyframes_and_servers import DEADLINE, pose, serving, until, wall
 from repository import ROOT
 from scripted_server import scripted
 
-from tsfusion import Client
+from tsfusion import Client, Keyframe
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import TransportError
+from tsfusion.delivery.backpressure import Backpressure
+from tsfusion.delivery.link_state import LinkState
+from tsfusion.delivery.outbox import Outbox
+from tsfusion.delivery.spool import Spool
 from tsfusion.wire.queries import fetch_status
 
 # --- policies ---
 
 
-def test_thin_leaves_no_hole_however_far_behind(tmp_path: Path) -> None:
-    """Nobody answers: 1 of 1, 2, 3, then 4, at 8, 16 and 24 in the spool."""
-    with Client(NOBODY, spool=tmp_path) as client:
-        taken = send_all(client, range(100))
-        stats = client.stats
-    assert taken[:8] == [*range(8)]
-    gaps = [b - a for a, b in pairwise(taken)]
-    assert gaps == sorted(gaps)
-    assert [gaps.count(n) for n in (1, 2, 3)] == [7, 8, 8]
-    assert set(gaps[23:]) == {4}
-    assert stats.sent == stats.waiting == len(taken)
-    assert stats.skipped == {"thinned": 100 - len(taken)}
-    with scripted() as server, joined(server, spool=tmp_path) as client:
-        client.flush(DEADLINE)
-        assert server.numbers == taken
-        assert send_all(client, range(100, 103)) == [100, 101, 102]  # no longer behind
+def test_a_server_that_restarts_costs_no_keyframe() -> None:
+    with scripted() as server, joined(server) as client:
+        taken = send_all(client, range(10))
+        client.wait_fused(DEADLINE)
+        for first in (10, 35):
+            server.stop()
+            taken += send_all(client, range(first, first + 20))
+            server.start()
+            taken += send_all(client, range(first + 20, first + 25))
+        client.wait_fused(DEADLINE)
+        assert (client.stats.fused, client.stats.skipped) == (60, {})
+        assert server.numbers == taken == [*range(60)]
 
 
-def test_thin_looks_at_the_map_as_well(tmp_path: Path) -> None:
-    """Journaled at once, fused slowly: the delay would grow without bound."""
-    with scripted(fuse_to=0) as server, joined(server, spool=tmp_path) as client:
-        taken = send_all(client, range(8))
-        client.flush(DEADLINE)
-        assert (client.stats.waiting, taken) == (0, [*range(8)])
-        assert send_all(client, range(8, 12)) == [9, 11]
-        server.fuse_to = None
-        client.wait_fused(DEADLINE)
-        assert send_all(client, range(12, 16)) == [12, 13, 14, 15]
-        client.wait_fused(DEADLINE)
-        assert server.numbers == [*range(8), 9, 11, 12, 13, 14, 15]
-        assert client.stats.fused == 14
+class Sensor:
+    """A client's way into the spool, and a link and a map that take what they are told, on one clock."""
+
+    def __init__(self, folder: Path, **settings: Any) -> None:
+        self.now = 0.0
+        self.outbox = Outbox(Spool(folder, 1 << 16), clock=lambda: self.now)
+        self.outbox.change_link_state(LinkState("connected"))
+        self.pressure = Backpressure(self.outbox, ClientConfig(min_free_bytes=0, **settings))
+        self.kept: list[bool] = []
+
+    def sense(self, count: int, rate: float, *, fused: float = 0.0) -> list[bool]:
+        """Take so many keyframes, so many a second; the map takes `fused` a second, one by one."""
+        point, done = np.zeros((1, 3), np.float32), self.now
+        kept = []
+        for _ in range(count):
+            self.now += 1 / rate
+            kept.append(self.pressure.put(Keyframe(points=point, T_world_camera=np.eye(4))) is not None)
+            while fused and done + 1 / fused <= self.now and self.outbox.behind:
+                done += 1 / fused
+                stats = self.outbox.stats()
+                self.outbox.acknowledge(self.outbox.next_seq - 1, stats.fused + 1)
+        self.kept += kept
+        return kept
+
+
+@pytest.fixture
+def sensor(tmp_path: Path) -> Iterator[Callable[..., Sensor]]:
+    """A maker of sensors; their spools are closed."""
+    made: list[Sensor] = []
+
+    def make(**settings: Any) -> Sensor:
+        made.append(Sensor(tmp_path / str(len(made)), **settings))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.outbox.close()
+
+
+def longest_hole(kept: list[bool]) -> int:
+    """The most keyframes in a row that were left out."""
+    return max((len(list(run)) for is_kept, run in groupby(kept) if not is_kept), default=0)
+
+
+def test_thin_waits_until_the_map_is_seconds_behind(
+    sensor: Callable[..., Sensor], caplog: pytest.LogCaptureFixture
+) -> None:
+    """10 a second for a map that takes 6.25: nothing goes before it is `catch_up` behind, and then 1 of 2."""
+    caplog.set_level(logging.INFO)
+    slow = sensor(catch_up=10.0)
+    assert all(slow.sense(100, 10, fused=6.25))
+    assert not caplog.records
+    slow.sense(1000, 10, fused=6.25)
+    assert 30 < slow.outbox.behind < 66
+    assert longest_hole(slow.kept) == 1
+    assert sum(slow.kept) == pytest.approx(1100 * 0.625 + slow.outbox.behind, rel=0.02)  # all it can take
+    begin = caplog.records[0]
+    assert (begin.levelname, caplog.records[1].levelname) == ("WARNING", "INFO")
+    assert re.match(
+        r"keyframes are left out from here on, 1 of 2 is kept: the map is 10.* s behind \(6\d keyframes "
+        r"wait, it takes 6\.\d a second, 10\.0 come; catch_up = 10 s\)",
+        begin.getMessage(),
+    )
+    assert re.match(r"every keyframe is kept again; \d+ were left out", caplog.records[1].getMessage())
+
+
+def test_a_map_that_is_very_slow_is_followed_too(sensor: Callable[..., Sensor]) -> None:
+    slow = sensor(catch_up=10.0)
+    slow.sense(2000, 10, fused=1.2)
+    assert slow.outbox.behind < 30
+    assert 4 < longest_hole(slow.kept) <= 16
+
+
+def test_a_link_that_is_down_is_no_slow_map(sensor: Callable[..., Sensor]) -> None:
+    """A minute without it, and what comes when it is back."""
+    cut = sensor(catch_up=20.0)
+    cut.sense(100, 10, fused=9)
+    assert cut.outbox.lag.rate == pytest.approx(9, rel=0.1)
+    cut.outbox.change_link_state(LinkState("silent"))
+    cut.sense(600, 10)
+    assert cut.outbox.lag.rate is None
+    cut.outbox.change_link_state(LinkState("connected"))
+    cut.outbox.welcome(0, 8)
+    cut.sense(100, 10, fused=40)
+    assert all(cut.kept)
+
+
+def test_a_spool_that_runs_short_is_thinned_before_it_is_full(
+    sensor: Callable[..., Sensor], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    small = sensor(spool_bytes=1 << 20)
+    small.outbox.change_link_state(LinkState("silent"))
+    small.sense(6000, 10)
+    skipped = small.outbox.stats().skipped
+    assert set(skipped) == {"room", "spool"}
+    assert small.kept.index(False) > sum(small.kept) / 2
+    full = len(small.kept) - skipped["spool"]
+    assert longest_hole(small.kept[:full]) < 16
+    assert "1 of 2 is kept: the spool" in caplog.text
+    assert [record.levelname for record in caplog.records] == ["WARNING", "ERROR"]
 
 
 def test_block_waits_for_the_map(tmp_path: Path) -> None:
@@ -168,33 +260,53 @@ def test_spool_all_keeps_everything(tmp_path: Path) -> None:
 
 
 def test_the_server_is_told(tmp_path: Path) -> None:
-    with Client(NOBODY, spool=tmp_path) as client:
-        send_all(client, range(20))
-    with scripted(taking=False) as server, joined(server, spool=tmp_path) as client:
-        thinned = 40 - len(send_all(client, range(40)))
-        waiting = 14 + 40 - thinned
-        until(lambda: bool(server.pings) and server.pings[-1].waiting == waiting)
-        ping = server.pings[-1]
-        assert (ping.skipped, client.stats.waiting) == ({"thinned": thinned}, waiting)
-        assert client.stats.waiting_bytes > 1000 * waiting
+    """What waits, corrections not counted, and what was left out: a map that is much too slow is followed."""
+    config = ClientConfig(stall_timeout=0.5, catch_up=1e-3)
+    with scripted(fuse_to=0) as server, joined(server, spool=tmp_path, config=config) as client:
+        send_all(client, range(24))
+        client.flush(DEADLINE)
+        for fused in range(1, 20):
+            server.fuse_to = fused
+            until(lambda fused=fused: client.stats.fused == fused)
+        server.taking = False
+        kept = len(send_all(client, range(24, 64)))
+        assert 0 < kept < 40
+        assert client.correct({1: pose(1)}) is not None
+        until(lambda: server.pings[-1].waiting == client.stats.waiting - 1 > 0)
+        assert server.pings[-1].skipped == {"thinned": 40 - kept}
+        assert client.stats.waiting_bytes > 1000 * (client.stats.waiting - 1)
         until(lambda: 0 < server.pings[-1].bound_ns < 5e7)
         server.taking = True
         client.flush(DEADLINE)
         assert (client.stats.waiting, client.stats.waiting_bytes) == (0, 0)
+        assert not any(ping.leaving for ping in server.pings)
+        client.close()
+        until(lambda: server.pings[-1].leaving)
+        assert (server.pings[-1].waiting, server.pings[-1].skipped) == (0, {"thinned": 40 - kept})
+
+
+def simulated(*arguments: object) -> dict[str, dict[str, Any]]:
+    """The rows of scripts/backpressure.py, by policy."""
+    command = [sys.executable, ROOT / "scripts" / "backpressure.py", "--json", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return {row["policy"]: row for row in map(json.loads, done.stdout.splitlines())}
+
+
+def test_nothing_is_lost_where_the_map_can_catch_up() -> None:
+    """Two restarts of two seconds, and a minute without the link."""
+    for arguments in (("--seconds", 30, "--outage", 2, "--outages", 2), ("--seconds", 100, "--outage", 60)):
+        row = simulated("--server", 12.5, "--policy", "thin", *arguments)["thin"]
+        assert (row["fused_percent"], row["hole_s"]) == (100.0, 0.1)
 
 
 def test_what_each_policy_is_for() -> None:
-    """scripts/backpressure.py: a sensor faster than the map, and a link that is down for a while."""
-    script = ROOT / "scripts" / "backpressure.py"
-    done = subprocess.run(
-        [sys.executable, script, "--seconds", "60", "--json"], capture_output=True, text=True, check=True
-    )
-    rows = {row["policy"]: row for row in map(json.loads, done.stdout.splitlines())}
+    """A sensor faster than the map, and a link that is down for a while."""
+    rows = simulated("--seconds", 60, "--catch-up", 1)
     assert rows["spool_all"]["fused_percent"] == 100.0
     assert rows["spool_all"]["delay_p50_s"] > 10.0
-    for policy in ("thin", "block", "drop_oldest"):
+    for policy, delay in (("thin", 5.0), ("block", 1.5), ("drop_oldest", 1.5)):
         assert rows[policy]["fused_percent"] > 50.0  # what the map can take
-        assert rows[policy]["delay_p50_s"] < 1.5
+        assert rows[policy]["delay_p50_s"] < delay
     assert rows["thin"]["hole_s"] < 0.5 < 9.0 < rows["drop_oldest"]["hole_s"]
     assert rows["drop_oldest"]["delay_max_s"] < 2.0
 
@@ -202,16 +314,18 @@ def test_what_each_policy_is_for() -> None:
 # --- with a real map ---
 
 
-def test_a_link_that_was_down_costs_detail_and_no_exactness(tmp_path: Path) -> None:
-    """Thinned while nobody answered; what was kept is in the map, and the counts add up."""
-    spool = tmp_path / "spool"
-    with Client(NOBODY, spool=spool) as client:
-        kept = send_all(client, range(24))
-        assert client.stats.skipped == {"thinned": 24 - len(kept)}
-    with serving(tmp_path / "state") as server, Client(server.address, spool=spool) as client:
-        client.wait_fused(DEADLINE)
-        assert client.stats.durable == fetch_status(server.address).keyframes_fused == len(kept)
-        assert server.terminate() == 0
+def test_a_map_whose_server_is_killed_has_every_keyframe(tmp_path: Path) -> None:
+    """More than twice `backlog` come while nobody answers: the map gets them all."""
+    state = tmp_path / "state"
+    with serving(state) as server, Client(server.address, spool=tmp_path / "spool") as client:
+        assert len(send_all(client, range(4))) == 4
+        server.kill()
+        assert len(send_all(client, range(4, 28))) == 24
+        with serving(state, listen=server.address) as again:
+            client.wait_fused(DEADLINE)
+            assert (client.stats.durable, client.stats.skipped) == (28, {})
+            assert fetch_status(again.address).keyframes_fused == 28
+            assert again.terminate() == 0
 
 
 def test_a_killed_server_and_drop_oldest(tmp_path: Path) -> None:

@@ -147,6 +147,7 @@ class World:
         self.config = ClientConfig(
             policy=rng.choice(POLICIES),
             backlog=rng.choice((1, 4, 8)),
+            catch_up=rng.choice((0.001, 0.1, 120.0)),
             min_free_bytes=0,
             segment_bytes=rng.choice((1 << 16, 1 << 20)),
         )
@@ -164,7 +165,7 @@ class World:
 
     def start_client(self) -> None:
         self.spool = Spool(self.folder, self.config.segment_bytes)
-        self.outbox = Outbox(self.spool)
+        self.outbox = Outbox(self.spool, clock=self.clock.monotonic)
         self.pressure = Backpressure(self.outbox, self.config)
         self.sender = Sender("tcp://data", "tcp://control", self.outbox, self.config)
         self.control, self.data = Link(), Link(self.meanwhile)

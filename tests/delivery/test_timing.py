@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from tsfusion.delivery.timing import CAPACITY, ClockOffset, KeyframeTimesTable
+from tsfusion.delivery.timing import CAPACITY, ClockOffset, KeyframeTimesTable, TakingRate
 from tsfusion.wire.keyframe_times import KeyframeTimes, Stamps
 
 
@@ -48,6 +48,23 @@ def test_impossible_stamps_do_no_harm() -> None:
     times.stamp(Stamps(1, 1 << 64, -(1 << 63), 5, 1 << 63), 1 << 62, 1 << 70)
     (row,) = times.copy()
     assert row.fuse_start_ns == 5 - (1 << 62)
+
+
+def test_the_maps_rate_is_what_it_took_while_it_had_work() -> None:
+    rate, now = TakingRate(), 0.0
+    for _ in range(20):  # each is there before the next comes: nobody knows how many it could take
+        now += 1.0
+        rate.note(now, 1, is_more_waiting=False)
+    assert rate.per_second is None
+    for taken in (1, 1, 2, 1, 1, 2, 1, 1, 2):
+        assert rate.per_second is None
+        now += 0.125 * taken
+        rate.note(now, taken, is_more_waiting=True)
+    assert rate.per_second == pytest.approx(8.0)
+    rate.note(now + 60.0, 1, is_more_waiting=True)  # a fuser that was stuck, and replaced
+    assert rate.per_second == pytest.approx(8.0)
+    rate.forget()
+    assert rate.per_second is None
 
 
 @pytest.mark.parametrize("seed", range(5))

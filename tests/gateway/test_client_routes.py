@@ -98,6 +98,18 @@ def test_a_clock_that_cannot_be_is_not_believed(clock: tuple[int, int]) -> None:
     assert (route.offset_ns, route.bound_ns, route.waiting) == (None, 0, 4)
 
 
+def test_who_left_is_gone_until_it_says_hello_again() -> None:
+    routes = ClientRoutes(cast(Ports, None))
+    route = routes.connect(SESSION, "default", b"1")
+    now = route.last_message
+    assert [route.state(now + seconds) for seconds in (0, 6, 31)] == ["connected", "silent", "gone"]
+    route.update(Ping(SESSION, 1, skipped={"thinned": 3}, leaving=True))
+    assert (route.state(now), route.skipped) == ("gone", {"thinned": 3})
+    routes.mark_alive(SESSION, "", scans=True)  # a keyframe that was still on its way
+    assert route.state(now) == "gone"
+    assert routes.connect(SESSION, "default", b"1").state(now) == "connected"
+
+
 def test_only_what_can_be_a_maps_topic_is_remembered() -> None:
     topics = Subscriptions()
     for good in (b"", b"me", b"mesh/", b"mesh/y", b"mesh/yard", b"mesh/yard/", b"mesh/attic/"):

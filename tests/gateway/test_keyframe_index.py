@@ -35,6 +35,16 @@ def test_recovery_counts_a_keyframe_once() -> None:
     assert index.segment(2) == 1
 
 
+def test_keyframes_are_counted_and_corrections_are_not() -> None:
+    """A scanner that was restarted goes on with numbers far above: they are no counts."""
+    index, sessions = index_of((1, 1, SESSION, 1), (1, 2, SESSION, 5_641_760))
+    session = sessions.open(SESSION)
+    index.add(Position(1, 3), session, 5_641_761, is_correction=True)
+    index.add(Position(1, 4), session, 5_641_762)
+    assert (session.keyframes, session.corrections) == (3, 1)
+    assert [index.keyframes_up_to(session, seq) for seq in (0, 1, 5_641_761, 5_641_762)] == [0, 1, 2, 3]
+
+
 def test_keyframes_whose_segments_are_gone_are_forgotten() -> None:
     other = bytes(16)
     index, sessions = index_of(

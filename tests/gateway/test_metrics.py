@@ -74,6 +74,7 @@ def test_a_snapshot_becomes_figures() -> None:
         client("cart", waiting=1, skipped={"thinned": 1, "spool": 5}),
         client("drone"),
         client("drone", waiting=50, held="disk", heard_s=metrics_families.RECENT + 1),
+        client("drone", waiting=7, state="gone"),
         refused={"header": 4}, duplicates=9, problems=("disk full",), ready=False,
         maps={
             "yard": map_health(state="busy", waiting=2, fuser_restarts=1, corrections=4),
@@ -95,7 +96,8 @@ def test_a_snapshot_becomes_figures() -> None:
         ("tsfusion_fuser_restarts_total", "yard"): 1,
         ("tsfusion_last_keyframe_age_seconds", "yard"): 5, ("tsfusion_delay_bound_seconds", "yard"): 0.0005,
         ("tsfusion_map_state", "yard", "busy"): 1, ("tsfusion_map_state", "yard", "idle"): 0,
-        ("tsfusion_client_sessions", "cart"): 2, ("tsfusion_client_waiting_keyframes", "cart"): 3,
+        ("tsfusion_client_sessions", "cart"): 2, ("tsfusion_client_connected_sessions", "drone"): 1,
+        ("tsfusion_client_waiting_keyframes", "cart"): 3,
         ("tsfusion_client_skipped_keyframes", "cart", "thinned"): 4,
         ("tsfusion_client_skipped_keyframes", "cart", "spool"): 5,
         ("tsfusion_client_waiting_keyframes", "drone"): 0,

@@ -341,10 +341,12 @@ def test_a_map_without_a_surface_keeps_the_trajectory(walk: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize("live", [True, False])
-def test_only_what_cannot_wait_is_thinned_out(live: bool, scanned: Callable[..., ScanSummary]) -> None:
+def test_only_what_cannot_wait_is_left_out(live: bool, scanned: Callable[..., ScanSummary]) -> None:
     """Also where nobody knows how many frames there will be, as in a folder or a camera's recording."""
     source = Frames(unposed(6), live=live)
     source.length = None
-    result = scanned(source, config=ScanConfig(distance=1e-6), client=ClientConfig(backlog=1))
-    assert bool(result.keyframes_rejected.get("thinned")) == live
+    result = scanned(
+        source, config=ScanConfig(distance=1e-6), client=ClientConfig(policy="drop_oldest", backlog=1)
+    )
+    assert bool(result.keyframes_rejected.get("dropped")) == live
     assert live or result.left == 6

@@ -14,6 +14,7 @@ from tsfusion.wire.queries import CommandRefused, fetch_health, fetch_status
 READY, NOT_READY = 0, 3  # exit statuses; 1 is every error's, also that nobody answers
 _RECHECK_INTERVAL = 0.5  # seconds between the checks that tell a stall from a pause
 _MIN_TIMEOUT = 0.2  # seconds for a fuser's answer
+_OF_KEYFRAMES = frozenset({"durable", "fused", "waiting", "skipped", "refused", "rejected", "quarantined"})
 
 
 class ServerSnapshot(Struct, frozen=True, kw_only=True):
@@ -58,7 +59,18 @@ class ServerSnapshot(Struct, frozen=True, kw_only=True):
         """The snapshot as plain values that JSON has."""
         fields = {"health": self.health, "maps": self.maps, "unavailable": self.unavailable,
                   "stalled": list(self.stalled), "exit_status": self.exit_status}  # fmt: skip
-        return msgspec.to_builtins(fields)  # type: ignore[no-any-return]
+        plain: dict[str, Any] = msgspec.to_builtins(fields)
+        if self.health is not None:
+            health = plain["health"]
+            health["messages_refused"] = health.pop("refused")
+            health["maps"] = {name: _with_units(one) for name, one in health["maps"].items()}
+            health["clients"] = [_with_units(one) for one in health["clients"]]
+        return plain
+
+
+def _with_units(counts: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a map or client, named for what they count."""
+    return {f"keyframes_{name}" if name in _OF_KEYFRAMES else name: one for name, one in counts.items()}
 
 
 class ServerWatcher:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from tsfusion.cli.output import counted, grouped, size
+from tsfusion.wire.messages import SKIP_REASONS
 
 if TYPE_CHECKING:
     from tsfusion.evaluation.trajectory_error import TrajectoryError
@@ -26,7 +27,7 @@ def print_replay(run: "ReplaySummary") -> None:
         "memory     " + ", ".join(f"{name} {size(peak)}" for name, peak in run.peak_rss_bytes.items()),
     ]
     if run.keyframes_rejected:
-        lines.insert(1, f"rejected   {counted(run.keyframes_rejected)}")
+        lines.insert(1, f"not in map {explained(run.keyframes_rejected)}")
     if run.camera:
         lines.insert(0, f"camera     {run.camera}")
     if run.accuracy is not None:
@@ -61,7 +62,7 @@ def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
     if result.frames_skipped:
         lines.append(f"left out   {counted(result.frames_skipped)}")
     if result.keyframes_rejected:
-        lines.append(f"rejected   {counted(result.keyframes_rejected)}")
+        lines.append(f"not in map {explained(result.keyframes_rejected)}")
     for found in result.maps:
         lines += _map_lines(found)
     if result.left:
@@ -81,6 +82,12 @@ def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
 def _results(folder: str) -> str:
     files = sorted(path.name for path in Path(folder).iterdir() if path.is_file())
     return f"results    {folder}/: {' '.join(files)}"
+
+
+def explained(counts: dict[str, int]) -> str:
+    """{"thinned": 2} → 2 × thinned (the map was too far behind)."""
+    named = {reason: f"{reason} ({SKIP_REASONS[reason]})" for reason in counts if reason in SKIP_REASONS}
+    return counted({named.get(reason, reason): count for reason, count in counts.items()})
 
 
 def _map_lines(found: "MapResult") -> list[str]:

@@ -11,7 +11,6 @@ from tsfusion.core.logs import printable
 from tsfusion.wire.health import ClientHealth, Health, MapHealth, Status
 from tsfusion.wire.keyframe_times import Spread
 
-SILENT_AFTER = 30.0  # seconds without a message: the row is dimmed
 MAX_CLIENTS = 40  # rows: the clients with the newest messages
 _STATE_STYLES = {"idle": "green", "busy": "green", "failed": "bold red"}
 
@@ -47,36 +46,46 @@ def _server(address: str, health: Health) -> Text:
 
 def _maps(maps: dict[str, MapHealth]) -> RenderableType:
     table = _table(
-        "map", "state", ">fused", ">waiting", ">delay, ms:\nmean/p95/max", ">blocks", ">memory", ">journal",
-        ">last",
+        "map", "state", ">keyframes\nfused/all", ">keyframes\nwaiting", ">delay, ms\nmean/p95/max",
+        ">blocks\nof 8³", ">memory\nMB", ">journal\nMB", ">last\nago",
     )  # fmt: skip
     for name, one in maps.items():
         table.add_row(
             _plain(name), _plain(one.state, style=_STATE_STYLES.get(one.state, "yellow")),
             f"{one.keyframes_fused}/{one.keyframes_durable}", _waiting(one.waiting),
-            _delay(one.delay_ms, one.delay_bound_ms), str(one.blocks), size(one.map_bytes),
-            size(one.journal_bytes), _duration(one.last_keyframe_s),
+            _delay(one.delay_ms, one.delay_bound_ms), str(one.blocks), _megabytes(one.map_bytes),
+            _megabytes(one.journal_bytes), _duration(one.last_keyframe_s),
         )  # fmt: skip
     return table
 
 
 def _clients(clients: list[ClientHealth]) -> list[RenderableType]:
     corrects = any(one.corrections for one in clients)
+    refuses = any(one.refused or one.rejected for one in clients)
     table = _table(
-        "client", "session", "map", ">fused", ">received", ">waiting", ">heard", "held", "skipped",
-        *([">corrections"] if corrects else ()),
+        "client", "session", "map", "state", ">keyframes\nfused/all", ">keyframes\nwaiting",
+        "keyframes\nleft out", ">received\nMB", "held", *([">keyframes\nrefused"] if refuses else ()),
+        *([">correc-\ntions"] if corrects else ()),
     )  # fmt: skip
-    latest = sorted(clients, key=lambda one: one.heard_s)
+    latest = sorted(clients, key=lambda one: (one.state == "gone", one.heard_s))
     for one in latest[:MAX_CLIENTS]:
         table.add_row(
-            _plain(one.client or "-"), _plain(one.session), _plain(one.map), f"{one.fused}/{one.durable}",
-            size(one.received_bytes), _waiting(one.waiting), _duration(one.heard_s),
-            _plain(one.held, style="yellow"), Text(_reasons(one.skipped), style="yellow"),
+            _plain(one.client or "-"), _plain(one.session), _plain(one.map), _presence(one),
+            f"{one.fused}/{one.durable}", _waiting(one.waiting), Text(_reasons(one.skipped), style="yellow"),
+            _megabytes(one.received_bytes), _plain(one.held, style="yellow"),
+            *([_waiting(one.refused + one.rejected)] if refuses else ()),
             *([str(one.corrections)] if corrects else ()),
-            style="dim" if one.heard_s > SILENT_AFTER else "",
+            style="dim" if one.state == "gone" else "",
         )  # fmt: skip
     more = len(latest) - MAX_CLIENTS
     return [table, Text(f"and {more} more sessions")] if more > 0 else [table]
+
+
+def _presence(one: ClientHealth) -> Text:
+    """Whether a client is there; else for how long it has not been heard."""
+    if one.state == "connected":
+        return Text(one.state, style="green")
+    return Text(f"{one.state} {_duration(one.heard_s)}", style="yellow" if one.state == "silent" else "")
 
 
 def _details(name: str, status: Status) -> Text:
@@ -113,6 +122,11 @@ def _reasons(counts: dict[str, int]) -> str:
 
 def _waiting(count: int) -> Text:
     return Text(str(count), style="yellow" if count else "")
+
+
+def _megabytes(count: int) -> str:
+    megabytes = count / 1e6
+    return f"{megabytes:.0f}" if megabytes >= 100 else f"{megabytes:.1f}"
 
 
 def _duration(seconds: float | None) -> str:

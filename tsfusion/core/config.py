@@ -197,7 +197,8 @@ class ClientConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     key: str | None = None  # own secret key, a file of `tsfusion keys new`; None = no keys
     server_key: str | None = None  # the server's public key: a file, or the 40 characters
     policy: Policy = "thin"  # when keyframes come faster than the server takes them
-    backlog: Annotated[int, Meta(ge=1, le=10_000)] = 8  # keyframes behind at which the policy begins to act
+    catch_up: Positive = 120.0  # seconds that the map may be behind before `thin` leaves keyframes out
+    backlog: Annotated[int, Meta(ge=1, le=10_000)] = 8  # keyframes behind: `block` waits, `drop_oldest` drops
     spool_bytes: Bytes = 8 << 30  # on the disk; when they are full, keyframes are skipped and counted
     min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left free on the spool's disk
     jpeg_quality: Annotated[int, Meta(ge=1, le=100)] = 90

@@ -2,16 +2,19 @@
 """Taking keyframes and corrections into the spool, or skipping and counting them.
 
 The policies act on how far the map is behind: on keyframes in the spool, and on those the server has on its
-disk but not yet in the map. A link that is down and a map that is slow are the same to whoever scans.
+disk but not yet in the map.
 
-    thin         1 of n is kept, n = 1 to 4 by how far behind: the map gets less detail, but no hole
+    thin         everything is kept until the map is `catch_up` seconds behind or the spool's room runs short,
+                 then 1 of n, so that the map can follow: it gets less detail, but no hole
     block        `send` waits: nothing is skipped, the sensor is held up (replays)
     drop_oldest  the oldest goes: the map follows the sensor closely, with holes (teleoperation)
     spool_all    everything is kept: the map may be long behind, and complete (surveys)
 """
 
 import logging
+import math
 import time
+from collections import deque
 
 from tsfusion.core import durable_files, process
 from tsfusion.core.config import ClientConfig
@@ -21,7 +24,7 @@ from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.wire import codec, corrections
 from tsfusion.wire.corrections import Correction
 
-_THINNEST = 4
+log = logging.getLogger(__name__)
 
 
 class Backpressure:
@@ -31,7 +34,7 @@ class Backpressure:
         self._outbox = outbox
         self._config = config
         self._limits = SpoolLimits(outbox, config.spool_bytes, config.min_free_bytes)
-        self._thinned_in_a_row = 0
+        self._thinning = Thinning(outbox, config.catch_up)
 
     @property
     def must_wait(self) -> bool:
@@ -44,8 +47,8 @@ class Backpressure:
         Raises:
             JournalError: never for what the disk refuses; that is skipped.
         """
-        if self._config.policy == "thin" and self._is_thinned_out():
-            self._outbox.skip("thinned")
+        if self._config.policy == "thin" and (reason := self._thinning.reason(self._limits.room())):
+            self._outbox.skip(reason)
             return None
         frames = codec.encode(
             keyframe,
@@ -68,12 +71,6 @@ class Backpressure:
             correction, session=self._outbox.session, seq=self._outbox.next_seq, map_name=self._config.map
         )
         return self._store(frames, None)
-
-    def _is_thinned_out(self) -> bool:
-        one_of = 1 + min(self._outbox.behind // self._config.backlog, _THINNEST - 1)
-        thinned_out = self._thinned_in_a_row + 1 < one_of
-        self._thinned_in_a_row = self._thinned_in_a_row + 1 if thinned_out else 0
-        return thinned_out
 
     @process.uninterrupted()  # Ctrl-C would leave half a record, and hide what follows it
     def _store(self, frames: list[bytes], keyframe: Keyframe | None) -> int | None:
@@ -104,7 +101,95 @@ class Backpressure:
         return "disk" if self._limits.disk_refuses(nbytes) else ""
 
 
-log = logging.getLogger(__name__)
+_ARRIVALS = 64  # keyframes of the sensor over which their rate is measured
+_THINNEST = 16  # of so many one is kept in any case
+_LATEST = 3  # a map that is later than so many times `catch_up` gets no fewer keyframes
+
+
+class Thinning:
+    """Keyframes that `thin` leaves out: none while there is time to catch up, and room. For one thread.
+
+    Args:
+        catch_up: seconds; the map may be so far behind, and the spool must not be full sooner than that.
+    """
+
+    def __init__(self, outbox: Outbox, catch_up: float) -> None:
+        self._outbox = outbox
+        self._catch_up = catch_up
+        self._arrivals: deque[float] = deque(maxlen=_ARRIVALS)
+        self._acts = False
+        self._left_out = self._in_a_row = 0
+
+    def reason(self, room: int) -> str:
+        """Why the next keyframe is left out: `thinned` or `room`; empty = it is kept.
+
+        Args:
+            room: bytes that the spool may still take.
+        """
+        self._arrivals.append(self._outbox.clock())
+        lag, full = self._outbox.lag, self._fullness(room)
+        shortage = max(lag.seconds / self._catch_up, full)  # 1 = act, 0.5 = enough
+        if full == math.inf:  # `SpoolLimits` says what is wrong
+            return ""
+        if shortage < (0.5 if self._acts else 1.0):
+            self._end()
+            return ""
+        reason = "room" if full >= shortage else "thinned"
+        one_of = self._one_of(shortage, 0.0 if reason == "room" else self._arrival_rate() / (lag.rate or 1.0))
+        self._begin(self._why(reason, room), one_of)
+        if self._in_a_row + 1 >= one_of:
+            self._in_a_row = 0
+            return ""
+        self._in_a_row += 1
+        self._left_out += 1
+        return reason
+
+    @staticmethod
+    def _one_of(shortage: float, faster: float) -> int:
+        """Of how many one is kept, so that a map gets no more than it takes.
+
+        Args:
+            faster: times that the sensor is faster than the map; 0 = the spool's room is what runs short.
+        """
+        pressure = max(int(shortage), 1)
+        return min((min(pressure, _LATEST) if faster else pressure) + max(int(faster), 1), _THINNEST)
+
+    def _arrival_rate(self) -> float:
+        """Keyframes a second that the sensor gives."""
+        seconds = self._arrivals[-1] - self._arrivals[0]
+        return (len(self._arrivals) - 1) / seconds if seconds > 0 else 0.0
+
+    def _fullness(self, room: int) -> float:
+        """What waits, or what comes in `catch_up` seconds if that is less, in parts of the room that is left.
+
+        So nothing is left out while the spool is not half full: it may be small and empty again soon.
+        """
+        waiting, nbytes = self._outbox.waiting()
+        if not waiting:
+            return 0.0
+        if room < nbytes / waiting:
+            return math.inf
+        return min(self._arrival_rate() * self._catch_up / waiting, 1.0) * nbytes / room
+
+    def _why(self, reason: str, room: int) -> str:
+        if reason == "room":
+            return f"the spool {self._outbox.spool_folder} has room for {room / 1e6:.3g} MB more"
+        lag = self._outbox.lag
+        return (
+            f"the map is {lag.seconds:.3g} s behind ({lag.keyframes} keyframes wait, it takes "
+            f"{lag.rate or 0:.1f} a second, {self._arrival_rate():.1f} come; catch_up = {self._catch_up:g} s)"
+        )
+
+    def _begin(self, why: str, one_of: int) -> None:
+        if not self._acts:
+            self._acts, self._left_out = True, 0
+            log.warning("keyframes are left out from here on, 1 of %d is kept: %s", one_of, why)
+
+    def _end(self) -> None:
+        if self._acts:
+            self._acts, self._in_a_row = False, 0
+            log.info("every keyframe is kept again; %d were left out", self._left_out)
+
 
 _LOOK_INTERVAL = 0.25  # seconds between questions for the free space
 _RETRY_INTERVAL = 0.5  # seconds until a disk that refused is tried again: each try may take long
@@ -133,6 +218,17 @@ class SpoolLimits:
             self._outbox.tidy()
         used, waiting = self._outbox.usage()
         return used + nbytes > self._spool_bytes or waiting >= _MAX_WAITING
+
+    def room(self) -> int:
+        """Bytes that the spool may still take."""
+        used, _ = self._outbox.usage()
+        room = self._spool_bytes - used
+        if self._min_free_bytes:
+            now = time.monotonic()
+            if now >= self._look_due:
+                self._measure_free_space(now)
+            room = min(room, self._free - self._written - self._min_free_bytes)
+        return room
 
     def on_full(self) -> None:
         """Note that the spool is at its limit, and nothing could be dropped."""

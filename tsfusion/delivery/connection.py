@@ -85,7 +85,7 @@ class Connection:
             self._retry_due = now + _RETRY_INTERVAL
         return news, ended
 
-    def close(self) -> None:
-        """Close it; nothing lingers."""
+    def close(self, linger_ms: int = 0) -> None:
+        """Close it; what was not sent has so long to leave."""
         self._monitor.close()
-        self.socket.close()
+        self.socket.close(linger_ms)

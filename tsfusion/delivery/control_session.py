@@ -94,14 +94,21 @@ class ControlSession:
     def _ping(self, now: float) -> None:
         settled = self.welcome is None or self.clock.count >= SAMPLES
         self._ping_due = now + (_PING_INTERVAL if settled else _FIRST_PINGS_INTERVAL)
-        stats = self._outbox.stats()
+        self._say_how_it_is()
+
+    def take_leave(self) -> None:
+        """Tell the server the last counts, and that this client ends."""
+        self._say_how_it_is(leaving=True)
+
+    def _say_how_it_is(self, *, leaving: bool = False) -> None:
         ping = messages.Ping(
             session=self._hello.session,
             sent_ns=time.monotonic_ns(),
             offset_ns=self.clock.offset_ns,
             bound_ns=self.clock.bound_ns,
-            waiting=stats.waiting,
-            skipped=stats.skipped,
+            waiting=self._outbox.keyframes_waiting,
+            skipped=self._outbox.stats().skipped,
+            leaving=leaving,
         )
         self._send(messages.encode(ping))
 

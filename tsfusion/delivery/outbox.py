@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.delivery.link_state import LinkState
 from tsfusion.delivery.spool import Spool, Waiting
-from tsfusion.delivery.timing import KeyframeTimesTable
+from tsfusion.delivery.timing import KeyframeTimesTable, TakingRate
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.wire.keyframe_times import KeyframeTimes, Stamps
 
@@ -34,9 +34,9 @@ class ClientStats(Struct, frozen=True):
         fused: keyframes in the server's map.
         refused: keyframes that the server turned away (or that are unreadable here) for good: reason → count.
         rejected: keyframes on the server's disk that the map could not take: reason → count.
-        skipped: keyframes that were never sent: reason → count. `thinned` and `dropped` by the policy (a
-            dropped one was taken before), `spool` (it has reached `spool_bytes`), `disk` (full, failing or
-            read-only).
+        skipped: keyframes that were never sent: reason → count. by the policy `thinned` (the map was too
+            far behind), `room` (the spool's ran short) and `dropped` (it was taken before); `spool` (it has
+            reached `spool_bytes`), `disk` (full, failing or read-only).
         waiting: keyframes and corrections in the spool.
         waiting_bytes: the bytes of those.
         state: of the spool: `ok`, or the reason why it cannot keep all that comes: `spool` or `disk`.
@@ -59,12 +59,26 @@ class ClientStats(Struct, frozen=True):
     corrections_refused: dict[str, int] = {}
 
 
+class Lag(Struct, frozen=True):
+    """How far the map is behind the sensor."""
+
+    keyframes: int  # that it has yet to get
+    rate: float | None  # keyframes a second that it takes; None = not known, as while the link is down
+
+    @property
+    def seconds(self) -> float:
+        """Time to catch up with what was sent up to now; 0 where the rate is not known."""
+        return self.keyframes / self.rate if self.rate else 0.0
+
+
 class Outbox:
     """The spool, the fate of what passed through it, and the state of the link. For any thread."""
 
-    def __init__(self, spool: Spool) -> None:
+    def __init__(self, spool: Spool, clock: Callable[[], float] = time.monotonic) -> None:
         self._changed = threading.Condition()
         self._spool = spool
+        self.clock = clock  # seconds, of the rates
+        self._rate = TakingRate()
         # How client and server stand with each other; replaced whole, by the sending thread alone
         self.link_state = LinkState()
         self.session = spool.session  # 16 bytes
@@ -120,6 +134,8 @@ class Outbox:
         with self._changed:
             is_new = state != self.link_state
             self.link_state = state
+            if state.kind != "connected":
+                self._rate.forget()
             if is_new:
                 self._changed.notify_all()
             return is_new
@@ -131,6 +147,20 @@ class Outbox:
         """Number of keyframes that the map has yet to get: in the spool, or durable and unfused."""
         with self._changed:
             return len(self._spool.waiting) + len(self._unfused) - len(self._corrections)
+
+    @property
+    def lag(self) -> "Lag":
+        """How far the map is behind."""
+        with self._changed:
+            return Lag(self.behind, self._rate.per_second)
+
+    @property
+    def keyframes_waiting(self) -> int:
+        """Number of keyframes in the spool."""
+        with self._changed:
+            waiting = self._spool.waiting
+            oldest = waiting[0].seq if waiting else 0
+            return len(waiting) - sum(bool(waiting) and seq >= oldest for seq in self._corrections)
 
     @property
     def next_seq(self) -> int:
@@ -148,6 +178,8 @@ class Outbox:
     def add(self, entry: Waiting, keyframe: Keyframe | None) -> None:
         """Queue a keyframe, or a correction (None), that was written."""
         with self._changed:
+            if not self.behind:
+                self._rate.rest()
             self._spool.add(entry)
             if keyframe is None:
                 self._corrections_sent += 1
@@ -165,6 +197,11 @@ class Outbox:
         """Bytes of the disk that the spool takes, and records in it."""
         with self._changed:
             return self._spool.used_bytes, len(self._spool.waiting)
+
+    def waiting(self) -> tuple[int, int]:
+        """Records in the spool, and their bytes."""
+        with self._changed:
+            return len(self._spool.waiting), self._spool.waiting_bytes
 
     def tidy(self) -> None:
         """Delete files that hold nothing any more. For the one thread that writes."""
@@ -276,6 +313,7 @@ class Outbox:
                 window = left[: max(window_keyframes, 1)]
                 self._perhaps_sent = min(self._perhaps_sent, window[-1] if window else durable)
             self._welcomed = True
+            self._rate.forget()  # it may be a new server, which fuses first what its last checkpoint lacks
 
     def is_foreign(self, durable: int) -> bool:
         """Whether the server has records of this session that were never sent from here."""
@@ -303,13 +341,17 @@ class Outbox:
             self._corrections_durable += corrections
             self._durable += len(dropped) - corrections
             self._unfused.extend(dropped)
+            taken = 0
             while self._unfused and self._unfused[0] <= fused:
                 seq = self._unfused.popleft()
                 if seq in self._corrections:
                     self._corrections.remove(seq)
                 else:
+                    taken += 1
                     self._fused += seq not in self._rejected_seqs
                 self._unmeshed.append(seq)
+            if taken:
+                self._rate.note(self.clock(), taken, is_more_waiting=self.behind > 0)
             for one in stamps:
                 if one.seq not in self._rejected_seqs:
                     self._times.stamp(one, offset_ns, bound_ns)

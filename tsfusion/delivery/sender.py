@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 _READ_INTERVAL = 0.5  # seconds until a record that could not be read is tried again
 _MAX_READS = 6
+_FAREWELL_MS = 100  # for the last message to leave
 _SCARCE = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # what others of this machine will give back
 
 
@@ -80,8 +81,9 @@ class Sender:
         try:
             while not self._stopping.is_set():
                 self._step()
+            self._control_session.take_leave()
         finally:
-            self._control.close()
+            self._control.close(_FAREWELL_MS)
             self._data.close()
             self._waker.close()
             self._woken.close()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""When each of the last keyframes passed each stage, in memory of one size."""
+"""Times at both ends: of each keyframe at each stage, the rate at which the map takes them, two clocks."""
 
 from collections import deque
 
@@ -63,6 +63,47 @@ class KeyframeTimesTable:
 
     def _has(self, seq: int) -> bool:
         return bool(self._rows[seq % CAPACITY, 0] == seq)
+
+
+_ANSWERS = 64  # of the map, over which its rate is measured
+_FEWEST_ANSWERS = 8  # before there is a rate
+
+
+class TakingRate:
+    """Keyframes a second that the map takes, as far as that was seen.
+
+    Time counts from one answer of the map to the next, and only while keyframes wait for it: what a map that
+    waits could take, nobody knows. The longest pause does not count: a fuser may have died in it.
+    """
+
+    def __init__(self) -> None:
+        self._answers: deque[tuple[float, int]] = deque(maxlen=_ANSWERS)  # seconds, keyframes taken in them
+        self._since: float | None = None  # the map's last answer; None = it had nothing to do since
+
+    def note(self, now: float, taken: int, *, is_more_waiting: bool) -> None:
+        """Note that the map took so many keyframes, and whether others wait."""
+        if self._since is not None:
+            self._answers.append((now - self._since, taken))
+        self._since = now if is_more_waiting else None
+
+    def rest(self) -> None:
+        """Note that no keyframe waits any more, whatever became of the last."""
+        self._since = None
+
+    def forget(self) -> None:
+        """Begin anew: the link was down, and that is not the map's fault."""
+        self._answers.clear()
+        self._since = None
+
+    @property
+    def per_second(self) -> float | None:
+        """The rate; None = not known."""
+        if len(self._answers) < _FEWEST_ANSWERS:
+            return None
+        pause, taken_after = max(self._answers)
+        seconds = sum(each for each, _ in self._answers) - pause
+        taken = sum(each for _, each in self._answers) - taken_after
+        return taken / seconds if seconds > 0 else None
 
 
 SAMPLES = 16

@@ -8,13 +8,15 @@ from collections.abc import Iterator
 from msgspec import Struct, field
 
 from tsfusion.gateway.ports import Ports
-from tsfusion.wire.health import ClientHealth
+from tsfusion.gateway.sessions import Session
+from tsfusion.wire.health import ClientHealth, ClientState
 from tsfusion.wire.messages import Ping, ToClient
 
 _MAX_ROUTES = 1024
 _MAX_ROUTES_OF_A_NAME = 64  # where there are keys
 _MIN_NEW_ROUTES = 16  # places of a name for clients that have sent no keyframe yet
-_ABANDONED_AFTER = 30.0  # seconds of silence after which another client may take over a session
+_SILENT_AFTER = 5.0  # seconds without a message; a client sends two a second
+ABANDONED_AFTER = 30.0  # seconds of silence: the client is gone, and another may take over its session
 _LARGEST_OFFSET_NS = 10 * 366 * 86_400 * 10**9  # ten years; monotonic clocks begin when a machine does
 _LARGEST_BOUND_NS = 3600 * 10**9
 
@@ -31,6 +33,9 @@ class ClientRoute(Struct, eq=False):
     waiting: int = 0  # this and `skipped`: figures of its last Ping
     skipped: dict[str, int] = field(default_factory=dict)
     received_bytes: int = 0
+    refused: int = 0  # records that were turned away for good
+    address: str = ""  # of its machine; empty = not known
+    left: bool = False  # whether it said goodbye
     scans: bool = False  # whether a keyframe of the session is in the journal
     last_message: float = 0.0  # `time.monotonic()`, as the next
     held_until: float = 0.0  # until then its keyframes are turned away, for `hold_reason`
@@ -43,35 +48,45 @@ class ClientRoute(Struct, eq=False):
 
     def open_to(self, client: str) -> bool:
         """Whether a client may go on with the session: it is its own, or the other client is long silent."""
-        return self.client == client or time.monotonic() - self.last_message >= _ABANDONED_AFTER
+        return self.client == client or time.monotonic() - self.last_message >= ABANDONED_AFTER
 
     def update(self, ping: Ping) -> None:
         """Note how the client is doing. A clock offset that is impossible is not believed."""
-        self.waiting, self.skipped = ping.waiting, ping.skipped
+        self.waiting, self.skipped, self.left = ping.waiting, ping.skipped, ping.leaving
         possible = abs(ping.offset_ns or 0) <= _LARGEST_OFFSET_NS and 0 <= ping.bound_ns <= _LARGEST_BOUND_NS
         self.offset_ns, self.bound_ns = (ping.offset_ns, ping.bound_ns) if possible else (None, 0)
 
-    def health(self, now: float, progress: tuple[int, int], corrections: int) -> ClientHealth:
+    def state(self, now: float) -> ClientState:
+        """Whether the client is there (`time.monotonic()`)."""
+        silence = now - self.last_message
+        if self.left or silence >= ABANDONED_AFTER:
+            return "gone"
+        return "silent" if silence >= _SILENT_AFTER else "connected"
+
+    def health(self, now: float, session: Session | None) -> ClientHealth:
         """How the client is doing.
 
         Args:
             now: `time.monotonic()`.
-            progress: the highest seq that is durable, and that is fused.
-            corrections: corrections of the session in the journal.
+            session: None = nothing of it is in the journal.
         """
-        durable, fused = progress
+        own = session or Session(self.session, -1)
         return ClientHealth(
             client=self.client,
             session=self.session.hex()[:8],
             map=self.map,
             heard_s=now - self.last_message,
-            durable=durable,
-            fused=fused,
+            durable=own.keyframes,
+            fused=own.answered - own.rejected,
             received_bytes=self.received_bytes,
             waiting=self.waiting,
             skipped=self.skipped,
             held=self.hold_reason if now < self.held_until else "",
-            corrections=corrections,
+            corrections=own.corrections,
+            state=self.state(now),
+            address=self.address,
+            refused=self.refused,
+            rejected=own.rejected,
         )
 
 
@@ -102,7 +117,7 @@ class ClientRoutes:
         if route is None or route.client != client or route.map != map_name:
             self._drop(route)
             route = self._by_session[session] = ClientRoute(session, map_name, identity, client)
-        route.identity = identity
+        route.identity, route.left = identity, False
         self._refresh(route, scans=scans)
         of_name = self._names[client]
         if client and len(of_name) > _MAX_ROUTES_OF_A_NAME:

@@ -18,6 +18,7 @@ from tsfusion.core.errors import DecodeError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import fuser_queries
 from tsfusion.gateway.access_control import AccessControl
+from tsfusion.gateway.activity_log import ActivityLog
 from tsfusion.gateway.admission import Admission
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.fuser_queries import FuserQueries
@@ -64,6 +65,7 @@ class Gateway:
         self._subscriptions = Subscriptions()
         self._publishing: dict[str, bool] = {}  # map → whether its fuser was told to send triangles
         self._memory = MemoryGuard(server.memory_bytes)
+        self._activity = ActivityLog()
         self._accepting = self._stopped = False
         self._started = time.monotonic()
         self._next_snapshot = 0.0
@@ -142,7 +144,8 @@ class Gateway:
             return
         self._next_snapshot = now + _SNAPSHOT_INTERVAL
         logs.log_left_out()
-        self._metrics.health = self.health()
+        self._metrics.health = health = self.health()
+        self._activity.note(health)
 
     # --- maps ---
 
@@ -184,14 +187,17 @@ class Gateway:
         if isinstance(message, messages.Command):
             self._on_command(identity.bytes, message, client)
         elif isinstance(message, messages.Hello):
-            self._on_hello(identity.bytes, message, client)
+            self._on_hello(identity, message, client)
         else:
             self._on_ping(identity.bytes, message, client)
 
-    def _on_hello(self, identity: bytes, hello: messages.Hello, client: str) -> None:
+    def _on_hello(self, frame: zmq.Frame, hello: messages.Hello, client: str) -> None:
+        identity = frame.bytes
         if denied := self._denial(identity, hello, client):
             self.ports.reply(identity, messages.Denied(hello.session, *denied))
             return
+        if (route := self._routes.get(hello.session)) is not None:
+            route.address = sockets.peer_address(frame)
         durable, fused = self.maps.progress(hello.map, hello.session)
         welcome = messages.Welcome(
             epoch=self.epoch,
@@ -269,8 +275,5 @@ class Gateway:
             refused=dict(self._refused + self._access.refused),
             duplicates=self._intake.duplicates,
             maps=found,
-            clients=tuple(
-                route.health(now, self.maps.progress(*route.place), self.maps.corrections(*route.place))
-                for route in self._routes
-            ),
+            clients=tuple(route.health(now, self.maps.session(*route.place)) for route in self._routes),
         )

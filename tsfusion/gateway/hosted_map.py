@@ -54,6 +54,7 @@ class HostedMap:
         self._metrics = metrics
         self._last_keyframe: float | None = None  # time.monotonic()
         self._loss = ""
+        self._checkpoints = 0  # written since the map was opened
         self._journal = _open_journal(self.folder, server)
         self.disk = DiskPause(self._journal, server.min_free_bytes, name)
         self._quarantine = Quarantine(self.folder / state_folder.QUARANTINE_FOLDER, server.quarantine_bytes)
@@ -154,6 +155,7 @@ class HostedMap:
             elif isinstance(message, fuser_messages.Ready):
                 self._on_ready(message)
             elif isinstance(message, fuser_messages.Saved):
+                self._checkpoints += message.written
                 self._retention.on_saved(message)
             elif isinstance(message, fuser_messages.Meshed):
                 self.outcomes.on_meshed(message)
@@ -171,13 +173,16 @@ class HostedMap:
         for key, progress in ready.done.items():
             session = self.sessions.open(key, progress.client)
             session.durable = max(session.durable, progress.seq)
-            session.fused = max(session.fused, progress.seq)
+            if progress.seq > session.fused:
+                session.fused = progress.seq
+                session.answered = self._index.keyframes_up_to(session, progress.seq)
         self._backlog.restart(ready.done)
         self.outcomes.on_ready(ready)
         self._retention.on_ready()
         if not self.warm:
             self.warm = True
-            log.info("the map is open", extra=logs.about(map=self.name))
+            what = f"the map is open, with {ready.keyframes} keyframes" if ready.done else "a new map is open"
+            log.info("%s", what, extra=logs.about(map=self.name))
         self._check_checkpoint(ready)
 
     def _check_checkpoint(self, ready: fuser_messages.Ready) -> None:
@@ -229,6 +234,7 @@ class HostedMap:
             delay_ms=outcomes.delays.summary(),
             delay_bound_ms=outcomes.delays.bound_ms,
             corrections=self._corrections,
+            checkpoints=self._checkpoints,
         )
 
 

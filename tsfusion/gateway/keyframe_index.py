@@ -66,6 +66,7 @@ class KeyframeIndex:
     ) -> int:
         """Append a record; its index."""
         session.corrections += is_correction
+        session.keyframes += not is_correction
         place = (position.segment, position.offset, session.number, seq, captured_ns, is_correction)
         values = (*place, received_ns, durable_ns, 0, 0)
         for column, value in zip(self._columns.values(), values, strict=True):
@@ -116,6 +117,11 @@ class KeyframeIndex:
         """How many records of a session that are not forgotten have a sequence number up to `seq`."""
         seqs, first = self._columns["seq"], self._first
         return bisect_right(session.entries, seq, key=lambda index: seqs[index - first])
+
+    def keyframes_up_to(self, session: Session, seq: int) -> int:
+        """How many keyframes of a session that are not forgotten have a sequence number up to `seq`."""
+        entries = session.entries[: self.after(session, seq)]
+        return len(entries) - self.corrections(entries)
 
     def segment(self, index: int) -> int:
         """The number of the segment that holds a record."""

@@ -131,4 +131,6 @@ class KeyframeIntake:
         key, seq = header.session, header.seq
         subject = logs.about(map=header.map, session=key, seq=seq, client=client, reason=error.reason)
         log.warning("a %s is refused: %s", header.kind, error, extra=subject)
+        if (route := self._routes.get(key)) is not None:
+            route.refused += 1
         self._routes.send(key, messages.Nack(key, seq, "door", error.reason, str(error)))

@@ -91,6 +91,9 @@ class KeyframeOutcomes:
             reported = done.index in self._reported_rejections
         if reported:
             return  # by a fuser that died before it wrote a checkpoint
+        if not entry.is_correction:
+            session.answered += 1
+            session.rejected += done.reason is not None
         self._index.set_fused(done.index, done.fuse_start_ns, done.fused_ns)
         entry = self._index[done.index]
         session.fused = max(session.fused, entry.stamps.seq)

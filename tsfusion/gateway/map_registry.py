@@ -14,6 +14,7 @@ from tsfusion.core.errors import TsfusionError
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.metrics import Metrics
+from tsfusion.gateway.sessions import Session
 from tsfusion.wire.health import MapHealth
 
 log = logging.getLogger(__name__)
@@ -49,11 +50,10 @@ class MapRegistry:
         hosted = self.get(name)
         return hosted.sessions.progress(session) if hosted else (0, 0)
 
-    def corrections(self, name: str, key: bytes) -> int:
-        """How many corrections of a session were journaled."""
+    def session(self, name: str, key: bytes) -> Session | None:
+        """A session of a map; None = it has nothing in the journal."""
         hosted = self.get(name)
-        session = hosted.sessions.get(key) if hosted else None
-        return session.corrections if session else 0
+        return hosted.sessions.get(key) if hosted else None
 
     def open_at_start(self, volumes: Mapping[str, VolumeConfig]) -> None:
         """Open maps by name with their settings; those that clients ask for get those of the default map.

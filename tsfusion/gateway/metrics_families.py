@@ -16,13 +16,12 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 
 from tsfusion.core.config import ServerConfig
 from tsfusion.wire.health import ClientHealth, Health, MapHealth, MapState
+from tsfusion.wire.messages import SKIP_REASONS
 
 NAMELESS = "-"  # clients without keys; no name looks like this
 OTHERS = "+"  # the label that all names beyond a limit share
 MAX_CLIENTS = 100
 RECENT = 30.0  # seconds; older figures of a session do not count: its client may have ended
-# Why clients leave keyframes out; other reasons, which a client may invent, are counted as "other".
-SKIPPED = frozenset({"thinned", "dropped", "spool", "disk"})
 
 Rows: TypeAlias = Iterable[tuple[tuple[str, ...], float]]
 
@@ -41,6 +40,7 @@ _OF_MAPS: tuple[tuple[str, str, Callable[[MapHealth], float]], ...] = (
 )
 _OF_CLIENTS: tuple[tuple[str, str, Callable[[list[ClientHealth]], float]], ...] = (
     ("sessions", "Sessions that were connected since the start.", len),
+    ("connected_sessions", "Sessions that are connected now.", lambda own: len(_recent(own))),
     (
         "waiting_keyframes",
         "Keyframes in the client's spools, as last reported.",
@@ -125,14 +125,14 @@ def _grouped(clients: Iterable[ClientHealth]) -> dict[str, list[ClientHealth]]:
 
 
 def _recent(sessions: Iterable[ClientHealth]) -> list[ClientHealth]:
-    return [one for one in sessions if one.heard_s <= RECENT]
+    return [one for one in sessions if one.heard_s <= RECENT and one.state != "gone"]
 
 
 def _skipped(sessions: Iterable[ClientHealth]) -> Counter[str]:
     total: Counter[str] = Counter()
     for session in sessions:
         for reason, count in session.skipped.items():
-            total[reason if reason in SKIPPED else "other"] += count
+            total[reason if reason in SKIP_REASONS else "other"] += count  # a client may invent more
     return total
 
 

@@ -24,6 +24,9 @@ class Session(Struct, eq=False):
     entries: "array[int]" = field(default_factory=lambda: array("q"))
     handed: int = 0  # how many of these the fuser was given
     corrections: int = 0  # records of corrected poses that came
+    keyframes: int = 0  # in the journal at the start, and journaled since
+    answered: int = 0  # of these, the keyframes that the map has taken or rejected
+    rejected: int = 0  # of these, rejected since the start
 
     @property
     def owner(self) -> str:

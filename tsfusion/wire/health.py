@@ -40,6 +40,10 @@ class MapHealth(Struct, frozen=True, kw_only=True):
     delay_ms: Spread
     delay_bound_ms: float  # error bound of the delays (half the best round trip of the worst client)
     corrections: int = 0  # records of corrected poses: in the journal at the start, and journaled since
+    checkpoints: int = 0  # written since the server began
+
+
+ClientState = Literal["connected", "silent", "gone"]
 
 
 class ClientHealth(Struct, frozen=True, kw_only=True):
@@ -49,13 +53,18 @@ class ClientHealth(Struct, frozen=True, kw_only=True):
     session: str  # first 8 hexadecimal digits of its number
     map: str
     heard_s: float  # seconds since its last message
-    durable: int
-    fused: int
+    durable: int  # keyframes: in the journal when the server began, or journaled since
+    fused: int  # of those, the keyframes in the map
     received_bytes: int
-    waiting: int  # this and `skipped` as in its last Ping
-    skipped: dict[str, int]
+    waiting: int  # number of keyframes in its spool, as in its last Ping
+    skipped: dict[str, int]  # number of keyframes that it never sent, by reason, as in its last Ping
     held: str  # reason why no keyframe of it is accepted now; empty = they are
     corrections: int = 0  # in the journal
+    # silent: nothing was heard for 5 s; gone: it said goodbye, or nothing was heard for 30 s
+    state: ClientState = "connected"
+    address: str = ""  # of its machine; empty = not known
+    refused: int = 0  # number of its keyframes and corrections that were turned away for good, not journaled
+    rejected: int = 0  # number of its keyframes that the map could not take, since the server began
 
 
 class Health(Struct, frozen=True, kw_only=True):

@@ -16,6 +16,14 @@ from tsfusion.wire.keyframe_times import Seq, Stamps
 from tsfusion.wire.record_header import SessionId
 
 PROTOCOL_VERSION = 2  # of these messages and of which kinds of records a server takes
+# Why a client never sends a keyframe: the reasons in `Ping.skipped`, in words
+SKIP_REASONS = {
+    "thinned": "the map was too far behind",
+    "room": "the spool's room ran short",
+    "dropped": "newer ones came first",
+    "spool": "the spool was full",
+    "disk": "the spool's disk was full or failed",
+}
 Counts = dict[Annotated[str, Meta(max_length=32)], Annotated[int, Meta(ge=0)]]  # by reason
 
 
@@ -100,6 +108,7 @@ class Ping(Struct, frozen=True, tag="ping", omit_defaults=True):
         waiting: number of keyframes in its spool.
         skipped: number of keyframes that were not spooled or left the spool unsent, by reason, since the
             client began.
+        leaving: whether it is the client's last message.
     """
 
     session: Annotated[bytes, Meta(max_length=16)]
@@ -108,6 +117,7 @@ class Ping(Struct, frozen=True, tag="ping", omit_defaults=True):
     bound_ns: int = 0
     waiting: Annotated[int, Meta(ge=0)] = 0
     skipped: Annotated[Counts, Meta(max_length=16)] = {}
+    leaving: bool = False
 
 
 class Pong(Struct, frozen=True, tag="pong"):

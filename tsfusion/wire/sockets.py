@@ -117,6 +117,14 @@ def _make(
     return made
 
 
+def peer_address(frame: zmq.Frame) -> str:
+    """Address of the machine that sent a frame; empty where ZeroMQ does not know it."""
+    try:
+        return str(frame.get("Peer-Address"))
+    except zmq.ZMQError:
+        return ""
+
+
 def parse_address(address: str) -> tuple[str, int]:
     """Host and port of `tcp://host:port` (port `*` or 0 = random).
 
