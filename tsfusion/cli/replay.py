@@ -25,7 +25,8 @@ def replay(
     overwrite: options.Overwrite = False,
     state: options.State = None,
     connect: options.Connect = None,
-    map_: options.Map = None,
+    map_: options.NewMap = None,
+    same_frame: options.SameFrame = False,
     control: options.Control = None,
     key: options.Key = None,
     server_key: options.ServerKey = None,
@@ -50,7 +51,7 @@ def replay(
 
     # Any server makes a mesh with another `min_weight`.
     own = {*options.MAP_OPTIONS, "state"} - {"min_weight"}
-    options.check_target_flags(context, connect, own=own, remote=())
+    options.check_target_flags(context, connect, own=own, remote=options.only_for_kept_maps(state))
     dataset = open_recording(
         path, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
         **options.dataset_options(option),
@@ -67,8 +68,8 @@ def replay(
     )
     _run(
         dataset, out, overwrite=overwrite, json=json, volume=chosen.volume,
-        server=options.own_server(chosen, state), client=client, connect=connect, rate=rate,
-        min_weight=settings["min_weight"],
+        server=options.own_server(chosen, state), client=client, connect=connect, same_frame=same_frame,
+        rate=rate, min_weight=settings["min_weight"],
     )  # fmt: skip
 
 
