@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from tsfusion.core.errors import TransportError as TransportError
     from tsfusion.core.errors import TsfusionError as TsfusionError
     from tsfusion.core.errors import WeightOverflow as WeightOverflow
+    from tsfusion.core.errors import WorldRefused as WorldRefused
     from tsfusion.datasets import Layout as Layout
     from tsfusion.datasets import open_dataset as open_dataset
     from tsfusion.geometry.keyframe import Intrinsics as Intrinsics
@@ -46,7 +47,7 @@ _ERRORS = (
     "CheckpointError", "DamagedCheckpoint", "DatasetError", "DecodeError", "FlushTimeout", "InvalidConfig",
     "InvalidKeyframe", "JournalError", "KeyframeRefused", "MapError", "MapFull", "MissingDependency",
     "NotAllowed", "OutputError", "ServerUnreachable", "SourceError",
-    "TransportError", "TsfusionError", "WeightOverflow",
+    "TransportError", "TsfusionError", "WeightOverflow", "WorldRefused",
 )  # fmt: skip
 _HOME = {
     "Client": "client",

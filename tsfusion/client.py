@@ -14,17 +14,28 @@ Taichi is never imported.
 import atexit
 import logging
 import os
+import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.config import ClientConfig, Policy, override
-from tsfusion.core.errors import FlushTimeout, KeyframeRefused, NotAllowed, ServerUnreachable, TransportError
+from tsfusion.core.errors import (
+    FlushTimeout,
+    InvalidConfig,
+    KeyframeRefused,
+    NotAllowed,
+    ServerUnreachable,
+    TransportError,
+    WorldRefused,
+)
 from tsfusion.delivery.backpressure import Backpressure
+from tsfusion.delivery.link_state import LinkState
 from tsfusion.delivery.outbox import ClientStats, Outbox
 from tsfusion.delivery.sender import Sender
 from tsfusion.delivery.spool import Spool
@@ -32,6 +43,7 @@ from tsfusion.geometry.keyframe import Keyframe, keyframe_of
 from tsfusion.wire import corrections, sockets
 from tsfusion.wire.curve import client_keys
 from tsfusion.wire.keyframe_times import KeyframeTimes
+from tsfusion.wire.record_header import WORLD_NAME
 from tsfusion.wire.sockets import control_address
 
 __all__ = ["Client", "ClientStats"]
@@ -48,8 +60,13 @@ class Client:
     Args:
         address: the server's data address.
         spool: a folder for keyframes that are not acknowledged yet; what a dead client left there is sent
-            first. None = a temporary one, deleted by `close`.
+            first. None = a temporary one, deleted by `close`. A `Spool` brings its own map and world.
         control: the server's control address; default the port after `address`.
+        world: name of the coordinate frame of the poses, up to 64 letters, digits, - and _ (such as
+            `uuid.uuid4().hex`), for whoever localises itself: a map takes keyframes of one world. Empty = the
+            poses are given, and whoever gives them sees to it that a map's share one frame. None = that of
+            what waits in the spool.
+        same_frame: declares that the poses are in the frame of the map, whatever worlds it has.
         map: the map to scan into; default the config's, as with the following.
         policy: what happens to keyframes that the map has no time for.
         key: the file of this client's secret key.
@@ -58,15 +75,18 @@ class Client:
 
     Raises:
         InvalidConfig: for a malformed address or setting, or a key file that is of no use.
-        JournalError: when the spool cannot be used, another client uses it, or it waits for another map.
+        JournalError: when the spool cannot be used, another client uses it, or what waits in it is for
+            another map or of another world.
     """
 
     def __init__(
         self,
         address: str = "tcp://127.0.0.1:5555",
         *,
-        spool: str | os.PathLike[str] | None = None,
+        spool: str | os.PathLike[str] | Spool | None = None,
         control: str | None = None,
+        world: str | None = None,
+        same_frame: bool = False,
         map: str | None = None,
         policy: Policy | None = None,
         key: str | os.PathLike[str] | None = None,
@@ -78,12 +98,19 @@ class Client:
             for name, given in (("key", key), ("server_key", server_key))
             if given is not None
         }
+        if isinstance(spool, Spool):
+            map = spool.map_name
         self._config = override(config or ClientConfig(), map=map, policy=policy, **keys)
         connection_keys = client_keys(self._config.key, self._config.server_key)
         address = sockets.connect_address(address)
         self._control = sockets.connect_address(control_address(address, control))
-        segment_bytes = min(self._config.segment_bytes, self._config.spool_bytes // _SEGMENTS)
-        self._outbox = Outbox(Spool(spool, segment_bytes, map_name=self._config.map))
+        if world and not re.fullmatch(WORLD_NAME, world):
+            raise InvalidConfig(f"world must be 1 to 64 letters, digits, - and _, got {world!r}")
+        if not isinstance(spool, Spool):
+            segment_bytes = min(self._config.segment_bytes, self._config.spool_bytes // _SEGMENTS)
+            spool = Spool(spool, segment_bytes, map_name=self._config.map, world=world, same_frame=same_frame)
+        self._outbox = Outbox(spool)
+        self.logs_refusal = True  # of its world; a run that ends with `check_world` says it itself
         self._pressure = Backpressure(self._outbox, self._config)
         self._sender = Sender(address, self._control, self._outbox, self._config, connection_keys)
         self._sending = threading.Lock()
@@ -98,7 +125,8 @@ class Client:
 
         A dict of a keyframe's fields, or an object with such attributes, will do.
 
-        Never waits for the network, unless the policy is `block`; never fails because of the disk.
+        Never waits for the network, unless the policy is `block`; never fails because of the disk. When the
+        map has keyframes of another world, that is logged, and the keyframe waits in the spool.
 
         Raises:
             TransportError: after `close`, also when that happens while this waits.
@@ -112,6 +140,9 @@ class Client:
                 seq = self._pressure.put(keyframe_of(keyframe))
             if seq is not None:
                 self._sender.wake()
+            if self.logs_refusal and self.is_of_other_world:
+                self.logs_refusal = False
+                log.error("nothing is sent: %s", self.link_state.why)
             return seq
 
     def correct(
@@ -154,26 +185,61 @@ class Client:
 
         Raises:
             NotAllowed: as soon as the server turns the keys away, or the lack of them.
+            WorldRefused: as soon as the server says that the map has keyframes of another world.
             ServerUnreachable: when it has not within `timeout` seconds (default: the config's), or answers
                 that it will not have this client.
         """
         timeout = self._config.connect_timeout if timeout is None else timeout
         box = self._outbox
         self._wait(lambda: box.link_state.is_connected or box.link_state.is_refused, timeout)
+        self.check_world()
         state = box.link_state
         if state.is_refused:
             raise (NotAllowed if state.kind == "locked_out" else ServerUnreachable)(state.why)
         if not state.is_connected:
             raise ServerUnreachable(f"{self._why()} (waited {timeout:g} s)")
 
+    def wait_answer(self, timeout: float) -> None:
+        """Wait until the server has answered or is known not to be there, at most `timeout` seconds."""
+
+        def is_known() -> bool:
+            return (
+                self.link_state.kind != "connecting" or self._sender.finds_nobody or bool(self.link_state.why)
+            )
+
+        self._wait(is_known, timeout)
+
+    @property
+    def spool_folder(self) -> Path:
+        """Folder of the spool."""
+        return self._outbox.spool_folder
+
+    @property
+    def link_state(self) -> LinkState:
+        """How client and server stand with each other."""
+        return self._outbox.link_state
+
+    @property
+    def is_of_other_world(self) -> bool:
+        """Whether the server said that the map has keyframes of another world; nothing is sent then."""
+        return self.link_state.kind == "other_world"
+
+    def check_world(self) -> None:
+        """Raise WorldRefused when the server said that the map has keyframes of another world."""
+        if self.is_of_other_world:
+            raise WorldRefused(self.link_state.why)
+
     def flush(self, timeout: float = 10.0) -> None:
         """Wait until everything sent is on the server's disk, corrections included.
 
         Raises:
+            WorldRefused: as soon as the map turns out to have keyframes of another world.
             FlushTimeout: after `timeout` seconds; the rest stays in the spool and is still being sent.
             KeyframeRefused: when the server turned some away for good since the last flush.
         """
-        done = self._wait(lambda: self._outbox.is_durable, timeout)
+        done = self._wait(lambda: self._outbox.is_durable or self.is_of_other_world, timeout)
+        if not self._outbox.is_durable:
+            self.check_world()
         if refusals := self._outbox.take_refusals():
             raise KeyframeRefused(refusals)
         if not done:

@@ -53,6 +53,7 @@ class Link:
         self.meanwhile = meanwhile  # what other threads do while this one sends
         self.socket = self
         self.problem, self.refused, self.due, self.is_made = "", False, 0.0, True
+        self.finds_nobody = False
         self.there: deque[Any] = deque()
         self.back: deque[Any] = deque()
         self.old: list[deque[Any]] = []  # what earlier connections still have under way

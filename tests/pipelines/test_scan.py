@@ -123,10 +123,11 @@ def test_without_taichi_to_a_server_elsewhere(walk: Path, tmp_path: Path) -> Non
             "scan", walk, "--connect", address, "--map", "hall", "--max-frames", 1,
             "--spool", tmp_path / "spool", "--out", tmp_path / "out", "--overwrite",
         )  # fmt: skip
-        assert "give it a map of its own (--map NAME)" in again.stderr
+        assert again.returncode == 1
+        assert "use --map hall-2 or --map auto" in again.stderr.splitlines()[-1]
         assert end(process) == 0
     stamps = [keyframe.timestamp_ns for keyframe in JournalRecording(tmp_path / "state", "hall")]
-    assert stamps == [*kept.timestamps_ns, stamps[0]]
+    assert stamps == [*kept.timestamps_ns]
 
 
 def test_ctrl_c_without_a_server_keeps_all_for_the_next_scan(walk: Path, tmp_path: Path) -> None:
@@ -291,16 +292,6 @@ def test_a_live_sources_first_frame_is_taken_unless_it_is_old(
     later = [dataclasses.replace(frame, timestamp_ns=frame.timestamp_ns + gap_ns) for frame in others]
     result = scanned(Frames([first, *later], live=True))
     assert (result.frames, result.frames_tracked) == (taken, taken)
-
-
-def test_what_waits_for_the_map_is_of_another_world(
-    scanned: Callable[..., ScanSummary], caplog: pytest.LogCaptureFixture
-) -> None:
-    for left in (1, 2):
-        assert "of an earlier scan" not in caplog.text
-        result = scanned(Frames(unposed(1)))
-        assert result.left == left
-    assert "of an earlier scan wait for the map default" in caplog.text
 
 
 def test_a_frame_that_cannot_be_followed_keeps_what_came_before(

@@ -70,7 +70,13 @@ def frames(count: int) -> Iterator[Frame]:
 
 @contextmanager
 def scanned(
-    spools: Path, localizer: Localizer, count: int, *, address: str = NOBODY, **config: float
+    spools: Path,
+    localizer: Localizer,
+    count: int,
+    *,
+    address: str = NOBODY,
+    free_name: str | None = None,
+    **config: float,
 ) -> Iterator[Scanner]:
     """A scanner that has taken so many frames; without a server all keyframes stay in its spools."""
     with ExitStack() as stack:
@@ -78,7 +84,9 @@ def scanned(
         def connect(name: str) -> Client:
             return stack.enter_context(Client(address, spool=spools / name, map=name, policy="spool_all"))
 
-        scanner = Scanner(localizer, ScanConfig(**config), connect, map_name="hall")
+        scanner = Scanner(
+            localizer, ScanConfig(**config), connect, map_name="hall", free_name=lambda: free_name
+        )
         scanner.run(frames(count), lambda _: None)
         yield scanner
 
@@ -112,6 +120,13 @@ def test_lost_for_long_a_new_map_begins(tmp_path: Path, caplog: pytest.LogCaptur
     assert spooled(tmp_path, "hall") == [0, 1, 2]
     assert spooled(tmp_path, "hall-2") == [14, 15, 17]
     assert "a new map, hall-2" in caplog.text
+
+
+@pytest.mark.parametrize(("free", "named"), [("hall-7", "hall-7"), ("hall", "hall-2")])
+def test_a_new_map_is_one_that_nobody_has(tmp_path: Path, free: str, named: str) -> None:
+    """The server knows which names are free; one that this scan has itself is not."""
+    with scanned(tmp_path, Scripted("T" + "L" * 12 + "T"), 14, free_name=free) as scanner:
+        assert [submap.name for submap in scanner.submaps] == ["hall", named]
 
 
 @pytest.mark.parametrize("script", ["L" * 30 + "TT", "TT" + "L" * 9 + "T"])

@@ -21,6 +21,11 @@ def test_control_messages_keep_their_bytes() -> None:
             Hello(SESSION, 1, map="yard"),
             f"84a474797065a568656c6c6fa773657373696f6ec410{key}a776657273696f6e01a36d6170a479617264",
         ),
+        (
+            Hello(SESSION, 1, world="w", same_frame=True),
+            f"85a474797065a568656c6c6fa773657373696f6ec410{key}a776657273696f6e01a5776f726c64a177"
+            "aa73616d655f6672616d65c3",
+        ),
         (Ping(b"", 5), "83a474797065a470696e67a773657373696f6ec400a773656e745f6e7305"),
     )
     for message, stored in golden:
@@ -30,6 +35,7 @@ def test_control_messages_keep_their_bytes() -> None:
         Welcome("e", 1, 3, 2, 8, 1, 1),
         Ack(SESSION, 3, 2, (Stamps(3, 1, 2, 3, 4, 5),), resend=True),
         Denied(SESSION, "map", "no room"),
+        Denied(SESSION, "world", "another one", "yard-2"),
         Hold(SESSION, 1.5, "disk", "full"),
         Nack(SESSION, 3, "door", "crc", "damaged"),
         Pong("e", 1, 2, 3),

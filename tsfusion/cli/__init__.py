@@ -25,6 +25,7 @@ from tsfusion.cli import (
     replay,
     scan,
     serve,
+    spool,
     status,
     verbs,
 )
@@ -80,6 +81,7 @@ verbs.verb(
 )(status.status)
 app.add_typer(journal.app, name="journal", rich_help_panel=SERVER)
 app.add_typer(keys.app, name="keys", rich_help_panel=SERVER)
+app.add_typer(spool.app, name="spool", rich_help_panel=SERVER)
 verbs.verb(app, "tsfusion doctor", "tsfusion doctor /mnt/maps", panel=SETUP)(doctor.doctor)
 app.add_typer(config.app, name="config", rich_help_panel=SETUP)
 

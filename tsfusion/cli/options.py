@@ -89,6 +89,13 @@ Control = Annotated[
     option("--control", "ADDRESS", "Its control address; else the port after the other.", rare=True),
 ]
 Map = Annotated[str | None, option("--map", "NAME", "Which of the server's maps; else default.")]
+NewMap = Annotated[
+    str | None,
+    option("--map", "NAME", "Which of the server's maps; else default; auto = the next free one."),
+]
+SameFrame = Annotated[
+    bool, option("--same-frame", None, "The poses are in the frame of the map that is there.", rare=True)
+]
 Key = Annotated[
     str | None,
     option("--key", "FILE", "This client's secret key, for a server with keys (`tsfusion keys`).", rare=True),
@@ -228,6 +235,11 @@ def own_server(config: "Config", state: Path | None) -> "ServerConfig | None":
     server = override(config.server, listen="tcp://127.0.0.1:0", state=str(state))
     # Only this machine reaches it; its errors are shown here.
     return replace(server, keys=None, metrics=None, log_format="text", max_maps=max(MAPS, server.max_maps))
+
+
+def only_for_kept_maps(state: Path | None) -> set[str]:
+    """The parameters that mean nothing to a server of the run's own whose maps are new."""
+    return set() if state is not None else {"same_frame"}
 
 
 def check_target_flags(

@@ -25,7 +25,8 @@ def replay(
     overwrite: options.Overwrite = False,
     state: options.State = None,
     connect: options.Connect = None,
-    map_: options.Map = None,
+    map_: options.NewMap = None,
+    same_frame: options.SameFrame = False,
     control: options.Control = None,
     key: options.Key = None,
     server_key: options.ServerKey = None,
@@ -55,7 +56,7 @@ def replay(
 
     # Any server makes a mesh with another `min_weight`.
     own = {*options.MAP_OPTIONS, "state"} - {"min_weight"}
-    options.check_target_flags(context, connect, own=own, remote=())
+    options.check_target_flags(context, connect, own=own, remote=options.only_for_kept_maps(state))
     dataset = open_recording(
         path, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
         **options.camera(intrinsics, calibration) | options.dataset_options(option),
@@ -71,8 +72,8 @@ def replay(
     )
     _run(
         dataset, out, overwrite=overwrite, json=json, volume=chosen.volume,
-        server=options.own_server(chosen, state), client=client, connect=connect, rate=rate,
-        min_weight=settings["min_weight"],
+        server=options.own_server(chosen, state), client=client, connect=connect, same_frame=same_frame,
+        rate=rate, min_weight=settings["min_weight"],
     )  # fmt: skip
     if wrong is not None:
         typer.echo(f"the map is likely wrong: {wrong} (--no-check accepts it)", err=True)

@@ -68,8 +68,8 @@ def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
     if result.left:
         why = f" ({result.link})" if result.link else ""
         lines.append(
-            f"spool      {result.left} keyframes are not acknowledged{why}: the next scan with "
-            f"--spool {spool} sends them"
+            f"spool      {result.left} keyframes are not acknowledged{why}: "
+            f"`tsfusion spool send --spool {spool}` or the next scan sends them"
         )
     lines.append(_results(result.folder))
     if connect is not None and result.keyframes_durable:

@@ -66,7 +66,8 @@ def scan(
     overwrite: options.Overwrite = False,
     state: options.State = None,
     connect: options.Connect = None,
-    map_: options.Map = None,
+    map_: options.NewMap = None,
+    same_frame: options.SameFrame = False,
     control: options.Control = None,
     key: options.Key = None,
     server_key: options.ServerKey = None,
@@ -94,7 +95,8 @@ def scan(
     **settings: Any,
 ) -> None:
     """Localise a sensor and fuse its keyframes; Ctrl-C ends the scan and keeps its results."""
-    options.check_target_flags(context, connect, own={*options.MAP_OPTIONS, "state"}, remote={"spool"})
+    remote = {"spool", *options.only_for_kept_maps(state)}
+    options.check_target_flags(context, connect, own={*options.MAP_OPTIONS, "state"}, remote=remote)
     from tsfusion.cli import output, progress, run_summary
     from tsfusion.pipelines.scan import scan as run
 
@@ -115,7 +117,7 @@ def scan(
         result = run(
             opened, out, overwrite=overwrite, config=chosen.scan, volume=chosen.volume,
             server=options.own_server(chosen, state), client=client, connect=connect, spool=spool,
-            min_weight=settings["min_weight"], progress=display,
+            same_frame=same_frame, min_weight=settings["min_weight"], progress=display,
         )  # fmt: skip
     if json:
         output.as_json(result)

@@ -16,6 +16,7 @@
     ├── TransportError
     │   ├── ServerUnreachable              nobody answered on the control socket in time
     │   ├── NotAllowed                     the server turned this client's keys away, or its lack of them
+    │   ├── WorldRefused                   the map has keyframes of another coordinate frame
     │   ├── FlushTimeout                   keyframes were still unacknowledged at the deadline
     │   └── KeyframeRefused                the server will never take this keyframe, and said why
     ├── OutputError                        a result cannot be written
@@ -106,6 +107,10 @@ class ServerUnreachable(TransportError):
 
 class NotAllowed(TransportError):
     """The server turned this client's keys away, or its lack of them; the message says what to do."""
+
+
+class WorldRefused(TransportError):
+    """The map has keyframes of another coordinate frame; this client's stay in its spool."""
 
 
 class FlushTimeout(TransportError):

@@ -45,6 +45,21 @@ def _lock(descriptor: int, deadline: float) -> None:
             time.sleep(_POLL_S)
 
 
+def owner_of(folder: Path, *, name: str = "lock") -> str | None:
+    """The pid of the process that holds a folder, "?" where it is not known; None = nobody does."""
+    if not (folder / name).exists():
+        return None
+    try:
+        hold(folder, name).close()
+    except BlockingIOError:
+        with suppress(OSError):
+            return (folder / name).read_text(encoding="ascii", errors="replace") or "?"
+        return "?"
+    except OSError:
+        return None
+    return None
+
+
 def lock_folder(
     folder: Path,
     kind: str,

@@ -55,6 +55,8 @@ class Backpressure:
             session=self._outbox.session,
             seq=self._outbox.next_seq,
             map_name=self._config.map,
+            world=self._outbox.world,
+            same_frame=self._outbox.same_frame,
             jpeg_quality=self._config.jpeg_quality,
         )
         return self._store(frames, keyframe)
@@ -68,7 +70,12 @@ class Backpressure:
             JournalError: as `put`.
         """
         frames = corrections.encode(
-            correction, session=self._outbox.session, seq=self._outbox.next_seq, map_name=self._config.map
+            correction,
+            session=self._outbox.session,
+            seq=self._outbox.next_seq,
+            map_name=self._config.map,
+            world=self._outbox.world,
+            same_frame=self._outbox.same_frame,
         )
         return self._store(frames, None)
 

@@ -52,6 +52,11 @@ class Connection:
         return self._monitor.connected
 
     @property
+    def finds_nobody(self) -> bool:
+        """Whether nobody listens, as far as the last attempt to connect shows."""
+        return self._monitor.retrying
+
+    @property
     def refused(self) -> bool:
         """Whether the server has certainly refused this client's key."""
         return self._monitor.refused

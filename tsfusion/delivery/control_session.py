@@ -22,6 +22,7 @@ _PING_INTERVAL = 0.5
 _FIRST_PINGS_INTERVAL = 0.02  # until the clock estimate stands on all its samples
 _REWIND_INTERVAL = 0.2  # one gap is reported by every keyframe behind it
 _LATEST = 1 << 62  # nanoseconds; no clock shows more than a century
+_OTHER_WORLD_INTERVAL = 5.0  # seconds; a map's frame changes when the server begins anew
 _HOLD = (0.05, 60.0)  # seconds: no server may hold a client for less or longer at a time
 
 
@@ -50,7 +51,9 @@ class ControlSession:
         self._refused = refused
         self._send = send
         self._address = address
-        self._hello = messages.Hello(outbox.session, PROTOCOL_VERSION, map_name)
+        self._hello = messages.Hello(
+            outbox.session, PROTOCOL_VERSION, map_name, outbox.world, outbox.same_frame
+        )
         self._hello_due = self._ping_due = self._rewound = self._held_until = 0.0
         self._hello_interval = _HELLO_INTERVAL[0]
         self._asked_again = False
@@ -191,8 +194,20 @@ class ControlSession:
             why = f"the server is opening the map {self._hello.map}"
             self._outbox.change_link_state(self._outbox.link_state.opening(why))
             self.greet_again(_HELLO_INTERVAL[1])
+        elif denied.reason == "world":
+            self._on_other_world(denied)
         else:
             self._refuse(f"the server at {self._address} refuses this client: {denied.message}")
+
+    def _on_other_world(self, denied: messages.Denied) -> None:
+        """Keep everything, and stop sending. Whoever sends says so (`Client.check_world`)."""
+        own = f"--map {denied.free_map} or --map auto" if denied.free_map else "another map"
+        why = (
+            f"the server at {self._address} refuses this client: {denied.message}: use {own}, or "
+            "--same-frame where both share one frame (of a Client: map=, same_frame=True)"
+        )
+        self._outbox.change_link_state(self._outbox.link_state.other_world(why))
+        self.greet_again(_OTHER_WORLD_INTERVAL)
 
     def _refuse(self, why: str) -> None:
         self._turned_away(self._outbox.link_state.refused(why))

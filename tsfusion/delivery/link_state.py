@@ -6,14 +6,15 @@
     held         the server answers, but wants nothing for now: its disk is full, or the quota is used up
     opening      the server answers, but the map is not open yet
     refused      the server does not want this client: another version, another's session, no such map
+    other_world  the map has keyframes of another session, in another coordinate frame
     locked_out   the server does not know the client's key, or asks for one
     silent       the server answered once, and has not been heard for too long
 
 A client begins as `connecting`. A Welcome leads back there from anywhere but `connected` and `held`: the
 server has let us in, and the next Pong means `connected`. From there a Hold leads to `held`, and progress
-back again. A Denied leads to `opening` or `refused`, a refused handshake to `locked_out`, and they stay until
-a Welcome, another Denied or, with `locked_out`, until the handshake succeeds. Silence leads to `silent` from
-`connected`, `held` and `opening`; the others say already why nothing moves.
+back again. A Denied leads to `opening`, `refused` or `other_world`, a refused handshake to `locked_out`, and
+they stay until a Welcome, another Denied or, with `locked_out`, until the handshake succeeds. Silence leads
+to `silent` from `connected`, `held` and `opening`; the others say already why nothing moves.
 
 Nobody gives up in any state: the client asks again for ever, because a person may put it right at the other
 end. States are values without behaviour: `ControlSession` sees the events and replaces the present state by
@@ -24,7 +25,9 @@ from typing import Literal
 
 from msgspec import Struct
 
-LinkKind = Literal["connecting", "connected", "held", "opening", "refused", "locked_out", "silent"]
+LinkKind = Literal[
+    "connecting", "connected", "held", "opening", "refused", "other_world", "locked_out", "silent"
+]
 
 
 class LinkState(Struct, frozen=True):
@@ -41,7 +44,7 @@ class LinkState(Struct, frozen=True):
     @property
     def is_refused(self) -> bool:
         """Whether the server does not want this client."""
-        return self.kind in ("refused", "locked_out")
+        return self.kind in ("refused", "other_world", "locked_out")
 
     # --- the transport ---
 
@@ -74,6 +77,10 @@ class LinkState(Struct, frozen=True):
     def refused(self, why: str) -> "LinkState":
         """The state when server and client cannot work together, by a Denied or by what a Welcome says."""
         return LinkState("refused", why)
+
+    def other_world(self, why: str) -> "LinkState":
+        """The state when the map's coordinate frame is not that of this client's poses."""
+        return LinkState("other_world", why)
 
     def welcomed(self) -> "LinkState":
         """The state after a Welcome."""

@@ -82,6 +82,7 @@ class Outbox:
         # How client and server stand with each other; replaced whole, by the sending thread alone
         self.link_state = LinkState()
         self.session = spool.session  # 16 bytes
+        self.map_name, self.world, self.same_frame = spool.map_name, spool.world, spool.same_frame
         self.spool_folder = spool.folder
         self.is_temporary = spool.temporary  # goes away when it is closed
         self.state = "ok"  # of the spool, as in `ClientStats`; set by the one thread that writes to it

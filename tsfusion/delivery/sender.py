@@ -54,6 +54,7 @@ class Sender:
         self._waker.setblocking(False)
         self._woken.setblocking(False)
         self._ahead = config.backlog if config.policy == "drop_oldest" else None
+        self.finds_nobody = False  # nobody listens at the control address, as far as is known; for any thread
         self._blocked = False  # the data socket takes no more for now
         self._unread = 0  # times that the next record could not be read
         self._read_due = 0.0
@@ -129,6 +130,9 @@ class Sender:
                 self._control_session.greet_again()  # the server does not know the new connection yet
             elif ended:
                 self._control_session.rewind()  # what was under way is lost
+        if self.finds_nobody != self._control.finds_nobody:
+            self.finds_nobody = self._control.finds_nobody
+            self._outbox.wake_waiting()
 
     def _watch_for_stall(self, now: float) -> None:
         patience = self._config.stall_timeout
@@ -178,7 +182,14 @@ class Sender:
     def _send(self, entry: Waiting, previous: int, frames: list[memoryview]) -> None:
         sent_ns = time.monotonic_ns()
         try:
-            head = stamp(frames[0], previous=previous, sent_ns=sent_ns)
+            head = stamp(
+                frames[0],
+                previous=previous,
+                sent_ns=sent_ns,
+                map=self._outbox.map_name,
+                world=self._outbox.world,
+                same_frame=self._outbox.same_frame,
+            )
         except (DecodeError, IndexError) as error:
             self._refused.give_up(entry, "spool", str(error))
             return

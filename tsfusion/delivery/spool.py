@@ -22,7 +22,7 @@ from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.delivery.tombstones import Tombstones
-from tsfusion.wire.record_header import is_correction, unpack
+from tsfusion.wire.record_header import RecordHeader, is_correction, unpack
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +33,7 @@ _RESTART_GAP = 1024
 _RESTART_SPREAD = 1 << 24
 _SESSION_BYTES = 16
 _MANY_TOMBSTONES = 65536  # numbers before those of deleted files are forgotten
+_LOOK_SECONDS = 0.2  # for which somebody may hold the lock who only looks whether it is held
 _RECORD_OVERHEAD = 512  # what MCAP adds to a keyframe, its share of the index at the end included
 
 
@@ -65,19 +66,32 @@ class Spool:
 
     Args:
         folder: None = a temporary folder, deleted at `close` with all that is in it.
-        map_name: the map that new records are for.
+        map_name: the map that records are for.
+        world: name of the coordinate frame of their poses, empty = given from elsewhere; None = that of the
+            records that wait. One that waits and names none takes this one.
+        same_frame: that frame is declared to be the map's; what waits may have declared it before.
+        elsewhere: take what waits for another map to this one.
 
     Raises:
-        JournalError: when the folder cannot be used, another scanner uses it, or it waits for another map.
+        JournalError: when the folder cannot be used, another scanner uses it, or what waits in it is for
+            another map or of another world.
     """
 
     def __init__(
-        self, folder: str | os.PathLike[str] | None, segment_bytes: int, *, map_name: str = DEFAULT_MAP
+        self,
+        folder: str | os.PathLike[str] | None,
+        segment_bytes: int,
+        *,
+        map_name: str = DEFAULT_MAP,
+        world: str | None = None,
+        same_frame: bool = False,
+        elsewhere: bool = False,
     ) -> None:
         self.temporary = folder is None
         self.map_name = map_name
+        self.world, self.same_frame = world or "", same_frame
         self.folder = _temporary_folder() if folder is None else Path(folder)
-        self._lock = lock_folder(self.folder, "spool", "scanner")
+        self._lock = lock_folder(self.folder, "spool", "scanner", wait=_LOOK_SECONDS)
         if (old := self.folder / "corrections.tsc").exists():
             log.warning(
                 "%s holds corrected poses as an earlier development version kept them: it is not read; "
@@ -85,12 +99,14 @@ class Spool:
                 old,
             )
         try:
-            self._open(segment_bytes, map_name)
+            self._open(segment_bytes)
+            if (left := self._first_left()) is not None:
+                self._take_over(left, world, elsewhere=elsewhere)
         except JournalError:
             self._lock.close()
             raise
 
-    def _open(self, segment_bytes: int, map_name: str) -> None:
+    def _open(self, segment_bytes: int) -> None:
         self._journal = journal.Journal(self.folder, segment_bytes, sync=not self.temporary)
         found, self._journal.found = self._journal.found, []
         sessions = {record.session for record in found} or {secrets.token_bytes(_SESSION_BYTES)}
@@ -119,18 +135,27 @@ class Spool:
         self._idle = {number for number, segment in self._segments.items() if not segment.waiting}
         # On the disk: records that have left the queue but share a file with others count
         self.used_bytes = sum(segment.nbytes for segment in self._segments.values())
-        left_for = self._left_for()
-        if left_for not in (None, map_name):
-            raise JournalError(
-                f"{self.folder} holds {len(self.waiting)} keyframes for the map {left_for}, not for "
-                f"{map_name}: send them first (a client with map={left_for!r}), or use another spool folder"
-            )
 
-    def _left_for(self) -> str | None:
-        """The map of what a dead scanner left: that of the first record that can be read."""
+    def _take_over(self, left: RecordHeader, world: str | None, *, elsewhere: bool) -> None:
+        """Go on with what a dead scanner left, or raise JournalError when that must not be."""
+        held = f"{self.folder} holds {len(self.waiting)} keyframes"
+        if left.map != self.map_name and not elsewhere:
+            raise JournalError(
+                f"{held} for the map {left.map}, not for {self.map_name}: send them first "
+                f"(a client with map={left.map!r}), or use another spool folder"
+            )
+        if world is not None and left.world not in ("", world):
+            raise JournalError(
+                f"{held} of another world, {left.world}: send them first (`tsfusion spool send`), or use "
+                "another spool folder"
+            )
+        self.world, self.same_frame = world or left.world, self.same_frame or left.same_frame
+
+    def _first_left(self) -> RecordHeader | None:
+        """The header of the first record that a dead scanner left and that can be read."""
         for entry in self.waiting:
             try:
-                return unpack(self.read(entry)[0]).map
+                return unpack(self.read(entry)[0])
             except (JournalError, DecodeError, IndexError):
                 continue  # it is found again, and reported, when it is to be sent
         return None

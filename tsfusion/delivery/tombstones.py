@@ -19,6 +19,18 @@ _SESSION_BYTES = 16
 log = logging.getLogger(__name__)
 
 
+def stored(folder: Path, session: bytes) -> set[int] | None:
+    """The numbers in a spool's file; None = it is another session's."""
+    try:
+        content = (folder / NAME).read_bytes()
+    except OSError:
+        return set()
+    if content[:_SESSION_BYTES] != session:
+        return None
+    whole = (len(content) - _SESSION_BYTES) // _NUMBER.itemsize
+    return set(np.frombuffer(content, _NUMBER, whole, _SESSION_BYTES).tolist())
+
+
 class Tombstones:
     """A file of numbers, behind the session they belong to. A disk that refuses is passed over."""
 
@@ -29,15 +41,10 @@ class Tombstones:
         self.written = len(self.numbers)  # count of the numbers in the file
 
     def _read(self) -> set[int]:
-        try:
-            stored = self._path.read_bytes()
-        except OSError:
-            return set()
-        if stored[:_SESSION_BYTES] != self._session:  # of a spool that was here before
+        found = stored(self._path.parent, self._session)
+        if found is None:  # of a spool that was here before
             self.clear()
-            return set()
-        whole = (len(stored) - _SESSION_BYTES) // _NUMBER.itemsize
-        return set(np.frombuffer(stored, _NUMBER, whole, _SESSION_BYTES).tolist())
+        return found or set()
 
     def add(self, seq: int) -> None:
         """Append a number."""

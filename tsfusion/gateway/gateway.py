@@ -210,8 +210,8 @@ class Gateway:
         )
         self.ports.reply(identity, welcome)
 
-    def _denial(self, identity: bytes, hello: messages.Hello, client: str) -> tuple[str, str] | None:
-        """The reason and message why a session is not opened; None = it is, and its route is made."""
+    def _denial(self, identity: bytes, hello: messages.Hello, client: str) -> tuple[str, ...] | None:
+        """The fields of the answer to a session that is not opened; None = it is, and its route is made."""
         if hello.version != messages.PROTOCOL_VERSION:
             speaks = f"the server speaks version {messages.PROTOCOL_VERSION} of the wire format"
             return "version", f"{speaks}, this client {hello.version}"
@@ -224,6 +224,10 @@ class Gateway:
             return "session", "the session of this spool is another client's: use another spool folder"
         if not hosted.sessions.room_for(hello.session):
             return "session", f"map {hello.map} has {len(hosted.sessions)} sessions and takes no new one"
+        if other := self.maps.denial_of_world(hosted, hello):
+            self._refused["world"] += 1
+            log.warning("%s", other.message, extra=logs.about(session=hello.session, client=client))
+            return other.reason, other.message, other.free_map
         scans = hosted.sessions.get(hello.session) is not None
         self._routes.connect(hello.session, hello.map, identity, client, scans=scans)
         return None
@@ -243,6 +247,10 @@ class Gateway:
             self.ports.reply(identity, messages.Reply(name="ping"))
         elif command.name == "health":
             self.ports.reply(identity, messages.Reply(name="health", health=self.health()))
+        elif command.name == "new_map":
+            name = self.maps.keep_free_name(command.map)
+            full = f"no room for another map: {self._server.max_maps} are open (max_maps)"
+            self.ports.reply(identity, messages.Reply(name="new_map", map=name, error=None if name else full))
         else:
             self._queries.submit(identity, command, self.maps.get(command.map), client)
 

@@ -112,7 +112,7 @@ class HostedMap:
             self.disk.begin(error)
             raise
         self.disk.end()
-        session = self.sessions.open(header.session, client)
+        session = self.sessions.open(header.session, client, header.world)
         session.durable = header.seq
         durable_ns = time.monotonic_ns()
         is_correction = isinstance(header, CorrectionHeader)

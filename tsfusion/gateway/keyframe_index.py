@@ -48,7 +48,7 @@ class KeyframeIndex:
         (The disk refused, the client sent it again, and the first copy had been written after all.)
         """
         for record in found:
-            session = sessions.open(record.session, record.client)
+            session = sessions.open(record.session, record.client, record.world)
             if record.seq > session.durable:
                 session.durable = record.seq
                 self.add(record.position, session, record.seq, is_correction=record.is_correction)

@@ -65,6 +65,11 @@ class KeyframeIntake:
             self._refused["session"] += 1
             subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
             log.warning("a %s is refused: its session is another client's", header.kind, extra=subject)
+        elif denied := self._maps.denial_of_world(hosted, header):
+            self._refused["world"] += 1
+            subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
+            log.warning("a %s is refused: %s", header.kind, denied.message, extra=subject)
+            self._routes.send(header.session, denied)
         elif not self._has_to_wait(hosted, header.session, client, nbytes):
             self._on_checked(hosted, header, buffers, client, received_ns)
 

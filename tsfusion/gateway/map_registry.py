@@ -2,25 +2,32 @@
 """The maps of a server: the open ones, and why others could not be opened."""
 
 import logging
+import re
 import time
 from collections.abc import Iterator, Mapping
+from itertools import count
 from typing import Any
 
 import zmq
 
 from tsfusion.core import logs
-from tsfusion.core.config import DEFAULT_MAP, ServerConfig, VolumeConfig
+from tsfusion.core.config import DEFAULT_MAP, MAP_NAME_LENGTH, ServerConfig, VolumeConfig
 from tsfusion.core.errors import TsfusionError
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.sessions import Session
+from tsfusion.journal import state_folder
 from tsfusion.wire.health import MapHealth
+from tsfusion.wire.messages import Denied, Hello
+from tsfusion.wire.record_header import RecordHeader
 
 log = logging.getLogger(__name__)
 
 _MAX_UNOPENED = 64
 _RETRY_INTERVAL = 10.0  # seconds before a map that could not be opened is tried again
+_KEPT_NAMES = 64  # free names that were given out
+_KEPT_SECONDS = 300.0  # until then nobody else is given them: a map takes a while to be opened
 
 
 class MapRegistry:
@@ -36,6 +43,7 @@ class MapRegistry:
         self._volumes: Mapping[str, VolumeConfig] = {}
         self._open: dict[str, HostedMap] = {}
         self._unopened: dict[str, tuple[str, float]] = {}  # name → why, when
+        self._kept: dict[str, float] = {}  # free name that was given out → when
         self._started = False
 
     def __iter__(self) -> Iterator[HostedMap]:
@@ -87,6 +95,40 @@ class MapRegistry:
         """Why a map cannot be opened."""
         why, _ = self._unopened.get(name, (f"{self._server.max_maps} are open (max_maps)", 0.0))
         return why
+
+    def denial_of_world(self, hosted: HostedMap, record: Hello | RecordHeader) -> Denied | None:
+        """The answer to a session that does not share a map's coordinate frame; None = it may go on.
+
+        Every record is asked this, not its session's greeting alone: of two that greet a map nobody has yet,
+        the one whose record comes first has it.
+        """
+        if hosted.sessions.shares_frame(record.session, record):
+            return None
+        keyframes = hosted.health().keyframes_durable
+        why = f"map {hosted.name} has {keyframes} keyframes of another session, in another coordinate frame"
+        return Denied(record.session, "world", why, self.free_name(hosted.name))
+
+    def free_name(self, like: str) -> str:
+        """The first of NAME, NAME-2, NAME-3, … that is no map's yet and was given to nobody just now."""
+        now = time.monotonic()
+        in_use = {one.name for one in self if len(one.sessions)} | {route.map for route in self._routes}
+        on_disk = {name for name in state_folder.map_names(self._server.state) if name not in self._open}
+        kept = {name for name, since in self._kept.items() if now - since < _KEPT_SECONDS}
+        taken = in_use | on_disk | kept | set(self._unopened)
+        stem = re.sub(r"-[0-9]+$", "", like)
+        stem = stem if stem in taken else like
+        names = (stem if number == 1 else _numbered(stem, number) for number in count(1))
+        return next(name for name in names if name not in taken)
+
+    def keep_free_name(self, like: str) -> str | None:
+        """A free name that nobody else is given; None = there is no room for another map."""
+        name = self.free_name(like)
+        if name not in self._open and len(self._open) >= self._server.max_maps:
+            return None
+        self._kept[name] = time.monotonic()
+        if len(self._kept) > _KEPT_NAMES:
+            self._kept.pop(next(iter(self._kept)))
+        return name
 
     def _open_map(self, name: str) -> HostedMap:
         volume = self._volumes.get(name) or self._volumes[DEFAULT_MAP]
@@ -162,3 +204,8 @@ class MapRegistry:
         problems += [f"map {hosted.name}: {notice}" for hosted in self for notice in hosted.notices]
         problems += [f"map {name} cannot be opened: {why}" for name, (why, _) in self._unopened.items()]
         return found, problems
+
+
+def _numbered(stem: str, number: int) -> str:
+    suffix = f"-{number}"
+    return stem[: MAP_NAME_LENGTH - len(suffix)] + suffix

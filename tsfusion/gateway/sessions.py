@@ -7,6 +7,9 @@ from typing import Literal
 
 from msgspec import Struct, field
 
+from tsfusion.wire.messages import Hello
+from tsfusion.wire.record_header import RecordHeader
+
 _MAX_SESSIONS = 100_000  # of a map; each takes some 60 bytes of every checkpoint, for ever
 SeqOrder = Literal["next", "duplicate", "gap"]
 
@@ -27,6 +30,7 @@ class Session(Struct, eq=False):
     keyframes: int = 0  # in the journal at the start, and journaled since
     answered: int = 0  # of these, the keyframes that the map has taken or rejected
     rejected: int = 0  # of these, rejected since the start
+    world: str | None = None  # that its first record names; None = no record of it is in the journal
 
     @property
     def owner(self) -> str:
@@ -39,11 +43,16 @@ class Session(Struct, eq=False):
 
 
 class Sessions:
-    """All sessions of a map's journal."""
+    """All sessions of a map's journal.
+
+    A map has one coordinate frame. The first session to be journaled brings it; another is let in when it
+    names a world that the map has, or when its client declares that it shares the frame.
+    """
 
     def __init__(self) -> None:
         self._by_key: dict[bytes, Session] = {}
         self._all: list[Session] = []
+        self._worlds: set[str] = set()
 
     def __iter__(self) -> Iterator[Session]:
         return iter(self._all)
@@ -59,12 +68,24 @@ class Sessions:
         """Whether a key has a session, or may still get one."""
         return key in self._by_key or len(self) < _MAX_SESSIONS
 
-    def open(self, key: bytes, client: str = "") -> Session:
-        """The session of a key, made when new."""
+    def shares_frame(self, key: bytes, record: Hello | RecordHeader) -> bool:
+        """Whether what a session sends is, or is declared to be, in the coordinate frame of this map."""
+        is_known = not self._all or key in self._by_key or record.world in self._worlds
+        return is_known or record.same_frame
+
+    def open(self, key: bytes, client: str = "", world: str | None = None) -> Session:
+        """The session of a key, made when new.
+
+        Args:
+            world: that its record names; None = it is opened for no record.
+        """
         session = self._by_key.get(key)
         if session is None:
             session = self._by_key[key] = Session(key, len(self._all), client)
             self._all.append(session)
+        if session.world is None and world is not None:
+            session.world = world
+            self._worlds.add(world)
         return session
 
     def admit(self, key: bytes, seq: int, previous: int) -> SeqOrder:

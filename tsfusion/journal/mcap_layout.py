@@ -20,7 +20,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from msgspec import Struct
 
 from tsfusion.core.errors import JournalError
-from tsfusion.wire.record_header import is_correction
+from tsfusion.wire.record_header import is_correction, world_of
 
 TOPIC = "/keyframes"
 ENCODING = "x-tsfusion"
@@ -79,6 +79,11 @@ class Record(Struct, frozen=True):
     def is_correction(self) -> bool:
         """Whether the message is a correction, by its first bytes."""
         return bool(self.frames) and is_correction(self.frames[0])
+
+    @property
+    def world(self) -> str:
+        """The world that the message names; empty = none, or its header cannot be read."""
+        return world_of(self.frames[0]) if self.frames else ""
 
 
 class ChunkHead(NamedTuple):

@@ -28,6 +28,7 @@ class RecordEntry(Struct, frozen=True):
     client: str
     nbytes: int
     is_correction: bool = False
+    world: str = ""  # as its header names it
 
 
 def segments(folder: Path) -> list[int]:
@@ -97,7 +98,7 @@ def list_records(path: Path) -> tuple[list[RecordEntry], int]:
             log.log(level, "%s", describe(path, step))
         else:
             place = (step.position, step.session, step.seq, step.client)
-            found.append(RecordEntry(*place, step.nbytes, step.is_correction))
+            found.append(RecordEntry(*place, step.nbytes, step.is_correction, step.world))
     return found, lost
 
 

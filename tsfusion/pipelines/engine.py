@@ -82,7 +82,8 @@ class Engine:
 
     def wait_acknowledged(self, clients: Iterable[Client]) -> None:
         """Wait until the server has every keyframe on its disk, or takes none any more."""
-        if self._wait(lambda stats: not stats.waiting, LINGER):
+        clients = [client for client in clients if not client.is_of_other_world]
+        if self._wait(lambda _: not any(client.stats.waiting for client in clients), LINGER):
             for client in clients:
                 # Corrections and stamps are no reason to lose a scan; what was refused is counted.
                 with suppress(FlushTimeout, KeyframeRefused):

@@ -28,6 +28,7 @@ def replay(
     server: ServerConfig | None = None,
     client: ClientConfig | None = None,
     connect: str | None = None,
+    same_frame: bool = False,
     rate: float | None = None,
     min_weight: float | None = None,
 ) -> ReplaySummary:
@@ -42,12 +43,14 @@ def replay(
         volume: the map of the own server; a server at `connect` has its own.
         server: settings of the own server; None = a free port, and a state folder that is thrown away.
         connect: data address of a running server; None starts one for this run.
+        same_frame: the poses are declared to be in the coordinate frame of the map, whatever worlds it has.
         rate: keyframes per second; None = as fast as they are fused, at most `AHEAD` on their way.
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
 
     Raises:
         OutputError: `out` cannot be written (checked first), or the mesh is empty.
-        TransportError: the server cannot be reached, ended, or stopped fusing.
+        TransportError: the server cannot be reached, ended, or stopped fusing; WorldRefused: the map has
+            keyframes of another world.
         DatasetError: a keyframe cannot be read.
     """
     with results(out, overwrite=overwrite) as (work, folder):
@@ -57,7 +60,7 @@ def replay(
             connect, work / ".scratch", volume=volume, client=client, server=server
         ) as target:
             # A recording leaves nothing out: `wait_turn` keeps the spool short, not the policy.
-            sender = target.client(target.link.map, policy="spool_all")
+            sender = target.client(target.link.map, policy="spool_all", same_frame=same_frame)
             sender.connect()
 
             def observe() -> ClientStats:
@@ -66,7 +69,9 @@ def replay(
                 return stats
 
             running = Engine(target, observe)
-            progress.stage(f"scanning {dataset.name}")
+            progress.stage(
+                f"scanning {dataset.name}" + (f" into the map {target.link.map}" if connect else "")
+            )
             ups, started = [], time.monotonic()
             for keyframe in _keyframes(dataset, first, running, rate):
                 running.wait_turn(AHEAD if rate is None else target.link.backlog)

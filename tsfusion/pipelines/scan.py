@@ -2,23 +2,23 @@
 """A whole scan: a source's frames localised, chosen, sent and fused, and its results left in a folder."""
 
 import dataclasses
-import logging
 import os
 import time
+import uuid
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
-from functools import partial
+from contextlib import ExitStack
 from pathlib import Path
 
 from tsfusion.client import Client, ClientStats
 from tsfusion.core import process
 from tsfusion.core.config import ClientConfig, ScanConfig, ServerConfig, VolumeConfig
-from tsfusion.core.errors import DatasetError, OutputError, SourceError, TransportError, TsfusionError
+from tsfusion.core.errors import DatasetError, OutputError, SourceError, TsfusionError, WorldRefused
 from tsfusion.core.output_folder import results
 from tsfusion.datasets.cameras import described
 from tsfusion.geometry.frame import Frame
 from tsfusion.pipelines import engine, mesh_preview, run_files, scan_results, target_server
 from tsfusion.pipelines.engine import Engine, Progress
+from tsfusion.pipelines.leftovers import ANSWER_SECONDS, Leftovers
 from tsfusion.pipelines.scan_results import MapResult, ScanSummary
 from tsfusion.pipelines.target_server import Target
 from tsfusion.scanner.localization import registry
@@ -26,8 +26,6 @@ from tsfusion.scanner.scanner import Scanner, Submap
 from tsfusion.scanner.sources.source import Source
 
 OUTDOOR_SENSORS = ("stereo", "lidar")
-
-log = logging.getLogger(__name__)
 
 
 def scan(
@@ -42,6 +40,7 @@ def scan(
     server: ServerConfig | None = None,
     connect: str | None = None,
     spool: str | os.PathLike[str] = "tsfusion-spool",
+    same_frame: bool = False,
     min_weight: float | None = None,
 ) -> ScanSummary:
     """Take a source's frames to its end, or until it is closed, and leave the results in the folder `out`.
@@ -56,7 +55,9 @@ def scan(
         volume: the map of the own server; a server at `connect` has its own.
         server: settings of the own server; None = a free port, and a state folder that is thrown away.
         connect: data address of a running server; None starts one for this scan.
-        spool: with `connect`, the folder where keyframes wait until they are acknowledged.
+        spool: with `connect`, the folder where keyframes wait until they are acknowledged; what earlier
+            scans left there goes to its own maps, or waits on.
+        same_frame: the scan's coordinate frame is declared to be that of the map, whatever worlds it has.
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
 
     Raises:
@@ -66,6 +67,7 @@ def scan(
         OutputError: `out` cannot be written, or no frame could be localised; or the own map has no surface,
             when all else is in `out`.
         TransportError: the server cannot be reached or stopped fusing.
+        WorldRefused: the map has keyframes of another session; those of this scan are in the spool.
     """
     failure: list[Exception] = []
     own = connect is None
@@ -81,15 +83,28 @@ def scan(
         with target_server.opened(
             connect, work / ".scratch", volume=volume, client=client, server=server, spools=Path(spool)
         ) as target:
-            if not localizer.absolute and (server is not None or not own):
-                _warn_if_map_is_in_use(target)
-            # A recording waits, so nothing of it is left out; what a live source gives is thinned out.
-            open_client = partial(target.client, policy=None if source.live else "spool_all")
+            leftovers = Leftovers(target, given=localizer.absolute)
+            leftovers.begin()
+
+            def open_client(map_name: str) -> Client:
+                return target.client(
+                    map_name,
+                    # A recording waits, so nothing of it is left out; what a live source gives is thinned.
+                    policy=None if source.live else "spool_all",
+                    world="" if localizer.absolute else uuid.uuid4().hex,
+                    same_frame=same_frame and map_name == target.link.map,
+                )
+
             scanner = Scanner(
                 localizer, config, open_client, map_name=target.link.map,
-                taken=_send_leftovers(target, open_client), outdoors=source.sensor in OUTDOOR_SENSORS,
+                taken=leftovers.maps, free_name=target.free_map_name,
+                outdoors=source.sensor in OUTDOOR_SENSORS,
                 most=target_server.MAPS - 1 if own else None,
             )  # fmt: skip
+            scanner.submaps[0].client.wait_answer(ANSWER_SECONDS)
+            if scanner.submaps[0].client.is_of_other_world:
+                leftovers.finish()
+                scanner.submaps[0].client.check_world()
 
             def observe() -> ClientStats:
                 state = scanner.state()
@@ -98,7 +113,7 @@ def scan(
 
             running = Engine(target, observe)
             pace = running.wait_turn if own and not source.live else running.check
-            progress.stage(f"scanning {source.name}")
+            progress.stage(f"scanning {source.name}" + ("" if own else f" into the map {target.link.map}"))
             started = time.monotonic()
             _run_scanner(scanner, _timely(source, first, frames, config.patience), pace, failure)
             peak = process.peak_rss_bytes()
@@ -113,6 +128,8 @@ def scan(
             else:
                 progress.stage("sending what is on its way")
                 running.wait_acknowledged(clients)
+                leftovers.finish()
+                failure = _refused_worlds(clients) or failure
             seconds = time.monotonic() - started
             progress.stage("writing the results")
             complete = not failure
@@ -171,6 +188,8 @@ def _run_scanner(
 
     def watch(_: Scanner) -> None:
         pace()
+        for submap in scanner.submaps:
+            submap.client.check_world()
 
     try:
         scanner.run(frames, watch)
@@ -185,33 +204,15 @@ def _not_localised(scanner: Scanner) -> OutputError:
     return OutputError(f"the sensor was not localised in any of {state.frames} frames: {state.why}")
 
 
-def _send_leftovers(target: Target, open_client: Callable[[str], Client]) -> set[str]:
-    """Names of the maps that keyframes of an earlier scan wait for.
-
-    Those keyframes are sent along with this scan's, which begins no submap of their names.
-    """
-    names = {path.parent.name for path in target.spools.glob("*/*.mcap")} - {target.link.map}
-    for name in sorted(names):
+def _refused_worlds(clients: list[Client]) -> list[Exception]:
+    """The refusal of a map of another world, with the number of keyframes that wait, and where."""
+    for client in clients:
         try:
-            count = open_client(name).stats.waiting
-            if count:
-                log.warning("an earlier scan left %d keyframes for the map %s: sent too", count, name)
-        except TsfusionError as error:
-            log.warning("the keyframes waiting in %s are not sent: %s", target.spools / name, error)
-    return names
-
-
-def _warn_if_map_is_in_use(target: Target) -> None:
-    """Log a warning when the map has keyframes already, or gets some: this scan's world is not theirs."""
-    name = target.link.map
-    advice = "a scan that localises itself begins its own world; give it a map of its own (--map NAME)"
-    if any((target.spools / name).glob("*.mcap")):
-        log.warning("keyframes of an earlier scan wait for the map %s: %s", name, advice)
-        return
-    with suppress(TransportError):  # a server that is not there yet, or has no such map
-        count = target.status(name, timeout=2.0).keyframes_durable
-        if count:
-            log.warning("the map %s has %d keyframes already: %s", name, count, advice)
+            client.check_world()
+        except WorldRefused as error:
+            kept = f"{client.stats.waiting} keyframes wait in {client.spool_folder} (`tsfusion spool list`)"
+            return [WorldRefused(f"{error}; {kept}")]
+    return []
 
 
 def _write(

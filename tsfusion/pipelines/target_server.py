@@ -15,21 +15,33 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from tsfusion.client import Client
 from tsfusion.core import config
-from tsfusion.core.config import ClientConfig, Config, Policy, ServerConfig, VolumeConfig, override
-from tsfusion.core.errors import TransportError
+from tsfusion.core.config import (
+    DEFAULT_MAP,
+    ClientConfig,
+    Config,
+    Policy,
+    ServerConfig,
+    VolumeConfig,
+    override,
+)
+from tsfusion.core.errors import JournalError, TransportError
+from tsfusion.core.folder_lock import owner_of
+from tsfusion.delivery import left_spools
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.journal import state_folder
 from tsfusion.wire.curve import ClientKeys, client_keys
 from tsfusion.wire.health import Status
-from tsfusion.wire.queries import fetch_mesh, fetch_status
+from tsfusion.wire.queries import fetch_mesh, fetch_new_map, fetch_status
 
 START_DEADLINE = 180.0  # seconds; a cold kernel compilation on a slow machine
 STOP_DEADLINE = 60.0  # seconds; draining and the checkpoint
 _ROUTINE = re.compile("tsfusion: (DEBUG|INFO|WARNING): ")  # lines of a server's log that are no error
+_NAME_TIMEOUT = 1.0  # seconds for a server to name a free map: a sensor waits
+NEW_MAP = "auto"  # as the name of a map: the next one that nobody has
 log = logging.getLogger(__name__)
 MAPS = 16  # that a run's own server may have open: its default one, and one for each submap
 
@@ -135,14 +147,31 @@ class Target:
     _clients: ExitStack
     _kept: dict[str, Path]  # maps of the server started for this run, and the files that they become
 
-    def client(self, map_name: str, *, policy: Policy | None = None) -> Client:
-        """A client that sends to a map; closed with the target.
+    def client(
+        self, map_name: str, *, policy: Policy | None = None, world: str = "", same_frame: bool = False
+    ) -> Client:
+        """A client that sends to a map, with a spool in which nothing waits; closed with the target.
 
         Args:
             policy: None = the settings' own.
+            world, same_frame: of its poses; see `Client`.
         """
+        while True:
+            folder = left_spools.free_folder(self.spools, map_name)
+            try:
+                return self._open(folder, map_name, policy=policy, world=world, same_frame=same_frame)
+            except JournalError:
+                if owner_of(folder) is None:  # else another scan was quicker: the next folder
+                    raise
+
+    def client_of_left(self, left: left_spools.LeftSpool, world: str) -> Client:
+        """A client that sends what an earlier scan left; closed with the target."""
+        return self._open(left.folder, left.map, policy="spool_all", world=world)
+
+    def _open(self, folder: Path, map_name: str, *, policy: Policy | None, **labels: Any) -> Client:
         link = override(self.link, map=map_name, policy=policy)
-        client = Client(link.address, spool=self.spools / map_name, control=link.control, config=link)
+        client = Client(link.address, spool=folder, control=link.control, config=link, **labels)
+        client.logs_refusal = False
         self._clients.callback(client.close)
         return client
 
@@ -150,6 +179,15 @@ class Target:
         """Write a map to a file when the server started for this run has stopped."""
         if self.child is not None:
             self._kept[map_name] = path
+
+    def free_map_name(self) -> str | None:
+        """A name like that of the map to scan into, which no map has; None = the server does not say soon."""
+        link = self.link
+        with suppress(TransportError):
+            return fetch_new_map(
+                link.address, link.map, control=link.control, timeout=_NAME_TIMEOUT, keys=self.keys
+            )
+        return None
 
     def check(self) -> None:
         """Raise TransportError when the server started for this run has ended."""
@@ -167,6 +205,18 @@ class Target:
         return fetch_mesh(address, control=control, map_name=map_name, min_weight=min_weight, keys=keys)
 
 
+def map_to_send_to(link: ClientConfig, name: str, like: str) -> str:
+    """The map of that name; for `auto` the first of LIKE, LIKE-2, … that no map of the server has.
+
+    Raises:
+        TransportError: when the server does not say.
+    """
+    if name != NEW_MAP:
+        return name
+    keys = client_keys(link.key, link.server_key)
+    return fetch_new_map(link.address, like, control=link.control, keys=keys)
+
+
 @contextmanager
 def opened(
     connect: str | None,
@@ -181,6 +231,7 @@ def opened(
 
     Args:
         connect: data address of a server that runs elsewhere; None starts one.
+        client: settings of the connection; `auto` as its map is the next name that no map of the server has.
         scratch: a folder that does not exist yet, removed at the end of the block.
         volume: the map of the server started here.
         server: settings of the server started here; None = a free port, and a state folder in `scratch`.
@@ -202,6 +253,7 @@ def opened(
         else:
             link = override(link, address=connect)
         keys = client_keys(link.key, link.server_key)
+        link = override(link, map=map_to_send_to(link, link.map, DEFAULT_MAP))
         yield Target(link, keys, spools or scratch / "spool", child, stack, kept)
     for name, path in kept.items():
         _copy_map(state_folder.map_folder(state, name) / state_folder.MAP_FILE, path)

@@ -9,7 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
-from itertools import count
+from itertools import chain, count
 from typing import Any, Literal
 
 import msgspec
@@ -78,6 +78,7 @@ class Scanner:
         connect: opens a client that sends to the map of that name.
         map_name: name of the first submap.
         taken: names that no submap may have.
+        free_name: asks for the name of a map that nobody has; None = nobody can say.
         outdoors: see `KeyframeSelector`.
         most: largest number of submaps; then a lost sensor has to be found again in the last one. None = any.
     """
@@ -90,11 +91,13 @@ class Scanner:
         *,
         map_name: str,
         taken: Collection[str] = (),
+        free_name: Callable[[], str | None] = lambda: None,
         outdoors: bool = False,
         most: int | None = None,
     ) -> None:
         self._localizer, self._config, self._most = localizer, config, most
         self._connect, self._map_name, self._taken = connect, map_name, {map_name, *taken}
+        self._free_name = free_name
         self._selector = KeyframeSelector(config, outdoors=outdoors)
         self._next: str | None = None  # the map of the submap that begins with the next pose
         self._lost_since: int | None = None
@@ -184,7 +187,8 @@ class Scanner:
             self._begin_submap(seconds)
 
     def _begin_submap(self, seconds: float) -> None:
-        name = next(name for name in map(self._name, count(2)) if name not in self._taken)
+        names = filter(None, chain([self._free_name()], map(self._name, count(2))))
+        name = next(name for name in names if name not in self._taken)
         self._taken.add(name)
         log.warning("lost for %.1f s (%s): what follows goes into a new map, %s", seconds, self._why, name)
         self._localizer.reset()

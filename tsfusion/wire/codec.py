@@ -59,6 +59,8 @@ def encode(
     seq: int,
     previous: int | None = None,
     map_name: str = DEFAULT_MAP,
+    world: str = "",
+    same_frame: bool = False,
     jpeg_quality: int,
 ) -> list[bytes]:
     """Encode a keyframe as frames: the header, then one frame for each array.
@@ -86,6 +88,8 @@ def encode(
         seq=seq,
         previous=seq - 1 if previous is None else previous,
         map=map_name,
+        world=world,
+        same_frame=same_frame,
         pose=tuple(keyframe.T_world_camera[:3].ravel().tolist()),
         buffers=tuple(buffers),
         scale=scales.get(keyframe.kind),

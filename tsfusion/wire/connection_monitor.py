@@ -50,6 +50,7 @@ class ConnectionMonitor:
         connected: whether the handshake is done and the connection stands.
         made: number of connections made so far, this one included. Messages on earlier ones may be lost: send
             them again when this rises; before that they would be lost, too.
+        retrying: whether the last attempt to connect found nobody.
         lost: number of connections that were made and have ended.
         gave_up: libzmq will not try again, whatever the server does: close the socket and make another.
         refused: the server has certainly refused this client.
@@ -58,6 +59,7 @@ class ConnectionMonitor:
     def __init__(self, socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = None) -> None:
         self.connected = False
         self.made = 0
+        self.retrying = False
         self.lost = 0
         self.gave_up = False
         self.refused = False
@@ -99,9 +101,9 @@ class ConnectionMonitor:
 
     def _handle_event(self, event: int, value: int) -> str | None:
         if event == zmq.EVENT_CONNECTED:
-            self._connected_at, self._ended_at = time.monotonic(), 0.0
+            self._connected_at, self._ended_at, self.retrying = time.monotonic(), 0.0, False
         elif event == zmq.EVENT_CONNECT_RETRIED:
-            self._ended_at = 0.0
+            self._ended_at, self.retrying = 0.0, True
         elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
             self.connected, self.refused, self._failures = True, False, 0
             self.made += 1

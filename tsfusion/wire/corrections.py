@@ -114,6 +114,8 @@ def encode(
     seq: int,
     previous: int | None = None,
     map_name: str = DEFAULT_MAP,
+    world: str = "",
+    same_frame: bool = False,
 ) -> list[bytes]:
     """A correction as frames: header and body. `sent_ns` is 0 until `record_header.stamp` fills it in."""
     T = correction.T_map_odometry
@@ -124,6 +126,8 @@ def encode(
         seq=seq,
         previous=seq - 1 if previous is None else previous,
         map=map_name,
+        world=world,
+        same_frame=same_frame,
         count=len(correction.seqs),
         removed=len(correction.removed),
         crc32=zlib.crc32(body),

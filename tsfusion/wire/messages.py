@@ -13,7 +13,7 @@ from tsfusion.core.config import MapName
 from tsfusion.core.errors import DecodeError
 from tsfusion.wire.health import Health, MeshLayout, Status
 from tsfusion.wire.keyframe_times import Seq, Stamps
-from tsfusion.wire.record_header import SessionId
+from tsfusion.wire.record_header import SessionId, WorldName
 
 PROTOCOL_VERSION = 2  # of these messages and of which kinds of records a server takes
 # Why a client never sends a keyframe: the reasons in `Ping.skipped`, in words
@@ -28,11 +28,18 @@ Counts = dict[Annotated[str, Meta(max_length=32)], Annotated[int, Meta(ge=0)]]  
 
 
 class Hello(Struct, frozen=True, tag="hello", omit_defaults=True):
-    """A client opens (or re-opens) its session."""
+    """A client opens (or re-opens) its session.
+
+    Attributes:
+        version: `PROTOCOL_VERSION` of the client.
+        world, same_frame: as in the headers of its records.
+    """
 
     session: SessionId
-    version: int  # `PROTOCOL_VERSION` of the client
+    version: int
     map: MapName = "default"
+    world: WorldName = ""
+    same_frame: bool = False
 
 
 class Welcome(Struct, frozen=True, tag="welcome"):
@@ -87,16 +94,22 @@ class Hold(Struct, frozen=True, tag="hold"):
     message: str
 
 
-class Denied(Struct, frozen=True, tag="denied"):
+class Denied(Struct, frozen=True, tag="denied", omit_defaults=True):
     """The answer to a Hello that opens no session (yet): ask again, but tell the user why.
 
-    `reason`: `opening` (the map is being opened), `map` (there is no such map, and no room for one, or it
-    cannot be opened), `session` (it is another client's) or `version`.
+    Also the answer to a record whose session must be opened first, or whose world the map is not of.
+
+    Attributes:
+        reason: `opening` (the map is being opened), `map` (there is no such map, and no room for one, or it
+            cannot be opened), `session` (it is another client's), `world` (the map has keyframes of another
+            world) or `version`.
+        free_map: of `world`, the name of a map that nobody has yet.
     """
 
     session: SessionId
     reason: str
     message: str
+    free_map: str = ""
 
 
 class Ping(Struct, frozen=True, tag="ping", omit_defaults=True):
@@ -134,8 +147,8 @@ class Pong(Struct, frozen=True, tag="pong"):
 class Command(Struct, frozen=True, tag="command", kw_only=True):
     """A request of a person or program; answered by one Reply."""
 
-    name: Literal["ping", "health", "status", "mesh"]
-    map: MapName = "default"
+    name: Literal["ping", "health", "status", "mesh", "new_map"]
+    map: MapName = "default"  # of `new_map`: the name to begin with, where that is free
     min_weight: float | None = None
 
 
@@ -145,6 +158,7 @@ class Reply(Struct, frozen=True, tag="reply", kw_only=True):
     name: str
     error: str | None = None  # why there is no answer, for a person
     retry: bool = False  # whether the same command may be answered soon, though it is not now
+    map: MapName | None = None  # a name that is free, and kept for who asked
     health: "Health | None" = None
     status: "Status | None" = None
     mesh: "MeshLayout | None" = None

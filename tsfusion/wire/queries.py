@@ -69,6 +69,28 @@ def fetch_status(
     return reply.status
 
 
+def fetch_new_map(
+    address: str,
+    like: str = DEFAULT_MAP,
+    *,
+    control: str | None = None,
+    timeout: float = 10.0,
+    keys: ClientKeys | None = None,
+) -> str:
+    """Ask the server at a data address for the name of a map that nobody has: NAME, NAME-2, NAME-3, …
+
+    The server gives it to nobody else for some minutes. See `fetch_health`.
+
+    Raises:
+        TransportError: when it has no room for another map.
+    """
+    command = Command(name="new_map", map=like)
+    reply, _ = _request_if_present(address, control, command, timeout, keys)
+    if reply.map is None:
+        raise TransportError(f"the server at {address} answered without the name of a map")
+    return reply.map
+
+
 def fetch_mesh(
     address: str,
     *,

@@ -5,6 +5,7 @@ A session's records are keyframes (`TSF`) and corrections of them (`TSC`), numbe
 byte changes when an old reader must not try; new optional fields are minor changes that an old reader skips.
 """
 
+import sys
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 import msgspec
@@ -24,6 +25,8 @@ Length = Annotated[int, Meta(ge=0, le=2_000_000)]
 Natural = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
 Crc32 = Annotated[int, Meta(ge=0, le=(1 << 32) - 1)]
 SessionId = Annotated[bytes, Meta(min_length=16, max_length=16)]
+WORLD_NAME = "[A-Za-z0-9_-]{1,64}"
+WorldName = Annotated[str, Meta(pattern=rf"\A({WORLD_NAME})?\Z")]
 RecordNumber = Annotated[int, Meta(ge=1, le=(1 << 63) - 1)]
 TransformRows = Annotated[tuple[float, ...], Meta(min_length=12, max_length=12)]
 
@@ -56,6 +59,9 @@ class KeyframeHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
         previous: the seq before this one among those the sender still offers, 0 = none: what lies
             between the two was dropped on purpose.
         map: the map it is for.
+        world: name of the coordinate frame of its pose, drawn by whoever localised it; empty = the pose was
+            given from elsewhere.
+        same_frame: the sender declares that this frame is the map's, whatever worlds the map has.
         sent_ns: the sender's monotonic clock when this copy was handed to the socket.
         pose: the upper three rows of `T_world_camera`, row by row.
         scale: `depth_scale` or `disparity_scale`.
@@ -69,6 +75,8 @@ class KeyframeHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
     pose: TransformRows
     buffers: Annotated[tuple[Buffer, ...], Meta(min_length=1, max_length=4)]
     map: MapName = "default"
+    world: WorldName = ""
+    same_frame: bool = False
     sent_ns: Natural = 0
     scale: float | None = None
     intrinsics: Intrinsics | None = None
@@ -82,7 +90,7 @@ class CorrectionHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The first frame of a correction, before the numbers and poses of its body.
 
     Attributes:
-        session, seq, previous, map, sent_ns: as of a keyframe.
+        session, seq, previous, map, world, same_frame, sent_ns: as of a keyframe.
         count: keyframes that get another pose.
         removed: keyframes that are to be taken out of the map.
         crc32: of the body.
@@ -98,6 +106,8 @@ class CorrectionHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
     count: Natural
     crc32: Crc32
     map: MapName = "default"
+    world: WorldName = ""
+    same_frame: bool = False
     sent_ns: Natural = 0
     removed: Natural = 0
     T_map_odometry: TransformRows | None = None
@@ -148,6 +158,14 @@ def is_correction(frame: Any) -> bool:
     return bytes(memoryview(frame)[:MAGIC_BYTES]) == _MAGIC[CorrectionHeader]
 
 
-def stamp(frame: Any, *, previous: int, sent_ns: int) -> bytes:
-    """Frame 0 again with the send time and the seq of the record sent before this one."""
-    return pack(msgspec.structs.replace(unpack(frame), previous=previous, sent_ns=sent_ns))
+def world_of(frame: Any) -> str:
+    """The world that frame 0 names; empty also when it is no header."""
+    try:
+        return sys.intern(unpack(frame).world)
+    except Refused:
+        return ""
+
+
+def stamp(frame: Any, **fields: Any) -> bytes:
+    """Frame 0 again with these fields: what is known only when the record is sent."""
+    return pack(msgspec.structs.replace(unpack(frame), **fields))

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: MIT
+"""A server whose maps open at once: its fusers take every keyframe and fuse none."""
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+from keyframes_and_servers import Server
+
+_FUSER = """
+import sys, zmq
+from tsfusion.fuser import messages as fuser_messages
+from tsfusion.wire import sockets
+
+link = sockets.pair(zmq.Context())
+link.connect(sys.argv[1])
+link.send(fuser_messages.encode(fuser_messages.Started()))
+while True:
+    message = fuser_messages.to_fuser.decode(link.recv())
+    if isinstance(message, fuser_messages.Begin):
+        link.send(fuser_messages.encode(fuser_messages.Ready({})))
+    elif isinstance(message, fuser_messages.Fuse):
+        link.send(fuser_messages.encode(fuser_messages.Done(message.index, 1, 2, message.skip)))
+    elif isinstance(message, fuser_messages.Finish):
+        sys.exit(0)
+"""
+_CODE = f"""
+import sys
+from tsfusion.gateway import fuser_process
+fuser_process.COMMAND = (sys.executable, "-c", {_FUSER!r})
+"""
+
+
+@contextmanager
+def keeping(state: Path, **settings: object) -> Iterator[Server]:
+    """Start a server that journals and fuses nothing, and end it afterwards whatever happens."""
+    with closing(Server(state, code=_CODE, **{"max_maps": 32, **settings})) as server:  # type: ignore[arg-type]
+        if not server.address:
+            raise RuntimeError(server.stderr_text())
+        yield server

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: MIT
+"""Spools in a folder of spools: which hold keyframes of an earlier scan, and where a new one may begin.
+
+A scan writes into a spool in which nothing waits: `FOLDER/MAP`, or `FOLDER/MAP.2`, `FOLDER/MAP.3`, … where an
+earlier scan's keyframes wait there. The name is for people: which map and world a spool is for stands in the
+headers of its records.
+"""
+
+import logging
+from collections.abc import Iterator
+from contextlib import suppress
+from itertools import count
+from pathlib import Path
+
+from msgspec import Struct
+
+from tsfusion import journal
+from tsfusion.core.errors import DecodeError, JournalError
+from tsfusion.core.folder_lock import lock_folder, owner_of
+from tsfusion.delivery import tombstones
+from tsfusion.journal.mcap_layout import Record
+from tsfusion.journal.record_scan import Damage, scan_records
+from tsfusion.wire.record_header import unpack
+
+log = logging.getLogger(__name__)
+
+
+class LeftSpool(Struct, frozen=True):
+    """A spool that holds records, as its first one describes it."""
+
+    folder: Path
+    map: str
+    world: str  # name of the coordinate frame; empty = poses given from elsewhere, or an older version's scan
+    session: bytes  # 16 bytes
+    since_ns: int  # wall clock of that record
+    used_by: str | None  # pid of the process that has it open; None = nobody has
+
+    @property
+    def own_world(self) -> str:
+        """The world, or where none is named a name that a map has only by this spool."""
+        return self.world or self.session.hex()
+
+    def count(self) -> tuple[int, int, int]:
+        """Keyframes, corrections, and bytes that wait. Reads all of it.
+
+        Raises:
+            JournalError: when a file cannot be read.
+        """
+        kinds = [(record.is_correction, record.nbytes) for record in _waiting(self.folder)]
+        corrections = sum(is_correction for is_correction, _ in kinds)
+        return len(kinds) - corrections, corrections, sum(nbytes for _, nbytes in kinds)
+
+
+def find(root: Path) -> list[LeftSpool]:
+    """The spools in a folder, or the folder itself where it is one, that hold records; oldest first."""
+    folders = [root, *(path for path in root.glob("*") if path.is_dir())] if root.is_dir() else []
+    found = (_describe(folder) for folder in folders)
+    return sorted((one for one in found if one is not None), key=lambda one: one.since_ns)
+
+
+def free_folder(root: Path, map_name: str) -> Path:
+    """The first of MAP, MAP.2, MAP.3, … in which nothing waits and that nobody has open."""
+    names = (map_name if number == 1 else f"{map_name}.{number}" for number in count(1))
+    folders = (root / name for name in names)
+    return next(folder for folder in folders if not any(folder.glob("*.mcap")) and owner_of(folder) is None)
+
+
+def drop(left: LeftSpool) -> None:
+    """Delete a spool and all that waits in it; what the server refused stays, in its folder `refused`.
+
+    Raises:
+        JournalError: when somebody has it open, or the disk refuses.
+    """
+    lock = lock_folder(left.folder, "spool", "scanner")
+    try:
+        for number in journal.segments(left.folder):
+            journal.segment_path(left.folder, number).unlink()
+        (left.folder / tombstones.NAME).unlink(missing_ok=True)
+    except OSError as error:
+        raise JournalError(f"cannot delete {left.folder}: {error.strerror}", error.errno) from error
+    finally:
+        lock.close()
+
+
+def _describe(folder: Path) -> LeftSpool | None:
+    try:
+        for record in _waiting(folder):
+            with suppress(DecodeError, IndexError):  # damaged: a later one says the same
+                header = unpack(record.frames[0])
+                place = (folder, header.map, header.world)
+                return LeftSpool(*place, record.session, record.logged_ns, owner_of(folder))
+    except JournalError as error:
+        log.warning("the spool %s is passed over: %s", folder, error)
+    return None
+
+
+def _waiting(folder: Path) -> Iterator[Record]:
+    gone: set[int] | None = None
+    for number in journal.segments(folder):
+        for step in scan_records(journal.segment_path(folder, number)):
+            if isinstance(step, Damage):
+                continue
+            if gone is None:
+                gone = tombstones.stored(folder, step.session) or set()
+            if step.seq not in gone:
+                yield step
