@@ -14,11 +14,18 @@ from tsfusion import InvalidConfig, Mesh, Volume, open_dataset
 from tsfusion.datasets import select
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.se3 import exp
-from tsfusion.geometry.up_direction import Up
+from tsfusion.geometry.up_direction import HeldSensor, Up
 
 
 def degrees(a: object, b: object) -> float:
     return math.degrees(math.acos(np.clip(np.dot(a, b) / np.linalg.norm(a) / np.linalg.norm(b), -1, 1)))
+
+
+def held(poses: list, sensor: str = "kinect", forces: list | None = None) -> HeldSensor:
+    sums = HeldSensor()
+    for T, force in zip(poses, forces or [None] * len(poses), strict=True):
+        sums.add(T, sensor, force)
+    return HeldSensor(sums.numbers)  # as it comes back from a checkpoint
 
 
 def scanned(path: Path, *, limit: int | None, voxel_size: float, **options: str) -> tuple[Mesh, list, str]:
@@ -53,7 +60,7 @@ def test_the_floor_of_real_scans(
     within: float,
 ) -> None:
     mesh, poses, sensor = scanned(data(folder), limit=limit, voxel_size=voxel_size, **options)
-    up = up_direction.find(mesh, poses, sensor=sensor)
+    up = up_direction.find(mesh, held(poses, sensor))
     assert up.found_by == "floor"
     assert degrees(up.direction, truth) < within
 
@@ -61,7 +68,7 @@ def test_the_floor_of_real_scans(
 def test_a_kitchen_whose_cameras_look_down(data: Callable[[str], Path]) -> None:
     """The mean camera is 26° off; a floor is square to the wall, which faces the first camera."""
     mesh, poses, sensor = scanned(data("7scenes/redkitchen"), limit=60, voxel_size=0.04)
-    up = up_direction.find(mesh, poses, sensor=sensor)
+    up = up_direction.find(mesh, held(poses, sensor))
     assert up.found_by == "floor"
     wall = up_direction._Surface(mesh)._plane(np.array((0.0, 0.46, -0.89)), np.True_)[0]
     assert degrees(up.direction, wall) == pytest.approx(90, abs=1.5)
@@ -85,7 +92,7 @@ def room() -> tuple[Mesh, list[np.ndarray]]:
 def test_a_turned_room(room: tuple[Mesh, list[np.ndarray]], seed: int) -> None:
     mesh, poses = room
     T = exp(np.append(np.zeros(3), np.random.default_rng(seed).normal(size=3)))
-    up = up_direction.find(turned(mesh, T), [T @ pose for pose in poses])
+    up = up_direction.find(turned(mesh, T), held([T @ pose for pose in poses]))
     assert up.found_by == "floor"
     assert degrees(up.direction, T[:3, 2]) < 0.3
     assert degrees(up.to_y() @ up.direction, (0, 1, 0)) < 1e-4
@@ -99,17 +106,17 @@ def test_without_a_floor_the_cameras_decide() -> None:
     pose = np.eye(4)
     pose[:3, :3] = np.stack(((-1.0, 0, 0), (0, 0, -1.0), (0, -1.0, 0)), axis=1)  # looks at it from y = 2
     pose[1, 3] = 2
-    assert up_direction.find(mesh, [pose]) == Up((0.0, 0.0, 1.0), "cameras")
+    assert up_direction.find(mesh, held([pose])) == Up((0.0, 0.0, 1.0), "cameras")
     # Alone it may be a wall of a map whose z is up, or the floor of one whose y is up.
     turned_about = [pose @ exp(np.array((0, 0, 0, 0, 0, angle))) for angle in (0, 2.1, 4.2)]
-    assert up_direction.find(mesh, turned_about) == up_direction.find(mesh)
+    assert up_direction.find(mesh, held(turned_about)) == up_direction.find(mesh, HeldSensor())
 
 
 def test_without_cameras_walls_and_floor_look_alike(room: tuple[Mesh, list[np.ndarray]]) -> None:
     mesh, _ = room
-    assert up_direction.find(mesh) is None
+    assert up_direction.find(mesh, HeldSensor()) is None
     no_points = np.zeros((0, 3), np.float32)
-    assert up_direction.find(Mesh(no_points, no_points.astype(np.int32), no_points)) is None
+    assert up_direction.find(Mesh(no_points, no_points.astype(np.int32), no_points), HeldSensor()) is None
 
 
 def test_the_accelerometer_beats_the_floor(room: tuple[Mesh, list[np.ndarray]]) -> None:
@@ -118,13 +125,13 @@ def test_the_accelerometer_beats_the_floor(room: tuple[Mesh, list[np.ndarray]]) 
     shakes = (1, 0, 0), (-1, 0, 0), (0, 2, 0), (0, -2, 0), (0, 0, 0)
     shaken = [9.81 * slope + shake for shake in shakes]
     forces = [None, *(pose[:3, :3].T @ force for pose, force in zip(poses[1:], shaken, strict=True))]
-    up = up_direction.find(mesh, poses, forces=forces)
+    up = up_direction.find(mesh, held(poses, forces=forces))
     assert (up.found_by, up.axis) == ("imu", "+z")
     assert degrees(up.direction, slope) < 1e-3
     in_g = [None if force is None else force / 9.81 for force in forces]
-    assert up_direction.find(mesh, poses, forces=in_g).found_by == "imu"
+    assert up_direction.find(mesh, held(poses, forces=in_g)).found_by == "imu"
     # Free of gravity, as some drivers give it, or in axes that are not known: the floor
-    assert up_direction.find(mesh, poses, forces=[np.array((0.1, 0, 0))] * 6).found_by == "floor"
+    assert up_direction.find(mesh, held(poses, forces=[np.array((0.1, 0, 0))] * 6)).found_by == "floor"
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ GRAVITY = 9.81  # m/s²
 # beyond half of that it would be taken for one.
 _CONE = math.cos(math.radians(45))
 _LEVEL = math.cos(math.radians(8))  # of a direction, in which a normal is one of a plane across it
-_SAMPLE = 30_000  # vertices looked at
+_SAMPLE = 50_000  # triangles looked at
 _UPRIGHT = 0.5  # least length of the mean of the cameras' unit up vectors: less, and they were turned about
 _LEAST = 0.02  # share of the surface that a floor has at least
 _APART = math.cos(math.radians(30))  # of two directions that are not the same
@@ -52,7 +52,7 @@ class Up(msgspec.Struct, frozen=True):
         return turn
 
     def __str__(self) -> str:
-        numbers = " ".join(f"{number:.4f}" for number in self.direction)
+        numbers = " ".join(f"{round(number, 4) + 0.0:.4f}" for number in self.direction)  # no -0.0
         return f"{self.axis} ({self.found_by}: {numbers})"
 
 
@@ -75,67 +75,103 @@ def parse(text: str) -> Up:
     return _up(numbers, "given")
 
 
-def sensor_ups(poses: NDArray[np.float64], sensor: str) -> NDArray[np.float64]:
-    """(n, 3) in the world: away from the ground, for sensors with (n, 4, 4) poses that are held upright.
-
-    A LiDAR's own axes are x forward, y left, z up; a camera's are x right, y down, z forward.
-    """
-    return poses[:, :3, 2] if sensor == "lidar" else -poses[:, :3, 1]
-
-
-def find(
-    mesh: "Mesh",
-    poses: Sequence[NDArray[np.float64]] = (),
-    *,
-    sensor: str = "kinect",
-    forces: Sequence[NDArray[np.float64] | None] = (),
-) -> Up | None:
-    """Find up from a mesh and from what is known of the sensor that saw it.
-
-    An accelerometer decides, where its mean over the scan is as long as gravity. Otherwise the plane with the
-    largest surface does, among those seen from above by a sensor that was held upright within 45°; without
-    such a plane the mean of how it was held. Without poses a direction counts only if three times as much
-    surface faces there as any other way, and it is −y, +y or +z within 45°: walls look like a floor.
+class HeldSensor:
+    """How the sensors of a map were held: sums over their poses, and over what accelerometers measured.
 
     Args:
-        poses: (4, 4) T_world_sensor each.
-        sensor: name of the sensor model: a LiDAR's z axis is up, a camera's −y.
-        forces: (3,) each, what an accelerometer measured, in the axes of each pose; None = nothing.
+        numbers: those of another, to go on from; None = nothing yet.
+    """
+
+    def __init__(self, numbers: Sequence[float] | None = None) -> None:
+        self._sums = np.zeros((3, 4)) if numbers is None else np.array(numbers, np.float64).reshape(3, 4)
+
+    @property
+    def numbers(self) -> list[float]:
+        """12 numbers that JSON can hold."""
+        found: list[float] = self._sums.ravel().tolist()
+        return found
+
+    def add(
+        self, T_world_sensor: NDArray[np.float64], sensor: str, force: NDArray[np.float64] | None = None
+    ) -> None:
+        """Take a keyframe into account.
+
+        Args:
+            T_world_sensor: (4, 4). A LiDAR's own axes are x forward, y left, z up; a camera's are x right, y
+                down, z forward.
+            sensor: name of the sensor model.
+            force: (3,) what an accelerometer measured, in the sensor's axes; None = nothing.
+        """
+        up = T_world_sensor[:3, 2] if sensor == "lidar" else -T_world_sensor[:3, 1]
+        rows = [up, T_world_sensor[:3, 3]] + ([] if force is None else [T_world_sensor[:3, :3] @ force])
+        self._sums[: len(rows)] += np.column_stack((rows, np.ones(len(rows))))
+
+    @property
+    def up(self) -> NDArray[np.float64]:
+        """(3,) mean of the directions away from the ground, if they were held upright: 0 to 1 long."""
+        return self._mean(0)
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """(3,) mean position, metres."""
+        return self._mean(1)
+
+    @property
+    def force(self) -> NDArray[np.float64]:
+        """(3,) mean specific force in the world, gravity's opposite: the sensors' own motion cancels out."""
+        return self._mean(2)
+
+    def _mean(self, row: int) -> NDArray[np.float64]:
+        mean: NDArray[np.float64] = self._sums[row, :3] / max(self._sums[row, 3], 1.0)
+        return mean
+
+
+def find(mesh: "Mesh", held: HeldSensor, *, given: Up | None = None) -> Up | None:
+    """Find up from a mesh and from how the sensors that saw it were held.
+
+    An accelerometer decides, where its mean over the scan is as long as gravity. Otherwise the plane with the
+    largest surface does, among those seen from above by sensors that were held upright within 45°; without
+    such a plane the mean of how they were held. Where that is not known a direction counts only if three
+    times as much surface faces there as any other way, and it is −y, +y or +z within 45°: walls look like a
+    floor.
+
+    Args:
+        given: by a person: the answer.
 
     Returns:
         None where it cannot be told.
     """
-    measured = _by_forces(poses, forces)
-    if measured is not None:
-        return measured
+    if given is not None:
+        return given
+    # In m/s², or in g as some drivers write. A wrong axis or pose makes the mean shorter.
+    force = float(np.linalg.norm(held.force))
+    if min(abs(force - GRAVITY) / GRAVITY, abs(force - 1)) < _SHORT:
+        return _up(held.force, "imu")
     surface = _Surface(mesh)
-    T = np.array(poses).reshape(-1, 4, 4)
-    held = sensor_ups(T, sensor).mean(axis=0) if len(T) else np.zeros(3)
-    if np.linalg.norm(held) < _UPRIGHT:
+    length = float(np.linalg.norm(held.up))
+    if length < _UPRIGHT:
         return surface.most_faced()
-    held /= np.linalg.norm(held)
-    floor = surface.floor(held, float((T[:, :3, 3] @ held).max()))
-    return _up(held, "cameras") if floor is None else _up(floor, "floor")
+    floor = surface.floor(held.up / length, held.position)
+    return _up(held.up, "cameras") if floor is None else _up(floor, "floor")
 
 
 class _Surface:
-    """A sample of a mesh's vertices: positions (n, 3), unit normals (n, 3), area around each (n,), sum 1."""
+    """A sample of a mesh's triangles: centres (n, 3), unit normals (n, 3), areas (n,) of sum 1."""
 
     def __init__(self, mesh: "Mesh") -> None:
-        vertices, faces = mesh.vertices.astype(np.float64), mesh.faces
-        a, b, c = (vertices[faces[:, i]] for i in range(3))
-        areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        area = np.bincount(faces.ravel(), np.repeat(areas, 3), len(vertices))
-        chosen = np.flatnonzero(area > 0)
-        chosen = chosen[:: max(1, len(chosen) // _SAMPLE)]
-        self.points, self.normals = vertices[chosen], mesh.normals[chosen].astype(np.float64)
-        self.area = area[chosen] / max(float(area[chosen].sum()), 1e-12)
-        # Within this a vertex belongs to a plane: two edges, which are about as long as a voxel
-        self.thickness = 2 * float(np.median(np.linalg.norm(b - a, axis=1))) if len(a) else 1.0
+        faces = mesh.faces[:: max(1, len(mesh.faces) // _SAMPLE)]
+        corners, normals = mesh.vertices[faces].astype(np.float64), mesh.normals[faces].astype(np.float64)
+        edges = np.diff(corners, axis=1)
+        area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+        self.area = area / max(float(area.sum()), 1e-12)
+        self.points, mean = corners.mean(axis=1), normals.sum(axis=1)
+        self.normals = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+        # Within this a point belongs to a plane: two edges, which are about as long as a voxel
+        self.thickness = 2 * float(np.median(np.linalg.norm(edges[:, 0], axis=1))) if len(faces) else 1.0
 
-    def floor(self, held: NDArray[np.float64], top: float) -> NDArray[np.float64] | None:
-        """(3,) normal of the largest plane seen from the side of `held` and below `top` along it."""
-        below = self.points @ held < top
+    def floor(self, held: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """(3,) normal of the largest plane seen from the side of `held` and below a camera."""
+        below = (self.points - camera) @ held < 0
         directions = _sphere()
         directions = directions[directions @ held > _CONE]
         shares = self._facing(directions, below)
@@ -179,19 +215,6 @@ class _Surface:
             axis = np.linalg.eigh((weights[:, None] * offsets).T @ offsets)[1][:, 0]
             normal = axis if axis @ normal > 0 else -axis
         return normal, share
-
-
-def _by_forces(
-    poses: Sequence[NDArray[np.float64]], forces: Sequence[NDArray[np.float64] | None]
-) -> Up | None:
-    """Gravity's opposite: over a scan, a sensor's own accelerations cancel out."""
-    found = [T[:3, :3] @ force for T, force in zip(poses, forces, strict=False) if force is not None]
-    if not found:
-        return None
-    mean = np.mean(found, axis=0)
-    # In m/s², or in g as some drivers write. A wrong axis or pose makes the mean shorter.
-    length = float(np.linalg.norm(mean))
-    return _up(mean, "imu") if min(abs(length - GRAVITY) / GRAVITY, abs(length - 1)) < _SHORT else None
 
 
 def _up(direction: NDArray[np.float64], found_by: str) -> Up:
