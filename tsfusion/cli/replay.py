@@ -41,6 +41,8 @@ def replay(
     check_: Annotated[
         bool, options.option("--check/--no-check", None, "Warn when poses and depth disagree.", rare=True)
     ] = True,
+    up: options.UpDirection = None,
+    keep_islands: options.KeepIslands = None,
     config: options.ConfigFile = None,
     json: options.Json = False,
     **settings: Any,
@@ -51,6 +53,7 @@ def replay(
     # Any server makes a mesh with another `min_weight`.
     own = {*options.MAP_OPTIONS, "state"} - {"min_weight"}
     options.check_target_flags(context, connect, own=own, remote=())
+    given_up = options.up_direction(up)
     dataset = open_recording(
         path, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
         **options.dataset_options(option),
@@ -68,7 +71,7 @@ def replay(
     _run(
         dataset, out, overwrite=overwrite, json=json, volume=chosen.volume,
         server=options.own_server(chosen, state), client=client, connect=connect, rate=rate,
-        min_weight=settings["min_weight"],
+        min_weight=settings["min_weight"], up=given_up, keep_islands=keep_islands,
     )  # fmt: skip
 
 

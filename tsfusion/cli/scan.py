@@ -91,12 +91,19 @@ def scan(
     modality: options.Modality = None,
     option: options.DatasetOptions = None,
     unpack: options.Unpack = False,
+    up: options.UpDirection = None,
+    keep_islands: options.KeepIslands = None,
     config: options.ConfigFile = None,
     json: options.Json = False,
     **settings: Any,
 ) -> None:
     """Localise a sensor and fuse its keyframes; Ctrl-C ends the scan and keeps its results."""
     options.check_target_flags(context, connect, own={*options.MAP_OPTIONS, "state"}, remote={"spool"})
+    if connect is not None:
+        options.refuse(
+            context, ("up", "keep_islands"), "has no effect with --connect: give it to `tsfusion mesh`"
+        )
+    given_up = options.up_direction(up)
     from tsfusion.cli import output, progress, run_summary
     from tsfusion.pipelines.scan import scan as run
 
@@ -116,7 +123,7 @@ def scan(
         result = run(
             opened, out, overwrite=overwrite, config=chosen.scan, volume=chosen.volume,
             server=options.own_server(chosen, state), client=client, connect=connect, spool=spool,
-            min_weight=settings["min_weight"], progress=display,
+            min_weight=settings["min_weight"], up=given_up, keep_islands=keep_islands, progress=display,
         )  # fmt: skip
     if json:
         output.as_json(result)
