@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 from clients_and_spools import deliver
-from command_processes import end, read_until, server, started, tsfusion
+from command_processes import Here, end, read_until, server, started, tsfusion
 from small_recordings import first_views
 
 from tsfusion import Client, FlushTimeout, Volume
@@ -45,6 +45,7 @@ def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
         assert " 2/2 " in tsfusion("status", "--connect", address).stdout
         done = tsfusion("mesh", address, tmp_path / "live.obj", "--min-weight", 0.5)
         assert done.returncode == 0, done.stderr
+        assert "up +z (floor: " in done.stdout
         done = tsfusion(
             "replay", "synthetic:room", "--start", 2, "--max-frames", 1, "--connect", address,
             "--out", tmp_path / "more", "--json",
@@ -102,10 +103,27 @@ def test_mesh_of_map_state_and_journal_agree(state: Path, tmp_path: Path) -> Non
     ):
         done = tsfusion("mesh", source[0], tmp_path / f"{index}.ply", *source[1:], "--json")
         assert done.returncode == 0, done.stderr
-        vertices.add(json.loads(done.stdout)["vertices"])
+        figures = json.loads(done.stdout)
+        vertices.add(figures["vertices"])
+        assert figures["up"]["found_by"] == "floor"
+        assert figures["up"]["direction"] == pytest.approx((0, 0, 1), abs=0.01)
         vertices.add(len(trimesh.load(tmp_path / f"{index}.ply", process=False).vertices))
     assert len(vertices) == 1
     assert vertices.pop() > 100
+
+
+def test_mesh_of_a_map_alone_says_that_up_is_not_known(state: Path, here: Here, tmp_path: Path) -> None:
+    """Walls look like a floor where nothing says how the sensor was held."""
+    Volume.load(state / "maps/default/map.tsf").save(tmp_path / "alone.tsf", meta={})
+    done = here("mesh", "alone.tsf", "a.glb", "--preview", "a.png")
+    assert done.returncode == 0, done.stderr
+    assert "up unknown" in done.stdout
+    assert "up is not known: GLB and pictures keep the map's axes (--up z" in done.stdout
+    lying = trimesh.load("a.glb", force="mesh").extents
+    done = here("mesh", "alone.tsf", "a.glb", "--up", "-x")
+    assert "up -x (given: -1.0000 0.0000 0.0000)" in done.stdout
+    assert "up is not known" not in done.stdout
+    assert trimesh.load("a.glb", force="mesh").extents == pytest.approx(lying[[1, 0, 2]], abs=0.1)
 
 
 @pytest.mark.slow
@@ -115,7 +133,9 @@ def test_mesh_fuses_what_the_checkpoint_missed(state: Path, tmp_path: Path) -> N
     volume = Volume(voxel_size=VOXEL)
     volume.integrate(first_views(1)[0])
     volume.save(tmp_path / "state/maps/default/map.tsf")
-    done = tsfusion("mesh", tmp_path / "state", tmp_path / "a.glb", "--preview", tmp_path / "a.png")
+    done = tsfusion(
+        "mesh", tmp_path / "state", tmp_path / "a.glb", "--preview", tmp_path / "a.png", "--keep-islands"
+    )
     assert done.returncode == 0, done.stderr
     for keyframe in first_views(6)[1:]:
         volume.integrate(keyframe)

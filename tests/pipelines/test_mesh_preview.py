@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The picture: right pixels, right depth, the same bytes every time."""
 
+import dataclasses
 import math
 
 import cv2
@@ -10,10 +11,10 @@ import pytest
 import trimesh
 
 from tsfusion.core.errors import OutputError
-from tsfusion.datasets import Synthetic
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.up_direction import Up, parse
 from tsfusion.pipelines import mesh_preview
-from tsfusion.pipelines.mesh_preview import PreviewCamera, choose_camera, draw, sensor_up
+from tsfusion.pipelines.mesh_preview import PreviewCamera, choose_camera, draw
 
 
 def from_trimesh(shape: trimesh.Trimesh, colors: np.ndarray | None = None) -> Mesh:
@@ -98,27 +99,6 @@ def test_same_bytes_every_time() -> None:
     assert all((draw(noisy, camera, 160, 120) == first).all() for _ in range(5))
 
 
-def test_up_comes_from_the_poses_and_is_refined_by_the_floor() -> None:
-    room = box_room()
-    tilt = trimesh.transformations.rotation_matrix(math.radians(75), (1, 0.3, 0))[:3, :3]
-    tilted = Mesh(
-        (room.vertices @ tilt.T).astype(np.float32), room.faces, (room.normals @ tilt.T).astype(np.float32)
-    )
-    nod = trimesh.transformations.rotation_matrix(math.radians(12), (1, 0, 0))
-    turned = np.eye(4)
-    turned[:3, :3] = tilt
-    poses = [turned @ look((0, 0, 1), (math.cos(a), math.sin(a), 0)) @ nod for a in np.linspace(0, 2, 9)]
-    ups = [sensor_up(pose, "kinect") for pose in poses]
-    assert mesh_preview.up_direction(tilted, ups) == pytest.approx(tilt @ (0, 0, 1), abs=1e-3)
-
-
-def test_a_lidar_stands_upright_too() -> None:
-    for sensor in ("kinect", "stereo", "lidar"):
-        dataset = Synthetic("street", sensor, count=3)
-        ups = [sensor_up(dataset.pose(index), sensor) for index in range(3)]
-        assert np.mean(ups, axis=0) == pytest.approx((0, 0, 1), abs=0.05)
-
-
 def test_without_colour_height_is_shown() -> None:
     """From below to above the ramp gets lighter; grey everywhere is no colour either."""
     room = box_room()
@@ -155,6 +135,20 @@ def test_render_writes_the_whole_file_or_none(tmp_path) -> None:
     with pytest.raises(OutputError, match="cannot write"):
         mesh_preview.render(box_room(), tmp_path / "missing" / "room.png", width=96, height=60)
     assert [entry.name for entry in tmp_path.iterdir()] == ["room.png"]
+
+
+def test_a_picture_is_held_by_the_mesh_s_up(tmp_path) -> None:
+    """A room that lies on its side is drawn as the same room that stands: by where its up is."""
+    room = box_room((4.0, 3.0, 2.8))
+    up = Up((0.0, -1.0, 0.0), "given")
+    back = up.to_y().T @ parse("z").to_y()  # takes +z to that up
+    lying = Mesh(np.float32(room.vertices @ back.T), room.faces, np.float32(room.normals @ back.T), up=up)
+    pictures = [
+        cv2.imread(str(mesh_preview.render(mesh, tmp_path / f"{number}.png", width=96, height=60)))
+        for number, mesh in enumerate((room, lying, dataclasses.replace(lying, up=None)))
+    ]
+    stands, lies, unknown = (cv2.resize(each, (12, 8), interpolation=cv2.INTER_AREA) for each in pictures)
+    assert np.abs(stands - 1.0 * lies).mean() < 0.5 * np.abs(stands - 1.0 * unknown).mean()
 
 
 def test_pixels_equal_the_twin_on_a_heap_of_triangles() -> None:

@@ -63,6 +63,18 @@ def test_replay_leaves_everything(run_folder: Path) -> None:
     assert all(float(row["delay_ms"]) > 0 for row in rows)
 
 
+def test_a_replay_says_where_up_is_and_its_glb_stands(run_folder: Path) -> None:
+    """The room's z is up: found by its floor, named in run.json and in the PLY, +Y in the GLB."""
+    out = run_folder / "out"
+    up = json.loads((out / "run.json").read_text())["mesh"]["up"]
+    assert up["found_by"] == "floor"
+    assert up["direction"] == pytest.approx((0, 0, 1), abs=0.01)
+    assert b"\ncomment up +z (floor: " in (out / "mesh.ply").read_bytes()[:400]
+    flat = trimesh.load(out / "mesh.ply", process=False)
+    stands = trimesh.load(out / "mesh.glb", force="mesh", process=False)
+    assert stands.extents[1] == pytest.approx(flat.extents[2], abs=0.05)
+
+
 def test_replay_over_sockets_is_the_map_of_the_library(run_folder: Path) -> None:
     run = json.loads((run_folder / "out" / "run.json").read_text())
     assert run["map_hash"] == map_hash(reversed(first_views(6)), VolumeConfig(voxel_size=VOXEL, threads=1))

@@ -97,11 +97,13 @@ def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, tmp_path: Path) -
     assert found["mesh"]["triangles"] > 1000
     assert Volume.load(out / "map.tsf").map_hash() == found["map_hash"]
     assert len(JournalRecording(state)) == run["keyframes_sent"]
+    assert found["mesh"]["up"]["found_by"] == "floor"
     assert found["trajectory_error"]["rmse"] < 0.005
     assert len(read_tum(out / "trajectory.txt").timestamps_ns) == 12
     assert len(read_tum(out / "keyframes.txt").timestamps_ns) == run["keyframes_sent"]
     assert cv2.imread(str(out / "preview.png")).std() > 5
-    shown = scan(walk, "--localizer", "given", "--out", tmp_path / "given")
+    shown = scan(walk, "--localizer", "given", "--out", tmp_path / "given", "--up", "-y")
+    assert "up -y (given: 0.0000 -1.0000 0.0000)" in shown.stdout
     assert "12/12 localised by given" in shown.stdout
     assert "rmse" in shown.stdout
 

@@ -124,6 +124,19 @@ class BagWriter:
         )  # fmt: skip
         self.write(topic, content, stamp)
 
+    def imu(self, topic: str, force: np.ndarray, stamp: int, frame: str, *, measured: bool = True) -> None:
+        zero, acceleration = (
+            self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z) for x, y, z in ((0.0,) * 3, force.tolist())
+        )
+        content = self.make(
+            "sensor_msgs/msg/Imu", header=self.heading(stamp, frame), angular_velocity=zero,
+            orientation=self.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+            linear_acceleration=acceleration,
+            orientation_covariance=np.zeros(9), angular_velocity_covariance=np.zeros(9),
+            linear_acceleration_covariance=np.append(0.0 if measured else -1.0, np.zeros(8)),
+        )  # fmt: skip
+        self.write(topic, content, stamp)
+
     def path(self, topic: str, poses: list[tuple[int, np.ndarray]], parent: str, stamp: int) -> None:
         stamped = [self.posed(T, parent, at) for at, T in poses]
         content = self.make("nav_msgs/msg/Path", header=self.heading(stamp, parent), poses=stamped)

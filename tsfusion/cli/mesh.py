@@ -11,7 +11,7 @@ from tsfusion.cli import options
 
 if TYPE_CHECKING:
     from tsfusion.core.config import VolumeConfig
-    from tsfusion.geometry.mesh import Mesh
+    from tsfusion.geometry.up_direction import HeldSensor
     from tsfusion.journal.recording import JournalRecording
     from tsfusion.tsdf.volume import Volume
 
@@ -28,6 +28,8 @@ def mesh(
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="A .ply, .glb or .obj file.")],
     *,
+    up: options.UpDirection = None,
+    keep_islands: options.KeepIslands = None,
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw a picture, too.")] = None,
     control: options.Control = None,
     map_: options.Map = None,
@@ -41,9 +43,14 @@ def mesh(
 
     A journal is fused again, with the map flags given here.
     """
-    from tsfusion.core.output_folder import check_writable
-    from tsfusion.geometry.mesh import FORMATS
+    from dataclasses import replace
 
+    from tsfusion.core.output_folder import check_writable
+    from tsfusion.geometry import up_direction
+    from tsfusion.geometry.mesh import FORMATS
+    from tsfusion.pipelines import mesh_files
+
+    given_up = options.up_direction(up)
     check_writable(out, FORMATS)
     if preview is not None:
         check_writable(preview, (".png",))
@@ -60,6 +67,7 @@ def mesh(
             source, control=control, map_name=map_ or DEFAULT_MAP, min_weight=settings["min_weight"],
             keys=client_keys(key, server_key),
         )  # fmt: skip
+        made = replace(made, up=given_up or made.up)
     else:
         options.refuse(
             context, ("control", "key", "server_key"),
@@ -74,65 +82,73 @@ def mesh(
         given = config is not None or any(
             value is not None for name, value in settings.items() if name not in options.VIEW_OPTIONS
         )
-        made = _volume(Path(source), chosen.volume, name=map_, given=given, quiet=json).extract_mesh()
-    made.save(out)
-    if preview is not None:
-        from tsfusion.pipelines.mesh_preview import render
+        volume, held = _volume(Path(source), chosen.volume, name=map_, given=given, quiet=json)
+        made = volume.extract_mesh()
+        made = replace(made, up=up_direction.find(made, held, given=given_up))
+    files = [out] if preview is None else [out, preview]
+    left_out = mesh_files.write(made, files, keep_islands=keep_islands)
+    written = made.without_islands() if out.name in left_out["files"] else made
+    _print_result(out, {**written.figures, "left_out": left_out}, json)
 
-        render(made, preview)
-    _print_result(made, out, json)
 
+def _volume(
+    source: Path, config: "VolumeConfig", *, name: str | None, given: bool, quiet: bool
+) -> tuple["Volume", "HeldSensor"]:
+    """The saved map where it is complete; otherwise a new map of every keyframe of the journal.
 
-def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bool, quiet: bool) -> "Volume":
-    """The saved map where it is complete; otherwise a new map of every keyframe of the journal."""
+    With it how its sensors were held.
+    """
     from tsfusion.core.config import VIEW_SETTINGS
     from tsfusion.core.errors import DatasetError
+    from tsfusion.geometry.up_direction import HeldSensor
     from tsfusion.tsdf.volume import Volume
 
     view = {name: getattr(config, name) for name in VIEW_SETTINGS}
     if not source.exists():
         raise DatasetError(f"{source} does not exist; expected a map (.tsf), a state folder or a journal")
-    if source.suffix == ".tsf":
-        return Volume.load(source, config.threads, **view)
     from tsfusion.journal import state_folder
     from tsfusion.journal.recording import JournalRecording
 
+    if source.suffix == ".tsf":
+        volume = Volume.load(source, config.threads, **view)
+        return volume, HeldSensor(volume.meta.get("held"))
     source = state_folder.resolve_map(source, name)
     recording = JournalRecording(source)
     saved = source / state_folder.MAP_FILE
     if saved.is_file() and not given:
         volume = Volume.load(saved, config.threads, **view)
         if volume.keyframes == len(recording):
-            return volume
+            return volume, HeldSensor(volume.meta.get("held"))
         config = volume.config  # the server died before it saved the rest
     return _fuse(recording, Volume(config), quiet)
 
 
-def _fuse(recording: "JournalRecording", volume: "Volume", quiet: bool) -> "Volume":
+def _fuse(recording: "JournalRecording", volume: "Volume", quiet: bool) -> tuple["Volume", "HeldSensor"]:
     """Add every keyframe; one that the map cannot take is counted and left out, as in the server."""
     from tsfusion.cli import progress
     from tsfusion.core.errors import MapError
+    from tsfusion.geometry.up_direction import HeldSensor
 
-    left_out: Counter[str] = Counter()
+    left_out, held = Counter[str](), HeldSensor()
     with progress.shown(quiet=quiet) as display:
         display.stage(f"fusing {recording.name}")
         for index, keyframe in enumerate(recording, 1):
             try:
                 volume.integrate(keyframe)
+                held.add(keyframe.T_world_camera, keyframe.sensor or recording.sensor)
             except MapError as error:
                 left_out[str(error)] += 1
             display.update(index, volume.keyframes, len(recording))
     for reason, count in left_out.items():
         typer.echo(f"left out {count} keyframes: {reason}", err=True)
-    return volume
+    return volume, held
 
 
-def _print_result(mesh: "Mesh", out: Path, json: bool) -> None:
-    from tsfusion.cli import output
+def _print_result(out: Path, figures: dict[str, Any], json: bool) -> None:
+    from tsfusion.cli import output, run_summary
+    from tsfusion.geometry.mesh import summarise
 
-    figures: dict[str, Any] = {"path": str(out), "vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
     if json:
-        output.as_json(figures)
+        output.as_json({"path": str(out), **figures})
     else:
-        vertices, triangles = output.grouped(figures["vertices"]), output.grouped(figures["triangles"])
-        typer.echo(f"{out}: {vertices} vertices, {triangles} triangles")
+        typer.echo("\n".join((f"{out}: {summarise(figures)}", *run_summary.mesh_notes(figures))))

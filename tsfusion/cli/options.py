@@ -17,6 +17,7 @@ from tsfusion.cli import verbs
 
 if TYPE_CHECKING:
     from tsfusion.core.config import ClientConfig, Config, ServerConfig
+    from tsfusion.geometry.up_direction import Up
 
 
 def option(
@@ -130,6 +131,15 @@ Intrinsics = Annotated[
     str | None, option("--intrinsics", "FX,FY,CX,CY", "The camera in pixels, instead of the recording's own.")
 ]
 Unpack = Annotated[bool, _rare_option("--unpack", None, "Unpack an archive beside itself.")]
+UpDirection = Annotated[str | None, _map_option("--up", "AXIS", "Which way is up: z, -y, … or X,Y,Z.")]
+KeepIslands = Annotated[
+    bool | None,
+    _map_option(
+        "--keep-islands/--drop-islands", None,
+        "Small loose pieces of the mesh; default: kept in PLY and OBJ, left out of GLB and pictures.",
+        rare=True,
+    ),
+]  # fmt: skip
 
 
 def refuse(context: typer.Context, names: Collection[str], reason: str) -> None:
@@ -167,6 +177,13 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
     }
     changed = {name: config.override(getattr(loaded, name), **given) for name, given in tables.items()}
     return config.Config(client=loaded.client, **changed)
+
+
+def up_direction(text: str | None) -> "Up | None":
+    """What --up says; raises InvalidConfig for nonsense."""
+    from tsfusion.geometry import up_direction
+
+    return None if text is None else up_direction.parse(text)
 
 
 def dataset_options(given: list[str] | None) -> dict[str, Any]:

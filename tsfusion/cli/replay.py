@@ -47,6 +47,8 @@ def replay(
             "--check/--no-check", None, "Warn when poses, camera and depth disagree; status 1.", rare=True
         ),
     ] = True,
+    up: options.UpDirection = None,
+    keep_islands: options.KeepIslands = None,
     config: options.ConfigFile = None,
     json: options.RunJson = False,
     **settings: Any,
@@ -57,6 +59,7 @@ def replay(
     # Any server makes a mesh with another `min_weight`.
     own = {*options.MAP_OPTIONS, "state"} - {"min_weight"}
     options.check_target_flags(context, connect, own=own, remote=options.only_for_kept_maps(state))
+    given_up = options.up_direction(up)
     dataset = open_recording(
         path, unpack=unpack, sequence=sequence, modality=modality, trajectory=trajectory,
         **options.camera(intrinsics, calibration) | options.dataset_options(option),
@@ -73,7 +76,7 @@ def replay(
     _run(
         dataset, out, overwrite=overwrite, json=json, volume=chosen.volume,
         server=options.own_server(chosen, state), client=client, connect=connect, same_frame=same_frame,
-        rate=rate, min_weight=settings["min_weight"],
+        rate=rate, min_weight=settings["min_weight"], up=given_up, keep_islands=keep_islands,
     )  # fmt: skip
     if wrong is not None:
         typer.echo(f"the map is likely wrong: {wrong} (--no-check accepts it)", err=True)

@@ -22,7 +22,7 @@ def print_replay(run: "ReplaySummary") -> None:
         f"keyframes  {run.keyframes_fused}/{run.keyframes_sent} fused in {run.seconds:.1f} s",
         f"delay      mean {delay.mean:.0f} ms, p50 {delay.p50:.0f}, p95 {delay.p95:.0f}, "
         f"p99 {delay.p99:.0f}, max {delay.max:.0f}; slope {run.delay_slope_ms_per_keyframe:+.2f} ms/keyframe",
-        f"mesh       {grouped(run.mesh['vertices'])} vertices, {grouped(run.mesh['triangles'])} triangles",
+        *mesh_lines(run.mesh),
         f"map        {grouped(run.blocks)} blocks, hash {run.map_hash}",
         "memory     " + ", ".join(f"{name} {size(peak)}" for name, peak in run.peak_rss_bytes.items()),
     ]
@@ -90,9 +90,29 @@ def explained(counts: dict[str, int]) -> str:
     return counted({named.get(reason, reason): count for reason, count in counts.items()})
 
 
+def mesh_lines(figures: dict[str, Any]) -> list[str]:
+    """A mesh in a line, and its notes."""
+    from tsfusion.geometry.mesh import summarise
+
+    notes = [f"           {note}" for note in mesh_notes(figures)]
+    return [f"mesh       {summarise(figures)}", *notes]
+
+
+def mesh_notes(figures: dict[str, Any]) -> list[str]:
+    """What a person may want to change about a mesh: a line each."""
+    notes = []
+    if left_out := figures["left_out"].get("islands"):
+        files = " and ".join(figures["left_out"]["files"])
+        notes.append(f"{grouped(left_out)} islands left out of {files} (--keep-islands keeps them)")
+    if figures["up"] is None:
+        notes.append("up is not known: GLB and pictures keep the map's axes (--up z, for instance, gives it)")
+    return notes
+
+
 def _map_lines(found: "MapResult") -> list[str]:
-    mesh = f", {grouped(found.mesh['triangles'])} triangles" if found.mesh else ""
-    lines = [f"map        {found.name}: {found.frames} frames, {found.keyframes} keyframes{mesh}"]
+    lines = [f"map        {found.name}: {found.frames} frames, {found.keyframes} keyframes"]
+    if found.mesh:
+        lines += mesh_lines(found.mesh)
     if found.trajectory_error is not None:
         lines.append(f"ATE        {_ate(found.trajectory_error)}")
     if found.corrected_error is not None:

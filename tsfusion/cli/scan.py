@@ -90,6 +90,8 @@ def scan(
     modality: options.Modality = None,
     option: options.DatasetOptions = None,
     unpack: options.Unpack = False,
+    up: options.UpDirection = None,
+    keep_islands: options.KeepIslands = None,
     config: options.ConfigFile = None,
     json: options.RunJson = False,
     **settings: Any,
@@ -97,6 +99,11 @@ def scan(
     """Localise a sensor and fuse its keyframes; Ctrl-C ends the scan and keeps its results."""
     remote = {"spool", *options.only_for_kept_maps(state)}
     options.check_target_flags(context, connect, own={*options.MAP_OPTIONS, "state"}, remote=remote)
+    if connect is not None:
+        options.refuse(
+            context, ("up", "keep_islands"), "has no effect with --connect: give it to `tsfusion mesh`"
+        )
+    given_up = options.up_direction(up)
     from tsfusion.cli import output, progress, run_summary
     from tsfusion.pipelines.scan import scan as run
 
@@ -117,7 +124,8 @@ def scan(
         result = run(
             opened, out, overwrite=overwrite, config=chosen.scan, volume=chosen.volume,
             server=options.own_server(chosen, state), client=client, connect=connect, spool=spool,
-            same_frame=same_frame, min_weight=settings["min_weight"], progress=display,
+            same_frame=same_frame, min_weight=settings["min_weight"], up=given_up,
+            keep_islands=keep_islands, progress=display,
         )  # fmt: skip
     if json:
         output.as_json(result)

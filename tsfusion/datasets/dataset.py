@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidKeyframe
+from tsfusion.datasets.accelerometer import Accelerometer
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Keyframe
 
@@ -53,6 +54,7 @@ class Frames(ABC):
     skipped: dict[str, int]
     quaternions: bool = False  # whether rotations were recorded as quaternions; else as matrices
     _poses: Sequence[NDArray[np.float64] | None] = ()
+    _accelerometer: Accelerometer | None = None
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -73,6 +75,12 @@ class Frames(ABC):
         index = self._checked(index)
         return self._poses[index] if self._poses else self.frame(index).T_world_camera
 
+    def specific_force(self, index: int) -> NDArray[np.float64] | None:
+        """(3,) m/s² in the frame's axes, as an accelerometer measured it; None where there is none."""
+        if self._accelerometer is None or self.timestamps_ns is None:
+            return None
+        return self._accelerometer.around(self._stamp(self._checked(index)))
+
     def __getitem__(self, index: int) -> Keyframe:
         frame = self.frame(index)
         if frame.T_world_camera is None:
@@ -91,7 +99,10 @@ class Frames(ABC):
     def _posed_frame(self, index: int, **measurement: Any) -> Frame:
         """A frame with the recorded pose, sensor and time of an index."""
         T, stamp = self._poses[index], self._stamp(index)
-        return Frame(T_world_camera=T, sensor=self.sensor, timestamp_ns=stamp, **measurement)
+        force = self.specific_force(index)
+        return Frame(
+            T_world_camera=T, sensor=self.sensor, timestamp_ns=stamp, specific_force=force, **measurement
+        )
 
     def _stamp(self, index: int) -> int:
         return 0 if self.timestamps_ns is None else int(self.timestamps_ns[index])
@@ -121,6 +132,9 @@ class Selection(Frames):
     def pose(self, index: int) -> NDArray[np.float64] | None:
         return pose_of(self._dataset, self._indices[self._checked(index)])
 
+    def specific_force(self, index: int) -> NDArray[np.float64] | None:
+        return force_of(self._dataset, self._indices[self._checked(index)])
+
     def _frame(self, index: int) -> Frame:
         return frame_of(self._dataset, self._indices[index])
 
@@ -138,6 +152,12 @@ def pose_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:
     """Frame `index`'s (4, 4) T_world_camera as recorded, of any dataset; None where there is none."""
     own: Callable[[int], NDArray[np.float64] | None] | None = getattr(dataset, "pose", None)
     return own(index) if own is not None else dataset[index].T_world_camera
+
+
+def force_of(dataset: Dataset, index: int) -> NDArray[np.float64] | None:
+    """Specific force of frame `index` of any dataset, (3,) m/s² in its axes; None where there is none."""
+    own: Callable[[int], NDArray[np.float64] | None] | None = getattr(dataset, "specific_force", None)
+    return own(index) if own is not None else None
 
 
 def keep_posed(

@@ -25,6 +25,7 @@ from tsfusion.core import process
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
+from tsfusion.geometry import up_direction
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.journal import state_folder
@@ -161,6 +162,7 @@ class Fuser:
                 found = codec.decode(record.frames)
                 if isinstance(found, Keyframe):  # a correction does not change the map (yet)
                     self._volume.integrate(found)
+                    self._map.held.add(found.T_world_camera, found.sensor or self._volume.config.sensor)
             except TsfusionError as error:
                 if isinstance(error, JournalError) and error.temporary:
                     log.error("%s: another process tries again, from the checkpoint", error)
@@ -192,7 +194,9 @@ class Fuser:
     def _answer(self, query: fuser_messages.FuserQuery) -> None:
         try:
             if query.command.name == "mesh":
-                layout, frames = _mesh_frames(self._volume.extract_mesh(query.command.min_weight))
+                mesh = self._volume.extract_mesh(query.command.min_weight)
+                layout, frames = _mesh_frames(mesh)
+                layout = msgspec.structs.replace(layout, up=up_direction.find(mesh, self._map.held))
                 self._send(fuser_messages.FuserReply(query.number, layout=layout), frames)
             else:
                 self._send(fuser_messages.FuserReply(query.number, status=self._status()))

@@ -32,6 +32,8 @@ class Frame:
         left, right: (H, W) uint8 grey, rectified, with `intrinsics` of both and `baseline_fx`.
         color: (H, W, 3) uint8 BGR of the depth or of the left image, or (N, 3) of the points.
         point_times_s: (N,) float32 seconds of each point after `timestamp_ns`; None = all at once.
+        specific_force: (3,) m/s², what an accelerometer measured, in the axes of the camera or LiDAR (at rest
+            it points away from the ground); None = nothing.
 
     Raises:
         InvalidKeyframe: naming the field, its value and what was expected.
@@ -53,6 +55,7 @@ class Frame:
     color: NDArray[np.uint8] | None = None
     confidence: NDArray[np.uint8] | None = None
     intrinsics: Intrinsics | None = None
+    specific_force: NDArray[np.float64] | None = None
     kind: FrameKind = field(init=False)
 
     def __post_init__(self) -> None:
@@ -72,6 +75,11 @@ class Frame:
             if self.points is None or times.shape != (len(self.points),) or not np.isfinite(times).all():
                 raise InvalidKeyframe(f"point_times_s must be finite, one a point, got shape {times.shape}")
             put(self, "point_times_s", times)
+        if self.specific_force is not None:
+            force = np.asarray(self.specific_force, dtype=np.float64)
+            if force.shape != (3,) or not np.isfinite(force).all():
+                raise InvalidKeyframe(f"specific_force must be 3 finite numbers, got {force}")
+            put(self, "specific_force", force)
 
     @classmethod
     def of(cls, keyframe: Keyframe, sensor: str) -> "Frame":

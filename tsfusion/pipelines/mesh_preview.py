@@ -3,7 +3,6 @@
 
 import math
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,17 +38,15 @@ def render(
     width: int = 1280,
     height: int = 800,
     camera: PreviewCamera | None = None,
-    ups: Sequence[NDArray[np.float64]] = (),
 ) -> Path:
-    """Draw `mesh` to a PNG file; complete or not at all.
+    """Draw `mesh` to a PNG file, its `up` above (+z where that is not known); complete or not at all.
 
     Triangles seen from behind are left out, so that a room can be looked into from outside.
 
     Args:
         width: pixels.
         height: pixels.
-        camera: None = chosen by `choose_camera` from the mesh and `ups`.
-        ups: `sensor_up` of the keyframes, which tells where up is; none = +z.
+        camera: None = chosen by `choose_camera`.
 
     Raises:
         OutputError: for an empty mesh or a place that cannot be written.
@@ -57,7 +54,7 @@ def render(
     path = Path(path)
     if not len(mesh.faces):
         raise OutputError(f"nothing to draw in {path}: the mesh has no triangles (yet)")
-    up = up_direction(mesh, ups)
+    up = np.array((0.0, 0.0, 1.0) if mesh.up is None else mesh.up.direction)
     camera = camera or choose_camera(mesh, up, aspect=width / height)
     image = draw(mesh, camera, width * _OVERSAMPLING, height * _OVERSAMPLING, up=up)
     _write_png(_develop(image, _OVERSAMPLING), path)
@@ -106,35 +103,6 @@ def height_colors(vertices: NDArray[np.float32], up: NDArray[np.float64]) -> NDA
     level = np.round(255 * (_RAMP[0] + (_RAMP[1] - _RAMP[0]) * share**0.7)).astype(np.uint8).reshape(-1, 1)
     bgr: NDArray[np.uint8] = cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS) if len(level) else level
     return bgr.reshape(-1, 3)[:, ::-1]
-
-
-def sensor_up(T_world_sensor: NDArray[np.float64], sensor: str) -> NDArray[np.float64]:
-    """(3,) float64, world: away from the ground, for a sensor that is held upright.
-
-    A LiDAR's own axes are x forward, y left, z up; a camera's are x right, y down, z forward.
-    """
-    return T_world_sensor[:3, 2] if sensor == "lidar" else -T_world_sensor[:3, 1]
-
-
-def up_direction(mesh: Mesh, ups: Sequence[NDArray[np.float64]] = ()) -> NDArray[np.float64]:
-    """(3,) unit float64: away from the ground.
-
-    Sensors are held upright, so the mean of their `ups` is near; the floor's normals make it exact.
-    Without any, +z.
-    """
-    up = np.array((0.0, 0.0, 1.0))
-    if len(ups):
-        mean = np.mean(ups, axis=0)
-        if np.linalg.norm(mean) > 1e-3:
-            up = mean / np.linalg.norm(mean)
-    normals = mesh.normals[:: max(1, len(mesh.normals) // 100_000)].astype(np.float64)
-    for degrees in (30.0, 15.0, 8.0):
-        level = normals[normals @ up > math.cos(math.radians(degrees))]
-        if len(level) < 0.01 * len(normals):
-            break
-        up = level.sum(axis=0)
-        up /= np.linalg.norm(up)
-    return up
 
 
 def choose_camera(mesh: Mesh, up: NDArray[np.float64], *, aspect: float) -> PreviewCamera:

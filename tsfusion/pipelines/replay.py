@@ -12,8 +12,10 @@ from tsfusion.core.config import ClientConfig, ServerConfig, VolumeConfig
 from tsfusion.core.errors import OutputError
 from tsfusion.core.output_folder import results
 from tsfusion.datasets import Dataset
+from tsfusion.datasets.dataset import force_of
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.pipelines import engine, mesh_preview, replay_results, run_files, target_server
+from tsfusion.geometry.up_direction import HeldSensor, Up
+from tsfusion.pipelines import engine, replay_results, run_files, target_server
 from tsfusion.pipelines.engine import AHEAD, Engine, Progress
 from tsfusion.pipelines.replay_results import ReplaySummary
 
@@ -31,6 +33,8 @@ def replay(
     same_frame: bool = False,
     rate: float | None = None,
     min_weight: float | None = None,
+    up: Up | None = None,
+    keep_islands: bool | None = None,
 ) -> ReplaySummary:
     """Send every keyframe of `dataset` to a server and leave the results in the folder `out`.
 
@@ -46,6 +50,8 @@ def replay(
         same_frame: the poses are declared to be in the coordinate frame of the map, whatever worlds it has.
         rate: keyframes per second; None = as fast as they are fused, at most `AHEAD` on their way.
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
+        up: away from the ground, in the map's frame; None = it is found.
+        keep_islands: see `mesh_files.write`.
 
     Raises:
         OutputError: `out` cannot be written (checked first), or the mesh is empty.
@@ -72,22 +78,24 @@ def replay(
             progress.stage(
                 f"scanning {dataset.name}" + (f" into the map {target.link.map}" if connect else "")
             )
-            ups, started = [], time.monotonic()
-            for keyframe in _keyframes(dataset, first, running, rate):
+            held, started = HeldSensor(), time.monotonic()
+            for index, keyframe in enumerate(_keyframes(dataset, first, running, rate)):
                 running.wait_turn(AHEAD if rate is None else target.link.backlog)
                 sender.send(dataclasses.replace(keyframe, captured_ns=time.monotonic_ns()))
-                ups.append(mesh_preview.sensor_up(keyframe.T_world_camera, dataset.sensor))
+                held.add(keyframe.T_world_camera, dataset.sensor, force_of(dataset, index))
             running.wait_fused()
             seconds = time.monotonic() - started
             peak = process.peak_rss_bytes()  # of sending: drawing the result is not the scanner's work
             progress.stage("writing the results")
             running.wait_meshed([sender])
             target.keep_map(target.link.map, work / run_files.MAP)
-            status, mesh = run_files.write_map(work, target, target.link.map, ups, min_weight=min_weight)
-        if not len(mesh.faces):
+            written = run_files.write_map(
+                work, target, target.link.map, held, up=up, min_weight=min_weight, keep_islands=keep_islands
+            )
+        if not len(written.mesh.faces):
             raise OutputError(run_files.no_surface(sender.stats))
         result = replay_results.summarise(
-            dataset, sender, mesh, status, folder=folder,
+            dataset, sender, written, folder=folder,
             seconds=seconds, rate=rate, peak_rss_bytes=peak,
             server_start_seconds=target.child.start_seconds if target.child else None,
         )  # fmt: skip

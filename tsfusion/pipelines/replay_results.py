@@ -13,6 +13,7 @@ from tsfusion.datasets import Dataset
 from tsfusion.datasets.cameras import camera_line
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.pipelines import latency_ledger, run_files
+from tsfusion.pipelines.run_files import WrittenMap
 from tsfusion.wire.health import Status
 from tsfusion.wire.keyframe_times import Spread
 
@@ -53,7 +54,7 @@ class ReplaySummary(msgspec.Struct, frozen=True, kw_only=True):
     delay_slope_ms_per_keyframe: float
     stages_ms: dict[str, Spread]
     clock_bound_ms: float
-    mesh: dict[str, int]
+    mesh: dict[str, Any]  # `Mesh.figures`, and what `mesh_files.write` left out
     accuracy: Accuracy | None
     peak_rss_bytes: dict[str, int]
     config: dict[str, Any]
@@ -63,8 +64,7 @@ class ReplaySummary(msgspec.Struct, frozen=True, kw_only=True):
 def summarise(
     dataset: Dataset,
     sender: Client,
-    mesh: Mesh,
-    status: Status,
+    written: WrittenMap,
     *,
     folder: Path,
     seconds: float,
@@ -75,13 +75,14 @@ def summarise(
     """A replay in figures.
 
     Args:
-        mesh, status: of the map that the keyframes went into.
+        written: the map that the keyframes went into.
         folder: of the results.
         seconds: from the first keyframe handed over to the last one fused.
         rate: keyframes a second that were asked for; None = as fast as they are fused.
         peak_rss_bytes: of the sending process.
         server_start_seconds: of the own server; None = the server was there already.
     """
+    status, mesh, figures = written
     stats, delays = sender.stats, latency_ledger.summarise(sender.records)
     return ReplaySummary(
         dataset=dataset.name,
@@ -98,7 +99,7 @@ def summarise(
         delay_slope_ms_per_keyframe=delays.slope_ms_per_keyframe,
         stages_ms=delays.stages_ms,
         clock_bound_ms=delays.clock_bound_ms,
-        mesh={"vertices": len(mesh.vertices), "triangles": len(mesh.faces)},
+        mesh=figures,
         accuracy=measure(dataset, mesh) if isinstance(dataset, DatasetWithSurface) else None,
         peak_rss_bytes={**server_rss(status), "client": peak_rss_bytes},
         config={**status.config, "rate": rate},

@@ -1,49 +1,64 @@
 # SPDX-License-Identifier: MIT
 """The files that every whole run leaves: meshes with their pictures, the latency ledger, `run.json`."""
 
+import dataclasses
 import platform
-from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from tsfusion.client import ClientStats
 from tsfusion.core.output_folder import RECORD
+from tsfusion.geometry import up_direction
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.pipelines import latency_ledger, mesh_preview
+from tsfusion.geometry.up_direction import HeldSensor, Up
+from tsfusion.pipelines import latency_ledger, mesh_files
 from tsfusion.pipelines.target_server import Target
 from tsfusion.wire.health import Status
 from tsfusion.wire.keyframe_times import KeyframeTimes
 
 MAP = "map.tsf"
+_MESH_FILES = (("mesh", ".ply"), ("mesh", ".glb"), ("preview", ".png"))
+
+
+class WrittenMap(NamedTuple):
+    """A map whose files were written."""
+
+    status: Status
+    mesh: Mesh  # with its `up`
+    figures: dict[str, Any]  # of the mesh, and what was `left_out` of some files
 
 
 def write_map(
     work: Path,
     target: Target,
     map_name: str,
-    ups: Sequence[NDArray[np.float64]],
+    held: HeldSensor,
     *,
     suffix: str = "",
+    up: Up | None = None,
     min_weight: float | None = None,
-) -> tuple[Status, Mesh]:
+    keep_islands: bool | None = None,
+) -> WrittenMap:
     """Fetch a map's status and mesh; write `mesh.ply`, `mesh.glb` and `preview.png` unless it is empty.
 
     Args:
-        ups: (3,) each, the sensor's upward direction at each keyframe: how to hold the picture.
+        held: how the sensor was held.
         suffix: stands before the endings.
+        up: away from the ground, in the map's frame; None = it is found.
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
+        keep_islands: see `mesh_files.write`.
     """
     status = target.status(map_name)
     mesh = target.mesh(map_name, min_weight=min_weight)
+    left_out: dict[str, Any] = {}
     if len(mesh.faces):
-        mesh.save(work / f"mesh{suffix}.ply")
-        mesh.save(work / f"mesh{suffix}.glb")
-        mesh_preview.render(mesh, work / f"preview{suffix}.png", ups=ups)
-    return status, mesh
+        mesh = dataclasses.replace(mesh, up=up_direction.find(mesh, held, given=up))
+        files = [work / f"{name}{suffix}{ending}" for name, ending in _MESH_FILES]
+        left_out = mesh_files.write(mesh, files, keep_islands=keep_islands)
+    return WrittenMap(status, mesh, {**mesh.figures, "left_out": left_out})
 
 
 def write_ledger(work: Path, records: list[KeyframeTimes]) -> None:

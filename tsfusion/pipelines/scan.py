@@ -7,7 +7,9 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from tsfusion.client import Client, ClientStats
 from tsfusion.core import process
@@ -16,7 +18,8 @@ from tsfusion.core.errors import DatasetError, OutputError, SourceError, Tsfusio
 from tsfusion.core.output_folder import results
 from tsfusion.datasets.cameras import described
 from tsfusion.geometry.frame import Frame
-from tsfusion.pipelines import engine, mesh_preview, run_files, scan_results, target_server
+from tsfusion.geometry.up_direction import HeldSensor, Up
+from tsfusion.pipelines import engine, run_files, scan_results, target_server
 from tsfusion.pipelines.engine import Engine, Progress
 from tsfusion.pipelines.leftovers import ANSWER_SECONDS, Leftovers
 from tsfusion.pipelines.scan_results import MapResult, ScanSummary
@@ -42,6 +45,8 @@ def scan(
     spool: str | os.PathLike[str] = "tsfusion-spool",
     same_frame: bool = False,
     min_weight: float | None = None,
+    up: Up | None = None,
+    keep_islands: bool | None = None,
 ) -> ScanSummary:
     """Take a source's frames to its end, or until it is closed, and leave the results in the folder `out`.
 
@@ -59,6 +64,8 @@ def scan(
             scans left there goes to its own maps, or waits on.
         same_frame: the scan's coordinate frame is declared to be that of the map, whatever worlds it has.
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
+        up: away from the ground, in the map's frame; None = it is found.
+        keep_islands: see `mesh_files.write`.
 
     Raises:
         SourceError: the sensor failed; what came before is in `out`.
@@ -133,10 +140,11 @@ def scan(
             seconds = time.monotonic() - started
             progress.stage("writing the results")
             complete = not failure
-            maps = [
-                _write(work, target, submap, number, sensor=source.sensor, min_weight=min_weight)
-                for number, submap in enumerate(scanner.submaps, 1)
-            ]
+            write = partial(
+                _write, work, target, sensor=source.sensor,
+                up=up, min_weight=min_weight, keep_islands=keep_islands,
+            )  # fmt: skip
+            maps = [write(submap, number) for number, submap in enumerate(scanner.submaps, 1)]
             if own and not any(found.mesh["triangles"] for found in maps if found.mesh):
                 failure.append(OutputError(run_files.no_surface(scanner.state().stats)))
             records = scan_results.records(scanner.submaps)
@@ -216,9 +224,13 @@ def _refused_worlds(clients: list[Client]) -> list[Exception]:
 
 
 def _write(
-    work: Path, target: Target, submap: Submap, number: int, *, sensor: str, min_weight: float | None
+    work: Path, target: Target, submap: Submap, number: int, *, sensor: str, **options: Any
 ) -> MapResult:
-    """Write the files of one submap, and give its figures."""
+    """Write the files of one submap, and give its figures.
+
+    Args:
+        options: as of `run_files.write_map`.
+    """
     if not submap.located:
         return scan_results.describe(submap, None)
     suffix = f"-{number}" if number > 1 else ""
@@ -226,6 +238,8 @@ def _write(
     if target.child is None:
         return scan_results.describe(submap, None)
     target.keep_map(submap.name, work / f"map{suffix}.tsf")
-    ups = [mesh_preview.sensor_up(T, sensor) for T in submap.located.poses()]
-    in_map = run_files.write_map(work, target, submap.name, ups, suffix=suffix, min_weight=min_weight)
-    return scan_results.describe(submap, in_map)
+    held = HeldSensor()
+    for T, force in zip(submap.located.poses(), submap.located.forces(), strict=True):
+        held.add(T, sensor, force)
+    written = run_files.write_map(work, target, submap.name, held, suffix=suffix, **options)
+    return scan_results.describe(submap, written)

@@ -10,12 +10,11 @@ import numpy as np
 from tsfusion.core.config import ScanConfig, VolumeConfig
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
-from tsfusion.geometry.mesh import Mesh
 from tsfusion.pipelines import latency_ledger, run_files
+from tsfusion.pipelines.run_files import WrittenMap
 from tsfusion.scanner.localization.localizer import PoseCorrections
 from tsfusion.scanner.scanner import Scanner, Submap
 from tsfusion.scanner.sources.source import Source
-from tsfusion.wire.health import Status
 from tsfusion.wire.keyframe_times import KeyframeTimes, Spread
 
 
@@ -30,7 +29,7 @@ class MapResult(msgspec.Struct, frozen=True, kw_only=True):
     corrected_error: TrajectoryError | None  # after loop closure; None = there were no corrections
     map_hash: str = ""
     blocks: int = 0
-    mesh: dict[str, int] = {}
+    mesh: dict[str, Any] = {}  # `Mesh.figures`, and what `mesh_files.write` left out
 
 
 class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -76,17 +75,16 @@ def write_trajectory(work: Path, submap: Submap, suffix: str) -> None:
         write_tum(work / f"trajectory-corrected{suffix}.txt", stamps, now)
 
 
-def describe(submap: Submap, in_map: tuple[Status, Mesh] | None) -> MapResult:
+def describe(submap: Submap, in_map: WrittenMap | None) -> MapResult:
     """A submap in figures.
 
     Args:
-        in_map: its map's status and mesh; None = its server was not asked.
+        in_map: its map, written; None = its server was not asked.
     """
     figures: dict[str, Any] = {}
     if in_map is not None:
-        status, mesh = in_map
-        triangles = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
-        figures = {"map_hash": status.map_hash, "blocks": status.blocks, "mesh": triangles}
+        status = in_map.status
+        figures = {"map_hash": status.map_hash, "blocks": status.blocks, "mesh": in_map.figures}
     corrections = submap.corrections
     return MapResult(
         name=submap.name,

@@ -171,7 +171,7 @@ class Scanner:
             self._selected[reason] += 1
             self._selector.accept(frame, T)
             seq = submap.client.send(frame.keyframe(T))
-        submap.located.add(pose, frame.T_world_camera, seq)
+        submap.located.add(pose, frame.T_world_camera, seq, frame.specific_force)
 
     def _handle_lost(self, lost: Lost, frame: Frame) -> None:
         self._lost += 1

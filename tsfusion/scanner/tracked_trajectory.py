@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Trajectory that may grow for hours: the poses of its frames in about 300 bytes each."""
 
+import math
 from array import array
 
 import numpy as np
@@ -27,19 +28,28 @@ class TrackedTrajectory:
         self._numbers = array("q")  # timestamp, anchor, seq, index of the reference
         self._poses = array("d")  # T_world_camera, T_anchor_camera
         self._references = array("d")
+        self._forces = array("d")  # NaN = nothing was measured
 
-    def add(self, pose: Pose, reference: Transform | None, seq: int | None) -> None:
+    def add(
+        self,
+        pose: Pose,
+        reference: Transform | None,
+        seq: int | None,
+        specific_force: NDArray[np.float64] | None = None,
+    ) -> None:
         """Append a frame.
 
         Args:
             reference: (4, 4), the source's own pose; None = it has none.
             seq: keyframe number; None = no keyframe.
+            specific_force: as of a `Frame`.
         """
         at = _NONE
         if reference is not None:
             at = len(self._references) // _ROWS
             self._references.frombytes(_bytes(reference))
         self._poses.frombytes(_bytes(pose.T_world_camera) + _bytes(pose.T_anchor_camera))
+        self._forces.extend((math.nan,) * 3 if specific_force is None else specific_force.tolist())
         self._numbers.extend((pose.timestamp_ns, pose.anchor, _NONE if seq is None else seq, at))
 
     def __len__(self) -> int:
@@ -54,6 +64,11 @@ class TrackedTrajectory:
     def seqs(self) -> NDArray[np.int64]:
         """Keyframe numbers of the frames, (n,); -1 where a frame is none."""
         return np.array(self._numbers[2::_COLUMNS], dtype=np.int64)
+
+    def forces(self) -> list[NDArray[np.float64] | None]:
+        """Specific force of each frame, (3,) m/s² in its sensor's axes; None = nothing was measured."""
+        rows = np.array(self._forces).reshape(-1, 3)
+        return [None if np.isnan(row).any() else row for row in rows]
 
     @property
     def last_seq(self) -> int:

@@ -5,15 +5,20 @@ from typing import Any, Literal
 
 from msgspec import Struct
 
+from tsfusion.geometry.up_direction import Up
 from tsfusion.wire.keyframe_times import Spread
 
 
 class MeshLayout(Struct, frozen=True, kw_only=True):
-    """Row counts of the frames that follow: vertices float32, faces int32, normals float32, colors uint8."""
+    """Row counts of the frames that follow: vertices float32, faces int32, normals float32, colors uint8.
+
+    `up` is of a whole map; None = not known, or the server is of an earlier version.
+    """
 
     vertices: int
     faces: int
     colors: bool
+    up: Up | None = None
 
 
 MapState = Literal["opening", "idle", "busy", "restarting", "failed"]

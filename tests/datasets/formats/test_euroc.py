@@ -16,6 +16,7 @@ from written_recordings import at, fits_together
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import EuRoC, describe, open_dataset
+from tsfusion.geometry import se3
 from tsfusion.geometry.calibration import Camera
 from tsfusion.geometry.se3 import angle, inverse
 
@@ -111,6 +112,29 @@ def test_a_broken_euroc_sequence_is_one_clear_line(euroc, change, match):
         assert len(list(EuRoC(euroc))) == 3
         return
     one_line(lambda: list(EuRoC(euroc)), match)
+
+
+def test_euroc_accelerometer_is_turned_into_the_cameras_axes(euroc):
+    """A body that moves evenly measures the opposite of gravity, along the room's z."""
+    turn = se3.exp(np.array((0.1, 0, 0, 0.3, -0.5, 0.7)))  # of the accelerometer on the body
+    rows = ["#timestamp [ns],w_RS_S_x [rad s^-1],...,a_RS_S_z [m s^-2]"]
+    for index, T in enumerate(circle(3)):
+        force = (T @ inverse(rig_recordings.T_BODY_LEFT) @ turn)[:3, :3].T @ (0, 0, 9.81)
+        stamp = rig_recordings.FIRST_NS + 50_000_000 * index
+        rows += [f"{stamp + late},0,0,0,{force[0]},{force[1]},{force[2]}" for late in (-9, 9)]
+    imu = euroc / "mav0" / "imu0"
+    imu.mkdir()
+    (imu / "sensor.yaml").write_text(f"T_BS:\n  cols: 4\n  rows: 4\n  data: {turn.reshape(-1).tolist()}\n")
+    (imu / "data.csv").write_text("\n".join(rows) + "\n")
+    dataset = open_dataset(euroc)
+    for index in range(3):
+        up = dataset.pose(index)[:3, :3] @ dataset.specific_force(index)
+        assert up == pytest.approx((0, 0, 9.81), abs=0.3)  # the neighbours' are within 50 ms, too
+        np.testing.assert_allclose(dataset.frame(index).specific_force, dataset.specific_force(index))
+    put("mav0/imu0/data.csv", "1,2,3\n")(euroc)
+    one_line(lambda: EuRoC(euroc), r"imu0/data\.csv:1: '1,2,3'; expected `ns,wx,wy,wz,ax,ay,az` a line")
+    (imu / "data.csv").unlink()
+    assert EuRoC(euroc).specific_force(0) is None
 
 
 def test_euroc_as_recorded(data):

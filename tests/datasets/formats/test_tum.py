@@ -14,7 +14,10 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import TUM, open_dataset
 from tsfusion.datasets.trajectory_files import nanoseconds, read_tum
 from tsfusion.evaluation.view_prediction import points_camera
+from tsfusion.geometry import up_direction
 from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.up_direction import HeldSensor
 
 scipy_spatial = pytest.importorskip("scipy.spatial")
 
@@ -113,6 +116,26 @@ def _read_pcd(path: Path) -> np.ndarray:
     start = next(i for i, line in enumerate(lines) if line.startswith("DATA"))
     points = np.array([line.split()[:3] for line in lines[start + 1 :]], dtype=np.float64)
     return points[np.isfinite(points).all(axis=1)]
+
+
+def test_a_kinects_accelerometer_finds_the_mocaps_up(data, tmp_path):
+    """Real forces and poses of a hand-held scan; the images are a stand-in, 2 a second."""
+    desk = data("tum_rgbd/rgbd_dataset_freiburg1_desk")
+    root = tmp_path / desk.name
+    root.mkdir()
+    for name in ("groundtruth.txt", "accelerometer.txt"):
+        (root / name).symlink_to(desk / name)
+    write(root / "0.png", np.full((480, 640), 5000, np.uint16))
+    (root / "depth.txt").write_text("".join(f"{1305031453.3 + 0.5 * i:.6f} 0.png\n" for i in range(40)))
+    dataset = TUM(root)
+    assert len(dataset) > 30
+    held = HeldSensor()
+    for index in range(len(dataset)):
+        held.add(dataset.pose(index), "kinect", dataset.specific_force(index))
+    nothing = np.zeros((0, 3), np.float32)
+    up = up_direction.find(Mesh(nothing, nothing.astype(np.int32), nothing), held)
+    assert up.found_by == "imu"
+    assert np.degrees(np.arccos(up.direction[2])) < 4  # the sensor is mounted a few degrees askew
 
 
 def test_icl_nuim_has_a_negative_fy_and_5000_units_a_metre(data):

@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 from keyframes_and_servers import SHAPE, pose, wall
 from mcap.writer import CompressionType, Writer
-from rosbag_scenes import DEPTH, FRAME_NS, T0, infos, journal_of, only_depth, scan
-from rosbag_writing import FORMS, OPTICAL, WORLD, BagWriter, writing
+from rosbag_scenes import DEPTH, FRAME_NS, T0, T_BODY_OPTICAL, infos, journal_of, only_depth, scan
+from rosbag_writing import BODY, FORMS, OPTICAL, WORLD, BagWriter, writing
 
 from tsfusion.cli import replay
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.rosbag.dataset import Bag, recognises
+from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal import segment_path
 from tsfusion.journal.recording import JournalRecording
@@ -47,6 +48,27 @@ def test_what_cannot_be_told_apart_or_is_of_another_size_is_counted(tmp_path: Pa
     found = only_depth(tmp_path, write)
     assert len(found) == 2
     assert found.skipped == {f"of {DEPTH} with another's time": 1, f"of {DEPTH} that are broken": 1}
+
+
+@pytest.mark.parametrize("form", ["ros1", "mcap"])
+def test_an_imu_on_the_robot_tells_each_frame_its_up(tmp_path: Path, form: str) -> None:
+    T_body_imu = se3.exp(np.array([0.2, 0.1, 0, 0.5, 1.5, -0.4]))
+    keyframes = [wall(index) for index in range(3)]
+    with writing(tmp_path, form) as (bag, path):
+        scan(bag, keyframes)
+        bag.transform(T_body_imu, BODY, "imu_link", T0, static=True)
+        for index, keyframe in enumerate(keyframes):
+            T_world_imu = keyframe.T_world_camera @ se3.inverse(T_BODY_OPTICAL) @ T_body_imu
+            force, stamp = T_world_imu[:3, :3].T @ (0, 0, 9.81), T0 + index * FRAME_NS
+            bag.imu("/imu/data", force, stamp, "imu_link")
+            bag.imu("/gyro/sample", np.zeros(3), stamp, "imu_link")
+            bag.imu("/a_model/imu", force[::-1], stamp, "imu_link", measured=False)
+            bag.imu("/elsewhere/imu", force[::-1], stamp, "another_robot")
+    dataset = open_dataset(path)
+    for index in range(3):
+        up = dataset.pose(index)[:3, :3] @ dataset.specific_force(index)
+        assert up == pytest.approx((0, 0, 9.81), abs=0.1)  # the neighbours' are within 50 ms, too
+    assert dataset.frame(1).specific_force == pytest.approx(dataset.specific_force(1))
 
 
 # --- every form, and both kinds of sensors ---

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, InvalidConfig, InvalidKeyframe
+from tsfusion.datasets.accelerometer import Accelerometer, read_table
 from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import SCAN, Frames, keep_posed, require_folder, require_frames
 from tsfusion.datasets.readers import read_image, read_lines
@@ -77,6 +78,7 @@ class EuRoC(Frames):
         self.timestamps_ns = np.array([stamp for stamp, _, _ in self._pairs], dtype=np.int64)
         self.intrinsics, self.baseline_fx = self._rectifier.intrinsics, self._rectifier.baseline_fx
         self.camera = RecordedCamera(self.intrinsics, self._rectifier.size, "from sensor.yaml, rectified")
+        self._accelerometer = _accelerometer(place, T_body_camera)
         self._with_color = color
 
     def __len__(self) -> int:
@@ -137,6 +139,21 @@ def _calibrated(place: Path) -> tuple[Rectifier, Transform]:
         return rectifier, check_pose(T_BS.reshape(4, 4)) @ rectifier.T_left_rectified
     except (InvalidConfig, InvalidKeyframe, KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"{files[0]} and cam1's: {error}") from error
+
+
+def _accelerometer(place: Path, T_body_camera: Transform) -> Accelerometer | None:
+    """That of `imu0`, where it is there."""
+    sensor, R_body_imu = place / "imu0" / "sensor.yaml", np.eye(3)
+    try:
+        if sensor.is_file():
+            T_BS = np.array(read_tree(sensor)["T_BS"]["data"], dtype=np.float64)
+            R_body_imu = check_pose(T_BS.reshape(4, 4))[:3, :3]
+    except (InvalidConfig, InvalidKeyframe, KeyError, TypeError, ValueError) as error:
+        raise DatasetError(f"{sensor}: {error}") from error
+    return read_table(
+        place / "imu0" / "data.csv", "`ns,wx,wy,wz,ax,ay,az` a line", T_body_camera[:3, :3].T @ R_body_imu,
+        separator=",", first=4,
+    )  # fmt: skip
 
 
 def _trajectory(place: Path, *, required: bool) -> Trajectory | None:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.accelerometer import read_table
 from tsfusion.datasets.cameras import PublishedCamera, find_camera
 from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
 from tsfusion.datasets.formats.image_folders import DepthImages, first_size
@@ -21,6 +22,8 @@ EXPECTED = (
     "camera-intrinsics.txt unless it is a recording of TUM, CoRBS or ICL-NUIM"
 )
 DEPTH_SCALE = 1 / 5000  # metres per unit
+# A Kinect's accelerometer is turned by half around the camera's axis.
+_R_CAMERA_KINECT = np.diag((-1.0, -1.0, 1.0))
 
 
 class _Benchmark(NamedTuple):
@@ -130,6 +133,10 @@ class TUM(DepthImages):
             timestamps_ns=np.array([listed.timestamps_ns[i] for i in chosen], dtype=np.int64),
         )
         self.uncolored = list(self._color).count(None)
+        self._accelerometer = read_table(
+            root / "accelerometer.txt", "`timestamp ax ay az` a line", _R_CAMERA_KINECT,
+            separator=None, first=1,
+        )  # fmt: skip
 
 
 def _poses_at(

@@ -7,6 +7,7 @@
 import logging
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,12 @@ from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import Frames, keep_posed, nearest_in_time, require_frames
 from tsfusion.datasets.depth_files import check_metres
 from tsfusion.datasets.rosbag import messages
+from tsfusion.datasets.rosbag.imu import ImuTopics
 from tsfusion.datasets.rosbag.messages import MILLIMETRES
 from tsfusion.datasets.rosbag.poses import PoseFinder, pose_streams
 from tsfusion.datasets.rosbag.reader import ENDINGS, BagRecording, Message, MessageLocation, recording
 from tsfusion.datasets.rosbag.topics import Modality, TopicChooser, recorded_scale
+from tsfusion.geometry import se3
 from tsfusion.geometry.depth_registration import Registration
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
@@ -140,17 +143,21 @@ class Bag(Frames):
             body_frame=body_frame,
             max_gap_s=max_gap_s,
         )
-        mains, others = self._index(poses)
+        imu = ImuTopics(self._recording)
+        mains, others = self._index(poses, imu)
         difference_s = _DIFFERENCE_S[chosen.modality] if max_difference_s is None else max_difference_s
         self._pair(mains, others, round(difference_s * 1e9))
         self._pose(poses.finish(required=posed), round(time_offset_s * 1e9), posed)
         self._registration = self._register(poses)
         require_frames(len(self._mains), path, EXPECTED, self.skipped)
+        self._accelerometer = imu.accelerometer(partial(self._from_frame, poses))
 
     def __len__(self) -> int:
         return len(self._mains)
 
-    def _index(self, poses: PoseFinder) -> tuple[dict[int, MessageLocation], dict[int, MessageLocation]]:
+    def _index(
+        self, poses: PoseFinder, imu: ImuTopics
+    ) -> tuple[dict[int, MessageLocation], dict[int, MessageLocation]]:
         """Locations by time of the main and the other messages, from one pass over the recording."""
         chosen = self._chosen
         used = [chosen.main]
@@ -159,7 +166,7 @@ class Bag(Frames):
         check = _CHECKS.get(chosen.main.kind)
         locations: dict[str, list[MessageLocation]] = {one.topic: [] for one in used}
         broken: Counter[str] = Counter()
-        for message in self._recording.messages([*used, *poses.streams]):
+        for message in self._recording.messages([*used, *poses.streams, *imu.streams]):
             if not isinstance(message, Message):
                 broken[message.topic] += message in used
             elif message.stream in used:
@@ -171,6 +178,8 @@ class Bag(Frames):
                 except DatasetError as error:
                     broken[message.stream.topic] += 1
                     log.debug("%s: %s %s", self._recording.path, message.stream.topic, error)
+            elif message.stream in imu.streams:
+                imu.add(message)
             else:
                 poses.add(message)
         for topic, count in broken.items():
@@ -241,6 +250,14 @@ class Bag(Frames):
             chosen.size,
             color_size=chosen.color_camera.size,
         )
+
+    def _from_frame(self, poses: PoseFinder, frame: str) -> Transform | None:
+        """The transform from another frame to that of the images or points; None = not known."""
+        T_sensor_frame = poses.between(self._chosen.frame, frame, self._stamp(0))
+        rig = self._chosen.rig
+        if T_sensor_frame is None or rig is None or rig.rectifier is None:
+            return T_sensor_frame
+        return se3.inverse(rig.rectifier.T_left_rectified) @ T_sensor_frame
 
     def _frame(self, index: int) -> Frame:
         chosen, location = self._chosen, self._mains[index]

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: MIT
+"""Which way is up in a map: as given, by an accelerometer, by the floor, or by how cameras are held."""
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import InvalidConfig
+from tsfusion.geometry import se3
+
+if TYPE_CHECKING:
+    from tsfusion.geometry.mesh import Mesh
+
+GRAVITY = 9.81  # m/s²
+# Of the mean of how a sensor was held, in which the floor's normal is looked for. A wall is 90° from a floor:
+# beyond half of that it would be taken for one.
+_CONE = math.cos(math.radians(45))
+_LEVEL = math.cos(math.radians(8))  # of a direction, in which a normal is one of a plane across it
+_SAMPLE = 50_000  # triangles looked at
+_UPRIGHT = 0.5  # least length of the mean of the cameras' unit up vectors: less, and they were turned about
+_LEAST = 0.02  # share of the surface that a floor has at least
+_APART = math.cos(math.radians(30))  # of two directions that are not the same
+_SURE = 3.0  # how many times more surface faces up than any other way, where no camera is known
+_USUAL = np.array(((0.0, 0, 1), (0, -1, 0), (0, 1, 0)))  # robots' and surveyors' up, that of a camera, glTF's
+_SHORT = 0.1  # relative difference of a mean specific force from gravity
+_FITS = 3  # of a plane, each to what the one before has found
+_AXES = ("x", "y", "z")
+
+
+class Up(msgspec.Struct, frozen=True):
+    """Direction away from the ground, in the map's frame, and how it was found."""
+
+    direction: tuple[float, float, float]  # of unit length
+    found_by: str  # given, imu, floor or cameras
+
+    @property
+    def axis(self) -> str:
+        """The nearest axis of the map, such as `+z` or `-y`."""
+        index = int(np.argmax(np.abs(self.direction)))
+        return ("-" if self.direction[index] < 0 else "+") + _AXES[index]
+
+    def to_y(self) -> NDArray[np.float64]:
+        """(3, 3) rotation that takes up to +y by the shortest way, or half around x and on from there."""
+        up = np.array(self.direction)
+        half = np.diag((1.0, -1, -1)) if up[1] < 0 else np.eye(3)
+        W = se3.hat(np.cross(half @ up, (0.0, 1, 0)))
+        turn: NDArray[np.float64] = (np.eye(3) + W + W @ W / (1 + abs(up[1]))) @ half
+        return turn
+
+    def __str__(self) -> str:
+        numbers = " ".join(f"{round(number, 4) + 0.0:.4f}" for number in self.direction)  # no -0.0
+        return f"{self.axis} ({self.found_by}: {numbers})"
+
+
+def parse(text: str) -> Up:
+    """Read `x`, `-y` or three numbers such as `0,-0.9,0.1`.
+
+    Raises:
+        InvalidConfig: for anything else.
+    """
+    sign, name = (-1.0, text[1:]) if text[:1] == "-" else (1.0, text.removeprefix("+"))
+    if name in _AXES:
+        return _up(sign * np.eye(3)[_AXES.index(name)], "given")
+    try:
+        numbers = np.array([float(word) for word in text.split(",")])
+    except ValueError:
+        numbers = np.zeros(0)
+    length = float(np.linalg.norm(numbers))
+    if numbers.shape != (3,) or not 1e-6 < length < math.inf:
+        raise InvalidConfig(f"up must be x, y, z, -x, -y, -z or three numbers X,Y,Z, got {text!r}")
+    return _up(numbers, "given")
+
+
+class HeldSensor:
+    """How the sensors of a map were held: sums over their poses, and over what accelerometers measured.
+
+    Args:
+        numbers: those of another, to go on from; None = nothing yet.
+    """
+
+    def __init__(self, numbers: Sequence[float] | None = None) -> None:
+        self._sums = np.zeros((3, 4)) if numbers is None else np.array(numbers, np.float64).reshape(3, 4)
+
+    @property
+    def numbers(self) -> list[float]:
+        """12 numbers that JSON can hold."""
+        found: list[float] = self._sums.ravel().tolist()
+        return found
+
+    def add(
+        self, T_world_sensor: NDArray[np.float64], sensor: str, force: NDArray[np.float64] | None = None
+    ) -> None:
+        """Take a keyframe into account.
+
+        Args:
+            T_world_sensor: (4, 4). A LiDAR's own axes are x forward, y left, z up; a camera's are x right, y
+                down, z forward.
+            sensor: name of the sensor model.
+            force: (3,) what an accelerometer measured, in the sensor's axes; None = nothing.
+        """
+        up = T_world_sensor[:3, 2] if sensor == "lidar" else -T_world_sensor[:3, 1]
+        rows = [up, T_world_sensor[:3, 3]] + ([] if force is None else [T_world_sensor[:3, :3] @ force])
+        self._sums[: len(rows)] += np.column_stack((rows, np.ones(len(rows))))
+
+    @property
+    def up(self) -> NDArray[np.float64]:
+        """(3,) mean of the directions away from the ground, if they were held upright: 0 to 1 long."""
+        return self._mean(0)
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """(3,) mean position, metres."""
+        return self._mean(1)
+
+    @property
+    def force(self) -> NDArray[np.float64]:
+        """(3,) mean specific force in the world, gravity's opposite: the sensors' own motion cancels out."""
+        return self._mean(2)
+
+    def _mean(self, row: int) -> NDArray[np.float64]:
+        mean: NDArray[np.float64] = self._sums[row, :3] / max(self._sums[row, 3], 1.0)
+        return mean
+
+
+def find(mesh: "Mesh", held: HeldSensor, *, given: Up | None = None) -> Up | None:
+    """Find up from a mesh and from how the sensors that saw it were held.
+
+    An accelerometer decides, where its mean over the scan is as long as gravity. Otherwise the plane with the
+    largest surface does, among those seen from above by sensors that were held upright within 45°; without
+    such a plane the mean of how they were held. Where that is not known a direction counts only if three
+    times as much surface faces there as any other way, and it is −y, +y or +z within 45°: walls look like a
+    floor.
+
+    Args:
+        given: by a person: the answer.
+
+    Returns:
+        None where it cannot be told.
+    """
+    if given is not None:
+        return given
+    # In m/s², or in g as some drivers write. A wrong axis or pose makes the mean shorter.
+    force = float(np.linalg.norm(held.force))
+    if min(abs(force - GRAVITY) / GRAVITY, abs(force - 1)) < _SHORT:
+        return _up(held.force, "imu")
+    surface = _Surface(mesh)
+    length = float(np.linalg.norm(held.up))
+    if length < _UPRIGHT:
+        return surface.most_faced()
+    floor = surface.floor(held.up / length, held.position)
+    return _up(held.up, "cameras") if floor is None else _up(floor, "floor")
+
+
+class _Surface:
+    """A sample of a mesh's triangles: centres (n, 3), unit normals (n, 3), areas (n,) of sum 1."""
+
+    def __init__(self, mesh: "Mesh") -> None:
+        faces = mesh.faces[:: max(1, len(mesh.faces) // _SAMPLE)]
+        corners, normals = mesh.vertices[faces].astype(np.float64), mesh.normals[faces].astype(np.float64)
+        edges = np.diff(corners, axis=1)
+        area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+        self.area = area / max(float(area.sum()), 1e-12)
+        self.points, mean = corners.mean(axis=1), normals.sum(axis=1)
+        self.normals = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+        # Within this a point belongs to a plane: two edges, which are about as long as a voxel
+        self.thickness = 2 * float(np.median(np.linalg.norm(edges[:, 0], axis=1))) if len(faces) else 1.0
+
+    def floor(self, held: NDArray[np.float64], camera: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """(3,) normal of the largest plane seen from the side of `held` and below a camera."""
+        below = (self.points - camera) @ held < 0
+        directions = _sphere()
+        directions = directions[directions @ held > _CONE]
+        shares = self._facing(directions, below)
+        likely = directions[shares >= max(_LEAST, 0.5 * shares.max())]
+        planes = [plane for d in likely if (plane := self._plane(d, below))[0] @ held > _CONE]
+        normal, share = max(planes, key=lambda plane: plane[1], default=(held, 0.0))
+        return normal if share >= _LEAST else None
+
+    def most_faced(self) -> Up | None:
+        """The direction that far more surface faces than any other, if maps are likely to have up there."""
+        directions = _sphere()
+        shares = self._facing(directions, np.ones(len(self.area), bool))
+        best = directions[shares.argmax()]
+        others = shares[directions @ best < _APART].max()
+        if shares.max() < max(_SURE * others, _LEAST) or (_USUAL @ best).max() < _CONE:
+            return None
+        normal, share = self._plane(best, np.ones(len(self.area), bool))
+        return _up(normal, "floor") if share >= _LEAST else None
+
+    def _facing(self, directions: NDArray[np.float64], among: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """(m,) share of the surface whose normal is near each of (m, 3) directions."""
+        normals, area = self.normals[among], self.area[among]
+        return np.array([area[normals @ direction > _LEVEL].sum() for direction in directions])
+
+    def _plane(
+        self, normal: NDArray[np.float64], among: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], float]:
+        """The largest plane across a direction: its exact normal, and its share of the surface."""
+        share = 0.0
+        for _ in range(_FITS):
+            facing = np.flatnonzero(among & (self.normals @ normal > _LEVEL))
+            if len(facing) < 3:
+                break
+            height = self.points[facing] @ normal
+            at = np.floor((height - height.min()) / self.thickness).astype(np.int64)
+            layers = np.bincount(at, self.area[facing])
+            inside = facing[np.abs(at - layers.argmax()) <= 1]
+            weights, points = self.area[inside], self.points[inside]
+            share = float(weights.sum())
+            offsets = points - weights @ points / share
+            axis = np.linalg.eigh((weights[:, None] * offsets).T @ offsets)[1][:, 0]
+            normal = axis if axis @ normal > 0 else -axis
+        return normal, share
+
+
+def _up(direction: NDArray[np.float64], found_by: str) -> Up:
+    x, y, z = (direction / np.linalg.norm(direction)).tolist()
+    return Up((x, y, z), found_by)
+
+
+def _sphere(count: int = 1500) -> NDArray[np.float64]:
+    """(count, 3) unit vectors, about 5° apart (Fibonacci's lattice)."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.pi * (3 - math.sqrt(5)) * np.arange(count)
+    r = np.sqrt(1 - z * z)
+    return np.stack((r * np.cos(turn), r * np.sin(turn), z), axis=1)
