@@ -301,7 +301,7 @@ def test_advice_speaks_of_what_the_data_holds() -> None:
 
 
 def test_quaternions_are_blamed_where_there_are_some(data: Data) -> None:
-    recorded = Corrupted(opened(data(FOLDERS["7scenes"])))
+    recorded = Corrupted(opened(data(FOLDERS["open3d"])))
     assert not any(name.startswith("quaternion") for name in check(recorded).tried)
     recorded.quaternions = True
     assert "quaternion wxyz" in check(recorded).tried
