@@ -339,6 +339,6 @@ def test_replay_of_a_wrong_camera_ends_with_status_1(
     assert run("replay", wrong) == 1
     lines = capsys.readouterr().err.strip().splitlines()
     assert "warning: camera and depth disagree: frames fit best with a focal length of about 58" in lines[-2]
-    assert lines[-1].startswith("the map is likely wrong: camera and depth disagree")
+    assert lines[-1].startswith("the map is likely wrong (--no-check accepts it): camera and depth disagree")
     assert run("replay", wrong, "--no-check") == 0
     assert run("replay", whole) == 0
