@@ -79,7 +79,7 @@ def replay(
         rate=rate, min_weight=settings["min_weight"], up=given_up, keep_islands=keep_islands,
     )  # fmt: skip
     if wrong is not None:
-        typer.echo(f"the map is likely wrong: {wrong} (--no-check accepts it)", err=True)
+        typer.echo(f"the map is likely wrong (--no-check accepts it): {wrong}", err=True)
         raise typer.Exit(1)
 
 

@@ -81,10 +81,8 @@ def _near_text(unit: DepthUnit) -> str:
 
 def _far_text(unit: DepthUnit) -> str:
     found = f"depth is unusable: it reads as {unit.typical_m:.3g} m on average"
-    if unit.nearest_m == 0:
+    if unit.farthest_m != FARTHEST_M:
         return f"{found}: millimetres were taken for metres (of the points, or the baseline): divide by 1000"
     if unit.integer:
-        return (
-            f"{found}: its unit is not {unit.scale:.4g} m; 16-bit depth in millimetres has depth_scale 0.001"
-        )
+        return f"{found}: its unit is not {unit.scale:.4g} m; for millimetres, --option depth_scale=0.001"
     return f"{found}: floats are expected in metres, these are millimetres: divide them by 1000"

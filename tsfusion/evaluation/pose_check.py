@@ -117,7 +117,9 @@ def check(dataset: Dataset) -> PoseCheckReport:
     color = misplaced_color({index: frame.outlines for index, frame in frames.items()})
     if color is None:
         return report
-    return replace(report, color=color, text=f"{report.text}; but {color}")
+    return replace(
+        report, color=color, text=f"{report.text}; {'but' if report.verdict == 'agree' else 'also'} {color}"
+    )
 
 
 def _with_doubt(
