@@ -27,7 +27,7 @@ from tsfusion.scanner.sources.recorded import RecordedSource
 from tsfusion.wire.queries import fetch_health
 
 FRAMES = 3
-OWN_WORLD = ("--source", "synthetic:room", "--localizer", "rgbd", "--max-frames", FRAMES)
+OWN_WORLD = ("synthetic:room", "--localizer", "rgbd", "--max-frames", FRAMES)
 Scan = Callable[..., ScanSummary]
 
 
@@ -74,7 +74,7 @@ def test_a_second_scan_into_a_map_is_refused_at_once(server: Server, here: Here,
     assert "--map hall-2 or --map auto, or --same-frame" in line
     assert "scanning" not in again.stderr  # before the first frame
     assert not (tmp_path / "again").exists()
-    replayed = here("replay", "synthetic:room", "--max-keyframes", 1, *to_hall[-4:], "--out", "replayed")
+    replayed = here("replay", "synthetic:room", "--max-frames", 1, *to_hall[-4:], "--out", "replayed")
     assert replayed.returncode == 1
     assert f"map hall has {taken} keyframes of another session" in replayed.stderr.splitlines()[-1]
     assert keyframes(server, "hall") == taken
