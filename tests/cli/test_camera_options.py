@@ -5,12 +5,18 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import own_recordings
 import pytest
 from command_processes import Here, tsfusion
-from own_recordings import KINECT, redwood_like, tum_like
+from own_recordings import KINECT
 from small_recordings import kitti, redwood
 
 CAMERA = "fx 585 fy 585 cx 320 cy 240, 640×480"
+
+
+@pytest.fixture
+def kitchen(data: Callable[[str], Path]) -> Path:
+    return data("7scenes/redkitchen")
 
 
 def failed(done: "object", status: int = 1) -> str:
@@ -23,17 +29,17 @@ def failed(done: "object", status: int = 1) -> str:
 
 @pytest.mark.parametrize("verb", [["check"], ["replay"], ["scan"]])
 def test_a_recording_of_an_unknown_camera_is_turned_away(
-    here: Here, tmp_path: Path, data: Callable[[str], Path], verb: list[str]
+    here: Here, tmp_path: Path, kitchen: Path, verb: list[str]
 ) -> None:
     """Where 525 was taken once, and all came out 11 % too wide."""
-    root = tum_like(tmp_path / "mine", data("7scenes/redkitchen"), count=2)
+    root = own_recordings.tum(tmp_path / "mine", own_recordings.views(kitchen, 2), camera=False)
     line = failed(here(*verb, root))
     assert "mine: the camera of these 640×480 images is not known: no camera-intrinsics.txt, K.txt," in line
     assert line.endswith("give --intrinsics fx,fy,cx,cy or --calibration FILE")
 
 
-def test_check_takes_a_camera_and_names_it(here: Here, tmp_path: Path, data: Callable[[str], Path]) -> None:
-    root = redwood_like(tmp_path / "mine", data("7scenes/redkitchen"))
+def test_check_takes_a_camera_and_names_it(here: Here, tmp_path: Path, kitchen: Path) -> None:
+    root = own_recordings.images(tmp_path / "mine", own_recordings.views(kitchen), camera=False)
     done = here("check", root, "--intrinsics", "585,585,320,240")
     assert f"; camera {CAMERA}, as given\n" in done.stderr
     (tmp_path / "k.txt").write_text(KINECT)
@@ -44,8 +50,12 @@ def test_check_takes_a_camera_and_names_it(here: Here, tmp_path: Path, data: Cal
     assert f"  camera {CAMERA}, from camera-intrinsics.txt\n" in here("datasets", root).stdout
 
 
-def test_a_replay_names_its_camera(tmp_path: Path, data: Callable[[str], Path]) -> None:
-    root, out = tum_like(tmp_path / "mine", data("7scenes/redkitchen"), count=2), tmp_path / "out"
+def test_a_replay_names_its_camera(tmp_path: Path, kitchen: Path) -> None:
+    root = own_recordings.tum(tmp_path / "mine", own_recordings.views(kitchen, 2), camera=False)
+    out = tmp_path / "out"
+        own_recordings.tum(tmp_path / "mine", own_recordings.views(kitchen, 2), camera=False),
+        tmp_path / "out",
+    )
     done = tsfusion("replay", root, "--intrinsics", "585,585,320,240", "--voxel-size", 0.08, "--out", out)
     assert done.returncode == 0, done.stderr
     assert f"camera     {CAMERA}, as given" in done.stdout

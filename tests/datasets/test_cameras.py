@@ -5,9 +5,10 @@ import json
 from pathlib import Path
 
 import numpy as np
+import own_recordings
 import pytest
 from geometry_checks import warp_residual
-from own_recordings import KINECT, redwood_like, tum_like
+from own_recordings import KINECT
 from small_recordings import CAMERA, corbs, kitti, one_line, redwood, seven_scenes
 from written_recordings import check, matrix, millimetres, through_lens, transforms, views, write
 
@@ -28,9 +29,9 @@ def kitchen(data):
     return data("7scenes/redkitchen")
 
 
-@pytest.mark.parametrize("make", [redwood_like, tum_like])
+@pytest.mark.parametrize("make", [own_recordings.images, own_recordings.tum])
 def test_a_folder_of_ones_own_without_a_camera_is_an_error(tmp_path, kitchen, make):
-    root = make(tmp_path / "mine", kitchen)
+    root = make(tmp_path / "mine", own_recordings.views(kitchen), camera=False)
     for posed in (True, False):
         one_line(lambda posed=posed: open_dataset(root, posed=posed), UNKNOWN)
     right, wrong = open_dataset(root, intrinsics=GIVEN), open_dataset(root, intrinsics=PRIMESENSE)
@@ -39,10 +40,10 @@ def test_a_folder_of_ones_own_without_a_camera_is_an_error(tmp_path, kitchen, ma
     assert warp_residual(right[0], right[2]) < 0.02 < warp_residual(wrong[0], wrong[2])
 
 
-@pytest.mark.parametrize("make", [redwood_like, tum_like])
+@pytest.mark.parametrize("make", [own_recordings.images, own_recordings.tum])
 @pytest.mark.parametrize("name", ["camera-intrinsics.txt", "K.txt", "depth/intrinsics.txt"])
 def test_the_camera_file_in_a_folder_of_ones_own_counts(tmp_path, kitchen, make, name):
-    root = make(tmp_path / "mine", kitchen, count=1)
+    root = make(tmp_path / "mine", own_recordings.views(kitchen, 1), camera=False)
     (root / name).write_text(KINECT)
     dataset = open_dataset(root)
     assert dataset.intrinsics == dataset[0].intrinsics == GIVEN

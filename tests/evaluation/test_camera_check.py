@@ -55,7 +55,7 @@ def test_wrong_focal_length_is_measured(name: str, factor: float, data: Data) ->
     report = checked(name, zoomed(factor), data)
     true = opened(data(FOLDERS[name])).frame(0).intrinsics.fx
     assert (report.verdict, report.mistake, report.alternatives) == ("disagree", "focal length", ())
-    assert report.camera[0] == pytest.approx(true, rel=0.02)
+    assert report.fitting_camera[0] == pytest.approx(true, rel=0.02)
     assert report.focal_px[0] == pytest.approx(true * factor, rel=1e-3)
     for words in (
         "too wide" if factor < 1 else "too narrow",
@@ -128,7 +128,7 @@ def test_misread_cameras_are_named(name: str, mistake: str, data: Data) -> None:
     report = checked(name, change, data)
     assert (report.verdict, report.mistake) == ("disagree", expected)
     true = opened(data(FOLDERS[name])).frame(0).intrinsics
-    fx, fy, cx, cy = report.camera
+    fx, fy, cx, cy = report.fitting_camera
     size = 0.5 if mistake == "half images" else 1.0
     assert (fx, fy) == pytest.approx((size * true.fx, size * true.fy), rel=1e-3)
     assert (cx, cy) == pytest.approx((size * true.cx, size * true.cy), abs=12)  # HoloLens' is 10 pixels off
@@ -143,7 +143,7 @@ def test_exchanged_focal_lengths_are_named(data: Data) -> None:
 
     report = checked("7scenes", stretched, data)
     assert report.mistake == "exchanged focal lengths"
-    assert report.camera[:2] == pytest.approx((731.25, 585))
+    assert report.fitting_camera[:2] == pytest.approx((731.25, 585))
 
 
 def test_landscape_camera_of_portrait_images_is_named(data: Data) -> None:

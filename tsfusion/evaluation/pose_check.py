@@ -87,7 +87,7 @@ class PoseCheckReport:
     # `unequal focal lengths`) or `unexplained`; None when they agree
     mistake: str | None = None
     alternatives: tuple[str, ...] = ()  # other mistakes whose correction fits as well
-    camera: tuple[float, float, float, float] | None = None  # that fits, where it is wrong
+    fitting_camera: tuple[float, float, float, float] | None = None  # that fits, where it is wrong
     # Focal length used, the one that fits best and its standard error, pixels; None where nobody can tell
     focal_px: tuple[float, float, float] | None = None
     color: str | None = None  # how the colour lies off the depth; None where it does not, or nobody can tell
@@ -142,7 +142,7 @@ def _with_doubt(
         text=f"{_CAMERA}: {doubt}",
         mistake=likely.name,
         alternatives=(),
-        camera=msgspec.structs.astuple(likely.camera),
+        fitting_camera=msgspec.structs.astuple(likely.camera),
     )
 
 
@@ -274,7 +274,7 @@ def _camera_report(
         camera.name,
         ("scale",) if either else (),
         factor=round(scale.factor, 4) if either else None,
-        camera=msgspec.structs.astuple(camera.camera),
+        fitting_camera=msgspec.structs.astuple(camera.camera),
     )
 
 
