@@ -23,7 +23,7 @@ try:
 except ImportError as error:  # also where libusb is missing, which importorskip takes for a failure
     pytest.skip(
         f"pyrealsense2 cannot be loaded ({error}); "
-        "pip install 'tsfusion[realsense]' and apt-get install libusb-1.0-0",
+        "pip install '.[realsense]' and apt-get install libusb-1.0-0",
         allow_module_level=True,
     )
 
@@ -200,6 +200,14 @@ def test_a_slow_reader_of_a_recording_loses_nothing(recording: Path) -> None:
     assert numbers == list(range(1, 13))
     assert source.skipped == {}
     assert not source.live
+
+
+def test_a_recording_stands_still_until_it_is_read(recording: Path) -> None:
+    """It would play on while its sensors are started one after the other, and their first frames be lost."""
+    with RealSense(recording=recording) as source:
+        assert source._stream._playback.current_status() == rs.playback_status.paused
+        assert [number_of(frame) for frame in source] == [*range(1, 13)]
+    RealSense(recording=recording).close()  # that was never read
 
 
 def test_a_recording_in_real_time_drops_and_counts(tmp_path: Path) -> None:
