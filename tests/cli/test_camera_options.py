@@ -53,9 +53,6 @@ def test_check_takes_a_camera_and_names_it(here: Here, tmp_path: Path, kitchen: 
 def test_a_replay_names_its_camera(tmp_path: Path, kitchen: Path) -> None:
     root = own_recordings.tum(tmp_path / "mine", own_recordings.views(kitchen, 2), camera=False)
     out = tmp_path / "out"
-        own_recordings.tum(tmp_path / "mine", own_recordings.views(kitchen, 2), camera=False),
-        tmp_path / "out",
-    )
     done = tsfusion("replay", root, "--intrinsics", "585,585,320,240", "--voxel-size", 0.08, "--out", out)
     assert done.returncode == 0, done.stderr
     assert f"camera     {CAMERA}, as given" in done.stdout
