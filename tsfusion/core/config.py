@@ -40,6 +40,9 @@ MAP_NAME_LENGTH = 32
 MAP_NAME = rf"[a-z0-9][a-z0-9_-]{{0,{MAP_NAME_LENGTH - 1}}}"
 # Becomes a folder's name, so it is no path: \A and \Z, because `$` would let a newline through.
 MapName = Annotated[str, Meta(pattern=rf"\A{MAP_NAME}\Z")]
+# A voxel nearly as large as the sensor's range shows nothing: as many must fit into it.
+LEAST_VOXELS = 10
+LEAST_VOXEL_SIZE = 0.00001  # metres: finer than any sensor
 ClientName = Annotated[str, Meta(pattern=r"\A[A-Za-z0-9][A-Za-z0-9_.-]{0,31}\Z")]
 Bytes = Annotated[int, Meta(ge=1 << 20)]
 
@@ -143,6 +146,35 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
             if (value := getattr(self, key, None)) is not None
         }
         return msgspec.structs.replace(SENSORS[name], **chosen)
+
+    def checked_model(self) -> SensorModel:
+        """The map's own sensor model, once the settings are found to fit each other.
+
+        Raises:
+            InvalidConfig: for ranges out of order, voxels so large that the sensor sees next to none, or
+                settings that exclude each other.
+        """
+        model = self.model()
+        if model.min_range >= model.max_range or model.min_support > model.max_support:
+            raise InvalidConfig(
+                f"ranges must be ordered: min_range {model.min_range} < max_range {model.max_range} m, "
+                f"min_support {model.min_support} ≤ max_support {model.max_support} voxels"
+            )
+        if self.voxel_size < LEAST_VOXEL_SIZE:
+            raise InvalidConfig(
+                f"voxel_size must be at least {LEAST_VOXEL_SIZE} m, got {self.voxel_size:g}: it is in metres"
+            )
+        if self.voxel_size * LEAST_VOXELS > model.max_range:
+            raise InvalidConfig(
+                f"voxel_size {self.voxel_size:g} m is too large for max_range {model.max_range:g} m: at "
+                f"least {LEAST_VOXELS} voxels must fit into it; 0.02 m suits a room, 0.1 m a street"
+            )
+        if self.space_carving and model.regularizer != "off":
+            raise InvalidConfig(
+                f"space_carving and the regularizer {model.regularizer!r} exclude each other: smoothing is "
+                "for the band around a ray's end; use regularizer = off"
+            )
+        return model
 
 
 # Settings of a map that change nothing stored in it (smoothness: unless it smooths along rays): a saved one
