@@ -134,7 +134,7 @@ class Client:
         """
         if not self._began_sending:
             self._began_sending = True
-            if wrong := wrong_unit(keyframe):
+            if wrong := wrong_unit(keyframe_of(keyframe)):
                 log.warning("the first keyframe has %s", wrong)
         while True:
             self._outbox.wait(lambda: not self._pressure.must_wait, None, self._check_running)
@@ -202,7 +202,10 @@ class Client:
         if state.is_refused:
             raise (NotAllowed if state.kind == "locked_out" else ServerUnreachable)(state.why)
         if not state.is_connected:
-            raise ServerUnreachable(f"{self._why()} (waited {timeout:g} s)")
+            raise ServerUnreachable(
+                f"{self._why()} (waited {timeout:g} s); is `tsfusion serve` running there, and is the port "
+                "right?"
+            )
 
     def wait_answer(self, timeout: float) -> None:
         """Wait until the server has answered or is known not to be there, at most `timeout` seconds."""

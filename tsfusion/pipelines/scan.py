@@ -217,7 +217,10 @@ def _not_localised(scanner: Scanner, first: Frame) -> OutputError:
     state = scanner.state()
     unit = "" if first.kind == "pair" else wrong_unit(first.keyframe(np.eye(4)))
     why = f"the first has {unit}" if unit else state.why
-    return OutputError(f"the sensor was not localised in any of {state.frames} frames: {why}")
+    return OutputError(
+        f"the sensor was not localised in any of {state.frames} frames: {why}; check "
+        "the camera and the depth's unit, or take poses from elsewhere (--trajectory FILE)"
+    )
 
 
 def _refused_worlds(clients: list[Client]) -> list[Exception]:

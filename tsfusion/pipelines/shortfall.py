@@ -28,8 +28,8 @@ def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str,
     if stats.waiting:
         return (
             f"{stats.waiting} keyframes are not at the server ({link or 'it is behind'}): they wait in "
-            f"{spool}; check the address with `tsfusion status --connect`, then send them with `tsfusion "
-            "spool send`"
+            f"{spool}; check the address with `tsfusion status --connect`, then "
+            f"`tsfusion spool send --spool {spool}`"
         )
     if lost:
         reasons = ", ".join(f"{count} × {reason}" for reason, count in lost.items())
