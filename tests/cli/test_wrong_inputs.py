@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Some two hundred wrong inputs: each gives one line that names cause and cure, and a status that is not 0."""
+"""Wrong inputs, over two hundred: each gives one line with cause and cure, and a status that is not 0."""
 
 import os
 from collections.abc import Iterator
