@@ -28,7 +28,7 @@ from small_recordings import kitti, seven_scenes
 import tsfusion
 from tsfusion.wire import key_folder
 
-SCAN = "scan --source"
+SCAN = "scan"
 NOBODY = "tcp://127.0.0.1:9"  # the discard port: nobody listens there, and nobody may without being root
 
 _COMMANDS = """
@@ -80,9 +80,9 @@ replay tum --sequence 06 | takes no `sequence` | it takes trajectory, intrinsics
 replay tum --option depth_topic=/x | takes no `depth_topic` | it takes trajectory, intrinsics
 replay tum --option speed | got 'speed' | must be KEY=VALUE, such as
 replay tum --option =3 | got '=3' | must be KEY=VALUE
-replay tum --poses missing.txt | missing.txt is missing | expected `timestamp tx
-replay tum --poses file | file:1: could not convert | expected `timestamp tx
-replay tum --poses other_times.txt | 3 without a pose in time | expected groundtruth.txt
+replay tum --trajectory missing.txt | missing.txt is missing | expected `timestamp tx
+replay tum --trajectory file | file:1: could not convert | expected `timestamp tx
+replay tum --trajectory other_times.txt | 3 without a pose in time | expected groundtruth.txt
 replay synthetic:cave | got 'cave' | world must be one of room
 replay synthetic:room:sonar | got 'sonar' | must be kinect, stereo or lidar
 replay synthetic:room --option count=0 | got count 0 | expected count >= 1
