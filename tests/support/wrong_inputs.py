@@ -56,7 +56,7 @@ replay tum_other_times | 3 without a pose in time | expected groundtruth.txt
 replay tum_empty_list | depth.txt lists no images | expected `timestamp path` a line
 replay tum_bad_list | depth.txt:1: 'depth/a.png' | expected `timestamp path` a line
 replay tum_8bit | got shape (48, 64) of uint8 | must hold one 16-bit channel
-replay tum_cut_png | cannot be decoded | expected a 16-bit depth image
+replay tum_cut_png | cannot be decoded | expected a depth image
 replay tum_missing_png | is missing (1 of 3 images | that tum_missing_png/depth.txt lists
 replay tum_folder_png | is missing (1 of 3 images | that tum_folder_png/depth.txt lists
 replay tum_color_size | is 32×24, its depth image 64×48 | expected equal sizes
@@ -66,8 +66,8 @@ replay scenes_scaled_pose | got |RᵀR - I| = 3 | must hold a rotation
 replay scenes_short_pose | pose.txt:1: 3 numbers | expected 4
 replay scenes_8bit | of uint8 | must hold one 16-bit channel
 replay scenes_color_depth | got shape (48, 64, 3) | must hold one 16-bit channel
-replay scenes_empty_png | cannot be decoded | expected a 16-bit depth image
-replay scenes_text_png | cannot be decoded | expected a 16-bit depth image
+replay scenes_empty_png | cannot be decoded | expected a depth image
+replay scenes_text_png | cannot be decoded | expected a depth image
 replay scenes_size | is 64×48, its depth image 32×24 | expected equal sizes
 replay scenes_blank | 0 of 2 keyframes fused; the keyframe has no usable sample | is the sensor covered
 replay kitti --sequence 99 | kitti/sequences/99 does not exist | expected a folder in the KITTI odometry
@@ -269,7 +269,7 @@ Volume.load("garbage.tsf") | not a tsfusion map | expected the map.tsf of a serv
 Volume().save("missing/a.tsf") | cannot write the map missing/a.tsf | No such file
 Keyframe(T_world_camera=pose) | got none | exactly one of depth, disparity and points
 Keyframe(depth=depth, T_world_camera=pose) | got None | intrinsics must be given with depth as Intrinsics(fx, fy, cx, cy)
-Keyframe(depth=depth, intrinsics=(500, 500, 320, 240), T_world_camera=pose) | got (500, 500, 320, 240) | as Intrinsics(fx, fy, cx, cy)
+Keyframe(depth=depth, intrinsics=(500, 500), T_world_camera=pose) | got (500, 500) | Intrinsics(fx, fy, cx, cy)
 Keyframe(depth=depth.astype("uint8"), intrinsics=K, T_world_camera=pose) | got uint8 | depth must be uint16 or float32
 Keyframe(depth=depth[None], intrinsics=K, T_world_camera=pose) | got (1, 6, 8) | depth must have shape
 Keyframe(depth=depth, intrinsics=K, T_world_camera=pose[:3]) | got (3, 4) | must have shape (4, 4)
