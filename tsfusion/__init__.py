@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from tsfusion.core.errors import DatasetError as DatasetError
     from tsfusion.core.errors import DecodeError as DecodeError
     from tsfusion.core.errors import FlushTimeout as FlushTimeout
+    from tsfusion.core.errors import IncompleteRun as IncompleteRun
     from tsfusion.core.errors import InvalidConfig as InvalidConfig
     from tsfusion.core.errors import InvalidKeyframe as InvalidKeyframe
     from tsfusion.core.errors import JournalError as JournalError
@@ -44,7 +45,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _ERRORS = (
-    "CheckpointError", "DamagedCheckpoint", "DatasetError", "DecodeError", "FlushTimeout", "InvalidConfig",
+    "CheckpointError", "DamagedCheckpoint", "DatasetError", "DecodeError", "FlushTimeout", "IncompleteRun",
+    "InvalidConfig",
     "InvalidKeyframe", "JournalError", "KeyframeRefused", "MapError", "MapFull", "MissingDependency",
     "NotAllowed", "OutputError", "ServerUnreachable", "SourceError",
     "TransportError", "TsfusionError", "WeightOverflow", "WorldRefused",

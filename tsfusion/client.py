@@ -40,6 +40,7 @@ from tsfusion.delivery.outbox import ClientStats, Outbox
 from tsfusion.delivery.sender import Sender
 from tsfusion.delivery.spool import Spool
 from tsfusion.geometry.keyframe import Keyframe, keyframe_of
+from tsfusion.geometry.sample_ranges import wrong_unit
 from tsfusion.wire import corrections, sockets
 from tsfusion.wire.curve import client_keys
 from tsfusion.wire.keyframe_times import KeyframeTimes
@@ -114,7 +115,7 @@ class Client:
         self._pressure = Backpressure(self._outbox, self._config)
         self._sender = Sender(address, self._control, self._outbox, self._config, connection_keys)
         self._sending = threading.Lock()
-        self._closed = False
+        self._closed = self._began_sending = False
         self._began = time.monotonic()
         self._thread = threading.Thread(target=self._sender.run, name="tsfusion-client", daemon=True)
         self._thread.start()
@@ -131,6 +132,10 @@ class Client:
         Raises:
             TransportError: after `close`, also when that happens while this waits.
         """
+        if not self._began_sending:
+            self._began_sending = True
+            if wrong := wrong_unit(keyframe_of(keyframe)):
+                log.warning("the first keyframe has %s", wrong)
         while True:
             self._outbox.wait(lambda: not self._pressure.must_wait, None, self._check_running)
             with self._sending:
@@ -197,7 +202,10 @@ class Client:
         if state.is_refused:
             raise (NotAllowed if state.kind == "locked_out" else ServerUnreachable)(state.why)
         if not state.is_connected:
-            raise ServerUnreachable(f"{self._why()} (waited {timeout:g} s)")
+            raise ServerUnreachable(
+                f"{self._why()} (waited {timeout:g} s); is `tsfusion serve` running there, and is the port "
+                "right?"
+            )
 
     def wait_answer(self, timeout: float) -> None:
         """Wait until the server has answered or is known not to be there, at most `timeout` seconds."""
@@ -278,6 +286,11 @@ class Client:
     def stats(self) -> ClientStats:
         """Counts since this client began."""
         return self._outbox.stats()
+
+    @property
+    def first_rejection(self) -> str:
+        """Why the map did not take the first keyframe that it rejected; empty = it took all so far."""
+        return self._outbox.first_rejection
 
     @property
     def connected(self) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from command_processes import python
 from geometry_checks import move, warp_residual
+from rgbd_scenes import track
 from scipy.spatial import cKDTree
 
 from tsfusion.core.errors import DatasetError
@@ -18,6 +19,7 @@ from tsfusion.datasets.synthetic import worlds
 from tsfusion.datasets.synthetic.dataset import DEPTH_SCALE, kinect, stereo
 from tsfusion.evaluation.view_prediction import depth_metres, points_world
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
 
 
 def digest(keyframe: Keyframe) -> str:
@@ -251,6 +253,20 @@ def test_the_tables_of_solids_and_materials_agree_with_the_kernel():
 def test_a_world_that_cannot_be_made_is_one_clear_line(settings, match):
     with pytest.raises(DatasetError, match=match):
         Synthetic(**settings)
+
+
+@pytest.mark.parametrize("world", ["corridor", "rooms"])
+def test_a_scanner_follows_a_world_as_it_comes(world):
+    """All 40 frames in one map; a number of frames that is given is spread over the whole path."""
+    dataset = Synthetic(world)
+    assert len(dataset) == 40
+    steps = np.linalg.norm(np.diff([dataset.pose(index)[:3, 3] for index in range(40)], axis=0), axis=1)
+    assert steps.max() < 0.25
+    result = track(RGBDLocalizer(), [dataset.frame(index) for index in range(40)])
+    assert not result.lost
+    assert result.ate() < 5
+    whole = Synthetic(world, count=dataset.world.steps)
+    np.testing.assert_array_equal(whole.pose(39), dataset.pose(39))
 
 
 @pytest.mark.parametrize("world", ["room", "street"])

@@ -140,11 +140,12 @@ def test_ctrl_c_without_a_server_keeps_all_for_the_next_scan(walk: Path, tmp_pat
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment(),
     )  # fmt: skip
     read_until(process, "no server answers")
-    assert end(process, signal.SIGINT) == 0
+    assert end(process, signal.SIGINT) == 1  # what was scanned is not at the server
     run = json.loads((tmp_path / "out" / "run.json").read_text())
     assert not run["complete"]
     assert 0 < run["frames"] < 40
     assert run["left"] == run["keyframes_sent"] >= 1
+    assert f"{run['left']} keyframes are not at the server (no server answers" in run["missed"]
     assert "no server answers" in run["link"]
     assert len(JournalRecording(spool / "default")) == run["left"]
     with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, _):
@@ -314,12 +315,14 @@ def test_keyframes_that_are_refused_do_not_cost_the_results(walk: Path, tmp_path
     settings = tmp_path / "server.toml"
     settings.write_text("[server]\nquota_extent = 0.001\n")
     with server(tmp_path / "state", "--config", settings) as (address, _):
-        run = figures(
-            tsfusion(
-                "scan", walk, "--localizer", "given", "--connect", address,
-                "--spool", tmp_path / "spool", "--out", tmp_path / "out", "--json",
-            )
+        done = tsfusion(
+            "scan", walk, "--localizer", "given", "--connect", address,
+            "--spool", tmp_path / "spool", "--out", tmp_path / "out", "--json",
         )  # fmt: skip
+    run = json.loads(done.stdout)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == f"tsfusion: {run['missed']}"
+    assert run["missed"].startswith(f"{run['keyframes_sent']} keyframes will never be at the server")
     assert run["keyframes_rejected"] == {"quota": run["keyframes_sent"]}
     assert run["left"] == 0
     assert len(read_tum(tmp_path / "out" / "trajectory.txt").timestamps_ns) == 12

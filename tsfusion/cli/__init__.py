@@ -113,7 +113,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     except TsfusionError as error:
         _fail(str(error), 1)
     except _UsageError as error:
-        _fail(f"{error.format_message()} (see --help)", 2)  # type: ignore[attr-defined]
+        _fail(f"{error.format_message()}{_variable(error)} (see --help)", 2)  # type: ignore[attr-defined]
     except (KeyboardInterrupt, typer.Abort):
         _fail("interrupted", INTERRUPTED)
     except SystemExit as ended:
@@ -131,6 +131,16 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 def _fail(message: str, code: int) -> NoReturn:
     typer.echo(f"tsfusion: {' '.join(message.split())}", err=True)
     sys.exit(code)
+
+
+def _variable(error: Exception) -> str:
+    """The environment variable that a wrong value comes from, in words; empty = it was typed."""
+    context, parameter = getattr(error, "ctx", None), getattr(error, "param", None)
+    if context is None or parameter is None:
+        return ""
+    source = context.get_parameter_source(parameter.name)
+    is_set = source is not None and source.name == "ENVIRONMENT"
+    return f" (environment variable {parameter.envvar})" if is_set else ""
 
 
 def _terminated(signum: int, frame: FrameType | None) -> NoReturn:

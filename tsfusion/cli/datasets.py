@@ -40,13 +40,17 @@ def list_(
     from tsfusion.cli import output
 
     rows = _layouts() if path is None else list(_found(path, _DEPTH))
+    if not rows:
+        from tsfusion.core.errors import DatasetError
+
+        raise DatasetError(
+            f"no datasets in or under {path}; `tsfusion datasets` says what each layout expects"
+        )
     if json:
         output.as_json(rows)
         return
     for row in rows:
         typer.echo(_line(**row))
-    if not rows:
-        typer.echo(f"no datasets that can be opened in or under {path}", err=True)
 
 
 def _line(

@@ -81,13 +81,15 @@ def _check(recordings: "list[PublicRecording]", to: Path, *, json: bool) -> None
     from tsfusion.datasets.download import download
 
     found = [one for recording in recordings for one in download.check(recording, to)]
+    if not found:
+        from tsfusion.core.errors import DatasetError
+
+        raise DatasetError(f"no archives of these recordings in {to}; give their folder with --to")
     if json:
         output.as_json([_row(one) for one in found])
         return
     for one in found:
         _print_archive(one)
-    if not found:
-        typer.echo(f"no archives of these recordings in {to}", err=True)
 
 
 def _row(one: "CheckedFile") -> dict[str, object]:

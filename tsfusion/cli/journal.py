@@ -156,6 +156,7 @@ def _run(
     from tsfusion.journal.state_folder import find_journal
 
     place = find_journal(path, map_name)
+    _check_journal(place)
     with progress.reading(f"{doing} {place.path}", quiet=json) as watch:
         result = work(place, watch)
     if json:
@@ -163,6 +164,20 @@ def _run(
     else:
         typer.echo(describe(result))
     return result
+
+
+def _check_journal(place: "JournalPlace") -> None:
+    """Raise JournalError where there is nothing to read: no segment, or one file that is no MCAP."""
+    from tsfusion.core.errors import JournalError
+    from tsfusion.journal.mcap_layout import MAGIC
+
+    expected = "expected a state folder, a map's, a journal or an .mcap file"
+    if not place.files():
+        raise JournalError(f"no journal in {place.path}; {expected}")
+    if place.path.is_file():
+        with place.path.open("rb") as file:
+            if not MAGIC.startswith(file.read(len(MAGIC))):
+                raise JournalError(f"{place.path} is no MCAP file; {expected}")
 
 
 def _describe_recovery(out: Path, done: "Recovery") -> str:

@@ -117,7 +117,7 @@ def _volume(
     saved = source / state_folder.MAP_FILE
     if saved.is_file() and not given:
         volume = Volume.load(saved, config.threads, **view)
-        if volume.keyframes == len(recording):
+        if volume.keyframes + sum(volume.meta.get("rejected", {}).values()) == len(recording):
             return volume, HeldSensor(volume.meta.get("held"))
         config = volume.config  # the server died before it saved the rest
     return _fuse(recording, Volume(config), quiet)

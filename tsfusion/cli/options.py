@@ -176,6 +176,7 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
         for name in ("volume", "server", "scan")
     }
     changed = {name: config.override(getattr(loaded, name), **given) for name, given in tables.items()}
+    changed["volume"].checked_model()
     return config.Config(client=loaded.client, **changed)
 
 

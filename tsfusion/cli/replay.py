@@ -166,3 +166,4 @@ def _run(dataset: "Dataset", out: Path | None, *, json: bool, **settings: Any) -
         output.as_json(result)
     else:
         run_summary.print_replay(result)
+    run_summary.check(result)

@@ -109,6 +109,14 @@ def mesh_notes(figures: dict[str, Any]) -> list[str]:
     return notes
 
 
+def check(run: "ReplaySummary | ScanSummary") -> None:
+    """Raise IncompleteRun when the run has missed what it was for: the last line, and status 1."""
+    from tsfusion.core.errors import IncompleteRun
+
+    if run.missed:
+        raise IncompleteRun(run.missed)
+
+
 def _map_lines(found: "MapResult") -> list[str]:
     lines = [f"map        {found.name}: {found.frames} frames, {found.keyframes} keyframes"]
     if found.mesh:

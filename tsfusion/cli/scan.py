@@ -131,6 +131,7 @@ def scan(
         output.as_json(result)
     else:
         run_summary.print_scan(result, spool, connect)
+    run_summary.check(result)
 
 
 def _open(

@@ -40,6 +40,10 @@ MAP_NAME_LENGTH = 32
 MAP_NAME = rf"[a-z0-9][a-z0-9_-]{{0,{MAP_NAME_LENGTH - 1}}}"
 # Becomes a folder's name, so it is no path: \A and \Z, because `$` would let a newline through.
 MapName = Annotated[str, Meta(pattern=rf"\A{MAP_NAME}\Z")]
+# A voxel nearly as large as the sensor's range shows nothing: as many must fit into it.
+LEAST_VOXELS = 10
+MOST_SAMPLES = 1 << 22  # full-confidence ones that a voxel can count
+LEAST_VOXEL_SIZE = 0.00001  # metres: finer than any sensor
 ClientName = Annotated[str, Meta(pattern=r"\A[A-Za-z0-9][A-Za-z0-9_.-]{0,31}\Z")]
 Bytes = Annotated[int, Meta(ge=1 << 20)]
 
@@ -118,7 +122,9 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     max_support: Annotated[float, Meta(ge=1, le=16)] | None = None  # voxels
     min_range: NonNegative | None = None  # metres
     max_range: Positive | None = None  # metres
-    min_weight: NonNegative | None = None  # full-confidence samples a voxel needs to be meshed
+    min_weight: Annotated[float, Meta(ge=0, le=MOST_SAMPLES)] | None = (
+        None  # full-confidence samples a voxel needs to be meshed
+    )
     feedback: bool | None = None  # smooth the smoothed values again (recursion) or the raw ones
     surface: Surface | None = None  # what is meshed: values as fused, smoothed along normals, or the field
     field_smoothness: Smoothness | None = None  # λ of the field, against full-confidence samples
@@ -143,6 +149,35 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
             if (value := getattr(self, key, None)) is not None
         }
         return msgspec.structs.replace(SENSORS[name], **chosen)
+
+    def checked_model(self) -> SensorModel:
+        """The map's own sensor model, once the settings are found to fit each other.
+
+        Raises:
+            InvalidConfig: for ranges out of order, voxels so large that the sensor sees next to none, or
+                settings that exclude each other.
+        """
+        model = self.model()
+        if model.min_range >= model.max_range or model.min_support > model.max_support:
+            raise InvalidConfig(
+                f"ranges must be ordered: min_range {model.min_range} < max_range {model.max_range} m, "
+                f"min_support {model.min_support} ≤ max_support {model.max_support} voxels"
+            )
+        if self.voxel_size < LEAST_VOXEL_SIZE:
+            raise InvalidConfig(
+                f"voxel_size must be at least {LEAST_VOXEL_SIZE} m, got {self.voxel_size:g}: it is in metres"
+            )
+        if self.voxel_size * LEAST_VOXELS > model.max_range:
+            raise InvalidConfig(
+                f"voxel_size {self.voxel_size:g} m is too large for max_range {model.max_range:g} m: at "
+                f"least {LEAST_VOXELS} voxels must fit into it; 0.02 m suits a room, 0.1 m a street"
+            )
+        if self.space_carving and model.regularizer != "off":
+            raise InvalidConfig(
+                f"space_carving and the regularizer {model.regularizer!r} exclude each other: smoothing is "
+                "for the band around a ray's end; use regularizer = off"
+            )
+        return model
 
 
 # Settings of a map that change nothing stored in it (smoothness: unless it smooths along rays): a saved one
@@ -284,13 +319,18 @@ _NAME = "1 to 32 of a-z, 0-9, - and _, a letter or digit first"  # MapName, the 
 
 def _message(struct: type[Struct], settings: dict[str, Any], problem: str) -> str:
     """Put msgspec's message into plain words: `volume.voxel_size must be > 0, got -0.05`."""
+    if "at `key` in `$.maps`" in problem:
+        name = next(name for name in settings["maps"] if not re.fullmatch(MAP_NAME, name))
+        return f"maps: a map's name must be {_NAME}, got {name!r}"
     problem, _, place = problem.partition(" - at `$.")
     *tables, key = place.rstrip("`").split(".")
     if unknown := re.search(r"unknown field `(.+)`", problem):
         where = place.rstrip("`")
         for table in filter(None, where.split(".")):
             struct = struct.__annotations__[table]
-        hint = other_names.instead(unknown[1], other_names.SETTINGS, struct.__struct_fields__)
+        known = struct.__struct_fields__
+        hint = other_names.instead(unknown[1], other_names.SETTINGS, known)
+        hint = hint or f"; known are {', '.join(known)}"
         return f"unknown setting {'.'.join(filter(None, (where, unknown[1])))}{hint}"
     wanted = re.match(
         r"Expected `(\w+)[^`]*`(?: ([<>]=? \S+?)(?:\.0)?)?(?:,|$)|Invalid enum|.* matching regex", problem
@@ -322,11 +362,15 @@ def load(path: str | Path | None, **volume: Any) -> Config:
     try:
         content = Path(path).read_bytes()
     except OSError as error:
-        raise InvalidConfig(f"cannot read the configuration {path}: {error.strerror}") from error
+        raise InvalidConfig(
+            f"cannot read the configuration {path}: {error.strerror}; `tsfusion config dump` writes one"
+        ) from error
     try:
         tables = tomllib.loads(content.decode("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InvalidConfig(f"{path} is not TOML: {error}") from error
+        raise InvalidConfig(
+            f"{path} is not TOML: {error}; `tsfusion config dump` shows what one looks like"
+        ) from error
     if isinstance(given := tables.get("volume", {}), dict):
         tables["volume"] = {**volume, **given}
     try:

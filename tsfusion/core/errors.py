@@ -20,6 +20,7 @@
     │   ├── FlushTimeout                   keyframes were still unacknowledged at the deadline
     │   └── KeyframeRefused                the server will never take this keyframe, and said why
     ├── OutputError                        a result cannot be written
+    ├── IncompleteRun                      a run has left its results, but missed what it was for
     └── MissingDependency                  an optional package is needed; the message names the command
 
 The command line prints any of these as one line and exits with status 1.
@@ -123,6 +124,10 @@ class KeyframeRefused(TransportError):
 
 class OutputError(TsfusionError):
     """A result cannot be written."""
+
+
+class IncompleteRun(TsfusionError):
+    """A run has left its results, but missed what it was for; the message says what to do."""
 
 
 class MissingDependency(TsfusionError):

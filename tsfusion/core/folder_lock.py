@@ -91,7 +91,7 @@ def lock_folder(
         raise error_type(in_use) from error
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL
         reason = getattr(error, "strerror", error)
-        raise error_type(f"cannot write the {kind} folder {folder}: {reason}") from error
+        raise error_type(f"cannot write the {kind} folder {folder}: {reason}; choose another") from error
     with suppress(OSError):  # only a message to whoever has to wait
         path.write_text(str(os.getpid()), encoding="ascii")
     return lock

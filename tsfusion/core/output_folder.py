@@ -78,7 +78,7 @@ def results(out: str | os.PathLike[str] | None, *, overwrite: bool = False) -> I
 
 def _check_folder(out: Path) -> None:
     if os.path.exists(out) and not out.is_dir():
-        raise OutputError(f"cannot write to {out}: it is not a folder")
+        raise OutputError(f"cannot write to {out}: it is not a folder; choose another name")
 
 
 def _visible(folder: Path) -> list[str]:
@@ -96,7 +96,7 @@ def _parents(out: Path) -> Iterator[None]:
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OutputError(f"cannot write to {out}: {error.strerror}") from error
+            raise OutputError(f"cannot write to {out}: {error.strerror}; choose another folder") from error
         yield
     except BaseException:
         for parent in missing:
@@ -112,7 +112,7 @@ def _workplace(work: Path, out: Path) -> Iterator[Path]:
         work.mkdir(exist_ok=True)
         lock = folder_lock.hold(work)
     except OSError as error:
-        raise OutputError(f"cannot write to {out}: {error.strerror}") from error
+        raise OutputError(f"cannot write to {out}: {error.strerror}; choose another folder") from error
     try:
         yield work
     finally:
@@ -142,7 +142,7 @@ def _claim(root: Path, stamp: str) -> tuple[Path, Path]:
         except FileExistsError:  # of a run that started in the same second
             continue
         except OSError as error:
-            raise OutputError(f"cannot write to {out}: {error.strerror}") from error
+            raise OutputError(f"cannot write to {out}: {error.strerror}; choose another folder") from error
     raise AssertionError("the count has no end")
 
 
@@ -166,7 +166,7 @@ def _move(work: Path, out: Path) -> None:
         for path in sorted(work.iterdir(), key=lambda path: path.name == RECORD):
             path.replace(out / path.name)
     except OSError as error:
-        raise OutputError(f"cannot write to {out}: {error.strerror}") from error
+        raise OutputError(f"cannot write to {out}: {error.strerror}; choose another folder") from error
 
 
 def check_writable(path: str | os.PathLike[str], endings: tuple[str, ...]) -> None:
@@ -178,6 +178,6 @@ def check_writable(path: str | os.PathLike[str], endings: tuple[str, ...]) -> No
         with tempfile.NamedTemporaryFile(prefix=f".{path.name}.", dir=path.parent):
             pass
     except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+        raise OutputError(f"cannot write {path}: {error.strerror}; choose another place") from error
     if path.is_dir():
-        raise OutputError(f"cannot write {path}: it is a folder")
+        raise OutputError(f"cannot write {path}: it is a folder; choose another name")

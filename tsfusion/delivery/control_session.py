@@ -263,8 +263,11 @@ class ControlSession:
     def _on_nack(self, nack: messages.Nack) -> None:
         self.last_moved = self.last_heard
         if nack.stage == "map":
-            kind = self._outbox.reject(nack.seq, nack.reason)
-            log.error("%s %d is not in the map (%s): %s", kind, nack.seq, nack.reason, nack.message)
+            kind, is_first = self._outbox.reject(nack.seq, nack.reason, nack.message)
+            log.log(  # the others are counted
+                logging.ERROR if is_first else logging.DEBUG,
+                "%s %d is not in the map (%s): %s", kind, nack.seq, nack.reason, nack.message,
+            )  # fmt: skip
         elif (entry := self._outbox.find_sent(nack.seq)) is not None:
             self._refused.give_up(entry, nack.reason, nack.message)
 

@@ -99,6 +99,7 @@ class Outbox:
         self._refusal_count = 0  # of which `flush` has not complained yet
         self._first_refusal = ""  # of those, in words
         self._rejected: Counter[str] = Counter()
+        self._first_rejection = ""
         self._rejected_seqs: OrderedDict[int, None] = OrderedDict()
         # Of what a dead scanner left, any may have been sent; and what a power cut took of it, too.
         self._perhaps_sent = spool.waiting[-1].seq if spool.waiting else 0
@@ -370,16 +371,28 @@ class Outbox:
 
     # --- turned away ---
 
-    def reject(self, seq: int, reason: str) -> str:
-        """Count a record that the server has and the map will not take; its kind in words."""
+    def reject(self, seq: int, reason: str, message: str = "") -> tuple[str, bool]:
+        """Count a record that the server has and the map will not take.
+
+        Returns its kind in words, and whether it is the first of this session for that reason.
+        """
         with self._changed:
             is_correction = seq in self._corrections
+            counts = self._corrections_refused if is_correction else self._rejected
+            is_first = not counts[reason]
             if seq not in self._rejected_seqs:
-                (self._corrections_refused if is_correction else self._rejected)[reason] += 1
+                counts[reason] += 1
                 self._rejected_seqs[seq] = None
+                self._first_rejection = self._first_rejection or message or reason
                 if len(self._rejected_seqs) > _MOST_REMEMBERED:
                     self._rejected_seqs.popitem(last=False)
-            return "correction" if is_correction else "keyframe"
+            return "correction" if is_correction else "keyframe", is_first
+
+    @property
+    def first_rejection(self) -> str:
+        """Why the map did not take the first record that it rejected; empty = it took all."""
+        with self._changed:
+            return self._first_rejection
 
     def find_sent(self, seq: int) -> Waiting | None:
         """The record of this number, if it waits and was sent."""

@@ -114,7 +114,8 @@ def associate(
     if not len(kept):
         raise DatasetError(
             f"no two poses are within {max_difference_ns / 1e9:g} s of each other: the trajectories cover "
-            f"{_span(first_ns)} and {_span(second_ns)}"
+            f"{_span(first_ns)} and {_span(second_ns)}; are they of one recording and clock? "
+            "--max-difference allows more"
         )
     return (nearest[kept], kept) if swapped else (kept, nearest[kept])
 
@@ -159,7 +160,7 @@ def dataset_trajectory(dataset: Dataset) -> tuple[NDArray[np.int64], Poses]:
     """
     found = [(index, T) for index in range(len(dataset)) if (T := pose_of(dataset, index)) is not None]
     if not found:
-        raise DatasetError(f"{dataset.name} has no poses to compare with")
+        raise DatasetError(f"{dataset.name} has no poses to compare with; give a trajectory file")
     stamps = dataset.timestamps_ns
     times = [(index + 1) * NOMINAL_NS if stamps is None else int(stamps[index]) for index, _ in found]
     return np.array(times, dtype=np.int64), np.array([T for _, T in found])

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The fuser process, `python -m tsfusion.fuser`: a loop over the gateway's messages and the mesh."""
 
+import logging
 import select
 import signal
 import sys
@@ -94,6 +95,7 @@ def main() -> int:
     """Run the fuser process with the arguments that the gateway gives it: ENDPOINT FORMAT LEVEL MAP."""
     endpoint, format_, level, map_name = sys.argv[1:]
     logs.configure(cast("LogFormat", format_), cast("LogLevel", level), "fuser", map=map_name)
+    logging.getLogger("tsfusion.tsdf.volume").disabled = True  # the gateway warns, and names the client
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # a terminal or supervisor signals all; the gateway decides
     return run(endpoint)

@@ -28,6 +28,7 @@ from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import state_folder
 from tsfusion.wire import codec, sockets
 from tsfusion.wire.health import MeshLayout
@@ -161,8 +162,11 @@ class Fuser:
                 record = journal.read(self._folder / state_folder.JOURNAL_FOLDER, order.position)
                 found = codec.decode(record.frames)
                 if isinstance(found, Keyframe):  # a correction does not change the map (yet)
-                    self._volume.integrate(found)
-                    self._map.held.add(found.T_world_camera, found.sensor or self._volume.config.sensor)
+                    stats = self._volume.integrate(found)
+                    if stats.samples:
+                        self._map.held.add(found.T_world_camera, found.sensor or self._volume.config.sensor)
+                    else:
+                        reason, message = NO_SAMPLES, self._volume.why_no_samples(found)
             except TsfusionError as error:
                 if isinstance(error, JournalError) and error.temporary:
                     log.error("%s: another process tries again, from the checkpoint", error)

@@ -17,6 +17,7 @@ from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.keyframe_index import IndexEntry, KeyframeIndex
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.sessions import Session, Sessions
+from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import read
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import keyframe_times, messages
@@ -52,6 +53,7 @@ class KeyframeOutcomes:
         self._journal = journal
         self._quarantine = quarantine
         self._reported_rejections: set[int] = set()  # indices
+        self._without_samples: set[bytes] = set()  # sessions that have been named for a keyframe of that kind
         self._meshed = 0  # keyframes that the present fuser answered and meshed
 
     def acknowledge(
@@ -117,8 +119,9 @@ class KeyframeOutcomes:
     def _on_rejected(self, session: Session, entry: IndexEntry, done: fuser_messages.Done) -> None:
         assert done.reason is not None
         self._reported_rejections.add(done.index)
-        seq = entry.stamps.seq
-        log.error(
+        seq, is_empty = entry.stamps.seq, done.reason == NO_SAMPLES
+        log.log(
+            logging.DEBUG if is_empty and session.key in self._without_samples else logging.ERROR,
             "a %s is not in the map: %s",
             "correction" if entry.is_correction else "keyframe",
             done.message or done.reason,
@@ -127,6 +130,9 @@ class KeyframeOutcomes:
             ),
         )
         self._routes.send(session.key, messages.Nack(session.key, seq, "map", done.reason, done.message))
+        if is_empty:  # nothing is wrong with the record
+            self._without_samples.add(session.key)
+            return
         try:
             frames = read(self._journal, entry.position).frames
         except JournalError:  # which is why it was rejected

@@ -36,7 +36,7 @@ class JournalRecording:
         self._places = _places(place)
         if not self._places:
             raise JournalError(
-                f"no keyframes in {place.path} (a state folder, a spool folder or an .mcap file)"
+                f"no keyframes in {place.path}; expected a state folder, a spool folder or an .mcap file"
             )
         first = self[0]
         self.sensor = first.sensor or VolumeConfig().sensor

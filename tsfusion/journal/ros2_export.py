@@ -123,7 +123,7 @@ class _Exporter:
         for path, record in self._held.values():
             self._write(path, record)
         if not self._keyframes:
-            raise JournalError(f"no keyframes in {place.path}")
+            raise JournalError(f"no keyframes in {place.path}; `tsfusion journal info` says what it holds")
         self._bag.finish()
 
     def _add(self, path: Path, record: Record) -> None:

@@ -15,7 +15,7 @@ from tsfusion.datasets import Dataset
 from tsfusion.datasets.dataset import force_of
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.up_direction import HeldSensor, Up
-from tsfusion.pipelines import engine, replay_results, run_files, target_server
+from tsfusion.pipelines import engine, map_size, replay_results, run_files, target_server
 from tsfusion.pipelines.engine import AHEAD, Engine, Progress
 from tsfusion.pipelines.replay_results import ReplaySummary
 
@@ -61,6 +61,8 @@ def replay(
     """
     with results(out, overwrite=overwrite) as (work, folder):
         first = dataset[0]  # a dataset that cannot be read is an error before a server starts
+        if connect is None:
+            map_size.check_fits(first, volume)
         progress.stage(engine.STARTING if connect is None else f"connecting to {connect}")
         with target_server.opened(
             connect, work / ".scratch", volume=volume, client=client, server=server
@@ -93,7 +95,7 @@ def replay(
                 work, target, target.link.map, held, up=up, min_weight=min_weight, keep_islands=keep_islands
             )
         if not len(written.mesh.faces):
-            raise OutputError(run_files.no_surface(sender.stats))
+            raise OutputError(run_files.no_surface(sender.stats, sender.first_rejection))
         result = replay_results.summarise(
             dataset, sender, written, folder=folder,
             seconds=seconds, rate=rate, peak_rss_bytes=peak,

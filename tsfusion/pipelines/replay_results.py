@@ -12,7 +12,7 @@ from tsfusion.client import Client
 from tsfusion.datasets import Dataset
 from tsfusion.datasets.cameras import camera_line
 from tsfusion.geometry.mesh import Mesh
-from tsfusion.pipelines import latency_ledger, run_files
+from tsfusion.pipelines import latency_ledger, run_files, shortfall
 from tsfusion.pipelines.run_files import WrittenMap
 from tsfusion.wire.health import Status
 from tsfusion.wire.keyframe_times import Spread
@@ -46,6 +46,7 @@ class ReplaySummary(msgspec.Struct, frozen=True, kw_only=True):
     keyframes_sent: int
     keyframes_fused: int
     keyframes_rejected: dict[str, int]
+    missed: str  # what the run was for and did not reach; empty = it did
     seconds: float  # first keyframe handed over → last one fused
     server_start_seconds: float | None  # None: the server was there already
     map_hash: str
@@ -91,6 +92,9 @@ def summarise(
         keyframes_sent=stats.sent,
         keyframes_fused=stats.fused,
         keyframes_rejected={**stats.skipped, **stats.refused, **stats.rejected},
+        missed=shortfall.of_delivery(
+            stats, spool="the spool", link=sender.problem, rejection=sender.first_rejection
+        ),
         seconds=round(seconds, 3),
         server_start_seconds=None if server_start_seconds is None else round(server_start_seconds, 3),
         map_hash=status.map_hash,

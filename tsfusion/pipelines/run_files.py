@@ -73,12 +73,14 @@ def write_record(work: Path, summary: msgspec.Struct) -> None:
     (work / RECORD).write_bytes(text + b"\n")
 
 
-def no_surface(stats: ClientStats) -> str:
-    """The error of a run whose map has no triangles."""
-    return (
-        f"the map has no surface to write: {stats.fused} of {stats.sent} keyframes fused; scan more of the "
-        "scene or lower --min-weight"
-    )
+def no_surface(stats: ClientStats, rejection: str) -> str:
+    """The error of a run whose map has no triangles.
+
+    Args:
+        rejection: why the map did not take the first keyframe that it rejected; empty = it took all.
+    """
+    why = rejection if not stats.fused and rejection else "scan more of the scene or lower --min-weight"
+    return f"the map has no surface to write: {stats.fused} of {stats.sent} keyframes fused; {why}"
 
 
 def versions() -> dict[str, str]:

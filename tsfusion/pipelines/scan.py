@@ -11,6 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tsfusion.client import Client, ClientStats
 from tsfusion.core import process
 from tsfusion.core.config import ClientConfig, ScanConfig, ServerConfig, VolumeConfig
@@ -18,8 +20,9 @@ from tsfusion.core.errors import DatasetError, OutputError, SourceError, Tsfusio
 from tsfusion.core.output_folder import results
 from tsfusion.datasets.cameras import described
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.sample_ranges import wrong_unit
 from tsfusion.geometry.up_direction import HeldSensor, Up
-from tsfusion.pipelines import engine, run_files, scan_results, target_server
+from tsfusion.pipelines import engine, map_size, run_files, scan_results, target_server
 from tsfusion.pipelines.engine import Engine, Progress
 from tsfusion.pipelines.leftovers import ANSWER_SECONDS, Leftovers
 from tsfusion.pipelines.scan_results import MapResult, ScanSummary
@@ -83,6 +86,8 @@ def scan(
         first = next(frames, None)
         if first is None:
             raise failure[0] if failure else SourceError(f"{source.name} gave no frames")
+        if own and first.kind != "pair":
+            map_size.check_fits(first.keyframe(np.eye(4)), volume)
         localizer = registry.create_localizer(config, first)
         stack.callback(getattr(localizer, "close", lambda: None))
         if own:
@@ -125,7 +130,7 @@ def scan(
             _run_scanner(scanner, _timely(source, first, frames, config.patience), pace, failure)
             peak = process.peak_rss_bytes()
             if not any(submap.located for submap in scanner.submaps):
-                raise failure[0] if failure else _not_localised(scanner)
+                raise failure[0] if failure else _not_localised(scanner, first)
             scanner.finish()
             clients = [submap.client for submap in scanner.submaps]
             if own:
@@ -146,13 +151,14 @@ def scan(
             )  # fmt: skip
             maps = [write(submap, number) for number, submap in enumerate(scanner.submaps, 1)]
             if own and not any(found.mesh["triangles"] for found in maps if found.mesh):
-                failure.append(OutputError(run_files.no_surface(scanner.state().stats)))
+                stats = scanner.state().stats
+                failure.append(OutputError(run_files.no_surface(stats, scanner.first_rejection)))
             records = scan_results.records(scanner.submaps)
             run_files.write_ledger(work, records)
             result = scan_results.summarise(
                 source, scanner, maps, records, folder=folder, camera=_camera(source, first),
-                localizer=registry.localizer_name(config, first), complete=complete, seconds=seconds,
-                peak_rss_bytes=peak, config=config, volume=volume if own else None,
+                localizer=registry.localizer_name(config, first), spool=spool, complete=complete,
+                seconds=seconds, peak_rss_bytes=peak, config=config, volume=volume if own else None,
             )  # fmt: skip
         run_files.write_record(work, result)
     if failure:
@@ -207,9 +213,14 @@ def _run_scanner(
         failure.append(error)
 
 
-def _not_localised(scanner: Scanner) -> OutputError:
+def _not_localised(scanner: Scanner, first: Frame) -> OutputError:
     state = scanner.state()
-    return OutputError(f"the sensor was not localised in any of {state.frames} frames: {state.why}")
+    unit = "" if first.kind == "pair" else wrong_unit(first.keyframe(np.eye(4)))
+    why = f"the first has {unit}" if unit else state.why
+    return OutputError(
+        f"the sensor was not localised in any of {state.frames} frames: {why}; check "
+        "the camera and the depth's unit, or take poses from elsewhere (--trajectory FILE)"
+    )
 
 
 def _refused_worlds(clients: list[Client]) -> list[Exception]:

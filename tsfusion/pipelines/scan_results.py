@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Results of a scan: the trajectories, and the contents of `run.json`."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from tsfusion.core.config import ScanConfig, VolumeConfig
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
-from tsfusion.pipelines import latency_ledger, run_files
+from tsfusion.pipelines import latency_ledger, run_files, shortfall
 from tsfusion.pipelines.run_files import WrittenMap
 from tsfusion.scanner.localization.localizer import PoseCorrections
 from tsfusion.scanner.scanner import Scanner, Submap
@@ -49,6 +50,7 @@ class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
     keyframes_fused: int
     keyframes_rejected: dict[str, int]
     keyframes_by_rule: dict[str, int]
+    missed: str  # what the scan was for and did not reach; empty = it did
     left: int  # keyframes still in the spool at the end
     link: str  # why the server took nothing at the end; empty = it did
     seconds: float  # from the first frame until the last keyframe was fused (or acknowledged, elsewhere)
@@ -106,6 +108,7 @@ def summarise(
     folder: Path,
     camera: str,
     localizer: str,
+    spool: str | os.PathLike[str],
     complete: bool,
     seconds: float,
     peak_rss_bytes: int,
@@ -130,6 +133,12 @@ def summarise(
         keyframes_fused=stats.fused,
         keyframes_rejected={**stats.skipped, **stats.refused, **stats.rejected},
         keyframes_by_rule=state.selected,
+        missed=shortfall.together(
+            (
+                shortfall.of_delivery(stats, spool=spool, link=state.link, rejection=scanner.first_rejection),
+                shortfall.of_tracking(state.frames, state.tracked, scanner.last_loss),
+            )
+        ),
         left=stats.waiting,
         link=state.link,
         seconds=round(seconds, 3),

@@ -102,6 +102,7 @@ class Scanner:
         self._next: str | None = None  # the map of the submap that begins with the next pose
         self._lost_since: int | None = None
         self._why = ""
+        self.last_loss = ""  # reason; empty = the sensor was never lost
         self._state: State = "starting"
         self._frames = self._lost = 0
         self._tracking_cpu = 0.0
@@ -133,6 +134,11 @@ class Scanner:
         for submap in self.submaps:
             if submap.corrections is not None and submap.located.last_seq > submap.corrected_seq:
                 submap.correct()
+
+    @property
+    def first_rejection(self) -> str:
+        """Why a map did not take the first keyframe that it rejected; empty = none did."""
+        return next(filter(None, (submap.client.first_rejection for submap in self.submaps)), "")
 
     @property
     def tracking_cpu_ms(self) -> float:
@@ -177,7 +183,7 @@ class Scanner:
         self._lost += 1
         if self._state == "tracking":
             log.warning("the sensor is lost: %s", lost.reason)
-        self._why = lost.reason
+        self._why = self.last_loss = lost.reason
         self._state = "lost" if self.submaps[-1].located and self._next is None else "starting"
         if self._lost_since is None:
             self._lost_since = frame.timestamp_ns

@@ -124,7 +124,10 @@ def _check_magic(file: BinaryIO, path: Path) -> None:
         return
     is_of_another_version = len(magic) == len(MAGIC) and magic.startswith(MAGIC[:-2])
     kind = CheckpointError if is_of_another_version else DamagedCheckpoint
-    raise kind(f"{path} is not a tsfusion map of version 1 (it starts with {magic!r})")
+    raise kind(
+        f"{path} is not a tsfusion map of version 1 (it starts with {magic!r}); "
+        "expected the map.tsf of a server"
+    )
 
 
 def _read_header(file: BinaryIO, path: Path) -> CheckpointHeader:

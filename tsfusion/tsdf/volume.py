@@ -8,6 +8,7 @@ the sums and never change them.
 """
 
 import hashlib
+import logging
 import os
 import struct
 from functools import partial
@@ -23,6 +24,7 @@ from tsfusion.core.config import VIEW_SETTINGS, Surface, VolumeConfig, make_sett
 from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.geometry.keyframe import Keyframe, keyframe_of
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.sample_ranges import why_no_samples
 from tsfusion.kernels import integrate, runtime
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
@@ -33,6 +35,8 @@ from tsfusion.tsdf.integrator import Integrator
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
 from tsfusion.tsdf.ray_buffers import RayBuffers, keyframes_of_every_kind
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
+
+log = logging.getLogger(__name__)
 
 
 class IntegrateStats(msgspec.Struct, frozen=True):
@@ -79,21 +83,11 @@ class Volume:
             config = make_settings(VolumeConfig, {**edge, **settings})
         elif settings:
             config = override(config, **settings)
-        model = config.model()
-        if model.min_range >= model.max_range or model.min_support > model.max_support:
-            raise InvalidConfig(
-                f"ranges must be ordered: min_range {model.min_range} < max_range {model.max_range} m, "
-                f"min_support {model.min_support} ≤ max_support {model.max_support} voxels"
-            )
-        if config.space_carving and model.regularizer != "off":
-            raise InvalidConfig(
-                f"space_carving and the regularizer {model.regularizer!r} exclude each other: smoothing is "
-                "for the band around a ray's end; use regularizer = off"
-            )
         self.config = config
-        self.model = model
+        self.model = model = config.checked_model()
         self.meta: dict[str, Any] = {}
-        self.keyframes = 0
+        self.keyframes = 0  # with a usable sample
+        self._has_warned = False  # of a keyframe without
         runtime.start(config.threads)
         smooths = model.regularizer != "off"
         self._store = BlockStore(voxel_size=config.voxel_size, color=config.color, corrected=smooths)
@@ -111,6 +105,8 @@ class Volume:
     def integrate(self, keyframe: Keyframe | None = None, *others: object, **fields: Any) -> IntegrateStats:
         """Add a keyframe. On an error the map is as it was.
 
+        One without a usable sample changes nothing and is not counted; the first of them is a warning.
+
         Args:
             keyframe: also a dict of a keyframe's fields, or an object with such attributes.
             fields: a keyframe's fields instead: `integrate(points=…, T_world_camera=…)`.
@@ -120,7 +116,17 @@ class Volume:
             MapFull: the keyframe or the map would exceed its limit of blocks.
             WeightOverflow: a voxel has taken as many votes as its integers hold.
         """
-        return self._apply(_keyframe(keyframe, others, fields), +1)
+        given = _keyframe(keyframe, others, fields)
+        stats = self._apply(given, +1)
+        if not stats.samples and not self._has_warned:
+            self._has_warned = True
+            log.warning("%s (others like it are not named)", self.why_no_samples(given))
+        return stats
+
+    def why_no_samples(self, keyframe: Keyframe) -> str:
+        """Why `integrate` found no usable sample in a keyframe, and what to do, for a person."""
+        model = self.config.model(keyframe.sensor)
+        return why_no_samples(keyframe, model.min_range, model.max_range)
 
     def retract(self, keyframe: Keyframe | None = None, *others: object, **fields: Any) -> IntegrateStats:
         """Remove a keyframe, given as to `integrate`: the sums get back the bytes they had without it.
@@ -279,7 +285,7 @@ class Volume:
         samples = self._ray_buffers.make_rays(keyframe, self.config)  # paper eq. 1
         with process.uninterrupted():
             updates = self._integrator.apply(sign)  # paper eq. 2 and 3
-            self.keyframes += sign
+            self.keyframes += sign if samples else 0
         return IntegrateStats(
             samples=samples,
             invalid=int(np.prod(keyframe.shape)) - samples,

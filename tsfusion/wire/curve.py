@@ -157,7 +157,9 @@ def _read(path: Path, *, secret: bool) -> dict[str, str]:
                 )
             content = file.read(_MAX_FILE_BYTES)
     except OSError as error:
-        raise InvalidConfig(f"cannot read the key {path}: {error.strerror}") from error
+        raise InvalidConfig(
+            f"cannot read the key {path}: {error.strerror}; `tsfusion keys new` makes one"
+        ) from error
     keys = dict(_LINE.findall(content.decode("utf-8", "replace")))
     for kind, key in keys.items():
         if not is_key(key):

@@ -122,7 +122,7 @@ def revoke(folder: Folder, name: str) -> str:
     with folder_lock.hold(place, wait=math.inf):
         listed = read_allow_list(place)
         if name not in listed.allowed:
-            names = ", ".join(sorted(listed.allowed)) or "nobody is allowed"
+            names = ", ".join(sorted(listed.allowed)) or "nobody is allowed (`tsfusion keys list`)"
             raise InvalidConfig(f"no key is allowed under the name {name!r}, but: {names}")
         left = dict(listed.allowed)
         key = left.pop(name)

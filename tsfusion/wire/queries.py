@@ -216,4 +216,7 @@ def _send_until_answered(
         if monitor.gave_up:
             raise (NotAllowed if monitor.refused else TransportError)(why)
     reason = f": {why}" if why else ""
-    raise ServerUnreachable(f"no server answered at {monitor.address} within {timeout:g} s{reason}")
+    raise ServerUnreachable(
+        f"no server answered at {monitor.address} within {timeout:g} s{reason}; is `tsfusion serve` "
+        "running there, and is the port right?"
+    )

@@ -204,7 +204,10 @@ def check_free(address: str) -> None:
         try:
             probe.bind((host.replace("*", ""), port))
         except OSError as error:
-            raise TransportError(f"cannot listen on {address}: {error.strerror}") from error
+            raise TransportError(
+                f"cannot listen on {address}: {error.strerror}; choose another address (--listen), or end "
+                "what has it"
+            ) from error
 
 
 def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, to: str | None) -> Addresses:
@@ -236,5 +239,8 @@ def bind_socket(made: AnySocket, address: str) -> str:
     try:
         made.bind(format_address(host, port) if port else format_address(host, 0).replace(":0", ":*"))
     except zmq.ZMQError as error:
-        raise TransportError(f"cannot listen on {address}: {error.strerror}") from error
+        raise TransportError(
+            f"cannot listen on {address}: {error.strerror}; choose another address (--listen), or end "
+            "what has it"
+        ) from error
     return made.getsockopt_string(zmq.LAST_ENDPOINT)

@@ -15,6 +15,7 @@ from tsfusion.datasets.synthetic import loop_worlds, worlds
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 
+USUAL_COUNT = 40  # keyframes
 FRAME_NS = 100_000_000  # nominal: ten keyframes a second
 DEPTH_SCALE = 1e-4  # metres per unit
 DISPARITY_SCALE = 1 / 16  # pixels per unit
@@ -76,7 +77,8 @@ class Synthetic(Frames):
     Args:
         world: a name in `WORLDS` (`room`, `street`, …), or a `World` of your own, seen with the room's camera
             and LiDAR.
-        count: keyframes; the room's path is a closed circle, the street's goes on by a metre each.
+        count: keyframes, spread over the whole path; default the first 40 of as many as let a scanner follow
+            it (`World.steps`). The room's path is a closed circle, the street's goes on by a metre each.
         seed: of the noise; the world does not change.
         width: of the image, pixels; default 320 in the room, 620 in the street. The noise in pixels stays.
         color: render colour too.
@@ -92,7 +94,7 @@ class Synthetic(Frames):
         world: str | worlds.World = "room",
         sensor: str = "kinect",
         *,
-        count: int = 40,
+        count: int | None = None,
         seed: int = 0,
         noise: bool = True,
         width: int | None = None,
@@ -103,6 +105,7 @@ class Synthetic(Frames):
             raise DatasetError(f"world must be one of {', '.join(WORLDS)}, got {world!r}")
         if sensor not in ("kinect", "stereo", "lidar"):
             raise DatasetError(f"sensor of a synthetic world must be kinect, stereo or lidar, got {sensor!r}")
+        given, count = count, USUAL_COUNT if count is None else count
         if count < 1 or seed < 0 or (width is not None and width < 16):
             raise DatasetError(
                 "expected count >= 1, seed >= 0 and width >= 16, "
@@ -118,6 +121,7 @@ class Synthetic(Frames):
         self.camera = _resized(CAMERAS.get(self.world.name, CAMERAS["room"]), width)
         self.lidar = LIDARS.get(self.world.name, LIDARS["room"])
         self._count, self._seed, self._noise, self._with_color = count, seed, noise, color
+        self._steps = self.world.steps if given is None else count
         self._directions = _lidar_rays(self.lidar) if sensor == "lidar" else _camera_rays(self.camera)
 
     def __len__(self) -> int:
@@ -129,7 +133,7 @@ class Synthetic(Frames):
 
     def pose(self, index: int) -> NDArray[np.float64]:
         """(4, 4) T_world_camera of a keyframe; for LiDAR, T_world_sensor."""
-        T = self._path(index, self._count)
+        T = self._path(index, self._steps)
         return T @ _T_CAMERA_LIDAR if self.sensor == "lidar" else T
 
     def _frame(self, index: int) -> Frame:

@@ -31,7 +31,7 @@ def ring() -> World:
     for outward, half in ((1, _HALF), (-1, inner)):
         for side in range(4):
             solids += _along_a_wall(rng, side, half, outward)
-    return World("corridor", np.array(solids), {"laps": _laps})
+    return World("corridor", np.array(solids), {"laps": _laps}, steps=520)
 
 
 def rooms(*, identical: bool = True) -> World:
@@ -51,7 +51,7 @@ def rooms(*, identical: bool = True) -> World:
         shifted[:, 1] += number * PITCH
         solids += shifted.tolist()
     name = "rooms" if identical else "distinct rooms"
-    return World(name, np.array(solids), {"walk": _walk, "return": _return})
+    return World(name, np.array(solids), {"walk": _walk, "return": _return}, steps=160)
 
 
 def _along_a_wall(

@@ -29,6 +29,8 @@ class World:
     solids: Solids  # (m, 11) float64, metres
     # `paths[name](index, count)` → (4, 4) T_world_camera, OpenCV axes; the first is the usual one
     paths: dict[str, Callable[[int, int], NDArray[np.float64]]]
+    # Frames of the whole usual path when a person walks it, near enough for a scanner to follow
+    steps: int = 40
 
     def distance(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Signed distance to the nearest surface: (n, 3) metres → (n,) float64, negative inside solids.

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: MIT
+"""Wrong inputs, over two hundred: each gives one line with cause and cure, and a status that is not 0."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from command_processes import python, tsfusion
+from wrong_inputs import CALLS, COMMANDS, Wrong, addresses, make_files, run_call, run_command
+
+LEAST = 110
+
+
+@pytest.fixture(scope="module")
+def named() -> Iterator[dict[str, str]]:
+    """Addresses that the rows name."""
+    with addresses() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wrong")
+    make_files(folder)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def in_the_folder(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(files)
+    for name in [name for name in os.environ if name.startswith("TSFUSION_")]:
+        monkeypatch.delenv(name)
+
+
+def test_the_table_is_long_and_every_row_asks_for_cause_and_cure() -> None:
+    rows = [*COMMANDS, *CALLS]
+    assert len({row.line for row in rows}) == len(rows) >= LEAST
+    assert all(row.cause and row.cure and row.status for row in rows)
+
+
+@pytest.mark.parametrize("row", COMMANDS, ids=lambda row: row.line)
+def test_a_wrong_command_says_cause_and_cure(row: Wrong, named: dict[str, str]) -> None:
+    status, said = run_command(row.line.format(**named))
+    check(row, status, said)
+
+
+@pytest.mark.parametrize("row", CALLS, ids=lambda row: row.line)
+def test_a_wrong_call_says_cause_and_cure(row: Wrong) -> None:
+    said = run_call(row.line)
+    assert row.cause in said
+    assert row.cure in said
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize("row", COMMANDS[:: len(COMMANDS) // 3], ids=lambda row: row.line)
+def test_a_process_of_its_own_ends_so_too(row: Wrong, files: Path, named: dict[str, str]) -> None:
+    done = tsfusion(*row.line.format(**named).split(), cwd=files)
+    check(row, done.returncode, done.stderr)
+
+
+def test_an_uncaught_error_of_python_names_the_error_last(files: Path) -> None:
+    done = python("import tsfusion; tsfusion.Volume(voxel_size=-1)")
+    assert done.stderr.splitlines()[-1].endswith("InvalidConfig: voxel_size must be > 0, got -1")
+
+
+def check(row: Wrong, status: int, said: str) -> None:
+    """The last line is the only message, and names cause and cure."""
+    assert status == row.status, said
+    assert "Traceback" not in said
+    last = said.strip().splitlines()[-1]
+    assert row.cause in last
+    assert row.cure in last
+    if not row.line.startswith("doctor"):  # whose report is on stdout
+        assert last.startswith("tsfusion: ")
+        assert said.count("\ntsfusion: ") + said.startswith("tsfusion: ") == 1

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: MIT
+"""Runs that missed what they were for, and voxels far too small for a first keyframe."""
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from tsfusion import Intrinsics, InvalidConfig, Keyframe, VolumeConfig
+from tsfusion.client import ClientStats
+from tsfusion.pipelines import map_size, shortfall
+
+STATS = ClientStats(
+    sent=10, durable=10, fused=10, refused={}, rejected={}, skipped={}, waiting=0, waiting_bytes=0, state="ok"
+)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({}, ""),
+        ({"skipped": {"thinned": 5, "dropped": 1}}, ""),  # which a policy asked for
+        ({"rejected": {"no_samples": 5}}, ""),
+        (
+            {"waiting": 3},
+            "3 keyframes are not at the server (no server answers): they wait in SPOOL; check",
+        ),
+        ({"refused": {"quota": 2}}, "2 keyframes will never be at the server (2 × quota)"),
+        ({"skipped": {"disk": 1}}, "1 keyframes will never be at the server (1 × disk)"),
+        ({"rejected": {"no_samples": 6}}, "the map took 4 of 10 keyframes only: all too far"),
+    ],
+)
+def test_what_is_not_at_the_server_or_in_its_map(changed: dict[str, Any], words: str) -> None:
+    stats = msgspec.structs.replace(STATS, **changed)
+    found = shortfall.of_delivery(stats, spool="SPOOL", link="no server answers", rejection="all too far")
+    assert words in found
+    assert bool(words) == bool(found)
+
+
+def test_most_frames_lost() -> None:
+    assert shortfall.of_tracking(40, 20, "dark") == ""
+    found = shortfall.of_tracking(40, 19, "dark")
+    assert found.startswith("only 19 of 40 frames were localised (dark): move more slowly")
+    assert shortfall.together(["", found, "", "more"]) == f"{found}; more"
+
+
+def test_a_voxel_size_that_a_keyframe_cannot_have_is_refused_with_a_proposal() -> None:
+    v, u = np.mgrid[:480, :640]
+    depth = (1500 + u // 4 + v // 3).astype(np.uint16)
+    keyframe = Keyframe(
+        depth=depth, intrinsics=Intrinsics(525.0, 525.0, 320.0, 240.0), T_world_camera=np.eye(4)
+    )
+    with pytest.raises(InvalidConfig, match=r"would need [0-9.]+ GB or more .*; use 0.002 or more"):
+        map_size.check_fits(keyframe, VolumeConfig(voxel_size=0.0001))
+    for size in (0.002, 0.02):
+        map_size.check_fits(keyframe, VolumeConfig(voxel_size=size))
+    blank = Keyframe(depth=np.zeros_like(depth), intrinsics=keyframe.intrinsics, T_world_camera=np.eye(4))
+    map_size.check_fits(blank, VolumeConfig(voxel_size=0.0001))

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: MIT
+"""Ranges of a keyframe's samples, and what is wrong with them when a sensor could not have measured them."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.geometry.keyframe import Keyframe
+
+NO_SAMPLES = "no_samples"  # the reason under which a keyframe without a usable sample is counted
+_FARTHEST = 100.0  # metres: where the sensor models end
+_NEAREST = 0.01  # metres: no sensor measures nearer
+
+
+def sample_ranges(keyframe: Keyframe) -> NDArray[np.float64]:
+    """(n,) metres of the samples with a return: depth along the optical axis, of points the ray's length."""
+    measured = keyframe.measurement
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        if keyframe.points is not None:
+            origins = 0.0 if keyframe.origins is None else keyframe.origins
+            ranges = np.linalg.norm((measured - origins).astype(np.float64), axis=-1)
+        elif keyframe.disparity is not None:
+            pixels = measured * keyframe.disparity_scale
+            ranges = np.where(pixels > 0, (keyframe.baseline_fx or 0.0) / pixels, 0.0)
+        else:
+            scale = keyframe.depth_scale if measured.dtype == np.uint16 else 1.0
+            ranges = measured.astype(np.float64) * scale
+        found: NDArray[np.float64] = ranges[np.isfinite(ranges) & (ranges > 0)]
+        return found
+
+
+def wrong_unit(keyframe: Keyframe) -> str:
+    """What to do about depth in a wrong unit, for a person; empty = it may be in metres.
+
+    Judged by the median: metres where no sensor measures any.
+    """
+    ranges = sample_ranges(keyframe)
+    if not len(ranges):
+        return ""
+    median = float(np.median(ranges))
+    if _NEAREST <= median <= _FARTHEST:
+        return ""
+    if keyframe.kind == "disparity":
+        return f"a median depth of {median:.3g} m: check baseline_fx and disparity_scale"
+    if keyframe.kind == "points":
+        return f"a median range of {median:.3g} m: points must be in metres"
+    if median < _NEAREST:
+        return f"a median depth of {median:.3g} m: check depth_scale (metres a unit), or give float32 metres"
+    return (
+        f"a median depth of {median:.4g} m looks like millimetres: give uint16 with depth_scale=0.001, or "
+        "float32 metres"
+    )
+
+
+def why_no_samples(keyframe: Keyframe, min_range: float, max_range: float) -> str:
+    """Why a map can use none of a keyframe's samples, and what to do, for a person.
+
+    Args:
+        min_range, max_range: of the sensor's model, metres.
+    """
+    ranges = sample_ranges(keyframe)
+    count = int(np.prod(keyframe.shape))
+    what = "points" if keyframe.kind == "points" else "pixels"
+    start = f"the keyframe has no usable sample: of {count} {what} "
+    if not len(ranges):
+        return start + f"none has a return; is the sensor covered, or is this no {keyframe.kind}?"
+    if not np.any((ranges >= min_range) & (ranges <= max_range)):
+        where = f"none is from {min_range:g} to {max_range:g} m away (median {np.median(ranges):.4g} m)"
+        return start + f"{where}; {wrong_unit(keyframe) or 'use another --sensor or --max-range'}"
+    if keyframe.confidence is not None and not keyframe.confidence.any():
+        return start + "every one has confidence 0; 255 is full confidence"
+    return start + "the few within range stand alone, as noise does; outlier_filter = false keeps them"

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: MIT
+"""Shortfalls of a run: what it was for and did not reach, in one line that says what to do.
+
+One rule for all runs. A run reached its purpose when each keyframe that it sent is on the server's disk, when
+the map took at least half of them, and when at least half of the frames were localised. What falls short of
+that still leaves its results; the command ends with the line, and with status 1.
+"""
+
+import os
+from collections.abc import Iterable
+
+from tsfusion.client import ClientStats
+
+_LOST = ("spool", "disk")  # reasons of skipping that no policy asks for
+
+
+def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str, rejection: str) -> str:
+    """Say which keyframes are not at the server, or not in its map; empty = enough are.
+
+    Args:
+        stats: sums over all clients of the run.
+        spool: where keyframes wait for the server.
+        link: why the server takes nothing; empty = it does.
+        rejection: why the map did not take the first keyframe that it rejected.
+    """
+    lost = stats.refused | {reason: n for reason, n in stats.skipped.items() if reason in _LOST}
+    rejected = sum(stats.rejected.values())
+    if stats.waiting:
+        return (
+            f"{stats.waiting} keyframes are not at the server ({link or 'it is behind'}): they wait in "
+            f"{spool}; check the address with `tsfusion status --connect`, then "
+            f"`tsfusion spool send --spool {spool}`"
+        )
+    if lost:
+        reasons = ", ".join(f"{count} × {reason}" for reason, count in lost.items())
+        return f"{sum(lost.values())} keyframes will never be at the server ({reasons}): see the log above"
+    if rejected and 2 * rejected > stats.sent:
+        return f"the map took {stats.sent - rejected} of {stats.sent} keyframes only: {rejection}"
+    return ""
+
+
+def of_tracking(frames: int, tracked: int, why: str) -> str:
+    """Say that most frames were lost; empty = at least half have a pose.
+
+    Args:
+        why: the sensor was lost the last time.
+    """
+    if 2 * tracked >= frames:
+        return ""
+    return (
+        f"only {tracked} of {frames} frames were localised ({why}): move more slowly, give every frame, or "
+        "take poses from elsewhere (--trajectory FILE)"
+    )
+
+
+def together(shortfalls: Iterable[str]) -> str:
+    """All shortfalls in one line; empty = there are none."""
+    return "; ".join(filter(None, shortfalls))
