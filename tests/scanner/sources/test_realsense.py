@@ -202,6 +202,14 @@ def test_a_slow_reader_of_a_recording_loses_nothing(recording: Path) -> None:
     assert not source.live
 
 
+def test_a_recording_stands_still_until_it_is_read(recording: Path) -> None:
+    """It would play on while its sensors are started one after the other, and their first frames be lost."""
+    with RealSense(recording=recording) as source:
+        assert source._stream._playback.current_status() == rs.playback_status.paused
+        assert [number_of(frame) for frame in source] == [*range(1, 13)]
+    RealSense(recording=recording).close()  # that was never read
+
+
 def test_a_recording_in_real_time_drops_and_counts(tmp_path: Path) -> None:
     """Librealsense then repeats an image beside the other stream's next one: neither is passed on."""
     path = record(tmp_path / "fast.db3", list(range(1, 200)))  # all within a moment

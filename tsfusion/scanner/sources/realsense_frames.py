@@ -4,6 +4,7 @@
 Every function raises RuntimeError where librealsense does.
 """
 
+import threading
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -37,7 +38,11 @@ class RealSenseStream(Protocol):
 
 
 class PipelineStream:
-    """Camera or recording of a librealsense `config`; `real_time` is None for a camera."""
+    """Camera or recording of a librealsense `config`; `real_time` is None for a camera.
+
+    A recording stands still until the first `wait`: librealsense reads on while it starts one sensor after
+    the other, and would drop what it reads for those that are not started yet.
+    """
 
     def __init__(self, rs: Any, config: Any, *, real_time: bool | None) -> None:
         self._stopped = rs.playback_status.stopped
@@ -47,10 +52,15 @@ class PipelineStream:
             resolved = config.resolve(rs.pipeline_wrapper(self._pipeline))
             self._playback = resolved.get_device().as_playback()
             self._playback.set_real_time(real_time)
+            self._playback.pause()
+        self._paused = self._playback is not None
         self._profile = self._pipeline.start(config)
         self.device = self._profile.get_device()
 
     def wait(self, milliseconds: int) -> Any:
+        if self._paused and self._playback is not None:
+            self._paused = False  # `resume` may return only after somebody takes frames
+            threading.Thread(target=self._playback.resume, daemon=True).start()
         there, frames = self._pipeline.try_wait_for_frames(milliseconds)
         return frames if there else None
 
