@@ -4,7 +4,8 @@
 import json
 import shutil
 import signal
-import time
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_processes import Here, end, started, tsfusion
+from command_processes import Here, end, read_until, tsfusion
 from keyframes_and_servers import pose, wall
 from mcap.reader import make_reader
 
@@ -336,20 +337,31 @@ def test_where_nothing_can_be_saved_nothing_is_made(tmp_path: Path, run: Run) ->
     assert not (tmp_path / "saved").exists()
 
 
+# The first record, a line, and no second one.
+HALFWAY = """
+import sys, threading
+from tsfusion.cli import main
+from tsfusion.journal.writer import Journal
+
+append = Journal.append
+def first_only(*arguments, **fields):
+    append(*arguments, **fields)
+    print("halfway", flush=True)
+    threading.Event().wait(60)
+
+Journal.append = first_only
+main(sys.argv[1:])
+"""
+
+
 def test_ctrl_c_leaves_nothing(tmp_path: Path) -> None:
-    folder = tmp_path / "journal"
-    log = Journal(folder, 64 << 20, sync=False)
-    for seq in range(1, 400):
-        log.append([b"head", bytes(1 << 20)], session=ANNA, seq=seq)
-    log.close()
-    process = started("journal", "recover", folder, tmp_path / "saved")
-    deadline = time.monotonic() + 60
-    while not any(tmp_path.glob(".saved.partial-*/*.mcap")) and process.poll() is None:
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    status = end(process, signal.SIGINT)
-    left = sorted(path.name for path in tmp_path.iterdir())
-    assert (status, left) in ((130, ["journal"]), (0, ["journal", "saved"]))  # it may have been quicker
+    folder = fill(tmp_path / "journal")
+    command = [sys.executable, "-c", HALFWAY, "journal", "recover", str(folder), str(tmp_path / "saved")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    read_until(process, "halfway")
+    assert any(tmp_path.glob(".saved.partial-*/*.mcap"))
+    assert end(process, signal.SIGINT) == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["journal"]
 
 
 # --- all of them ---

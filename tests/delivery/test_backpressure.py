@@ -169,8 +169,6 @@ def test_block_waits_for_the_map(tmp_path: Path) -> None:
 
 def test_who_is_blocked_can_be_stopped() -> None:
     """By closing the client, and by Ctrl-C."""
-    client = Client(NOBODY, policy="block", config=ClientConfig(backlog=1))
-    client.send(wall())
     failed: list[str] = []
 
     def send() -> None:
@@ -179,16 +177,19 @@ def test_who_is_blocked_can_be_stopped() -> None:
         except TransportError as error:
             failed.append(str(error))
 
-    blocked = threading.Thread(target=send)
-    blocked.start()
-    timer = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
-    timer.start()
-    with pytest.raises(KeyboardInterrupt):
-        client.send(wall(2))
-    assert blocked.is_alive()
-    client.close()
-    blocked.join(DEADLINE)
-    assert failed == ["the client is closed"]
+    # Left by an error, too, it is closed: a thread that is blocked would keep the tests from ending.
+    with Client(NOBODY, policy="block", config=ClientConfig(backlog=1)) as client:
+        client.send(wall())
+        blocked = threading.Thread(target=send)
+        blocked.start()
+        timer = threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT))
+        timer.start()
+        with pytest.raises(KeyboardInterrupt):
+            client.send(wall(2))
+        assert blocked.is_alive()
+        client.close()
+        blocked.join(DEADLINE)
+        assert failed == ["the client is closed"]
 
 
 def test_drop_oldest_keeps_the_newest_and_says_so(tmp_path: Path) -> None:

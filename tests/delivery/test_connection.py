@@ -3,18 +3,21 @@
 
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
+import zmq
 from clients_and_spools import joined, send_all
 from keyframes_and_servers import DEADLINE, until, wall
-from scripted_server import ScriptedServer, scripted
+from scripted_server import ScriptedServer, bind, scripted
 
 from tsfusion import Client
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, InvalidConfig, NotAllowed, ServerUnreachable
+from tsfusion.delivery.connection import Connection
 from tsfusion.delivery.link_state import LinkKind, LinkState
-from tsfusion.wire import key_folder
+from tsfusion.wire import key_folder, sockets
 from tsfusion.wire.curve import server_keys
 
 PATIENT = ClientConfig(stall_timeout=1000.0, policy="spool_all")
@@ -54,12 +57,33 @@ def test_what_a_cut_took_is_sent_again_at_once() -> None:
         send_all(client, range(20))
         until(lambda: client._outbox.outstanding == server.window)
         server.stop()  # with eight keyframes in its memory
-        until(lambda: client._outbox.outstanding == 0)
         server.taking = True
         server.start()
         client.flush(DEADLINE)
         client.wait_fused(DEADLINE)
         assert server.numbers == [*range(20)]
+
+
+def test_the_connection_after_a_cut_is_news_as_well() -> None:
+    """For a moment after the cut libzmq still takes messages, and they are lost."""
+    with zmq.Context() as context:
+        server = sockets.pull(context, 1 << 20)
+        server.bind("tcp://127.0.0.1:*")
+        address = server.getsockopt_string(zmq.LAST_ENDPOINT)
+        with closing(Connection(context, sockets.push, address, None)) as connection:
+            cuts: list[bool] = []
+
+            def news() -> int:
+                cuts.append(connection.check(time.monotonic())[1])
+                return sum(cuts)
+
+            until(lambda: news() == 0 and connection.is_made)
+            server.close()
+            until(lambda: news() == 1)
+            with sockets.pull(context, 1 << 20) as server:
+                bind(server, address)
+                until(lambda: news() == 2)
+            assert connection.is_made
 
 
 def test_a_server_that_comes_and_goes_gets_everything_once() -> None:

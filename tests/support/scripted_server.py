@@ -88,7 +88,7 @@ class ScriptedServer:
         self._data = sockets.pull(self._context, 1 << 20, self.keys)
         self._router = sockets.router(self._context, self.keys)
         for made, address in ((self._data, self.address), (self._router, self.control)):
-            _bind(made, address.replace(":0", ":*") if address.endswith(":0") else address)
+            bind(made, address.replace(":0", ":*") if address.endswith(":0") else address)
         self.address = self._data.getsockopt_string(zmq.LAST_ENDPOINT)
         self.control = self._router.getsockopt_string(zmq.LAST_ENDPOINT)
         self._thread = threading.Thread(target=self._run)
@@ -180,7 +180,8 @@ class ScriptedServer:
             self._router.send_multipart([self._identities[session], messages.encode(message)])
 
 
-def _bind(made: sockets.AnySocket, address: str) -> None:
+def bind(made: sockets.AnySocket, address: str) -> None:
+    """Listen where another socket may just have listened."""
     deadline = time.monotonic() + 10
     while True:
         try:

@@ -38,7 +38,7 @@ class Connection:
     def _open(self) -> None:
         self.socket = self._make(self._context, self._keys)
         self._monitor = ConnectionMonitor(self.socket, self._address, self._keys)
-        self._lost = 0
+        self._cuts = 0  # connections that ended, and that were made after one
         self.socket.connect(self._address)
 
     @property
@@ -76,10 +76,11 @@ class Connection:
 
         Returns:
             The problem, if that is a new one (empty = it is over, None = nothing new), and whether a
-            connection ended.
+            connection ended, or another one stands after it: what was sent in between is lost, too.
         """
         news = self._monitor.problem()
-        ended, self._lost = self._monitor.lost > self._lost, self._monitor.lost
+        cuts = self._monitor.lost + max(self._monitor.made - 1, 0)
+        ended, self._cuts = cuts > self._cuts, cuts
         if news == self.problem:
             news = None
         self.problem = self.problem if news is None else news
