@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Fixtures of all tests; which tests are collected, and how they start."""
 
+import faulthandler
 import logging
 import os
 import signal
@@ -19,6 +20,7 @@ from tsfusion.core.errors import MissingDependency
 
 os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # programs that tests start find what tests find
 OPTIONAL = ("kiss_icp", "pooch", "pyrealsense2", "rosbags", "scipy")
+STDERR = pytest.StashKey[Any]()
 DATA = Path(os.environ.get("TSFUSION_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
@@ -26,13 +28,28 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--nightly", action="store_true", help="also run the tests marked nightly (long)")
 
 
-def pytest_configure() -> None:
-    """Let Ctrl-C reach the tests and the commands they start.
+def pytest_configure(config: pytest.Config) -> None:
+    """Let Ctrl-C reach the tests and the commands they start; keep a stderr for `deadline`.
 
     A shell starts its background jobs with SIGINT ignored, and their children inherit that.
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    config.stash[STDERR] = os.fdopen(os.dup(2), "w")
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """End this process a minute after its last test, even if a thread of a failed one still waits."""
+    faulthandler.dump_traceback_later(60, exit=True, file=config.stash[STDERR])
+
+
+def pytest_timeout_set_timer(item: pytest.Item, settings: Any) -> None:
+    """End a process whose test hangs in C, where no Python code can fail it, a little after the time limit."""
+    faulthandler.dump_traceback_later(1.2 * settings.timeout, exit=True, file=item.config.stash[STDERR])
+
+
+def pytest_timeout_cancel_timer() -> None:
+    faulthandler.cancel_dump_traceback_later()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
