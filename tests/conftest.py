@@ -44,7 +44,7 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 
 def pytest_timeout_set_timer(item: pytest.Item, settings: Any) -> None:
-    """End a process whose test hangs in C, where no Python code can fail it, a little after the time limit."""
+    """End a process whose test hangs in C, where no Python code can fail it, soon after the time limit."""
     faulthandler.dump_traceback_later(1.2 * settings.timeout, exit=True, file=item.config.stash[STDERR])
 
 

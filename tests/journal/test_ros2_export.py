@@ -312,5 +312,5 @@ def test_without_rosbags_the_error_names_the_command(
         return real(name, *arguments, **more)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(MissingDependency, match=r"pip install 'tsfusion\[ros\]'"):
+    with pytest.raises(MissingDependency, match=r"pip install '.\[ros\]'"):
         export(small, tmp_path / "out.mcap", lambda *_: None)

@@ -24,8 +24,8 @@ def test_ctrl_c():
         signal.pause()
 
 def test_ctrl_c_of_a_child():
-    code = "import os, signal; os.kill(os.getpid(), signal.SIGINT)"
-    assert subprocess.run([sys.executable, "-c", code], stderr=subprocess.DEVNULL).returncode == -signal.SIGINT
+    command = [sys.executable, "-c", "import os, signal; os.kill(os.getpid(), signal.SIGINT)"]
+    assert subprocess.run(command, stderr=subprocess.DEVNULL).returncode == -signal.SIGINT
 """
 STUCK_IN_C = """
 import ctypes

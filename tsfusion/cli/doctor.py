@@ -108,7 +108,10 @@ def _packages() -> Iterator[Finding]:
         requirements = [Requirement(line) for line in metadata.requires("tsfusion") or []]
     except (ImportError, metadata.PackageNotFoundError) as error:
         yield Finding(
-            "packages", False, f"tsfusion is not installed completely ({error})", "pip install tsfusion"
+            "packages",
+            False,
+            f"tsfusion is not installed completely ({error})",
+            "pip install . in your clone of tsfusion",
         )
         return
     for requirement in sorted(requirements, key=lambda requirement: requirement.name):
@@ -137,7 +140,7 @@ def _package(requirement: "Requirement") -> Finding:
 def _extra(name: str) -> Finding:
     """A finding for an optional part: no fault when it is missing, one when it is broken."""
     package, purpose = _EXTRAS[name]
-    install = f"pip install 'tsfusion[{name}]'"
+    install = f"pip install '.[{name}]' in your clone of tsfusion"
     try:
         version = metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -145,7 +148,7 @@ def _extra(name: str) -> Finding:
     try:
         import_module(package.replace("-", "_"))
     except Exception as error:  # noqa: BLE001  as above
-        return Finding(package, False, f"{version} does not import: {error}", f"{install} --force-reinstall")
+        return Finding(package, False, f"{version} does not import: {error}", f"again: {install}")
     return Finding(package, True, f"{version} ({purpose})")
 
 

@@ -20,7 +20,7 @@ from tsfusion.journal.state_folder import JournalPlace, Watcher
 from tsfusion.wire import codec
 from tsfusion.wire.record_header import unpack_keyframe
 
-_INSTALL = "export needs rosbags: pip install 'tsfusion[ros]'"
+_INSTALL = "export needs rosbags: pip install '.[ros]' in your clone of tsfusion"
 _LAST_SECOND = 2**31 - 1  # of a ROS 2 time stamp
 
 

@@ -145,7 +145,7 @@ def test_without_pooch_the_error_names_the_command(
     server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pooch", None)
-    with pytest.raises(MissingDependency, match=r"pip install 'tsfusion\[download\]'"):
+    with pytest.raises(MissingDependency, match=r"pip install '.\[download\]'"):
         fetch(one(server.url), tmp_path, silent)
 
 

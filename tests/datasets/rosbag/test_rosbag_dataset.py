@@ -314,5 +314,5 @@ def test_empty_and_foreign_files_are_named(tmp_path: Path) -> None:
 def test_without_rosbags_the_error_names_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = walls(tmp_path)
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    with pytest.raises(MissingDependency, match=r"pip install 'tsfusion\[ros\]'"):
+    with pytest.raises(MissingDependency, match=r"pip install '.\[ros\]'"):
         open_dataset(path)

@@ -18,7 +18,7 @@ from tsfusion.geometry import se3
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization.localizer import Lost, Pose
 
-pytest.importorskip("kiss_icp", exc_type=ImportError, reason="no kiss-icp: pip install 'tsfusion[lidar]'")
+pytest.importorskip("kiss_icp", exc_type=ImportError, reason="no kiss-icp: pip install '.[lidar]'")
 
 from tsfusion.scanner.localization.lidar import LidarLocalizer
 
@@ -189,7 +189,7 @@ def test_without_kiss_icp_the_command_is_named() -> None:
         "from tsfusion.scanner.localization.lidar import LidarLocalizer\n"
         "from tsfusion.core.errors import MissingDependency\n"
         "try: LidarLocalizer()\n"
-        'except MissingDependency as error: sys.exit("tsfusion[lidar]" not in str(error))\n'
+        'except MissingDependency as error: sys.exit(".[lidar]" not in str(error))\n'
         "sys.exit(2)"
     )
     assert python(program).returncode == 0

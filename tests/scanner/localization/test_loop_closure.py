@@ -268,7 +268,7 @@ def test_lidar_frames_pass_through():
 
 def test_without_scipy_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "scipy.sparse", None)
-    with pytest.raises(MissingDependency, match=r"pip install 'tsfusion\[slam\]'"):
+    with pytest.raises(MissingDependency, match=r"pip install '.\[slam\]'"):
         LoopClosing(Drifting())
 
 

@@ -163,5 +163,5 @@ def test_small_graphs():
 def test_without_scipy_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "scipy", None)
     monkeypatch.setitem(sys.modules, "scipy.sparse", None)
-    with pytest.raises(MissingDependency, match=r"pip install 'tsfusion\[slam\]'"):
+    with pytest.raises(MissingDependency, match=r"pip install '.\[slam\]'"):
         optimise({0: np.eye(4)}, [])

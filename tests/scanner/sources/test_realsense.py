@@ -23,7 +23,7 @@ try:
 except ImportError as error:  # also where libusb is missing, which importorskip takes for a failure
     pytest.skip(
         f"pyrealsense2 cannot be loaded ({error}); "
-        "pip install 'tsfusion[realsense]' and apt-get install libusb-1.0-0",
+        "pip install '.[realsense]' and apt-get install libusb-1.0-0",
         allow_module_level=True,
     )
 

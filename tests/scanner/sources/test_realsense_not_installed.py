@@ -11,7 +11,7 @@ from tsfusion.scanner.sources.realsense import RealSense
 
 def test_without_pyrealsense2_the_command_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    with pytest.raises(MissingDependency, match=r"install it with: pip install 'tsfusion\[realsense\]'$"):
+    with pytest.raises(MissingDependency, match=r"install it with: pip install '.\[realsense\]'"):
         RealSense()
 
 

@@ -15,7 +15,7 @@ from tsfusion.datasets.download import archives, http
 from tsfusion.datasets.download.catalogue import File, PublicRecording
 from tsfusion.datasets.download.http import Watcher
 
-_INSTALL = "downloads need pooch; install it with: pip install 'tsfusion[download]'"
+_INSTALL = "downloads need pooch; install it with: pip install '.[download]' in your clone of tsfusion"
 ENDING = ".sha256"
 
 

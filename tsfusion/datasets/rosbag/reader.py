@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 ENDINGS = (".bag", ".db3", ".mcap")
 _SQLITE = b"SQLite format 3"
 METADATA = "metadata.yaml"
-_INSTALL = "ROS recordings are read by rosbags; install it with: pip install 'tsfusion[ros]'"
+_INSTALL = "ROS recordings are read by rosbags; install: pip install '.[ros]' in your clone of tsfusion"
 _HINTS = {
     "not indexed": "it was not closed when recording ended: `rosbag reindex FILE` repairs it",
     "File end magic": "it was not closed when recording ended: `mcap recover FILE -o NEW` repairs it",

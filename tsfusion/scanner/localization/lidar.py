@@ -17,7 +17,7 @@ from tsfusion.scanner.localization.tracking_keyframes import TrackingKeyframes
 
 Points = NDArray[np.float64]  # (n, 3) metres
 
-_INSTALL = "the localizer lidar needs kiss-icp; install it with: pip install 'tsfusion[lidar]'"
+_INSTALL = "the localizer lidar needs kiss-icp; install: pip install '.[lidar]' in your clone of tsfusion"
 MIN_POINTS = 30  # after thinning
 MIN_UPRIGHT_POINTS = 50
 MIN_OVERLAP = 0.6  # share of the points; 0.88 and more in real and synthetic scans, 0.5 in another street

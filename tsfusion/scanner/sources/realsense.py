@@ -245,7 +245,8 @@ def _pyrealsense2() -> Any:
         import pyrealsense2
     except ModuleNotFoundError as error:
         raise MissingDependency(
-            "RealSense needs pyrealsense2; install it with: pip install 'tsfusion[realsense]'"
+            "RealSense needs pyrealsense2; install it with: pip install '.[realsense]' "
+            "in your clone of tsfusion"
         ) from error
     except ImportError as error:  # a shared library that the wheel does not bring along
         raise MissingDependency(

@@ -233,6 +233,6 @@ def require() -> tuple[Any, Any]:
         import scipy.sparse.linalg
     except ImportError as error:
         raise MissingDependency(
-            "pose graphs need scipy; install it with: pip install 'tsfusion[slam]'"
+            "pose graphs need scipy; install it with: pip install '.[slam]' in your clone of tsfusion"
         ) from error
     return scipy.sparse.linalg, scipy.sparse
