@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Common odometry of RGB-D cameras to compare with: Open3D's and OpenCV's, frame to frame."""
+"""Common odometry of RGB-D cameras to compare with: OpenCV's, and Open3D's in each of its modes."""
 
 from abc import ABC, abstractmethod
 from importlib import import_module
@@ -13,6 +13,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
 
 MAX_DEPTH = 5.0  # metres
+KEYFRAME = 0.1, np.deg2rad(10)  # metres, radians: a new one when the camera has moved or turned so far
 
 
 class FrameToFrame(ABC):
@@ -75,6 +76,99 @@ class Open3D(FrameToFrame):
             odometry.RGBDOdometryJacobianFromHybridTerm(), odometry.OdometryOption(depth_max=MAX_DEPTH),
         )  # fmt: skip
         return np.asarray(T_last_now) if found else None
+
+
+class Open3DKeyframes(FrameToFrame):
+    """`t.pipelines.odometry.rgbd_odometry_multi_scale` against the last keyframe, from the last pose."""
+
+    method = "PointToPlane"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._T_key_last = np.eye(4)
+
+    def prepare(self, frame: Frame) -> Any:
+        o3d: Any = import_module("open3d")
+        assert frame.depth_m is not None
+        color = np.zeros((*frame.shape, 3), np.uint8) if frame.color is None else frame.color[:, :, ::-1]
+        images = color.astype(np.float32) / 255, frame.depth_m.astype(np.float32)
+        return o3d.t.geometry.RGBDImage(
+            *(o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(image))) for image in images)
+        )
+
+    def motion(self, last: Any, now: Any, frame: Frame) -> NDArray[np.float64] | None:
+        o3d: Any = import_module("open3d")
+        assert frame.intrinsics is not None
+        odometry = o3d.t.pipelines.odometry
+        self._key = last if self._number == 1 else self._key
+        try:
+            found = odometry.rgbd_odometry_multi_scale(
+                now, self._key, o3d.core.Tensor(frame.intrinsics.matrix), o3d.core.Tensor(self._T_key_last),
+                depth_scale=1.0, depth_max=MAX_DEPTH, method=getattr(odometry.Method, self.method),
+            )  # fmt: skip
+        except RuntimeError:  # a singular system: too few pixels agree
+            return None
+        T_key_now = found.transformation.numpy()
+        step = np.asarray(np.linalg.inv(self._T_key_last) @ T_key_now)
+        if self.is_far(T_key_now):
+            self._key, T_key_now = now, np.eye(4)
+        self._T_key_last = T_key_now
+        return step
+
+    def is_far(self, T_key_now: NDArray[np.float64]) -> bool:
+        """Whether the camera is so far from the keyframe that its frame becomes the next one."""
+        angle = np.arccos(np.clip((np.trace(T_key_now[:3, :3]) - 1) / 2, -1, 1))
+        return bool(np.linalg.norm(T_key_now[:3, 3]) > KEYFRAME[0] or angle > KEYFRAME[1])
+
+
+class Open3DIntensity(Open3DKeyframes):
+    """Intensity term, frame to frame: every frame is a keyframe."""
+
+    method = "Intensity"
+
+    def is_far(self, T_key_now: NDArray[np.float64]) -> bool:
+        return True
+
+
+class Open3DModel(FrameToFrame):
+    """Frame to model: `t.pipelines.slam.Model`, the depth that its map predicts from the last pose."""
+
+    voxel_size = 0.01  # metres
+
+    def prepare(self, frame: Frame) -> Any:
+        o3d: Any = import_module("open3d")
+        assert frame.depth_m is not None
+        assert frame.intrinsics is not None
+        device = o3d.core.Device("CPU:0")
+        K = o3d.core.Tensor(frame.intrinsics.matrix)
+        now, seen = (o3d.t.pipelines.slam.Frame(*frame.shape, K, device) for _ in range(2))
+        color = np.zeros((*frame.shape, 3), np.uint8) if frame.color is None else frame.color[:, :, ::-1]
+        for name, image in (("depth", frame.depth_m), ("color", color / 255)):
+            pixels = o3d.core.Tensor(np.ascontiguousarray(image, np.float32))
+            now.set_data_from_image(name, o3d.t.geometry.Image(pixels))
+        if self._last is None:
+            T = o3d.core.Tensor(np.eye(4))
+            o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
+            self._model = o3d.t.pipelines.slam.Model(self.voxel_size, 16, 10_000, T, device)
+            self._add(now, seen)
+        return now, seen
+
+    def motion(self, last: Any, now: Any, frame: Frame) -> NDArray[np.float64] | None:
+        try:
+            found = self._model.track_frame_to_model(now[0], last[1], 1.0, MAX_DEPTH, 0.07)
+        except RuntimeError:  # a singular system: too few pixels agree
+            return None
+        step = np.asarray(found.transformation.numpy())
+        self._T_world_now = self._T @ step
+        self._add(*now)
+        return step
+
+    def _add(self, now: Any, seen: Any) -> None:
+        o3d: Any = import_module("open3d")
+        T = self._T_world_now if self._number else np.eye(4)
+        self._model.update_frame_pose(self._number, o3d.core.Tensor(T))
+        self._model.integrate(now, 1.0, MAX_DEPTH, 8.0)
+        self._model.synthesize_model_frame(seen, 1.0, 0.1, MAX_DEPTH, 8.0, False)
 
 
 class OpenCV(FrameToFrame):

@@ -60,9 +60,9 @@ class Open3D:
         else:
             self.grid.integrate(blocks, depth, K, extrinsic, *reach)
 
-    def extract_mesh(self) -> Mesh:
-        """The surface of voxels seen at least twice."""
-        mesh = self.grid.extract_triangle_mesh(weight_threshold=2.0)
+    def extract_mesh(self, weight: float = 2.0) -> Mesh:
+        """The surface of voxels seen so often; its own default is 3."""
+        mesh = self.grid.extract_triangle_mesh(weight_threshold=weight)
         return Mesh(
             mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy().astype(np.int32),
             mesh.vertex.normals.numpy(),

@@ -97,7 +97,7 @@ SCENES = (
           ("kitchen, 125", KITCHEN, {}, {}), ("kitchen, every 3rd", KITCHEN, {}, {"stride": 3}),
           ("room", "synthetic:room", HANDHELD, {}), ("room-bare", "synthetic:room-bare", HANDHELD, {}),
           ("room-untextured", "synthetic:room-untextured", HANDHELD, {}),
-      ) for peer in ("Open3D", "OpenCV")),
+      ) for peer in ("Open3D", "Open3DIntensity", "Open3DKeyframes", "Open3DModel", "OpenCV")),
     Scene("HoloLens", "hololens", "rgbd"),
     Scene("Redwood living room", "redwood_livingroom1", "rgbd"),
     *(Scene(f"room{name}", f"synthetic:room{name}", "rgbd", HANDHELD, bar=bar)
