@@ -3,8 +3,9 @@
 
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,11 +48,17 @@ METHODS: dict[str, dict[str, Any]] = {  # what is not said is the sensor preset'
     "ray+field": {"regularizer": "ray", "surface": "field"},
     "carving": {"regularizer": "off", "space_carving": True},
     "open3d": {},
+    "open3d-1": {},
     "vdbfusion": {},
 }
-PEERS = {"open3d": Open3D, "vdbfusion": VDBFusion}
-SOME = ("default", "off", "paper", "ray", "normal", "carving", "open3d")
-FEW = ("default", "off", "ray", "ray+field", "open3d")
+# of Open3D, voxels of weight ≥ 2, and ≥ 1
+PEERS: dict[str, Callable[..., Any]] = {
+    "open3d": Open3D,
+    "open3d-1": partial(Open3D, mesh_weight=1.0),
+    "vdbfusion": VDBFusion,
+}
+SOME = ("default", "off", "paper", "ray", "normal", "carving", "open3d", "open3d-1")
+FEW = ("default", "off", "ray", "ray+field", "open3d", "open3d-1")
 DRIFT = ("default", "off", "paper", "ray")
 
 
@@ -93,7 +100,7 @@ def rows() -> list[Row]:
         Row(setup, method, setup.question == "keyframes" and setup.keyframes == 20)
         for setup, methods in _setups()
         for method in methods
-        if setup.noise not in ("lidar", "recorded-scan") or method != "open3d"
+        if setup.noise not in ("lidar", "recorded-scan") or not method.startswith("open3d")
         if setup.noise != "recorded-scan" or method != "vdbfusion"
     ]
 

@@ -13,6 +13,7 @@ from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.localization.localizer import Lost, Pose, PoseCorrections
 
 MAX_DEPTH = 5.0  # metres
+ITERATIONS = (20, 10, 5)  # coarse to fine; the default, twice to five times fewer, is too few at 7.5 Hz
 KEYFRAME = 0.1, np.deg2rad(10)  # metres, radians: a new one when the camera has moved or turned so far
 
 
@@ -86,6 +87,7 @@ class Open3DKeyframes(FrameToFrame):
     def __init__(self) -> None:
         super().__init__()
         self._T_key_last = np.eye(4)
+        self._key: Any = None
 
     def prepare(self, frame: Frame) -> Any:
         o3d: Any = import_module("open3d")
@@ -100,11 +102,12 @@ class Open3DKeyframes(FrameToFrame):
         o3d: Any = import_module("open3d")
         assert frame.intrinsics is not None
         odometry = o3d.t.pipelines.odometry
-        self._key = last if self._number == 1 else self._key
+        self._key = last if self._key is None else self._key
         try:
             found = odometry.rgbd_odometry_multi_scale(
                 now, self._key, o3d.core.Tensor(frame.intrinsics.matrix), o3d.core.Tensor(self._T_key_last),
-                depth_scale=1.0, depth_max=MAX_DEPTH, method=getattr(odometry.Method, self.method),
+                depth_scale=1.0, depth_max=MAX_DEPTH, criteria_list=_criteria(odometry),
+                method=getattr(odometry.Method, self.method),
             )  # fmt: skip
         except RuntimeError:  # a singular system: too few pixels agree
             return None
@@ -128,6 +131,10 @@ class Open3DIntensity(Open3DKeyframes):
 
     def is_far(self, T_key_now: NDArray[np.float64]) -> bool:
         return True
+
+
+def _criteria(odometry: Any) -> list[Any]:
+    return [odometry.OdometryConvergenceCriteria(steps, 1e-6, 1e-6) for steps in ITERATIONS]
 
 
 class Open3DModel(FrameToFrame):
@@ -155,7 +162,10 @@ class Open3DModel(FrameToFrame):
 
     def motion(self, last: Any, now: Any, frame: Frame) -> NDArray[np.float64] | None:
         try:
-            found = self._model.track_frame_to_model(now[0], last[1], 1.0, MAX_DEPTH, 0.07)
+            odometry = import_module("open3d").t.pipelines.odometry
+            found = self._model.track_frame_to_model(
+                now[0], last[1], 1.0, MAX_DEPTH, 0.07, odometry.Method.PointToPlane, _criteria(odometry)
+            )
         except RuntimeError:  # a singular system: too few pixels agree
             return None
         step = np.asarray(found.transformation.numpy())

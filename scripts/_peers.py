@@ -27,13 +27,15 @@ class Open3D:
     """VoxelBlockGrid: projective, 8³ blocks. Set OMP_NUM_THREADS before the first one."""
 
     def __init__(
-        self, voxel_size: float, *, max_range: float, truncation: float, color: bool = False
-    ) -> None:
+        self, voxel_size: float, *, max_range: float, truncation: float, color: bool = False,
+        mesh_weight: float = 2.0,
+    ) -> None:  # fmt: skip
         import open3d
 
         o3d: Any = open3d  # whose stubs know too little
         self._o3d, self._color = o3d, color
         self._range, self._truncation = max_range, truncation
+        self.mesh_weight = mesh_weight
         channels = (1, 1, 3) if color else (1, 1)
         self.grid = o3d.t.geometry.VoxelBlockGrid(
             attr_names=("tsdf", "weight", "color")[: len(channels)],
@@ -60,9 +62,9 @@ class Open3D:
         else:
             self.grid.integrate(blocks, depth, K, extrinsic, *reach)
 
-    def extract_mesh(self, weight: float = 2.0) -> Mesh:
-        """The surface of voxels seen so often; its own default is 3."""
-        mesh = self.grid.extract_triangle_mesh(weight_threshold=weight)
+    def extract_mesh(self) -> Mesh:
+        """The surface of voxels seen `mesh_weight` times; its own default is 3."""
+        mesh = self.grid.extract_triangle_mesh(weight_threshold=self.mesh_weight)
         return Mesh(
             mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy().astype(np.int32),
             mesh.vertex.normals.numpy(),

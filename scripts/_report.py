@@ -214,7 +214,7 @@ def _color(method: str) -> str:
     known = {
         "default": "#111111", "off": "#8c8c8c", "exact": "#c7c7c7", "paper": "#d62728", "ray": "#1f77b4",
         "normal": "#17becf", "field": "#2ca02c", "ray+normal": "#9467bd", "ray+field": "#bcbd22",
-        "open3d": "#ff7f0e", "vdbfusion": "#8c564b", "carving": "#e377c2",
+        "open3d": "#ff7f0e", "open3d-1": "#ffbb78", "vdbfusion": "#8c564b", "carving": "#e377c2",
     }  # fmt: skip
     return known[method]
 

@@ -155,7 +155,11 @@ def measure_row(row: Row, threads: int, children: set["subprocess.Popen[str]"]) 
 
 def runnable(chosen: list[Row]) -> list[Row]:
     """The rows that can run here; of the others it is said why not, once a reason."""
-    peers = {peer: unimportable(peer) for peer in PEERS if any(peer == row.method for row in chosen)}
+    peers = {
+        peer: unimportable(peer.partition("-")[0])
+        for peer in PEERS
+        if any(peer == row.method for row in chosen)
+    }
     scipy = unimportable("scipy")
     if scipy:
         say(f"completeness and F are left out: {scipy}")

@@ -24,7 +24,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -203,7 +202,8 @@ def run_case(case: Case, threads: int, keyframes: int) -> dict[str, Any]:
         spent = row["keyframe"]["cpu_ms_median"] / beside["keyframe"]["cpu_ms_median"]
         row["ratio"] = {"keyframe": round(spent, 3)}
         for weight in (1, 2):
-            mesh, cpu_ms = timed_mesh(partial(peer.extract_mesh, float(weight)))
+            peer.mesh_weight = float(weight)
+            mesh, cpu_ms = timed_mesh(peer.extract_mesh)
             error = source.error_mm(mesh.vertices, mesh.faces)
             beside[f"mesh_weight_{weight}"] = {
                 "cpu_ms": cpu_ms, "triangles": len(mesh.faces), "error_mm": error
@@ -318,7 +318,7 @@ def main() -> int:
             continue
         command = [sys.executable, __file__, "--case", case.name, "--threads", str(options.threads)]
         command += ["--keyframes", str(options.keyframes)]
-        rows = []
+        rows: list[dict[str, Any]] = []
         for _ in range(options.repeat):
             done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
             print(done.stdout, end="", flush=True)
