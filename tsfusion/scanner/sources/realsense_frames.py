@@ -53,19 +53,22 @@ class PipelineStream:
             self._playback = resolved.get_device().as_playback()
             self._playback.set_real_time(real_time)
             self._playback.pause()
-        self._paused = self._playback is not None
+        self._resuming: threading.Thread | None = None
         self._profile = self._pipeline.start(config)
         self.device = self._profile.get_device()
 
     def wait(self, milliseconds: int) -> Any:
-        if self._paused and self._playback is not None:
-            self._paused = False  # `resume` may return only after somebody takes frames
-            threading.Thread(target=self._playback.resume, daemon=True).start()
+        if self._resuming is None and self._playback is not None:
+            # In a thread: `resume` may return only after somebody takes frames.
+            self._resuming = threading.Thread(target=self._playback.resume, daemon=True)
+            self._resuming.start()
         there, frames = self._pipeline.try_wait_for_frames(milliseconds)
         return frames if there else None
 
     def over(self) -> bool:
-        return self._playback is not None and self._playback.current_status() == self._stopped
+        if self._playback is None or self._resuming is None or self._resuming.is_alive():
+            return False  # one that has not begun to play counts as stopped, too
+        return bool(self._playback.current_status() == self._stopped)
 
     def profile(self, stream: Any, index: int = -1) -> Any:
         return self._profile.get_stream(stream, index).as_video_stream_profile()
