@@ -269,6 +269,7 @@ def inverted(place: Path, folder: Path) -> Path:
     copy.mkdir()
     for name in ("depth", "color"):
         (copy / name).symlink_to(place / name)
+    (copy / "K.txt").write_text("525 0 319.5\n0 525 239.5\n0 0 1\n")
     text = ""
     for index, T in read_log(place / "trajectory.log"):
         rows = "\n".join(" ".join(repr(float(value)) for value in row) for row in se3.inverse(T))

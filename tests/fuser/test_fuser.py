@@ -51,7 +51,7 @@ SESSION = bytes(16)
 
 
 def order(index: int, position: Position, skip: str | None = None) -> messages.Fuse:
-    return messages.Fuse(index, position, SESSION, index + 1, "robot", skip)
+    return messages.Fuse(index, position, SESSION, index + 1, "robot", skip=skip)
 
 
 def fill(state: Path, count: int) -> list[Position]:

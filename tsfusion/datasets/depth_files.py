@@ -76,7 +76,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
     try:
         import OpenEXR
     except ImportError as error:
-        raise MissingDependency(f"{path}: to read EXR: pip install 'tsfusion[exr]'") from error
+        raise MissingDependency(f"{path}: to read EXR: pip install '.[exr]'") from error
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = [channel.pixels for name, channel in file.channels().items() if name != "A"]

@@ -179,7 +179,7 @@ class Fuser:
             self._current.set(fuser_messages.NOT_WORKING)  # not reached if the keyframe ended the process
         if reason is not None and not order.is_correction:
             self._map.rejected[reason] = self._map.rejected.get(reason, 0) + 1
-        self._map.done[order.session] = fuser_messages.SessionProgress(order.seq, order.client)
+        self._map.done[order.session] = fuser_messages.SessionProgress(order.seq, order.client, order.world)
         self._send(fuser_messages.Done(order.index, start, time.monotonic_ns(), reason, message))
         self._since_checkpoint += 1
         if self._begin.checkpoint_every and self._since_checkpoint >= self._begin.checkpoint_every:

@@ -7,6 +7,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from tsfusion.core import durable_files
 from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
@@ -62,7 +64,7 @@ class MapCheckpoints:
         Nothing is lost then: the next start goes on from the checkpoint before, with the journal. Until the
         new one is on the disk, the old ones keep their names.
         """
-        done = {key.hex(): [progress.seq, progress.client] for key, progress in self.done.items()}
+        done = {key.hex(): msgspec.structs.astuple(progress) for key, progress in self.done.items()}
         meta = {"done": done, "rejected": self.rejected, "held": self.held.numbers}
         try:
             self.volume.save(self._new, meta=meta)

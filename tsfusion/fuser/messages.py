@@ -42,10 +42,14 @@ class Begin(Struct, frozen=True, tag="begin"):
 
 
 class SessionProgress(Struct, frozen=True, array_like=True):
-    """How far a map is with a client's session: every keyframe up to `seq` is fused or rejected."""
+    """How far a map is with a client's session: every keyframe up to `seq` is fused or rejected.
+
+    `world`: the session's coordinate frame, empty = that of poses given from elsewhere.
+    """
 
     seq: int
     client: str
+    world: str = ""
 
 
 class Fuse(Struct, frozen=True, tag="fuse"):
@@ -59,6 +63,7 @@ class Fuse(Struct, frozen=True, tag="fuse"):
     session: bytes
     seq: int
     client: str = ""
+    world: str = ""
     skip: str | None = None
     is_correction: bool = False
 

@@ -70,6 +70,7 @@ class FuserBacklog:
                 session.key,
                 entry.stamps.seq,
                 session.client,
+                session.world or "",
                 is_correction=entry.is_correction,
             )
             if not fuser.fuse(order):

@@ -171,7 +171,7 @@ class HostedMap:
 
     def _on_ready(self, ready: fuser_messages.Ready) -> None:
         for key, progress in ready.done.items():
-            session = self.sessions.open(key, progress.client)
+            session = self.sessions.open(key, progress.client, progress.world)
             session.durable = max(session.durable, progress.seq)
             if progress.seq > session.fused:
                 session.fused = progress.seq
