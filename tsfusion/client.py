@@ -103,7 +103,7 @@ class Client:
             map = spool.map_name
         self._config = override(config or ClientConfig(), map=map, policy=policy, **keys)
         connection_keys = client_keys(self._config.key, self._config.server_key)
-        address = sockets.connect_address(address)
+        self._address = address = sockets.connect_address(address)
         self._control = sockets.connect_address(control_address(address, control))
         if world and not re.fullmatch(WORLD_NAME, world):
             raise InvalidConfig(f"world must be 1 to 64 letters, digits, - and _, got {world!r}")
@@ -342,7 +342,7 @@ class Client:
             return box.link_state.why
         silence = time.monotonic() - last_heard
         if not last_heard:
-            return f"no server answers at {self._control}"
+            return f"no server answers at {self._address} (control {self._control})"
         why = "the server is behind"
         if silence > _SILENCE:
             why = f"nothing was heard from the server at {self._control} for {silence:.1f} s"
