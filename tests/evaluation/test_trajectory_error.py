@@ -16,8 +16,8 @@ from tsfusion import DatasetError
 from tsfusion.cli.ate import table
 from tsfusion.datasets import open_dataset, select
 from tsfusion.datasets.dataset import pose_of
-from tsfusion.datasets.trajectory_files import read_tum, write_tum
-from tsfusion.evaluation.trajectory_error import absolute_error, associate, paired, read, umeyama
+from tsfusion.datasets.trajectory_files import read_poses, read_tum, write_tum
+from tsfusion.evaluation.trajectory_error import absolute_error, associate, paired, umeyama
 from tsfusion.geometry import se3
 from tsfusion.geometry.trajectory import quaternion, rigid
 from tsfusion.scanner.sources.recorded import RecordedSource
@@ -91,7 +91,7 @@ def test_tum_files_are_read_as_they_were_written(tmp_path):
     write_tum(tmp_path / "a.txt", stamps, list(poses))
     again = read_tum(tmp_path / "a.txt")
     assert list(again.timestamps_ns) == stamps
-    np.testing.assert_allclose(read(tmp_path / "a.txt")[1], poses, atol=2e-9)
+    np.testing.assert_allclose(read_poses(tmp_path / "a.txt")[1], poses, atol=2e-9)
 
 
 # `evo_ape kitti poses/00.txt 00_ORB.txt`, with and without -a (evo 1.38.1)
@@ -129,7 +129,7 @@ def test_evo_itself_agrees(data, tmp_path, form, estimate, reference):
     command = ["evo_ape", form, reference, estimate, "-a", "--save_results", result]
     subprocess.run(command, check=True, capture_output=True, timeout=120)
     with zipfile.ZipFile(result) as archive:
-        stats = json.loads(archive.read("stats.json"))
+        stats = json.loads(archive.read_poses("stats.json"))
     error = absolute_error(*paired(estimate, reference))
     for name in ("rmse", "mean", "median", "std", "min", "max"):
         assert getattr(error, name) == pytest.approx(stats[name], abs=1e-9), name
@@ -212,7 +212,7 @@ def test_what_is_no_trajectory(tmp_path: Path, text, match):
     if text is not None:
         (tmp_path / "a.txt").write_text(text)
     with pytest.raises(DatasetError, match=match):
-        read(tmp_path / "a.txt")
+        read_poses(tmp_path / "a.txt")
 
 
 def test_unequal_numbers_without_times(data, tmp_path):

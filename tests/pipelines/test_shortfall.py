@@ -42,6 +42,10 @@ def test_most_frames_lost() -> None:
     assert shortfall.of_tracking(40, 20, "dark") == ""
     found = shortfall.of_tracking(40, 19, "dark")
     assert found.startswith("only 19 of 40 frames were localised (dark): move more slowly")
+    late = shortfall.of_tracking(40, 19, "late", localizer="feed")
+    assert "send poses sooner" in late
+    assert "slowly" not in late
+    assert "in its clock" in shortfall.of_tracking(40, 19, "gap", localizer="trajectory")
     assert shortfall.together(["", found, "", "more"]) == f"{found}; more"
 
 

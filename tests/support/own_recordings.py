@@ -62,6 +62,16 @@ def images(root: Path, views: Sequence[Keyframe], *, camera: bool = True, poses:
     return root
 
 
+def timed_images(root: Path, views: Sequence[Keyframe]) -> Path:
+    """PNG folders without poses, whose names are the seconds of the frames."""
+    images(root, views, poses=False)
+    for number, stamp in enumerate(stamps_ns(len(views))):
+        for kind in ("depth", "color"):
+            image = root / kind / f"{number:06d}.png"
+            image.rename(image.with_name(f"{stamp / 1e9:.6f}.png"))
+    return root
+
+
 def nerfstudio(root: Path, views: Sequence[Keyframe]) -> Path:
     """A capture with `transforms.json`: OpenGL axes, pixel centres at halves."""
     K, frames = views[0].intrinsics, []

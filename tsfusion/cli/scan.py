@@ -111,7 +111,7 @@ def scan(
         context, source, options.dataset_options(option),
         camera=options.camera(intrinsics, calibration), rate=rate,
         recording={"unpack": unpack, "sequence": sequence, "modality": modality},
-        part={"start": start, "stride": stride, "limit": max_frames},
+        part={"start": start, "stride": stride, "limit": max_frames}, settings=settings,
     )  # fmt: skip
     if waits_for := getattr(opened, "waits_for", str)():
         poses = settings["trajectory"] or settings["feed"] or "found from the frames"
@@ -143,8 +143,12 @@ def _open(
     rate: float | None,
     recording: dict[str, Any],
     part: dict[str, Any],
+    settings: dict[str, Any],
 ) -> "Source":
-    """The source of that name with the options `given`; of a recording, the part that is asked for."""
+    """The source of that name with the options `given`; of a recording, the part that is asked for.
+
+    Where the recording or the trajectory in `settings` has no times, its poses are made the recording's own.
+    """
     from tsfusion.scanner.sources.recorded import LimitedSource
     from tsfusion.scanner.sources.registry import is_live, open_source
 
@@ -159,6 +163,7 @@ def _open(
     from tsfusion.cli.replay import open_recording
     from tsfusion.core.errors import DatasetError
     from tsfusion.datasets import select
+    from tsfusion.datasets.given_trajectory import WithTrajectory, pairs_by_time
     from tsfusion.scanner.sources.recorded import RecordedSource
 
     path = Path(spec)
@@ -168,6 +173,12 @@ def _open(
             "realsense, camera:0, folder:PATH (docs/sources.md)"
         )
     dataset = open_recording(path, **recording | camera | given, posed=False)
+    if settings["trajectory"] is not None:
+        trajectory = Path(settings["trajectory"]).expanduser()
+        if not pairs_by_time(trajectory, dataset.timestamps_ns):
+            dataset = WithTrajectory(dataset, trajectory)
+            settings |= {"trajectory": None, "localizer": "given"}
+            typer.echo(f"poses: {trajectory}, one a frame in order, as not both have times", err=True)
     return RecordedSource(select(dataset, **part), rate=rate)
 
 

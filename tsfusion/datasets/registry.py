@@ -28,6 +28,7 @@ from tsfusion.datasets.formats import (
     sevenscenes,
     tum,
 )
+from tsfusion.datasets.given_trajectory import WithTrajectory
 from tsfusion.datasets.rosbag import dataset as rosbag_dataset
 
 GROUP = "tsfusion.datasets"
@@ -137,7 +138,7 @@ def find(path: str | Path, *, unpack: bool = False) -> Found:
 
 
 def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) -> Dataset:
-    """Call a layout's opener; it may lack the option `posed`; `poses` and `trajectory` are one.
+    """Call a layout's opener; it may lack the options `posed` and `trajectory`; `poses` is the latter.
 
     Raises:
         DatasetError: an option that it does not take, or of the wrong type.
@@ -151,7 +152,16 @@ def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) 
     for given, known in (("poses", "trajectory"), ("trajectory", "poses")):
         if given in options and not plugins.takes(opener, given) and plugins.takes(opener, known):
             options[known] = options.pop(given)
-    return plugins.call(opener, options, name=f"a {name} dataset", error=DatasetError)
+    trajectory = options.get("trajectory")
+    if trajectory is None or plugins.takes(opener, "trajectory"):
+        return plugins.call(opener, options, name=f"a {name} dataset", error=DatasetError)
+    del options["trajectory"]
+    posed = options.get("posed", True)
+    if plugins.takes(opener, "posed"):
+        options["posed"] = False
+    where = {key: options[key] for key in ("max_gap_s", "time_offset_s") if options.get(key) is not None}
+    dataset = plugins.call(opener, options, name=f"a {name} dataset", error=DatasetError)
+    return WithTrajectory(dataset, Path(trajectory).expanduser(), posed=posed, **where)
 
 
 def describe(dataset: Dataset) -> str:

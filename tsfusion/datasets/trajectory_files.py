@@ -11,7 +11,7 @@ from tsfusion.core.errors import DatasetError, InvalidKeyframe
 from tsfusion.datasets.readers import numbers, read_lines, read_numbers
 from tsfusion.geometry.keyframe import check_pose
 from tsfusion.geometry.se3 import Transform
-from tsfusion.geometry.trajectory import Trajectory, quaternion
+from tsfusion.geometry.trajectory import Trajectory, quaternion, rigid
 
 
 def write_tum(path: Path, timestamps_ns: Sequence[int], poses: Sequence[Transform]) -> None:
@@ -119,6 +119,40 @@ def read_log(path: Path) -> list[tuple[int, Transform]]:
         rows = [numbers(path, n, line.split(), 4, "a 4×4 matrix") for n, line in lines[start + 1 : start + 5]]
         poses.append((int(words[0]), checked_pose(np.array(rows), f"{path}:{number}")))
     return poses
+
+
+def read_poses(path: Path) -> tuple[NDArray[np.int64] | None, NDArray[np.float64]]:
+    """Read a trajectory file: TUM (8 numbers in the first line), KITTI (12) or Redwood's `.log` (3).
+
+    Returns:
+        (n,) timestamps in nanoseconds, None where the format has none; (n, 4, 4) poses.
+
+    Raises:
+        DatasetError: for a missing file, or one of another format.
+    """
+    columns = _columns(path)
+    if columns == 8:
+        tum = read_tum(path)
+        poses = [rigid(q, t) for q, t in zip(tum.quaternions, tum.translations, strict=True)]
+        return tum.timestamps_ns, np.array(poses)
+    if columns == 12:
+        return None, np.array(read_kitti(path))
+    if columns == 3:
+        return None, np.array([T for _, T in read_log(path)])
+    raise DatasetError(
+        f"{path} is no trajectory: expected 8 numbers a line (TUM), 12 (KITTI) or a Redwood .log, "
+        f"got {columns}"
+    )
+
+
+def is_log(path: Path) -> bool:
+    """Whether a trajectory is a Redwood `.log`, or nothing that `read_poses` reads."""
+    return _columns(path) not in (8, 12)
+
+
+def _columns(path: Path) -> int:
+    lines = read_lines(path, "a trajectory: TUM, KITTI or .log")
+    return len(lines[0][1].replace(",", " ").split()) if lines else 0
 
 
 def checked_pose(matrix: NDArray[np.float64], source: object) -> Transform:

@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, nearest_in_time, pose_of
-from tsfusion.datasets.readers import read_lines
-from tsfusion.datasets.trajectory_files import read_kitti, read_log, read_tum
+from tsfusion.datasets.trajectory_files import read_poses
 from tsfusion.geometry import se3
-from tsfusion.geometry.trajectory import rigid
 
 Poses = NDArray[np.float64]  # (n, 4, 4) T_world_camera
 
@@ -124,31 +122,6 @@ def _span(stamps_ns: NDArray[np.int64]) -> str:
     return f"{stamps_ns[0] / 1e9:.3f} to {stamps_ns[-1] / 1e9:.3f} s"
 
 
-def read(path: Path) -> tuple[NDArray[np.int64] | None, Poses]:
-    """Read a trajectory file: TUM (8 numbers in the first line), KITTI (12) or Redwood's `.log` (3).
-
-    Returns:
-        (n,) timestamps in nanoseconds, None where the format has none; (n, 4, 4) poses.
-
-    Raises:
-        DatasetError: for a missing file, or one of another format.
-    """
-    lines = read_lines(path, "a trajectory: TUM, KITTI or .log")
-    columns = len(lines[0][1].replace(",", " ").split()) if lines else 0
-    if columns == 8:
-        tum = read_tum(path)
-        poses = [rigid(q, t) for q, t in zip(tum.quaternions, tum.translations, strict=True)]
-        return tum.timestamps_ns, np.array(poses)
-    if columns == 12:
-        return None, np.array(read_kitti(path))
-    if columns == 3:
-        return None, np.array([T for _, T in read_log(path)])
-    raise DatasetError(
-        f"{path} is no trajectory: expected 8 numbers a line (TUM), 12 (KITTI) or a Redwood .log, "
-        f"got {columns}"
-    )
-
-
 def dataset_trajectory(dataset: Dataset) -> tuple[NDArray[np.int64], Poses]:
     """The poses of a recording; without times in it, the times that `tsfusion scan` would give.
 
@@ -174,8 +147,8 @@ def paired(
     Raises:
         DatasetError: when nothing can be paired, or without times for unequal numbers.
     """
-    stamps, poses = read(estimate)
-    of_reference = read(reference) if isinstance(reference, Path) else dataset_trajectory(reference)
+    stamps, poses = read_poses(estimate)
+    of_reference = read_poses(reference) if isinstance(reference, Path) else dataset_trajectory(reference)
     reference_stamps, references = of_reference
     if stamps is not None and reference_stamps is not None:
         a, b = associate(stamps, reference_stamps, round(max_difference_s * 1e9))

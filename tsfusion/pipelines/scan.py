@@ -22,7 +22,7 @@ from tsfusion.datasets.cameras import described
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.sample_ranges import wrong_unit
 from tsfusion.geometry.up_direction import HeldSensor, Up
-from tsfusion.pipelines import engine, map_size, run_files, scan_results, target_server
+from tsfusion.pipelines import engine, map_size, run_files, scan_results, shortfall, target_server
 from tsfusion.pipelines.engine import Engine, Progress
 from tsfusion.pipelines.leftovers import ANSWER_SECONDS, Leftovers
 from tsfusion.pipelines.scan_results import MapResult, ScanSummary
@@ -130,7 +130,7 @@ def scan(
             _run_scanner(scanner, _timely(source, first, frames, config.patience), pace, failure)
             peak = process.peak_rss_bytes()
             if not any(submap.located for submap in scanner.submaps):
-                raise failure[0] if failure else _not_localised(scanner, first)
+                raise (failure[0] if failure else _not_localised(scanner, first, config))
             scanner.finish()
             clients = [submap.client for submap in scanner.submaps]
             if own:
@@ -213,14 +213,17 @@ def _run_scanner(
         failure.append(error)
 
 
-def _not_localised(scanner: Scanner, first: Frame) -> OutputError:
+def _not_localised(scanner: Scanner, first: Frame, config: ScanConfig) -> OutputError:
     state = scanner.state()
     unit = "" if first.kind == "pair" else wrong_unit(first.keyframe(np.eye(4)))
     why = f"the first has {unit}" if unit else state.why
-    return OutputError(
-        f"the sensor was not localised in any of {state.frames} frames: {why}; check "
-        "the camera and the depth's unit, or take poses from elsewhere (--trajectory FILE)"
+    localizer = registry.localizer_name(config, first)
+    cure = (
+        shortfall.cure_of_tracking(localizer)
+        if localizer in ("trajectory", "feed", "given") and not unit
+        else "check the camera and the depth's unit, or take poses from elsewhere (--trajectory FILE)"
     )
+    return OutputError(f"the sensor was not localised in any of {state.frames} frames: {why}; {cure}")
 
 
 def _refused_worlds(clients: list[Client]) -> list[Exception]:

@@ -136,7 +136,7 @@ def summarise(
         missed=shortfall.together(
             (
                 shortfall.of_delivery(stats, spool=spool, link=state.link, rejection=scanner.first_rejection),
-                shortfall.of_tracking(state.frames, state.tracked, scanner.last_loss),
+                shortfall.of_tracking(state.frames, state.tracked, scanner.last_loss, localizer=localizer),
             )
         ),
         left=stats.waiting,

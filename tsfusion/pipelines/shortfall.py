@@ -39,7 +39,21 @@ def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str,
     return ""
 
 
-def of_tracking(frames: int, tracked: int, why: str) -> str:
+def cure_of_tracking(localizer: str) -> str:
+    """What to do when frames are lost, by the name of the localizer."""
+    if localizer == "trajectory":
+        return (
+            "give the trajectory of this recording, in its clock (--time-offset SECONDS is added to the "
+            "times of frames, --max-gap SECONDS bridges gaps)"
+        )
+    if localizer == "feed":
+        return "send poses sooner and in the frames' clock, or record them for --trajectory FILE"
+    if localizer == "given":
+        return "give poses of all frames (--trajectory FILE), or let them be found (--localizer rgbd)"
+    return "move more slowly, give every frame, or take poses from elsewhere (--trajectory FILE)"
+
+
+def of_tracking(frames: int, tracked: int, why: str, *, localizer: str = "rgbd") -> str:
     """Say that most frames were lost; empty = at least half have a pose.
 
     Args:
@@ -47,10 +61,7 @@ def of_tracking(frames: int, tracked: int, why: str) -> str:
     """
     if 2 * tracked >= frames:
         return ""
-    return (
-        f"only {tracked} of {frames} frames were localised ({why}): move more slowly, give every frame, or "
-        "take poses from elsewhere (--trajectory FILE)"
-    )
+    return f"only {tracked} of {frames} frames were localised ({why}): {cure_of_tracking(localizer)}"
 
 
 def together(shortfalls: Iterable[str]) -> str:

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: MIT
 """Base of layouts with depth images in one folder and colour images in another."""
 
+import re
 from collections.abc import Sequence
+from decimal import Decimal
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,7 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
+_NANOSECONDS = 19  # digits of a time of this century
 
 
 class DepthImages(Frames):
@@ -160,6 +164,20 @@ def color_images(depth: list[Path], where: Path, expected: str) -> list[Path]:
                 f"{where / image.stem}.png or .jpg is missing, but {image} is there; expected {expected}"
             )
     return [by_stem[image.stem] for image in depth]
+
+
+def time_of(name: str) -> int | None:
+    """Timestamp in a name, nanoseconds: of decimal seconds (TUM) or nanoseconds (EuRoC); None = neither."""
+    if re.fullmatch(r"\d+\.\d+", name, re.ASCII):
+        return int(Decimal(name) * 1_000_000_000)
+    return int(name) if re.fullmatch(rf"\d{{{_NANOSECONDS}}}", name, re.ASCII) else None
+
+
+def times_of(files: Sequence[Path]) -> NDArray[np.int64] | None:
+    """(n,) nanoseconds from the names of a recording's images; None unless all are times, in order."""
+    stamps = [stamp for file in files if (stamp := time_of(file.stem)) is not None]
+    in_order = len(stamps) == len(files) and all(a < b for a, b in pairwise(stamps))
+    return np.array(stamps, dtype=np.int64) if in_order else None
 
 
 def poses_by_number(

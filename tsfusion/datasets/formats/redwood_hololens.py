@@ -13,8 +13,10 @@ from tsfusion.datasets.formats.image_folders import (
     depth_images,
     first_size,
     poses_by_number,
+    times_of,
 )
-from tsfusion.datasets.trajectory_files import read_log, read_matrix_rows
+from tsfusion.datasets.given_trajectory import poses_of
+from tsfusion.datasets.trajectory_files import is_log, read_log, read_matrix_rows
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
@@ -110,12 +112,12 @@ class Redwood(DepthImages):
     http://redwood-data.org and Open3D's reconstruction system: `depth/` beside `image/`, `color/` or `rgb/`,
     or Redwood's own `NAME-depth-clean/`, `NAME-color/`, `NAME-traj.txt`. With as many poses as images the
     k-th pose is the k-th image's; otherwise a pose's number is its image's file name. Poses without an image
-    are ignored. No timestamps.
+    are ignored. Images named by their seconds or nanoseconds have times, others none.
 
     Args:
         path: the folder, or the `.log` in it to take the poses from.
         trajectory: default `trajectory.log`, `scene/trajectory.log`, `odometry.log` or the one file named
-            `*traj*.log` or `*-traj.txt`.
+            `*traj*.log` or `*-traj.txt`; a file of another SLAM in TUM's or KITTI's format too.
         intrinsics, calibration: default a file of the camera in the folder (`cameras.FILES`); for recordings
             that Redwood and Open3D distribute, known by their names, at 640×480 else 525, 525, 319.5, 239.5.
         depth_scale: metres per unit; default 0.001, and 1 for floats.
@@ -148,7 +150,7 @@ class Redwood(DepthImages):
         if log is None and posed:
             raise DatasetError(f"{root} has no trajectory; expected {REDWOOD_EXPECTED}; {SCAN}")
         skipped: dict[str, int] = {}
-        found = [None] * len(files) if log is None else poses_by_number(files, read_log(log), log)
+        found = _poses(files, log, posed=posed)
         depth, poses = keep_posed(files, found, posed=posed, skipped=skipped)
         require_frames(len(depth), root, REDWOOD_EXPECTED, skipped)
         where = _color_folder(root)
@@ -165,7 +167,17 @@ class Redwood(DepthImages):
             camera=camera,
             skipped=skipped,
             depth_scale=depth_scale,
+            timestamps_ns=times_of(depth),
         )
+
+
+def _poses(files: list[Path], path: Path | None, *, posed: bool) -> list[Transform | None]:
+    """Of a `.log` by number; of another trajectory by time, or one an image."""
+    if path is None:
+        return [None] * len(files)
+    if is_log(path):
+        return poses_by_number(files, read_log(path), path)
+    return poses_of(path, len(files), times_of(files), posed=posed)
 
 
 def _root_of(log: Path) -> Path | None:

@@ -13,7 +13,7 @@ from tsfusion.datasets.cameras import PublishedCamera, find_camera
 from tsfusion.datasets.dataset import SCAN, keep_posed, require_folder, require_frames
 from tsfusion.datasets.formats.image_folders import DepthImages, first_size
 from tsfusion.datasets.formats.tum_lists import ASSOCIATIONS, read_recording
-from tsfusion.datasets.trajectory_files import read_tum
+from tsfusion.datasets.given_trajectory import poses_of
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.se3 import Transform
 
@@ -107,8 +107,9 @@ class TUM(DepthImages):
         poses = _poses_at(
             listed.timestamps_ns,
             _trajectory(root, trajectory, posed=posed),
-            max_gap_ns=round(max_gap_s * 1e9),
-            offset_ns=round(time_offset_s * 1e9),
+            posed=posed,
+            max_gap_s=max_gap_s,
+            time_offset_s=time_offset_s,
         )
         chosen, poses = keep_posed(
             range(len(poses)), poses, posed=posed, skipped=skipped, reason="without a pose in time"
@@ -140,12 +141,13 @@ class TUM(DepthImages):
 
 
 def _poses_at(
-    stamps_ns: list[int], trajectory: Path | None, *, max_gap_ns: int, offset_ns: int
+    stamps_ns: list[int], trajectory: Path | None, *, posed: bool, max_gap_s: float, time_offset_s: float
 ) -> list[Transform | None]:
     if trajectory is None:
         return [None] * len(stamps_ns)
-    poses = read_tum(trajectory)
-    return [poses.at(stamp + offset_ns, max_gap_ns=max_gap_ns) for stamp in stamps_ns]
+    return poses_of(
+        trajectory, len(stamps_ns), stamps_ns, posed=posed, max_gap_s=max_gap_s, time_offset_s=time_offset_s
+    )
 
 
 def _trajectory(root: Path, given: str | Path | None, *, posed: bool) -> Path | None:

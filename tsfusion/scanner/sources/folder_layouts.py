@@ -29,7 +29,6 @@ _ANY_IMAGE, _DEPTH, _SCAN = (re.compile(rf"([^.].*){ending}") for ending in _END
 _FLAT_DEPTH, _FLAT_COLOR = re.compile(r"(frame-.+)\.depth\.png"), re.compile(rf"(frame-.+)\.color{_IMAGES}")
 _PNG_END, _JPEG_END = b"\0\0\0\0IEND\xaeB`\x82", b"\xff\xd9"
 _POINT = 16  # bytes: x, y, z and intensity in float32
-_NANOSECONDS = 19  # digits of a time of this century
 
 
 @dataclass(frozen=True)
@@ -82,13 +81,6 @@ def order(name: str) -> SortKey:
     """Sort key of names by their numbers: 9 before 10, 1.25 before 1.5."""
     parts = re.findall(r"([0-9]+(?:\.[0-9]+)?)|([^0-9]+)", name)
     return tuple((0, Decimal(number), "") if number else (1, Decimal(0), text) for number, text in parts)
-
-
-def time_of(name: str) -> int | None:
-    """Timestamp in a name, nanoseconds: of decimal seconds (TUM) or nanoseconds (EuRoC); None = neither."""
-    if re.fullmatch(r"\d+\.\d+", name, re.ASCII):
-        return int(Decimal(name) * 1_000_000_000)
-    return int(name) if re.fullmatch(rf"\d{{{_NANOSECONDS}}}", name, re.ASCII) else None
 
 
 def whole_image(path: Path, flags: int) -> NDArray[Any] | None:

@@ -22,6 +22,7 @@ from tsfusion.datasets.cameras import (
     find_camera,
 )
 from tsfusion.datasets.depth_files import check_metres, read_depth
+from tsfusion.datasets.formats.image_folders import time_of
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources import folder_layouts, stereo_pairs
@@ -296,7 +297,7 @@ class WatchedFolder(LiveSource):
     def _stamps(self, name: str, first: Path) -> tuple[int, int]:
         """`timestamp_ns`, which always grows, and `captured_ns`."""
         written_ns = first.stat().st_mtime_ns
-        self._stamp = max(folder_layouts.time_of(name) or written_ns, self._stamp + 1)
+        self._stamp = max(time_of(name) or written_ns, self._stamp + 1)
         own = written_ns >= self._opened_ns
         captured = monotonic_of(written_ns, oldest_s=_OLDEST_S) if own else time.monotonic_ns()
         return self._stamp, captured

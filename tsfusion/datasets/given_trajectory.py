@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: MIT
+"""Poses of another SLAM for a recording: by time where both have times, else one a frame, in order."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.datasets.dataset import Dataset, Frames, force_of, frame_of, keep_posed, require_frames
+from tsfusion.datasets.trajectory_files import read_poses, read_tum
+from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.se3 import Transform
+
+EXPECTED = "poses at the times of its frames"
+
+
+def poses_of(
+    path: Path,
+    count: int,
+    stamps_ns: Sequence[int] | NDArray[np.int64] | None,
+    *,
+    posed: bool,
+    max_gap_s: float = 0.2,
+    time_offset_s: float = 0.0,
+) -> list[Transform | None]:
+    """The (4, 4) T_world_camera of each of `count` frames, from a TUM, KITTI or Redwood `.log` file.
+
+    Args:
+        stamps_ns: times of the frames, nanoseconds; None = they have none.
+        posed: whether it is an error that the poses end before the frames begin, or the other way round.
+        max_gap_s: seconds between two poses at most; there is no pose in longer gaps.
+        time_offset_s: seconds to add to a frame's stamp before its pose is looked up.
+
+    Raises:
+        DatasetError: a missing or malformed file, times that do not meet, or without times in one
+            of both another number of poses than of frames.
+    """
+    times, poses = read_poses(path)
+    if times is None or stamps_ns is None:
+        if len(poses) != count:
+            timeless = path.name if times is None else "the recording"
+            raise DatasetError(
+                f"{path} has {len(poses)} poses for {count} frames, and {timeless} has no times to pair them "
+                "by: give one pose a frame, or times in both (TUM's format; images named by their seconds)"
+            )
+        return list(poses)
+    trajectory, offset = read_tum(path), round(time_offset_s * 1e9)
+    found = [trajectory.at(int(stamp) + offset, max_gap_ns=round(max_gap_s * 1e9)) for stamp in stamps_ns]
+    if posed and (times[-1] < stamps_ns[0] + offset or times[0] > stamps_ns[-1] + offset):
+        raise DatasetError(
+            f"{path} has no pose at the time of any frame: it covers {_span(times)}, the frames "
+            f"{_span(stamps_ns)}; expected one clock (--option time_offset_s=SECONDS is added to the frames)"
+        )
+    return found
+
+
+def pairs_by_time(path: Path, stamps_ns: NDArray[np.int64] | None) -> bool:
+    """Whether poses of a file and frames are paired by their times: both have them."""
+    return stamps_ns is not None and read_poses(path)[0] is not None
+
+
+class WithTrajectory(Frames):
+    """Another dataset's frames with the poses of a file.
+
+    Args:
+        posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
+        where: as of `poses_of`.
+    """
+
+    def __init__(self, dataset: Dataset, path: Path, *, posed: bool = True, **where: float) -> None:
+        self._dataset, self.skipped = dataset, dict(dataset.skipped)
+        self.name, self.sensor = dataset.name, dataset.sensor
+        self.camera = getattr(dataset, "camera", None)
+        found = poses_of(path, len(dataset), dataset.timestamps_ns, posed=posed, **where)
+        self._indices, self._poses = keep_posed(
+            range(len(dataset)), found, posed=posed, skipped=self.skipped, reason="without a pose in time"
+        )
+        require_frames(len(self._indices), path, EXPECTED, self.skipped)
+        if dataset.timestamps_ns is not None:
+            self.timestamps_ns = dataset.timestamps_ns[self._indices]
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def specific_force(self, index: int) -> NDArray[np.float64] | None:
+        return force_of(self._dataset, self._indices[self._checked(index)])
+
+    def _frame(self, index: int) -> Frame:
+        measured = frame_of(self._dataset, self._indices[index])
+        return dataclasses.replace(measured, T_world_camera=self._poses[index])
+
+
+def _span(stamps_ns: Sequence[int] | NDArray[np.int64]) -> str:
+    return f"{stamps_ns[0] / 1e9:.3f} to {stamps_ns[-1] / 1e9:.3f} s"
