@@ -1,19 +1,30 @@
 # SPDX-License-Identifier: MIT
-"""Own recordings made from real frames: the path alone gives the keyframes that were recorded."""
+"""Own recordings made from real frames: the path alone gives what was recorded, and the right mesh."""
 
+import socket
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import own_recordings
 import pytest
 import rosbag_scenes
+import trimesh
+from command_processes import COMMAND, DEADLINE, Here, end, environment, eventually, tsfusion
+from repository import ROOT
 
 from tsfusion import Keyframe, open_dataset
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets.trajectory_files import write_tum
+from tsfusion.evaluation.surface_error import nearest
 
 COUNT = 6
+MANY = 60  # frames of the recordings that are fused
 Data = Callable[[str], Path]
 Write = Callable[[Path, Sequence[Keyframe]], Path]
 
@@ -50,7 +61,11 @@ def poses_file(path: Path, form: str, kitchen: list[Keyframe]) -> Path:
     if form == "kitti":
         np.savetxt(path, [T[:3].ravel() for T in poses])
     else:
-        stamps = own_recordings.stamps_ns(COUNT) if form == "times" else [i * 10**9 for i in range(COUNT)]
+        stamps = (
+            own_recordings.stamps_ns(len(poses))
+            if form == "times"
+            else [i * 10**9 for i in range(len(poses))]
+        )
         write_tum(path, stamps, poses)
     return path
 
@@ -101,3 +116,123 @@ def test_a_scan_of_images_without_times_takes_one_pose_a_frame(
     assert settings == {"trajectory": None, "localizer": "given"}
     np.testing.assert_allclose(found, [kitchen[2].T_world_camera, kitchen[4].T_world_camera], atol=1e-6)
     assert "one a frame in order" in capsys.readouterr().err
+
+
+def test_the_list_of_datasets_says_why_one_cannot_be_opened(
+    kitchen: list[Keyframe], tmp_path: Path, here: Here
+) -> None:
+    own_recordings.images(tmp_path / "unknown", kitchen[:1], camera=False)
+    found = here("datasets", tmp_path / "unknown")
+    assert found.returncode == 1
+    assert "the camera of these 640×480 images is not known" in found.stderr
+    assert "no datasets in" not in found.stderr
+    lacking = own_recordings.tum(tmp_path / "lacking", kitchen[:2])
+    next((lacking / "depth").iterdir()).unlink()
+    found = here("datasets", lacking)
+    assert found.returncode == 1
+    assert "depth/17000000" in found.stderr
+    assert "no datasets in" not in found.stderr
+
+
+class Bound(NamedTuple):
+    """What a form's mesh may differ from that of the recording itself, millimetres."""
+
+    median: float
+    p95: float
+
+
+REPLAYED = Bound(0.1, 1.0)  # the same keyframes
+GIVEN = Bound(6.0, 30.0)  # fewer keyframes, the same poses
+LOCALISED = Bound(25.0, 80.0)  # own poses; the kitchen's are good to 30 mm
+PACE = 0.1  # seconds between frames of a sensor that is watched
+MESHES = dict.fromkeys(FORMS, REPLAYED) | {
+    "trajectory": REPLAYED, "scan": LOCALISED, "growing": LOCALISED, "feed": GIVEN,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def many(data: Data) -> list[Keyframe]:
+    return own_recordings.views(data("7scenes/redkitchen"), MANY, every=1)
+
+
+@pytest.fixture(scope="module")
+def reference(data: Data, tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
+    """(n, 3) vertices of the recording's own mesh."""
+    out = tmp_path_factory.mktemp("reference")
+    return vertices(out, fused("replay", data("7scenes/redkitchen"), "--max-frames", MANY, out=out))
+
+
+def fused(*words: object, out: Path) -> "subprocess.CompletedProcess[str]":
+    return tsfusion(*words, "--voxel-size", 0.02, "--out", out, "--overwrite")
+
+
+def vertices(out: Path, ended: "subprocess.CompletedProcess[str]") -> np.ndarray:
+    assert ended.returncode == 0, ended.stderr
+    assert "camera     fx 585 fy 585 cx 320 cy 240, 640×480, from" in ended.stdout
+    assert (out / "preview.png").stat().st_size > 50_000
+    return np.asarray(trimesh.load(out / "mesh.ply", process=False).vertices)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("form", MESHES)
+def test_the_mesh_of_every_form_is_that_of_the_recording(
+    many: list[Keyframe], reference: np.ndarray, tmp_path: Path, form: str
+) -> None:
+    root, out = tmp_path / "Küche süd", tmp_path / "out"
+    if form in FORMS:
+        ended = fused("replay", FORMS[form](root, many), out=out)
+    elif form in ("growing", "feed"):
+        ended = watched(root, out, many, feed=form == "feed")
+    else:
+        own_recordings.images(root, many, poses=False)
+        slam = poses_file(tmp_path / "slam.txt", "kitti", many)
+        given = ["replay", root, "--trajectory", slam] if form == "trajectory" else ["scan", root]
+        ended = fused(*given, out=out)
+    found = vertices(out, ended)
+    if MESHES[form] is LOCALISED:  # in the frame of its first camera
+        T = many[0].T_world_camera
+        found = found @ T[:3, :3].T + T[:3, 3]
+    distance = 1000 * nearest(found, reference)[0]
+    median, p95 = np.median(distance), np.percentile(distance, 95)
+    print(f"{form}: median {median:.2f}, p95 {p95:.2f} mm")
+    assert median <= MESHES[form].median
+    assert p95 <= MESHES[form].p95
+    assert np.median(nearest(reference, found)[0]) * 1000 <= MESHES[form].p95
+
+
+def unused_address() -> str:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+
+
+def watched(
+    root: Path, out: Path, views: list[Keyframe], *, feed: bool
+) -> "subprocess.CompletedProcess[str]":
+    """Scan a folder while a sensor writes it, and another SLAM sends the poses of its frames."""
+    root.mkdir()
+    log, address = root.parent / "log.txt", unused_address()
+    words = ["scan", f"folder:{root}", "--voxel-size", "0.02", "--out", str(out)]
+    slam = None
+    with ExitStack() as stack:
+        if feed:
+            words += ["--feed", address]
+            sender = [sys.executable, str(ROOT / "contrib" / "pose_sender.py"), address]
+            slam = stack.enter_context(subprocess.Popen(sender, stdin=subprocess.PIPE, text=True))
+            stack.callback(slam.stdin.close)
+        scan = subprocess.Popen(
+            [*COMMAND, *words], stdout=stack.enter_context(log.open("w")), stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL, env=environment(),
+        )  # fmt: skip
+        stack.callback(end, scan)
+        assert eventually(lambda: "no frames yet; waits for" in log.read_text(), DEADLINE)
+        for number, (view, stamp) in enumerate(zip(views, own_recordings.stamps_ns(len(views)), strict=True)):
+            if number == 1:  # the first frame brings the scanner up
+                assert eventually(lambda: "scanning folder" in log.read_text(), DEADLINE), log.read_text()
+            if slam is not None:
+                slam.stdin.write(own_recordings.tum_line(stamp, view))
+                slam.stdin.flush()
+            own_recordings.image(root, str(stamp), view)
+            time.sleep(PACE)
+        (root / "DONE").touch()
+        scan.wait(DEADLINE)
+    return subprocess.CompletedProcess(words, scan.returncode, log.read_text(), log.read_text())

@@ -13,6 +13,7 @@ from written_recordings import matrix, write
 from tsfusion.datasets import SevenScenes
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.trajectory import quaternion
 
 T0_NS, FRAME_NS = 1_700_000_000_000_000_000, 133_333_333
 KINECT = "585 0 320\n0 585 240\n0 0 1\n"
@@ -51,15 +52,28 @@ def tum(root: Path, views: Sequence[Keyframe], *, camera: bool = True) -> Path:
 def images(root: Path, views: Sequence[Keyframe], *, camera: bool = True, poses: bool = True) -> Path:
     """PNG folders of equal names, with the 3×3 matrix of the camera and Redwood's `trajectory.log`."""
     for number, view in enumerate(views):
-        assert view.color is not None
-        write(root / "depth" / f"{number:06d}.png", np.asarray(view.measurement))
-        write(root / "color" / f"{number:06d}.png", view.color)
-    if camera:
-        _camera_matrix(root / "camera-intrinsics.txt", views[0])
+        image(root, f"{number:06d}", view, camera=camera)
     if poses:
         rows = (f"{i} {i} {i + 1}\n{matrix(view.T_world_camera)}" for i, view in enumerate(views))
         (root / "trajectory.log").write_text("".join(rows))
     return root
+
+
+def image(root: Path, name: str, view: Keyframe, *, camera: bool = True) -> None:
+    """One frame of PNG folders, as a sensor adds it."""
+    assert view.color is not None
+    if camera and not (root / "camera-intrinsics.txt").exists():
+        root.mkdir(exist_ok=True, parents=True)
+        _camera_matrix(root / "camera-intrinsics.txt", view)
+    write(root / "depth" / f"{name}.png", np.asarray(view.measurement))
+    write(root / "color" / f"{name}.png", view.color)
+
+
+def tum_line(stamp_ns: int, view: Keyframe) -> str:
+    """A pose as a SLAM prints it: `seconds tx ty tz qx qy qz qw`."""
+    T = view.T_world_camera
+    row = " ".join(f"{x:.9f}" for x in (*T[:3, 3], *quaternion(T[:3, :3])))
+    return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d} {row}\n"
 
 
 def timed_images(root: Path, views: Sequence[Keyframe]) -> Path:

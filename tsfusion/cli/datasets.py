@@ -78,11 +78,23 @@ def _layouts() -> list[dict[str, Any]]:
     return [{"name": name, "description": description} for name, description in [*rows, SYNTHETIC]]
 
 
+def _is_one(path: Path) -> bool:
+    """Whether a path is in a known layout, or holds one such folder."""
+    from tsfusion.core.errors import DatasetError
+    from tsfusion.datasets.registry import find
+
+    try:
+        find(path)
+    except DatasetError:
+        return False
+    return True
+
+
 def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
     """The datasets in and under a folder; a dataset is not searched for others.
 
     Raises:
-        DatasetError: when there is no folder.
+        DatasetError: there is no folder, or it is a dataset that cannot be opened.
     """
     from tsfusion.core.errors import DatasetError, MissingDependency
     from tsfusion.datasets import open_dataset
@@ -91,21 +103,21 @@ def _found(path: Path, depth: int) -> Iterator[dict[str, Any]]:
     for posed in (True, False):
         try:
             dataset = open_dataset(path, posed=posed)
-        except MissingDependency as error:
-            typer.echo(f"{path}: {error}", err=True)
+        except (MissingDependency, UnknownCamera) as error:
+            if depth == _DEPTH:
+                raise
+            typer.echo(f"{path}: {error}" if isinstance(error, MissingDependency) else str(error), err=True)
             return
-        except UnknownCamera as error:
-            typer.echo(str(error), err=True)
-            return
-        except DatasetError:
+        except DatasetError as error:
+            failure = error
             continue
         yield {
             "path": str(path), "name": dataset.name, "sensor": dataset.sensor,
             "keyframes": len(dataset), "posed": posed, "camera": camera_line(dataset),
         }  # fmt: skip
         return
-    if not path.is_dir():
-        open_dataset(path)
+    if depth == _DEPTH and (not path.is_dir() or _is_one(path)):
+        raise failure
     for child in _folders_in(path) if depth else []:
         yield from _found(child, depth - 1)
 

@@ -64,7 +64,7 @@ def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
     if result.keyframes_rejected:
         lines.append(f"not in map {explained(result.keyframes_rejected)}")
     for found in result.maps:
-        lines += _map_lines(found)
+        lines += _map_lines(found, given=result.localizer == "given")
     if result.left:
         why = f" ({result.link})" if result.link else ""
         lines.append(
@@ -117,11 +117,12 @@ def check(run: "ReplaySummary | ScanSummary") -> None:
         raise IncompleteRun(run.missed)
 
 
-def _map_lines(found: "MapResult") -> list[str]:
+def _map_lines(found: "MapResult", *, given: bool) -> list[str]:
+    """A map in a few lines; poses that were given have no error against themselves."""
     lines = [f"map        {found.name}: {found.frames} frames, {found.keyframes} keyframes"]
     if found.mesh:
         lines += mesh_lines(found.mesh)
-    if found.trajectory_error is not None:
+    if found.trajectory_error is not None and not given:
         lines.append(f"ATE        {_ate(found.trajectory_error)}")
     if found.corrected_error is not None:
         lines.append(f"  loops    {_ate(found.corrected_error)} ({found.loops} loops)")
