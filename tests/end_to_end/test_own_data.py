@@ -100,6 +100,8 @@ def test_poses_that_cannot_be_paired_are_an_error_that_says_so(
     other = poses_file(tmp_path / "other.txt", "numbers", kitchen)
     with pytest.raises(DatasetError, match=r"no pose at the time of any frame: .* expected one clock"):
         open_dataset(timed, trajectory=other)
+    late = open_dataset(timed, trajectory=other, time_offset_s=-own_recordings.T0_NS / 1e9)
+    assert len(late) == 1  # the poses are a second apart
 
 
 @pytest.mark.parametrize("poses", ["kitti", "numbers"])

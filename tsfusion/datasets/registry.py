@@ -160,6 +160,7 @@ def open_as(name: str, opener: Callable[..., Dataset], options: dict[str, Any]) 
     if plugins.takes(opener, "posed"):
         options["posed"] = False
     where = {key: options[key] for key in ("max_gap_s", "time_offset_s") if options.get(key) is not None}
+    options = {key: value for key, value in options.items() if key not in where or plugins.takes(opener, key)}
     dataset = plugins.call(opener, options, name=f"a {name} dataset", error=DatasetError)
     return WithTrajectory(dataset, Path(trajectory).expanduser(), posed=posed, **where)
 

@@ -121,6 +121,7 @@ class Redwood(DepthImages):
         intrinsics, calibration: default a file of the camera in the folder (`cameras.FILES`); for recordings
             that Redwood and Open3D distribute, known by their names, at 640×480 else 525, 525, 319.5, 239.5.
         depth_scale: metres per unit; default 0.001, and 1 for floats.
+        time_offset_s: added to an image's time before its pose is looked up, seconds.
         posed: leave out frames without a pose; else they are kept, with `T_world_camera` None.
 
     Raises:
@@ -135,6 +136,7 @@ class Redwood(DepthImages):
         intrinsics: Intrinsics | None = None,
         calibration: str | Path | None = None,
         depth_scale: float | None = None,
+        time_offset_s: float = 0.0,
         sensor: str = "kinect",
         color: bool = True,
         posed: bool = True,
@@ -150,7 +152,7 @@ class Redwood(DepthImages):
         if log is None and posed:
             raise DatasetError(f"{root} has no trajectory; expected {REDWOOD_EXPECTED}; {SCAN}")
         skipped: dict[str, int] = {}
-        found = _poses(files, log, posed=posed)
+        found = _poses(files, log, posed=posed, time_offset_s=time_offset_s)
         depth, poses = keep_posed(files, found, posed=posed, skipped=skipped)
         require_frames(len(depth), root, REDWOOD_EXPECTED, skipped)
         where = _color_folder(root)
@@ -171,13 +173,15 @@ class Redwood(DepthImages):
         )
 
 
-def _poses(files: list[Path], path: Path | None, *, posed: bool) -> list[Transform | None]:
+def _poses(
+    files: list[Path], path: Path | None, *, posed: bool, time_offset_s: float
+) -> list[Transform | None]:
     """Of a `.log` by number; of another trajectory by time, or one an image."""
     if path is None:
         return [None] * len(files)
     if is_log(path):
         return poses_by_number(files, read_log(path), path)
-    return poses_of(path, len(files), times_of(files), posed=posed)
+    return poses_of(path, len(files), times_of(files), posed=posed, time_offset_s=time_offset_s)
 
 
 def _root_of(log: Path) -> Path | None:
