@@ -175,7 +175,7 @@ def _open(
     dataset = open_recording(path, **recording | camera | given, posed=False)
     if settings["trajectory"] is not None:
         trajectory = Path(settings["trajectory"]).expanduser()
-        if not pairs_by_time(trajectory, dataset.timestamps_ns):
+        if not pairs_by_time(trajectory, dataset):
             dataset = WithTrajectory(dataset, trajectory)
             settings |= {"trajectory": None, "localizer": "given"}
             typer.echo(f"poses: {trajectory}, one a frame in order, as not both have times", err=True)

@@ -57,9 +57,13 @@ def poses_of(
     return found
 
 
-def pairs_by_time(path: Path, stamps_ns: NDArray[np.int64] | None) -> bool:
-    """Whether poses of a file and frames are paired by their times: both have them."""
-    return stamps_ns is not None and read_poses(path)[0] is not None
+def pairs_by_time(path: Path, dataset: Dataset) -> bool:
+    """Whether a scan pairs poses and frames by their times: both have them.
+
+    Frames without times have a scan's nominal ones; as many poses as frames are theirs in order.
+    """
+    times, poses = read_poses(path)
+    return times is not None and (dataset.timestamps_ns is not None or len(poses) != len(dataset))
 
 
 class WithTrajectory(Frames):
