@@ -38,6 +38,8 @@ class Run:
 class SlowClient:
     """A client that never hears of its last keyframe."""
 
+    is_of_other_world = False
+
     def flush(self) -> None:
         raise FlushTimeout("late")
 
