@@ -40,6 +40,10 @@ class SlowClient:
 
     is_of_other_world = False
 
+    @property
+    def stats(self) -> ClientStats:
+        return stats(5, 5)
+
     def flush(self) -> None:
         raise FlushTimeout("late")
 
