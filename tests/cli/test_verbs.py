@@ -18,7 +18,7 @@ from tsfusion.cli import verbs
 from tsfusion.core.errors import OutputError
 from tsfusion.datasets import Dataset
 
-WIDTH, MOST_LINES = 100, 40
+WIDTH, MOST_LINES = 80, 40  # a terminal as it opens
 
 
 def commands(command: Any, *names: str) -> Iterator[tuple[tuple[str, ...], Any]]:

@@ -86,6 +86,33 @@ def test_the_connection_after_a_cut_is_news_as_well() -> None:
             assert connection.is_made
 
 
+def test_a_lost_server_is_named_once_and_so_is_its_return(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", logger="tsfusion")
+    with scripted() as server, joined(server, config=PATIENT) as client:
+        send_all(client, range(3))
+        client.flush(DEADLINE)
+        server.stop()
+        until(lambda: "is gone; keyframes wait in" in caplog.text)
+        send_all(client, range(3, 5))
+        assert "again" not in caplog.text
+        server.start()
+        client.flush(DEADLINE)
+        until(lambda: "answers again; 2 keyframes wait for it" in caplog.text)
+        assert caplog.text.count("is gone") == 1
+
+
+def test_a_silent_server_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO", logger="tsfusion")
+    impatient = ClientConfig(stall_timeout=2.0)
+    with scripted() as server, joined(server, config=impatient) as client:
+        send_all(client, range(3))
+        client.flush(DEADLINE)
+        server.deaf = True
+        until(lambda: "is silent; keyframes wait in" in caplog.text)
+        server.deaf = False
+        until(lambda: "answers again; 0 keyframes wait" in caplog.text)
+
+
 def test_a_server_that_comes_and_goes_gets_everything_once() -> None:
     with scripted() as server, joined(server, config=PATIENT) as client:
         for life in range(4):

@@ -88,6 +88,33 @@ def room() -> tuple[Mesh, list[np.ndarray]]:
     return volume.extract_mesh(), [one.T_world_camera for one in keyframes]
 
 
+def test_a_volume_knows_up_and_keeps_it(tmp_path: Path) -> None:
+    first, *others = first_views(6)
+    volume = Volume(voxel_size=0.06)
+    assert volume.extract_mesh().up is None
+    volume.integrate(first)
+    before = volume.held.numbers
+    for keyframe in others:
+        volume.integrate(keyframe)
+    up = volume.extract_mesh().up
+    assert (up.axis, up.found_by) == ("+z", "floor")
+    loaded = Volume.load(volume.save(tmp_path / "map.tsf"))
+    assert (loaded.extract_mesh().up, loaded.meta) == (up, {})
+    box = trimesh.load(loaded.extract_mesh().save(tmp_path / "room.glb"), force="mesh").extents
+    assert box[1] == pytest.approx(np.ptp(loaded.extract_mesh().vertices[:, 2]), abs=0.06)
+    for keyframe in reversed(others):
+        volume.retract(keyframe)
+    assert volume.held.numbers == before
+
+
+def test_of_points_without_a_sensor_nobody_knows_the_axes() -> None:
+    volume = Volume(voxel_size=0.1)
+    points = np.random.default_rng(1).uniform(-1, 1, (100, 3)).astype(np.float32) + np.float32((0, 0, 3))
+    volume.integrate(points=points, T_world_camera=np.eye(4))
+    assert volume.keyframes == 1
+    assert not any(volume.held.numbers)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_turned_room(room: tuple[Mesh, list[np.ndarray]], seed: int) -> None:
     mesh, poses = room

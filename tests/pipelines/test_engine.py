@@ -38,6 +38,12 @@ class Run:
 class SlowClient:
     """A client that never hears of its last keyframe."""
 
+    is_of_other_world = False
+
+    @property
+    def stats(self) -> ClientStats:
+        return stats(5, 5)
+
     def flush(self) -> None:
         raise FlushTimeout("late")
 

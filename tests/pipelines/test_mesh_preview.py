@@ -142,10 +142,12 @@ def test_a_picture_is_held_by_the_mesh_s_up(tmp_path) -> None:
     room = box_room((4.0, 3.0, 2.8))
     up = Up((0.0, -1.0, 0.0), "given")
     back = up.to_y().T @ parse("z").to_y()  # takes +z to that up
-    lying = Mesh(np.float32(room.vertices @ back.T), room.faces, np.float32(room.normals @ back.T), up=up)
+    lying = Mesh(
+        np.float32(room.vertices @ back.T), room.faces, np.float32(room.normals @ back.T), known_up=up
+    )
     pictures = [
         cv2.imread(str(mesh_preview.render(mesh, tmp_path / f"{number}.png", width=96, height=60)))
-        for number, mesh in enumerate((room, lying, dataclasses.replace(lying, up=None)))
+        for number, mesh in enumerate((room, lying, dataclasses.replace(lying, known_up=None)))
     ]
     stands, lies, unknown = (cv2.resize(each, (12, 8), interpolation=cv2.INTER_AREA) for each in pictures)
     assert np.abs(stands - 1.0 * lies).mean() < 0.5 * np.abs(stands - 1.0 * unknown).mean()

@@ -144,7 +144,7 @@ mesh garbage.tsf /proc/a.ply | cannot write /proc/a.ply | choose another place
 mesh garbage.tsf folder.ply | it is a folder | choose another name
 mesh garbage.tsf a.ply --preview a.gif | cannot write a.gif | a name ending in .png
 # servers that are not there, or are no servers
-replay synthetic:room --connect {nobody} --config quick.toml | no server answers at tcp://127.0.0.1:10 | is `tsfusion serve` running there
+replay synthetic:room --connect {nobody} --config quick.toml | no server answers at tcp://127.0.0.1:9 (control tcp://127.0.0.1:10) | is `tsfusion serve` running there
 replay synthetic:room --connect {busy} --config quick.toml | no server answers at | is `tsfusion serve` running there
 replay synthetic:room --connect tcp://no-such-host.invalid:5555 --config quick.toml | no server answers at tcp://no-such-host | is the port right?
 replay synthetic:room --connect 127.0.0.1:5555 | got '127.0.0.1:5555' | an address looks like tcp://127.0.0.1:5555

@@ -43,8 +43,8 @@ app = typer.Typer(
     cls=verbs.Group,
     help="Depth sensors in, one exact 3-D map out.",
     epilog=(
-        "Every flag can be set by an environment variable: --voxel-size by TSFUSION_VOXEL_SIZE, and so on. "
-        "Every setting stands in the file that `tsfusion config dump` writes."
+        "Each flag is an environment variable, too: TSFUSION_VOXEL_SIZE for --voxel-size. "
+        "`tsfusion config dump` writes every setting."
     ),
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -74,7 +74,7 @@ verbs.verb(app, "tsfusion download", "tsfusion download tum-fr1-xyz --to dataset
 )
 verbs.verb(
     app, "tsfusion serve --state my-maps --voxel-size 0.02",
-    "tsfusion serve --listen tcp://0.0.0.0:5555 --keys tsfusion-keys --state my-maps", panel=SERVER,
+    "tsfusion serve --listen tcp://0.0.0.0:5555 --keys tsfusion-keys", panel=SERVER,
 )(serve.serve)  # fmt: skip
 verbs.verb(
     app, "tsfusion status --watch 1", "tsfusion status --connect tcp://server:5555 --json", panel=SERVER

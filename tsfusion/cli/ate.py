@@ -34,7 +34,7 @@ def ate(
     option: options.DatasetOptions = None,
     json: options.Json = False,
 ) -> None:
-    """Print the absolute trajectory error (ATE): an estimate against the truth."""
+    """Print the absolute trajectory error (ATE) of an estimate."""
     from tsfusion.cli import output
     from tsfusion.core.output_folder import check_writable
     from tsfusion.evaluation import trajectory_error

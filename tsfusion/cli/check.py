@@ -25,7 +25,7 @@ def check(
     json: options.Json = False,
     help_all: verbs.HelpAll = None,
 ) -> None:
-    """Check that a dataset's poses, camera and depth agree, and say what is wrong if not.
+    """Check that poses, camera and depth agree, and say what is wrong.
 
     Exit status 1 when they disagree; 0 when they agree, and when nobody can tell.
     """

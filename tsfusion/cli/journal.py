@@ -23,7 +23,7 @@ _MOST_LINES = 20  # printed of one kind; --json has all
 
 app = typer.Typer(
     cls=verbs.Group,
-    help="Describe a journal, check it, save its whole keyframes, export it to other tools.\n\n"
+    help="Describe, check, rescue or export the keyframes of a journal.\n\n"
     "None of this changes a journal, and all of it works while a server runs.",
 )
 

@@ -11,7 +11,6 @@ from tsfusion.cli import options
 
 if TYPE_CHECKING:
     from tsfusion.core.config import VolumeConfig
-    from tsfusion.geometry.up_direction import HeldSensor
     from tsfusion.journal.recording import JournalRecording
     from tsfusion.tsdf.volume import Volume
 
@@ -46,7 +45,6 @@ def mesh(
     from dataclasses import replace
 
     from tsfusion.core.output_folder import check_writable
-    from tsfusion.geometry import up_direction
     from tsfusion.geometry.mesh import FORMATS
     from tsfusion.pipelines import mesh_files
 
@@ -67,7 +65,6 @@ def mesh(
             source, control=control, map_name=map_ or DEFAULT_MAP, min_weight=settings["min_weight"],
             keys=client_keys(key, server_key),
         )  # fmt: skip
-        made = replace(made, up=given_up or made.up)
     else:
         options.refuse(
             context, ("control", "key", "server_key"),
@@ -82,25 +79,20 @@ def mesh(
         given = config is not None or any(
             value is not None for name, value in settings.items() if name not in options.VIEW_OPTIONS
         )
-        volume, held = _volume(Path(source), chosen.volume, name=map_, given=given, quiet=json)
+        volume = _volume(Path(source), chosen.volume, name=map_, given=given, quiet=json)
         made = volume.extract_mesh()
-        made = replace(made, up=up_direction.find(made, held, given=given_up))
+    if given_up is not None:
+        made = replace(made, known_up=given_up)
     files = [out] if preview is None else [out, preview]
     left_out = mesh_files.write(made, files, keep_islands=keep_islands)
     written = made.without_islands() if out.name in left_out["files"] else made
     _print_result(out, {**written.figures, "left_out": left_out}, json)
 
 
-def _volume(
-    source: Path, config: "VolumeConfig", *, name: str | None, given: bool, quiet: bool
-) -> tuple["Volume", "HeldSensor"]:
-    """The saved map where it is complete; otherwise a new map of every keyframe of the journal.
-
-    With it how its sensors were held.
-    """
+def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bool, quiet: bool) -> "Volume":
+    """The saved map where it is complete; otherwise a new map of every keyframe of the journal."""
     from tsfusion.core.config import VIEW_SETTINGS
     from tsfusion.core.errors import DatasetError
-    from tsfusion.geometry.up_direction import HeldSensor
     from tsfusion.tsdf.volume import Volume
 
     view = {name: getattr(config, name) for name in VIEW_SETTINGS}
@@ -110,38 +102,35 @@ def _volume(
     from tsfusion.journal.recording import JournalRecording
 
     if source.suffix == ".tsf":
-        volume = Volume.load(source, config.threads, **view)
-        return volume, HeldSensor(volume.meta.get("held"))
+        return Volume.load(source, config.threads, **view)
     source = state_folder.resolve_map(source, name)
     recording = JournalRecording(source)
     saved = source / state_folder.MAP_FILE
     if saved.is_file() and not given:
         volume = Volume.load(saved, config.threads, **view)
         if volume.keyframes + sum(volume.meta.get("rejected", {}).values()) == len(recording):
-            return volume, HeldSensor(volume.meta.get("held"))
+            return volume
         config = volume.config  # the server died before it saved the rest
     return _fuse(recording, Volume(config), quiet)
 
 
-def _fuse(recording: "JournalRecording", volume: "Volume", quiet: bool) -> tuple["Volume", "HeldSensor"]:
+def _fuse(recording: "JournalRecording", volume: "Volume", quiet: bool) -> "Volume":
     """Add every keyframe; one that the map cannot take is counted and left out, as in the server."""
     from tsfusion.cli import progress
     from tsfusion.core.errors import MapError
-    from tsfusion.geometry.up_direction import HeldSensor
 
-    left_out, held = Counter[str](), HeldSensor()
+    left_out = Counter[str]()
     with progress.shown(quiet=quiet) as display:
         display.stage(f"fusing {recording.name}")
         for index, keyframe in enumerate(recording, 1):
             try:
                 volume.integrate(keyframe)
-                held.add(keyframe.T_world_camera, keyframe.sensor or recording.sensor)
             except MapError as error:
                 left_out[str(error)] += 1
             display.update(index, volume.keyframes, len(recording))
     for reason, count in left_out.items():
         typer.echo(f"left out {count} keyframes: {reason}", err=True)
-    return volume, held
+    return volume
 
 
 def _print_result(out: Path, figures: dict[str, Any], json: bool) -> None:

@@ -76,15 +76,13 @@ def takes_map_settings(verb: Callable[..., Any], also: dict[str, Any] | None = N
 ConfigFile = Annotated[Path | None, option("--config", "FILE", "TOML; `tsfusion config dump` writes one.")]
 Out = Annotated[
     Path | None,
-    option("--out", "DIR", "Folder for the results; default: out/DATE_TIME, and out/latest."),
+    option("--out", "DIR", "Folder of results; default: a dated one."),
 ]
 Overwrite = Annotated[
     bool, option("--overwrite", None, "Replace the results that --out holds already.", rare=True)
 ]
-State = Annotated[Path | None, option("--state", "DIR", "Keep journal and map of the run's own server here.")]
-Connect = Annotated[
-    str | None, option("--connect", "ADDRESS", "Send to this server instead of one of the run's own.")
-]
+State = Annotated[Path | None, option("--state", "DIR", "Keep the journal and the map here.")]
+Connect = Annotated[str | None, option("--connect", "ADDRESS", "Send to this server, not to its own.")]
 Control = Annotated[
     str | None,
     option("--control", "ADDRESS", "Its control address; else the port after the other.", rare=True),
@@ -92,7 +90,7 @@ Control = Annotated[
 Map = Annotated[str | None, option("--map", "NAME", "Which of the server's maps; else default.")]
 NewMap = Annotated[
     str | None,
-    option("--map", "NAME", "Which of the server's maps; else default; auto = the next free one."),
+    option("--map", "NAME", "Map of the server; auto = next free one."),
 ]
 SameFrame = Annotated[
     bool, option("--same-frame", None, "The poses are in the frame of the map that is there.", rare=True)
@@ -117,18 +115,20 @@ Rate = Annotated[
     float | None,
     _rare_option("--rate", "HZ", "So many a second; default: as fast as they are taken.", min=1e-3),
 ]
-Trajectory = Annotated[Path | None, option("--trajectory", "FILE", "Poses instead of the recording's own.")]
+Trajectory = Annotated[
+    Path | None, option("--trajectory", "FILE", "Poses of another SLAM: TUM's or KITTI's.")
+]
 Sequence = Annotated[str | None, _rare_option("--sequence", "NN", "KITTI: which sequence.")]
 Modality = Annotated[str | None, _rare_option("--modality", "KIND", "KITTI: stereo or lidar.")]
 DatasetOptions = Annotated[
     list[str] | None,
-    option("--option", "KEY=VALUE", "A setting of the layout, such as depth_topic=/depth."),
+    option("--option", "KEY=VALUE", "Setting of a layout: depth_topic=/depth."),
 ]
 Calibration = Annotated[
-    Path | None, option("--calibration", "FILE", "The camera's file, instead of the recording's own.")
+    Path | None, option("--calibration", "FILE", "Camera file, instead of the recording's.")
 ]
 Intrinsics = Annotated[
-    str | None, option("--intrinsics", "FX,FY,CX,CY", "The camera in pixels, instead of the recording's own.")
+    str | None, option("--intrinsics", "FX,FY,CX,CY", "Camera in pixels, instead of its own.")
 ]
 Unpack = Annotated[bool, _rare_option("--unpack", None, "Unpack an archive beside itself.")]
 UpDirection = Annotated[str | None, _map_option("--up", "AXIS", "Which way is up: z, -y, … or X,Y,Z.")]

@@ -53,7 +53,7 @@ def replay(
     json: options.RunJson = False,
     **settings: Any,
 ) -> None:
-    """Fuse a recording that has poses, or a journal: mesh, picture and figures."""
+    """Fuse a recording that has poses, or a journal: mesh and figures."""
     from tsfusion.datasets import select
 
     # Any server makes a mesh with another `min_weight`.
@@ -144,7 +144,7 @@ def demo(
     json: options.RunJson = False,
     **settings: Any,
 ) -> None:
-    """Scan a synthetic world, and measure how far the mesh is from its true surface."""
+    """Scan a synthetic world, and measure the error of its mesh."""
     chosen = options.configuration(config, preset=_STREET if world == "street" else None, **settings)
     from tsfusion.datasets import Synthetic
 

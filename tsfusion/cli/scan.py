@@ -24,11 +24,11 @@ _keyframe_option = partial(options.option, panel="Keyframes", rare=True)
 # By name: settings of the `scan` table.
 SCAN_OPTIONS: dict[str, Any] = {
     "localizer": Annotated[str | None, options.option(
-        "--localizer", "NAME", "rgbd, stereo, lidar; given: the recording's own poses.")],
+        "--localizer", "NAME", "rgbd, stereo, lidar; given: its poses.")],
     "trajectory": Annotated[str | None, options.option(
-        "--trajectory", "FILE", "Poses of another SLAM, in TUM's or KITTI's format.")],
+        "--trajectory", "FILE", "Poses of another SLAM: TUM's or KITTI's.")],
     "feed": Annotated[str | None, options.option(
-        "--feed", "ADDRESS", "Poses of another SLAM while it runs: tcp://HOST:PORT.")],
+        "--feed", "ADDRESS", "Live poses of a SLAM: tcp://HOST:PORT.")],
     "time_offset": Annotated[float | None, _pose_option(
         "--time-offset", "SECONDS", "Added to a frame's time before its pose is looked up.")],
     "max_gap": Annotated[float | None, _pose_option(
@@ -56,10 +56,7 @@ def scan(
     context: typer.Context,
     source: Annotated[
         str,
-        typer.Argument(
-            metavar="PATH|SOURCE",
-            help="A recording, or live: realsense, camera:0, folder:PATH.",
-        ),
+        typer.Argument(metavar="PATH|SOURCE", help="A recording, realsense, camera:0, folder:PATH."),
     ],
     *,
     out: options.Out = None,
@@ -96,7 +93,7 @@ def scan(
     json: options.RunJson = False,
     **settings: Any,
 ) -> None:
-    """Localise a sensor and fuse its keyframes; Ctrl-C ends the scan and keeps its results."""
+    """Localise a sensor and fuse its keyframes until the end or Ctrl-C."""
     remote = {"spool", *options.only_for_kept_maps(state)}
     options.check_target_flags(context, connect, own={*options.MAP_OPTIONS, "state"}, remote=remote)
     if connect is not None:

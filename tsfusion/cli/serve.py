@@ -26,15 +26,15 @@ def _flag(flag: str, metavar: str, help_: str) -> Any:
 
 # By name: settings of the `server` table.
 SERVER_OPTIONS: dict[str, Any] = {
-    "listen": _flag("--listen", "ADDRESS", "Address for keyframes; port 0 = any free port."),
-    "control": _flag("--control", "ADDRESS", "Address for commands; default: the next port."),
-    "state": _flag("--state", "DIR", "Folder of journals and maps; those there are continued."),
+    "listen": _flag("--listen", "ADDRESS", "Address for keyframes; port 0 = a free one."),
+    "control": _flag("--control", "ADDRESS", "Address for commands; else the next port."),
+    "state": _flag("--state", "DIR", "Folder of journals and maps, continued."),
     "metrics": _flag("--metrics", "HOST:PORT",
-                     "Address for Prometheus and health checks, such as 127.0.0.1:9464; this machine only."),
+                     "Prometheus and health checks, such as at 127.0.0.1:9464."),
     "log_format": _flag("--log-format", "FORMAT", "Log on stderr as text or json."),
     "log_level": _flag("--log-level", "LEVEL", "Log from debug, info, warning or error on."),
     "keys": _flag("--keys", "DIR",
-                  "Let only those connect whom `tsfusion keys allow` named; needed beyond this machine."),
+                  "Who may connect: `tsfusion keys`; needed beyond this machine."),
 }  # fmt: skip
 
 
@@ -46,7 +46,7 @@ def serve(
     until_eof: Annotated[bool, typer.Option("--until-eof", hidden=True)] = False,
     **settings: Any,
 ) -> int:
-    """Fuse keyframes that scanners send; Ctrl-C or SIGTERM saves the maps and ends.
+    """Fuse what scanners send, until Ctrl-C or SIGTERM saves the maps.
 
     A line with `ready` is printed once keyframes may come: every kernel is compiled by then.
     """

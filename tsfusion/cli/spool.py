@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     cls=verbs.Group,
-    help="""List, send or delete keyframes that wait on this machine for a server.
+    help="""List, send or delete keyframes that wait here for a server.
 
     A scan to a server writes each keyframe to a spool first, and the server's acknowledgement takes it out.
     What a server did not have at the end of a scan stays there. The next scan sends it to the map it was made

@@ -39,7 +39,7 @@ def status(
     json: options.Json = False,
     help_all: verbs.HelpAll = None,
 ) -> int:
-    """Ask a running server how it is: its maps, its clients, and what is wrong.
+    """Ask a server how it is: its maps, its clients, and what is wrong.
 
     Exit status, for health checks: 0 = ready; 1 = nobody answers; 2 = wrong usage; 3 = it answers, but is not
     ready, or a map is stalled (it takes --stall-after seconds to be sure of that).

@@ -9,12 +9,13 @@ from typer.core import TyperCommand, TyperGroup
 
 PREFIX = "TSFUSION_"
 RENAMED = {"--max-keyframes": "--max-frames", "--poses": "--trajectory"}  # understood until version 0.3
+_ALL = "tsfusion.help_all"  # in a context's notes: --help-all was asked for
 
 _Verb = TypeVar("_Verb", bound=Callable[..., Any])
 
 
 class _ShortHelp:
-    """Help without the type of switches, and with the names of environment variables left out."""
+    """Help in few lines: no type of a switch, no second name of a flag, no environment variable."""
 
     def get_params(self, ctx: Any) -> Any:
         params = super().get_params(ctx)  # type: ignore[misc]
@@ -23,6 +24,12 @@ class _ShortHelp:
                 param.show_envvar = False
                 param.metavar = "" if param.is_flag else param.metavar
         return params
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        if _ALL not in ctx.meta:
+            for param in self.get_params(ctx):  # a column of second names takes room from every line
+                param.opts, param.secondary_opts = [max(param.opts, key=len)], []
+        super().format_help(ctx, formatter)  # type: ignore[misc]
 
 
 class Group(_ShortHelp, TyperGroup):
@@ -68,6 +75,7 @@ def verb(
 def _show_all(context: typer.Context, wanted: bool) -> None:
     if not wanted:
         return
+    context.meta[_ALL] = True
     for param in context.command.params:
         if getattr(param, "help", None):
             param.hidden = False  # type: ignore[attr-defined]

@@ -57,6 +57,7 @@ class ControlSession:
         self._hello_due = self._ping_due = self._rewound = self._held_until = 0.0
         self._hello_interval = _HELLO_INTERVAL[0]
         self._asked_again = False
+        self._is_lost = False  # whether it was said that the server is gone or silent
 
     @property
     def terms(self) -> messages.Welcome | None:
@@ -138,7 +139,28 @@ class ControlSession:
 
     def on_silence(self) -> None:
         """Note that no message of the server came for too long."""
-        self._outbox.change_link_state(self._outbox.link_state.silent())
+        if self._outbox.change_link_state(self._outbox.link_state.silent()):
+            self._note_loss("is silent")
+
+    def on_cut(self) -> None:
+        """Note that the control connection ended: the server does not know the next one yet."""
+        if self.welcome is not None:
+            self._note_loss("is gone")
+        self.greet_again()
+
+    def _note_loss(self, how: str) -> None:
+        if not self._is_lost:
+            self._is_lost = True
+            folder = self._outbox.spool_folder
+            log.warning(
+                "the server at %s %s; keyframes wait in %s until it answers", self._address, how, folder
+            )
+
+    def _note_answer(self) -> None:
+        if self._is_lost and self._outbox.link_state.is_connected:
+            self._is_lost = False
+            waiting = self._outbox.keyframes_waiting
+            log.info("the server at %s answers again; %d keyframes wait for it", self._address, waiting)
 
     # --- messages of the server ---
 
@@ -233,6 +255,7 @@ class ControlSession:
             self._ping_due = 0.0  # tells the server the offset before the first keyframe comes
         self.clock.add(pong.ping_sent_ns, pong.received_ns, pong.sent_ns, returned_ns)
         self._outbox.change_link_state(self._outbox.link_state.answered())
+        self._note_answer()
         self._on_progress(pong.durable, pong.fused)
 
     def _on_ack(self, ack: messages.Ack) -> None:

@@ -127,7 +127,7 @@ class Sender:
             if news is not None and is_reported:
                 self._control_session.on_connection(news, before, refused=connection.refused)
             if ended and connection is self._control:
-                self._control_session.greet_again()  # the server does not know the new connection yet
+                self._control_session.on_cut()
             elif ended:
                 self._control_session.rewind()  # what was under way is lost
         if self.finds_nobody != self._control.finds_nobody:

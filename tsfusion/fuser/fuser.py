@@ -25,7 +25,6 @@ from tsfusion.core import process
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
-from tsfusion.geometry import up_direction
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
@@ -163,9 +162,7 @@ class Fuser:
                 found = codec.decode(record.frames)
                 if isinstance(found, Keyframe):  # a correction does not change the map (yet)
                     stats = self._volume.integrate(found)
-                    if stats.samples:
-                        self._map.held.add(found.T_world_camera, found.sensor or self._volume.config.sensor)
-                    else:
+                    if not stats.samples:
                         reason, message = NO_SAMPLES, self._volume.why_no_samples(found)
             except TsfusionError as error:
                 if isinstance(error, JournalError) and error.temporary:
@@ -200,7 +197,6 @@ class Fuser:
             if query.command.name == "mesh":
                 mesh = self._volume.extract_mesh(query.command.min_weight)
                 layout, frames = _mesh_frames(mesh)
-                layout = msgspec.structs.replace(layout, up=up_direction.find(mesh, self._map.held))
                 self._send(fuser_messages.FuserReply(query.number, layout=layout), frames)
             else:
                 self._send(fuser_messages.FuserReply(query.number, status=self._status()))
@@ -248,7 +244,8 @@ def _mesh_frames(mesh: Mesh) -> tuple[MeshLayout, list[Any]]:
     arrays: list[NDArray[Any]] = [mesh.vertices, mesh.faces, mesh.normals]
     if mesh.colors is not None:
         arrays.append(mesh.colors)
-    layout = MeshLayout(vertices=len(mesh.vertices), faces=len(mesh.faces), colors=mesh.colors is not None)
+    counts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    layout = MeshLayout(**counts, colors=mesh.colors is not None, up=mesh.up)
     return layout, [np.ascontiguousarray(array).data for array in arrays]
 
 

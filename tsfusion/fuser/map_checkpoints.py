@@ -13,7 +13,6 @@ from tsfusion.core import durable_files
 from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
 from tsfusion.fuser.messages import SessionProgress
-from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.journal import state_folder
 
 if TYPE_CHECKING:
@@ -56,7 +55,6 @@ class MapCheckpoints:
                 bytes.fromhex(key): SessionProgress(*progress) for key, progress in meta["done"].items()
             }
             self.rejected = dict(meta["rejected"])
-        self.held = HeldSensor(meta.get("held"))  # how the sensors of the keyframes in the map were held
 
     def save(self) -> bool:
         """Write a checkpoint; False when that failed, which is logged.
@@ -65,7 +63,7 @@ class MapCheckpoints:
         new one is on the disk, the old ones keep their names.
         """
         done = {key.hex(): msgspec.structs.astuple(progress) for key, progress in self.done.items()}
-        meta = {"done": done, "rejected": self.rejected, "held": self.held.numbers}
+        meta = {"done": done, "rejected": self.rejected}
         try:
             self.volume.save(self._new, meta=meta)
             if self._keep_previous:

@@ -181,9 +181,16 @@ class HostedMap:
         self._retention.on_ready()
         if not self.warm:
             self.warm = True
-            what = f"the map is open, with {ready.keyframes} keyframes" if ready.done else "a new map is open"
-            log.info("%s", what, extra=logs.about(map=self.name))
+            log.info("%s", self._contents(ready), extra=logs.about(map=self.name))
         self._check_checkpoint(ready)
+
+    def _contents(self, ready: fuser_messages.Ready) -> str:
+        """What there is of a map when it is opened, for the log."""
+        waiting = self._backlog.keyframes
+        if not ready.done and not waiting:
+            return "a new map is open"
+        rest = f"; {waiting} more are fused from its journal" if waiting else ""
+        return f"the map is open, with {ready.keyframes} keyframes{rest}"
 
     def _check_checkpoint(self, ready: fuser_messages.Ready) -> None:
         """Report keyframes that are neither in a checkpoint nor in the journal."""

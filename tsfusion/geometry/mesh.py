@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from tsfusion.core import durable_files, process
 from tsfusion.core.errors import MissingDependency, OutputError
-from tsfusion.geometry import mesh_islands
-from tsfusion.geometry.up_direction import Up
+from tsfusion.geometry import mesh_islands, up_direction
+from tsfusion.geometry.up_direction import HeldSensor, Up
 
 FORMATS = (".ply", ".glb", ".obj")
 _COMMENTS = {".ply": (b"comment ", b"format binary_little_endian 1.0\n"), ".obj": (b"# ", b"")}
@@ -29,14 +29,23 @@ class Mesh:
         faces: (m, 3) int32, counter-clockwise seen from outside.
         normals: (n, 3) float32, unit length.
         colors: (n, 3) uint8 RGB (sRGB); grey where no colour was seen, None if the map holds none.
-        up: away from the ground (`geometry.up_direction.find`); None = not known.
+        known_up: away from the ground; None = `up` finds it.
+        held: how the sensors that saw a whole map were held; None = nobody knows.
     """
 
     vertices: NDArray[np.float32]
     faces: NDArray[np.int32]
     normals: NDArray[np.float32]
     colors: NDArray[np.uint8] | None = None
-    up: Up | None = field(default=None, kw_only=True)
+    known_up: Up | None = field(default=None, kw_only=True)
+    held: HeldSensor | None = field(default=None, kw_only=True, repr=False)
+
+    @cached_property
+    def up(self) -> Up | None:
+        """Direction away from the ground, as given or found; None = not known."""
+        if self.known_up is not None or self.held is None:
+            return self.known_up
+        return up_direction.find(self, self.held)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write PLY (binary), GLB or OBJ by the file's suffix; complete or not at all.
@@ -112,6 +121,7 @@ class Mesh:
             faces=number[self.faces[kept[self.faces[:, 0]]]],
             normals=self.normals[kept],
             colors=None if self.colors is None else self.colors[kept],
+            known_up=self.up,
         )
 
     @property

@@ -25,6 +25,7 @@ _UPRIGHT = 0.5  # least length of the mean of the cameras' unit up vectors: less
 _LEAST = 0.02  # share of the surface that a floor has at least
 _APART = math.cos(math.radians(30))  # of two directions that are not the same
 _SURE = 3.0  # how many times more surface faces up than any other way, where no camera is known
+_GRAIN = 2.0**-20  # of the sums of poses, metres or none: they are exact in any order
 _USUAL = np.array(((0.0, 0, 1), (0, -1, 0), (0, 1, 0)))  # robots' and surveyors' up, that of a camera, glTF's
 _SHORT = 0.1  # relative difference of a mean specific force from gravity
 _FITS = 3  # of a plane, each to what the one before has found
@@ -92,7 +93,12 @@ class HeldSensor:
         return found
 
     def add(
-        self, T_world_sensor: NDArray[np.float64], sensor: str, force: NDArray[np.float64] | None = None
+        self,
+        T_world_sensor: NDArray[np.float64],
+        sensor: str,
+        force: NDArray[np.float64] | None = None,
+        *,
+        times: int = 1,
     ) -> None:
         """Take a keyframe into account.
 
@@ -101,10 +107,12 @@ class HeldSensor:
                 down, z forward.
             sensor: name of the sensor model.
             force: (3,) what an accelerometer measured, in the sensor's axes; None = nothing.
+            times: -1 takes it out again.
         """
         up = T_world_sensor[:3, 2] if sensor == "lidar" else -T_world_sensor[:3, 1]
         rows = [up, T_world_sensor[:3, 3]] + ([] if force is None else [T_world_sensor[:3, :3] @ force])
-        self._sums[: len(rows)] += np.column_stack((rows, np.ones(len(rows))))
+        rounded = np.round(np.array(rows) / _GRAIN) * _GRAIN
+        self._sums[: len(rows)] += times * np.column_stack((rounded, np.ones(len(rows))))
 
     @property
     def up(self) -> NDArray[np.float64]:

@@ -55,7 +55,7 @@ def write_map(
     mesh = target.mesh(map_name, min_weight=min_weight)
     left_out: dict[str, Any] = {}
     if len(mesh.faces):
-        mesh = dataclasses.replace(mesh, up=up_direction.find(mesh, held, given=up))
+        mesh = dataclasses.replace(mesh, known_up=up_direction.find(mesh, held, given=up))
         files = [work / f"{name}{suffix}{ending}" for name, ending in _MESH_FILES]
         left_out = mesh_files.write(mesh, files, keep_islands=keep_islands)
     return WrittenMap(status, mesh, {**mesh.figures, "left_out": left_out})

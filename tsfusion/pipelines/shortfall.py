@@ -26,8 +26,9 @@ def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str,
     lost = stats.refused | {reason: n for reason, n in stats.skipped.items() if reason in _LOST}
     rejected = sum(stats.rejected.values())
     if stats.waiting:
+        unnamed = "it is behind" if stats.durable else "no server answers so far"
         return (
-            f"{stats.waiting} keyframes are not at the server ({link or 'it is behind'}): they wait in "
+            f"{stats.waiting} keyframes are not at the server ({link or unnamed}): they wait in "
             f"{spool}; check the address with `tsfusion status --connect`, then "
             f"`tsfusion spool send --spool {spool}`"
         )

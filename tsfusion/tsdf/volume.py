@@ -11,6 +11,7 @@ import hashlib
 import logging
 import os
 import struct
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -25,6 +26,7 @@ from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.geometry.keyframe import Keyframe, keyframe_of
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.sample_ranges import why_no_samples
+from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.kernels import integrate, runtime
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
@@ -37,6 +39,8 @@ from tsfusion.tsdf.ray_buffers import RayBuffers, keyframes_of_every_kind
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
 
 log = logging.getLogger(__name__)
+
+_HELD = "held"  # in a checkpoint's meta, as the fuser wrote it first
 
 
 class IntegrateStats(msgspec.Struct, frozen=True):
@@ -87,6 +91,7 @@ class Volume:
         self.model = model = config.checked_model()
         self.meta: dict[str, Any] = {}
         self.keyframes = 0  # with a usable sample
+        self.held = HeldSensor()  # their sensors
         self._has_warned = False  # of a keyframe without
         runtime.start(config.threads)
         smooths = model.regularizer != "off"
@@ -182,7 +187,8 @@ class Volume:
             reachable = (np.abs(np.asarray(blocks, np.int64)) < 1 << 18).all(axis=1)  # others have no key
             chosen = np.unique(pack_keys(blocks[reachable]))
             chosen = chosen[store.slots_of(chosen) >= 0]
-        return extract(np.sort(chosen), self._store, min_weight, self._mesh_buffers, self._view(surface))
+        mesh = extract(np.sort(chosen), self._store, min_weight, self._mesh_buffers, self._view(surface))
+        return mesh if blocks is not None else replace(mesh, held=self.held)
 
     def map_hash(self) -> str:
         """Hex digest of the exact sums: equal for the same keyframes in any order, on any number of threads.
@@ -243,7 +249,7 @@ class Volume:
             config=self.config,
             keyframes=self.keyframes,
             map_hash=self.map_hash(),
-            meta=self.meta if meta is None else meta,
+            meta={**(self.meta if meta is None else meta), _HELD: self.held.numbers},
             layers=list(layers),
         )
         used = self._store.used()
@@ -274,6 +280,7 @@ class Volume:
             array[: len(keys)] = stored[name]
         volume._store.measure_bounds()
         volume.keyframes = header.keyframes
+        volume.held = HeldSensor(header.meta.pop(_HELD, None))
         volume.meta = header.meta
         checkpoint.verify(Path(path), header, volume.map_hash())
         return volume
@@ -285,7 +292,9 @@ class Volume:
         samples = self._ray_buffers.make_rays(keyframe, self.config)  # paper eq. 1
         with process.uninterrupted():
             updates = self._integrator.apply(sign)  # paper eq. 2 and 3
-            self.keyframes += sign if samples else 0
+            if samples:
+                self.keyframes += sign
+                self._note_held(keyframe, sign)
         return IntegrateStats(
             samples=samples,
             invalid=int(np.prod(keyframe.shape)) - samples,
@@ -294,6 +303,11 @@ class Volume:
             new_blocks=self._store.count - blocks_before,
             updates=updates,
         )
+
+    def _note_held(self, keyframe: Keyframe, sign: int) -> None:
+        sensor = keyframe.sensor or self.config.sensor
+        if keyframe.points is None or sensor == "lidar":  # of other points nobody knows the sensor's axes
+            self.held.add(keyframe.T_world_camera, sensor, times=sign)
 
     @property
     def _field(self) -> field_regularizer.FieldSettings:

@@ -151,7 +151,7 @@ def mesh_of(layout: MeshLayout, frames: list[memoryview]) -> Mesh:
     arrays: list[NDArray[Any]] = [
         np.frombuffer(frame, dtype).reshape(-1, 3) for frame, (_, dtype) in zip(frames, wanted, strict=True)
     ]
-    return Mesh(*arrays, up=layout.up)
+    return Mesh(*arrays, known_up=layout.up)
 
 
 _POLL_S = 0.2  # seconds
