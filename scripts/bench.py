@@ -231,7 +231,9 @@ def run(case: Case, source: Source, threads: int, peer: Open3D | None) -> dict[s
     def remesh(_: Any) -> None:
         volume.extract_mesh(blocks=volume.cells_to_mesh(volume.take_dirty()))
 
-    steps = (volume.integrate, remesh, *([peer.integrate] if peer else []))
+    steps: list[Callable[[Any], Any]] = [volume.integrate, remesh]
+    if peer:
+        steps.append(peer.integrate)
     with stages.watch():
         spent = timed_keyframes(source.fused, *steps, after_warm_up=stages.times.clear)
         stages.keyframes = spent.shape[2]

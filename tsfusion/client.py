@@ -252,7 +252,8 @@ class Client:
             raise KeyframeRefused(refusals)
         if not done:
             waiting = self._outbox.describe_waiting()
-            raise FlushTimeout(f"{waiting} are not acknowledged after {timeout:g} s: {self._why()}")
+            kept = "" if self._outbox.is_temporary else f"; they stay in {self._outbox.spool_folder}"
+            raise FlushTimeout(f"{waiting} are not acknowledged after {timeout:g} s: {self._why()}{kept}")
 
     def wait_fused(self, timeout: float = 60.0) -> None:
         """Wait until the map has taken or rejected everything sent (`stats.rejected` counts the latter).
@@ -301,6 +302,8 @@ class Client:
     def problem(self) -> str:
         """Why the server takes nothing at the moment; empty when it does."""
         state = self._outbox.link_state
+        if state.kind == "held":
+            return state.why
         is_early = time.monotonic() - self._began < _SILENCE and (state.kind == "opening" or not state.why)
         return "" if state.is_connected or (is_early and not state.is_refused) else self._why()
 
@@ -346,4 +349,4 @@ class Client:
         why = "the server is behind"
         if silence > _SILENCE:
             why = f"nothing was heard from the server at {self._control} for {silence:.1f} s"
-        return why if box.is_temporary else f"{why}; they stay in {box.spool_folder}"
+        return why

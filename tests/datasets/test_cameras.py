@@ -18,6 +18,7 @@ from tsfusion.datasets.cameras import camera_line
 from tsfusion.datasets.formats.sevenscenes import KINECT as SEVEN_SCENES
 from tsfusion.geometry.calibration import Camera
 from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.scanner.sources.recorded import RecordedSource
 
 GIVEN = Intrinsics(585, 585, 320, 240)
 PRIMESENSE = Intrinsics(525, 525, 319.5, 239.5)  # which was taken for the camera of both
@@ -255,6 +256,11 @@ def test_other_layouts_say_that_they_take_no_camera(tmp_path):
         open_dataset("synthetic:room", calibration="a.yaml")
 
 
+def test_the_present_folder_has_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(redwood(tmp_path / "yard", [0], [0]))
+    assert open_dataset(".").name == "Redwood yard"
+
+
 def test_a_selection_and_any_dataset_name_their_camera(tmp_path):
     root = redwood(tmp_path, [0, 1], [0, 1])
     assert (root / "camera-intrinsics.txt").read_text() == CAMERA
@@ -263,3 +269,5 @@ def test_a_selection_and_any_dataset_name_their_camera(tmp_path):
     assert camera_line(open_dataset(kitti(tmp_path / "kitti"), modality="lidar")) == ""
     room = open_dataset("synthetic:room", width=64)
     assert camera_line(room) == "fx 58.5 fy 58.5 cx 31.5 cy 23.5, 64×48, from its frames"
+    assert RecordedSource(room).camera == ""  # of no file: a scan says what its frames have
+    assert RecordedSource(open_dataset(root)).camera == line

@@ -65,6 +65,13 @@ def test_wrong_focal_length_is_measured(name: str, factor: float, data: Data) ->
         assert words in report.text
 
 
+def test_few_frames_of_a_short_way_show_a_wrong_focal_length(data: Data) -> None:
+    few = select(opened(data(FOLDERS["7scenes"])), limit=20)
+    report = check(Corrupted(few, frame=zoomed(525 / 585)))
+    assert (report.verdict, report.mistake) == ("disagree", "focal length")
+    assert check(few).verdict == "agree"
+
+
 @pytest.mark.parametrize("name", ["hololens", "redwood"])
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_depth_scale_is_not_taken_for_the_camera(name: str, factor: float, data: Data) -> None:
@@ -339,6 +346,8 @@ def test_replay_of_a_wrong_camera_ends_with_status_1(
     assert run("replay", wrong) == 1
     lines = capsys.readouterr().err.strip().splitlines()
     assert "warning: camera and depth disagree: frames fit best with a focal length of about 58" in lines[-2]
-    assert lines[-1].startswith("the map is likely wrong (--no-check accepts it): camera and depth disagree")
+    assert lines[-1].startswith(
+        "tsfusion: the map is likely wrong (--no-check accepts it): camera and depth disagree"
+    )
     assert run("replay", wrong, "--no-check") == 0
     assert run("replay", whole) == 0

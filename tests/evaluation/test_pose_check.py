@@ -275,6 +275,8 @@ def inverted(place: Path, folder: Path) -> Path:
         rows = "\n".join(" ".join(repr(float(value)) for value in row) for row in se3.inverse(T))
         text += f"{index} {index} {index + 1}\n{rows}\n"
     (copy / "trajectory.log").write_text(text)
+    K = opened(place).frame(0).intrinsics
+    (copy / "K.txt").write_text(f"{K.fx} {K.fy} {K.cx} {K.cy}")
     return copy
 
 

@@ -12,6 +12,7 @@ from tsfusion.client import Client, ClientStats
 from tsfusion.core.errors import FlushTimeout, TransportError
 from tsfusion.pipelines import engine
 from tsfusion.pipelines.engine import Engine
+from tsfusion.pipelines.run_files import no_surface
 from tsfusion.pipelines.target_server import ServerChild, Target
 
 
@@ -76,6 +77,24 @@ def test_a_server_that_fuses_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(engine, "STALL_TIMEOUT", 0.05)
     with pytest.raises(TransportError, match="the server has fused nothing for 0 s"):
         Run(stats(5, 1, waiting=4)).engine.wait_fused()
+
+
+def test_why_nothing_moves_is_logged_once_and_named_at_the_end(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(engine, "_PATIENCE", 0.02)
+    monkeypatch.setattr(engine, "STALL_TIMEOUT", 0.1)
+    run = Run(stats(5, 1, waiting=4))
+    waiting = Engine(cast(Target, run), run.observe, lambda: "the server's disk is full")
+    with pytest.raises(TransportError, match="keyframes wait: the server's disk is full"):
+        waiting.wait_fused()
+    assert [record.message for record in caplog.records] == [
+        "nothing moves: the server's disk is full; waiting for at most 0 s"
+    ]
+
+
+def test_a_run_whose_disk_is_full_says_so() -> None:
+    assert "the disk of their spool is full" in no_surface(stats(0, 0, skipped={"disk": 4}), "")
 
 
 def test_a_server_elsewhere_that_takes_nothing_is_left(monkeypatch: pytest.MonkeyPatch) -> None:

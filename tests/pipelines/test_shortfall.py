@@ -27,7 +27,10 @@ STATS = ClientStats(
             "3 keyframes are not at the server (no server answers): they wait in SPOOL; check",
         ),
         ({"refused": {"quota": 2}}, "2 keyframes will never be at the server (2 × quota)"),
-        ({"skipped": {"disk": 1}}, "1 keyframes will never be at the server (1 × disk)"),
+        (
+            {"skipped": {"disk": 1}},
+            "1 keyframes will never be at the server (1 × disk): the disk",
+        ),
         ({"rejected": {"no_samples": 6}}, "the map took 4 of 10 keyframes only: all too far"),
     ],
 )

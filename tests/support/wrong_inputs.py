@@ -23,6 +23,7 @@ from unittest import mock
 
 import cv2
 import numpy as np
+from idle_fuser import keeping
 from small_recordings import kitti, seven_scenes
 
 import tsfusion
@@ -37,10 +38,10 @@ replay missing | missing does not exist | expected a dataset
 replay empty | empty is in no layout known | `tsfusion datasets` says what each expects
 replay file | file is not a folder | a file that stands for a dataset
 replay photo.png | photo.png is not a folder | a file that stands for a dataset
-replay garbage.zip --unpack | garbage.zip | unpack
+replay garbage.zip --unpack | cannot unpack garbage.zip: File is not a zip file | get it again
 replay zipped.zip | is an archive | unpack it with: unzip
-replay garbage.bag | garbage.bag is not a folder | a file that stands for a dataset
-replay garbage.db3 | garbage.db3 is not a folder | a file that stands for a dataset
+replay garbage.bag | garbage.bag is no ROS bag | expected a whole .bag
+replay garbage.db3 | garbage.db3 is no ROS bag | `tsfusion scan realsense:garbage.db3`
 replay garbage.mcap | no keyframes in garbage.mcap | expected a state folder
 replay several | holds 2 datasets | open one of them: several/a, several/b
 check missing | missing does not exist | expected a dataset
@@ -106,11 +107,11 @@ replay synthetic:room --regularizer very | got 'very' | must be one of off, pape
 replay synthetic:room --surface smooth | got 'smooth' | must be one of raw, normal, field
 replay synthetic:room --lambda -1 | got -1.0 | smoothness must be >= 0
 replay synthetic:room --support 3-6 | got '3-6' | must be LEAST:MOST, such as 3:6
-replay synthetic:room --support 6:3 | min_support 6.0 ≤ max_support 3.0 | ranges must be ordered
+replay synthetic:room --support 6:3 | got 3 | max_support must be at least min_support, 6 voxels
 replay synthetic:room --support 3:99 | got 99 | max_support must be <= 16
 replay synthetic:room --truncation 4 --support 3:6 | exclude each other | give one of them
 replay synthetic:room --truncation 0 | got 0.0 | min_support must be >= 1
-replay synthetic:room --max-range 0.05 | min_range 0.1 < max_range 0.05 m | ranges must be ordered
+replay synthetic:room --max-range 0.05 | got 0.05 m | max_range must be larger than min_range, 0.1 m
 replay synthetic:room --max-range -3 | got -3.0 | max_range must be > 0
 replay synthetic:room --min-weight -1 | got -1.0 | min_weight must be >= 0
 replay synthetic:room --min-weight nan | got nan | min_weight must be >= 0
@@ -177,7 +178,7 @@ serve --metrics 0.0.0.0:9464 | got '0.0.0.0:9464' | on this machine, such as 127
 serve --log-level loud | got 'loud' | must be one of debug, info
 serve --keys missing | server.key_secret does not exist | `tsfusion keys new server --dir missing`
 serve --voxel-size 20 | too large for max_range | suits a room
-serve --max-range 0.01 | max_range 0.01 m | ranges must be ordered
+serve --max-range 0.01 | got 0.01 m | max_range must be larger than min_range
 # scan
 {scan} nowhere | nowhere does not exist | realsense, camera:0, folder:PATH
 {scan} empty | in no layout known | `tsfusion datasets`
@@ -251,7 +252,51 @@ replay --voxel-size 0.02 | Missing argument 'PATH' | see --help | 2
 mesh state | Missing argument 'OUT' | see --help | 2
 replay synthetic:room --fast | No such option: --fast | Possible options | 2
 replay synthetic:room --voxelsize 0.02 | No such option: --voxelsize | --voxel-size | 2
-# --- rows about cameras, worlds and spools, delivery, the command's words and meshes go here ---
+# the camera
+replay tum_no_camera | the camera of these 64×48 images is not known | give --intrinsics fx,fy,cx,cy
+scan tum_no_camera | the camera of these 64×48 images is not known | or --calibration FILE
+check tum_no_camera | is not known | give --intrinsics
+replay scenes_nan_pose --intrinsics 60,60 | got '60,60' | must be fx,fy,cx,cy in pixels
+replay tum --intrinsics 60,60,31.5,nan | got '60,60,31.5,nan' | must be fx,fy,cx,cy in pixels
+replay tum --intrinsics 585,585,320,240 | cx 320 lies outside of the images, which are 64×48 | in pixels of these images
+replay tum --intrinsics 60,60,31.5,23.5 --calibration file | exclude each other | give one of them
+replay tum --calibration missing.yaml | missing.yaml is missing | expected
+replay tum --calibration file | file: could not convert | or fx fy cx cy
+replay tum --calibration photo.png | photo.png is not a text file | expected
+replay tum_two_cameras | contradict each other | remove one file, or give --intrinsics
+replay tum_transposed_K | it is transposed | its 3×3 matrix
+replay tum_other_size | is the camera of images of 64×64, but these are 64×48 | give --intrinsics
+replay tum_color_camera | of the colour camera, and the depth camera has no file | give --calibration
+replay tum_empty_camera | K.txt: 0 numbers | or fx fy cx cy
+replay synthetic:room --intrinsics 500,500,80,60 | comes with what it needs of a camera | leave out --intrinsics
+# what check finds
+check tum --option depth_scale=1e-8 | depth is unusable | check the depth scale
+check tum --option depth_scale=1 | it reads as 6.82e+03 m on average | --option depth_scale=0.001
+# which way is up, islands
+replay tum --up sideways | got 'sideways' | must be x, y, z
+mesh garbage.tsf a.ply --up 0,0,0 | got '0,0,0' | or three numbers
+scan tum --connect {nobody} --up z | --up has no effect with --connect | give it to `tsfusion mesh`
+scan tum --connect {nobody} --keep-islands | --keep-islands has no effect with --connect | give it to `tsfusion mesh`
+# results that are there already
+demo --out full | full holds files already (file) | add --overwrite
+replay tum --out full | full holds files already (file) | name a new folder
+scan tum --out full | full holds files already (file) | name a new folder
+# worlds and spools
+scan tum --same-frame | --same-frame has no effect | without --connect
+scan tum --connect {server} | has 1 keyframes of another session, in another coordinate frame | or --same-frame
+replay tum --connect {server} | has 1 keyframes of another session | or --map auto
+scan tum --connect {server} --map auto | no room for another map: 1 are open | with a larger max_maps
+replay tum --connect {server} --map other --config quick.toml | 1 are open | use one of them
+replay tum --connect {nobody} --map auto | no server answered | is the port right?
+spool list --spool missing | missing is no folder | expected the one that a scan had as --spool
+spool send --spool missing | missing is no folder | expected the one that a scan had as --spool
+spool send other --spool left | no keyframes wait in a spool other of left | spools there: default
+spool send --spool left --connect {nobody} --config quick.toml | 1 keyframes did not get through | is `tsfusion serve` running at
+spool send --spool left --connect {server} | in another coordinate frame | or --same-frame
+spool send default --map "My Map" --spool left --connect {server} | got 'My Map' | 1 to 32 of a-z
+spool send default --map auto --spool left --connect {server} | no room for another map | with a larger max_maps
+spool drop default --spool left | 1 keyframes for the map default in left/default would be deleted | say --yes
+spool drop other --spool left | no keyframes wait in a spool other | spools there: default
 """
 
 _CALLS = """
@@ -260,7 +305,7 @@ Volume(voxel_size="2 cm") | got '2 cm' | voxel_size must be a number
 Volume(voxel_size=20) | 20 m is too large | 0.02 m suits a room
 Volume(voxelsize=0.02) | unknown setting voxelsize | did you mean voxel_size?
 Volume(sensor="sonar") | got 'sonar' | must be one of kinect
-Volume(min_range=3, max_range=2) | min_range 3.0 < max_range 2.0 m | ranges must be ordered
+Volume(min_range=3, max_range=2) | got 2 m | max_range must be larger than min_range, 3 m
 Volume(min_weight=float("nan")) | got nan | min_weight must be
 Volume().extract_mesh(min_weight=1e9) | got 1000000000.0 | must be from 0 to
 Volume().extract_mesh(surface="smooth") | got 'smooth' | must be one of raw
@@ -271,7 +316,7 @@ Keyframe(T_world_camera=pose) | got none | exactly one of depth, disparity and p
 Keyframe(depth=depth, T_world_camera=pose) | got None | intrinsics must be given with depth as Intrinsics(fx, fy, cx, cy)
 Keyframe(depth=depth, intrinsics=(500, 500), T_world_camera=pose) | got (500, 500) | Intrinsics(fx, fy, cx, cy)
 Keyframe(depth=depth.astype("uint8"), intrinsics=K, T_world_camera=pose) | got uint8 | depth must be uint16 or float32
-Keyframe(depth=depth[None], intrinsics=K, T_world_camera=pose) | got (1, 6, 8) | depth must have shape
+Keyframe(depth=depth[None], intrinsics=K, T_world_camera=pose) | got (1, 6, 8) | depth must have shape (H, W)
 Keyframe(depth=depth, intrinsics=K, T_world_camera=pose[:3]) | got (3, 4) | must have shape (4, 4)
 Keyframe(depth=depth, intrinsics=K, T_world_camera=2 * pose) | got |RᵀR - I| | must hold a rotation
 Keyframe(depth=depth, intrinsics=K, T_world_camera=pose * float("nan")) | nan | must be finite
@@ -279,7 +324,7 @@ Keyframe(depth=depth, color=depth, intrinsics=K, T_world_camera=pose) | got uint
 Keyframe(depth=depth, depth_scale=0, intrinsics=K, T_world_camera=pose) | got 0 | depth_scale must be finite and > 0
 Keyframe(disparity=depth, intrinsics=K, T_world_camera=pose) | with disparity | baseline in metres × fx in pixels
 Keyframe(points=depth, T_world_camera=pose) | got uint16 | points must be float32 or float64
-Keyframe(points=np.zeros((4, 2)), T_world_camera=pose) | got (4, 2) | must have shape (*, 3)
+Keyframe(points=np.zeros((4, 2)), T_world_camera=pose) | got (4, 2) | must have shape (N, 3)
 Client("127.0.0.1:5555") | got '127.0.0.1:5555' | an address looks like tcp://127.0.0.1:5555
 Client(map="My Map") | got 'My Map' | 1 to 32 of a-z
 Client(policy="fast") | got 'fast' | must be one of thin
@@ -323,6 +368,7 @@ def make_files(root: Path) -> None:
     _make_trajectories(root)
     _make_tum(root)
     _make_scenes(root)
+    _make_spool(root / "left" / "default")
     kitti(root / "kitti")
     kitti(root / "kitti_no_calib")
     (root / "kitti_no_calib" / "sequences" / "06" / "calib.txt").unlink()
@@ -378,10 +424,29 @@ def _make_tum(root: Path) -> None:
         "cut_png": lambda at: _cut(at / "depth" / first),
         "missing_png": lambda at: (at / "depth" / first).unlink(),
         "folder_png": lambda at: ((at / "depth" / first).unlink(), (at / "depth" / first).mkdir()),
+        "no_camera": lambda at: (at / "camera-intrinsics.txt").unlink(),
+        "two_cameras": lambda at: (at / "K.txt").write_text("70 70 31.5 23.5"),
+        "transposed_K": lambda at: (at / "camera-intrinsics.txt").write_text("60 0 0\n0 60 0\n31 23 1\n"),
+        "other_size": lambda at: _replace_camera(
+            at, "camera.json", '{"width": 64, "height": 64, "fx": 60, "fy": 60, "cx": 31, "cy": 31}'
+        ),
+        "color_camera": lambda at: _replace_camera(at, "rgb-intrinsics.txt", "60 60 31.5 23.5"),
+        "empty_camera": lambda at: _replace_camera(at, "K.txt", ""),
         "color_size": lambda at: cv2.imwrite(str(at / "rgb" / first), np.zeros((24, 32, 3), np.uint8)),
     }.items():
         shutil.copytree(good, root / f"tum_{name}")
         change(root / f"tum_{name}")
+
+
+def _make_spool(folder: Path) -> None:
+    """A spool that a scan left, of one keyframe in a coordinate frame of its own."""
+    with tsfusion.Client(NOBODY, spool=folder, world="scan-that-left-it") as client:
+        client.send(_keyframe())
+
+
+def _keyframe() -> tsfusion.Keyframe:
+    K = tsfusion.Intrinsics(5.0, 5.0, 4.0, 3.0)
+    return tsfusion.Keyframe(depth=np.full((6, 8), 900, np.uint16), intrinsics=K, T_world_camera=np.eye(4))
 
 
 def _make_scenes(root: Path) -> None:
@@ -411,23 +476,45 @@ def _make_scenes(root: Path) -> None:
         seven_scenes(root / "several" / name, 1, (48, 64))
 
 
+def _replace_camera(at: Path, name: str, text: str) -> None:
+    (at / "camera-intrinsics.txt").unlink()
+    (at / name).write_text(text)
+
+
 def _cut(file: Path) -> None:
     file.write_bytes(file.read_bytes()[:60])
 
 
 @contextlib.contextmanager
 def addresses() -> Iterator[dict[str, str]]:
-    """Addresses by name: `nobody` listens there, the port is `busy` with one who never answers."""
-    with socket.socket() as taken:
+    """Addresses by name: `nobody` listens there, the port is `busy` with one who never answers.
+
+    The `server` has one keyframe, of another world, in its only map, and no room for a second one.
+    """
+    with socket.socket() as taken, tempfile.TemporaryDirectory() as folder, _server(Path(folder)) as server:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        yield {"nobody": NOBODY, "busy": f"tcp://127.0.0.1:{taken.getsockname()[1]}", "scan": SCAN}
+        yield {
+            "nobody": NOBODY,
+            "busy": f"tcp://127.0.0.1:{taken.getsockname()[1]}",
+            "scan": SCAN,
+            "server": server,
+        }
+
+
+@contextlib.contextmanager
+def _server(folder: Path) -> Iterator[str]:
+    with keeping(folder / "state", max_maps=1) as server:
+        with tsfusion.Client(server.address, world="first-scan") as client:
+            client.send(_keyframe())
+            client.flush(timeout=60)
+        yield server.address
 
 
 def run_command(line: str) -> tuple[int, str]:
     """Run a command line in this process: its exit status, and all that it printed on stderr.
 
-    Words `NAME=VALUE` before it are its environment. A command without any stderr gives its stdout.
+    Words `NAME=VALUE` before it are its environment. A command without an error gives its stdout.
     """
     from tsfusion.cli import main
 
@@ -446,7 +533,8 @@ def run_command(line: str) -> tuple[int, str]:
         ):
             main(words[count:])
     except SystemExit as ended:
-        return int(ended.code or 0), err.getvalue() or out.getvalue()
+        failed = "\ntsfusion: " in f"\n{err.getvalue()}"
+        return int(ended.code or 0), err.getvalue() if failed else out.getvalue() or err.getvalue()
     finally:
         for signum, handler in handlers.items():
             signal.signal(signum, handler)

@@ -4,6 +4,7 @@
 Each verb imports what it needs when it runs, so that `--help` and `status` answer at once.
 """
 
+import errno
 import os
 import signal
 import sys
@@ -99,6 +100,10 @@ def _root(
         typer.echo(context.get_help())
 
 
+# A run writes in many places: that a disk refuses is the user's to mend in all of them.
+_DISK_REFUSES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
+
+
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run a command line (default: this process's) and exit.
 
@@ -123,6 +128,13 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     except BrokenPipeError:  # the reader of our output went away
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
+    except OSError as error:
+        if error.errno not in _DISK_REFUSES:
+            raise
+        place = f" ({error.filename})" if error.filename else ""
+        _fail(
+            f"a disk refuses to be written{place}: {error.strerror}; make room, or choose another folder", 1
+        )
     if code == INTERRUPTED:
         _fail("interrupted", INTERRUPTED)
     sys.exit(code if isinstance(code, int) else 0)

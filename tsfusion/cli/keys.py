@@ -118,7 +118,8 @@ def list_(*, folder: Dir = _FOLDER, json: options.Json = False) -> None:
         rows += [("allowed", name, key) for name, key in sorted(listed.allowed.items())]
         rows += [("revoked", name, key) for key, name in listed.revoked.items()]
     if not rows:
-        typer.echo(f"no keys in {folder}", err=True)
+        made = "`tsfusion keys new server` makes a server's, `tsfusion keys new NAME` a scanner's"
+        typer.echo(f"no keys in {folder}: {made} (--dir names the folder)", err=True)
     width = max((len(name) for _, name, _ in rows), default=0)
     for state, name, key in rows:
         typer.echo(f"{state:<8} {name:<{width}}  {key}")

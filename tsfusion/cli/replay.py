@@ -54,6 +54,7 @@ def replay(
     **settings: Any,
 ) -> None:
     """Fuse a recording that has poses, or a journal: mesh and figures."""
+    from tsfusion.core.errors import IncompleteRun
     from tsfusion.datasets import select
 
     # Any server makes a mesh with another `min_weight`.
@@ -79,8 +80,7 @@ def replay(
         rate=rate, min_weight=settings["min_weight"], up=given_up, keep_islands=keep_islands,
     )  # fmt: skip
     if wrong is not None:
-        typer.echo(f"the map is likely wrong (--no-check accepts it): {wrong}", err=True)
-        raise typer.Exit(1)
+        raise IncompleteRun(f"the map is likely wrong (--no-check accepts it): {wrong}")
 
 
 def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dataset":

@@ -39,6 +39,7 @@ def list_(*, spool: Dir = _FOLDER, json: options.Json = False) -> None:
     """List the spools in which keyframes wait: map, world, keyframes, bytes, age; oldest first."""
     from tsfusion.delivery import left_spools
 
+    _check_there(spool)
     rows = [(left, *left.count()) for left in left_spools.find(spool)]
     if json:
         from tsfusion.cli import output
@@ -120,11 +121,20 @@ def send(
         raise TransportError(f"{kept}: {'; '.join(reasons)}")
 
 
+def _check_there(spool: Path) -> None:
+    """Raise JournalError for a folder that somebody named and that does not exist."""
+    from tsfusion.core.errors import JournalError
+
+    if spool != _FOLDER and not spool.is_dir():
+        raise JournalError(f"{spool} is no folder; expected the one that a scan had as --spool")
+
+
 def _choose(root: Path, names: list[str] | None) -> "list[LeftSpool]":
     """The spools of these names; raises JournalError for one that is not there."""
     from tsfusion.core.errors import JournalError
     from tsfusion.delivery import left_spools
 
+    _check_there(root)
     found = {left.folder.name: left for left in left_spools.find(root)}
     if unknown := [name for name in names or () if name not in found]:
         there = ", ".join(found) or "none"
@@ -155,14 +165,14 @@ def _send(
         Client(link.address, spool=opened, control=link.control, config=link) as client,
         progress.reading(f"sending {left.folder}", quiet=quiet) as watch,
     ):
-        why = _wait(client, watch, link.connect_timeout)
+        why = _wait(client, watch, link.address, link.connect_timeout)
         stats = client.stats
         if refused := sum(stats.refused.values()):
             why = why or f"the server refused {refused} for good; they are in {left.folder / 'refused'}"
         return name, stats.waiting + refused, why
 
 
-def _wait(client: "Client", watch: "Callable[[int, int], None]", patience: float) -> str:
+def _wait(client: "Client", watch: "Callable[[int, int], None]", address: str, patience: float) -> str:
     """Wait until the spool is empty; the reason why it is not, once nothing moved for `patience` seconds."""
     total = client.stats.waiting_bytes
     last, moved = total, time.monotonic()
@@ -171,7 +181,8 @@ def _wait(client: "Client", watch: "Callable[[int, int], None]", patience: float
         if (now := client.stats.waiting_bytes) != last:
             last, moved = now, time.monotonic()
         elif time.monotonic() - moved > patience:
-            return client.problem or f"no server took anything for {patience:g} s"
+            silent = f"nothing was taken for {patience:g} s; is `tsfusion serve` running at {address}?"
+            return client.problem or silent
         time.sleep(_POLL)
     return client.problem if client.stats.waiting else ""
 

@@ -158,10 +158,14 @@ class VolumeConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
                 settings that exclude each other.
         """
         model = self.model()
-        if model.min_range >= model.max_range or model.min_support > model.max_support:
+        if model.min_range >= model.max_range:
             raise InvalidConfig(
-                f"ranges must be ordered: min_range {model.min_range} < max_range {model.max_range} m, "
-                f"min_support {model.min_support} ≤ max_support {model.max_support} voxels"
+                f"max_range must be larger than min_range, {model.min_range:g} m, got {model.max_range:g} m"
+            )
+        if model.min_support > model.max_support:
+            raise InvalidConfig(
+                f"max_support must be at least min_support, {model.min_support:g} voxels, got "
+                f"{model.max_support:g}"
             )
         if self.voxel_size < LEAST_VOXEL_SIZE:
             raise InvalidConfig(

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets.readers import read_image
+from tsfusion.geometry.sample_ranges import FARTHEST_M, NEAREST_M
 
 SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".exr", ".npy")
-# No depth image has half of its pixels outside of these: its floats are in another unit
-_NEAREST_M, _FARTHEST_M = 0.005, 100.0
 _EVERY = 4  # pixels, looked at for the unit
 
 
@@ -39,15 +38,15 @@ def read_depth(path: Path, *, invalid: int | None = None) -> NDArray[Any]:
 
 
 def check_metres(depth: NDArray[np.float32], source: object) -> None:
-    """Raise DatasetError where floats are evidently not metres: half are beyond 100 m, or within 5 mm."""
+    """Raise DatasetError where floats are evidently not metres: half are beyond 100 m, or within 1 cm."""
     some = depth[::_EVERY, ::_EVERY]
     valid = some[np.isfinite(some) & (some > 0)]
     middle = float(np.median(valid)) if valid.size else 1.0
-    if _NEAREST_M <= middle <= _FARTHEST_M:
+    if NEAREST_M <= middle <= FARTHEST_M:
         return
-    unit, scale = ("millimetres", "0.001") if middle > _FARTHEST_M else ("divided once too often", "1")
+    unit, scale = ("millimetres", "0.001") if middle > FARTHEST_M else ("divided once too often", "1")
     raise DatasetError(
-        f"{source}: depth is expected in metres, but half of its floats are beyond {middle:.5g}: {unit}? "
+        f"{source}: depth is expected in metres, but the median of its floats is {middle:.5g}: {unit}? "
         f"then give --option depth_scale={scale} (in Python depth_scale={scale})"
     )
 

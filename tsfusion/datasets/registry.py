@@ -30,6 +30,7 @@ from tsfusion.datasets.formats import (
 )
 from tsfusion.datasets.given_trajectory import WithTrajectory
 from tsfusion.datasets.rosbag import dataset as rosbag_dataset
+from tsfusion.datasets.rosbag.reader import ENDINGS
 
 GROUP = "tsfusion.datasets"
 
@@ -120,6 +121,8 @@ def find(path: str | Path, *, unpack: bool = False) -> Found:
     root = Path(path).expanduser()
     if not root.exists():
         raise DatasetError(f"{root} does not exist; expected a dataset or synthetic:room, synthetic:street")
+    if root.name in ("", ".."):  # such as the present folder: a benchmark is known by its folder's name
+        root = root.resolve()
     if root.is_file() and archives.is_archive(root):
         root = _unpacked(root, unpack=unpack)
     found = _match([root])
@@ -246,6 +249,11 @@ def _unrecognised(root: Path, several: list[Path]) -> str:
         return f"{root} holds {len(several)} datasets; open one of them: {', '.join(map(str, several))}"
     if root.suffix == ".sens":
         return f"{root} is a ScanNet recording; export it to folders first with ScanNet's SensReader"
+    if root.is_file() and root.suffix.lower() in ENDINGS:
+        realsense = f"; a RealSense recording: `tsfusion scan realsense:{root}`" * (root.suffix == ".db3")
+        return (
+            f"{root} is no ROS bag, by its first bytes; expected a whole {', '.join(ENDINGS)} file{realsense}"
+        )
     if root.is_file():
         return (
             f"{root} is not a folder, nor a file that stands for a dataset (an archive, a transforms.json, "

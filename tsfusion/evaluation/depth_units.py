@@ -8,10 +8,9 @@ import numpy as np
 
 from tsfusion.evaluation.depth_views import DepthView
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.sample_ranges import FARTHEST_M, NEAREST_M
 
-NEAREST_M = 0.01  # median depth below which no depth camera measures
-FARTHEST_M = 150.0  # median depth above which none does
-FARTHEST_OTHERS_M = 1000.0  # the same of stereo and LiDAR
+FARTHEST_OTHERS_M = 1000.0  # median range of stereo and LiDAR above which none measures
 FEW_LEVELS = 24  # different values of an image that holds whole metres
 MIN_SHARE = 0.8  # of the frames
 

@@ -103,7 +103,9 @@ def sure_gain(fits: Fits, given: Fits) -> float:
         return mean_gain(fits, given)
     gains = (fits - given)[evidence]
     gain, error = float(gains.mean()), float(gains.std() / np.sqrt(len(gains)))
-    no_accident = gain > MIN_GAIN_SIGMAS * error or (gains > 0).all()
+    # Where the sensor moves little most pairs show nothing: few gain, but none loses.
+    one_sided = (gains > AS_GOOD).sum() >= MIN_PAIRS and gains.min() > -AS_GOOD / 2
+    no_accident = gain > MIN_GAIN_SIGMAS * error or (gains > 0).all() or one_sided
     enough = gain > max(MIN_SURE_GAIN, MIN_EXPLAINED * float(1 - given[evidence].mean()))
     return gain if no_accident and enough else mean_gain(fits, given)
 

@@ -249,8 +249,8 @@ class Gateway:
             self.ports.reply(identity, messages.Reply(name="health", health=self.health()))
         elif command.name == "new_map":
             name = self.maps.keep_free_name(command.map)
-            full = f"no room for another map: {self._server.max_maps} are open (max_maps)"
-            self.ports.reply(identity, messages.Reply(name="new_map", map=name, error=None if name else full))
+            error = None if name else f"no room for another map: {self.maps.why_full}"
+            self.ports.reply(identity, messages.Reply(name="new_map", map=name, error=error))
         else:
             self._queries.submit(identity, command, self.maps.get(command.map), client)
 

@@ -93,8 +93,17 @@ class MapRegistry:
 
     def why_not(self, name: str) -> str:
         """Why a map cannot be opened."""
-        why, _ = self._unopened.get(name, (f"{self._server.max_maps} are open (max_maps)", 0.0))
+        why, _ = self._unopened.get(name, (self.why_full, 0.0))
         return why
+
+    @property
+    def why_full(self) -> str:
+        """Why there is no room for another map, and what makes some."""
+        most = self._server.max_maps
+        return (
+            f"{most} are open; use one of them (`tsfusion status` lists them), or restart the server with a "
+            f"larger max_maps than {most} (--config)"
+        )
 
     def denial_of_world(self, hosted: HostedMap, record: Hello | RecordHeader) -> Denied | None:
         """The answer to a session that does not share a map's coordinate frame; None = it may go on.

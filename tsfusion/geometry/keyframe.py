@@ -308,7 +308,8 @@ def _array(name: str, value: Any, dtypes: tuple[type, ...], shape: tuple[int | N
     if array.dtype.type not in dtypes:
         raise InvalidKeyframe(f"{name} must be {expected}, got {array.dtype}")
     if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
-        wanted = "(" + ", ".join("*" if n is None else str(n) for n in shape) + ")"
+        free = iter("HW" if shape.count(None) == 2 else "N")
+        wanted = "(" + ", ".join(next(free) if n is None else str(n) for n in shape) + ")"
         raise InvalidKeyframe(f"{name} must have shape {wanted}, got {array.shape}")
     if array.size == 0 and name in ("depth", "disparity"):
         raise InvalidKeyframe(f"{name} must not be empty, got shape {array.shape}")

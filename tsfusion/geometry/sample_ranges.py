@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 from tsfusion.geometry.keyframe import Keyframe
 
 NO_SAMPLES = "no_samples"  # the reason under which a keyframe without a usable sample is counted
-_FARTHEST = 100.0  # metres: where the sensor models end
-_NEAREST = 0.01  # metres: no sensor measures nearer
+# Metres. A median depth outside of these is in another unit: no camera measures nearer, and the sensor
+# models end there.
+NEAREST_M, FARTHEST_M = 0.01, 100.0
 
 
 def sample_ranges(keyframe: Keyframe) -> NDArray[np.float64]:
@@ -37,13 +38,13 @@ def wrong_unit(keyframe: Keyframe) -> str:
     if not len(ranges):
         return ""
     median = float(np.median(ranges))
-    if _NEAREST <= median <= _FARTHEST:
+    if NEAREST_M <= median <= FARTHEST_M:
         return ""
     if keyframe.kind == "disparity":
         return f"a median depth of {median:.3g} m: check baseline_fx and disparity_scale"
     if keyframe.kind == "points":
         return f"a median range of {median:.3g} m: points must be in metres"
-    if median < _NEAREST:
+    if median < NEAREST_M:
         return f"a median depth of {median:.3g} m: check depth_scale (metres a unit), or give float32 metres"
     return (
         f"a median depth of {median:.4g} m looks like millimetres: give uint16 with depth_scale=0.001, or "

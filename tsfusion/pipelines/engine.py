@@ -6,6 +6,7 @@ client on they are the same: each hands keyframes to the clients of one `Target`
 next one may go and when all of them are in the map.
 """
 
+import logging
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -19,9 +20,12 @@ from tsfusion.scanner.scanner import ScanState
 AHEAD = 3  # keyframes of a recording under way: fusing, waiting, travelling
 # Seconds without progress before a run that needs the map gives up: a server restarts a stuck fuser after 60.
 STALL_TIMEOUT = 120.0
+_PATIENCE = 5.0  # seconds without progress before the reason is logged
 LINGER = 10.0  # seconds without progress before what a distant server does not take is left in the spool
 _STAMPS_TIMEOUT = 5.0  # seconds for a distant server to say when it fused the last ones: for the figures only
 _POLL = 0.01  # seconds
+
+log = logging.getLogger(__name__)
 
 STARTING = "starting a server (the first start compiles kernels)"
 
@@ -49,10 +53,13 @@ class Engine:
     Args:
         target: where they go.
         observe: shows how far the run is, and returns the counts of all its clients together.
+        problem: why the server takes nothing at the moment; empty = it does.
     """
 
-    def __init__(self, target: Target, observe: Callable[[], ClientStats]) -> None:
-        self._target, self._observe = target, observe
+    def __init__(
+        self, target: Target, observe: Callable[[], ClientStats], problem: Callable[[], str] = str
+    ) -> None:
+        self._target, self._observe, self._problem = target, observe, problem
 
     def check(self) -> ClientStats:
         """Show how far the run is; raise TransportError when its own server has ended."""
@@ -94,20 +101,23 @@ class Engine:
         if not self._wait(reached, STALL_TIMEOUT):
             raise TransportError(
                 f"the server has fused nothing for {STALL_TIMEOUT:.0f} s, and keyframes wait: "
-                "`tsfusion status` says how a server is"
+                + (self._problem() or "`tsfusion status` says how a server is")
             )
 
     def _wait(self, reached: Callable[[ClientStats], bool], timeout: float) -> bool:
-        """Whether it was reached; False = nothing has moved for `timeout` seconds."""
-        last, moved = (-1, -1), time.monotonic()
+        """Whether it was reached; False = nothing has moved for `timeout` seconds. Logs why, once."""
+        last, moved, logged = (-1, -1), time.monotonic(), False
         while True:
             stats = self.check()
             if reached(stats):
                 return True
             if (now := (stats.waiting, stats.durable + _settled(stats))) != last:
-                last, moved = now, time.monotonic()
+                last, moved, logged = now, time.monotonic(), False
             elif time.monotonic() - moved > timeout:
                 return False
+            elif not logged and time.monotonic() - moved > _PATIENCE and (why := self._problem()):
+                log.warning("nothing moves: %s; waiting for at most %.0f s", why, timeout)
+                logged = True
             time.sleep(_POLL)
 
 

@@ -76,7 +76,7 @@ def replay(
                 progress.update(stats.sent, stats.fused, len(dataset))
                 return stats
 
-            running = Engine(target, observe)
+            running = Engine(target, observe, lambda: sender.problem)
             progress.stage(
                 f"scanning {dataset.name}" + (f" into the map {target.link.map}" if connect else "")
             )

@@ -14,7 +14,7 @@ from tsfusion.core.output_folder import RECORD
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import HeldSensor, Up
-from tsfusion.pipelines import latency_ledger, mesh_files
+from tsfusion.pipelines import latency_ledger, mesh_files, shortfall
 from tsfusion.pipelines.target_server import Target
 from tsfusion.wire.health import Status
 from tsfusion.wire.keyframe_times import KeyframeTimes
@@ -79,6 +79,8 @@ def no_surface(stats: ClientStats, rejection: str) -> str:
     Args:
         rejection: why the map did not take the first keyframe that it rejected; empty = it took all.
     """
+    if lost := shortfall.of_disk(stats):
+        return f"the map has no surface to write: {lost}"
     why = rejection if not stats.fused and rejection else "scan more of the scene or lower --min-weight"
     return f"the map has no surface to write: {stats.fused} of {stats.sent} keyframes fused; {why}"
 

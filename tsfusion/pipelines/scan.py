@@ -123,7 +123,7 @@ def scan(
                 progress.update(state.frames, state.stats.fused, source.length, state)
                 return state.stats
 
-            running = Engine(target, observe)
+            running = Engine(target, observe, lambda: scanner.state().link)
             pace = running.wait_turn if own and not source.live else running.check
             progress.stage(f"scanning {source.name}" + ("" if own else f" into the map {target.link.map}"))
             started = time.monotonic()

@@ -23,7 +23,6 @@ def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str,
         link: why the server takes nothing; empty = it does.
         rejection: why the map did not take the first keyframe that it rejected.
     """
-    lost = stats.refused | {reason: n for reason, n in stats.skipped.items() if reason in _LOST}
     rejected = sum(stats.rejected.values())
     if stats.waiting:
         unnamed = "it is behind" if stats.durable else "no server answers so far"
@@ -32,12 +31,24 @@ def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str,
             f"{spool}; check the address with `tsfusion status --connect`, then "
             f"`tsfusion spool send --spool {spool}`"
         )
-    if lost:
-        reasons = ", ".join(f"{count} × {reason}" for reason, count in lost.items())
-        return f"{sum(lost.values())} keyframes will never be at the server ({reasons}): see the log above"
+    if lost := of_disk(stats):
+        return lost
+    if stats.refused:
+        return f"{_never(stats.refused)}: see the log above"
     if rejected and 2 * rejected > stats.sent:
         return f"the map took {stats.sent - rejected} of {stats.sent} keyframes only: {rejection}"
     return ""
+
+
+def of_disk(stats: ClientStats) -> str:
+    """Say which keyframes this machine's disk could not keep; empty = it kept all."""
+    lost = {reason: count for reason, count in stats.skipped.items() if reason in _LOST}
+    if not lost:
+        return ""
+    return (
+        f"{_never(lost)}: the disk of their spool is full or failed, or spool_bytes is reached; make room, "
+        "or choose another folder (--spool with --connect, else --out)"
+    )
 
 
 def cure_of_tracking(localizer: str) -> str:
@@ -68,3 +79,8 @@ def of_tracking(frames: int, tracked: int, why: str, *, localizer: str = "rgbd")
 def together(shortfalls: Iterable[str]) -> str:
     """All shortfalls in one line; empty = there are none."""
     return "; ".join(filter(None, shortfalls))
+
+
+def _never(counts: dict[str, int]) -> str:
+    reasons = ", ".join(f"{count} × {reason}" for reason, count in counts.items())
+    return f"{sum(counts.values())} keyframes will never be at the server ({reasons})"

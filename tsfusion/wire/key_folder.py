@@ -122,8 +122,9 @@ def revoke(folder: Folder, name: str) -> str:
     with folder_lock.hold(place, wait=math.inf):
         listed = read_allow_list(place)
         if name not in listed.allowed:
-            names = ", ".join(sorted(listed.allowed)) or "nobody is allowed (`tsfusion keys list`)"
-            raise InvalidConfig(f"no key is allowed under the name {name!r}, but: {names}")
+            names = ", ".join(sorted(listed.allowed))
+            there = f"under these: {names}" if names else "nor under any other"
+            raise InvalidConfig(f"no key is allowed under the name {name!r}, {there} (`tsfusion keys list`)")
         left = dict(listed.allowed)
         key = left.pop(name)
         _write(place / ALLOWED, _format_list(Allowed(left, {**listed.revoked, key: name})))

@@ -75,7 +75,7 @@ def extract(path: Path, into: Path, *, nested: bool = False) -> None:
     except (ValueError, tarfile.TarError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError,
             NotImplementedError, RuntimeError) as error:  # fmt: skip
         reason = " ".join(str(error).split())  # tarfile's goes over many lines
-        raise DatasetError(f"cannot unpack {path}: {reason}") from error
+        raise DatasetError(f"cannot unpack {path}: {reason}; is it broken? get it again") from error
     for inner in sorted(into.rglob("*.zip")) if nested else ():
         extract(inner, inner.parent)
         inner.unlink()

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from itertools import islice
 
+from tsfusion.datasets.cameras import RecordedCamera
 from tsfusion.datasets.dataset import NOMINAL_NS, Dataset, frame_of
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.sources.source import LiveSource, Source
@@ -26,7 +27,8 @@ class RecordedSource(LiveSource):
         self.skipped = dataset.skipped
         self.length = len(dataset)
         self._dataset, self._rate = dataset, rate
-        self.camera = str(getattr(dataset, "camera", None) or "")
+        camera = getattr(dataset, "camera", None)
+        self.camera = str(camera) if isinstance(camera, RecordedCamera) else ""
 
     def __iter__(self) -> Iterator[Frame]:
         """Yield frames with the recording's timestamps, or nominal ones where it has none."""
