@@ -4,6 +4,7 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -90,6 +91,17 @@ def test_a_journal_replays_to_the_same_map(run_folder: Path, tmp_path: Path) -> 
     assert json.loads(done.stdout)["map_hash"] == first["map_hash"]
     assert {path.name for path in (tmp_path / "again").iterdir()} == RESULTS
     assert (tmp_path / "again").stat().st_mode & 0o777 == 0o777 & ~_umask()
+
+
+@pytest.mark.slow
+def test_poses_added_to_a_map_are_said_to_be_in_its_frame(run_folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(run_folder / "state", tmp_path / "state")
+    done = tsfusion(
+        "replay", "synthetic:room", "--max-frames", 1, "--voxel-size", VOXEL,
+        "--state", tmp_path / "state", "--out", tmp_path / "again",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "the map default has 6 keyframes already, and these are added to them" in done.stderr
 
 
 def slow_replay(out: Path) -> "subprocess.Popen[str]":

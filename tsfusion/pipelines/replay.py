@@ -2,6 +2,7 @@
 """A whole replay: every keyframe of a recorded dataset sent and fused, and its results left in a folder."""
 
 import dataclasses
+import logging
 import os
 import time
 from collections.abc import Iterator
@@ -18,6 +19,9 @@ from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.pipelines import engine, map_size, replay_results, run_files, target_server
 from tsfusion.pipelines.engine import AHEAD, Engine, Progress
 from tsfusion.pipelines.replay_results import ReplaySummary
+from tsfusion.pipelines.target_server import Target
+
+log = logging.getLogger(__name__)
 
 
 def replay(
@@ -70,6 +74,7 @@ def replay(
             # A recording leaves nothing out: `wait_turn` keeps the spool short, not the policy.
             sender = target.client(target.link.map, policy="spool_all", same_frame=same_frame)
             sender.connect()
+            _warn_of_keyframes_there(target, same_frame=same_frame)
 
             def observe() -> ClientStats:
                 stats = sender.stats
@@ -104,6 +109,17 @@ def replay(
         run_files.write_ledger(work, sender.records)
         run_files.write_record(work, result)
         return result
+
+
+def _warn_of_keyframes_there(target: Target, *, same_frame: bool) -> None:
+    """Warn that given poses are taken for poses in the frame of a map that has keyframes."""
+    there = target.status(target.link.map).keyframes_durable
+    if there and not same_frame:
+        log.warning(
+            "the map %s has %d keyframes already, and these are added to them: their poses must be in the "
+            "same coordinate frame (--map NAME names another map, --same-frame says that they are)",
+            target.link.map, there,
+        )  # fmt: skip
 
 
 def _keyframes(dataset: Dataset, first: Keyframe, running: Engine, rate: float | None) -> Iterator[Keyframe]:
