@@ -16,6 +16,7 @@ from command_processes import Here, end, read_until, server, started, tsfusion
 from small_recordings import first_views
 
 from tsfusion import Client, FlushTimeout, Volume
+from tsfusion.geometry.up_direction import HeldSensor
 
 VOXEL = 0.08
 
@@ -114,7 +115,9 @@ def test_mesh_of_map_state_and_journal_agree(state: Path, tmp_path: Path) -> Non
 
 def test_mesh_of_a_map_alone_says_that_up_is_not_known(state: Path, here: Here, tmp_path: Path) -> None:
     """Walls look like a floor where nothing says how the sensor was held."""
-    Volume.load(state / "maps/default/map.tsf").save(tmp_path / "alone.tsf", meta={})
+    volume = Volume.load(state / "maps/default/map.tsf")
+    volume.held = HeldSensor()  # as of points whose sensor is not known
+    volume.save(tmp_path / "alone.tsf", meta={})
     done = here("mesh", "alone.tsf", "a.glb", "--preview", "a.png")
     assert done.returncode == 0, done.stderr
     assert "up unknown" in done.stdout

@@ -103,7 +103,7 @@ def test_earlier_names_are_understood(here: Here, asked: dict[str, Any]) -> None
     here("replay", "synthetic:room", "--max-keyframes=2")
     assert len(asked["dataset"]) == 2
     done = here("replay", "synthetic:room", "--poses", "a.txt")
-    assert "a synthetic dataset takes no `trajectory`" in done.stderr
+    assert "a.txt is missing; expected a trajectory" in done.stderr
     for words in (["--source", "nowhere"], ["--source=nowhere"]):
         assert "nowhere does not exist" in here("scan", *words).stderr
 

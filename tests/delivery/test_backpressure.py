@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from clients_and_spools import NOBODY, joined, send_all
-from keyframes_and_servers import DEADLINE, pose, serving, until, wall
+from keyframes_and_servers import DEADLINE, lasting_address, pose, serving, until, wall
 from repository import ROOT
 from scripted_server import scripted
 
@@ -318,7 +318,10 @@ def test_what_each_policy_is_for() -> None:
 def test_a_map_whose_server_is_killed_has_every_keyframe(tmp_path: Path) -> None:
     """More than twice `backlog` come while nobody answers: the map gets them all."""
     state = tmp_path / "state"
-    with serving(state) as server, Client(server.address, spool=tmp_path / "spool") as client:
+    with (
+        serving(state, listen=lasting_address()) as server,
+        Client(server.address, spool=tmp_path / "spool") as client,
+    ):
         assert len(send_all(client, range(4))) == 4
         server.kill()
         assert len(send_all(client, range(4, 28))) == 24
@@ -332,7 +335,10 @@ def test_a_map_whose_server_is_killed_has_every_keyframe(tmp_path: Path) -> None
 def test_a_killed_server_and_drop_oldest(tmp_path: Path) -> None:
     """Every keyframe is in the map or was dropped, none is both."""
     config = ClientConfig(stall_timeout=0.5, backlog=4, policy="drop_oldest")
-    with serving(tmp_path) as server, Client(server.address, config=config) as client:
+    with (
+        serving(tmp_path, listen=lasting_address()) as server,
+        Client(server.address, config=config) as client,
+    ):
         client.connect(DEADLINE)
         send_all(client, range(4))
         server.kill()

@@ -17,6 +17,7 @@ from keyframes_and_servers import (
     Server,
     connected,
     journaled_corrections,
+    lasting_address,
     pose,
     secured,
     serving,
@@ -212,7 +213,7 @@ writer.Journal.append = append
 @pytest.mark.parametrize("writes", [False, True])
 def test_a_server_that_dies_before_it_answers(tmp_path: Path, writes: bool) -> None:
     state = tmp_path / "state"
-    with serving(state, code=_DIES.format(writes=writes)) as first:  # type: ignore[arg-type]
+    with serving(state, listen=lasting_address(), code=_DIES.format(writes=writes)) as first:  # type: ignore[arg-type]
         address = first.address
         client = Client(address, spool=tmp_path / "spool", config=QUICK)
         try:

@@ -14,7 +14,18 @@ import pytest
 import zmq
 from clients_and_spools import NOBODY, QUICK, send_all
 from command_processes import alive
-from keyframes_and_servers import DEADLINE, Server, at_once, connected, map_hash, pose, serving, until, wall
+from keyframes_and_servers import (
+    DEADLINE,
+    Server,
+    at_once,
+    connected,
+    lasting_address,
+    map_hash,
+    pose,
+    serving,
+    until,
+    wall,
+)
 
 import tsfusion
 from tsfusion import Client, Keyframe
@@ -95,7 +106,10 @@ def test_a_killed_server_loses_nothing_acknowledged(tmp_path: Path, offline_hash
             FlushTimeout, match=r"1 keyframes are not acknowledged after 0\.1 s: no server answers"
         ):
             early.flush(timeout=0.1)
-    with serving(state, checkpoint_every=3) as server, Client(server.address, config=QUICK) as client:
+    with (
+        serving(state, listen=lasting_address(), checkpoint_every=3) as server,
+        Client(server.address, config=QUICK) as client,
+    ):
         send_all(client, range(5))
         client.flush(timeout=DEADLINE)
         until(lambda: fused(server.address) >= 3)

@@ -55,7 +55,7 @@ def test_each_measurement_is_accepted_and_normalised() -> None:
         ({}, "exactly one of depth, disparity and points must be given, got none"),
         ({"depth": DEPTH, "points": POINTS}, "got depth and points"),
         ({"depth": DEPTH.astype(np.float64)}, "depth must be uint16 or float32, got float64"),
-        ({"depth": DEPTH[0]}, r"depth must have shape \(\*, \*\), got \(5,\)"),
+        ({"depth": DEPTH[0]}, r"depth must have shape \(H, W\), got \(5,\)"),
         ({"depth": np.zeros((0, 5), np.uint16)}, "depth must not be empty"),
         ({"depth": np.zeros((1, 9000), np.uint16)}, "at most 8192"),
         ({"depth": DEPTH, "intrinsics": None}, "intrinsics must be given with depth"),

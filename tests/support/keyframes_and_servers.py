@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Keyframes and server processes for the tests of the wire."""
 
+import random
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -194,6 +196,16 @@ class Server:
         """The fusers, one for each map that is open."""
         pids = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
         return [int(pid) for pid in pids]
+
+
+def lasting_address() -> str:
+    """An address at which a server can start again: no program's own end of a connection gets such a port."""
+    while True:
+        port = random.randrange(10_000, 32_000, 4)  # the system gives out those from 32768
+        with ExitStack() as stack, suppress(OSError):
+            for each in range(port, port + 3):  # data, control, publish
+                stack.enter_context(socket.socket()).bind(("127.0.0.1", each))
+            return f"tcp://127.0.0.1:{port}"
 
 
 @contextmanager
