@@ -28,6 +28,7 @@ from tsfusion.pipelines.leftovers import ANSWER_SECONDS, Leftovers
 from tsfusion.pipelines.scan_results import MapResult, ScanSummary
 from tsfusion.pipelines.target_server import Target
 from tsfusion.scanner.localization import registry
+from tsfusion.scanner.localization.localizer import Localizer
 from tsfusion.scanner.scanner import Scanner, Submap
 from tsfusion.scanner.sources.source import Source
 
@@ -98,25 +99,7 @@ def scan(
             leftovers = Leftovers(target, given=localizer.absolute)
             leftovers.begin()
 
-            def open_client(map_name: str) -> Client:
-                return target.client(
-                    map_name,
-                    # A recording waits, so nothing of it is left out; what a live source gives is thinned.
-                    policy=None if source.live else "spool_all",
-                    world="" if localizer.absolute else uuid.uuid4().hex,
-                    same_frame=same_frame and map_name == target.link.map,
-                )
-
-            scanner = Scanner(
-                localizer, config, open_client, map_name=target.link.map,
-                taken=leftovers.maps, free_name=target.free_map_name,
-                outdoors=source.sensor in OUTDOOR_SENSORS,
-                most=target_server.MAPS - 1 if own else None,
-            )  # fmt: skip
-            scanner.submaps[0].client.wait_answer(ANSWER_SECONDS)
-            if scanner.submaps[0].client.is_of_other_world:
-                leftovers.finish()
-                scanner.submaps[0].client.check_world()
+            scanner = _open_scanner(source, localizer, config, target, leftovers, same_frame=same_frame)
 
             def observe() -> ClientStats:
                 state = scanner.state()
@@ -132,16 +115,7 @@ def scan(
             if not any(submap.located for submap in scanner.submaps):
                 raise (failure[0] if failure else _not_localised(scanner, first, config))
             scanner.finish()
-            clients = [submap.client for submap in scanner.submaps]
-            if own:
-                progress.stage("fusing what is on its way")
-                running.wait_fused()
-                running.wait_meshed(clients)
-            else:
-                progress.stage("sending what is on its way")
-                running.wait_acknowledged(clients)
-                leftovers.finish()
-                failure = _refused_worlds(clients) or failure
+            failure = _settle(scanner, running, leftovers, progress, own=own) or failure
             seconds = time.monotonic() - started
             progress.stage("writing the results")
             complete = not failure
@@ -164,6 +138,56 @@ def scan(
     if failure:
         raise failure[0]
     return result
+
+
+def _open_scanner(
+    source: Source,
+    localizer: Localizer,
+    config: ScanConfig,
+    target: Target,
+    leftovers: Leftovers,
+    *,
+    same_frame: bool,
+) -> Scanner:
+    """A scanner that sends to a target; raises WorldRefused at once when the map is of another world."""
+
+    def open_client(map_name: str) -> Client:
+        return target.client(
+            map_name,
+            # A recording waits, so nothing of it is left out; what a live source gives is thinned.
+            policy=None if source.live else "spool_all",
+            world="" if localizer.absolute else uuid.uuid4().hex,
+            same_frame=same_frame and map_name == target.link.map,
+        )
+
+    scanner = Scanner(
+        localizer, config, open_client, map_name=target.link.map,
+        taken=leftovers.maps, free_name=target.free_map_name,
+        outdoors=source.sensor in OUTDOOR_SENSORS,
+        most=None if target.child is None else target_server.MAPS - 1,
+    )  # fmt: skip
+    client = scanner.submaps[0].client
+    client.wait_answer(ANSWER_SECONDS)
+    if client.is_of_other_world:
+        leftovers.finish()
+        client.check_world()
+    return scanner
+
+
+def _settle(
+    scanner: Scanner, running: Engine, leftovers: Leftovers, progress: Progress, *, own: bool
+) -> list[Exception]:
+    """Wait for all keyframes under way; the refusal of a map of another world, else nothing."""
+    clients = [submap.client for submap in scanner.submaps]
+    if own:
+        progress.stage("fusing what is on its way")
+        running.wait_fused()
+        running.wait_meshed(clients)
+        return []
+    progress.stage("sending what is on its way")
+    running.wait_acknowledged(clients)
+    leftovers.finish()
+    return _refused_worlds(clients)
 
 
 def _camera(source: Source, first: Frame) -> str:
