@@ -237,7 +237,7 @@ def test_busy_port(here: Here, tmp_path: Path) -> None:
 
 @pytest.fixture
 def replayed(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """What `replay` asks of the pipeline, which is not run."""
+    """Arguments that `replay` hands to the pipeline, which is not run."""
     asked: dict[str, Any] = {}
 
     def record(dataset: Dataset, out: Path, **settings: Any) -> None:

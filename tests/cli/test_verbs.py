@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the verbs have in common: help on one screen, examples that run, variables, completion."""
+"""Rules for every verb: help on one screen, examples that run, variables, completion."""
 
 import shlex
 import stat
@@ -75,7 +75,7 @@ def test_rare_flags_are_shown_on_request(here: Here, verb: str) -> None:
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """What `replay` asks of the pipeline, which is not run."""
+    """Arguments that `replay` hands to the pipeline, which is not run."""
     found: dict[str, Any] = {}
 
     def record(dataset: Dataset, out: Path | None, **settings: Any) -> None:

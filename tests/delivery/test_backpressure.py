@@ -261,7 +261,7 @@ def test_spool_all_keeps_everything(tmp_path: Path) -> None:
 
 
 def test_the_server_is_told(tmp_path: Path) -> None:
-    """What waits, corrections not counted, and what was left out: a map that is much too slow is followed."""
+    """The server hears how many keyframes wait and were left out; corrections do not count."""
     config = ClientConfig(stall_timeout=0.5, catch_up=1e-3)
     with scripted(fuse_to=0) as server, joined(server, spool=tmp_path, config=config) as client:
         send_all(client, range(24))

@@ -137,7 +137,7 @@ def test_the_list_of_datasets_says_why_one_cannot_be_opened(
 
 
 class Bound(NamedTuple):
-    """What a form's mesh may differ from that of the recording itself, millimetres."""
+    """Largest distances of a form's mesh from that of the recording itself, millimetres."""
 
     median: float
     p95: float

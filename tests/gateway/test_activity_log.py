@@ -31,7 +31,7 @@ def clock() -> Clock:
 
 @pytest.fixture
 def told(clock: Clock, caplog: pytest.LogCaptureFixture) -> Told:
-    """What is logged of a snapshot, a second after the one before."""
+    """Lines that are logged of a snapshot, a second after the one before."""
     activity = ActivityLog(clock)
     caplog.set_level(logging.INFO)
 

@@ -157,7 +157,7 @@ def test_what_was_left_goes_to_its_own_map_or_waits_and_is_named(
 def test_what_an_older_version_left_is_never_fused_into_another_session(
     scan: Scan, server: Server, tmp_path: Path
 ) -> None:
-    """Its records name no world, and neither do those that the map has."""
+    """Records of an old spool name no world, and neither do those that the map has."""
     with Client(server.address, map="old") as client:
         deliver(client, [wall(0)])
     for name in ("old", "older"):

@@ -21,7 +21,7 @@ SOURCES = sorted(
 
 
 def installed() -> list[str]:
-    """What the install lines name, each once: `.`, `.[ros]`, …"""
+    """Targets of the install lines, each once: `.`, `.[ros]` and so on."""
     found = {
         shlex.split(words)[-1] for path in SOURCES for words in PIP.findall(path.read_text(encoding="utf-8"))
     }

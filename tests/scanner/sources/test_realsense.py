@@ -203,7 +203,7 @@ def test_a_slow_reader_of_a_recording_loses_nothing(recording: Path) -> None:
 
 
 def test_a_recording_stands_still_until_it_is_read(recording: Path) -> None:
-    """It would play on while its sensors are started one after the other, and their first frames be lost."""
+    """A recording that plays while its sensors start one after the other would lose their first frames."""
     with RealSense(recording=recording) as source:
         assert source._stream._playback.current_status() != rs.playback_status.playing
         assert not source._stream.over()
