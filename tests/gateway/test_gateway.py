@@ -2,7 +2,6 @@
 """The gateway with fusers that misbehave, in this process; and real scans by file and by socket."""
 
 import errno
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -245,19 +244,22 @@ def test_no_room_for_a_new_fuser_is_waited_out(start: Start, monkeypatch: pytest
     assert default(gateway).problem == ""
 
 
-def test_a_vanished_scratch_folder_is_made_anew(
+def test_a_vanished_temporary_folder_is_waited_for(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "scratch"))
-    (tmp_path / "scratch").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
     gateway = start(_CRASHES_ON_2)
     stepped(gateway, lambda: gateway.maps.warm)
-    shutil.rmtree(next((tmp_path / "scratch").iterdir()))
+    (tmp_path / "temporary").rmdir()  # is empty: a running fuser needs nothing in it
+    stepped(gateway, lambda: "cannot be started" in default(gateway).problem)
+    (tmp_path / "temporary").mkdir()
     drained(gateway)
 
 
-def test_the_last_words_of_a_dead_fuser_are_not_heard(start: Start) -> None:
+def test_the_last_words_of_a_dead_fuser_are_not_heard(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     """ZeroMQ may deliver them late, when its keyframes are handed out anew."""
+    monkeypatch.setattr(fuser_process.FuserProcess, "remove_socket_file", lambda _: None)
     gateway = start(_CANNOT_COME_BACK)
     (hosted,) = gateway.maps
     stepped(gateway, lambda: hosted.fuser._restart_at > time.monotonic() + 0.5)

@@ -38,11 +38,10 @@ def run(endpoint: str) -> int:
 
 
 def _remove_scratch_folder(endpoint: str) -> None:
-    """Clear up behind a gateway that was killed; one that lives needs the folder, or removes it itself."""
+    """Clear up behind a gateway that was killed before it saw `Started`; otherwise it did that itself."""
     socket_file = Path(endpoint.removeprefix("ipc://"))
     with suppress(OSError):
-        for file in (socket_file, socket_file.parent / fuser_messages.WORKING_FILE):
-            file.unlink(missing_ok=True)
+        socket_file.unlink(missing_ok=True)
         socket_file.parent.rmdir()
 
 

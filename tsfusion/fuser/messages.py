@@ -17,7 +17,6 @@ from tsfusion.wire.health import MeshLayout
 from tsfusion.wire.messages import Command
 
 NOT_WORKING = -1  # instead of a keyframe's index
-WORKING_FILE = "working"  # in the folder of the socket
 
 
 class Begin(Struct, frozen=True, tag="begin"):

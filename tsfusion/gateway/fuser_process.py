@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """One fuser process: its socket, and the file that says which keyframe it is at."""
 
+import os
 import shutil
 import struct
 import subprocess
@@ -32,8 +33,8 @@ class FuserProcess:
     def __init__(
         self, context: "zmq.Context[Any]", name: str, log_format: LogFormat, log_level: LogLevel
     ) -> None:
+        self._working = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  nameless, held as long as this
         self._scratch = Path(tempfile.mkdtemp(prefix="tsfusion-"))  # a socket's path has to be short
-        self.working_file = self._scratch / fuser_messages.WORKING_FILE  # see `fuser.messages.Begin`
         self.socket = sockets.pair(context)  # the gateway's end
         try:
             self.clear_current_keyframe()
@@ -43,12 +44,17 @@ class FuserProcess:
                 [*COMMAND, endpoint, log_format, log_level, name],
                 stdin=subprocess.PIPE,  # closes when the gateway dies, however it dies
                 stdout=subprocess.DEVNULL,
+                pass_fds=[self._working.fileno()],
                 start_new_session=True,  # a Ctrl-C is for the gateway
             )
         except BaseException:
-            self.socket.close()
-            shutil.rmtree(self._scratch, ignore_errors=True)
+            self._clear_up()
             raise
+
+    @property
+    def working_file(self) -> str:
+        """The path by which the process opens it; see `fuser.messages.Begin`."""
+        return f"/dev/fd/{self._working.fileno()}"
 
     @property
     def status(self) -> int | None:
@@ -59,14 +65,18 @@ class FuserProcess:
     def current_keyframe(self) -> int:
         """The index of the keyframe that it is at, or `fuser.messages.NOT_WORKING`."""
         try:
-            (index,) = struct.unpack("<q", self.working_file.read_bytes())
+            (index,) = struct.unpack("<q", os.pread(self._working.fileno(), 8, 0))
         except (OSError, struct.error):
             return fuser_messages.NOT_WORKING
         return int(index)
 
     def clear_current_keyframe(self) -> None:
         """Write that it is at no keyframe."""
-        self.working_file.write_bytes(struct.pack("<q", fuser_messages.NOT_WORKING))
+        os.pwrite(self._working.fileno(), struct.pack("<q", fuser_messages.NOT_WORKING), 0)
+
+    def remove_socket_file(self) -> None:
+        """Remove the file by which the process has connected: none stays behind a killed gateway."""
+        shutil.rmtree(self._scratch, ignore_errors=True)
 
     def kill(self) -> None:
         """Kill the process, and wait until it has ended."""
@@ -82,5 +92,9 @@ class FuserProcess:
             self._process.wait(timeout)
         except subprocess.TimeoutExpired:
             self.kill()
+        self._clear_up()
+
+    def _clear_up(self) -> None:
         self.socket.close()
-        shutil.rmtree(self._scratch, ignore_errors=True)
+        self._working.close()
+        self.remove_socket_file()

@@ -127,7 +127,8 @@ class FuserSupervisor:
         elif isinstance(message, fuser_messages.Failed):
             raise message.error()
         if isinstance(message, fuser_messages.Started):
-            self.send(msgspec.structs.replace(self._begin, working=str(self._process.working_file)))
+            self._process.remove_socket_file()
+            self.send(msgspec.structs.replace(self._begin, working=self._process.working_file))
         elif isinstance(message, fuser_messages.Ready):
             self.ready = self._was_ready = True
             self._ready_since = self._last_message
