@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""Attack a server in a dozen ways and show what a well-behaved scanner notices of it.
+"""Attack a server in many ways and show what a well-behaved scanner notices of it.
 
-    python scripts/hostile.py                     every attack for 5 s, a table
-    python scripts/hostile.py --seconds 20 --json the same as one JSON line
+    python scripts/hostile.py                     each attack for 5 s, each at a server of its own; a table
+    python scripts/hostile.py --seconds 20 --json the same as a JSON line an attack
     python scripts/hostile.py --only unfinished tiny
 
-The exit status is 1 when a keyframe of the well-behaved scanner is not in the map, the server or its fuser
-died, or the gateway held more memory than its bound.
+Each line is one attack and the time until everything is as before: the delay of the scanner's keyframes from
+capture to map, the longest wait for an answer of the control port, the highest memory of gateway and fuser,
+restarts of fusers, seconds from the attack's end until everything is as before, and the problems that the
+server told in its health.
+
+The exit status is 1 when a keyframe of the well-behaved scanner is not in the map exactly once, its delay or
+an answer takes longer than the bounds, the gateway held more memory than its own bound, or a process died.
 """
 
 import argparse
@@ -18,10 +23,12 @@ import msgspec
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 from attacks import ATTACKS
-from hostile_run import run, table
+from hostile_run import ACCESS, HEADING, MEMORY_BYTES, Bounds, Outcome, row, run
+
+_MB = 1 << 20
 
 
-def main() -> int:
+def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -29,15 +36,40 @@ def main() -> int:
         "--seconds", type=float, default=5.0, help="of each attack, and of peace before and after"
     )
     parser.add_argument("--only", nargs="+", choices=list(ATTACKS), default=list(ATTACKS), metavar="ATTACK")
-    parser.add_argument("--keys", action="store_true", help="the server asks for them; attackers have none")
-    parser.add_argument("--json", action="store_true", help="one line instead of a table")
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="tsfusion-hostile-") as folder:
-        outcome = run(Path(folder), options.seconds, tuple(options.only), keys=options.keys)
-    print(msgspec.json.encode(outcome).decode() if options.json else table(outcome))
+    parser.add_argument(
+        "--access", choices=ACCESS, default="open",
+        help="open: there are no keys; stranger: the server asks for keys, attackers have none; allowed: "
+        "attackers have a key that the server allows",
+    )  # fmt: skip
+    parser.add_argument("--delay", type=float, default=1.0, help="bound on the 99th percentile, s")
+    parser.add_argument("--control", type=float, default=1.0, help="bound on the longest answer, s")
+    parser.add_argument("--slack", type=float, default=0.0, help="MB of the gateway above its own bound")
+    parser.add_argument("--json", action="store_true", help="lines of JSON instead of a table")
+    return parser.parse_args()
+
+
+def _show(outcome: Outcome, as_json: bool) -> None:
+    if as_json:
+        print(msgspec.json.encode(outcome).decode(), flush=True)
+    else:
+        print("\n".join(row(one) for one in outcome.phases if one.attack != "none"), flush=True)
     for problem in outcome.problems:
-        print(problem, file=sys.stderr)
-    return 1 if outcome.problems else 0
+        print(f"  {problem}", file=sys.stderr, flush=True)
+
+
+def main() -> int:
+    options = _options()
+    bounds = Bounds(delay_s=options.delay, control_s=options.control, slack_bytes=int(options.slack * _MB))
+    if not options.json:
+        print(f"the gateway's bound is {MEMORY_BYTES / 1e6:.0f} MB\n{HEADING}", flush=True)
+    harmed = 0
+    for attack in options.only:
+        with tempfile.TemporaryDirectory(prefix="tsfusion-hostile-") as folder:
+            outcome = run(Path(folder), options.seconds, (attack,), access=options.access, bounds=bounds)
+        _show(outcome, options.json)
+        harmed += bool(outcome.problems)
+    print(f"{len(options.only) - harmed} of {len(options.only)} attacks harmed nobody", file=sys.stderr)
+    return 1 if harmed else 0
 
 
 if __name__ == "__main__":

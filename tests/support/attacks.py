@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Attacks of strangers on a server, each some seconds long in a process of its own; bounded, loopback only.
 
-python tests/support/attacks.py NAME DATA CONTROL PUBLISH SERVER_KEY SECONDS
+python tests/support/attacks.py NAME TARGET SECONDS
 
 It prints `begun`, and in the end how many messages, connections or bytes it came to.
 """
@@ -9,6 +9,7 @@ It prints `begun`, and in the end how many messages, connections or bytes it cam
 import contextlib
 import itertools
 import os
+import resource
 import socket
 import struct
 import sys
@@ -17,9 +18,11 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import Any
 
+import costly_keyframes
 import msgspec
 import numpy as np
 import zmq
+from attack_target import Target
 from hostile_messages import Frames, bad_values, bombs, hostile_corrections, lies
 from keyframes_and_servers import connected, wall
 
@@ -27,7 +30,8 @@ from tsfusion.wire import codec, corrections, messages, sockets
 from tsfusion.wire.curve import ClientKeys
 from tsfusion.wire.messages import PROTOCOL_VERSION, Command
 
-_HALF_OPEN = 1000
+_HALF_OPEN = 36_000
+_EMPTY = 2_000_000
 _UNFINISHED = 400  # parts
 _PART_BYTES = 900_000
 _LORISES = 50
@@ -35,23 +39,9 @@ _READERS, _DEAF = 16, 16
 _PAUSE = 0.002  # between hostile messages: they shall be checked, not only queued
 
 
-class Target(msgspec.Struct, frozen=True):
-    """The server under attack, and when to stop."""
-
-    data: str
-    control: str
-    publish: str
-    server_key: str  # its public one; empty = it asks for none
-    end: float
-
-    @property
-    def over(self) -> bool:
-        return time.monotonic() >= self.end
-
-
 def _push(target: Target, made: Callable[[], Iterator[Frames]]) -> int:
     sent = 0
-    with connected(sockets.push, target.data) as push:
+    with target.data_link() as push:
         while not target.over:
             for frames in made():
                 if target.over or not push.poll(1000, zmq.POLLOUT):
@@ -66,11 +56,24 @@ def oversized(target: Target) -> int:
     """Frames larger than a server takes, each on a new connection: the last one was closed for it."""
     sent, huge = 0, bytes(33 << 20)
     while not target.over:
-        with connected(sockets.push, target.data) as push:
+        with target.data_link() as push:
             if push.poll(1000, zmq.POLLOUT):
                 push.send_multipart([b"TSF\x01", huge], copy=False)
                 sent += 1
                 time.sleep(0.05)
+    return sent
+
+
+def _push_costly(target: Target, made: Callable[[int], Frames], interval: float) -> int:
+    """Keyframes at intervals, each of a session of its own."""
+    sent = 0
+    with target.data_link() as push:
+        while push.poll(1000, zmq.POLLOUT):
+            push.send_multipart(costly_keyframes.fresh(made(sent)))
+            sent += 1
+            time.sleep(interval)
+            if target.over:
+                break
     return sent
 
 
@@ -91,7 +94,7 @@ def rubbish(target: Target) -> int:
         messages.encode(messages.Ping(bytes(16), 1, skipped={f"r{i}": 1 << 62 for i in range(16)})),
     ]  # fmt: skip
     sent = 0
-    with connected(sockets.dealer, target.control) as link:
+    with target.control_link() as link:
         for message in itertools.cycle(wrong):
             if target.over or not link.poll(1000, zmq.POLLOUT):
                 break
@@ -108,7 +111,7 @@ def wrong_corrections(target: Target) -> int:
     few = corrections.checked({1 + i: np.eye(4) for i in range(20)})
     seq = corrections.MAX_KEYFRAMES
     keyframe = codec.encode(wall(), session=session, seq=seq, previous=0, jpeg_quality=90)
-    with connected(sockets.push, target.data) as push:
+    with target.data_link() as push:
         if push.poll(1000, zmq.POLLOUT):
             push.send_multipart(keyframe)
         while True:
@@ -126,7 +129,7 @@ def wrong_corrections(target: Target) -> int:
 def greetings(target: Target) -> int:
     """Sessions without end, for maps without end."""
     sent = 0
-    with connected(sockets.dealer, target.control) as link:
+    with target.control_link() as link:
         while not target.over and link.poll(1000, zmq.POLLOUT):
             link.send(messages.encode(messages.Hello(os.urandom(16), PROTOCOL_VERSION, f"map{sent % 1000}")))
             sent += 1
@@ -137,7 +140,7 @@ def greetings(target: Target) -> int:
 def sessions(target: Target) -> int:
     """Sessions without end for the map that is open: each would be told how it is doing."""
     sent = 0
-    with connected(sockets.dealer, target.control) as link:
+    with target.control_link() as link:
         while not target.over and link.poll(1000, zmq.POLLOUT):
             link.send(messages.encode(messages.Hello(os.urandom(16), PROTOCOL_VERSION)))
             while link.poll(0):
@@ -151,7 +154,7 @@ def mesh_flood(target: Target) -> int:
     question = messages.encode(Command(name="mesh", min_weight=0.0))
     asked = 0
     with ExitStack() as stack:
-        readers = [stack.enter_context(connected(sockets.dealer, target.control)) for _ in range(_READERS)]
+        readers = [stack.enter_context(target.control_link()) for _ in range(_READERS)]
         deaf = [stack.enter_context(contextlib.closing(raw(target.control, b"DEALER"))) for _ in range(_DEAF)]
         while not target.over:
             for one in deaf:
@@ -172,7 +175,10 @@ def mesh_flood(target: Target) -> int:
 def tiny(target: Target) -> int:
     """Small messages on both ports, as many as go through."""
     sent = 0
-    with connected(sockets.push, target.data) as push, connected(sockets.dealer, target.control) as link:
+    with (
+        target.data_link() as push,
+        target.control_link() as link,
+    ):
         while not target.over and sent < 2_000_000:
             for one in (push, link):
                 with contextlib.suppress(zmq.Again):
@@ -185,13 +191,15 @@ def tiny(target: Target) -> int:
 def subscriptions(target: Target) -> int:
     """Topics without end, long and short."""
 
-    def xsub(context: "zmq.Context[Any]") -> sockets.AnySocket:
+    def xsub(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> sockets.AnySocket:
         made: sockets.AnySocket = context.socket(zmq.XSUB)
         made.setsockopt(zmq.LINGER, 0)
+        if keys:
+            keys.secure(made)
         return made
 
     sent = 0
-    with connected(xsub, target.publish) as stranger:
+    with connected(xsub, target.publish, target.keys) as stranger:
         while not target.over and stranger.poll(1000, zmq.POLLOUT):
             more = 60_000 if sent % 500 == 499 else 400 if sent % 5 == 0 else 0
             topic = os.urandom(8) + bytes(more)
@@ -223,7 +231,7 @@ def knocking(target: Target) -> int:
     return knocks
 
 
-# --- below the messages: ZMTP 3.1 by hand ---
+# --- below the messages: ZMTP 3.1 by hand, where there are no keys ---
 
 _GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"NULL".ljust(20, b"\0") + bytes(32)
 
@@ -281,10 +289,43 @@ def unfinished_control(target: Target) -> int:
     return _parts(target, target.control, b"DEALER", most=10 * _UNFINISHED, size=60_000, links=1)
 
 
+def empty_frames(target: Target) -> int:
+    """Messages of two million frames each, all of them empty, in turn on the three ports."""
+    if target.server_key:
+        return _empty_frames_by_zmq(target)
+    content = b"\x01\x00" * _EMPTY + b"\x00\x00"
+    ports = ((target.data, b"PUSH"), (target.control, b"DEALER"), (target.publish, b"XSUB"))
+    sent = 0
+    with ExitStack() as stack:
+        for address, kind in itertools.cycle(ports):
+            with contextlib.suppress(OSError):
+                link = stack.enter_context(contextlib.closing(raw(address, kind)))
+                link.sendall(content)
+                sent += 1
+            time.sleep(0.5)
+            if target.over:
+                break
+    return sent
+
+
+def _empty_frames_by_zmq(target: Target) -> int:
+    sent, content = 0, [b""] * (_EMPTY // 10)
+    with target.data_link() as push, target.control_link() as dealer:
+        while not target.over:
+            for link in (push, dealer):
+                if link.poll(1000, zmq.POLLOUT):
+                    link.send_multipart(content)
+                    sent += 1
+                time.sleep(0.1)
+    return sent
+
+
 def half_open(target: Target) -> int:
     """Connections that say nothing, or the beginning of a greeting."""
     with ExitStack() as stack:
         made = 0
+        _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
         addresses = itertools.cycle((target.data, target.control, target.publish))
         while not target.over and made < _HALF_OPEN:
             host, _, port = next(addresses).removeprefix("tcp://").rpartition(":")
@@ -332,12 +373,17 @@ ATTACKS: dict[str, Callable[[Target], int]] = {
     "unfinished": unfinished,
     "unfinished control": unfinished_control,
     "knocking": knocking,
+    "empty frames": empty_frames,
     "half open": half_open,
     "slow loris": slow_loris,
+    "crossings": lambda target: _push_costly(target, lambda _: costly_keyframes.crossings(), 2.0),
+    "surplus idat": lambda target: _push_costly(target, lambda _: costly_keyframes.surplus_idat(), 0.5),
+    "fill": lambda target: _push_costly(target, costly_keyframes.filling, 0.05),
 }
 
 
 if __name__ == "__main__":
-    name, *where, seconds = sys.argv[1:]
+    name, where, seconds = sys.argv[1:]
     print("begun", flush=True)
-    print(ATTACKS[name](Target(*where, time.monotonic() + float(seconds))))
+    target = msgspec.json.decode(where, type=Target)
+    print(ATTACKS[name](msgspec.structs.replace(target, end=time.monotonic() + float(seconds))))

@@ -6,41 +6,72 @@ import os
 import resource
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
+from typing import Literal, get_args
 
 import msgspec
+from attack_target import Target
 from attacks import ATTACKS
-from keyframes_and_servers import UNSECURED, Secured, Server, secured, serving, until
+from hostile_watch import Seen, Watch
+from keyframes_and_servers import (
+    NUMBERED_NS,
+    UNSECURED,
+    Secured,
+    Server,
+    map_hash,
+    secured,
+    serving,
+    until,
+    wall,
+)
 from msgspec import Struct
-from scanner_process import Plan, Report, plan_in
+from scanner_process import Plan, Report, journals, plan_in
 from supervisors import PATIENCE, SCANNER
 
+from tsfusion import journal
 from tsfusion.core.config import ClientConfig, override
 from tsfusion.pipelines import latency_ledger
-from tsfusion.wire import keyframe_times
+from tsfusion.wire import key_folder, keyframe_times
 from tsfusion.wire.keyframe_times import KeyframeTimes, Spread
+from tsfusion.wire.queries import fetch_status
+from tsfusion.wire.record_header import unpack_keyframe
 
+Access = Literal["open", "stranger", "allowed"]  # no keys; attackers without one; attackers with their own
+ACCESS: tuple[Access, ...] = get_args(Access)
 RATE = 8.0  # keyframes a second of the well-behaved one
 MEMORY_BYTES = 192 << 20  # the bound on the gateway
-# What may come over it: a tick's worth of input before the gateway looks, and what the allocator keeps.
-MEMORY_SLACK = 128 << 20
+FUSER_MEMORY_BYTES = 2 << 30
 _ATTACK = Path(__file__).with_name("attacks.py")
 _FILES = 8192
 _MORE_FILES = 30  # of maps that were opened meanwhile
+_HANGS_S = 120.0  # after an attack; a server that is not well by then stays as it is
+
+
+class Bounds(Struct, frozen=True, kw_only=True):
+    """Limits on what others may notice.
+
+    Attributes:
+        delay_s: 99 of 100 keyframes are fused so soon after they were captured.
+        control_s: the longest wait for an answer of the control port.
+        slack_bytes: of the gateway's memory above `MEMORY_BYTES`.
+    """
+
+    delay_s: float = 1.0
+    control_s: float = 1.0
+    slack_bytes: int = 0
 
 
 class Phase(Struct, kw_only=True):
-    """An attack (or none) and its effect on the others."""
+    """An attack (or none) and its effect on the others, until everything is as before."""
 
     attack: str
     hostile: int  # messages, connections or bytes of it
     seconds: float
+    recovered_s: float  # from its end until everything is as before
     durable_ms: Spread  # captured → on the server's disk, of the well-behaved scanner's keyframes
     fused_ms: Spread
-    gateway_mb: float  # highest RSS
-    fuser_mb: float
+    seen: Seen
 
 
 class Outcome(Struct, kw_only=True):
@@ -48,81 +79,76 @@ class Outcome(Struct, kw_only=True):
 
     problems: list[str]
     phases: list[Phase]
-    keyframes: int
-    refused: dict[str, int]
-    rejected: dict[str, int]
+    keyframes: int = 0
+    map_hash: str = ""
+    refused: dict[str, int] = {}
+    rejected: dict[str, int] = {}
 
 
-class Rss:
-    """The highest RSS of server and largest fuser since last asked, looked at all the time."""
-
-    def __init__(self, server: Server) -> None:
-        self._server = server
-        self._over = threading.Event()
-        self._highest = [0, 0]
-        self._thread = threading.Thread(target=self._look)
-        self._thread.start()
-
-    def _look(self) -> None:
-        while not self._over.wait(0.02):
-            with contextlib.suppress(OSError):
-                held = [[self._server.process.pid], self._server.children()]
-                for at, pids in enumerate(held):
-                    self._highest[at] = max(self._highest[at], *map(rss_bytes, pids), 0)
-
-    def highest(self) -> list[int]:
-        """Highest RSS of gateway and fuser since the last call, bytes."""
-        found, self._highest = self._highest, [0, 0]
-        return found
-
-    def close(self) -> None:
-        self._over.set()
-        self._thread.join()
-
-
-def rss_bytes(pid: int) -> int:
-    """RSS of a process; 0 when it has ended."""
-    with contextlib.suppress(OSError):
-        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-            if line.startswith("VmRSS:"):
-                return int(line.split()[1]) * 1024
-    return 0
+class _Span(Struct):
+    attack: str
+    hostile: int
+    started: float
+    ended: float
+    well: float  # again
+    seen: Seen
 
 
 def run(
-    folder: Path, seconds: float, attacks: tuple[str, ...] = tuple(ATTACKS), *, keys: bool = False
+    folder: Path,
+    seconds: float,
+    attacks: tuple[str, ...] = tuple(ATTACKS),
+    *,
+    access: Access = "open",
+    bounds: Bounds = Bounds(),  # noqa: B008  frozen
 ) -> Outcome:
-    """`seconds` of peace, so many of each attack, and the same of peace again.
-
-    Args:
-        keys: the server asks for them, and the attackers have none.
-    """
-    given = secured(folder / "keys") if keys else UNSECURED
+    """`seconds` of peace, so many of each attack, and the same of peace again, at one server."""
+    given, target = _secured(folder / "keys", access)
     names = ("", *attacks, "")
     _raise_file_limit()
+    limits = {"memory_bytes": MEMORY_BYTES, "fuser_memory_bytes": FUSER_MEMORY_BYTES}
     with contextlib.ExitStack() as stack:
-        server = stack.enter_context(serving(folder / "state", memory_bytes=MEMORY_BYTES, **given.server))
+        server = stack.enter_context(serving(folder / "state", **limits, **given.server))
+        target = msgspec.structs.replace(
+            target, data=server.address, control=server.control, publish=server.publish
+        )
         plan = _plan(folder, server, given)
         scanner = subprocess.Popen([sys.executable, str(SCANNER), msgspec.json.encode(plan).decode()])
         stack.callback(scanner.kill)
-        rss = Rss(server)
-        stack.callback(rss.close)
         until(lambda: len(list((folder / "spool").glob("*.mcap"))) > 0)  # it sends
         files = _files(server)
-        public = given.keys.server if given.keys else ""
-        spans = [_attack(server, public, name, seconds, rss) for name in names]
+        watch = Watch(server, given)
+        stack.callback(watch.close)
+        spans = [_attack(server, target, name, seconds, watch) for name in names]
+        watch.close()
         (folder / "enough").touch()
         problems = []
-        if scanner.wait(PATIENCE):
+        if scanner.wait(PATIENCE + 30):
             problems.append("the well-behaved scanner did not see everything fused")
         if server.process.poll() is not None:
             problems.append(f"the server died: {server.stderr_text()[-1000:]}")
-            return Outcome(problems=problems, phases=[], keyframes=0, refused={}, rejected={})
+            return Outcome(problems=problems, phases=[])
         with contextlib.suppress(AssertionError):  # who never greets is cut off after five seconds
             until(lambda: _files(server) <= files + _MORE_FILES, 15.0)
         if (left := _files(server)) > files + _MORE_FILES:
             problems.append(f"{left - files} connections were left behind")
-        return _outcome(folder, server, spans, problems, given)
+        found = _outcome(folder, server, spans, problems, given, bounds)
+    if found.map_hash:
+        found.problems += _inexact(folder / "state", found.keyframes, found.map_hash, access)
+    return found
+
+
+def _secured(folder: Path, access: Access) -> tuple[Secured, Target]:
+    """The keys of the server and its scanner, and what an attacker has of that."""
+    if access == "open":
+        return UNSECURED, Target()
+    given = secured(folder)
+    assert given.keys is not None
+    if access == "stranger":
+        return given, Target(server_key=given.keys.server)
+    own = key_folder.create_pair(folder / "attacker", "attacker")
+    key_folder.allow(folder / "server", "attacker", own.public)
+    return given, Target(server_key=given.keys.server, public=own.public, secret=own.secret)
 
 
 def _files(server: Server) -> int:
@@ -143,81 +169,118 @@ def _plan(folder: Path, server: Server, given: Secured) -> Plan:
     )
 
 
-class _Span(Struct):
-    attack: str
-    hostile: int
-    started: float
-    ended: float
-    rss: list[int]
-
-
-def _attack(server: Server, public: str, name: str, seconds: float, rss: Rss) -> _Span:
+def _attack(server: Server, target: Target, name: str, seconds: float, watch: Watch) -> _Span:
     hostile = 0
     if name:
-        at = [server.address, server.control, server.publish, public]
-        command = [sys.executable, str(_ATTACK), name, *at, str(seconds)]
+        command = [sys.executable, str(_ATTACK), name, msgspec.json.encode(target).decode(), str(seconds)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             process.stdout.readline()
-            started = time.monotonic()
-            rss.highest()
+            started = watch.begin()
             hostile = int(process.stdout.read() or 0)
         if process.returncode:
             raise RuntimeError(f"the attack {name!r} failed")
     else:
-        started = time.monotonic()
-        rss.highest()
+        started = watch.begin()
         time.sleep(seconds)
-    return _Span(name or "none", hostile, started, time.monotonic(), rss.highest())
+    ended = time.monotonic()
+    with contextlib.suppress(AssertionError):
+        until(lambda: watch.well(ended) or server.process.poll() is not None, _HANGS_S)
+    well = time.monotonic()
+    return _Span(name or "none", hostile, started, ended, well, watch.seen(started, well))
 
 
 def _outcome(
-    folder: Path, server: Server, spans: list[_Span], problems: list[str], given: Secured
+    folder: Path, server: Server, spans: list[_Span], problems: list[str], given: Secured, bounds: Bounds
 ) -> Outcome:
-    from tsfusion.wire.queries import fetch_status
-
-    report = msgspec.json.decode((folder / "report.json").read_bytes(), type=Report)
+    report = _report(folder)
+    phases = [_phase(span, report.times if report else [], bounds) for span in spans]
+    problems += [problem for phase in phases for problem in _exceeded(phase, bounds)]
+    if report is None:
+        return Outcome(problems=problems, phases=phases)
     status = fetch_status(server.address, keys=given.keys)
     if (report.durable, report.fused, report.refused, report.rejected) != (report.sent, report.sent, {}, {}):
-        problems.append(f"of {report.sent} keyframes {report.fused} are in the map")
-    if given is not UNSECURED and status.keyframes_durable != report.sent:
-        problems.append(f"{status.keyframes_durable - report.sent} keyframes of strangers are in the journal")
-    if status.fuser_restarts:
-        problems.append(f"the fuser was restarted {status.fuser_restarts} times")
-    phases = [_phase(span, report.times) for span in spans]
-    for phase in phases:
-        if phase.gateway_mb * 1e6 > MEMORY_BYTES + MEMORY_SLACK:
-            problems.append(f"{phase.attack}: the gateway held {phase.gateway_mb} MB")
+        lost = {**report.refused, **report.rejected}
+        problems.append(f"of {report.sent} keyframes {report.fused} are in the map: {lost}")
     return Outcome(
         problems=problems,
         phases=phases,
         keyframes=report.sent,
+        map_hash=status.map_hash,
         refused=status.messages_refused,
         rejected=status.keyframes_rejected,
     )
 
 
-def _phase(span: _Span, times: list[KeyframeTimes]) -> Phase:
-    sent = [one for one in times if span.started <= one.captured_ns / 1e9 < span.ended]
-    gateway, fuser = (round(size / 1e6, 1) for size in span.rss)
+def _inexact(state: Path, sent: int, told_hash: str, access: Access) -> list[str]:
+    """Mistakes in the journal; and in the map, where no keyframe of an attacker could come into it."""
+    (folder,) = [one for one in journals(state) if one.parent.name == "default"]
+    sessions: dict[bytes, list[int]] = {}
+    for number in journal.segments(folder):
+        for record in journal.records(journal.segment_path(folder, number)):
+            own = sessions.setdefault(record.session, [])
+            if not record.is_correction:
+                own.append(unpack_keyframe(record.frames[0]).timestamp_ns - NUMBERED_NS)
+    if list(range(sent)) not in sessions.values():
+        return [f"the journal has not the {sent} keyframes of the well-behaved scanner, each once"]
+    if len(sessions) == 1 and told_hash != map_hash(map(wall, range(sent))):
+        return ["the map is not that of the keyframes of the well-behaved scanner"]
+    strangers = access == "stranger" and len(sessions) - 1
+    return [f"{strangers} sessions of strangers are in the journal"] if strangers else []
+
+
+def _report(folder: Path) -> Report | None:
+    with contextlib.suppress(OSError):
+        return msgspec.json.decode((folder / "report.json").read_bytes(), type=Report)
+    return None
+
+
+def _exceeded(phase: Phase, bounds: Bounds) -> list[str]:
+    if phase.attack == "none":
+        return []
+    problems = []
+    seen = phase.seen
+    if phase.fused_ms.p99 > 1e3 * bounds.delay_s:
+        problems.append(f"{phase.attack}: p99 of the delay is {phase.fused_ms.p99 / 1e3:.2f} s")
+    if seen.control_s > bounds.control_s:
+        problems.append(f"{phase.attack}: an answer of the control port took {seen.control_s:.2f} s")
+    if seen.gateway_mb * 1e6 > MEMORY_BYTES + bounds.slack_bytes:
+        problems.append(f"{phase.attack}: the gateway held {seen.gateway_mb} MB")
+    if seen.restarts:
+        problems.append(f"{phase.attack}: the fuser was restarted {seen.restarts} times")
+    return problems
+
+
+def _phase(span: _Span, times: list[KeyframeTimes], bounds: Bounds) -> Phase:
+    sent = [one for one in times if span.started <= one.captured_ns / 1e9 < span.well]
+    late = [one.fused_ns / 1e9 for one in sent if one.fused_ns - one.captured_ns > 1e9 * bounds.delay_s]
     return Phase(
         attack=span.attack,
         hostile=span.hostile,
         seconds=round(span.ended - span.started, 2),
+        recovered_s=round(max(span.well, *late, 0.0) - span.ended, 2),
         durable_ms=keyframe_times.spread(latency_ledger.durations_ms(sent, "captured_ns", "durable_ns")),
         fused_ms=keyframe_times.spread(latency_ledger.durations_ms(sent, "captured_ns", "fused_ns")),
-        gateway_mb=gateway,
-        fuser_mb=fuser,
+        seen=span.seen,
     )
+
+
+def _line(name: str, *words: str) -> str:
+    return f"{name:20}" + "".join(f"{word:>11}" for word in words)
+
+
+_DELAYS = ("p50 ms", "p99 ms", "longest ms")
+_OTHERS = ("control ms", "gateway MB", "fuser MB", "restarts", "well s")
+HEADING = _line("attack", "hostile", *_DELAYS, *_OTHERS)
+
+
+def row(one: Phase) -> str:
+    """A line of the table for people, with the problems that the server itself told."""
+    seen, delay = one.seen, one.fused_ms
+    figures = (delay.p50, delay.p99, delay.max, 1e3 * seen.control_s, seen.gateway_mb, seen.fuser_mb)
+    words = (*(f"{figure:.0f}" for figure in figures), str(seen.restarts), f"{one.recovered_s:.1f}")
+    return _line(one.attack, str(one.hostile), *words) + "".join(f"  {said}" for said in seen.problems)
 
 
 def table(outcome: Outcome) -> str:
     """Table for people, one line an attack."""
-    head = ("attack", "hostile", "durable p50", "p95 ms", "fused p50", "p95 ms", "gateway MB", "fuser MB")
-    rows = [head]
-    for one in outcome.phases:
-        delays = (one.durable_ms.p50, one.durable_ms.p95, one.fused_ms.p50, one.fused_ms.p95)
-        memory = (one.gateway_mb, one.fuser_mb)
-        rows.append(
-            (one.attack, str(one.hostile), *(f"{x:.1f}" for x in delays), *(f"{x:.0f}" for x in memory))
-        )
-    return "\n".join(f"{name:20}" + "".join(f"{word:>12}" for word in words) for name, *words in rows)
+    return "\n".join((HEADING, *map(row, outcome.phases)))

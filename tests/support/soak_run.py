@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import median
 
 import msgspec
-from hostile_run import rss_bytes
+from hostile_watch import rss_bytes
 from keyframes_and_servers import Server, connected, serving
 from msgspec import Struct
 from scanner_process import Report, plan_in, save_room
