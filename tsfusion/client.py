@@ -300,7 +300,10 @@ class Client:
 
     @property
     def problem(self) -> str:
-        """Why the server takes nothing at the moment; empty when it does."""
+        """Why the spool keeps nothing, or the server takes nothing, at the moment; empty when they do."""
+        return "; ".join(filter(None, (self._outbox.spool_problem, self._link_problem())))
+
+    def _link_problem(self) -> str:
         state = self._outbox.link_state
         if state.kind == "held":
             return state.why

@@ -145,14 +145,14 @@ def test_an_interrupted_append_leaves_nothing_behind(tmp_path: Path, monkeypatch
 
 def test_a_read_only_folder_is_read_and_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path, 2)
-    real = Path.open
+    real = os.open
 
-    def read_only(path: Path, mode: str = "r", **more: Any) -> Any:
-        if set(mode) & set("wxa+"):
+    def read_only(path: Any, flags: int, *more: Any, **options: Any) -> int:
+        if flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
             raise OSError(errno.EROFS, "Read-only file system")
-        return real(path, mode, **more)
+        return real(path, flags, *more, **options)
 
-    monkeypatch.setattr(Path, "open", read_only)
+    monkeypatch.setattr(os, "open", read_only)
     log = Journal(tmp_path, BIG)
     assert len(log.found) == 2
     with pytest.raises(JournalError, match="Read-only file system"):

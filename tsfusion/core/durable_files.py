@@ -3,6 +3,7 @@
 
 import errno
 import os
+import re
 import shlex
 import stat
 from collections.abc import Iterator
@@ -63,6 +64,15 @@ def replacing(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
         raise
+
+
+def sweep(folder: Path, pattern: str) -> None:
+    """Delete the files whose whole name matches: parts that a killed writer left. What cannot go stays."""
+    with suppress(OSError):
+        for name in os.listdir(folder):
+            if re.fullmatch(pattern, name):
+                with suppress(OSError):
+                    (folder / name).unlink()
 
 
 def free_bytes(folder: Path) -> int:

@@ -26,7 +26,9 @@
 The command line prints any of these as one line and exits with status 1.
 """
 
-from errno import ENOENT
+from errno import ENOENT, ENOTDIR, ESTALE
+
+MISSING = (ENOENT, ENOTDIR, ESTALE)  # answers of a system that does not find a file or its folder
 
 
 class TsfusionError(Exception):
@@ -66,8 +68,8 @@ class JournalError(TsfusionError):
 
     @property
     def temporary(self) -> bool:
-        """Whether a record that is there may be readable later: the system refused to read it now."""
-        return self.errno not in (None, ENOENT)
+        """Whether a record may be readable later: the system refused to read it now, or did not find it."""
+        return self.errno is not None
 
 
 class MapError(TsfusionError):

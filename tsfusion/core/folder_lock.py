@@ -47,10 +47,9 @@ def _lock(descriptor: int, deadline: float) -> None:
 
 def owner_of(folder: Path, *, name: str = "lock") -> str | None:
     """The pid of the process that holds a folder, "?" where it is not known; None = nobody does."""
-    if not (folder / name).exists():
-        return None
+    is_named = (folder / name).exists()
     try:
-        hold(folder, name).close()
+        hold(folder, name if is_named else None).close()
     except BlockingIOError:
         with suppress(OSError):
             return (folder / name).read_text(encoding="ascii", errors="replace") or "?"
@@ -58,6 +57,17 @@ def owner_of(folder: Path, *, name: str = "lock") -> str | None:
     except OSError:
         return None
     return None
+
+
+def _hold_itself(folder: Path, lock: ExitStack, wait: float) -> None:
+    """Lock a folder together with its file; a file system that locks no folders has the file alone."""
+    try:
+        lock.push(hold(folder, wait=max(wait, _POLL_S)))  # somebody may just look whether it is held
+    except BlockingIOError:
+        lock.close()
+        raise
+    except OSError:
+        return
 
 
 def lock_folder(
@@ -68,21 +78,27 @@ def lock_folder(
     name: str = "lock",
     wait: float = 0.0,
     error_type: type[TsfusionError] = JournalError,
+    make: bool = True,
 ) -> ExitStack:
     """Make a folder and hold it for this process; the lock file `name` says which process that is.
+
+    The folder itself is locked, too: somebody may delete the file.
 
     Args:
         kind: the folder, in the words of an error: `spool`, `state`, `map`.
         owner: the program that uses such a folder: `scanner`, `server`, `fuser`.
         wait: seconds to wait for another owner.
+        make: make the folder when it is absent.
 
     Raises:
         TsfusionError: of `error_type`, when the folder cannot be written, or another process holds it.
     """
     path = folder / name
     try:
-        durable_files.make_folder(folder)
+        if make:
+            durable_files.make_folder(folder)
         lock = hold(folder, name, wait=wait)
+        _hold_itself(folder, lock, wait)
     except BlockingIOError as error:
         with suppress(OSError):
             if pid := path.read_text(encoding="ascii", errors="replace"):

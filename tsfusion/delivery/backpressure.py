@@ -270,7 +270,7 @@ class SpoolLimits:
         self._written += nbytes
         state, (used, _) = self._outbox.state, self._outbox.usage()
         if state == "disk" or (state == "spool" and used < 0.9 * self._spool_bytes):
-            self._outbox.state = "ok"
+            self._outbox.state, self._outbox.spool_problem = "ok", ""
             log.info("the spool %s takes every keyframe again", self._outbox.spool_folder)
 
     def _measure_free_space(self, now: float) -> None:
@@ -281,7 +281,7 @@ class SpoolLimits:
             self._free = 1 << 62
 
     def _enter(self, state: str, why: str) -> None:
+        problem = f"the spool {self._outbox.spool_folder} cannot keep them: {why}"
         if self._outbox.state != state:
-            self._outbox.state = state
-            folder = self._outbox.spool_folder
-            log.error("keyframes are lost from here on: the spool %s cannot keep them: %s", folder, why)
+            log.error("keyframes are lost from here on: %s", problem)
+        self._outbox.state, self._outbox.spool_problem = state, f"keyframes are lost: {problem}"

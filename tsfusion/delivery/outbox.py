@@ -86,6 +86,7 @@ class Outbox:
         self.spool_folder = spool.folder
         self.is_temporary = spool.temporary  # goes away when it is closed
         self.state = "ok"  # of the spool, as in `ClientStats`; set by the one thread that writes to it
+        self.spool_problem = ""  # why the spool cannot keep what comes; empty = it can
         self._outstanding = 0  # of the oldest in the spool, so many are on their way
         self._unfused: deque[int] = deque()  # durable, and not answered by the map
         self._unmeshed: deque[int] = deque(maxlen=_MOST_REMEMBERED)

@@ -15,8 +15,9 @@ from typing import Any
 
 import zmq
 
+from tsfusion import journal
 from tsfusion.core.config import ClientConfig
-from tsfusion.core.errors import DecodeError, JournalError
+from tsfusion.core.errors import MISSING, DecodeError, JournalError
 from tsfusion.delivery.connection import Connection
 from tsfusion.delivery.control_session import ControlSession
 from tsfusion.delivery.outbox import Outbox
@@ -30,6 +31,7 @@ log = logging.getLogger(__name__)
 
 _READ_INTERVAL = 0.5  # seconds until a record that could not be read is tried again
 _MAX_READS = 6
+_MAX_READS_AWAY = 120  # the folder may come back
 _FAREWELL_MS = 100  # for the last message to leave
 _SCARCE = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # what others of this machine will give back
 
@@ -109,7 +111,7 @@ class Sender:
         polled = [(source, zmq.POLLIN) for source in sources]
         if self._blocked:
             polled.append((data.socket, zmq.POLLOUT))
-        others = (self._read_due if self._unread else 0.0, control.due, data.due)
+        others = (self._read_due if now < self._read_due else 0.0, control.due, data.due)
         due = min([self._control_session.due, *filter(None, others)])
         zmq.zmq_poll(polled, max(int((due - now) * 1000), 1))
         with suppress(BlockingIOError):
@@ -168,16 +170,21 @@ class Sender:
             frames = self._outbox.read(entry)
         except JournalError as error:
             self._unread += 1
-            if error.errno in _SCARCE or (error.errno == errno.EIO and self._unread < _MAX_READS):
+            if error.errno in _SCARCE or (error.errno is not None and self._unread < self._most_reads()):
                 level = logging.WARNING if self._unread == 1 else logging.DEBUG
                 log.log(level, "%s; it is tried again", error)
                 self._read_due = now + _READ_INTERVAL
                 self._outbox.unclaim()
                 return None
             self._refused.give_up(entry, "spool", str(error), readable=False)
-            frames = None
+            if error.errno not in MISSING:  # those of a file that is gone are not waited for one by one
+                self._unread = 0
+            return None
         self._unread = 0
         return frames
+
+    def _most_reads(self) -> int:
+        return _MAX_READS_AWAY if journal.is_away(self._outbox.spool_folder) else _MAX_READS
 
     def _send(self, entry: Waiting, previous: int, frames: list[memoryview]) -> None:
         sent_ns = time.monotonic_ns()

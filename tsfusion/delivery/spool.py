@@ -19,7 +19,7 @@ from msgspec import Struct
 from tsfusion import journal
 from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.durable_files import size_of
-from tsfusion.core.errors import DecodeError, JournalError
+from tsfusion.core.errors import MISSING, DecodeError, JournalError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.delivery.tombstones import Tombstones
 from tsfusion.wire.record_header import RecordHeader, is_correction, unpack
@@ -107,7 +107,7 @@ class Spool:
             raise
 
     def _open(self, segment_bytes: int) -> None:
-        self._journal = journal.Journal(self.folder, segment_bytes, sync=not self.temporary)
+        self._journal = journal.Journal(self.folder, segment_bytes, sync=not self.temporary, keep_open=True)
         found, self._journal.found = self._journal.found, []
         sessions = {record.session for record in found} or {secrets.token_bytes(_SESSION_BYTES)}
         if len(sessions) > 1:
@@ -189,12 +189,18 @@ class Spool:
         self._idle.discard(number)
 
     def read(self, entry: Waiting) -> list[memoryview]:
-        """The frames of a record.
+        """The frames of a record, also of one that this process wrote when its file was deleted since.
 
         Raises:
             JournalError: when the disk has lost it.
         """
-        return journal.read(self.folder, entry.position).frames
+        try:
+            return journal.read(self.folder, entry.position).frames
+        except JournalError as error:
+            kept = self._journal.read_kept(entry.position) if error.errno in MISSING else None
+            if kept is None:
+                raise
+            return kept.frames
 
     def drop(self, durable: int) -> list[int]:
         """Let go of everything up to `durable`; the numbers of the records that waited."""
@@ -243,14 +249,18 @@ class Spool:
         try:
             self._journal.forget(number)
         except JournalError as error:
-            log.warning("%s", error)
+            if error.errno not in MISSING:  # it is gone with its folder
+                log.warning("%s", error)
 
     def close(self) -> None:
         """Release the folder. An empty spool takes its files with it: the next starts a new session."""
         try:
             self._journal.close()
-        except JournalError as error:  # it lacks only its index
-            log.warning("%s", error)
+        except JournalError as error:
+            if self.waiting and journal.is_away(self.folder):
+                log.error("%d records are not in the spool any more: %s", len(self.waiting), error)
+            else:  # the last file lacks only its index
+                log.warning("%s", error)
         if self.temporary:
             shutil.rmtree(self.folder, ignore_errors=True)
         elif not self.waiting:

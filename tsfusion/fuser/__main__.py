@@ -16,7 +16,7 @@ from tsfusion.core.config import LogFormat, LogLevel
 from tsfusion.core.errors import MapError, TsfusionError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.fuser.fuser import Fuser
+from tsfusion.fuser.fuser import LOCK, RETRY_MS, Fuser
 from tsfusion.wire import sockets
 
 _LOCK_WAIT_S = 60.0  # for another fuser to end: it may be reading a large map
@@ -60,9 +60,14 @@ def _serve(link: sockets.AnySocket) -> int:
             fuser.refine()
             continue
         process.on_parent_end(signal.SIGCONT)  # a stopped process would not notice the gateway's end
-        events = dict(poller.poll())
+        is_held = fuser is not None and fuser.is_held
+        events = dict(poller.poll(RETRY_MS if is_held else None))
         if sys.stdin.fileno() in events:  # nothing is ever written there: the gateway has ended
             return 1
+        if not events and fuser is not None:
+            process.on_parent_end(signal.SIGKILL)
+            fuser.go_on()
+            continue
         message = fuser_messages.to_fuser.decode(link.recv())
         if isinstance(message, fuser_messages.Begin):
             fuser = _open_map(link, message)
@@ -80,8 +85,9 @@ def _open_map(link: sockets.AnySocket, message: fuser_messages.Begin) -> Fuser |
         process.end_first()
         # held until this process ends
         lock_folder(
-            Path(message.folder), "map", "fuser", name="fuser.lock", wait=_LOCK_WAIT_S, error_type=MapError
-        )
+            Path(message.folder), "map", "fuser", name=LOCK, wait=_LOCK_WAIT_S, error_type=MapError,
+            make=False,  # one that is away must not be made in its place
+        )  # fmt: skip
         fuser = Fuser(link, message)
     except TsfusionError as error:
         link.send(fuser_messages.encode(fuser_messages.Failed.of(error)))

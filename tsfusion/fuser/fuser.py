@@ -6,11 +6,14 @@ begin again. While it opens the map or waits, it sees its standard input close a
 the system ends it (Linux), however long the work would take.
 """
 
+import errno
 import logging
 import mmap
+import os
 import platform
 import struct
 import time
+from collections import deque
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -35,6 +38,9 @@ from tsfusion.wire.record_header import Refused
 
 _TAICHI_RESERVES = 2 << 30  # bytes that Taichi asks for and hardly uses
 _KEPT_FREE = 256 << 20  # bytes that keyframes leave to meshes and checkpoints
+LOCK = "fuser.lock"  # in the map's folder
+_PATIENCE_S = 10.0  # for a record that the system refuses to read, or whose segment is not there
+RETRY_MS = 500  # until it is tried again
 _FOR_A_CHECKPOINT = 64 << 20  # bytes beyond the limit: meshes may have taken what was kept free
 _REFINED_AT_ONCE = 256  # blocks: about 50 ms
 _REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
@@ -51,6 +57,8 @@ class Fuser:
         self._folder = Path(begin.folder)
         self._since_checkpoint = 0
         self._watched = False
+        self._orders: deque[fuser_messages.Fuse] = deque()  # not answered; the first cannot be read for now
+        self._held_since: float | None = None  # time.monotonic(); None = nothing is held
         self._answered = self._meshed = 0  # keyframes of this process
         self._next_mesh = 0.0
         self._unrefined = np.zeros((0, 3), np.int32)  # cells that viewers have with the raw surface
@@ -59,6 +67,7 @@ class Fuser:
         self._memory_limit = process.data_bytes() + _TAICHI_RESERVES + begin.memory_bytes
         process.limit_memory(self._memory_limit)
         self.exit_status: int | None = None  # of the process, which has to end; None = it goes on
+        self._home = os.stat(self._folder)
         self._map = MapCheckpoints(self._folder, begin.volume, keep_previous=begin.keep_previous)
         self._volume = self._map.volume
         self._volume.warm_up()
@@ -73,7 +82,8 @@ class Fuser:
     def handle(self, message: fuser_messages.ToFuser) -> None:
         """Do the work for a message of the gateway."""
         if isinstance(message, fuser_messages.Fuse):
-            self._fuse(message)
+            self._orders.append(message)
+            self.go_on()
         elif isinstance(message, fuser_messages.FuserQuery):
             self._answer(message)
         elif isinstance(message, fuser_messages.Publish):
@@ -84,6 +94,17 @@ class Fuser:
             self._checkpoint()
         elif isinstance(message, fuser_messages.Finish):
             self.exit_status = 0 if self._checkpoint() else 1
+
+    @property
+    def is_held(self) -> bool:
+        """Whether records wait for one that cannot be read for now: call `go_on` every `RETRY_MS`."""
+        return bool(self._orders)
+
+    def go_on(self) -> None:
+        """Take the records that were ordered, in order, up to one that cannot be read now."""
+        while self._orders and self.exit_status is None and self._fuse(self._orders[0]):
+            self._orders.popleft()
+            self._held_since = None
 
     def mesh_due(self, idle: bool) -> bool:
         """Whether the mesh is behind and it is time for it: at once when idle, otherwise after a pause."""
@@ -146,13 +167,14 @@ class Fuser:
         stats = self._volume.stats()
         return fuser_messages.Meshed(self._meshed, meshed_ns, blocks, stats.blocks, stats.bytes, layout)
 
-    def _fuse(self, order: fuser_messages.Fuse) -> None:
+    def _fuse(self, order: fuser_messages.Fuse) -> bool:
+        """Take a record into the map, or reject it; False when it cannot be read for now."""
         start = time.monotonic_ns()
-        self._answered += 1
         before = self._map.done.get(order.session)
         if before is not None and order.seq <= before.seq:
+            self._answered += 1
             self._send(fuser_messages.Done(order.index, start, start))
-            return
+            return True
         reason, message = order.skip, ""
         if reason is None:
             self._current.set(order.index)
@@ -165,10 +187,8 @@ class Fuser:
                     if not stats.samples:
                         reason, message = NO_SAMPLES, self._volume.why_no_samples(found)
             except TsfusionError as error:
-                if isinstance(error, JournalError) and error.temporary:
-                    log.error("%s: another process tries again, from the checkpoint", error)
-                    self.exit_status = 1
-                    return  # marked as at work on it: the gateway gives a keyframe up after a few deaths
+                if isinstance(error, JournalError) and self._hold(error):
+                    return False
                 reason, message = _reason(error), str(error)
             except MemoryError as error:
                 reason, message = "memory", f"no memory to fuse it: {error}"
@@ -176,21 +196,59 @@ class Fuser:
             self._current.set(fuser_messages.NOT_WORKING)  # not reached if the keyframe ended the process
         if reason is not None and not order.is_correction:
             self._map.rejected[reason] = self._map.rejected.get(reason, 0) + 1
+        self._answered += 1
         self._map.done[order.session] = fuser_messages.SessionProgress(order.seq, order.client, order.world)
         self._send(fuser_messages.Done(order.index, start, time.monotonic_ns(), reason, message))
         self._since_checkpoint += 1
         if self._begin.checkpoint_every and self._since_checkpoint >= self._begin.checkpoint_every:
             self._checkpoint()
+        return True
+
+    def _hold(self, error: JournalError) -> bool:
+        """Whether to wait with a record that cannot be read: its folder, its file or the disk may come back.
+
+        When the system refuses to read it for long, another process tries again, and the gateway gives the
+        record up after a few of them. One whose segment alone is missing for long is rejected.
+        """
+        now = time.monotonic()
+        if not error.temporary:
+            return False
+        if self._held_since is None:
+            log.warning("%s; it is tried again", error)
+            self._held_since = now
+        is_over = now - self._held_since >= _PATIENCE_S
+        is_away = journal.is_away(self._folder / state_folder.JOURNAL_FOLDER)
+        if is_over and not is_away and error.errno == errno.ENOENT:
+            return False
+        if is_over and not is_away:
+            log.error("%s: another process tries again, from the checkpoint", error)
+            self.exit_status = 1  # marked as at work on it
+            return True
+        process.limit_memory(self._memory_limit)
+        self._current.set(fuser_messages.NOT_WORKING)
+        self._send(fuser_messages.Held(str(error)))
+        return True
 
     def _checkpoint(self) -> bool:
-        written = False
-        if self._since_checkpoint:
+        written, problem = False, ""
+        if self._since_checkpoint and not self._is_home:
+            problem = f"the folder {self._folder} is not there, or is another one"
+        elif self._since_checkpoint:
             process.limit_memory(self._memory_limit + _FOR_A_CHECKPOINT)
             written = self._map.save()
             process.limit_memory(self._memory_limit)
             self._since_checkpoint = 0 if written else 1
-        self._send(fuser_messages.Saved(written))
+            problem = self._map.problem
+        self._send(fuser_messages.Saved(written, problem))
         return not self._since_checkpoint
+
+    @property
+    def _is_home(self) -> bool:
+        """Whether the folder is the one that was opened: another may be the place of a disk that is away."""
+        try:
+            return os.path.samestat(os.stat(self._folder), self._home) or (self._folder / LOCK).exists()
+        except OSError:
+            return False
 
     def _answer(self, query: fuser_messages.FuserQuery) -> None:
         try:

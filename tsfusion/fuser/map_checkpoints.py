@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 # Settings that may differ between a checkpoint and the server that goes on with it: none changes the sums.
 _FREE_SETTINGS = ("threads", "max_blocks", "max_blocks_per_keyframe", *VIEW_SETTINGS)
 _NEW_FILE = "map.new.tsf"
+_PARTS = r"map\.new\.tsf|\.map\.new\.tsf\.partial"
 
 log = logging.getLogger(__name__)
 
@@ -43,9 +44,9 @@ class MapCheckpoints:
 
         self._path, self._previous = folder / state_folder.MAP_FILE, folder / state_folder.PREVIOUS_FILE
         self._new = folder / _NEW_FILE
-        with suppress(OSError):  # left by a process that was killed
-            self._new.unlink()
+        durable_files.sweep(folder, _PARTS)  # of a process that was killed
         self._keep_previous = keep_previous
+        self.problem = ""  # why the last checkpoint could not be written; empty = it could
         self.done: dict[bytes, SessionProgress] = {}  # session → how far the map is with it
         self.rejected: dict[str, int] = {}  # reason → number of keyframes that the map could not take
         # The map, at first as it was in the last checkpoint
@@ -72,8 +73,13 @@ class MapCheckpoints:
             self._new.replace(self._path)
             durable_files.sync_folder(self._path.parent)
         except (TsfusionError, OSError, MemoryError) as error:
-            log.error("no checkpoint: %s", error)
+            if str(error) != self.problem:  # the same one is logged once
+                log.error("no checkpoint: %s", error)
+            self.problem = str(error) or type(error).__name__
             return False
+        if self.problem:
+            log.warning("checkpoints are written again")
+            self.problem = ""
         return True
 
 

@@ -105,10 +105,18 @@ class Ready(Struct, frozen=True, tag="ready"):
 class Saved(Struct, frozen=True, tag="saved"):
     """The checkpoint holds every keyframe that was answered with `Done` before this message.
 
-    `written`: whether it is a new one; otherwise the one before held them all already.
+    `written`: whether it is a new one; otherwise the one before held them all already, unless there is a
+    `problem`: why no checkpoint can be written.
     """
 
     written: bool
+    problem: str = ""
+
+
+class Held(Struct, frozen=True, tag="held"):
+    """The next record cannot be read for now; it is tried again, and said again at each try."""
+
+    message: str
 
 
 FailureKind = Literal["config", "checkpoint", "map", "other"]
@@ -185,7 +193,7 @@ class FuserReply(Struct, frozen=True, tag="answer"):
 
 
 ToFuser = Begin | Fuse | FuserQuery | Publish | Save | Finish
-ToGateway = Started | Ready | Failed | Done | Saved | Meshed | FuserReply
+ToGateway = Started | Ready | Failed | Done | Saved | Held | Meshed | FuserReply
 to_fuser: "msgspec.msgpack.Decoder[ToFuser]" = msgspec.msgpack.Decoder(ToFuser)
 to_gateway: "msgspec.msgpack.Decoder[ToGateway]" = msgspec.msgpack.Decoder(ToGateway)
 encode = msgspec.msgpack.encode

@@ -58,6 +58,7 @@ class FuserSupervisor:
         self.finishing = self._finish_sent = False
         self.restarts = 0
         self.failed = ""  # why no process stays alive; empty = one does; tried again, ever more rarely
+        self.held = ""  # why its next record cannot be read for now; empty = it can
         self._was_ready = False
         try:
             self._start()
@@ -69,6 +70,7 @@ class FuserSupervisor:
             self._context, self._map, self._server.log_format, self._server.log_level
         )
         self.ready = False  # it has opened the map and compiled the kernels
+        self.held = ""
         self._restart_at = 0.0
         self._last_message = self._ready_since = time.monotonic()
         self._oom_kills = process.oom_kills()
@@ -136,9 +138,11 @@ class FuserSupervisor:
             self.in_flight.popleft()
             if self._blame.get(message.index, 0) < GIVE_UP_AT:  # one that is given up stays so
                 self._blame.pop(message.index, None)
-            self.failed = ""
+            self.failed = self.held = ""
             if self._last_message - self._ready_since > _STEADY_AFTER:
                 self._early_deaths = 0
+        elif isinstance(message, fuser_messages.Held):
+            self.held = message.message
         elif isinstance(message, fuser_messages.Saved) and message.written:
             self._early_deaths = 0
         return message, frames

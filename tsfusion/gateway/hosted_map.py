@@ -14,6 +14,7 @@ from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.client_routes import ClientRoutes
+from tsfusion.gateway.disk_pause import DiskPause
 from tsfusion.gateway.fuser_backlog import FuserBacklog
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.journal_retention import JournalRetention
@@ -30,7 +31,8 @@ from tsfusion.wire.record_header import CorrectionHeader, RecordHeader
 log = logging.getLogger(__name__)
 
 _SEGMENTS_KEPT = 4  # a journal with a limit is deleted in quarters of that limit
-_DISK_PAUSE = 1.0  # seconds without keyframes after the disk refused one
+_FOR_GONE = "what no checkpoint holds of them is lost, unless they are put back"
+_SAVE_PAUSE = 10.0  # seconds until a checkpoint is tried again that could not be written
 ForPeople = tuple[fuser_messages.Meshed | fuser_messages.FuserReply, Sequence[zmq.Frame]]
 
 
@@ -55,8 +57,11 @@ class HostedMap:
         self._last_keyframe: float | None = None  # time.monotonic()
         self._loss = ""
         self._checkpoints = 0  # written since the map was opened
+        self._unsaved = ""  # why no checkpoint can be written; empty = it can
+        self._save_at = 0.0  # time.monotonic()
+        self._missing = 0  # segments of the journal that were missing when a checkpoint was asked for
         self._journal = _open_journal(self.folder, server)
-        self.disk = DiskPause(self._journal, server.min_free_bytes, name)
+        self.disk = DiskPause(self._journal, name)
         self._quarantine = Quarantine(self.folder / state_folder.QUARANTINE_FOLDER, server.quarantine_bytes)
         self._index = KeyframeIndex()
         self._index.recover(self._journal.found, self.sessions)
@@ -83,8 +88,8 @@ class HostedMap:
 
     @property
     def settled(self) -> bool:
-        """Whether the map is drained, or never will be: its fuser cannot be kept alive."""
-        return self.drained or bool(self.fuser.failed)
+        """Whether the map is drained, or will not be soon: its fuser cannot be kept alive, or read."""
+        return self.drained or bool(self.fuser.failed or self.fuser.held) or self.disk.is_away
 
     def idle_since(self, since: float) -> bool:
         """Whether no keyframe waits, nor came since then (`time.monotonic()`)."""
@@ -155,21 +160,43 @@ class HostedMap:
             elif isinstance(message, fuser_messages.Ready):
                 self._on_ready(message)
             elif isinstance(message, fuser_messages.Saved):
-                self._checkpoints += message.written
-                self._retention.on_saved(message)
+                self._on_saved(message)
             elif isinstance(message, fuser_messages.Meshed):
                 self.outcomes.on_meshed(message)
                 for_people.append((message, frames))
             elif isinstance(message, fuser_messages.FuserReply):
                 for_people.append((message, frames))
-        if ended and not self.fuser.finishing:
+        if ended and not self.fuser.finishing and not self.disk.is_away:  # it would find an empty map
             self.fuser.restart()
         self._backlog.hand_out(self.fuser)
         self.disk.step()
-        self._retention.step(self.fuser, self.outcomes.unmeshed)
+        if not self.disk.is_away:
+            self._retention.step(self.fuser, self.outcomes.unmeshed)
+        self._save_again()
         return for_people
 
+    def _on_saved(self, saved: fuser_messages.Saved) -> None:
+        self._checkpoints += saved.written
+        self._unsaved = saved.problem
+        self._save_at = time.monotonic() + _SAVE_PAUSE
+        self._retention.on_saved(saved)
+
+    def _save_again(self) -> None:
+        """Ask for a checkpoint where the last one failed, or segments of the journal have gone since."""
+        now, missing = time.monotonic(), len(self._journal.missing)
+        is_due = self._unsaved and now >= self._save_at
+        if (
+            self.fuser.ready
+            and (is_due or missing > self._missing)
+            and self.fuser.send(fuser_messages.Save())
+        ):
+            self._save_at = now + _SAVE_PAUSE
+            self._missing = missing
+        self._missing = min(self._missing, missing)
+
     def _on_ready(self, ready: fuser_messages.Ready) -> None:
+        if not self.warm:
+            self._compare(ready)
         for key, progress in ready.done.items():
             session = self.sessions.open(key, progress.client, progress.world)
             session.durable = max(session.durable, progress.seq)
@@ -183,6 +210,18 @@ class HostedMap:
             self.warm = True
             log.info("%s", self._contents(ready), extra=logs.about(map=self.name))
         self._check_checkpoint(ready)
+
+    def _compare(self, ready: fuser_messages.Ready) -> None:
+        """Say that the journal, of which nothing was deleted on purpose, ends before the checkpoint does."""
+        shorter = [key for key, done in ready.done.items() if self.sessions.progress(key)[0] < done.seq]
+        if shorter and self._journal.first == 1:
+            log.warning(
+                "its checkpoint holds keyframes of %d sessions that its journal %s lacks: was the journal "
+                "deleted, or is its disk not mounted? The map cannot be built again from it",
+                len(shorter),
+                self._journal.folder,
+                extra=logs.about(map=self.name),
+            )
 
     def _contents(self, ready: fuser_messages.Ready) -> str:
         """What there is of a map when it is opened, for the log."""
@@ -216,16 +255,28 @@ class HostedMap:
     @property
     def notices(self) -> list[str]:
         """Losses that a person should know of, though keyframes are taken and fused."""
-        damaged = self._journal.damaged
+        damaged, put_back = self._journal.damaged, self._journal.put_back
         notices = [f"{damaged} keyframes of its journal are damaged and lost"] if damaged else []
-        return [*notices, self._loss] if self._loss else notices
+        if absent := self._journal.absent:
+            notices.append(f"{absent} segments of its journal were not there at the start: {_FOR_GONE}")
+        if missing := self._journal.missing:
+            first = f"{missing[0]:06d}.mcap"
+            notices.append(f"{len(missing)} segments of its journal are gone, first {first}: {_FOR_GONE}")
+        if put_back:
+            notices.append(
+                f"its journal was taken away while it was written to, {put_back} times, and was put back "
+                "with every keyframe: find out who deletes or moves files there"
+            )
+        if self._unsaved:
+            notices.append(f"no checkpoint can be written: {self._unsaved}")
+        return [*notices, *filter(None, (self._quarantine.problem, self._loss))]
 
     def health(self) -> MapHealth:
         """How the map is doing, as far as it is known without asking the fuser."""
         now, outcomes = time.monotonic(), self.outcomes
         return MapHealth(
             state=self.state,
-            problem=self.disk.problem or self.fuser.failed,
+            problem=self.disk.problem or self.fuser.failed or self.fuser.held,
             keyframes_durable=outcomes.fused + outcomes.rejected.total() + self._backlog.keyframes,
             keyframes_fused=outcomes.fused,
             waiting=self._backlog.keyframes,
@@ -261,47 +312,3 @@ def _warn_of_old_corrections(folder: Path) -> None:
             "delete the folder to silence this",
             old,
         )
-
-
-class DiskPause:
-    """The time after the disk refused a keyframe, in which no other is tried."""
-
-    def __init__(self, journal: Journal, min_free_bytes: int, map_name: str) -> None:
-        self.problem = ""  # why no keyframe is taken; empty = they are
-        self._journal = journal
-        self._min_free_bytes = min_free_bytes
-        self._map = map_name
-        self._until = 0.0  # time.monotonic()
-
-    def seconds_left(self, now: float) -> float:
-        """Seconds until a keyframe is tried again; 0 = none has to wait."""
-        return max(self._until - now, 0.0)
-
-    def begin(self, error: JournalError) -> None:
-        """Pause because of an error."""
-        if str(error) != self.problem:  # the same one is logged once
-            log.error("no keyframes are taken: %s", error, extra=logs.about(map=self._map))
-        self.problem = str(error)
-        self._until = time.monotonic() + _DISK_PAUSE
-
-    def end(self) -> None:
-        """Take keyframes (again)."""
-        if self.problem:
-            log.warning("keyframes are taken again", extra=logs.about(map=self._map))
-            self.problem = ""
-
-    def step(self) -> None:
-        """End the pause as soon as the disk has room, though no keyframe comes: clients may wait for that."""
-        now = time.monotonic()
-        if self.problem and now > self._until:
-            if self._is_full():
-                self._until = now + _DISK_PAUSE
-            else:
-                self._until = 0.0
-                self.end()
-
-    def _is_full(self) -> bool:
-        try:
-            return self._journal.free_bytes < self._min_free_bytes
-        except JournalError:
-            return True

@@ -10,6 +10,7 @@ from tsfusion.journal.record_scan import Damage, scan_records, segment_number
 from tsfusion.journal.segments import (
     RecordEntry,
     describe,
+    is_away,
     is_closed,
     is_segment,
     list_records,
@@ -28,6 +29,7 @@ __all__ = [
     "Record",
     "RecordEntry",
     "describe",
+    "is_away",
     "is_closed",
     "is_segment",
     "list_records",

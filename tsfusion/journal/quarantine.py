@@ -31,6 +31,8 @@ class Quarantine:
     def __init__(self, folder: Path, max_bytes: int) -> None:
         self.folder = folder
         self._max_bytes = max_bytes
+        self.problem = ""  # why the last keyframe could not be kept, or older ones go; empty = neither
+        durable_files.sweep(folder, rf"\.{_FILE_NAME.pattern}\.partial")  # of a writer that was killed
         self._files = dict(_by_age(folder))  # sizes, oldest first
         self._nbytes = sum(self._files.values())
 
@@ -48,13 +50,17 @@ class Quarantine:
         word = re.sub("[^a-z0-9]", "_", reason.lower())[:_MAX_REASON_LENGTH] or "unknown"
         path = self.folder / f"{session[:4].hex()}-{seq}-{word}.mcap"
         try:
-            durable_files.make_folder(self.folder)
+            with suppress(FileExistsError):
+                self.folder.mkdir()  # alone: the folder above may be away, and come back
+                durable_files.sync_folder(self.folder.parent)
             journal.write_file(path, frames, session=session, seq=seq, client=client)
             size = path.stat().st_size
         except (JournalError, OSError) as error:
             subject = logs.about(session=session, seq=seq, client=client, reason=reason)
             log.error("a keyframe could not be put into quarantine: %s", error, extra=subject)
+            self.problem = f"a keyframe could not be put into quarantine: {error}"
             return None
+        self.problem = ""
         self._nbytes += size - self._files.pop(path, 0)
         self._files[path] = size
         self._prune()
@@ -62,6 +68,7 @@ class Quarantine:
 
     def _prune(self) -> None:
         while len(self) > 1 and (self._nbytes > self._max_bytes or len(self) > _MAX_FILES):
+            self.problem = f"the quarantine {self.folder} is full: the oldest keyframes in it are deleted"
             path = next(iter(self._files))
             self._nbytes -= self._files.pop(path)
             with suppress(OSError):
@@ -77,8 +84,10 @@ def quarantined_files(folder: Path) -> list[Path]:
 def _by_age(folder: Path) -> list[tuple[Path, int]]:
     """The files of a folder and their sizes, oldest first."""
     found = []
-    for path in folder.glob("*.mcap"):
-        with suppress(OSError):  # a person took it away just now
-            stat = path.stat()
-            found.append((stat.st_mtime_ns, path, stat.st_size))
+    with suppress(OSError):  # none is there, or they are not known: none of them is deleted for room then
+        for path in folder.iterdir():
+            with suppress(OSError):  # a person took it away just now
+                stat = path.stat()
+                if path.suffix == ".mcap":
+                    found.append((stat.st_mtime_ns, path, stat.st_size))
     return [(path, size) for _, path, size in sorted(found)]

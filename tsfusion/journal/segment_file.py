@@ -6,6 +6,7 @@ import logging
 import os
 import struct
 import zlib
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
 from typing import Literal
@@ -23,13 +24,16 @@ log = logging.getLogger(__name__)
 class SegmentFile:
     """A segment file at its present length: bytes that a writer adds later are not seen.
 
+    Args:
+        descriptor: of the file where it is open already; it is closed with this. None = open the path.
+
     Raises:
         OSError: as `open` does.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, descriptor: int | None = None) -> None:
         self.path = path
-        self._file = path.open("rb", buffering=0)
+        self._file = path.open("rb", buffering=0) if descriptor is None else FileIO(descriptor, "rb")
         self.size = os.fstat(self._file.fileno()).st_size
         self.failed = False  # the disk could not read some part that was asked for
         self.answered = False  # the disk has read some part

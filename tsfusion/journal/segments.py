@@ -48,6 +48,14 @@ def segments(folder: Path) -> list[int]:
     )
 
 
+def is_away(folder: Path) -> bool:
+    """Whether a folder of segments is not to be found, or has none: moved, or its disk is not mounted."""
+    try:
+        return not segments(folder)
+    except JournalError:
+        return True
+
+
 def segment_path(folder: Path, number: int) -> Path:
     """The file of a segment."""
     return folder / f"{number:06d}.mcap"
@@ -69,16 +77,25 @@ def read_at(path: Path, offset: int) -> Record:
         JournalError: when it is not there or its CRC differs, or with an `errno` when the system refuses.
     """
     try:
-        with SegmentFile(path) as source:
-            head = mcap_layout.parse_head(source.read(offset, mcap_layout.HEAD_BYTES))
-            raw = b"" if head is None else source.read(offset, head.nbytes)
-            record = mcap_layout.parse_record(raw, Position(segment_number(path), offset))
-            if record is None and source.failed:
-                raise OSError(errno.EIO, os.strerror(errno.EIO))
+        source = SegmentFile(path)
     except OSError as error:
         raise journal_error("read", path, error) from error
+    with source:
+        return record_at(source, segment_number(path), offset)
+
+
+def record_at(source: SegmentFile, number: int, offset: int) -> Record:
+    """One record of the open segment file of this number; raises JournalError as `read_at`."""
+    try:
+        head = mcap_layout.parse_head(source.read(offset, mcap_layout.HEAD_BYTES))
+        raw = b"" if head is None else source.read(offset, head.nbytes)
+        record = mcap_layout.parse_record(raw, Position(number, offset))
+        if record is None and source.failed:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+    except OSError as error:
+        raise journal_error("read", source.path, error) from error
     if record is None:
-        raise JournalError(f"{path} holds no whole keyframe at byte {offset}")
+        raise JournalError(f"{source.path} holds no whole keyframe at byte {offset}")
     return record
 
 

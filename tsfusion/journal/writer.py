@@ -2,22 +2,28 @@
 """Writing a journal: append, wait for the disk, begin the next segment, delete old ones."""
 
 import contextlib
+import errno
 import logging
 import os
 import secrets
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from tsfusion.core import durable_files
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import mcap_layout
-from tsfusion.journal.mcap_layout import Position
+from tsfusion.journal.free_space import FreeSpace
+from tsfusion.journal.mcap_layout import Position, Record
+from tsfusion.journal.open_segment import OpenSegment
 from tsfusion.journal.record_scan import journal_error
 from tsfusion.journal.segments import RecordEntry, list_records, segment_path, segments
 
 log = logging.getLogger(__name__)
+
+_PARTS = r"\.[0-9]{6,9}\.mcap\.partial"  # files that a killed writer leaves
+_KEPT_OPEN = 64  # segments
 
 
 class Journal:
@@ -28,10 +34,15 @@ class Journal:
         segment_bytes: a segment that has grown past this is closed and the next begun.
         sync: wait for the disk at each append (fdatasync); without it a power cut may lose the tail.
         min_free_bytes: what `append` leaves free on the disk.
+        keep_open: keep the files of closed segments open, so that `read_kept` finds their records although
+            somebody has deleted the folder.
 
     Attributes:
         found: records in the segments of earlier runs, in journal order; the caller may empty the list.
         damaged: number of their damaged records. A segment that is damaged from end to end counts as one.
+        absent: number of segments that were not there at the start, between others that were.
+        missing: numbers of segments that somebody has taken away since, at the last look.
+        put_back: number of times that the open segment was taken away and written again.
 
     Raises:
         JournalError: when the folder cannot be made or listed, or one of its segments cannot be read or is
@@ -45,20 +56,23 @@ class Journal:
         *,
         sync: bool = True,
         min_free_bytes: int = 0,
+        keep_open: bool = False,
     ) -> None:
         self.folder = Path(folder)
         self._segment_bytes = segment_bytes
         self._sync = sync
         self._room = FreeSpace(self.folder, min_free_bytes)
-        self._file: BinaryIO | None = None
-        self._writer: Any = None
-        self._identity = b""
-        self._first = 0  # where the open segment's first record starts
+        self._keep_open = keep_open
+        self._open: OpenSegment | None = None
+        self._kept: dict[int, OpenSegment] = {}  # by number, oldest first; the open one among them
         self._closed: dict[int, int] = {}  # bytes by number, oldest first
         self.found: list[RecordEntry] = []
-        self.damaged = 0
+        self.damaged = self.put_back = 0
+        self.missing: list[int] = []
         try:
             durable_files.make_folder(self.folder)
+            durable_files.sweep(self.folder, _PARTS)
+            self._home = os.stat(self.folder)
         except OSError as error:
             raise journal_error("create the journal", self.folder, error) from error
         self._recover()
@@ -78,11 +92,12 @@ class Journal:
             self.found += found
             self.damaged += damaged
         self._number = numbers[-1] + 1 if numbers else 1
+        self.absent = self._number - self.first - len(numbers)
 
     @property
     def nbytes(self) -> int:
         """Bytes of all segments."""
-        return sum(self._closed.values()) + (self._file.tell() if self._file else 0)
+        return sum(self._closed.values()) + (self._open.nbytes if self._open else 0)
 
     @property
     def free_bytes(self) -> int:
@@ -123,29 +138,35 @@ class Journal:
                 counts then.
         """
         self._room.reserve(sum(memoryview(frame).nbytes for frame in frames))
+        self._keep_place()
         now_ns = time.time_ns() if logged_ns is None else logged_ns
         position = Position(self._number, 0)
         try:
-            file = self._open()
-            position = Position(self._number, file.tell())
-            payload = mcap_layout.pack_record(frames, self._identity, session, seq, client)
-            mcap_layout.write_record(self._writer, payload, seq, now_ns)
-            self._flush()
+            segment = self._begin()
+            position = Position(self._number, segment.nbytes)
+            segment.append(frames, session, seq, client, now_ns)
         except OSError as error:
             self._abandon(position.offset)
             raise journal_error("write", self.folder, error) from error
         except BaseException:  # interrupted in between
             self._abandon(position.offset)
             raise
-        if file.tell() >= self._segment_bytes:
+        self._keep_place()  # nothing is acknowledged in a file that nobody finds
+        if self._open is not None and segment.nbytes >= self._segment_bytes:
             self._rotate_or_abandon()
         return position
 
-    def _flush(self) -> None:
-        assert self._file is not None
-        self._file.flush()
-        if self._sync:
-            os.fdatasync(self._file.fileno())
+    def _begin(self) -> OpenSegment:
+        if self._open is None:
+            self.look()
+            while self._open is None:
+                path = segment_path(self.folder, self._number)
+                try:
+                    self._open = self._kept[self._number] = OpenSegment(path, sync=self._sync)
+                except FileExistsError:  # somebody has put a file there
+                    self._number += 1
+            self._open.begin()
+        return self._open
 
     def _rotate_or_abandon(self) -> None:
         """Close the segment; an error is only logged: the keyframe is on the disk, with or without index."""
@@ -157,19 +178,91 @@ class Journal:
 
     def rotate(self) -> None:
         """Close the segment with its index; the next append begins another."""
-        if self._file is None:
+        if self._open is None:
             return
-        self._writer.finish()
-        self._flush()
+        self._open.finish()
         self._abandon()
 
     def close(self) -> None:
-        """Finish the segment. The journal may be read, not written, from here on."""
+        """Finish the segment. The journal may be read, not written, from here on.
+
+        Raises:
+            JournalError: when the disk refuses, or the open segment was taken away and cannot be put back.
+        """
         try:
+            self._keep_place()
             self.rotate()
         except OSError as error:
-            self._abandon()
             raise journal_error("close", self.folder, error) from error
+        finally:
+            self._abandon()
+            for number in list(self._kept):
+                self._kept.pop(number).close()
+
+    # --- files that are taken away ---
+
+    def check(self) -> None:
+        """Raise JournalError unless a record could be written: the folder is there, and the disk has room."""
+        self._keep_place()
+        self.look()
+        self._room.reserve(0)
+
+    def look(self) -> None:
+        """Note which segments are `missing`; raise JournalError when the folder is another one, or not there.
+
+        A folder that has none of the segments it had is the place of a disk that is not mounted, or somebody
+        has deleted everything: what is written there may never be found again.
+        """
+        there = set(segments(self.folder))
+        missing = [number for number in self._closed if number not in there]
+        for number in set(missing).difference(self.missing):
+            log.error("%s is not there any more", segment_path(self.folder, number))
+        self.missing = missing
+        if missing and not there.difference(missing):
+            raise self._strange_folder()
+
+    def _strange_folder(self) -> JournalError:
+        return JournalError(
+            f"cannot write {self.folder}: none of its segments is there; put them back (is its disk "
+            "mounted?), or restart to go on without them",
+            errno.ENOENT,
+        )
+
+    def _keep_place(self) -> None:
+        """Put the open segment back where readers look for it, if it was taken away.
+
+        Raises:
+            JournalError: when that cannot be done now. The file stays open, and nothing is lost yet.
+        """
+        segment = self._open
+        if segment is None:
+            return
+        try:
+            if segment.is_in_place:
+                return
+            here = os.stat(self.folder)
+            is_home = os.path.samestat(here, self._home) or self._closed.keys() & set(segments(self.folder))
+            if not segment.is_deleted and not is_home:
+                raise self._strange_folder()  # the segment is with its folder, elsewhere
+            segment.put_back()
+        except OSError as error:
+            raise journal_error("write", self.folder, error) from error
+        self._home = here
+        self.put_back += 1
+        log.error(
+            "%s was taken away while it was written to: it is written again, with all of its records",
+            segment.path,
+        )
+        self._abandon()
+
+    def read_kept(self, position: Position) -> Record | None:
+        """A record by its open file, wherever that is; None = it is not open. From any thread.
+
+        Raises:
+            JournalError: when the disk has lost it.
+        """
+        segment = self._kept.get(position.segment)
+        return segment.read(position.segment, position.offset) if segment else None
 
     def forget(self, number: int) -> None:
         """Delete a closed segment whose keyframes are safe elsewhere.
@@ -179,10 +272,12 @@ class Journal:
         """
         path = segment_path(self.folder, number)
         try:
-            path.unlink()
+            path.unlink(missing_ok=self.folder.exists())
         except OSError as error:
             raise journal_error("delete", path, error) from error
         self._closed.pop(number, None)
+        if number in self._kept:
+            self._kept.pop(number).close()
 
     def retire(self, below: int, limit: int) -> int:
         """Delete the oldest closed segments until the journal is no larger than `limit`.
@@ -204,36 +299,24 @@ class Journal:
                 log.warning("%s", error)
         return before - self.nbytes
 
-    def _open(self) -> BinaryIO:
-        if self._file is None:
-            self._first = 0
-            self._file = segment_path(self.folder, self._number).open("xb")
-            self._identity = secrets.token_bytes(mcap_layout.IDENTITY_BYTES)
-            self._writer = mcap_layout.begin_segment(self._file, self._identity, time.time_ns())
-            # Before the first record: what a reader needs to find its way is never the end that a cut takes.
-            self._flush()
-            if self._sync:
-                durable_files.sync_folder(self.folder)
-            self._first = self._file.tell()
-        return self._file
-
     def _abandon(self, end: int | None = None) -> None:
         """Leave the segment. Bytes behind `end` were reported as not written: nobody may find them later."""
-        if self._file is None:
+        segment, number = self._open, self._number
+        if segment is None:
             return
-        path, number = segment_path(self.folder, self._number), self._number
-        with contextlib.suppress(OSError):  # a full disk fails here a second time
-            self._file.close()
-        self._file = self._writer = None
+        self._open = None
         self._number += 1
+        self._closed[number] = 0
         with contextlib.suppress(OSError):
-            if end is not None and end <= self._first:
-                path.unlink()
+            self._closed[number] = segment.end(end)
+            if end is not None and end <= segment.first:
+                segment.path.unlink()
                 self._number = number
-            else:
-                if end is not None:
-                    _cut(path, end)
-                self._closed[number] = path.stat().st_size
+                del self._closed[number]
+        if not self._keep_open or number not in self._closed:
+            self._kept.pop(number).close()
+        elif len(self._kept) > _KEPT_OPEN:
+            self._kept.pop(next(iter(self._kept))).close()
 
 
 def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, client: str = "") -> None:
@@ -255,57 +338,3 @@ def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, c
 
 def _advise(error: JournalError) -> JournalError:
     return JournalError(f"{error}; make it readable, or move it away to go on without its keyframes")
-
-
-def _cut(path: Path, end: int) -> None:
-    """Shorten a file; it is so on the disk when this returns."""
-    with path.open("r+b") as file:
-        file.truncate(end)
-        os.fsync(file.fileno())
-
-
-_CHECK_BYTES = 16 << 20  # written between two checks of the disk, at most
-_CHECK_S = 1.0
-
-
-class FreeSpace:
-    """Room to write on a folder's disk, of which `min_free_bytes` stay free."""
-
-    def __init__(self, folder: Path, min_free_bytes: int) -> None:
-        self._folder = folder
-        self._kept = min_free_bytes
-        self._left = 0  # bytes to write before the next check
-        self._check_at = 0.0
-
-    def reserve(self, nbytes: int) -> None:
-        """Raise JournalError when writing so much would leave too little."""
-        now = time.monotonic()
-        if self._kept and (now >= self._check_at or nbytes > self._left):
-            spare = self.free_bytes - self._kept
-            self._left = min(spare, max(_CHECK_BYTES, nbytes))
-            self._check_at = now + _CHECK_S
-            if nbytes > spare:
-                self._check_at = 0.0
-                raise JournalError(
-                    f"cannot write {self._folder}: its disk has {_mb(spare + self._kept)} free, "
-                    f"and {_mb(self._kept)} must stay so: free some space"
-                )
-        self._left -= nbytes
-
-    @property
-    def free_bytes(self) -> int:
-        """Room on the disk.
-
-        Raises:
-            JournalError: when the disk does not say.
-        """
-        try:
-            return durable_files.free_bytes(self._folder)
-        except OSError as error:
-            raise JournalError(
-                f"cannot tell how full the disk of {self._folder} is: {error.strerror}", error.errno
-            ) from error
-
-
-def _mb(count: int) -> str:
-    return f"{count / 1e6:.1f} MB"
