@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from clients_and_spools import NOBODY, joined, send_all
+from clients_and_spools import NOBODY, joined, noise, send_all
 from failures import raising, refuse
 from keyframes_and_servers import DEADLINE, pose, until, wall
 from scripted_server import scripted
@@ -38,12 +38,6 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 def full_disk(small_disk: Callable[[int], Path]) -> Path:
     """A file system of 1 MiB."""
     return small_disk(1)
-
-
-def noise(i: int) -> Keyframe:
-    """Some 40 kB, whatever the codec does."""
-    depth = np.random.default_rng(i).integers(0, 65536, (120, 160)).astype(np.uint16)
-    return Keyframe(depth=depth, intrinsics=wall().intrinsics, T_world_camera=pose(), timestamp_ns=10**9 + i)
 
 
 def messages_of(caplog: pytest.LogCaptureFixture, level: int) -> list[str]:

@@ -143,7 +143,7 @@ def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
 def test_what_cannot_be_fused_is_counted_also_after_a_restart(tmp_path: Path) -> None:
     positions = fill(tmp_path, 2)
     fuser, link = opened(tmp_path, checkpoint_every=1)
-    fuser.handle(order(0, Position(7, 42)))
+    fuser.handle(order(0, Position(1, 42)))
     assert link.done().reason == "JournalError"
     fuser.handle(order(1, positions[0], skip="crash"))
     assert link.done().reason == "crash"
@@ -310,7 +310,10 @@ def test_a_record_that_cannot_be_read_now_is_left_to_another_process(
 
     monkeypatch.setattr(os, "pread", refuse(code))
     fuser.handle(order(0, position))
-    assert (fuser.exit_status, link.sent, fuser.ready().done) == (1, [], {})
+    assert held(fuser, link)  # at first: the disk may be itself again
+    monkeypatch.setattr("tsfusion.fuser.fuser._PATIENCE_S", 0.0)
+    fuser.go_on()
+    assert (fuser.exit_status, len(link.sent), fuser.ready().done) == (1, 1, {})
     assert (tmp_path / "working").read_bytes() == bytes(8)  # it was at this one
     monkeypatch.undo()
     again, link = opened(tmp_path)
@@ -434,3 +437,109 @@ def test_a_fusers_own_lines_obey_log_level(level: str, shown: list[str]) -> None
         assert [line["message"] for line in lines if line["logger"] == name] == shown
     assert {(line["process"], line["map"]) for line in lines} == {("fuser", "yard")}
     assert len(lines) == 2 * len(shown)
+
+
+# --- folders that are away ---
+
+
+def held(fuser: Fuser, link: Link) -> bool:
+    return isinstance(link.last(), messages.Held) and fuser.is_held
+
+
+def test_a_journal_that_is_away_is_waited_for_and_the_order_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tsfusion.fuser.fuser._PATIENCE_S", 0.0)
+    first, second = fill(tmp_path, 2)
+    fuser, link = opened(tmp_path)
+    (tmp_path / "journal").rename(tmp_path / "aside")
+    for number in range(3):
+        fuser.handle(order(0, first)) if not number else fuser.go_on()
+        assert held(fuser, link)
+        assert "No such file" in link.last().message
+    assert (tmp_path / "working").read_bytes() == b"\xff" * 8  # a death now is not the keyframe's fault
+    fuser.handle(order(1, second))
+    assert status(fuser, link).keyframes_fused == 0  # questions are answered meanwhile
+    (tmp_path / "aside").rename(tmp_path / "journal")
+    fuser.go_on()
+    done = [message for message, _ in link.sent if isinstance(message, messages.Done)]
+    assert [(one.index, one.reason) for one in done] == [(0, None), (1, None)]
+    assert (fuser.is_held, fuser.exit_status) == (False, None)
+
+
+def test_a_keyframe_whose_segment_alone_is_gone_is_rejected_after_a_while(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (position,) = fill(tmp_path, 1)
+    fill(tmp_path, 1)
+    (tmp_path / "journal" / "000001.mcap").unlink()
+    fuser, link = opened(tmp_path)
+    fuser.handle(order(0, position))
+    assert held(fuser, link)
+    monkeypatch.setattr("tsfusion.fuser.fuser._PATIENCE_S", 0.0)
+    fuser.go_on()
+    assert (link.last().index, link.last().reason) == (0, "JournalError")
+
+
+def test_a_checkpoint_that_cannot_be_written_is_said_until_it_can(tmp_path: Path) -> None:
+    folder, aside = tmp_path / "map", tmp_path / "aside"
+    folder.mkdir()
+    position, fuser, link = opened_with_one(folder)
+    fuser.handle(order(0, position))
+    folder.rename(aside)
+    fuser.handle(messages.Save())
+    assert not link.last().written
+    assert "is not there" in link.last().problem
+    folder.mkdir()  # a checkpoint in there would be hidden again
+    fuser.handle(messages.Save())
+    assert not link.last().written
+    assert list(folder.iterdir()) == []
+    folder.rmdir()
+    aside.rename(folder)
+    fuser.handle(messages.Save())
+    assert (link.last().written, link.last().problem) == (True, "")
+    again, _ = opened(folder)
+    assert again.ready().done == {SESSION: messages.SessionProgress(1, "robot")}
+
+
+def test_a_disk_that_refuses_a_checkpoint_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    position, fuser, link = opened_with_one(tmp_path)
+    fuser.handle(order(0, position))
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", refuse(errno.ENOSPC))
+        fuser.handle(messages.Save())
+    assert "No space left" in link.last().problem
+    fuser.handle(messages.Save())
+    assert (link.last().written, link.last().problem) == (True, "")
+
+
+def test_a_checkpoint_is_on_the_disk_before_it_has_its_name_and_then_the_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = MapCheckpoints(tmp_path, VOLUME, keep_previous=True)
+    assert written.save()
+    happened: list[str] = []
+    sync, rename = os.fsync, os.replace
+
+    def synced(descriptor: int) -> None:
+        happened.append(f"sync {Path(os.readlink(f'/proc/self/fd/{descriptor}')).name}")
+        sync(descriptor)
+
+    def renamed(old: Path, new: Path) -> None:
+        happened.append(f"{Path(old).name} > {Path(new).name}")
+        rename(old, new)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", renamed)
+    assert written.save()
+    assert happened == [
+        *("sync .map.new.tsf.partial", ".map.new.tsf.partial > map.new.tsf", f"sync {tmp_path.name}"),
+        *("map.tsf > map.previous.tsf", "map.new.tsf > map.tsf", f"sync {tmp_path.name}"),
+    ]
+
+
+def test_parts_of_a_killed_checkpoint_are_swept_and_nothing_else(tmp_path: Path) -> None:
+    for name in ("map.new.tsf", ".map.new.tsf.partial", "map.damaged", "notes.partial"):
+        (tmp_path / name).write_bytes(b"half")
+    MapCheckpoints(tmp_path, VOLUME, keep_previous=False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["map.damaged", "notes.partial"]

@@ -4,7 +4,8 @@
 import time
 from collections.abc import Iterable
 
-from keyframes_and_servers import DEADLINE, wall
+import numpy as np
+from keyframes_and_servers import CAMERA, DEADLINE, NUMBERED_NS, pose, wall
 from scripted_server import ScriptedServer
 
 from tsfusion import Client, Keyframe
@@ -16,6 +17,12 @@ QUICK = ClientConfig(stall_timeout=0.5)
 
 def joined(server: ScriptedServer, **settings: object) -> Client:
     return Client(server.address, control=server.control, **{"config": QUICK, **settings})  # type: ignore[arg-type]
+
+
+def noise(i: int) -> Keyframe:
+    """Some 40 kB, whatever the codec does."""
+    depth = np.random.default_rng(i).integers(0, 65536, (120, 160)).astype(np.uint16)
+    return Keyframe(depth=depth, intrinsics=CAMERA, T_world_camera=pose(), timestamp_ns=NUMBERED_NS + i)
 
 
 def send_all(client: Client, numbers: range) -> list[int]:
