@@ -184,8 +184,8 @@ class World:
 
     def end_client(self) -> None:
         self.spool._lock.close()
-        if self.spool._journal._file is not None:
-            self.spool._journal._file.close()
+        for segment in self.spool._journal._kept.values():
+            segment.close()
         self.sender._waker.close()
         self.sender._woken.close()
 

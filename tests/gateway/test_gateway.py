@@ -257,6 +257,99 @@ def test_a_vanished_temporary_folder_is_waited_for(
     drained(gateway)
 
 
+# --- folders and files that are away ---
+
+
+def journal_folder(state: Path) -> Path:
+    return state_folder.map_folder(state, "default") / "journal"
+
+
+def test_a_journal_that_is_away_is_said_although_no_keyframe_comes_until_it_is_back(
+    start: Start, tmp_path: Path
+) -> None:
+    gateway = start(_CRASHES_ON_2.replace("sys.exit(7)", "time.sleep(0.5); sys.exit(7)"))
+    stepped(gateway, lambda: gateway.maps.warm)
+    journal_folder(tmp_path).rename(tmp_path / "aside")
+    stepped(gateway, lambda: "No such file" in default(gateway).problem)
+    assert not gateway.health().ready
+    hosted = gateway.maps.get("default")
+    assert hosted is not None
+    stepped(gateway, hosted.fuser.ended)
+    for _ in range(3):
+        gateway.step()
+    assert default(gateway).fuser_restarts == 0  # it would begin with an empty map
+    assert not journal_folder(tmp_path).exists()
+    assert hosted.settled  # a server that is to end does not wait for it
+    (tmp_path / "aside").rename(journal_folder(tmp_path))
+    stepped(gateway, lambda: not default(gateway).problem)
+    assert default(drained(gateway)).keyframes_fused == 4
+
+
+def test_segments_that_vanish_are_named_and_the_map_is_saved_at_once(start: Start, tmp_path: Path) -> None:
+    saved = f"""{_FUSES}
+    if isinstance(message, fuser_messages.Save):
+        open({str(tmp_path / "saved")!r}, "w").close()
+"""
+    gateway = drained(start(saved))
+    segment = journal.segment_path(journal_folder(tmp_path), 1)
+    other = Journal(tmp_path / "other", 1 << 20)
+    other.append([b"head"], session=bytes(16), seq=1)
+    other.close()
+    journal.segment_path(tmp_path / "other", 1).rename(journal.segment_path(journal_folder(tmp_path), 9))
+    segment.rename(tmp_path / "aside")
+    stepped(gateway, (tmp_path / "saved").exists)
+    (problem,) = gateway.health().problems
+    assert "map default: 1 segments of its journal are gone, first 000001.mcap" in problem
+    (tmp_path / "aside").rename(segment)
+    stepped(gateway, lambda: not gateway.health().problems)
+
+
+def test_a_gap_in_the_journal_is_said_from_the_start(start: Start, tmp_path: Path) -> None:
+    begin = Journal(journal_folder(tmp_path), 1)
+    for seq in range(10, 13):
+        begin.append([b"head"], session=bytes(16), seq=seq)
+    journal.segment_path(journal_folder(tmp_path), 2).unlink()
+    gateway = start(_FUSES)
+    stepped(gateway, lambda: gateway.maps.warm)
+    assert (
+        "map default: 1 segments of its journal were not there at the start" in gateway.health().problems[0]
+    )
+
+
+def test_a_checkpoint_that_cannot_be_written_is_a_problem_and_tried_again(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tsfusion.gateway.hosted_map._SAVE_PAUSE", 0.0)
+    gateway = start(f"""{_FUSES}
+        say(fuser_messages.Saved(False, "No space left on device"))
+    if isinstance(message, fuser_messages.Save):
+        say(fuser_messages.Saved(True))
+""")
+    seen: list[str] = []
+
+    def is_saved() -> bool:
+        seen.extend(gateway.health().problems)
+        return default(gateway).checkpoints > 0 and not gateway.health().problems
+
+    stepped(gateway, is_saved)
+    assert "map default: no checkpoint can be written: No space left on device" in seen
+
+
+def test_a_record_that_waits_for_its_folder_is_a_problem(start: Start) -> None:
+    gateway = start(fusing("say(fuser_messages.Held('cannot read it')); time.sleep(0.3)"))
+    stepped(gateway, lambda: default(gateway).problem == "cannot read it")
+    assert default(drained(gateway)).problem == ""
+
+
+def test_a_journal_that_ends_before_its_checkpoint_is_said(
+    start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    ready = "fuser_messages.Ready({bytes(16): fuser_messages.SessionProgress(9, '')})"
+    gateway = start(_FUSES.replace("fuser_messages.Ready({})", ready))
+    stepped(gateway, lambda: gateway.maps.warm)
+    assert "its checkpoint holds keyframes of 1 sessions that its journal" in caplog.text
+
+
 def test_the_last_words_of_a_dead_fuser_are_not_heard(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     """ZeroMQ may deliver them late, when its keyframes are handed out anew."""
     monkeypatch.setattr(fuser_process.FuserProcess, "remove_socket_file", lambda _: None)

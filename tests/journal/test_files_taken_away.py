@@ -149,6 +149,17 @@ def test_nothing_is_written_into_an_empty_folder_in_the_place_of_the_journal(
     assert seqs(folder) == [1, 3]
 
 
+def test_a_journal_whose_files_are_all_deleted_goes_on_and_names_them(tmp_path: Path) -> None:
+    log = Journal(tmp_path, 1)  # each record fills a segment
+    fill(log, 1, 2)
+    for number in (1, 2):
+        segment_path(tmp_path, number).unlink()
+    log.check()
+    assert log.missing == [1, 2]
+    fill(log, 3)
+    assert (seqs(tmp_path), journal.segments(tmp_path)) == ([3], [3])
+
+
 def test_closed_segments_that_vanish_are_named_until_they_are_back(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -196,6 +196,11 @@ class Outbox:
         with self._changed:
             (self._corrections_refused if is_correction else self._skipped)[reason] += 1
 
+    @property
+    def spool_is_away(self) -> bool:
+        """Whether the spool's folder is not to be found, or an empty one is in its place."""
+        return self._spool.is_away
+
     def usage(self) -> tuple[int, int]:
         """Bytes of the disk that the spool takes, and records in it."""
         with self._changed:

@@ -15,7 +15,6 @@ from typing import Any
 
 import zmq
 
-from tsfusion import journal
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import MISSING, DecodeError, JournalError
 from tsfusion.delivery.connection import Connection
@@ -184,7 +183,7 @@ class Sender:
         return frames
 
     def _most_reads(self) -> int:
-        return _MAX_READS_AWAY if journal.is_away(self._outbox.spool_folder) else _MAX_READS
+        return _MAX_READS_AWAY if self._outbox.spool_is_away else _MAX_READS
 
     def _send(self, entry: Waiting, previous: int, frames: list[memoryview]) -> None:
         sent_ns = time.monotonic_ns()

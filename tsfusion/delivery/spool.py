@@ -202,6 +202,11 @@ class Spool:
                 raise
             return kept.frames
 
+    @property
+    def is_away(self) -> bool:
+        """Whether the folder is not to be found, or an empty one is in its place. From any thread."""
+        return self._journal.is_away
+
     def drop(self, durable: int) -> list[int]:
         """Let go of everything up to `durable`; the numbers of the records that waited."""
         dropped = []
@@ -257,7 +262,7 @@ class Spool:
         try:
             self._journal.close()
         except JournalError as error:
-            if self.waiting and journal.is_away(self.folder):
+            if self.waiting and self.is_away:
                 log.error("%d records are not in the spool any more: %s", len(self.waiting), error)
             else:  # the last file lacks only its index
                 log.warning("%s", error)

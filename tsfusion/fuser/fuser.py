@@ -67,7 +67,9 @@ class Fuser:
         self._memory_limit = process.data_bytes() + _TAICHI_RESERVES + begin.memory_bytes
         process.limit_memory(self._memory_limit)
         self.exit_status: int | None = None  # of the process, which has to end; None = it goes on
-        self._home = os.stat(self._folder)
+        self._home, self._journal_home = os.stat(self._folder), None
+        with suppress(OSError):
+            self._journal_home = os.stat(self._folder / state_folder.JOURNAL_FOLDER)
         self._map = MapCheckpoints(self._folder, begin.volume, keep_previous=begin.keep_previous)
         self._volume = self._map.volume
         self._volume.warm_up()
@@ -217,7 +219,7 @@ class Fuser:
             log.warning("%s; it is tried again", error)
             self._held_since = now
         is_over = now - self._held_since >= _PATIENCE_S
-        is_away = journal.is_away(self._folder / state_folder.JOURNAL_FOLDER)
+        is_away = journal.is_away(self._folder / state_folder.JOURNAL_FOLDER, self._journal_home)
         if is_over and not is_away and error.errno == errno.ENOENT:
             return False
         if is_over and not is_away:

@@ -48,11 +48,15 @@ def segments(folder: Path) -> list[int]:
     )
 
 
-def is_away(folder: Path) -> bool:
-    """Whether a folder of segments is not to be found, or has none: moved, or its disk is not mounted."""
+def is_away(folder: Path, home: os.stat_result | None) -> bool:
+    """Whether a folder of segments is not to be found, or an empty one is in its place: it may come back.
+
+    Args:
+        home: of the folder as it was; None = it was not there.
+    """
     try:
-        return not segments(folder)
-    except JournalError:
+        return (home is None or not os.path.samestat(os.stat(folder), home)) and not segments(folder)
+    except (JournalError, OSError):
         return True
 
 

@@ -18,7 +18,7 @@ from tsfusion.journal.free_space import FreeSpace
 from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.open_segment import OpenSegment
 from tsfusion.journal.record_scan import journal_error
-from tsfusion.journal.segments import RecordEntry, list_records, segment_path, segments
+from tsfusion.journal.segments import RecordEntry, is_away, list_records, segment_path, segments
 
 log = logging.getLogger(__name__)
 
@@ -210,16 +210,21 @@ class Journal:
     def look(self) -> None:
         """Note which segments are `missing`; raise JournalError when the folder is another one, or not there.
 
-        A folder that has none of the segments it had is the place of a disk that is not mounted, or somebody
-        has deleted everything: what is written there may never be found again.
+        Another folder that has none of the segments is the place of a disk that is not mounted, or somebody
+        has made it anew: what is written there may never be found again.
         """
         there = set(segments(self.folder))
         missing = [number for number in self._closed if number not in there]
         for number in set(missing).difference(self.missing):
             log.error("%s is not there any more", segment_path(self.folder, number))
         self.missing = missing
-        if missing and not there.difference(missing):
+        if missing and self.is_away:
             raise self._strange_folder()
+
+    @property
+    def is_away(self) -> bool:
+        """Whether the folder is not to be found, or an empty one is in its place. From any thread."""
+        return is_away(self.folder, self._home)
 
     def _strange_folder(self) -> JournalError:
         return JournalError(
@@ -241,8 +246,7 @@ class Journal:
             if segment.is_in_place:
                 return
             here = os.stat(self.folder)
-            is_home = os.path.samestat(here, self._home) or self._closed.keys() & set(segments(self.folder))
-            if not segment.is_deleted and not is_home:
+            if not segment.is_deleted and self.is_away:
                 raise self._strange_folder()  # the segment is with its folder, elsewhere
             segment.put_back()
         except OSError as error:
