@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: MIT
 """One process at a time in a folder."""
 
+import errno
+import fcntl
+import os
 import signal
+import stat
 import subprocess
 import sys
 from contextlib import ExitStack
@@ -11,7 +15,7 @@ import pytest
 from keyframes_and_servers import DEADLINE
 
 from tsfusion.core.errors import JournalError, MapError
-from tsfusion.core.folder_lock import hold, lock_folder
+from tsfusion.core.folder_lock import hold, lock_folder, owner_of
 
 _OTHER = """
 import sys, time
@@ -63,3 +67,40 @@ def test_a_lock_is_free_again_after_its_block(tmp_path: Path, name: str | None) 
         with pytest.raises(BlockingIOError):
             hold(tmp_path, name)
     assert (tmp_path / "part").read_bytes() == b"half"
+
+
+def test_a_deleted_lock_file_lets_no_second_process_in(tmp_path: Path) -> None:
+    lock = lock_folder(tmp_path, "state", "server")
+    (tmp_path / "lock").unlink()
+    assert owner_of(tmp_path) == "?"
+    with pytest.raises(JournalError, match="in use by another server"):
+        lock_folder(tmp_path, "state", "server")
+    lock.close()
+    assert owner_of(tmp_path) is None
+    lock_folder(tmp_path, "state", "server").close()
+
+
+def test_a_folder_that_is_away_is_not_made_in_its_place(tmp_path: Path) -> None:
+    with pytest.raises(JournalError, match="No such file"):
+        lock_folder(tmp_path / "map", "map", "fuser", make=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_system_that_locks_no_folders_has_the_file_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As NFS: it emulates these locks by those of byte ranges, which need a file open for writing."""
+    real = fcntl.flock
+
+    def files_only(descriptor: int, operation: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        real(descriptor, operation)
+
+    monkeypatch.setattr(fcntl, "flock", files_only)
+    lock = lock_folder(tmp_path, "spool", "scanner")
+    assert owner_of(tmp_path) is not None
+    with pytest.raises(JournalError, match="in use by another scanner"):
+        lock_folder(tmp_path, "spool", "scanner")
+    lock.close()
+    assert owner_of(tmp_path) is None

@@ -2,6 +2,7 @@
 """A spool whose files or folder somebody deletes or moves while a scan goes on."""
 
 import logging
+import os
 import shutil
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.delivery import backpressure
 from tsfusion.delivery.spool import Spool
+from tsfusion.delivery.tombstones import NAME, Tombstones
 
 SMALL = ClientConfig(policy="spool_all", segment_bytes=1 << 16, stall_timeout=0.5)
 
@@ -105,6 +107,19 @@ def test_a_deleted_lock_file_lets_nobody_else_in(tmp_path: Path) -> None:
         (tmp_path / "lock").unlink()
         with pytest.raises(JournalError, match="in use by another scanner"):
             Spool(tmp_path, 1 << 16)
+
+
+@pytest.mark.parametrize("torn", [1, 7, 15, 16, 17, 23, 24, 25])
+def test_a_number_that_was_cut_off_shifts_no_other(tmp_path: Path, torn: int) -> None:
+    """A full disk takes part of a write: read out of step, the rest would be numbers of nobody."""
+    session = bytes(range(1, 17))
+    gone = Tombstones(tmp_path, session)
+    gone.add(7)
+    path = tmp_path / NAME
+    os.truncate(path, 16 + 8)
+    path.write_bytes((path.read_bytes() + b"\xff" * 8)[:torn])
+    gone.add(8)
+    assert Tombstones(tmp_path, session).numbers == ({7, 8} if torn >= 24 else {8})
 
 
 def test_the_spools_limit_is_a_problem_too(tmp_path: Path) -> None:

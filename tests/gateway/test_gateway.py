@@ -2,6 +2,7 @@
 """The gateway with fusers that misbehave, in this process; and real scans by file and by socket."""
 
 import errno
+import os
 import subprocess
 import sys
 import tempfile
@@ -286,7 +287,7 @@ def test_a_journal_that_is_away_is_said_although_no_keyframe_comes_until_it_is_b
 
 
 def test_segments_that_vanish_are_named_and_the_map_is_saved_at_once(start: Start, tmp_path: Path) -> None:
-    saved = f"""{_FUSES}
+    saved = f"""{fusing("pass")}
     if isinstance(message, fuser_messages.Save):
         open({str(tmp_path / "saved")!r}, "w").close()
 """
@@ -304,12 +305,28 @@ def test_segments_that_vanish_are_named_and_the_map_is_saved_at_once(start: Star
     stepped(gateway, lambda: not gateway.health().problems)
 
 
+@pytest.mark.parametrize("call", ["listdir", "fsync", "stat"])
+def test_a_disk_that_fails_while_a_map_is_opened_for_a_client_is_said(
+    start: Start, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
+    gateway = start(fusing("pass"))
+    stepped(gateway, lambda: gateway.maps.warm)
+    gateway.maps.end_start()
+    with monkeypatch.context() as patched:
+        patched.setattr(os, call, refuse(errno.EIO))
+        assert gateway.maps.open_for_client("yard") is None
+        assert "error" in gateway.maps.why_not("yard")
+        assert gateway.maps.free_name("yard") != "yard"
+    monkeypatch.setattr("tsfusion.gateway.map_registry._RETRY_INTERVAL", 0.0)
+    assert gateway.maps.open_for_client("yard") is not None
+
+
 def test_a_gap_in_the_journal_is_said_from_the_start(start: Start, tmp_path: Path) -> None:
     begin = Journal(journal_folder(tmp_path), 1)
     for seq in range(10, 13):
         begin.append([b"head"], session=bytes(16), seq=seq)
     journal.segment_path(journal_folder(tmp_path), 2).unlink()
-    gateway = start(_FUSES)
+    gateway = start(fusing("pass"))
     stepped(gateway, lambda: gateway.maps.warm)
     assert (
         "map default: 1 segments of its journal were not there at the start" in gateway.health().problems[0]
@@ -320,7 +337,7 @@ def test_a_checkpoint_that_cannot_be_written_is_a_problem_and_tried_again(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tsfusion.gateway.hosted_map._SAVE_PAUSE", 0.0)
-    gateway = start(f"""{_FUSES}
+    gateway = start(f"""{fusing("pass")}
         say(fuser_messages.Saved(False, "No space left on device"))
     if isinstance(message, fuser_messages.Save):
         say(fuser_messages.Saved(True))
@@ -345,7 +362,7 @@ def test_a_journal_that_ends_before_its_checkpoint_is_said(
     start: Start, caplog: pytest.LogCaptureFixture
 ) -> None:
     ready = "fuser_messages.Ready({bytes(16): fuser_messages.SessionProgress(9, '')})"
-    gateway = start(_FUSES.replace("fuser_messages.Ready({})", ready))
+    gateway = start(fusing("pass").replace("fuser_messages.Ready({})", ready))
     stepped(gateway, lambda: gateway.maps.warm)
     assert "its checkpoint holds keyframes of 1 sessions that its journal" in caplog.text
 

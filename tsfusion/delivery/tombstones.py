@@ -31,6 +31,12 @@ def stored(folder: Path, session: bytes) -> set[int] | None:
     return set(np.frombuffer(content, _NUMBER, whole, _SESSION_BYTES).tolist())
 
 
+def _whole_bytes(size: int) -> int:
+    """Bytes of a file of this size up to its last whole number."""
+    numbers = (size - _SESSION_BYTES) // _NUMBER.itemsize
+    return _SESSION_BYTES + numbers * _NUMBER.itemsize if size >= _SESSION_BYTES else 0
+
+
 class Tombstones:
     """A file of numbers, behind the session they belong to. A disk that refuses is passed over."""
 
@@ -65,7 +71,9 @@ class Tombstones:
         added = np.fromiter(numbers, _NUMBER)
         try:
             with self._path.open("ab") as file:
-                head = b"" if file.tell() else self._session
+                whole = _whole_bytes(file.tell())
+                file.truncate(whole)  # what a full disk took of the last number would shift all that follow
+                head = b"" if whole else self._session
                 file.write(head + added.tobytes())
         except OSError as error:
             log.debug("%s cannot be written: %s", self._path, error.strerror)

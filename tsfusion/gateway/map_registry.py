@@ -5,6 +5,7 @@ import logging
 import re
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from itertools import count
 from typing import Any
 
@@ -87,7 +88,7 @@ class MapRegistry:
             return None
         try:
             return self._open_map(name)
-        except TsfusionError as error:
+        except (TsfusionError, OSError) as error:  # OSError: the disk fails where nobody expects it
             self._give_up(name, error)
             return None
 
@@ -121,7 +122,10 @@ class MapRegistry:
         """The first of NAME, NAME-2, NAME-3, … that is no map's yet and was given to nobody just now."""
         now = time.monotonic()
         in_use = {one.name for one in self if len(one.sessions)} | {route.map for route in self._routes}
-        on_disk = {name for name in state_folder.map_names(self._server.state) if name not in self._open}
+        on_disk: set[str] = set()
+        with suppress(OSError):  # a name that is taken after all is denied at the greeting
+            on_disk.update(state_folder.map_names(self._server.state))
+        on_disk.difference_update(self._open)
         kept = {name for name, since in self._kept.items() if now - since < _KEPT_SECONDS}
         taken = in_use | on_disk | kept | set(self._unopened)
         stem = re.sub(r"-[0-9]+$", "", like)
@@ -147,7 +151,7 @@ class MapRegistry:
         self._unopened.pop(name, None)
         return hosted
 
-    def _give_up(self, name: str, error: TsfusionError) -> None:
+    def _give_up(self, name: str, error: Exception) -> None:
         log.error("the map cannot be opened: %s", error, extra=logs.about(map=name))
         self._unopened[name] = (str(error), time.monotonic())
         if len(self._unopened) > _MAX_UNOPENED:
