@@ -67,6 +67,7 @@ def test_a_full_disk_costs_keyframes_and_nothing_else(
         assert 8 < len(taken) < 20
         assert taken == [*range(len(taken))]
         assert client.stats.state == "disk"
+        assert "No space left on device" in client.problem
         assert client.stats.skipped == {"disk": 30 - len(taken)}
         assert len(messages_of(caplog, logging.ERROR)) == 1
         assert "No space left on device" in messages_of(caplog, logging.ERROR)[0]
@@ -115,10 +116,12 @@ def test_a_read_only_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         read_only[0] = True
         assert [client.send(noise(i)) for i in range(4, 7)] == [None] * 3
         assert client.stats.state == "disk"
+        assert "Read-only file system" in client.problem
         server.taking = True
         client.flush(DEADLINE)
         read_only[0] = False
         assert client.send(noise(7)) == 8
+        assert "cannot keep" not in client.problem
         client.flush(DEADLINE)
         assert (client.stats.state, server.numbers) == ("ok", [0, 1, 2, 3, 7])
         read_only[0] = True
@@ -205,6 +208,7 @@ def test_some_of_the_disk_stays_free(
         assert client.send(wall(1)) is None
         assert client.send(wall(2)) is None
         assert (client.stats.state, client.stats.skipped) == ("disk", {"disk": 2})
+        assert "67108864 must stay free" in client.problem
         free[0] = 65 << 20  # just over the limit: it would be under it again at once
         assert client.send(wall(3)) is None
         free[0] = 100 << 20

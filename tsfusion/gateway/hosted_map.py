@@ -293,6 +293,8 @@ class HostedMap:
             delay_bound_ms=outcomes.delays.bound_ms,
             corrections=self._corrections,
             checkpoints=self._checkpoints,
+            journal_missing=self._journal.absent + len(self._journal.missing),
+            journal_put_back=self._journal.put_back,
         )
 
 

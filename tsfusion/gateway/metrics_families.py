@@ -33,6 +33,7 @@ _OF_MAPS: tuple[tuple[str, str, Callable[[MapHealth], float]], ...] = (
     ("sessions", "Sessions that sent keyframes.", lambda one: one.sessions),
     ("journal_bytes", "Bytes of the journal.", lambda one: one.journal_bytes),
     ("journal_damaged", "Records of the journal that could not be read.", lambda one: one.journal_damaged),
+    ("journal_missing", "Segments of the journal that are gone.", lambda one: one.journal_missing),
     ("map_blocks", "Blocks of 8³ voxels.", lambda one: one.blocks),
     ("map_bytes", "Bytes of the map in memory.", lambda one: one.map_bytes),
     ("map_problem", "Whether something keeps it from taking or fusing.", lambda one: bool(one.problem)),

@@ -46,6 +46,8 @@ class MapHealth(Struct, frozen=True, kw_only=True):
     delay_bound_ms: float  # error bound of the delays (half the best round trip of the worst client)
     corrections: int = 0  # records of corrected poses: in the journal at the start, and journaled since
     checkpoints: int = 0  # written since the server began
+    journal_missing: int = 0  # segments of the journal that are gone, at the start or since
+    journal_put_back: int = 0  # times that the segment being written was taken away, and written again
 
 
 ClientState = Literal["connected", "silent", "gone"]
