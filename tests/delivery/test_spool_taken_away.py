@@ -32,17 +32,17 @@ def test_a_spool_that_is_deleted_is_told_by_the_next_send_and_what_it_had_is_sti
 ) -> None:
     spool = tmp_path / "spool"
     with scripted(taking=False) as server, joined(server, spool=spool, config=SMALL) as client:
-        taken = [i for i in range(8) if client.send(noise(i)) is not None]
+        taken = [i for i in range(24) if client.send(noise(i)) is not None]
         assert len(list(spool.glob("*.mcap"))) > 2
         shutil.rmtree(spool)
-        assert client.send(noise(8)) is None
+        assert client.send(noise(24)) is None
         assert (client.stats.state, client.stats.skipped) == ("disk", {"disk": 1})
         assert f"keyframes are lost: the spool {spool} cannot keep them" in client.problem
         assert "No such file" in client.problem
         server.taking = True
         client.flush(DEADLINE)
-        assert server.numbers == taken == [*range(8)]
-        assert (client.stats.durable, client.stats.refused) == (8, {})
+        assert server.numbers == taken == [*range(24)]
+        assert (client.stats.durable, client.stats.refused) == (24, {})
         assert not spool.exists()
     lost = [one.getMessage() for one in caplog.records if one.levelno == logging.ERROR]
     assert len(lost) == 1  # when it began
