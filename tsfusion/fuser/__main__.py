@@ -83,7 +83,9 @@ def _open_map(link: sockets.AnySocket, message: fuser_messages.Begin) -> Fuser |
             Path(message.folder), "map", "fuser", name="fuser.lock", wait=_LOCK_WAIT_S, error_type=MapError
         )
         fuser = Fuser(link, message)
-    except TsfusionError as error:
+    except (TsfusionError, MemoryError) as error:
+        if isinstance(error, MemoryError):
+            error = MapError(f"no memory to open the map: {error}; raise fuser_memory_bytes")
         link.send(fuser_messages.encode(fuser_messages.Failed.of(error)))
         return None
     link.send(fuser_messages.encode(fuser.ready()))
