@@ -4,21 +4,20 @@
 import errno
 import hashlib
 import os
-import resource
 import struct
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+from failures import memory_limited
 from formula_scenes import sphere_views, volume_of
 
 from tsfusion import Volume, VolumeConfig
-from tsfusion.core import process
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, MapFull, WeightOverflow
 from tsfusion.tsdf import checkpoint
 from tsfusion.tsdf.block_store import pack_keys
@@ -47,17 +46,6 @@ def test_a_map_comes_back_and_goes_on_as_if_never_saved(tmp_path: Path, settings
     assert (loaded.extract_mesh().vertices == volume.extract_mesh().vertices).all()
 
 
-@contextmanager
-def memory(nbytes: int) -> Iterator[None]:
-    """Let this process take so many bytes more for the block."""
-    before = resource.getrlimit(resource.RLIMIT_DATA)
-    process.limit_memory(process.data_bytes() + nbytes)
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, before)
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit memory")
 def test_a_map_is_read_and_written_in_little_more_memory_than_it_takes(tmp_path: Path) -> None:
     volume = Volume(VolumeConfig(regularizer="ray"))
@@ -65,16 +53,16 @@ def test_a_map_is_read_and_written_in_little_more_memory_than_it_takes(tmp_path:
     volume._store.insert(pack_keys(np.stack([numbers % 100, numbers // 100, 0 * numbers], axis=1)))
     for layer in volume._store.layers().values():
         layer[: len(numbers)] = numbers[:, None]
-    with memory(32 << 20):
+    with memory_limited(32 << 20):
         path = volume.save(tmp_path / "map.tsf")
     size, map_hash = volume.stats().bytes, volume.map_hash()
     assert size > 140 << 20
     del volume
-    with memory(size + (32 << 20)):
+    with memory_limited(size + (32 << 20)):
         loaded = Volume.load(path)
         assert loaded.map_hash() == map_hash
     assert loaded.stats().bytes == size
-    with memory(size // 2), pytest.raises(CheckpointError, match="does not fit"):
+    with memory_limited(size // 2), pytest.raises(CheckpointError, match="does not fit"):
         Volume.load(path)
 
 
