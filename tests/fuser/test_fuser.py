@@ -226,7 +226,7 @@ def test_a_checkpoint_that_cannot_be_read_now_stays(
 def test_a_checkpoint_without_memory_for_it_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = saved(tmp_path)
 
-    monkeypatch.setattr("tsfusion.tsdf.volume.Volume.load", raising(MemoryError()))
+    monkeypatch.setattr("tsfusion.tsdf.block_store.BlockStore.reserve", raising(MemoryError()))
     with pytest.raises(errors.CheckpointError, match="does not fit"):
         opened(tmp_path)
     assert path.exists()
@@ -326,7 +326,8 @@ def test_no_memory_for_a_keyframe_is_no_crash(tmp_path: Path, monkeypatch: pytes
 
     monkeypatch.setattr(codec, "decode", raising(MemoryError("no room for 9 GB")))
     fuser.handle(order(0, position))
-    assert (link.last().reason, link.last().message) == ("memory", "no memory to fuse it: no room for 9 GB")
+    assert link.last().reason == "memory"
+    assert link.last().message == "no memory to fuse it: no room for 9 GB; raise fuser_memory_bytes"
 
 
 @pytest.mark.parametrize("min_weight", [float("nan"), float("inf"), 1e308, 1e20, -1.0])
@@ -335,6 +336,26 @@ def test_no_question_ends_the_fuser(tmp_path: Path, min_weight: float) -> None:
     fuser.handle(order(0, position))
     fuser.handle(messages.FuserQuery(1, Command(name="mesh", min_weight=min_weight)))
     assert "min_weight must be" in link.last().error
+
+
+def test_a_mesh_that_there_is_no_memory_for_is_an_answer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    position, fuser, link = opened_with_one(tmp_path)
+    fuser.handle(order(0, position))
+    with monkeypatch.context() as patched:
+        patched.setattr(tsfusion.Volume, "extract_mesh", raising(MemoryError("no room for 9 GB")))
+        fuser.handle(messages.FuserQuery(1, Command(name="mesh")))
+    assert link.last().error == "not enough memory for that: no room for 9 GB; raise fuser_memory_bytes"
+    fuser.handle(messages.FuserQuery(2, Command(name="mesh")))
+    assert link.last().layout.faces > 0
+
+
+def test_a_map_opens_with_the_limits_of_now(tmp_path: Path) -> None:
+    saved(tmp_path)
+    for limit in (10_000, 20_000):
+        fuser, link = opened(tmp_path, msgspec.structs.replace(VOLUME, max_blocks=limit))
+        assert status(fuser, link).config["max_blocks"] == limit
 
 
 # --- the fuser and its gateway ---

@@ -249,12 +249,20 @@ def run_checkpoint(content: bytes) -> str:
     path = scratch() / "map.tsf"
     path.write_bytes(content)
     try:
-        header, keys, _ = checkpoint.read(path)
+        with checkpoint.reading(path) as (header, chunks):
+            blocks = sum(_read_chunk(chunk, header.layers) for chunk in chunks)
     except CheckpointError as error:
         return f"CheckpointError {str(error).replace(str(path), '')}"
-    if len(keys) != header.blocks:
+    if blocks != header.blocks:
         raise Broken("blocks without keys")
     return "good"
+
+
+def _read_chunk(chunk: checkpoint.Chunk, layers: list[str]) -> int:
+    chunk.fill(np.empty(chunk.blocks, np.int64))
+    for name in layers:
+        chunk.fill(np.empty((chunk.blocks, 512), checkpoint.LAYER_DTYPES[name]))
+    return chunk.blocks
 
 
 # --- corrections ---

@@ -5,18 +5,22 @@ import errno
 import hashlib
 import os
 import struct
+import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+from failures import memory_limited
 from formula_scenes import sphere_views, volume_of
 
 from tsfusion import Volume, VolumeConfig
-from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, WeightOverflow
+from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, MapFull, WeightOverflow
 from tsfusion.tsdf import checkpoint
+from tsfusion.tsdf.block_store import pack_keys
 
 VIEWS = sphere_views(0.4, 4)
 
@@ -40,6 +44,57 @@ def test_a_map_comes_back_and_goes_on_as_if_never_saved(tmp_path: Path, settings
         either.retract(VIEWS[0])
     assert loaded.map_hash() == volume.map_hash()
     assert (loaded.extract_mesh().vertices == volume.extract_mesh().vertices).all()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit memory")
+def test_a_map_is_read_and_written_in_little_more_memory_than_it_takes(tmp_path: Path) -> None:
+    volume = Volume(VolumeConfig(regularizer="ray"))
+    numbers = np.arange(1, 12_001, dtype=np.int32)
+    volume._store.insert(pack_keys(np.stack([numbers % 100, numbers // 100, 0 * numbers], axis=1)))
+    for layer in volume._store.layers().values():
+        layer[: len(numbers)] = numbers[:, None]
+    with memory_limited(32 << 20):
+        path = volume.save(tmp_path / "map.tsf")
+    size, map_hash = volume.stats().bytes, volume.map_hash()
+    assert size > 140 << 20
+    del volume
+    with memory_limited(size + (32 << 20)):
+        loaded = Volume.load(path)
+        assert loaded.map_hash() == map_hash
+    assert loaded.stats().bytes == size
+    with memory_limited(size // 2), pytest.raises(CheckpointError, match="does not fit"):
+        Volume.load(path)
+
+
+def test_a_map_takes_no_more_than_it_may_however_it_has_grown(tmp_path: Path) -> None:
+    """What fits does not depend on when the map was saved and read, and what does not leaves it as it was."""
+    once, again = volume_of([]), volume_of([])
+    fitted: list[list[int]] = [[], []]
+    most = volume_of(VIEWS[:2]).stats().bytes
+    for number in (0, 2, 1, 3, 0, 2):
+        again = Volume.load(again.save(tmp_path / "map.tsf"))
+        for volume, numbers in zip((once, again), fitted, strict=True):
+            volume.limit_memory(most)
+            with suppress(MemoryError):
+                volume.integrate(VIEWS[number])
+                numbers.append(number)
+    assert fitted[0] == fitted[1]
+    assert 0 < len(fitted[0]) < 6
+    assert once.map_hash() == again.map_hash() == volume_of(VIEWS[i] for i in fitted[0]).map_hash()
+    assert again.stats().bytes == once.stats().bytes <= most
+
+
+def test_a_saved_map_goes_on_with_other_limits(tmp_path: Path) -> None:
+    blocks = small().stats().blocks
+    path = small(max_blocks=blocks).save(tmp_path / "map.tsf")
+    with pytest.raises(MapFull):
+        Volume.load(path).integrate(VIEWS[3])
+    Volume.load(path, max_blocks=2 * blocks).integrate(VIEWS[3])
+    lowered = Volume.load(path, max_blocks=1)
+    lowered.integrate(VIEWS[0])
+    with pytest.raises(MapFull, match=f"it has {blocks}"):
+        lowered.integrate(VIEWS[3])
+    assert Volume.load(lowered.save(path)).map_hash() == lowered.map_hash()
 
 
 def test_blocks_emptied_by_retraction_are_not_saved(tmp_path: Path) -> None:
@@ -99,17 +154,17 @@ def test_a_forged_file_is_refused_before_it_asks_for_memory(saved: Path, tmp_pat
         altered = msgspec.msgpack.encode(msgspec.structs.replace(header, **change))
         forge(path, whole[:8] + struct.pack("<I", len(altered)) + altered + whole[12 + size :])
         with pytest.raises(CheckpointError):
-            checkpoint.read(path)
+            Volume.load(path)
     for length in (0, 1 << 20, 2**32 - 1):
         forge(path, whole[:8] + struct.pack("<I", length) + whole[12:])
         with pytest.raises(CheckpointError):
-            checkpoint.read(path)
+            Volume.load(path)
         forge(path, whole[: 12 + size] + struct.pack("<I", length) + whole[16 + size :])
         with pytest.raises(CheckpointError):
-            checkpoint.read(path)
+            Volume.load(path)
     forge(path, whole[: 16 + size] + bytes(len(whole) - 16 - size))
     with pytest.raises(CheckpointError):
-        checkpoint.read(path)
+        Volume.load(path)
 
 
 def test_a_map_of_another_version_or_that_cannot_be_read_now_is_not_damaged(
@@ -184,7 +239,8 @@ def test_a_disk_that_really_fills_up_keeps_the_old_file(small_disk: Callable[[in
     assert path.read_bytes() == before
     assert [path] == list(path.parent.iterdir())
     save(120)
-    assert checkpoint.read(path)[0].keyframes == 120
+    with checkpoint.reading(path) as (header, _):
+        assert header.keyframes == 120
 
 
 def test_a_loaded_map_knows_how_full_its_voxels_are(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from block_stores import store_of
+from failures import raising
 from formula_scenes import sphere_views, tilted_plane, volume_of
 from kernel_twins import Voxel
 from numpy.typing import NDArray
@@ -19,6 +20,8 @@ from scipy.spatial import cKDTree
 from tsfusion import Mesh, Volume
 from tsfusion.core.errors import InvalidConfig
 from tsfusion.datasets.formats import stanford_bunny
+from tsfusion.kernels import surface_cells
+from tsfusion.tsdf import mesh_extraction
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
 
@@ -190,6 +193,18 @@ def as_set(blocks: NDArray[np.int32]) -> set[tuple[int, ...]]:
 def test_what_cannot_be_extracted_is_named(name: str, value: object, message: str) -> None:
     with pytest.raises(InvalidConfig, match=message):
         volume_of([]).extract_mesh(**{name: value})
+
+
+def test_a_mesh_that_there_is_no_memory_for_leaves_none_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    volume = volume_of(sphere_views(0.4, 1))
+    before = volume.stats().scratch_bytes
+    monkeypatch.setattr(mesh_extraction, "KEPT_BLOCKS", 8)
+    with monkeypatch.context() as patched:
+        patched.setattr(surface_cells, "find_cells", raising(MemoryError()))
+        with pytest.raises(MemoryError):
+            volume.extract_mesh()
+    assert volume.stats().scratch_bytes == before
+    assert len(volume.extract_mesh().faces) > 0
 
 
 def test_blocks_that_do_not_exist_give_an_empty_mesh() -> None:

@@ -3,12 +3,15 @@
 
 import os
 import signal
+import sys
+from contextlib import suppress
 from dataclasses import replace
 
 import kernel_twins
 import numpy as np
 import pytest
 from command_processes import python
+from failures import memory_limited
 from formula_scenes import CAMERA, SHAPE, plane_keyframe, sphere_views, volume_of
 from numpy.typing import NDArray
 
@@ -188,6 +191,23 @@ def test_the_limits_hold_and_leave_the_map_alone() -> None:
     assert bytes_of(small) == before
     with pytest.raises(MapFull, match="max_blocks_per_keyframe"):
         volume_of(VIEWS[:1], max_blocks_per_keyframe=3)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit memory")
+@pytest.mark.parametrize("regularizer", ["off", "ray"])
+def test_without_memory_a_keyframe_fits_or_leaves_the_map_alone(regularizer: str) -> None:
+    """Kernels that are compiled need none: they run in less than the process has already."""
+    volume, fitted = volume_of(VIEWS[:1], voxel_size=0.004, regularizer=regularizer), VIEWS[:1]
+    volume.warm_up()
+    for room, view in zip((-1 << 26, 0, 1 << 14, 1 << 18, 1 << 20, 1 << 22, 1 << 24), VIEWS[1:], strict=True):
+        with memory_limited(room):
+            volume.integrate(VIEWS[0])
+            volume.retract(VIEWS[0])
+            with suppress(MemoryError):
+                volume.integrate(view)
+                fitted = [*fitted, view]
+    assert 1 < len(fitted) < 8
+    assert volume.map_hash() == volume_of(fitted, voxel_size=0.004).map_hash()
 
 
 def test_full_voxels_refuse_more_and_lose_nothing() -> None:

@@ -111,6 +111,7 @@ def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bo
         if volume.keyframes + sum(volume.meta.get("rejected", {}).values()) == len(recording):
             return volume
         config = volume.config  # the server died before it saved the rest
+        del volume  # two maps may not fit
     return _fuse(recording, Volume(config), quiet)
 
 

@@ -194,6 +194,8 @@ VIEW_SETTINGS = (
     "field_edge",
     "field_reweightings",
 )
+# Settings of a map that limit how it grows: a saved one goes on with others.
+LIMIT_SETTINGS = ("max_blocks", "max_blocks_per_keyframe")
 
 
 class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):

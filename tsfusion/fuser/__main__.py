@@ -89,7 +89,9 @@ def _open_map(link: sockets.AnySocket, message: fuser_messages.Begin) -> Fuser |
             make=False,  # one that is away must not be made in its place
         )  # fmt: skip
         fuser = Fuser(link, message)
-    except TsfusionError as error:
+    except (TsfusionError, MemoryError) as error:
+        if isinstance(error, MemoryError):
+            error = MapError(f"no memory to open the map: {error}; raise fuser_memory_bytes")
         link.send(fuser_messages.encode(fuser_messages.Failed.of(error)))
         return None
     link.send(fuser_messages.encode(fuser.ready()))

@@ -14,7 +14,8 @@ import platform
 import struct
 import time
 from collections import deque
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -36,12 +37,12 @@ from tsfusion.wire import codec, sockets
 from tsfusion.wire.health import MeshLayout
 from tsfusion.wire.record_header import Refused
 
-_TAICHI_RESERVES = 2 << 30  # bytes that Taichi asks for and hardly uses
-_KEPT_FREE = 256 << 20  # bytes that keyframes leave to meshes and checkpoints
+_WORKING_MEMORY = 768 << 20  # bytes for keyframes and meshes, beyond those of the map
+_FOR_KEYFRAMES = 256 << 20  # bytes of it that meshes leave free
+_FOR_A_CHECKPOINT = 64 << 20  # bytes beyond both
 LOCK = "fuser.lock"  # in the map's folder
 _PATIENCE_S = 10.0  # for a record that the system refuses to read, or whose segment is not there
 RETRY_MS = 500  # until it is tried again
-_FOR_A_CHECKPOINT = 64 << 20  # bytes beyond the limit: meshes may have taken what was kept free
 _REFINED_AT_ONCE = 256  # blocks: about 50 ms
 _REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
 
@@ -52,6 +53,8 @@ class Fuser:
     """One map, and the work for each message of the gateway."""
 
     def __init__(self, link: sockets.AnySocket, begin: fuser_messages.Begin) -> None:
+        from tsfusion.kernels import runtime
+
         self._link = link
         self._begin = begin
         self._folder = Path(begin.folder)
@@ -64,15 +67,18 @@ class Fuser:
         self._unrefined = np.zeros((0, 3), np.int32)  # cells that viewers have with the raw surface
         self._hashes: tuple[int, str, str] | None = None  # keyframes answered, map hash, colour hash
         self._current = CurrentKeyframe(begin.working)
-        self._memory_limit = process.data_bytes() + _TAICHI_RESERVES + begin.memory_bytes
+        runtime.start(begin.volume.threads)  # it reserves a GB, and more for each thread, and hardly uses it
+        self._memory_limit = process.data_bytes() + _WORKING_MEMORY + begin.memory_bytes
         process.limit_memory(self._memory_limit)
         self.exit_status: int | None = None  # of the process, which has to end; None = it goes on
         self._home, self._journal_home = os.stat(self._folder), None
         with suppress(OSError):
             self._journal_home = os.stat(self._folder / state_folder.JOURNAL_FOLDER)
+        # A map of any size opens, as long as there is memory; from then on it may not outgrow its own.
         self._map = MapCheckpoints(self._folder, begin.volume, keep_previous=begin.keep_previous)
         self._volume = self._map.volume
         self._volume.warm_up()
+        self._volume.limit_memory(begin.memory_bytes)
 
     def ready(self) -> fuser_messages.Ready:
         """The message that the map is open, and how far it is."""
@@ -119,7 +125,8 @@ class Fuser:
         Without enough memory, viewers miss a part; a mesh on request is whole, once there is enough.
         """
         try:
-            self._mesh()
+            with self._memory_beyond(-_FOR_KEYFRAMES):
+                self._mesh()
         except MemoryError as error:
             log.error("no memory to mesh the changed part of the map: %s", error)
             self._meshed = self._answered
@@ -155,7 +162,7 @@ class Fuser:
         Call it only while there is nothing else to do: a keyframe that comes meanwhile waits.
         """
         cells, self._unrefined = self._unrefined[:_REFINED_AT_ONCE], self._unrefined[_REFINED_AT_ONCE:]
-        with suppress(MemoryError):  # the raw surface stays
+        with suppress(MemoryError), self._memory_beyond(-_FOR_KEYFRAMES):  # the raw surface stays
             self._publish(time.monotonic_ns(), 0, cells, self._volume.extract_mesh(blocks=cells))
 
     def _publish(self, meshed_ns: int, blocks: int, cells: NDArray[np.int32], mesh: Mesh) -> None:
@@ -180,7 +187,6 @@ class Fuser:
         reason, message = order.skip, ""
         if reason is None:
             self._current.set(order.index)
-            process.limit_memory(self._memory_limit - min(_KEPT_FREE, self._begin.memory_bytes // 2))
             try:
                 record = journal.read(self._folder / state_folder.JOURNAL_FOLDER, order.position)
                 found = codec.decode(record.frames)
@@ -193,8 +199,7 @@ class Fuser:
                     return False
                 reason, message = _reason(error), str(error)
             except MemoryError as error:
-                reason, message = "memory", f"no memory to fuse it: {error}"
-            process.limit_memory(self._memory_limit)
+                reason, message = "memory", f"no memory to fuse it: {error}; raise fuser_memory_bytes"
             self._current.set(fuser_messages.NOT_WORKING)  # not reached if the keyframe ended the process
         if reason is not None and not order.is_correction:
             self._map.rejected[reason] = self._map.rejected.get(reason, 0) + 1
@@ -226,19 +231,26 @@ class Fuser:
             log.error("%s: another process tries again, from the checkpoint", error)
             self.exit_status = 1  # marked as at work on it
             return True
-        process.limit_memory(self._memory_limit)
         self._current.set(fuser_messages.NOT_WORKING)
         self._send(fuser_messages.Held(str(error)))
         return True
+
+    @contextmanager
+    def _memory_beyond(self, nbytes: int) -> Iterator[None]:
+        """The memory limit moved by so many bytes for the block."""
+        process.limit_memory(self._memory_limit + nbytes)
+        try:
+            yield
+        finally:
+            process.limit_memory(self._memory_limit)
 
     def _checkpoint(self) -> bool:
         written, problem = False, ""
         if self._since_checkpoint and not self._is_home:
             problem = f"the folder {self._folder} is not there, or is another one"
         elif self._since_checkpoint:
-            process.limit_memory(self._memory_limit + _FOR_A_CHECKPOINT)
-            written = self._map.save()
-            process.limit_memory(self._memory_limit)
+            with self._memory_beyond(_FOR_A_CHECKPOINT):
+                written = self._map.save()
             self._since_checkpoint = 0 if written else 1
             problem = self._map.problem
         self._send(fuser_messages.Saved(written, problem))
@@ -255,12 +267,16 @@ class Fuser:
     def _answer(self, query: fuser_messages.FuserQuery) -> None:
         try:
             if query.command.name == "mesh":
-                mesh = self._volume.extract_mesh(query.command.min_weight)
+                with self._memory_beyond(-_FOR_KEYFRAMES):
+                    mesh = self._volume.extract_mesh(query.command.min_weight)
                 layout, frames = _mesh_frames(mesh)
                 self._send(fuser_messages.FuserReply(query.number, layout=layout), frames)
             else:
                 self._send(fuser_messages.FuserReply(query.number, status=self._status()))
-        except (TsfusionError, ArithmeticError, ValueError, MemoryError) as error:
+        except MemoryError as error:
+            why = f"not enough memory for that: {error}; raise fuser_memory_bytes"
+            self._send(fuser_messages.FuserReply(query.number, error=why))
+        except (TsfusionError, ArithmeticError, ValueError) as error:
             # The process goes on whatever was asked: a crash would be blamed on the next keyframe.
             self._send(fuser_messages.FuserReply(query.number, error=str(error) or type(error).__name__))
 

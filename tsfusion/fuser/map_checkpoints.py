@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from tsfusion.core import durable_files
-from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig
+from tsfusion.core.config import LIMIT_SETTINGS, VIEW_SETTINGS, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
 from tsfusion.fuser.messages import SessionProgress
 from tsfusion.journal import state_folder
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 # Settings that may differ between a checkpoint and the server that goes on with it: none changes the sums.
-_FREE_SETTINGS = ("threads", "max_blocks", "max_blocks_per_keyframe", *VIEW_SETTINGS)
+_FREE_SETTINGS = ("threads", *LIMIT_SETTINGS, *VIEW_SETTINGS)
 _NEW_FILE = "map.new.tsf"
 _PARTS = r"map\.new\.tsf|\.map\.new\.tsf\.partial"
 
@@ -91,7 +91,8 @@ def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
     from tsfusion.tsdf.volume import Volume
 
     try:
-        volume = Volume.load(path, wanted.threads, **{name: getattr(wanted, name) for name in VIEW_SETTINGS})
+        changed = {name: getattr(wanted, name) for name in (*VIEW_SETTINGS, *LIMIT_SETTINGS)}
+        volume = Volume.load(path, wanted.threads, **changed)
     except DamagedCheckpoint as error:
         _set_aside(path, error)
         return None
@@ -99,8 +100,6 @@ def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
         if error.missing:
             return None
         raise
-    except MemoryError as error:
-        raise CheckpointError(f"the map {path} does not fit into this machine's memory") from error
     if "done" not in volume.meta:
         raise CheckpointError(f"{path} was not saved by a server: it does not say which keyframes it holds")
     for name in VolumeConfig.__struct_fields__:

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from tsfusion.kernels import block_hash
 from tsfusion.kernels.integrate import CUBE, WEIGHT_MASK
 from tsfusion.tsdf.checkpoint import LAYER_DTYPES
-from tsfusion.tsdf.growing_array import GrowingArray
+from tsfusion.tsdf.growing_array import MAX_ITEMS, GrowingArray
 
 _FIRST_CAPACITY = 1024
 _CHUNK = 1024  # blocks read at a time where a whole layer would be copied
+_HASH_BYTES = 4 * 12  # most that a block takes in the hash, which is a quarter full or fuller
 # What the keys of a block and of its neighbours towards −x, −y, −z are smaller by
 _CELL_STEPS = np.array([x << 42 | y << 21 | z for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 
@@ -32,6 +33,7 @@ class BlockStore:
         self.voxel_size = voxel_size
         self.color, self.corrected = color, corrected
         self.count = 0
+        self._most_blocks = MAX_ITEMS
         self.hash_keys = np.zeros(4 * _FIRST_CAPACITY, np.int64)
         self.hash_slots = np.zeros(4 * _FIRST_CAPACITY, np.int32)
         self._keys = GrowingArray((), np.int64, _FIRST_CAPACITY)
@@ -86,22 +88,38 @@ class BlockStore:
         """The layers the map has, by name."""
         return {name: self._layers[name].array for name in self._present}
 
-    def insert(self, keys: NDArray[np.int64]) -> None:
-        """Append blocks with distinct new keys; their voxels are zero.
+    def limit(self, nbytes: int) -> None:
+        """Let the map take no more than so many bytes from now on; one that is larger stays as it is.
+
+        The number of blocks that this allows depends on the layers alone, never on how the map has grown.
+        """
+        self._most_blocks = nbytes // (self.bytes_per_block + _HASH_BYTES)
+
+    def reserve(self, count: int) -> None:
+        """Make room for `count` blocks in all.
 
         Raises:
             MemoryError: when there is not enough; the map is as it was.
         """
-        first, count = self.count, self.count + len(keys)
+        if count > max(self._most_blocks, self.count):
+            raise MemoryError(
+                f"the map may have {self._most_blocks} blocks in the memory that is set; "
+                f"it has {self.count}, and {count - self.count} more are needed"
+            )
         for array in self._arrays():
             array.reserve(count)
-        grown = 2 * count > len(self.hash_keys)
-        if grown:
-            size = 1 << (4 * count - 1).bit_length()
+        if 2 * count > len(self.hash_keys):
+            size = 1 << (2 * count - 1).bit_length()  # of the count alone, not of how it was reached
             self.hash_keys, self.hash_slots = np.zeros(size, np.int64), np.zeros(size, np.int32)
+            self._hash(0)
+
+    def insert(self, keys: NDArray[np.int64]) -> None:
+        """Append blocks with distinct new keys; their voxels are zero. Raises as `reserve`."""
+        first, count = self.count, self.count + len(keys)
+        self.reserve(count)
         self._keys.array[first:count] = keys
         self.count = count
-        self._hash(0 if grown else first)
+        self._hash(first)
 
     def drop(self, count: int) -> None:
         """Take back the newest blocks, so that `count` remain; their voxels must be zero."""
@@ -131,16 +149,22 @@ class BlockStore:
 
     def used(self) -> NDArray[np.int64]:
         """Slots with any vote left, in the order of their keys."""
+        has_votes = np.empty(self.count, bool)
+        for i in range(0, self.count, _CHUNK):
+            chunk = slice(i, min(i + _CHUNK, self.count))
+            self.sums[chunk].any(axis=1, out=has_votes[chunk])
         order = np.argsort(self.keys)
-        chunks = [order[i : i + _CHUNK] for i in range(0, len(order), _CHUNK)]
-        return np.concatenate([order[:0], *(chunk[self.sums[chunk].any(axis=1)] for chunk in chunks)])
+        return order[has_votes[order]]
 
     def in_order(self, layer: str) -> Iterator[tuple[NDArray[np.int64], NDArray[Any]]]:
         """Keys and rows of the used blocks in key order, up to 1024 at a time."""
-        used = self.used()
+        used, rows = self.used(), self._layers[layer].array
         for i in range(0, len(used), _CHUNK):
             chunk = used[i : i + _CHUNK]
-            yield self.keys[chunk], self._layers[layer].array[chunk]
+            if (np.diff(chunk) == 1).all():  # as in a map that was just loaded: nothing has to be gathered
+                yield self.keys[chunk], rows[chunk[0] : chunk[-1] + 1]
+            else:
+                yield self.keys[chunk], rows[chunk]
 
     def _hash(self, first: int) -> None:
         """Put the blocks from `first` on into the hash."""

@@ -10,9 +10,11 @@ blocks in key order; the digest is blake2b-128 of everything before it.
 import hashlib
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import msgspec
 import numpy as np
@@ -26,6 +28,8 @@ from tsfusion.core.errors import CheckpointError, DamagedCheckpoint
 MAGIC = b"TSFMAP1\n"
 CHUNK = 1024  # blocks
 CUBE = 512  # voxels a block
+_ROWS = 128  # that are gathered at a time
+_MAX_WINDOW_BYTES = 1 << 24  # of zstd; level 1 uses less
 LAYER_DTYPES = {"sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "correction": np.float32}
 
 
@@ -38,6 +42,18 @@ class CheckpointHeader(msgspec.Struct, kw_only=True):
     layers: list[str]
     meta: dict[str, Any]
     blocks: int = 0
+
+
+class Chunk(NamedTuple):
+    """Up to 1024 blocks of a checkpoint that is being read.
+
+    `fill` reads the next bytes into an array: first the keys (blocks,) int64, then for each layer of the
+    header, in its order, rows (blocks, 512) of the layer's dtype.
+    """
+
+    first: int
+    blocks: int
+    fill: Callable[[NDArray[Any]], None]
 
 
 def write(
@@ -61,7 +77,7 @@ def write(
         with durable_files.replacing(path) as file:
             file.write(MAGIC)
             for payload in _payloads(header, keys, slots, layers):
-                for part in (struct.pack("<I", len(payload)), payload):
+                for part in (struct.pack("<I", sum(map(len, payload))), *payload):
                     digest.update(part)
                     file.write(part)
             file.write(digest.digest())
@@ -70,8 +86,11 @@ def write(
     return path
 
 
-def read(path: Path) -> tuple[CheckpointHeader, NDArray[np.int64], dict[str, NDArray[Any]]]:
-    """Header, keys and layers of a checkpoint.
+@contextmanager
+def reading(path: Path) -> Iterator[tuple[CheckpointHeader, Iterator[Chunk]]]:
+    """Header and chunks of a checkpoint, for the block to put straight into their place.
+
+    No more than a chunk is held beside that place. A MemoryError of the block is one of the checkpoint.
 
     Raises:
         DamagedCheckpoint: when a byte differs from what was written.
@@ -82,20 +101,12 @@ def read(path: Path) -> tuple[CheckpointHeader, NDArray[np.int64], dict[str, NDA
             _check_magic(file, path)
             _check_digest(file, path)
             header = _read_header(file, path)
-            keys = np.empty(header.blocks, np.int64)
-            layers = {name: np.empty((header.blocks, CUBE), LAYER_DTYPES[name]) for name in header.layers}
-            for first, chunk in _read_chunks(file, path, header):
-                count, at = min(CHUNK, header.blocks - first), 0
-                for target in (keys, *layers.values()):
-                    part = target[first : first + count]
-                    part[...] = np.frombuffer(chunk, part.dtype, part.size, at).reshape(part.shape)
-                    at += part.nbytes
+            yield header, _read_chunks(file, path, header)
     except OSError as error:
         missing = isinstance(error, FileNotFoundError)
         raise CheckpointError(f"cannot read the map {path}: {error.strerror}", missing=missing) from error
     except MemoryError as error:
         raise CheckpointError(f"the map {path} does not fit into this machine's memory") from error
-    return header, keys, layers
 
 
 def verify(path: Path, header: CheckpointHeader, map_hash: str) -> None:
@@ -109,13 +120,15 @@ def _payloads(
     keys: NDArray[np.int64],
     slots: NDArray[np.int64],
     layers: dict[str, NDArray[Any]],
-) -> Iterator[bytes]:
-    compressor = zstandard.ZstdCompressor(level=1)
-    yield msgspec.msgpack.encode(header)
+) -> Iterator[list[bytes]]:
+    """The header, then each chunk, in parts: the map may have left little memory."""
+    yield [msgspec.msgpack.encode(header)]
     for i in range(0, len(keys), CHUNK):
         chunk = slots[i : i + CHUNK]
-        raw = keys[i : i + CHUNK].tobytes() + b"".join(layer[chunk].tobytes() for layer in layers.values())
-        yield compressor.compress(raw)
+        compressor = zstandard.ZstdCompressor(level=1).compressobj(size=len(chunk) * _block_bytes(layers))
+        rows = (layer[chunk[j : j + _ROWS]] for layer in layers.values() for j in range(0, len(chunk), _ROWS))
+        parts = [compressor.compress(part.data) for part in (keys[i : i + CHUNK], *rows)]
+        yield [*parts, compressor.flush()]
 
 
 def _check_magic(file: BinaryIO, path: Path) -> None:
@@ -145,18 +158,35 @@ def _read_header(file: BinaryIO, path: Path) -> CheckpointHeader:
     return header
 
 
-def _read_chunks(file: BinaryIO, path: Path, header: CheckpointHeader) -> Iterator[tuple[int, bytes]]:
-    per_block = 8 + sum(CUBE * np.dtype(LAYER_DTYPES[name]).itemsize for name in header.layers)
+def _block_bytes(layers: Iterable[str]) -> int:
+    """Bytes of a block: its key and its row in each layer."""
+    return 8 + sum(CUBE * np.dtype(LAYER_DTYPES[name]).itemsize for name in layers)
+
+
+def _read_chunks(file: BinaryIO, path: Path, header: CheckpointHeader) -> Iterator[Chunk]:
+    decompressor = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW_BYTES)
     for first in range(0, header.blocks, CHUNK):
-        size = min(CHUNK, header.blocks - first) * per_block
+        count = min(CHUNK, header.blocks - first)
+        size = count * _block_bytes(header.layers)
         (length,) = struct.unpack("<I", _read_exactly(file, 4, path))
         frame = _read_exactly(file, length, path)
         try:
             if zstandard.get_frame_parameters(frame).content_size != size:
                 raise DamagedCheckpoint(f"{path} is damaged: a chunk is not of the {size} bytes expected")
-            yield first, zstandard.ZstdDecompressor().decompress(frame)
+            with decompressor.stream_reader(frame) as stream:
+                yield Chunk(first, count, partial(_fill, stream, path))
         except zstandard.ZstdError as error:
             raise DamagedCheckpoint(f"{path} is damaged: {error}") from error
+
+
+def _fill(stream: zstandard.ZstdDecompressionReader, path: Path, rows: NDArray[Any]) -> None:
+    """Read the next bytes of a chunk into `rows`, which are contiguous."""
+    try:
+        read = stream.readinto(rows.data)
+    except zstandard.ZstdError as error:
+        raise DamagedCheckpoint(f"{path} is damaged: {error}") from error
+    if read != rows.nbytes:
+        raise DamagedCheckpoint(f"{path} is damaged: a chunk ends {rows.nbytes - read} bytes early")
 
 
 def _check_digest(file: BinaryIO, path: Path) -> None:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+_MOVES_PAGES = sys.platform == "linux"
+_STEP = 4096  # items more than are needed, at most: what is reserved counts against a memory limit
 MAX_ITEMS = (1 << 22) - 1  # × 512 voxels stays below the 2³¹ elements that a Taichi kernel can index
 
 
@@ -44,13 +46,14 @@ class GrowingArray:
         """
         if capacity <= self.capacity:
             return
+        ahead = min(2 * self.capacity, self.capacity + _STEP if _MOVES_PAGES else MAX_ITEMS, MAX_ITEMS)
         try:
-            self._grow(max(capacity, min(2 * self.capacity, MAX_ITEMS)))
+            self._grow(max(capacity, ahead))
         except MemoryError:
             self._grow(capacity)  # near the limit, no more than is needed
 
     def _grow(self, capacity: int) -> None:
-        if sys.platform != "linux":
+        if not _MOVES_PAGES:
             grown = np.zeros((capacity, *self._item), self._dtype)
             grown[: self.capacity] = self.array
             self.array = grown

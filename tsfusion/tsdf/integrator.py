@@ -72,7 +72,7 @@ class Integrator:
             self._store.drop(self._admitted)
         for part in added:
             self._launch(part, -sign)
-        self._buffers.take_missing()
+        self._buffers.forget_missing()
         if self._store.count > before:
             self._store.drop(before)
 

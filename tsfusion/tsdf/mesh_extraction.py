@@ -89,6 +89,15 @@ def extract(
 ) -> Mesh:
     """Mesh of the cells of the map's blocks `wanted` (sorted distinct keys)."""
     buffers = buffers or MeshBuffers()
+    try:
+        return _extract(wanted, store, min_weight, buffers, view)
+    finally:
+        buffers.release()  # also of a mesh that there was no memory for
+
+
+def _extract(
+    wanted: NDArray[np.int64], store: BlockStore, min_weight: float, buffers: MeshBuffers, view: SurfaceView
+) -> Mesh:
     keys = buffers.keys_around(wanted, store)
     count = len(keys)
     buffers.reserve(count)
@@ -115,5 +124,4 @@ def extract(
         count, around, inside, active, edges, starts, first,
         marching_tables.TRIANGLE_COUNT, marching_tables.TRIANGLE_STARTS, faces,
     )  # fmt: skip
-    buffers.release()
     return Mesh(positions, faces, normals, colors if store.color else None)

@@ -92,8 +92,12 @@ class RayBuffers:
     def take_missing(self) -> NDArray[np.int64]:
         """Keys of the missing blocks, in an order that only the set of them decides. Empties `missing`."""
         keys: NDArray[np.int64] = self.missing[self.missing != 0]
-        self.missing[:] = 0
+        self.forget_missing()
         return keys
+
+    def forget_missing(self) -> None:
+        """Empty `missing`; takes no memory."""
+        self.missing[:] = 0
 
     def grow_missing(self) -> None:
         """Double the size of `missing` after an overflow, and empty it."""

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import other_names, process
-from tsfusion.core.config import VIEW_SETTINGS, Surface, VolumeConfig, make_settings, override
-from tsfusion.core.errors import InvalidConfig, MapError
+from tsfusion.core.config import LIMIT_SETTINGS, VIEW_SETTINGS, Surface, VolumeConfig, make_settings, override
+from tsfusion.core.errors import CheckpointError, InvalidConfig, MapError
 from tsfusion.geometry.keyframe import Keyframe, keyframe_of
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.sample_ranges import why_no_samples
@@ -256,34 +256,43 @@ class Volume:
         return checkpoint.write(Path(path), header, self._store.keys[used], used, layers)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], threads: int | None = None, **view: Any) -> "Volume":
+    def load(cls, path: str | os.PathLike[str], threads: int | None = None, **changed: Any) -> "Volume":
         """Read a checkpoint back, verified against its own hash.
 
         Args:
-            view: settings of how the surface is read (`config.VIEW_SETTINGS`) instead of the saved ones;
-                None = as saved.
+            changed: settings instead of the saved ones, of how the surface is read (`config.VIEW_SETTINGS`)
+                or of how the map may grow (`config.LIMIT_SETTINGS`); None = as saved.
 
         Raises:
             InvalidConfig: for a setting that the stored sums depend on.
             CheckpointError: when the file is missing, torn, altered or of another version.
         """
-        header, keys, stored = checkpoint.read(Path(path))
-        saved = header.config
-        fixed = {name for name in view if name not in VIEW_SETTINGS}
-        if saved.model().regularizer != "off" and view.get("smoothness") not in (None, saved.smoothness):
-            fixed.add("smoothness")  # it has smoothed along rays already
-        if fixed:
-            raise InvalidConfig(f"a saved map cannot change {', '.join(sorted(fixed))}; fuse it anew")
-        volume = cls(override(msgspec.structs.replace(saved, threads=threads), **view))
-        volume._store.insert(keys)
-        for name, array in volume._store.layers().items():
-            array[: len(keys)] = stored[name]
-        volume._store.measure_bounds()
-        volume.keyframes = header.keyframes
-        volume.held = HeldSensor(header.meta.pop(_HELD, None))
-        volume.meta = header.meta
-        checkpoint.verify(Path(path), header, volume.map_hash())
+        with checkpoint.reading(Path(path)) as (header, chunks):
+            volume = cls(_loaded_config(header, threads, changed))
+            store = volume._store
+            store.reserve(header.blocks)
+            layers = store.layers()
+            if set(header.layers) != set(layers):
+                raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
+            for chunk in chunks:
+                keys = np.empty(chunk.blocks, np.int64)
+                chunk.fill(keys)
+                store.insert(keys)
+                for name in header.layers:
+                    chunk.fill(layers[name][chunk.first : store.count])
+            store.measure_bounds()
+            volume.keyframes = header.keyframes
+            volume.held = HeldSensor(header.meta.pop(_HELD, None))
+            volume.meta = header.meta
+            checkpoint.verify(Path(path), header, volume.map_hash())
         return volume
+
+    def limit_memory(self, nbytes: int) -> None:
+        """Let a keyframe fail with MemoryError from now on if the map, with it, would take more bytes.
+
+        The map stays as it is, also where it takes more already. Working memory is not counted.
+        """
+        self._store.limit(nbytes)
 
     def _apply(self, keyframe: Keyframe, sign: int) -> IntegrateStats:
         if sign < 0 and self.keyframes == 0:
@@ -326,6 +335,20 @@ class Volume:
         if surface == "normal":
             return partial(field_regularizer.along_normals, smoothness=self.model.smoothness)
         return values_of
+
+
+def _loaded_config(
+    header: checkpoint.CheckpointHeader, threads: int | None, changed: dict[str, Any]
+) -> VolumeConfig:
+    """The settings of a saved map, with those that may be others."""
+    saved = header.config
+    fixed = {name for name in changed if name not in (*VIEW_SETTINGS, *LIMIT_SETTINGS)}
+    if saved.model().regularizer != "off" and changed.get("smoothness") not in (None, saved.smoothness):
+        fixed.add("smoothness")  # it has smoothed along rays already
+    if fixed:
+        raise InvalidConfig(f"a saved map cannot change {', '.join(sorted(fixed))}; fuse it anew")
+    config = override(msgspec.structs.replace(saved, threads=threads), **changed)
+    return override(config, max_blocks=max(config.max_blocks, header.blocks))
 
 
 def _keyframe(keyframe: Any, others: tuple[object, ...], fields: dict[str, Any]) -> Keyframe:

@@ -19,6 +19,7 @@ from tsfusion.wire.record_header import Refused
 _ZSTD_LEVEL = 1
 _MAX_WINDOW_BYTES = 1 << 24
 _SAMPLE = 512
+_CV_NO_MEMORY = -4  # cv::Error::StsNoMem
 _MM_LIMIT = 2**31 - 1
 
 
@@ -75,6 +76,8 @@ def unpack_image(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> ND
     try:
         image = cv2.imdecode(np.frombuffer(frame, np.uint8), flags)
     except cv2.error as error:
+        if error.code == _CV_NO_MEMORY:
+            raise MemoryError(f"an image {shape} {dtype}") from error
         raise Refused("payload", f"not a readable image: {error}") from error
     if image is None or image.shape != shape or image.dtype != dtype:
         got = "nothing" if image is None else f"{image.shape} {image.dtype}"
