@@ -28,8 +28,9 @@ from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.memory_guard import MemoryGuard
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Ports, Subscriptions, receive_some
+from tsfusion.gateway.problems import Problem, ProblemTimes
 from tsfusion.wire import messages, sockets
-from tsfusion.wire.health import Health
+from tsfusion.wire.health import Health, MapHealth
 from tsfusion.wire.sockets import mesh_topic
 
 log = logging.getLogger(__name__)
@@ -37,6 +38,7 @@ log = logging.getLogger(__name__)
 _TICK_MS = 100  # within which a signal or a fuser's death is noticed
 _RENEW_TICK_MS = 10  # while the sockets are made anew
 _SNAPSHOT_INTERVAL = 1.0  # seconds
+_CLIENT_PROBLEMS = 10  # lines about single clients
 _MESHES_SHARE = 4  # one fourth of the memory is for meshes that wait to be read
 Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
@@ -66,6 +68,7 @@ class Gateway:
         self._publishing: dict[str, bool] = {}  # map → whether its fuser was told to send triangles
         self._memory = MemoryGuard(server.memory_bytes)
         self._activity = ActivityLog()
+        self._problems = ProblemTimes()
         self._accepting = self._stopped = False
         self._started = time.monotonic()
         self._next_snapshot = 0.0
@@ -144,6 +147,7 @@ class Gateway:
             return
         self._next_snapshot = now + _SNAPSHOT_INTERVAL
         logs.log_left_out()
+        self._problems.note(self._find_problems())
         self._metrics.health = health = self.health()
         self._activity.note(health)
 
@@ -268,20 +272,33 @@ class Gateway:
     def health(self) -> Health:
         """How the server is doing."""
         now = time.monotonic()
-        found, problems = self.maps.health()
-        if self._access.problem:
-            problems.insert(0, f"nobody may connect: {self._access.problem}")
-        if self.ports.problem:
-            problems.insert(0, self.ports.problem)
-        blocked = self.ports.problem or self._access.problem or any(one.problem for one in found.values())
+        maps = self.maps.health()
+        blocked = self.ports.problem or self._access.problem or _all_blocked(maps)
         return Health(
             ready=self._accepting and not blocked,
-            problems=tuple(problems),
+            problems=self._problems.lines(self._find_problems()),
             epoch=self.epoch,
             uptime_s=now - self._started,
             rss_bytes=process.rss_bytes(),
             refused=dict(self._refused + self._access.refused),
             duplicates=self._intake.duplicates,
-            maps=found,
+            maps=maps,
             clients=tuple(route.health(now, self.maps.session(*route.place)) for route in self._routes),
         )
+
+    def _find_problems(self) -> list[Problem]:
+        """What a person has to know of now: of the whole server first, then of its maps, then of clients."""
+        found = [Problem(self.ports.problem, is_logged=True)] if self.ports.problem else []
+        if self._access.problem:
+            found.append(Problem(f"nobody may connect: {self._access.problem}", is_logged=True))
+        found += self.maps.problems()
+        of_clients = [one for route in self._routes if (one := route.problem) is not None]
+        if len(of_clients) > _CLIENT_PROBLEMS:
+            rest = len(of_clients) - _CLIENT_PROBLEMS
+            of_clients[_CLIENT_PROBLEMS:] = [Problem(f"{rest} more clients have problems of this kind")]
+        return found + of_clients
+
+
+def _all_blocked(maps: dict[str, MapHealth]) -> bool:
+    """Whether no map takes and fuses keyframes: one that does is a reason to go on sending to this server."""
+    return bool(maps) and all(one.problem for one in maps.values())

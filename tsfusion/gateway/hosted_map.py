@@ -30,6 +30,7 @@ from tsfusion.wire.record_header import CorrectionHeader, RecordHeader
 log = logging.getLogger(__name__)
 
 _SEGMENTS_KEPT = 4  # a journal with a limit is deleted in quarters of that limit
+_STALLED_AFTER = 10.0  # seconds in which keyframes wait and none is fused
 _DISK_PAUSE = 1.0  # seconds without keyframes after the disk refused one
 ForPeople = tuple[fuser_messages.Meshed | fuser_messages.FuserReply, Sequence[zmq.Frame]]
 
@@ -53,6 +54,7 @@ class HostedMap:
         self.warm = False  # the fuser has been ready once: from then on it is known what the map has
         self._metrics = metrics
         self._last_keyframe: float | None = None  # time.monotonic()
+        self._moved = 0.0  # time.monotonic(): the fuser answered, or had nothing to answer
         self._loss = ""
         self._checkpoints = 0  # written since the map was opened
         self._journal = _open_journal(self.folder, server)
@@ -125,6 +127,8 @@ class HostedMap:
             durable_ns=durable_ns,
             is_correction=is_correction,
         )
+        if self.drained:
+            self._moved = time.monotonic()
         self._backlog.add(session, is_correction=is_correction)
         if is_correction:
             self._corrections += 1
@@ -150,6 +154,7 @@ class HostedMap:
         while (received := self.fuser.receive()) is not None:
             message, frames = received
             if isinstance(message, fuser_messages.Done):
+                self._moved = time.monotonic()
                 self._backlog.on_done(message.index)
                 self.outcomes.on_done(message)
             elif isinstance(message, fuser_messages.Ready):
@@ -181,6 +186,7 @@ class HostedMap:
         self._retention.on_ready()
         if not self.warm:
             self.warm = True
+            self._moved = time.monotonic()
             log.info("%s", self._contents(ready), extra=logs.about(map=self.name))
         self._check_checkpoint(ready)
 
@@ -214,10 +220,22 @@ class HostedMap:
         return "idle" if self.drained else "busy"
 
     @property
+    def problem(self) -> str:
+        """Why keyframes are not accepted or not fused, and what to do; empty = they are."""
+        if problem := self.disk.problem or self.fuser.problem:
+            return problem
+        stalled = self.warm and not self._backlog.is_empty and time.monotonic() - self._moved > _STALLED_AFTER
+        if stalled and self.fuser.ready:
+            return "keyframes wait and none is fused: its fuser makes a mesh or a checkpoint, or it hangs"
+        return "keyframes wait, and its fuser is still starting again: read the log" if stalled else ""
+
+    @property
     def notices(self) -> list[str]:
-        """Losses that a person should know of, though keyframes are taken and fused."""
+        """What a person should know of, though keyframes are taken and will be fused."""
         damaged = self._journal.damaged
         notices = [f"{damaged} keyframes of its journal are damaged and lost"] if damaged else []
+        if self.state == "restarting" and not self.problem:
+            notices.append("its fuser ended, and another one takes over: the log says why")
         return [*notices, self._loss] if self._loss else notices
 
     def health(self) -> MapHealth:
@@ -225,7 +243,7 @@ class HostedMap:
         now, outcomes = time.monotonic(), self.outcomes
         return MapHealth(
             state=self.state,
-            problem=self.disk.problem or self.fuser.failed,
+            problem=self.problem,
             keyframes_durable=outcomes.fused + outcomes.rejected.total() + self._backlog.keyframes,
             keyframes_fused=outcomes.fused,
             waiting=self._backlog.keyframes,

@@ -100,7 +100,9 @@ class KeyframeIntake:
         seconds = min(max(seconds, _SHORTEST_HOLD), _LONGEST_HOLD)
         route = self._routes.get(key)
         if route is not None:
-            route.hold_reason, route.held_until = reason, time.monotonic() + seconds
+            route.hold_reason, route.hold_message = reason, message
+            route.held_until = time.monotonic() + seconds
+            route.fates.held()
         self._routes.send(key, messages.Hold(key, seconds, reason, message))
 
     def _on_checked(
@@ -119,6 +121,8 @@ class KeyframeIntake:
             self._quotas.check(header, buffers)
             self._routes.mark_alive(header.session, client, scans=True)
             hosted.accept(header, buffers, client, received_ns)
+            if (route := self._routes.get(header.session)) is not None:
+                route.fates.taken()
         except Refused as error:
             self._refuse(error, client, header)
         except JournalError:
@@ -138,4 +142,5 @@ class KeyframeIntake:
         log.warning("a %s is refused: %s", header.kind, error, extra=subject)
         if (route := self._routes.get(key)) is not None:
             route.refused += 1
+            route.fates.turned_away(str(error))
         self._routes.send(key, messages.Nack(key, seq, "door", error.reason, str(error)))

@@ -16,6 +16,7 @@ from tsfusion.core.errors import TsfusionError
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.metrics import Metrics
+from tsfusion.gateway.problems import Problem
 from tsfusion.gateway.sessions import Session
 from tsfusion.journal import state_folder
 from tsfusion.wire.health import MapHealth
@@ -26,6 +27,7 @@ log = logging.getLogger(__name__)
 
 _MAX_UNOPENED = 64
 _RETRY_INTERVAL = 10.0  # seconds before a map that could not be opened is tried again
+_UNOPENED_KEPT = 600.0  # seconds after which nobody misses a map that could not be opened
 _KEPT_NAMES = 64  # free names that were given out
 _KEPT_SECONDS = 300.0  # until then nobody else is given them: a map takes a while to be opened
 
@@ -206,13 +208,22 @@ class MapRegistry:
         for hosted in self:
             hosted.close()
 
-    def health(self) -> tuple[dict[str, MapHealth], list[str]]:
-        """How each map is doing, by name, and the problems of all."""
-        found = {hosted.name: hosted.health() for hosted in self}
-        problems = [f"map {name}: {one.problem}" for name, one in found.items() if one.problem]
-        problems += [f"map {hosted.name}: {notice}" for hosted in self for notice in hosted.notices]
-        problems += [f"map {name} cannot be opened: {why}" for name, (why, _) in self._unopened.items()]
-        return found, problems
+    def health(self) -> dict[str, MapHealth]:
+        """How each map is doing, by name."""
+        return {hosted.name: hosted.health() for hosted in self}
+
+    def problems(self) -> list[Problem]:
+        """What is wrong with the maps: what keeps them from taking or fusing keyframes comes first."""
+        problems = [
+            Problem(problem, hosted.name, is_logged=bool(hosted.disk.problem))
+            for hosted in self
+            if (problem := hosted.problem)
+        ]
+        problems += [Problem(notice, hosted.name) for hosted in self for notice in hosted.notices]
+        before = time.monotonic() - _UNOPENED_KEPT
+        self._unopened = {name: one for name, one in self._unopened.items() if one[1] > before}
+        problems += [Problem(f"cannot be opened: {why}", name) for name, (why, _) in self._unopened.items()]
+        return problems
 
 
 def _numbered(stem: str, number: int) -> str:
