@@ -220,7 +220,6 @@ def test_time_in_which_the_server_stood_still_counts_for_nobody(
 ) -> None:
     """A suspended machine or a paused container stops gateway and fuser alike."""
     gateway = start(fusing("if message.index == 2: time.sleep(0.5)"), fuser_timeout=30.0)
-    (hosted,) = gateway.maps
     stepped(gateway, lambda: default(gateway).keyframes_fused == 2)
     real = time.monotonic
     monkeypatch.setattr(time, "monotonic", lambda: real() + 3600.0)

@@ -115,8 +115,8 @@ def test_all_held_off_for_a_while(clock: Clock) -> None:
     problem = route.problem
     assert problem is not None
     assert problem.words == (
-        "map yard: client robot1, session 00000000: every keyframe is held off: the server takes 1 keyframe a "
-        "second"
+        "map yard: client robot1, session 00000000: every keyframe is held off: the server takes 1 keyframe "
+        "a second"
     )
     route.hold_reason = "disk"
     assert route.problem is None, "its map tells that already"

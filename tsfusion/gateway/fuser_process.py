@@ -85,7 +85,7 @@ class FuserProcess:
         shutil.rmtree(self._scratch, ignore_errors=True)
 
     def kill(self) -> None:
-        """Kill the process, and wait until it has ended: some seconds, for one that waits for a disk may not."""
+        """Kill the process, and wait until it has ended: for some seconds, for one that waits for a disk."""
         self._process.kill()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(_KILL_DEADLINE)

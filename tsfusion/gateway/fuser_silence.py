@@ -12,8 +12,8 @@ _LONGEST_STEP = 1.0  # seconds that one look counts: what is beyond them, the ga
 class FuserSilence:
     """Seconds since a process answered, by what it could do in them. Call `look` again and again.
 
-    A process that is stopped (SIGSTOP, a debugger) or that waits for a disk does nothing, so that no keyframe is
-    to blame. Nor is one while the gateway stands still, too: the machine or the container was suspended.
+    A process that is stopped (SIGSTOP, a debugger) or that waits for a disk does nothing, so that no keyframe
+    is to blame. Nor is one while the gateway stands still, too: the machine or the container was suspended.
 
     Args:
         pid: of the process.

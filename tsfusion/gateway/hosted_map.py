@@ -21,7 +21,7 @@ from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.sessions import Sessions
-from tsfusion.journal import Journal, state_folder
+from tsfusion.journal import Journal, ReadingWatcher, state_folder
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import keyframe_times
 from tsfusion.wire.health import MapHealth, MapState
@@ -36,7 +36,11 @@ ForPeople = tuple[fuser_messages.Meshed | fuser_messages.FuserReply, Sequence[zm
 
 
 class HostedMap:
-    """An open map. Call `step` again and again, and `accept` for each keyframe."""
+    """An open map. Call `step` again and again, and `accept` for each keyframe.
+
+    Args:
+        watch: told how far the journal is read: that may take minutes, in which nothing else is done.
+    """
 
     def __init__(
         self,
@@ -47,6 +51,7 @@ class HostedMap:
         *,
         routes: ClientRoutes,
         metrics: Metrics,
+        watch: ReadingWatcher = lambda _done, _all, _records: None,
     ) -> None:
         self.name = name
         self.folder = state_folder.map_folder(server.state, name)
@@ -57,7 +62,7 @@ class HostedMap:
         self._moved = 0.0  # time.monotonic(): the fuser answered, or had nothing to answer
         self._loss = ""
         self._checkpoints = 0  # written since the map was opened
-        self._journal = _open_journal(self.folder, server)
+        self._journal = _open_journal(self.folder, server, watch)
         self.disk = DiskPause(self._journal, server.min_free_bytes, name)
         self._quarantine = Quarantine(self.folder / state_folder.QUARANTINE_FOLDER, server.quarantine_bytes)
         self._index = KeyframeIndex()
@@ -263,12 +268,17 @@ class HostedMap:
         )
 
 
-def _open_journal(folder: Path, server: ServerConfig) -> Journal:
+def _open_journal(folder: Path, server: ServerConfig, watch: ReadingWatcher) -> Journal:
     """The map's journal, in segments small enough to keep it to its limit."""
     segment_bytes = server.segment_bytes
     if server.journal_bytes is not None:
         segment_bytes = min(segment_bytes, server.journal_bytes // _SEGMENTS_KEPT)
-    return Journal(folder / state_folder.JOURNAL_FOLDER, segment_bytes, min_free_bytes=server.min_free_bytes)
+    return Journal(
+        folder / state_folder.JOURNAL_FOLDER,
+        segment_bytes,
+        min_free_bytes=server.min_free_bytes,
+        watch=watch,
+    )
 
 
 def _warn_of_old_corrections(folder: Path) -> None:

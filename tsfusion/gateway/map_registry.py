@@ -4,7 +4,8 @@
 import logging
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from itertools import count
 from typing import Any
 
@@ -25,6 +26,8 @@ from tsfusion.wire.record_header import RecordHeader
 
 log = logging.getLogger(__name__)
 
+# A map whose journal is read: bytes that were read, bytes of all, and records so far
+MapWatcher = Callable[[str, int, int, int], None]
 _MAX_UNOPENED = 64
 _RETRY_INTERVAL = 10.0  # seconds before a map that could not be opened is tried again
 _UNOPENED_KEPT = 600.0  # seconds after which nobody misses a map that could not be opened
@@ -43,6 +46,7 @@ class MapRegistry:
         self._routes = routes
         self._metrics = metrics
         self._volumes: Mapping[str, VolumeConfig] = {}
+        self._watch: MapWatcher = lambda *_progress: None
         self._open: dict[str, HostedMap] = {}
         self._unopened: dict[str, tuple[str, float]] = {}  # name → why, when
         self._kept: dict[str, float] = {}  # free name that was given out → when
@@ -65,13 +69,19 @@ class MapRegistry:
         hosted = self.get(name)
         return hosted.sessions.get(key) if hosted else None
 
-    def open_at_start(self, volumes: Mapping[str, VolumeConfig]) -> None:
+    def open_at_start(
+        self, volumes: Mapping[str, VolumeConfig], watch: MapWatcher = lambda *_progress: None
+    ) -> None:
         """Open maps by name with their settings; those that clients ask for get those of the default map.
+
+        Args:
+            watch: told how far the journal of a map is read, also of a map that is opened later. What it
+                raises ends the start.
 
         Raises:
             TsfusionError: when a journal cannot be opened.
         """
-        self._volumes = volumes
+        self._volumes, self._watch = volumes, watch
         for name in volumes:
             self._open_map(name)
 
@@ -144,7 +154,13 @@ class MapRegistry:
     def _open_map(self, name: str) -> HostedMap:
         volume = self._volumes.get(name) or self._volumes[DEFAULT_MAP]
         hosted = self._open[name] = HostedMap(
-            self._context, name, self._server, volume, routes=self._routes, metrics=self._metrics
+            self._context,
+            name,
+            self._server,
+            volume,
+            routes=self._routes,
+            metrics=self._metrics,
+            watch=partial(self._watch, name),
         )
         self._unopened.pop(name, None)
         return hosted

@@ -6,7 +6,7 @@ import logging
 import os
 import secrets
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,6 +19,9 @@ from tsfusion.journal.segments import RecordEntry, list_records, segment_path, s
 
 log = logging.getLogger(__name__)
 
+# Bytes of the journal that were read, bytes of all, and records so far
+ReadingWatcher = Callable[[int, int, int], None]
+
 
 class Journal:
     """The one writer of a folder of segments.
@@ -28,6 +31,7 @@ class Journal:
         segment_bytes: a segment that has grown past this is closed and the next begun.
         sync: wait for the disk at each append (fdatasync); without it a power cut may lose the tail.
         min_free_bytes: what `append` leaves free on the disk.
+        watch: called again and again while the segments of earlier runs are read; what it raises ends that.
 
     Attributes:
         found: records in the segments of earlier runs, in journal order; the caller may empty the list.
@@ -45,6 +49,7 @@ class Journal:
         *,
         sync: bool = True,
         min_free_bytes: int = 0,
+        watch: ReadingWatcher = lambda _done, _all, _records: None,
     ) -> None:
         self.folder = Path(folder)
         self._segment_bytes = segment_bytes
@@ -61,15 +66,21 @@ class Journal:
             durable_files.make_folder(self.folder)
         except OSError as error:
             raise journal_error("create the journal", self.folder, error) from error
-        self._recover()
+        self._recover(watch)
 
-    def _recover(self) -> None:
+    def _recover(self, watch: ReadingWatcher) -> None:
         numbers = segments(self.folder)
+        total = sum(durable_files.size_of(segment_path(self.folder, number)) for number in numbers)
+        done = 0
+
+        def note(at: int, records: int) -> None:
+            watch(done + at, total, len(self.found) + records)
+
         for number in numbers:
             path = segment_path(self.folder, number)
             self._closed[number] = 0
             try:
-                found, damaged = list_records(path)
+                found, damaged = list_records(path, note)
                 self._closed[number] = path.stat().st_size
             except OSError as error:
                 raise _advise(journal_error("read", path, error)) from error
@@ -77,6 +88,7 @@ class Journal:
                 raise _advise(error) from error
             self.found += found
             self.damaged += damaged
+            done += self._closed[number]
         self._number = numbers[-1] + 1 if numbers else 1
 
     @property
