@@ -57,7 +57,10 @@ class KeyframeIntake:
             self._refuse(error, client)
             return
         hosted = self._maps.get(header.map)
-        if hosted is None or not hosted.warm:  # its client will say hello, and send it again
+        if forbidden := self._admission.denial_of_map(client, header.map):
+            subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
+            log.warning("a %s is refused: %s", header.kind, forbidden, extra=subject)
+        elif hosted is None or not hosted.warm:  # its client will say hello, and send it again
             self._refused["map"] += 1
         elif not hosted.sessions.room_for(header.session):  # its client is told when it says hello
             self._refused["session"] += 1
@@ -65,7 +68,7 @@ class KeyframeIntake:
             self._refused["session"] += 1
             subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
             log.warning("a %s is refused: its session is another client's", header.kind, extra=subject)
-        elif denied := self._maps.denial_of_world(hosted, header):
+        elif denied := self._maps.denial_of_world(hosted, header, self._admission.maps_of(client)):
             self._refused["world"] += 1
             subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
             log.warning("a %s is refused: %s", header.kind, denied.message, extra=subject)

@@ -6,7 +6,6 @@ import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from itertools import count
 from typing import Any
 
 import zmq
@@ -20,6 +19,7 @@ from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.problems import Problem
 from tsfusion.gateway.sessions import Session
 from tsfusion.journal import state_folder
+from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
 from tsfusion.wire.health import MapHealth
 from tsfusion.wire.messages import Denied, Hello
 from tsfusion.wire.record_header import RecordHeader
@@ -117,8 +117,18 @@ class MapRegistry:
             f"larger max_maps than {most} (--config)"
         )
 
-    def denial_of_world(self, hosted: HostedMap, record: Hello | RecordHeader) -> Denied | None:
+    def why_none_free(self, like: str, maps: AllowedMaps) -> str:
+        """Why `keep_free_name` has no name for a client."""
+        if self.free_name(like, maps) is None:
+            return f"no name is free of the maps that this key may use: {maps}"
+        return f"no room for another map: {self.why_full}"
+
+    def denial_of_world(
+        self, hosted: HostedMap, record: Hello | RecordHeader, maps: AllowedMaps = ALL_MAPS
+    ) -> Denied | None:
         """The answer to a session that does not share a map's coordinate frame; None = it may go on.
+
+        `maps`: that its client may use, of which a free one is named.
 
         Every record is asked this, not its session's greeting alone: of two that greet a map nobody has yet,
         the one whose record comes first has it.
@@ -127,23 +137,33 @@ class MapRegistry:
             return None
         keyframes = hosted.health().keyframes_durable
         why = f"map {hosted.name} has {keyframes} keyframes of another session, in another coordinate frame"
-        return Denied(record.session, "world", why, self.free_name(hosted.name))
+        return Denied(record.session, "world", why, self.free_name(hosted.name, maps) or "")
 
-    def free_name(self, like: str) -> str:
-        """The first of NAME, NAME-2, NAME-3, … that is no map's yet and was given to nobody just now."""
+    def free_name(self, like: str, maps: AllowedMaps = ALL_MAPS) -> str | None:
+        """The first of NAME, NAME-2, NAME-3, … that is no map's yet and was given to nobody just now.
+
+        Where a client may not use that name: the first such name that is like one that it may use.
+
+        Args:
+            maps: that the client may use; None of their names may be free.
+        """
         now = time.monotonic()
         in_use = {one.name for one in self if len(one.sessions)} | {route.map for route in self._routes}
         on_disk = {name for name in state_folder.map_names(self._server.state) if name not in self._open}
         kept = {name for name, since in self._kept.items() if now - since < _KEPT_SECONDS}
         taken = in_use | on_disk | kept | set(self._unopened)
         stem = re.sub(r"-[0-9]+$", "", like)
-        stem = stem if stem in taken else like
-        names = (stem if number == 1 else _numbered(stem, number) for number in count(1))
-        return next(name for name in names if name not in taken)
+        stems = [stem if stem in taken else like]
+        stems += [one.rstrip("*").rstrip("-_") for one in maps.patterns or ()]
+        # Of so many names one is not taken.
+        numbered = (_numbered(one, number) for one in stems if one for number in range(1, len(taken) + 3))
+        return next((name for name in numbered if name not in taken and name in maps), None)
 
-    def keep_free_name(self, like: str) -> str | None:
-        """A free name that nobody else is given; None = there is no room for another map."""
-        name = self.free_name(like)
+    def keep_free_name(self, like: str, maps: AllowedMaps = ALL_MAPS) -> str | None:
+        """A free name that nobody else is given; None = there is none, or no room for another map."""
+        name = self.free_name(like, maps)
+        if name is None:
+            return None
         if name not in self._open and len(self._open) >= self._server.max_maps:
             return None
         self._kept[name] = time.monotonic()
@@ -243,5 +263,6 @@ class MapRegistry:
 
 
 def _numbered(stem: str, number: int) -> str:
-    suffix = f"-{number}"
+    """NAME, NAME-2, NAME-3, …"""
+    suffix = f"-{number}" if number > 1 else ""
     return stem[: MAP_NAME_LENGTH - len(suffix)] + suffix

@@ -62,8 +62,12 @@ def router(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySo
 
 
 def publisher(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySocket:
-    """The server's mesh updates; a slow viewer misses some, never holds the server up."""
-    limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES}
+    """The server's mesh updates; a slow viewer misses some, never holds the server up.
+
+    Who subscribes gets nothing before SUBSCRIBE is set for it: at once, since it counts for the sender of the
+    message that was received last.
+    """
+    limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES, zmq.XPUB_MANUAL: 1}
     return _make(context, zmq.XPUB, {**_ANY, **limits}, keys)
 
 
