@@ -64,8 +64,8 @@ def test_a_problem_is_logged_when_it_begins_and_when_it_ends(caplog: pytest.LogC
     times.note([other])
     times.note([])
     assert [(record.levelname, record.getMessage()) for record in caplog.records] == [
-        ("WARNING", "problem: map yard-2: 0 keyframes wait"),
-        ("INFO", "no longer a problem, after 3 min: map yard-2: 89 keyframes wait"),
+        ("WARNING", "problem: 0 keyframes wait"),
+        ("INFO", "no longer a problem, after 3 min: 89 keyframes wait"),
     ]
 
 
@@ -114,7 +114,7 @@ def test_all_held_off_for_a_while(clock: Clock) -> None:
         clock.now += 1.0
     problem = route.problem
     assert problem is not None
-    assert problem.words == (
+    assert problem.line == (
         "map yard: client robot1, session 00000000: every keyframe is held off: the server takes 1 keyframe "
         "a second"
     )

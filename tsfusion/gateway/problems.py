@@ -35,9 +35,13 @@ class Problem(Struct, frozen=True):
 
     @property
     def words(self) -> str:
-        """The problem with its map and its client."""
-        place = f"map {self.map}: " if self.map else ""
-        return place + (f"{self.client}: " if self.client else "") + self.text
+        """The problem, with the client that it is about."""
+        return f"{self.client}: {self.text}" if self.client else self.text
+
+    @property
+    def line(self) -> str:
+        """The problem, with the map and the client that it is about."""
+        return f"map {self.map}: {self.words}" if self.map else self.words
 
 
 class ProblemTimes:
@@ -58,7 +62,8 @@ class ProblemTimes:
         for key in self._began.keys() - present.keys():
             ended, since = self._began.pop(key)
             if not ended.is_logged:
-                log.info("no longer a problem, after %s: %s", span(now - since), ended.words)
+                after, about = span(now - since), logs.about(map=ended.map)
+                log.info("no longer a problem, after %s: %s", after, ended.words, extra=about)
         for key, one in present.items():
             if key not in self._began and not one.is_logged:
                 log.warning("problem: %s", one.words, extra=logs.about(map=one.map))
@@ -67,7 +72,7 @@ class ProblemTimes:
     def lines(self, problems: Iterable[Problem]) -> tuple[str, ...]:
         """The problems in words, each with how long it has been there."""
         now = self._clock()
-        return tuple(f"{one.words} (for {span(now - self._since(one, now))})" for one in problems)
+        return tuple(f"{one.line} (for {span(now - self._since(one, now))})" for one in problems)
 
     def _since(self, problem: Problem, now: float) -> float:
         return self._began.get(problem.key, (problem, now))[1]
