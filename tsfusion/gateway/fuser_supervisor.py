@@ -229,7 +229,10 @@ class FuserSupervisor:
         pause = 0.0
         if not blamed and not killed:
             if self._early_deaths >= _MAX_EARLY_DEATHS:
-                self.failed = f"its fuser process ended {self._early_deaths} times, last with status {status}"
+                self.failed = (
+                    f"its fuser process ended {self._early_deaths} times, last with status {status}: the log "
+                    "says why; keyframes are journaled, and it is tried again every minute"
+                )
             pause = min(2.0**self._early_deaths - 1, _LONGEST_PAUSE)
             self._early_deaths += 1
         self.in_flight.clear()
