@@ -9,12 +9,13 @@ from typing import NamedTuple
 
 import pytest
 from clients_and_spools import QUICK
+from health_snapshots import map_health
 from idle_fuser import keeping
 from keyframes_and_servers import Server, pose, until, wall
 
 from tsfusion import Client
 from tsfusion.core import process
-from tsfusion.gateway import fuser_silence, recent_fates
+from tsfusion.gateway import fuser_silence, gateway, recent_fates
 from tsfusion.gateway.client_routes import ClientRoute
 from tsfusion.gateway.fuser_silence import FuserSilence
 from tsfusion.gateway.problems import Problem, ProblemTimes, span
@@ -153,6 +154,12 @@ def test_a_client_of_which_everything_is_refused_is_a_problem_and_the_server_rea
         for i in range(5):
             client.send(wall(i))
         until(lambda: not told())
+
+
+@pytest.mark.parametrize(("problems", "blocked"), [(["", "stuck"], False), (["stuck"], True), ([], False)])
+def test_a_server_with_a_good_map_is_ready(problems: list[str], blocked: bool) -> None:
+    maps = {f"map{number}": map_health(problem=problem) for number, problem in enumerate(problems)}
+    assert gateway.all_blocked(maps) == blocked
 
 
 # --- a fuser that does nothing ---

@@ -68,7 +68,6 @@ def new(
     app,
     "tsfusion keys allow robot1 robot1.key",
     "tsfusion keys allow robot1 --maps 'house,yard-*'",
-    "tsfusion keys allow robot1 -- '-40 characters-'",
 )
 def allow(
     name: Name,

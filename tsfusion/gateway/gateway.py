@@ -301,7 +301,7 @@ class Gateway:
         """
         now = time.monotonic()
         maps = self.maps.health()
-        blocked = self.ports.problem or self._access.problem or _all_blocked(maps)
+        blocked = self.ports.problem or self._access.problem or all_blocked(maps)
         return Health(
             ready=self._accepting and not blocked,
             problems=self._problems.lines(self._find_problems(shown)),
@@ -331,6 +331,6 @@ class Gateway:
         return found + of_clients
 
 
-def _all_blocked(maps: dict[str, MapHealth]) -> bool:
+def all_blocked(maps: dict[str, MapHealth]) -> bool:
     """Whether no map takes and fuses keyframes: one that does is a reason to go on sending to this server."""
     return bool(maps) and all(one.problem for one in maps.values())
