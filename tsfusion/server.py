@@ -91,7 +91,7 @@ def _open(
     stack.callback(context.term)
     access = AccessControl(context, server.keys)
     stack.callback(access.close)
-    ports = Ports(context, server, access.keys)
+    ports = Ports(context, server, access.keys, grants_topics=lambda: access.limits_maps)
     stack.callback(ports.close)
     metrics = Metrics(server)
     stack.callback(metrics.close)

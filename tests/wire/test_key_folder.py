@@ -455,3 +455,14 @@ def test_a_stale_list_is_tried_again_though_its_file_is_the_same(
     monkeypatch.setattr(allowed, "_again", 0.0)
     allowed.refresh()
     assert allowed.name_of(one) == "robot1"
+
+
+def test_a_first_key_for_some_maps_is_a_change_for_all(server: Path, one: str) -> None:
+    """From then on the server decides what viewers get."""
+    allowed = AllowList(server)
+    assert not allowed.limits_maps
+    key_folder.allow(server, "robot2", key(), maps=["yard"])
+    assert allowed.refresh()
+    assert allowed.limits_maps
+    key_folder.allow(server, "robot3", key(), maps=["yard"])
+    assert not allowed.refresh()

@@ -69,6 +69,11 @@ class AccessControl:
         key = sender_of(frame)
         return None if key is None else self._allowed.name_of(key)
 
+    @property
+    def limits_maps(self) -> bool:
+        """Whether there is a client that may not use every map."""
+        return self._allowed is not None and self._allowed.limits_maps
+
     def maps_of(self, client: str) -> AllowedMaps:
         """The maps that the client of a name may use: without keys every map."""
         return ALL_MAPS if self._allowed is None else self._allowed.maps_of(client)

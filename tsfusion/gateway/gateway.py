@@ -274,8 +274,9 @@ class Gateway:
         change, topic = frames[0].bytes[:1], frames[0].bytes[1:]
         if len(frames) > 1 or change not in (b"\x00", b"\x01"):
             self._refused["subscription"] += 1
-            self.ports.renew_viewers()  # ZeroMQ would take the next ones for another viewer's
-            self._subscriptions.clear()
+            if self.ports.pass_over_rubbish():
+                log.warning("a viewer sends what is no subscription: all viewers connect anew")
+                self._subscriptions.clear()
             return
         client = self._access.client_of(
             frames[0]

@@ -23,14 +23,24 @@ Handler: TypeAlias = Callable[[list[zmq.Frame]], None]
 
 
 class Ports:
-    """The sockets: keyframes in, control both ways, mesh updates out."""
+    """The sockets: keyframes in, control both ways, mesh updates out.
+
+    Args:
+        grants_topics: asked when sockets are made: whether viewers get only what `grant_topics` says.
+    """
 
     def __init__(
-        self, context: "zmq.Context[Any]", server: ServerConfig, keys: ServerKeys | None = None
+        self,
+        context: "zmq.Context[Any]",
+        server: ServerConfig,
+        keys: ServerKeys | None = None,
+        *,
+        grants_topics: Callable[[], bool] = lambda: False,
     ) -> None:
         self._context = context
         self._server = server
         self._keys = keys
+        self._grants_topics = grants_topics
         self._addresses: Addresses | None = None
         self._next_bind = 0.0
         self.problem = ""  # why nobody can connect; empty = clients can
@@ -39,7 +49,11 @@ class Ports:
     def _open(self) -> None:
         self.keyframes = sockets.pull(self._context, self._server.max_frame_bytes, keys=self._keys)
         self.control = sockets.router(self._context, keys=self._keys)
-        self.viewers = sockets.publisher(self._context, keys=self._keys)
+        self._open_viewers()
+
+    def _open_viewers(self) -> None:
+        self._is_manual = self._grants_topics()
+        self.viewers = sockets.publisher(self._context, keys=self._keys, manual=self._is_manual)
 
     def bind(self) -> Addresses:
         """Bind the sockets, so that clients can connect.
@@ -62,17 +76,28 @@ class Ports:
 
     def grant_topics(self, topics: Iterable[bytes]) -> None:
         """Send these topics' updates to the viewer whose message was received last."""
-        for topic in topics:
+        for topic in topics if self._is_manual else ():
             self.viewers.setsockopt(zmq.SUBSCRIBE, topic)
 
     def revoke_topics(self, topics: Iterable[bytes]) -> None:
         """Send these topics' updates to that viewer no more."""
-        for topic in topics:
+        for topic in topics if self._is_manual else ():
             self.viewers.setsockopt(zmq.UNSUBSCRIBE, topic)
 
-    def renew_viewers(self) -> None:
-        """Drop the viewers' connections; `step` listens at the same port again."""
-        self.viewers.close()
+    def pass_over_rubbish(self) -> bool:
+        """Pass over what a viewer sent that is no subscription; whether all viewers have to connect anew.
+
+        Where topics are granted, ZeroMQ takes subscriptions that wait behind it for other viewers' than those
+        that sent them.
+        """
+        for _ in range(_MESSAGES_A_STEP if self._is_manual else 0):
+            if not int(self.viewers.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+                return False
+            if self.viewers.recv_multipart(copy=False)[0].bytes[:1] in (b"\x00", b"\x01"):
+                break
+        if self._is_manual:
+            self.viewers.close()
+        return self._is_manual
 
     def renew(self) -> None:
         """Drop every connection, with all that it holds in memory; `step` listens at the same ports again."""
@@ -106,7 +131,7 @@ class Ports:
 
     def _listen_for_viewers(self) -> None:
         try:
-            self.viewers = sockets.publisher(self._context, keys=self._keys)
+            self._open_viewers()
             if self._addresses is not None:
                 sockets.bind_socket(self.viewers, self._addresses.publish)
         except (TransportError, zmq.ZMQError) as error:

@@ -246,7 +246,7 @@ class AllowList:
         seen = self._stamp()
         if seen == self._seen and not (self.problem and time.monotonic() > self._again):
             return False
-        before, maps_before, self._seen = self._names, self._maps, seen
+        before, maps_before, limited, self._seen = self._names, self._maps, self.limits_maps, seen
         try:
             durable_files.check_private_folder(self._folder)
             listed = read_allow_list(self._folder)
@@ -260,7 +260,7 @@ class AllowList:
             level = logging.INFO if self._names else logging.WARNING
             counts = len(self._names), len(self._revoked)
             log.log(level, "clients that may connect: %d, keys revoked: %d", *counts)
-        return any(
+        return limited != self.limits_maps or any(
             self._names.get(key) != name or self.maps_of(name) != maps_before[name]
             for key, name in before.items()
         )
@@ -268,6 +268,11 @@ class AllowList:
     def name_of(self, key: str | None) -> str | None:
         """The name under which a public key is allowed; None = it is not allowed."""
         return self._names.get(key) if key is not None else None
+
+    @property
+    def limits_maps(self) -> bool:
+        """Whether there is a name that may not use every map."""
+        return any(maps.patterns is not None for maps in self._maps.values())
 
     def maps_of(self, name: str) -> AllowedMaps:
         """The maps that the client of a name may use."""
