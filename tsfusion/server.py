@@ -27,6 +27,8 @@ from tsfusion.wire.sockets import Addresses
 log = logging.getLogger(__name__)
 
 _SECOND_SIGNAL = 1.0  # seconds after the first
+_REPORT_INTERVAL = 0.5  # seconds between two reports of how far the start is
+_LOG_INTERVAL = 5.0  # seconds between two lines of that in the log
 
 
 def run(
@@ -57,13 +59,19 @@ def run(
     _check_addresses(server)
     with ExitStack() as stack:
         signals = stack.enter_context(_signals())
-        gateway, watchdog = _open(stack, server, {DEFAULT_MAP: volume, **(volumes or {})})
+        try:
+            gateway, watchdog, report = _open(
+                stack, server, {DEFAULT_MAP: volume, **(volumes or {})}, signals
+            )
+        except _StoppedAtStart:
+            return 0
         while not gateway.maps.warm:
             gateway.step()
             if signals:
                 return 0
         addresses = gateway.ports.bind()
         gateway.accept()
+        report.is_started = True
         watchdog.ready(f"listening at {addresses.data}")
         if on_ready is not None:
             on_ready(addresses)
@@ -71,8 +79,8 @@ def run(
 
 
 def _open(
-    stack: ExitStack, server: ServerConfig, volumes: dict[str, VolumeConfig]
-) -> tuple[Gateway, Watchdog]:
+    stack: ExitStack, server: ServerConfig, volumes: dict[str, VolumeConfig], signals: list[int]
+) -> tuple[Gateway, Watchdog, "_ReadingReport"]:
     process.raise_file_limit()
     state = Path(server.state)
     stack.enter_context(lock_folder(state, "state", "server"))
@@ -83,7 +91,7 @@ def _open(
     stack.callback(context.term)
     access = AccessControl(context, server.keys)
     stack.callback(access.close)
-    ports = Ports(context, server, access.keys)
+    ports = Ports(context, server, access.keys, grants_topics=lambda: access.limits_maps)
     stack.callback(ports.close)
     metrics = Metrics(server)
     stack.callback(metrics.close)
@@ -91,8 +99,49 @@ def _open(
         log.info("figures and health checks are at http://%s", metrics.serve(server.metrics))
     gateway = Gateway(context, server, ports, access, metrics)
     stack.callback(gateway.maps.close)
-    gateway.maps.open_at_start(volumes)
-    return gateway, Watchdog()
+    watchdog = Watchdog()
+    report = _ReadingReport(metrics, watchdog, signals)
+    gateway.maps.open_at_start(volumes, report)
+    return gateway, watchdog, report
+
+
+class _StoppedAtStart(Exception):
+    """A signal to stop came before the server was ready."""
+
+
+class _ReadingReport:
+    """How far a map's journal is read: for the health checks, the service manager and the log."""
+
+    def __init__(self, metrics: Metrics, watchdog: Watchdog, signals: list[int]) -> None:
+        self._metrics = metrics
+        self._watchdog = watchdog
+        self._signals = signals
+        self.is_started = False  # from then on a signal is the main loop's, and no start is to be extended
+        self._next_report = 0.0
+        self._next_line = time.monotonic() + _LOG_INTERVAL
+
+    def __call__(self, map_name: str, done: int, total: int, records: int) -> None:
+        """Report it, unless that was done a moment ago.
+
+        Raises:
+            _StoppedAtStart: when a signal to stop has come.
+        """
+        if self._signals and not self.is_started:
+            raise _StoppedAtStart
+        now = time.monotonic()
+        if now < self._next_report:
+            return
+        self._next_report = now + _REPORT_INTERVAL
+        share = f"{100 * done // max(total, 1)} % of {total / 1e6:.0f} MB"
+        text = f"reading the journal of map {map_name}: {share}, {records:,} records"
+        self._metrics.report_start(text)
+        if self.is_started:
+            self._watchdog.pet()
+        else:
+            self._watchdog.starting(text)
+        if now >= self._next_line:
+            self._next_line = now + _LOG_INTERVAL
+            log.info("%s", text)
 
 
 def _serve(gateway: Gateway, signals: list[int], watchdog: Watchdog) -> int:

@@ -135,6 +135,7 @@ def test_ready_is_0(asking: Here) -> None:
     [
         (health(ready=False), "not ready"),
         (health(ready=False, problems=("map yard: the disk is full",)), "✗ map yard: the disk is full"),
+        (health(maps={"shed": map_health(), "yard": map_health(problem="stands still")}), "  ready  up 1 h"),
     ],
 )
 def test_not_ready_is_3(told: Health, words: str, asking: Here) -> None:

@@ -45,6 +45,7 @@ def manager(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Manager]
 
 def test_start_status_and_end_are_reported(manager: Manager) -> None:
     dog = Watchdog(manager.environment)
+    dog.starting("reading the journal: 35 %")
     dog.ready("2 maps")
     dog.pet("2 maps")
     dog.pet("2 maps, 1 keyframe waiting")
@@ -52,6 +53,7 @@ def test_start_status_and_end_are_reported(manager: Manager) -> None:
     dog.close()
     dog.pet("sent to nobody")
     assert manager.received() == [
+        "EXTEND_TIMEOUT_USEC=120000000\nSTATUS=reading the journal: 35 %",
         "READY=1\nSTATUS=2 maps", "STATUS=2 maps, 1 keyframe waiting", "STOPPING=1",
     ]  # fmt: skip
 

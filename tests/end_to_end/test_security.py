@@ -19,7 +19,7 @@ from tsfusion.core.errors import FlushTimeout, NotAllowed, TransportError
 from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec, key_folder, messages, sockets
 from tsfusion.wire.curve import ClientKeys, client_keys, server_keys
-from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_status
+from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_new_map, fetch_status
 
 
 class Site:
@@ -31,10 +31,11 @@ class Site:
         self.state = folder / "state"
         key_folder.create_pair(self.keys, "server")
         self.public = server_keys(self.keys).public
-        for name in ("robot", "cart", "stranger"):
+        for name in ("robot", "cart", "guest", "stranger"):
             key_folder.create_pair(folder / name, name)
         for name in ("robot", "cart"):
             key_folder.allow(self.keys, name, str(folder / name / f"{name}.key"))
+        key_folder.allow(self.keys, "guest", str(folder / "guest/guest.key"), maps=["yard-*", "shed"])
 
     def key_file(self, name: str) -> Path:
         return self.folder / name / f"{name}.key_secret"
@@ -44,9 +45,9 @@ class Site:
         assert made is not None
         return made
 
-    def client(self, server: Server, name: str, spool: Path | None = None) -> Client:
+    def client(self, server: Server, name: str, spool: Path | None = None, **more: str) -> Client:
         return Client(
-            server.address, spool=spool, key=self.key_file(name), server_key=self.public, config=QUICK
+            server.address, spool=spool, key=self.key_file(name), server_key=self.public, config=QUICK, **more
         )
 
 
@@ -172,6 +173,128 @@ def test_a_replayed_message_counts_once(site: Site, server: Server) -> None:
         until(lambda: refused(server, site) > before.refused.get("session", 0))
     after = fetch_health(server.address, keys=site.of("cart"))
     assert after.maps["default"].keyframes_durable == before.maps["default"].keyframes_durable + 1
+
+
+# --- a key for some maps ---
+
+
+def test_a_key_for_some_maps_sends_into_no_other(site: Site, server: Server) -> None:
+    with site.client(server, "robot") as robot:
+        robot.send(wall(20))
+        robot.wait_fused(timeout=DEADLINE)
+    before = fetch_health(server.address, keys=site.of("robot"))
+    why = "this key may not use map default, but: yard-\\*, shed"
+    with site.client(server, "guest") as guest, pytest.raises(TransportError, match=why):
+        guest.connect(timeout=5)
+    with Raw(server, site.of("guest")) as raw:
+        for name in ("default", "yard", "attic"):  # one that is there, and others
+            denied = raw.say(messages.Hello(os.urandom(16), messages.PROTOCOL_VERSION, map=name))
+            assert isinstance(denied, messages.Denied)
+            assert (denied.reason, denied.message) == ("map", why.replace("default", name).replace("\\", ""))
+        raw.send(codec.encode(wall(21), session=os.urandom(16), seq=1, jpeg_quality=90))
+
+        def refused_now() -> int:
+            counts = fetch_health(server.address, keys=site.of("robot")).refused
+            return counts["forbidden"] - before.refused.get("forbidden", 0)
+
+        until(lambda: refused_now() >= 4)
+    after = fetch_health(server.address, keys=site.of("robot"))
+    assert after.maps["default"].keyframes_durable == before.maps["default"].keyframes_durable
+    assert set(after.maps) == set(before.maps)
+    with site.client(server, "guest", map="yard-1") as guest:
+        guest.send(wall(22))
+        guest.wait_fused(timeout=DEADLINE)
+        assert guest.stats.fused == 1
+
+
+def test_a_key_for_some_maps_is_told_of_no_other(site: Site, server: Server) -> None:
+    with site.client(server, "robot") as robot, site.client(server, "guest", map="yard-1") as guest:
+        robot.connect()
+        guest.connect()
+        seen = fetch_health(server.address, keys=site.of("guest"))
+        assert (set(seen.maps), {one.client for one in seen.clients}) == ({"yard-1"}, {"guest"})
+        everything = fetch_health(server.address, keys=site.of("robot"))
+        assert set(everything.maps) >= {"default", "yard-1"}
+        assert {one.client for one in everything.clients} >= {"robot", "guest"}
+    for name in ("default", "attic"):
+        for ask in (fetch_status, fetch_mesh):
+            with pytest.raises(TransportError, match=f"this key may not use map {name}"):
+                ask(server.address, map_name=name, keys=site.of("guest"))  # type: ignore[operator]
+    assert fetch_status(server.address, map_name="yard-1", keys=site.of("guest")).map == "yard-1"
+    assert fetch_new_map(server.address, "yard-1", keys=site.of("guest")).startswith("yard-")
+    assert fetch_new_map(server.address, "default", keys=site.of("guest")).startswith("yard-")
+
+
+def test_a_key_for_some_maps_watches_no_other(site: Site, server: Server) -> None:
+    """Also not while it says what makes ZeroMQ take another's subscription for its own."""
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+
+    def viewer(name: str, *topics: bytes) -> "zmq.Socket[bytes]":
+        made = context.socket(zmq.XSUB)
+        made.setsockopt(zmq.LINGER, 0)
+        site.of(name).secure(made)
+        made.connect(server.publish)
+        for topic in topics:
+            made.send(b"\x01" + topic)
+        return made
+
+    def maps_of_updates(made: "zmq.Socket[bytes]") -> set[bytes]:
+        found = set()
+        while made.poll(0):
+            found.add(made.recv_multipart()[0])
+        return found
+
+    guest = viewer("guest", b"mesh/default/", b"mesh/", b"mesh/shed/", b"")
+    robot = viewer("robot", b"mesh/default/")
+    everything = viewer("robot", b"mesh/")
+    liar = viewer("guest")
+    seen: dict[str, set[bytes]] = {"guest": set(), "robot": set(), "everything": set(), "liar": set()}
+    viewers = {"guest": guest, "robot": robot, "everything": everything, "liar": liar}
+    try:
+        with site.client(server, "robot") as one, site.client(server, "robot", map="yard-1") as other:
+            number = iter(range(30, 10_000))
+
+            def told() -> bool:
+                for client in (one, other):
+                    client.send(wall(next(number) % 60))
+                    client.wait_fused(timeout=DEADLINE)
+                for name, made in viewers.items():
+                    seen[name] |= maps_of_updates(made)
+                return bool(seen["guest"] and seen["robot"]) and len(seen["everything"]) == 2
+
+            until(told)
+            for lie in (b"\x01mesh/yard-1/", b"x", b"\x01mesh/yard-1/", b""):
+                liar.send(lie)
+            fresh = viewer("robot", b"mesh/default/")
+            viewers["fresh"], seen["fresh"] = fresh, set()
+            for made in seen.values():
+                made.clear()
+            until(lambda: told() and bool(seen["fresh"]))
+    finally:
+        for made in (guest, robot, everything, liar, *viewers.values()):
+            made.close()
+        context.term()
+    assert seen["guest"] == {b"mesh/yard-1/"}
+    assert seen["robot"] == {b"mesh/default/"} == seen["fresh"]
+    assert seen["liar"] <= {b"mesh/yard-1/"}
+
+
+def test_other_maps_take_effect_at_once(tmp_path: Path) -> None:
+    site = Site(tmp_path)
+    with serving(site.state, keys=str(site.keys)) as server, site.client(server, "robot") as robot:
+        robot.send(wall(0))
+        robot.flush(timeout=DEADLINE)
+        key_folder.allow(site.keys, "robot", maps=["yard-*"])
+        robot.send(wall(1))
+        with pytest.raises(FlushTimeout, match="this key may not use map default, but: yard-"):
+            robot.flush(timeout=5)
+        assert fetch_health(server.address, keys=site.of("cart")).maps["default"].keyframes_durable == 1
+        key_folder.allow(site.keys, "robot", maps=["*"])
+        robot.flush(timeout=DEADLINE)
+        assert fetch_health(server.address, keys=site.of("robot")).maps["default"].keyframes_durable == 2
+
+
+# --- revocation ---
 
 
 def test_a_revocation_cuts_at_once_and_others_go_on(tmp_path: Path) -> None:

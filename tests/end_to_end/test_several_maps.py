@@ -85,7 +85,7 @@ def test_maps_that_cannot_be_opened_are_remembered_up_to_a_number(
     found._volumes = {"default": VolumeConfig()}
     for i in range(200):
         assert found.open_for_client(f"map{i}") is None
-    assert len(found.health()[1]) == 64
+    assert len(found.problems()) == 64
     assert found.why_not("map199") == "no room"
 
 

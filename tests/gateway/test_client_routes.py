@@ -129,3 +129,19 @@ def test_topics_are_few_and_those_of_open_maps_have_room() -> None:
     topics.discard(b"mesh/yard/")
     assert not topics.watched("yard")
     assert topics.watched("map1")
+
+
+def test_subscriptions_that_were_denied_make_nobody_watch_and_take_nothing_away() -> None:
+    """A connection that ends takes its subscriptions back, and nobody says whose they were."""
+    topics, topic = Subscriptions(), b"mesh/yard/"
+    assert not topics.add(topic, ["yard"], granted=False)
+    assert not topics.watched("yard")
+    assert topics.add(topic, ["yard"])
+    topics.discard(topic)  # of the one or the other
+    assert topics.watched("yard")
+    topics.discard(topic)
+    assert not topics.watched("yard")
+    assert topics.add(topic, ["yard"])
+    assert topics.add(topic, ["yard"])
+    topics.discard(topic, granted=True)
+    assert topics.watched("yard")

@@ -3,6 +3,7 @@
 
 import errno
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -176,6 +177,53 @@ def test_a_fuser_that_is_killed_is_not_the_keyframes_fault(start: Start, tmp_pat
     )
     health = default(drained(start(body)))
     assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (3, {}, 5)
+
+
+def test_a_fuser_that_is_stopped_is_not_the_keyframes_fault(start: Start, tmp_path: Path) -> None:
+    """Somebody stops it three times at the same keyframe, and never lets it go on."""
+    body = fusing(
+        f"""
+            with open({str(tmp_path / "stops")!r}, "a+") as stops:
+                stops.seek(0)
+                if message.index == 2 and len(stops.read()) < 3:
+                    stops.write("x")
+                    stops.close()
+                    os.kill(os.getpid(), 19)
+        """.strip()
+    )
+    gateway = start(body, fuser_timeout=0.3)
+    gateway.accept()
+    stepped(gateway, lambda: "is stopped from outside" in default(gateway).problem)
+    assert not gateway.health().ready
+    health = default(drained(gateway))
+    assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (3, {}, 5)
+    assert health.problem == ""
+
+
+def test_a_stopped_fuser_that_goes_on_is_waited_for(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fuser_supervisor, "STANDS_STILL_AFTER", 0.3)
+    mark = tmp_path / "stopped"
+    line = f"if message.index == 2: open({str(mark)!r}, 'w').close(); os.kill(os.getpid(), 19)"
+    gateway = start(fusing(line), fuser_timeout=600.0)
+    stepped(gateway, mark.exists)
+    (hosted,) = gateway.maps
+    stepped(gateway, lambda: "is stopped" in hosted.fuser.problem)
+    os.kill(hosted.fuser.pid, signal.SIGCONT)
+    assert default(drained(gateway)).fuser_restarts == 0
+    assert hosted.fuser.problem == ""
+
+
+def test_time_in_which_the_server_stood_still_counts_for_nobody(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A suspended machine or a paused container stops gateway and fuser alike."""
+    gateway = start(fusing("if message.index == 2: time.sleep(0.5)"), fuser_timeout=30.0)
+    stepped(gateway, lambda: default(gateway).keyframes_fused == 2)
+    real = time.monotonic
+    monkeypatch.setattr(time, "monotonic", lambda: real() + 3600.0)
+    assert default(drained(gateway)).fuser_restarts == 0
 
 
 def test_a_death_between_keyframes_is_nobodys_fault(start: Start, tmp_path: Path) -> None:

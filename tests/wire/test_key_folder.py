@@ -172,6 +172,58 @@ def test_revoke(run: Run) -> None:
     )
 
 
+def test_a_key_for_some_maps(run: Run) -> None:
+    run("new", "server")
+    one, two = key(), key()
+    assert run("allow", "robot1", one, "--maps", "house, yard-*") == (
+        "robot1 may connect, and use these maps: house, yard-*\n"
+    )
+    run("allow", "robot2", two)
+    assert f"allowed  robot1  {one}  maps: house, yard-*\n" in run("list")
+    assert json.loads(run("list", "--json"))["maps"] == {"robot1": ["house", "yard-*"]}
+    assert f'"robot1" = {{ key = "{one}", maps = ["house", "yard-*"] }}' in listed_text()
+    assert f'"robot2" = "{two}"' in listed_text()
+
+    new = key()
+    run("allow", "robot1", new)  # with its maps
+    assert f'"robot1" = {{ key = "{new}", maps = ["house", "yard-*"] }}' in listed_text()
+    run("allow", "robot1", "--maps", "shed")
+    assert f'"robot1" = {{ key = "{new}", maps = ["shed"] }}' in listed_text()
+    assert run("allow", "robot1", "--maps", "*") == "robot1 may connect\n"
+    assert f'"robot1" = "{new}"' in listed_text()
+    run("allow", "robot1", "--maps", "shed")
+    run("revoke", "robot1")
+    run("allow", "robot1", one)
+    assert f'"robot1" = "{one}"' in listed_text()
+
+
+def listed_text() -> str:
+    return Path("tsfusion-keys/allowed.toml").read_text()
+
+
+def test_a_list_follows_the_maps_of_its_names(server: Path, one: str) -> None:
+    allowed = AllowList(server)
+    assert "house" in allowed.maps_of("robot1")
+    assert "house" not in allowed.maps_of("robot2")
+    path = server / key_folder.ALLOWED
+
+    def write(entry: str) -> bool:
+        path.write_text(f"[allowed]\nrobot1 = {entry}\n")
+        return allowed.refresh()
+
+    assert write(f"{{key = '{one}', maps = ['yard-*']}}")
+    maps = allowed.maps_of("robot1")
+    assert [name in maps for name in ("yard-1", "yard", "house")] == [True, False, False]
+    assert write(f"{{key = '{one}', maps = []}}")
+    assert "house" not in allowed.maps_of("robot1")
+    assert write(f"{{key = '{one}', maps = ['yard', '*']}}")
+    assert not write(f"'{one}'"), "every map, as before"
+    for bad in ("maps = ['../x']", "maps = ['a*b']", "maps = 'yard'", "map = ['yard']", "maps = ['ya\\n']"):
+        assert write(f"{{key = '{one}', {bad}}}")
+        assert "damaged" in allowed.problem
+        assert write(f"'{one}'") is False
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -179,6 +231,10 @@ def test_revoke(run: Run) -> None:
         (["new", "a" * 33], "a name is 1 to 32 letters"),
         (["new", "robot\n"], "a name is 1 to 32 letters"),
         (["allow", "a b", "KEY"], "a name is 1 to 32 letters"),
+        (["allow", "robot1"], "no key is allowed under the name 'robot1' yet: give its public key, too"),
+        (["allow", "robot1", "KEY", "--maps", "Yard"], "maps are names of 1 to 32 of a-z"),
+        (["allow", "robot1", "KEY", "--maps", "ya*rd"], "or the like with `*` behind; got 'ya*rd'"),
+        (["allow", "robot1", "KEY", "--maps", ""], "maps are names of 1 to 32 of a-z"),
         (["allow", "robot1", "short"], "a public key is a file or 40 characters, got 'short'"),
         (["allow", "robot1", "#" * 40], "a public key is a file or 40 characters"),  # more than 32 bits
         (["allow", "robot1", "ä" * 40], "a public key is a file or 40 characters"),
@@ -399,3 +455,14 @@ def test_a_stale_list_is_tried_again_though_its_file_is_the_same(
     monkeypatch.setattr(allowed, "_again", 0.0)
     allowed.refresh()
     assert allowed.name_of(one) == "robot1"
+
+
+def test_a_first_key_for_some_maps_is_a_change_for_all(server: Path, one: str) -> None:
+    """From then on the server decides what viewers get."""
+    allowed = AllowList(server)
+    assert not allowed.limits_maps
+    key_folder.allow(server, "robot2", key(), maps=["yard"])
+    assert allowed.refresh()
+    assert allowed.limits_maps
+    key_folder.allow(server, "robot3", key(), maps=["yard"])
+    assert not allowed.refresh()

@@ -46,13 +46,14 @@ class ServerSnapshot(Struct, frozen=True, kw_only=True):
 
     @property
     def exit_status(self) -> int:
-        """0 = ready; 3 = not ready, or a map is stalled. Counts the map that was asked for, or all."""
+        """0 = ready; 3 = not ready, or a map is blocked or stalled. Counts the map asked for, or all."""
         assert self.health is not None
         if self.only and not self.missing:
             one = self.health.maps[self.only]
             well = not one.problem and one.state in ("idle", "busy")
         else:
-            well = self.health.ready and not self.missing
+            blocked = any(one.problem for one in self.health.maps.values())
+            well = self.health.ready and not blocked and not self.missing
         return READY if well and not self.stalled else NOT_READY
 
     def as_json(self) -> dict[str, Any]:

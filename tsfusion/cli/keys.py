@@ -64,24 +64,45 @@ def new(
         typer.echo(f"next, on the server: tsfusion keys allow {name} {shlex.quote(made.public)}")
 
 
-@verbs.verb(app, "tsfusion keys allow robot1 robot1.key", "tsfusion keys allow robot1 -- '-40 characters-'")
+@verbs.verb(
+    app,
+    "tsfusion keys allow robot1 robot1.key",
+    "tsfusion keys allow robot1 --maps 'house,yard-*'",
+)
 def allow(
     name: Name,
     key: Annotated[
-        str, typer.Argument(metavar="KEY|FILE", help="A public key: 40 characters, or a .key file.")
-    ],
+        str | None,
+        typer.Argument(
+            metavar="[KEY|FILE]",
+            help="A public key: 40 characters, or a .key file. Not needed of a name that has one.",
+        ),
+    ] = None,
     *,
+    maps: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAMES",
+            help="Maps it may send into, ask about and watch, with commas; yard-* = all that begin so, '*' = "
+            "every map. Else as before; a new name may use every map.",
+        ),
+    ] = None,
     folder: Dir = _FOLDER,
 ) -> None:
     """Let a scanner connect; a running server lets it in at once.
 
-    A name has one key: a new one replaces the old, and the name keeps its sessions. KEY may hold characters
-    that mean something to a shell: put it in single quotes, with -- before it if it begins with a dash.
+    A name has one key: a new one replaces the old, and the name keeps its sessions and its maps. KEY may hold
+    characters that mean something to a shell: put it in single quotes, with -- before it if it begins with a
+    dash.
     """
     from tsfusion.wire import key_folder
 
-    earlier = key_folder.allow(folder, name, key)
-    typer.echo(f"{name} may connect")
+    patterns = None if maps is None else [one.strip() for one in maps.split(",")]
+    earlier = key_folder.allow(folder, name, key, maps=patterns)
+    limits = key_folder.read_allow_list(folder).maps.get(name)
+    typer.echo(
+        f"{name} may connect" + ("" if limits is None else f", and use these maps: {', '.join(limits)}")
+    )
     if earlier is not None:
         typer.echo(f"its earlier key no longer may: {earlier}")
 
@@ -110,6 +131,7 @@ def list_(*, folder: Dir = _FOLDER, json: options.Json = False) -> None:
                 "own": {pair.name: pair.public for pair in own},
                 "allowed": listed.allowed if listed else {},
                 "revoked": listed.revoked if listed else {},
+                "maps": listed.maps if listed else {},
             }
         )
         return
@@ -120,6 +142,8 @@ def list_(*, folder: Dir = _FOLDER, json: options.Json = False) -> None:
     if not rows:
         made = "`tsfusion keys new server` makes a server's, `tsfusion keys new NAME` a scanner's"
         typer.echo(f"no keys in {folder}: {made} (--dir names the folder)", err=True)
+    limits = listed.maps if listed else {}
     width = max((len(name) for _, name, _ in rows), default=0)
     for state, name, key in rows:
-        typer.echo(f"{state:<8} {name:<{width}}  {key}")
+        maps = f"  maps: {', '.join(limits[name])}" if state == "allowed" and name in limits else ""
+        typer.echo(f"{state:<8} {name:<{width}}  {key}{maps}")

@@ -42,7 +42,7 @@ def status(
     """Ask a server how it is: its maps, its clients, and what is wrong.
 
     Exit status, for health checks: 0 = ready; 1 = nobody answers; 2 = wrong usage; 3 = it answers, but is not
-    ready, or a map is stalled (it takes --stall-after seconds to be sure of that).
+    ready, or a map takes or fuses nothing (it takes --stall-after seconds to be sure of that).
 
     With --watch, a terminal is redrawn until Ctrl-C. Elsewhere a block of lines (with --json: a line) is
     printed each time, until nobody answers (1) or the server was not ready for --stall-after seconds (3).

@@ -40,6 +40,8 @@ MAP_NAME_LENGTH = 32
 MAP_NAME = rf"[a-z0-9][a-z0-9_-]{{0,{MAP_NAME_LENGTH - 1}}}"
 # Becomes a folder's name, so it is no path: \A and \Z, because `$` would let a newline through.
 MapName = Annotated[str, Meta(pattern=rf"\A{MAP_NAME}\Z")]
+# Of a key in the allow-list: a map, or all whose names begin so
+MapPattern = Annotated[str, Meta(pattern=rf"\A({MAP_NAME}|({MAP_NAME})?\*)\Z")]
 # A voxel nearly as large as the sensor's range shows nothing: as many must fit into it.
 LEAST_VOXELS = 10
 MOST_SAMPLES = 1 << 22  # full-confidence ones that a voxel can count

@@ -58,6 +58,18 @@ def limit_memory(most: int) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (most if hard < 0 else min(most, hard), hard))
 
 
+def state(pid: int) -> str:
+    """State of a process as the system's letter; empty where it does not tell, or there is none.
+
+    R = runs, S = sleeps, D = waits for a disk and cannot even be killed, T and t = stopped.
+    """
+    with suppress(OSError, IndexError):
+        # Not at the first bracket: the name before the state may hold one.
+        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+        return stat.rpartition(")")[2].split()[0]
+    return ""
+
+
 def end_first() -> None:
     """Let the system end this process before others when the machine's memory runs out (Linux)."""
     with suppress(OSError):

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from tsfusion.core.logs import printable
 
 _STATUS_CHARACTERS = 200
+_START_EXTENSION_US = 120_000_000  # microseconds until the next report at a start
 
 log = logging.getLogger(__name__)
 
@@ -37,6 +38,11 @@ class Watchdog:
         self._socket.setblocking(False)
         self.interval = _interval(environment)
         self._next_pet = clock()
+
+    def starting(self, status: str) -> None:
+        """Report how far a start is that takes long; it may take longer than TimeoutStartSec, then."""
+        self._status = status
+        self._send(f"EXTEND_TIMEOUT_USEC={_START_EXTENSION_US}", _line(status))
 
     def ready(self, status: str = "") -> None:
         """Report that the start is over: keyframes are accepted."""

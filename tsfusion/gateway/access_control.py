@@ -12,6 +12,7 @@ import zmq
 from zmq.utils import z85
 
 from tsfusion.core.errors import InvalidConfig
+from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
 from tsfusion.wire.curve import DOMAIN, ServerKeys, server_keys
 from tsfusion.wire.key_folder import AllowList
 
@@ -52,7 +53,7 @@ class AccessControl:
         return Counter() if self._zap is None else self._zap.refused
 
     def step(self) -> bool:
-        """Answer new connections. True when a key was revoked: every connection has to be made anew."""
+        """Answer new connections. True when a key was revoked or has other maps: all have to connect anew."""
         if self._allowed is None or self._zap is None:
             return False
         self._revoked |= self._allowed.refresh()
@@ -67,6 +68,15 @@ class AccessControl:
         self._revoked |= self._allowed.refresh()  # the file may have changed since the last step
         key = sender_of(frame)
         return None if key is None else self._allowed.name_of(key)
+
+    @property
+    def limits_maps(self) -> bool:
+        """Whether there is a client that may not use every map."""
+        return self._allowed is not None and self._allowed.limits_maps
+
+    def maps_of(self, client: str) -> AllowedMaps:
+        """The maps that the client of a name may use: without keys every map."""
+        return ALL_MAPS if self._allowed is None else self._allowed.maps_of(client)
 
     def close(self) -> None:
         """Stop answering: nobody can connect any more."""

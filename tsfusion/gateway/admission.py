@@ -8,6 +8,7 @@ import zmq
 from tsfusion.gateway.access_control import AccessControl
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.sessions import Sessions
+from tsfusion.wire.allowed_maps import AllowedMaps
 
 
 class Admission:
@@ -24,6 +25,18 @@ class Admission:
         if client is None:
             self.refused["key"] += 1
         return client
+
+    def maps_of(self, client: str) -> AllowedMaps:
+        """The maps that a client may use."""
+        return self._access.maps_of(client)
+
+    def denial_of_map(self, client: str, map_name: str) -> str:
+        """Why a client may not use a map, which is counted; empty = it may."""
+        maps = self._access.maps_of(client)
+        if map_name in maps:
+            return ""
+        self.refused["forbidden"] += 1
+        return maps.denial(map_name)
 
     def owns(self, sessions: Sessions, key: bytes, client: str) -> bool:
         """Whether a client may go on with a session: no other client has journaled it, or is connected."""

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from msgspec import Struct, field
 
 from tsfusion.gateway.ports import Ports
+from tsfusion.gateway.problems import Problem
+from tsfusion.gateway.recent_fates import RecentFates
 from tsfusion.gateway.sessions import Session
 from tsfusion.wire.health import ClientHealth, ClientState
 from tsfusion.wire.messages import Ping, ToClient
@@ -40,6 +42,8 @@ class ClientRoute(Struct, eq=False):
     last_message: float = 0.0  # `time.monotonic()`, as the next
     held_until: float = 0.0  # until then its keyframes are turned away, for `hold_reason`
     hold_reason: str = ""
+    hold_message: str = ""
+    fates: RecentFates = field(default_factory=RecentFates)
 
     @property
     def place(self) -> tuple[str, bytes]:
@@ -62,6 +66,14 @@ class ClientRoute(Struct, eq=False):
         if self.left or silence >= ABANDONED_AFTER:
             return "gone"
         return "silent" if silence >= _SILENT_AFTER else "connected"
+
+    @property
+    def problem(self) -> Problem | None:
+        """Why next to none of its keyframes comes into the map; None = they do."""
+        hold = "" if self.hold_reason == "disk" else self.hold_message  # of the disk its map tells already
+        text = self.fates.problem(hold)
+        who = self.client or f"at {self.address or 'an unknown address'}"
+        return Problem(text, self.map, f"client {who}, session {self.session.hex()[:8]}") if text else None
 
     def health(self, now: float, session: Session | None) -> ClientHealth:
         """How the client is doing.

@@ -17,6 +17,7 @@ from tsfusion.core.config import LogFormat, LogLevel
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.wire import sockets
 
+_KILL_DEADLINE = 5.0  # seconds
 COMMAND = (sys.executable, "-m", "tsfusion.fuser")
 
 
@@ -57,6 +58,11 @@ class FuserProcess:
         return f"/dev/fd/{self._working.fileno()}"
 
     @property
+    def pid(self) -> int:
+        """The number of the process."""
+        return self._process.pid
+
+    @property
     def status(self) -> int | None:
         """The exit status; None = it runs."""
         return self._process.poll()
@@ -79,9 +85,10 @@ class FuserProcess:
         shutil.rmtree(self._scratch, ignore_errors=True)
 
     def kill(self) -> None:
-        """Kill the process, and wait until it has ended."""
+        """Kill the process, and wait until it has ended: for some seconds, for one that waits for a disk."""
         self._process.kill()
-        self._process.wait()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_KILL_DEADLINE)
 
     def close(self, timeout: float = 0.0) -> None:
         """End the process and clear up. It may end by itself within so many seconds; then it is killed."""

@@ -18,6 +18,7 @@ from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import MapError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.fuser_process import FuserProcess
+from tsfusion.gateway.fuser_silence import FuserSilence
 from tsfusion.wire import sockets
 
 log = logging.getLogger(__name__)
@@ -33,6 +34,7 @@ CRASH_WEIGHT = 3
 KILL_WEIGHT = 1
 _STEADY_AFTER = 60.0  # seconds of fusing, after which earlier deaths no longer count
 _BETWEEN_KEYFRAMES = 10  # times `fuser_timeout` for a mesh or a checkpoint, which may take longer
+STANDS_STILL_AFTER = 5.0  # seconds at one keyframe, stopped, or waiting for a disk, before that is a problem
 
 
 class FuserSupervisor:
@@ -72,6 +74,7 @@ class FuserSupervisor:
         self.ready = False  # it has opened the map and compiled the kernels
         self.held = ""
         self._restart_at = 0.0
+        self._silence = FuserSilence(self._process.pid)
         self._last_message = self._ready_since = time.monotonic()
         self._oom_kills = process.oom_kills()
         self.in_flight: deque[int] = deque()  # indices that it has not answered, oldest first
@@ -80,6 +83,35 @@ class FuserSupervisor:
     def socket(self) -> sockets.AnySocket:
         """The socket to poll before `receive`."""
         return self._process.socket
+
+    @property
+    def pid(self) -> int:
+        """The number of the process."""
+        return self._process.pid
+
+    @property
+    def problem(self) -> str:
+        """Why no keyframe is fused now, and what to do; empty = they are."""
+        if self.failed or self._restart_at:
+            return self.failed
+        if self.held:
+            return self.held
+        silence, timeout = self._silence, self._server.fuser_timeout
+        process_ = f"its fuser (process {self.pid})"
+        if silence.stopped >= min(STANDS_STILL_AFTER, timeout / 2):
+            return (
+                f"{process_} is stopped from outside, as by SIGSTOP or a debugger: let it go on (kill -CONT "
+                f"{self.pid}); another takes over after {timeout:g} s"
+            )
+        if silence.disk >= STANDS_STILL_AFTER:
+            return f"{process_} waits for a disk that does not answer: look at the disk of its map's folder"
+        if self._at_keyframe and silence.working >= STANDS_STILL_AFTER:
+            return f"{process_} is still at the same keyframe; another takes over after {timeout:g} s"
+        return ""
+
+    @property
+    def _at_keyframe(self) -> bool:
+        return self._process.current_keyframe != fuser_messages.NOT_WORKING
 
     @property
     def idle(self) -> bool:
@@ -106,7 +138,7 @@ class FuserSupervisor:
         if not self.send(order):
             return False
         if not self.in_flight:
-            self._last_message = time.monotonic()
+            self._silence.answered()
         self.in_flight.append(order.index)
         return True
 
@@ -123,6 +155,7 @@ class FuserSupervisor:
         except zmq.Again:
             return None
         self._last_message = time.monotonic()
+        self._silence.answered()
         message = fuser_messages.to_gateway.decode(head.buffer)
         if isinstance(message, fuser_messages.Failed) and self._was_ready:
             log.error("the fuser cannot open the map: %s", message.message)
@@ -152,16 +185,23 @@ class FuserSupervisor:
         if self._process.status is not None:
             return True
         busy = bool(self.in_flight) or self._finish_sent
+        self._silence.look(owes=busy and self.ready)
         timeout = self._server.fuser_timeout
-        if self._process.current_keyframe == fuser_messages.NOT_WORKING:
+        if (busy or not self.ready) and self._silence.stopped > timeout:
+            return self._replace(f"the fuser process has been stopped for {timeout:.0f} s", blame=0)
+        if not self._at_keyframe:
             timeout *= _BETWEEN_KEYFRAMES
-        if busy and self.ready and time.monotonic() - self._last_message > timeout:
-            subject = logs.about(map=self._map)
-            log.error("the fuser process has been silent for %.0f s: it is killed", timeout, extra=subject)
-            self._blame_current_keyframe(CRASH_WEIGHT)
-            self._process.kill()
-            return True
+        if self._silence.working > timeout:
+            return self._replace(f"the fuser process has been silent for {timeout:.0f} s", blame=CRASH_WEIGHT)
         return False
+
+    def _replace(self, why: str, *, blame: int) -> bool:
+        """Kill a process that stands still; whether it has ended (one that waits for a disk may not)."""
+        log.error("%s: it is killed", why, extra=logs.about(map=self._map))
+        self._blame_current_keyframe(blame)
+        self._silence.answered()
+        self._process.kill()
+        return self._process.status is not None
 
     def restart(self) -> None:
         """Start a new process in the place of a dead one, after a pause when that happens again and again.
@@ -195,7 +235,10 @@ class FuserSupervisor:
         pause = 0.0
         if not blamed and not killed:
             if self._early_deaths >= _MAX_EARLY_DEATHS:
-                self.failed = f"its fuser process ended {self._early_deaths} times, last with status {status}"
+                self.failed = (
+                    f"its fuser process ended {self._early_deaths} times, last with status {status}: the log "
+                    "says why; keyframes are journaled, and it is tried again every minute"
+                )
             pause = min(2.0**self._early_deaths - 1, _LONGEST_PAUSE)
             self._early_deaths += 1
         self.in_flight.clear()
@@ -222,7 +265,7 @@ class FuserSupervisor:
         """Ask for a checkpoint and the end of the process. Call it until `ended`: the queue may be full."""
         if not self._finish_sent:
             self._finish_sent = self.send(fuser_messages.Finish())
-            self._last_message = time.monotonic()
+            self._silence.answered()
         self.finishing = True
 
     @property

@@ -28,8 +28,10 @@ from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.memory_guard import MemoryGuard
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Ports, Subscriptions, receive_some
+from tsfusion.gateway.problems import Problem, ProblemTimes
 from tsfusion.wire import messages, sockets
-from tsfusion.wire.health import Health
+from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
+from tsfusion.wire.health import Health, MapHealth
 from tsfusion.wire.sockets import mesh_topic
 
 log = logging.getLogger(__name__)
@@ -37,6 +39,7 @@ log = logging.getLogger(__name__)
 _TICK_MS = 100  # within which a signal or a fuser's death is noticed
 _RENEW_TICK_MS = 10  # while the sockets are made anew
 _SNAPSHOT_INTERVAL = 1.0  # seconds
+_CLIENT_PROBLEMS = 10  # lines about single clients
 _MESHES_SHARE = 4  # one fourth of the memory is for meshes that wait to be read
 Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
@@ -66,6 +69,7 @@ class Gateway:
         self._publishing: dict[str, bool] = {}  # map → whether its fuser was told to send triangles
         self._memory = MemoryGuard(server.memory_bytes)
         self._activity = ActivityLog()
+        self._problems = ProblemTimes()
         self._accepting = self._stopped = False
         self._started = time.monotonic()
         self._next_snapshot = 0.0
@@ -108,7 +112,9 @@ class Gateway:
         """The handler of each socket's messages; none while the sockets are made anew."""
         if self.ports.problem:
             return {}
-        handlers: Handlers = {self.ports.control: self._on_control, self.ports.viewers: self._on_subscription}
+        handlers: Handlers = {self.ports.control: self._on_control}
+        if not self.ports.viewers.closed:
+            handlers[self.ports.viewers] = self._on_subscription
         if self._accepting:
             handlers[self.ports.keyframes] = self._intake.handle
         elif self._stopped:
@@ -121,7 +127,7 @@ class Gateway:
         ZeroMQ limits a frame and a queue of whole messages, not a message that never ends.
         """
         if self._access.step():
-            log.warning("a key was revoked: every connection is made anew")
+            log.warning("a key was revoked, or may use other maps: every connection is made anew")
             self._refused["revoked"] += 1
         else:
             held = self._memory.excess(self._queries.nbytes)
@@ -144,6 +150,7 @@ class Gateway:
             return
         self._next_snapshot = now + _SNAPSHOT_INTERVAL
         logs.log_left_out()
+        self._problems.note(self._find_problems())
         self._metrics.health = health = self.health()
         self._activity.note(health)
 
@@ -215,6 +222,8 @@ class Gateway:
         if hello.version != messages.PROTOCOL_VERSION:
             speaks = f"the server speaks version {messages.PROTOCOL_VERSION} of the wire format"
             return "version", f"{speaks}, this client {hello.version}"
+        if forbidden := self._admission.denial_of_map(client, hello.map):
+            return "map", forbidden
         hosted = self.maps.open_for_client(hello.map)
         if hosted is None:
             return "map", f"map {hello.map} cannot be opened: {self.maps.why_not(hello.map)}"
@@ -224,7 +233,7 @@ class Gateway:
             return "session", "the session of this spool is another client's: use another spool folder"
         if not hosted.sessions.room_for(hello.session):
             return "session", f"map {hello.map} has {len(hosted.sessions)} sessions and takes no new one"
-        if other := self.maps.denial_of_world(hosted, hello):
+        if other := self.maps.denial_of_world(hosted, hello, self._admission.maps_of(client)):
             self._refused["world"] += 1
             log.warning("%s", other.message, extra=logs.about(session=hello.session, client=client))
             return other.reason, other.message, other.free_map
@@ -243,45 +252,86 @@ class Gateway:
         self.ports.reply(identity, pong)
 
     def _on_command(self, identity: bytes, command: messages.Command, client: str) -> None:
+        maps = self._admission.maps_of(client)
         if command.name == "ping":
             self.ports.reply(identity, messages.Reply(name="ping"))
         elif command.name == "health":
-            self.ports.reply(identity, messages.Reply(name="health", health=self.health()))
+            self.ports.reply(identity, messages.Reply(name="health", health=self.health(maps)))
         elif command.name == "new_map":
-            name = self.maps.keep_free_name(command.map)
-            error = None if name else f"no room for another map: {self.maps.why_full}"
+            name = self.maps.keep_free_name(command.map, maps)
+            error = None if name else self.maps.why_none_free(command.map, maps)
             self.ports.reply(identity, messages.Reply(name="new_map", map=name, error=error))
+        elif forbidden := self._admission.denial_of_map(client, command.map):
+            self.ports.reply(identity, messages.Reply(name=command.name, error=forbidden))
         else:
             self._queries.submit(identity, command, self.maps.get(command.map), client)
 
     def _on_subscription(self, frames: list[zmq.Frame]) -> None:
+        """Let a viewer have the updates that it asks for, before the next message is read.
+
+        Until then ZeroMQ knows whose message it was.
+        """
         change, topic = frames[0].bytes[:1], frames[0].bytes[1:]
-        if change == b"\x01" and self._admission.client_of(frames[0]) is None:
-            return
-        if change == b"\x00":
-            self._subscriptions.discard(topic)
-        elif change != b"\x01" or not self._subscriptions.add(topic, (hosted.name for hosted in self.maps)):
+        if len(frames) > 1 or change not in (b"\x00", b"\x01"):
             self._refused["subscription"] += 1
+            if self.ports.pass_over_rubbish():
+                log.warning("a viewer sends what is no subscription: all viewers connect anew")
+                self._subscriptions.clear()
+            return
+        client = self._access.client_of(
+            frames[0]
+        )  # None also of a subscription that ends with its connection
+        allowed = [] if client is None else self._admission.maps_of(client).topics(topic)
+        if change == b"\x00":
+            self._subscriptions.discard(topic, granted=None if client is None else bool(allowed))
+            self.ports.revoke_topics(allowed)
+        elif client is None:
+            self._refused["key"] += 1
+        elif not self._subscriptions.add(topic, (one.name for one in self.maps), granted=bool(allowed)):
+            self._refused["subscription" if allowed else "forbidden"] += 1
+        else:
+            self.ports.grant_topics(allowed)
 
     # --- health ---
 
-    def health(self) -> Health:
-        """How the server is doing."""
+    def health(self, shown: AllowedMaps = ALL_MAPS) -> Health:
+        """How the server is doing.
+
+        Args:
+            shown: only these maps, their clients, and their problems; `ready` is the whole server's.
+        """
         now = time.monotonic()
-        found, problems = self.maps.health()
-        if self._access.problem:
-            problems.insert(0, f"nobody may connect: {self._access.problem}")
-        if self.ports.problem:
-            problems.insert(0, self.ports.problem)
-        blocked = self.ports.problem or self._access.problem or any(one.problem for one in found.values())
+        maps = self.maps.health()
+        blocked = self.ports.problem or self._access.problem or all_blocked(maps)
         return Health(
             ready=self._accepting and not blocked,
-            problems=tuple(problems),
+            problems=self._problems.lines(self._find_problems(shown)),
             epoch=self.epoch,
             uptime_s=now - self._started,
             rss_bytes=process.rss_bytes(),
             refused=dict(self._refused + self._access.refused),
             duplicates=self._intake.duplicates,
-            maps=found,
-            clients=tuple(route.health(now, self.maps.session(*route.place)) for route in self._routes),
+            maps={name: one for name, one in maps.items() if name in shown},
+            clients=tuple(
+                route.health(now, self.maps.session(*route.place))
+                for route in self._routes
+                if route.map in shown
+            ),
         )
+
+    def _find_problems(self, shown: AllowedMaps = ALL_MAPS) -> list[Problem]:
+        """What a person has to know of now: of the whole server first, then of its maps, then of clients."""
+        found = [Problem(self.ports.problem, is_logged=True)] if self.ports.problem else []
+        if self._access.problem:
+            found.append(Problem(f"nobody may connect: {self._access.problem}", is_logged=True))
+        found += (one for one in self.maps.problems() if one.map in shown)
+        of_clients = [one for route in self._routes if route.map in shown and (one := route.problem)]
+        if len(of_clients) > _CLIENT_PROBLEMS:
+            rest = len(of_clients) - _CLIENT_PROBLEMS
+            of_clients[_CLIENT_PROBLEMS:] = [Problem(f"{rest} more clients have problems of this kind")]
+        return found + of_clients
+
+
+def all_blocked(maps: dict[str, MapHealth]) -> bool:
+    """Whether no map takes and fuses keyframes: one that does is a reason to go on sending to this server."""
+    return bool(maps) and all(one.problem for one in maps.values())

@@ -22,7 +22,7 @@ from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.sessions import Sessions
-from tsfusion.journal import Journal, state_folder
+from tsfusion.journal import Journal, ReadingWatcher, state_folder
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import keyframe_times
 from tsfusion.wire.health import MapHealth, MapState
@@ -33,11 +33,16 @@ log = logging.getLogger(__name__)
 _SEGMENTS_KEPT = 4  # a journal with a limit is deleted in quarters of that limit
 _FOR_GONE = "what no checkpoint holds of them is lost, unless they are put back"
 _SAVE_PAUSE = 10.0  # seconds until a checkpoint is tried again that could not be written
+_STALLED_AFTER = 10.0  # seconds in which keyframes wait and none is fused
 ForPeople = tuple[fuser_messages.Meshed | fuser_messages.FuserReply, Sequence[zmq.Frame]]
 
 
 class HostedMap:
-    """An open map. Call `step` again and again, and `accept` for each keyframe."""
+    """An open map. Call `step` again and again, and `accept` for each keyframe.
+
+    Args:
+        watch: told how far the journal is read: that may take minutes, in which nothing else is done.
+    """
 
     def __init__(
         self,
@@ -48,6 +53,7 @@ class HostedMap:
         *,
         routes: ClientRoutes,
         metrics: Metrics,
+        watch: ReadingWatcher = lambda _done, _all, _records: None,
     ) -> None:
         self.name = name
         self.folder = state_folder.map_folder(server.state, name)
@@ -55,12 +61,13 @@ class HostedMap:
         self.warm = False  # the fuser has been ready once: from then on it is known what the map has
         self._metrics = metrics
         self._last_keyframe: float | None = None  # time.monotonic()
+        self._moved = 0.0  # time.monotonic(): the fuser answered, or had nothing to answer
         self._loss = ""
         self._checkpoints = 0  # written since the map was opened
         self._unsaved = ""  # why no checkpoint can be written; empty = it can
         self._save_at = 0.0  # time.monotonic()
         self._missing = 0  # segments of the journal that were missing when a checkpoint was asked for
-        self._journal = _open_journal(self.folder, server)
+        self._journal = _open_journal(self.folder, server, watch)
         self.disk = DiskPause(self._journal, name)
         self._quarantine = Quarantine(self.folder / state_folder.QUARANTINE_FOLDER, server.quarantine_bytes)
         self._index = KeyframeIndex()
@@ -130,6 +137,8 @@ class HostedMap:
             durable_ns=durable_ns,
             is_correction=is_correction,
         )
+        if self.drained:
+            self._moved = time.monotonic()
         self._backlog.add(session, is_correction=is_correction)
         if is_correction:
             self._corrections += 1
@@ -155,6 +164,7 @@ class HostedMap:
         while (received := self.fuser.receive()) is not None:
             message, frames = received
             if isinstance(message, fuser_messages.Done):
+                self._moved = time.monotonic()
                 self._backlog.on_done(message.index)
                 self.outcomes.on_done(message)
             elif isinstance(message, fuser_messages.Ready):
@@ -208,6 +218,7 @@ class HostedMap:
         self._retention.on_ready()
         if not self.warm:
             self.warm = True
+            self._moved = time.monotonic()
             log.info("%s", self._contents(ready), extra=logs.about(map=self.name))
         self._check_checkpoint(ready)
 
@@ -253,8 +264,18 @@ class HostedMap:
         return "idle" if self.drained else "busy"
 
     @property
+    def problem(self) -> str:
+        """Why keyframes are not accepted or not fused, and what to do; empty = they are."""
+        if problem := self.disk.problem or self.fuser.problem:
+            return problem
+        stalled = self.warm and not self._backlog.is_empty and time.monotonic() - self._moved > _STALLED_AFTER
+        if stalled and self.fuser.ready:
+            return "keyframes wait and none is fused: its fuser makes a mesh or a checkpoint, or it hangs"
+        return "keyframes wait, and its fuser is still starting again: read the log" if stalled else ""
+
+    @property
     def notices(self) -> list[str]:
-        """Losses that a person should know of, though keyframes are taken and fused."""
+        """What a person should know of, though keyframes are taken and will be fused."""
         damaged, put_back = self._journal.damaged, self._journal.put_back
         notices = [f"{damaged} keyframes of its journal are damaged and lost"] if damaged else []
         if absent := self._journal.absent:
@@ -269,6 +290,8 @@ class HostedMap:
             )
         if self._unsaved:
             notices.append(f"no checkpoint can be written: {self._unsaved}")
+        if self.state == "restarting" and not self.problem:
+            notices.append("its fuser ended, and another one takes over: the log says why")
         return [*notices, *filter(None, (self._quarantine.problem, self._loss))]
 
     def health(self) -> MapHealth:
@@ -276,7 +299,7 @@ class HostedMap:
         now, outcomes = time.monotonic(), self.outcomes
         return MapHealth(
             state=self.state,
-            problem=self.disk.problem or self.fuser.failed or self.fuser.held,
+            problem=self.problem,
             keyframes_durable=outcomes.fused + outcomes.rejected.total() + self._backlog.keyframes,
             keyframes_fused=outcomes.fused,
             waiting=self._backlog.keyframes,
@@ -298,12 +321,17 @@ class HostedMap:
         )
 
 
-def _open_journal(folder: Path, server: ServerConfig) -> Journal:
+def _open_journal(folder: Path, server: ServerConfig, watch: ReadingWatcher) -> Journal:
     """The map's journal, in segments small enough to keep it to its limit."""
     segment_bytes = server.segment_bytes
     if server.journal_bytes is not None:
         segment_bytes = min(segment_bytes, server.journal_bytes // _SEGMENTS_KEPT)
-    return Journal(folder / state_folder.JOURNAL_FOLDER, segment_bytes, min_free_bytes=server.min_free_bytes)
+    return Journal(
+        folder / state_folder.JOURNAL_FOLDER,
+        segment_bytes,
+        min_free_bytes=server.min_free_bytes,
+        watch=watch,
+    )
 
 
 def _warn_of_old_corrections(folder: Path) -> None:

@@ -57,7 +57,10 @@ class KeyframeIntake:
             self._refuse(error, client)
             return
         hosted = self._maps.get(header.map)
-        if hosted is None or not hosted.warm:  # its client will say hello, and send it again
+        if forbidden := self._admission.denial_of_map(client, header.map):
+            subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
+            log.warning("a %s is refused: %s", header.kind, forbidden, extra=subject)
+        elif hosted is None or not hosted.warm:  # its client will say hello, and send it again
             self._refused["map"] += 1
         elif not hosted.sessions.room_for(header.session):  # its client is told when it says hello
             self._refused["session"] += 1
@@ -65,7 +68,7 @@ class KeyframeIntake:
             self._refused["session"] += 1
             subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
             log.warning("a %s is refused: its session is another client's", header.kind, extra=subject)
-        elif denied := self._maps.denial_of_world(hosted, header):
+        elif denied := self._maps.denial_of_world(hosted, header, self._admission.maps_of(client)):
             self._refused["world"] += 1
             subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
             log.warning("a %s is refused: %s", header.kind, denied.message, extra=subject)
@@ -100,7 +103,9 @@ class KeyframeIntake:
         seconds = min(max(seconds, _SHORTEST_HOLD), _LONGEST_HOLD)
         route = self._routes.get(key)
         if route is not None:
-            route.hold_reason, route.held_until = reason, time.monotonic() + seconds
+            route.hold_reason, route.hold_message = reason, message
+            route.held_until = time.monotonic() + seconds
+            route.fates.held()
         self._routes.send(key, messages.Hold(key, seconds, reason, message))
 
     def _on_checked(
@@ -119,6 +124,8 @@ class KeyframeIntake:
             self._quotas.check(header, buffers)
             self._routes.mark_alive(header.session, client, scans=True)
             hosted.accept(header, buffers, client, received_ns)
+            if (route := self._routes.get(header.session)) is not None:
+                route.fates.taken()
         except Refused as error:
             self._refuse(error, client, header)
         except JournalError:
@@ -138,4 +145,5 @@ class KeyframeIntake:
         log.warning("a %s is refused: %s", header.kind, error, extra=subject)
         if (route := self._routes.get(key)) is not None:
             route.refused += 1
+            route.fates.turned_away(str(error))
         self._routes.send(key, messages.Nack(key, seq, "door", error.reason, str(error)))

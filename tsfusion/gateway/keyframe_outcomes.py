@@ -107,6 +107,8 @@ class KeyframeOutcomes:
 
     def _on_fused(self, session: Session, entry: IndexEntry) -> None:
         route, stamps = self._routes.get(session.key), entry.stamps
+        if route is not None and not entry.is_correction:
+            route.fates.fused()
         if stamps.durable_ns and not entry.is_correction:  # 0: journaled by an earlier server
             waited, fused = stamps.fuse_start_ns - stamps.durable_ns, stamps.fused_ns - stamps.fuse_start_ns
             self._metrics.observe(self._name, "queue", waited / 1e9)
@@ -129,6 +131,8 @@ class KeyframeOutcomes:
                 map=self._name, session=session.key, seq=seq, client=session.client, reason=done.reason
             ),
         )
+        if (route := self._routes.get(session.key)) is not None:
+            route.fates.turned_away(done.message or done.reason)
         self._routes.send(session.key, messages.Nack(session.key, seq, "map", done.reason, done.message))
         if is_empty:  # nothing is wrong with the record
             self._without_samples.add(session.key)

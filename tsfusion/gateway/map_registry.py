@@ -4,9 +4,9 @@
 import logging
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from itertools import count
+from functools import partial
 from typing import Any
 
 import zmq
@@ -17,16 +17,21 @@ from tsfusion.core.errors import TsfusionError
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.metrics import Metrics
+from tsfusion.gateway.problems import Problem
 from tsfusion.gateway.sessions import Session
 from tsfusion.journal import state_folder
+from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
 from tsfusion.wire.health import MapHealth
 from tsfusion.wire.messages import Denied, Hello
 from tsfusion.wire.record_header import RecordHeader
 
 log = logging.getLogger(__name__)
 
+# A map whose journal is read: bytes that were read, bytes of all, and records so far
+MapWatcher = Callable[[str, int, int, int], None]
 _MAX_UNOPENED = 64
 _RETRY_INTERVAL = 10.0  # seconds before a map that could not be opened is tried again
+_UNOPENED_KEPT = 600.0  # seconds after which nobody misses a map that could not be opened
 _KEPT_NAMES = 64  # free names that were given out
 _KEPT_SECONDS = 300.0  # until then nobody else is given them: a map takes a while to be opened
 
@@ -42,6 +47,7 @@ class MapRegistry:
         self._routes = routes
         self._metrics = metrics
         self._volumes: Mapping[str, VolumeConfig] = {}
+        self._watch: MapWatcher = lambda *_progress: None
         self._open: dict[str, HostedMap] = {}
         self._unopened: dict[str, tuple[str, float]] = {}  # name → why, when
         self._kept: dict[str, float] = {}  # free name that was given out → when
@@ -64,13 +70,19 @@ class MapRegistry:
         hosted = self.get(name)
         return hosted.sessions.get(key) if hosted else None
 
-    def open_at_start(self, volumes: Mapping[str, VolumeConfig]) -> None:
+    def open_at_start(
+        self, volumes: Mapping[str, VolumeConfig], watch: MapWatcher = lambda *_progress: None
+    ) -> None:
         """Open maps by name with their settings; those that clients ask for get those of the default map.
+
+        Args:
+            watch: told how far the journal of a map is read, also of a map that is opened later. What it
+                raises ends the start.
 
         Raises:
             TsfusionError: when a journal cannot be opened.
         """
-        self._volumes = volumes
+        self._volumes, self._watch = volumes, watch
         for name in volumes:
             self._open_map(name)
 
@@ -106,8 +118,18 @@ class MapRegistry:
             f"larger max_maps than {most} (--config)"
         )
 
-    def denial_of_world(self, hosted: HostedMap, record: Hello | RecordHeader) -> Denied | None:
+    def why_none_free(self, like: str, maps: AllowedMaps) -> str:
+        """Why `keep_free_name` has no name for a client."""
+        if self.free_name(like, maps) is None:
+            return f"no name is free of the maps that this key may use: {maps}"
+        return f"no room for another map: {self.why_full}"
+
+    def denial_of_world(
+        self, hosted: HostedMap, record: Hello | RecordHeader, maps: AllowedMaps = ALL_MAPS
+    ) -> Denied | None:
         """The answer to a session that does not share a map's coordinate frame; None = it may go on.
+
+        `maps`: that its client may use, of which a free one is named.
 
         Every record is asked this, not its session's greeting alone: of two that greet a map nobody has yet,
         the one whose record comes first has it.
@@ -116,10 +138,16 @@ class MapRegistry:
             return None
         keyframes = hosted.health().keyframes_durable
         why = f"map {hosted.name} has {keyframes} keyframes of another session, in another coordinate frame"
-        return Denied(record.session, "world", why, self.free_name(hosted.name))
+        return Denied(record.session, "world", why, self.free_name(hosted.name, maps) or "")
 
-    def free_name(self, like: str) -> str:
-        """The first of NAME, NAME-2, NAME-3, … that is no map's yet and was given to nobody just now."""
+    def free_name(self, like: str, maps: AllowedMaps = ALL_MAPS) -> str | None:
+        """The first of NAME, NAME-2, NAME-3, … that is no map's yet and was given to nobody just now.
+
+        Where a client may not use that name: the first such name that is like one that it may use.
+
+        Args:
+            maps: that the client may use; None of their names may be free.
+        """
         now = time.monotonic()
         in_use = {one.name for one in self if len(one.sessions)} | {route.map for route in self._routes}
         on_disk: set[str] = set()
@@ -129,13 +157,17 @@ class MapRegistry:
         kept = {name for name, since in self._kept.items() if now - since < _KEPT_SECONDS}
         taken = in_use | on_disk | kept | set(self._unopened)
         stem = re.sub(r"-[0-9]+$", "", like)
-        stem = stem if stem in taken else like
-        names = (stem if number == 1 else _numbered(stem, number) for number in count(1))
-        return next(name for name in names if name not in taken)
+        stems = [stem if stem in taken else like]
+        stems += [one.rstrip("*").rstrip("-_") for one in maps.patterns or ()]
+        # Of so many names one is not taken.
+        numbered = (_numbered(one, number) for one in stems if one for number in range(1, len(taken) + 3))
+        return next((name for name in numbered if name not in taken and name in maps), None)
 
-    def keep_free_name(self, like: str) -> str | None:
-        """A free name that nobody else is given; None = there is no room for another map."""
-        name = self.free_name(like)
+    def keep_free_name(self, like: str, maps: AllowedMaps = ALL_MAPS) -> str | None:
+        """A free name that nobody else is given; None = there is none, or no room for another map."""
+        name = self.free_name(like, maps)
+        if name is None:
+            return None
         if name not in self._open and len(self._open) >= self._server.max_maps:
             return None
         self._kept[name] = time.monotonic()
@@ -146,7 +178,13 @@ class MapRegistry:
     def _open_map(self, name: str) -> HostedMap:
         volume = self._volumes.get(name) or self._volumes[DEFAULT_MAP]
         hosted = self._open[name] = HostedMap(
-            self._context, name, self._server, volume, routes=self._routes, metrics=self._metrics
+            self._context,
+            name,
+            self._server,
+            volume,
+            routes=self._routes,
+            metrics=self._metrics,
+            watch=partial(self._watch, name),
         )
         self._unopened.pop(name, None)
         return hosted
@@ -210,15 +248,25 @@ class MapRegistry:
         for hosted in self:
             hosted.close()
 
-    def health(self) -> tuple[dict[str, MapHealth], list[str]]:
-        """How each map is doing, by name, and the problems of all."""
-        found = {hosted.name: hosted.health() for hosted in self}
-        problems = [f"map {name}: {one.problem}" for name, one in found.items() if one.problem]
-        problems += [f"map {hosted.name}: {notice}" for hosted in self for notice in hosted.notices]
-        problems += [f"map {name} cannot be opened: {why}" for name, (why, _) in self._unopened.items()]
-        return found, problems
+    def health(self) -> dict[str, MapHealth]:
+        """How each map is doing, by name."""
+        return {hosted.name: hosted.health() for hosted in self}
+
+    def problems(self) -> list[Problem]:
+        """What is wrong with the maps: what keeps them from taking or fusing keyframes comes first."""
+        problems = [
+            Problem(problem, hosted.name, is_logged=bool(hosted.disk.problem))
+            for hosted in self
+            if (problem := hosted.problem)
+        ]
+        problems += [Problem(notice, hosted.name) for hosted in self for notice in hosted.notices]
+        before = time.monotonic() - _UNOPENED_KEPT
+        self._unopened = {name: one for name, one in self._unopened.items() if one[1] > before}
+        problems += [Problem(f"cannot be opened: {why}", name) for name, (why, _) in self._unopened.items()]
+        return problems
 
 
 def _numbered(stem: str, number: int) -> str:
-    suffix = f"-{number}"
+    """NAME, NAME-2, NAME-3, …"""
+    suffix = f"-{number}" if number > 1 else ""
     return stem[: MAP_NAME_LENGTH - len(suffix)] + suffix

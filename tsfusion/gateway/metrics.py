@@ -24,6 +24,7 @@ from tsfusion.wire.keyframe_times import STAGES as LEDGER_STAGES
 STAGES = (*LEDGER_STAGES, "total")
 BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)  # seconds
 FRESH = 10.0  # seconds; a gateway renews its snapshot every second
+FRESH_START = 60.0  # seconds; while it reads a journal a slow disk may keep it from reporting for a while
 _TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
 _MAX_MAPS = 256  # with a label of their own; the others share `metrics_families.OTHERS`
 
@@ -42,6 +43,7 @@ class Metrics(Collector):
         self._server = server
         self._clock = clock
         self._seen: tuple[Health, float] | None = None
+        self._starting = ("the gateway is starting", clock())  # what it does instead of its rounds, and when
         self._maps: set[str] = set()
         self._page: MetricsPage | None = None
         self._registry = CollectorRegistry()
@@ -72,6 +74,10 @@ class Metrics(Collector):
     def health(self, snapshot: Health) -> None:
         self._seen = (snapshot, self._clock())
 
+    def report_start(self, progress: str) -> None:
+        """Note that the gateway is alive, though it does something long instead of its rounds."""
+        self._starting = (progress, self._clock())
+
     def serve(self, address: str) -> str:
         """Answer HTTP at HOST:PORT (port 0 = a random one) until `close`; the real address.
 
@@ -96,25 +102,31 @@ class Metrics(Collector):
         return HttpResponse(200, generate_latest(self._registry), _TEXT_FORMAT)
 
     def _alive(self) -> HttpResponse:
-        _, silence = self._fresh()
-        return HttpResponse(503, silence) if silence else HttpResponse(200, "alive")
+        _, progress, silence = self._look()
+        if silence:
+            return HttpResponse(503, silence)
+        return HttpResponse(200, f"alive: {progress}" if progress else "alive")
 
     def _ready(self) -> HttpResponse:
-        health, silence = self._fresh()
+        health, progress, silence = self._look()
         if health is None:
-            return HttpResponse(503, silence)
-        problems = "\n".join(map(printable, health.problems))
-        return HttpResponse(200, "ready") if health.ready else HttpResponse(503, problems or "not ready")
+            return HttpResponse(503, progress or silence)
+        if health.ready:
+            return HttpResponse(200, "ready")
+        opening = [name for name, one in health.maps.items() if one.state == "opening"]
+        lines = [*health.problems, *(f"map {name} is being opened" for name in opening)]
+        return HttpResponse(503, "\n".join(map(printable, lines)) or "not ready")
 
-    def _fresh(self) -> tuple[Health | None, str]:
-        """The snapshot, or why there is none."""
-        if self._seen is None:
-            return None, "the gateway is starting"
-        health, then = self._seen
-        age = self._clock() - then
-        if age > FRESH:
-            return None, f"the gateway has done nothing for {age:.0f} s"
-        return health, ""
+    def _look(self) -> tuple[Health | None, str, str]:
+        """The snapshot; or what the gateway does at its start; or for how long it has done nothing."""
+        now, (progress, told) = self._clock(), self._starting
+        if self._seen is None or self._seen[1] < told:
+            age, most = now - told, FRESH_START
+        else:
+            age, most, progress = now - self._seen[1], FRESH, ""
+        if age > most:
+            return None, "", f"the gateway has done nothing for {age:.0f} s"
+        return (None if progress else self._seen and self._seen[0]), progress, ""
 
     # --- figures ---
 

@@ -20,12 +20,13 @@ from tsfusion.journal.segments import (
     segment_path,
     segments,
 )
-from tsfusion.journal.writer import Journal, write_file
+from tsfusion.journal.writer import Journal, ReadingWatcher, write_file
 
 __all__ = [
     "Damage",
     "Journal",
     "Position",
+    "ReadingWatcher",
     "Record",
     "RecordEntry",
     "describe",

@@ -123,7 +123,7 @@ class OpenSegment:
             if self._descriptor < 0:
                 raise JournalError(f"{self.path} is closed", errno.EBADF)
             descriptor = os.dup(self._descriptor)
-        with SegmentFile(self.path, descriptor) as source:
+        with SegmentFile(self.path, descriptor=descriptor) as source:
             return record_at(source, number, offset)
 
     # --- its end ---

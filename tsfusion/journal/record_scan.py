@@ -8,7 +8,7 @@ so that damage costs the records it hit and no other.
 import errno
 import os
 import re
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 from msgspec import Struct
@@ -37,14 +37,17 @@ class Damage(Struct, frozen=True):
     torn: bool = False  # the end of the last write, cut off before it was acknowledged: no keyframe is lost
 
 
-def scan_records(path: Path) -> Iterator[Record | Damage]:
+def scan_records(path: Path, on_read: Callable[[], None] = lambda: None) -> Iterator[Record | Damage]:
     """The records and damaged places of a segment file in their order; one record at a time is read.
+
+    Args:
+        on_read: called before each read.
 
     Raises:
         JournalError: when the file cannot be opened or read.
     """
     try:
-        with SegmentFile(path) as source:
+        with SegmentFile(path, on_read) as source:
             yield from _Scan(source, segment_number(path)).steps()
     except OSError as error:
         raise journal_error("read", path, error) from error

@@ -6,6 +6,7 @@ import logging
 import os
 import struct
 import zlib
+from collections.abc import Callable
 from io import FileIO
 from pathlib import Path
 from types import TracebackType
@@ -25,14 +26,18 @@ class SegmentFile:
     """A segment file at its present length: bytes that a writer adds later are not seen.
 
     Args:
+        on_read: called before each read: a large file takes long.
         descriptor: of the file where it is open already; it is closed with this. None = open the path.
 
     Raises:
         OSError: as `open` does.
     """
 
-    def __init__(self, path: Path, descriptor: int | None = None) -> None:
+    def __init__(
+        self, path: Path, on_read: Callable[[], None] = lambda: None, *, descriptor: int | None = None
+    ) -> None:
         self.path = path
+        self._on_read = on_read
         self._file = path.open("rb", buffering=0) if descriptor is None else FileIO(descriptor, "rb")
         self.size = os.fstat(self._file.fileno()).st_size
         self.failed = False  # the disk could not read some part that was asked for
@@ -49,6 +54,7 @@ class SegmentFile:
 
         A part that the disk cannot read is zeros: the CRC of its record fails, and no other.
         """
+        self._on_read()
         count = min(count, (self.size if end is None else end) - at)
         if count <= 0:
             return b""

@@ -5,7 +5,7 @@ import errno
 import logging
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from msgspec import Struct
@@ -103,16 +103,27 @@ def record_at(source: SegmentFile, number: int, offset: int) -> Record:
     return record
 
 
-def list_records(path: Path) -> tuple[list[RecordEntry], int]:
+def list_records(
+    path: Path, watch: Callable[[int, int], None] = lambda _at, _records: None
+) -> tuple[list[RecordEntry], int]:
     """Every whole record of a segment in order, and how many keyframes are lost to damage between them.
 
     A torn tail was never acknowledged and does not count as damage. Each damaged place is logged.
 
+    Args:
+        watch: called at each read with the byte that the list has come to, and its records so far.
+
     Raises:
         JournalError: when the file cannot be opened or read.
     """
-    found, lost = [], 0
-    for step in scan_records(path):
+    found: list[RecordEntry] = []
+    at = lost = 0
+
+    def note() -> None:
+        watch(at, len(found))
+
+    for step in scan_records(path, note):
+        at = step.position.offset
         if isinstance(step, Damage):
             lost += step.lost
             level = logging.ERROR if step.lost else logging.WARNING

@@ -7,7 +7,7 @@ import logging
 import os
 import secrets
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,8 @@ log = logging.getLogger(__name__)
 
 _PARTS = r"\.[0-9]{6,9}\.mcap\.partial"  # files that a killed writer leaves
 _KEPT_OPEN = 64  # segments
+# Bytes of the journal that were read, bytes of all, and records so far
+ReadingWatcher = Callable[[int, int, int], None]
 
 
 class Journal:
@@ -36,6 +38,7 @@ class Journal:
         min_free_bytes: what `append` leaves free on the disk.
         keep_open: keep the files of closed segments open, so that `read_kept` finds their records although
             somebody has deleted the folder.
+        watch: called again and again while the segments of earlier runs are read; what it raises ends that.
 
     Attributes:
         found: records in the segments of earlier runs, in journal order; the caller may empty the list.
@@ -57,6 +60,7 @@ class Journal:
         sync: bool = True,
         min_free_bytes: int = 0,
         keep_open: bool = False,
+        watch: ReadingWatcher = lambda _done, _all, _records: None,
     ) -> None:
         self.folder = Path(folder)
         self._segment_bytes = segment_bytes
@@ -75,15 +79,21 @@ class Journal:
             self._home = os.stat(self.folder)
         except OSError as error:
             raise journal_error("create the journal", self.folder, error) from error
-        self._recover()
+        self._recover(watch)
 
-    def _recover(self) -> None:
+    def _recover(self, watch: ReadingWatcher) -> None:
         numbers = segments(self.folder)
+        total = sum(durable_files.size_of(segment_path(self.folder, number)) for number in numbers)
+        done = 0
+
+        def note(at: int, records: int) -> None:
+            watch(done + at, total, len(self.found) + records)
+
         for number in numbers:
             path = segment_path(self.folder, number)
             self._closed[number] = 0
             try:
-                found, damaged = list_records(path)
+                found, damaged = list_records(path, note)
                 self._closed[number] = path.stat().st_size
             except OSError as error:
                 raise _advise(journal_error("read", path, error)) from error
@@ -91,6 +101,7 @@ class Journal:
                 raise _advise(error) from error
             self.found += found
             self.damaged += damaged
+            done += self._closed[number]
         self._number = numbers[-1] + 1 if numbers else 1
         self.absent = self._number - self.first - len(numbers)
 

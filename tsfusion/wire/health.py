@@ -77,7 +77,13 @@ class ClientHealth(Struct, frozen=True, kw_only=True):
 class Health(Struct, frozen=True, kw_only=True):
     """Health of a server, answered at once whatever its fusers do. Counts begin with its start.
 
-    `ready`: keyframes are accepted, journaled and fused. `problems`: why not, or what a person must do.
+    `ready`: keyframes are accepted, journaled and fused, into one map at least: a server with three good maps
+    and a bad one is ready, for whoever sends to the good ones. Not ready is a server that starts or ends,
+    that nobody can connect to, or of which every map has a `MapHealth.problem`.
+
+    `problems`: why it is not ready, and all else that a person has to know of and may put right: a map that
+    takes or fuses nothing, whose fuser starts again, or that cannot be opened; a client of which next to no
+    keyframe comes into the map. One line each, with how long it has been so; it is gone when it is over.
     """
 
     ready: bool

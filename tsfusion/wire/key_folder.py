@@ -4,7 +4,10 @@
 | file | holds |
 |---|---|
 | `NAME.key_secret`, `NAME.key` | a pair, and its public half to give away; `server` is the server's own |
-| `allowed.toml` | the server's allow-list: names and public keys, and the keys that were revoked |
+| `allowed.toml` | the server's allow-list: names, public keys, the maps they may use; and revoked keys |
+
+In `[allowed]` stands `"NAME" = "KEY"` for a client that may use every map, and `"NAME" = { key = "KEY",
+maps = ["house", "yard-*"] }` for one that may use these: a map's name, or with a `*` all that begin so.
 
 The folder is its owner's alone (0700), every file 0600 from its first byte, and replaced whole.
 """
@@ -15,6 +18,7 @@ import os
 import re
 import stat
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -23,9 +27,10 @@ import zmq
 from msgspec import Meta, Struct
 
 from tsfusion.core import durable_files, folder_lock
-from tsfusion.core.config import ClientName
+from tsfusion.core.config import ClientName, MapPattern
 from tsfusion.core.errors import InvalidConfig, OutputError
 from tsfusion.wire import curve
+from tsfusion.wire.allowed_maps import AllowedMaps
 
 log = logging.getLogger(__name__)
 
@@ -39,11 +44,29 @@ _PAIR_HEAD = "#   ZeroMQ CURVE {}: written by `tsfusion keys new`.\n"
 Folder = str | os.PathLike[str]
 
 
-class Allowed(Struct, frozen=True, forbid_unknown_fields=True):
+class Allowed(Struct, frozen=True):
     """The allow-list of a server. No key is in it twice."""
 
-    allowed: dict[ClientName, Annotated[str, Meta(max_length=64)]] = {}  # name → public key
-    revoked: dict[str, ClientName] = {}  # public key → the name it had
+    allowed: dict[str, str] = {}  # name → public key
+    revoked: dict[str, str] = {}  # public key → the name it had
+    maps: dict[str, tuple[str, ...]] = {}  # name → the maps it may use; a name without may use every map
+
+
+_Key = Annotated[str, Meta(max_length=64)]
+
+
+class _Entry(Struct, frozen=True, forbid_unknown_fields=True):
+    """A client in the file that may not use every map."""
+
+    key: _Key
+    maps: Annotated[tuple[MapPattern, ...], Meta(max_length=256)]
+
+
+class _ListFile(Struct, frozen=True, forbid_unknown_fields=True):
+    """The allow-list as it stands in its file."""
+
+    allowed: dict[ClientName, _Key | _Entry] = {}
+    revoked: dict[str, ClientName] = {}
 
 
 class Pair(Struct, frozen=True):
@@ -81,34 +104,45 @@ def create_pair(folder: Folder, name: str, *, force: bool = False) -> Pair:
     return Pair(name, public)
 
 
-def allow(folder: Folder, name: str, key: str) -> str | None:
+def allow(
+    folder: Folder, name: str, key: str | None = None, *, maps: Iterable[str] | None = None
+) -> str | None:
     """Allow a client with this public key under this name; the name's earlier key is revoked.
 
     Args:
-        key: 40 characters, or a file.
+        key: 40 characters, or a file; None = the one that the name has.
+        maps: that it may use: names, or with a `*` at the end how names begin. None = those that the name
+            may use already, of a new name every map.
 
     Returns:
-        The name's earlier key.
+        The name's earlier key, if it has another one now.
 
     Raises:
-        InvalidConfig: for a bad name or key, or one that is taken, or a folder without a server's keys.
+        InvalidConfig: for a bad name, key or map, a key that is taken, or a folder without a server's keys.
         OutputError: when the list cannot be written.
     """
     check_name(name)
-    public = curve.public_key(key)
+    given = None if key is None else curve.public_key(key)
+    patterns = None if maps is None else _checked_patterns(maps)
     place = _existing_folder(folder)
     with folder_lock.hold(place, wait=math.inf):
         own = curve.server_keys(place).public
         listed = read_allow_list(place) if has_allow_list(place) else Allowed()
         earlier = listed.allowed.get(name)
+        public = given or earlier
+        if public is None:
+            raise InvalidConfig(f"no key is allowed under the name {name!r} yet: give its public key, too")
         _check_not_taken(name, public, own, listed)
-        if earlier == public:
-            return None
         revoked = {key: was for key, was in listed.revoked.items() if key != public}
-        if earlier is not None:
-            revoked[earlier] = name
-        _write(place / ALLOWED, _format_list(Allowed({**listed.allowed, name: public}, revoked)))
-    return earlier
+        if earlier not in (None, public):
+            revoked[str(earlier)] = name
+        rights = dict(listed.maps)
+        if patterns is not None:
+            rights[name] = patterns
+        changed = Allowed({**listed.allowed, name: public}, revoked, _limits(rights))
+        if changed != listed:
+            _write(place / ALLOWED, _format_list(changed))
+    return None if earlier == public else earlier
 
 
 def revoke(folder: Folder, name: str) -> str:
@@ -127,7 +161,8 @@ def revoke(folder: Folder, name: str) -> str:
             raise InvalidConfig(f"no key is allowed under the name {name!r}, {there} (`tsfusion keys list`)")
         left = dict(listed.allowed)
         key = left.pop(name)
-        _write(place / ALLOWED, _format_list(Allowed(left, {**listed.revoked, key: name})))
+        rights = {other: maps for other, maps in listed.maps.items() if other != name}
+        _write(place / ALLOWED, _format_list(Allowed(left, {**listed.revoked, key: name}, rights)))
     return key
 
 
@@ -175,6 +210,23 @@ def check_name(name: str) -> None:
         ) from error
 
 
+def _checked_patterns(maps: Iterable[str]) -> tuple[str, ...]:
+    found = tuple(dict.fromkeys(maps))
+    try:
+        msgspec.convert(found, _Entry.__annotations__["maps"])
+    except msgspec.ValidationError as error:
+        raise InvalidConfig(
+            "maps are names of 1 to 32 of a-z, 0-9, - and _, a letter or digit first, or the like with "
+            f"`*` behind; got {', '.join(found)!r}"
+        ) from error
+    return found
+
+
+def _limits(rights: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+    """The rights without those of names that may use every map."""
+    return {name: maps for name, maps in rights.items() if "*" not in maps}
+
+
 class AllowList:
     """Names and keys of the clients that may connect, as in the file now; nobody while it cannot be read."""
 
@@ -186,14 +238,15 @@ class AllowList:
         self._again = 0.0  # when a list that cannot be read is tried once more, though nothing has changed
         self._names: dict[str, str] = {}  # public key → name
         self._revoked: dict[str, str] = {}
+        self._maps: dict[str, AllowedMaps] = {}  # name → what it may use
         self.refresh()
 
     def refresh(self) -> bool:
-        """Read the file again if it has changed; returns whether a key has lost its name. Never raises."""
+        """Read the file again if it changed; whether a key lost its name or has other maps. Never raises."""
         seen = self._stamp()
         if seen == self._seen and not (self.problem and time.monotonic() > self._again):
             return False
-        before, self._seen = self._names, seen
+        before, maps_before, limited, self._seen = self._names, self._maps, self.limits_maps, seen
         try:
             durable_files.check_private_folder(self._folder)
             listed = read_allow_list(self._folder)
@@ -203,14 +256,27 @@ class AllowList:
             self.problem = ""
             self._names = {key: name for name, key in listed.allowed.items()}
             self._revoked = dict(listed.revoked)
+            self._maps = {name: AllowedMaps(listed.maps.get(name)) for name in listed.allowed}
             level = logging.INFO if self._names else logging.WARNING
             counts = len(self._names), len(self._revoked)
             log.log(level, "clients that may connect: %d, keys revoked: %d", *counts)
-        return any(self._names.get(key) != name for key, name in before.items())
+        return limited != self.limits_maps or any(
+            self._names.get(key) != name or self.maps_of(name) != maps_before[name]
+            for key, name in before.items()
+        )
 
     def name_of(self, key: str | None) -> str | None:
         """The name under which a public key is allowed; None = it is not allowed."""
         return self._names.get(key) if key is not None else None
+
+    @property
+    def limits_maps(self) -> bool:
+        """Whether there is a name that may not use every map."""
+        return any(maps.patterns is not None for maps in self._maps.values())
+
+    def maps_of(self, name: str) -> AllowedMaps:
+        """The maps that the client of a name may use."""
+        return self._maps.get(name, AllowedMaps(()))
 
     def rejection_reason(self, key: str) -> str:
         """One word for the reason why a key is not allowed."""
@@ -235,7 +301,7 @@ class AllowList:
             log.error("nobody is allowed to connect: %s", problem)
         self.problem = problem
         self._again = time.monotonic() + _RETRY
-        self._names, self._revoked = {}, {}
+        self._names, self._revoked, self._maps = {}, {}, {}
 
 
 def _existing_folder(folder: Folder) -> Path:
@@ -260,7 +326,7 @@ def _write(path: Path, text: str) -> None:
 
 def _parse_list(content: bytes, path: Path) -> Allowed:
     try:
-        listed = msgspec.toml.decode(content, type=Allowed)
+        listed = _listed(msgspec.toml.decode(content, type=_ListFile))
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InvalidConfig(f"the allow-list {path} is damaged: {error}") from error
     keys = [*listed.allowed.values(), *listed.revoked]
@@ -271,9 +337,20 @@ def _parse_list(content: bytes, path: Path) -> Allowed:
     return listed
 
 
+def _listed(file: _ListFile) -> Allowed:
+    entries = {name: one for name, one in file.allowed.items() if isinstance(one, _Entry)}
+    keys = {name: one.key if isinstance(one, _Entry) else one for name, one in file.allowed.items()}
+    return Allowed(keys, file.revoked, _limits({name: one.maps for name, one in entries.items()}))
+
+
 def _format_list(listed: Allowed) -> str:
-    lines = [_LIST_HEAD, "[allowed]"]  # a Z85 key has no quote and no backslash
-    lines += [f'"{name}" = "{key}"' for name, key in sorted(listed.allowed.items())]
+    lines = [_LIST_HEAD, "[allowed]"]  # a Z85 key has no quote and no backslash, nor has a map's name
+    for name, key in sorted(listed.allowed.items()):
+        maps = listed.maps.get(name)
+        quoted = "" if maps is None else ", ".join(f'"{one}"' for one in maps)
+        lines.append(
+            f'"{name}" = "{key}"' if maps is None else f'"{name}" = {{ key = "{key}", maps = [{quoted}] }}'
+        )
     lines += ["", "[revoked]"]
     lines += [f'"{key}" = "{name}"' for key, name in listed.revoked.items()]
     return "\n".join(lines) + "\n"

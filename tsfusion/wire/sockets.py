@@ -61,9 +61,16 @@ def router(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySo
     return _make(context, zmq.ROUTER, {**_ANY, **limits}, keys)
 
 
-def publisher(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySocket:
-    """The server's mesh updates; a slow viewer misses some, never holds the server up."""
-    limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES}
+def publisher(
+    context: "zmq.Context[Any]", keys: ServerKeys | None = None, *, manual: bool = False
+) -> AnySocket:
+    """The server's mesh updates; a slow viewer misses some, never holds the server up.
+
+    Args:
+        manual: who subscribes gets nothing before SUBSCRIBE is set for it: at once, since that counts for the
+            sender of the message that was received last.
+    """
+    limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES, zmq.XPUB_MANUAL: int(manual)}
     return _make(context, zmq.XPUB, {**_ANY, **limits}, keys)
 
 
