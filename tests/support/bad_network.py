@@ -36,6 +36,8 @@ class Proxy:
         self._listeners: list[asyncio.Server] = []
         self._connections: set[tuple[asyncio.StreamWriter, asyncio.StreamWriter]] = set()
         self._streams: set[asyncio.Event] = set()  # whether a data connection's content comes
+        self._forgotten: set[asyncio.StreamWriter] = set()  # ends of connections over which nothing comes
+        self._forgets_new = False
         self._tasks: set[asyncio.Task[None]] = set()
         self._rate: float | None = None
         self._delay = 0.0
@@ -101,6 +103,17 @@ class Proxy:
         if not swallows:
             self.cut()
 
+    def forget(self) -> None:
+        """Let all that is sent over the present connections vanish, both ways, and say nothing: as a NAT that
+        forgot them, or after a scanner roamed to another address. New connections are carried."""
+        self._run(self._forget())
+
+    def black_hole(self, begun: bool) -> None:
+        """As `forget`, for as long as it lasts also for new connections; none of them ever works again."""
+        self._forgets_new = begun
+        if begun:
+            self.forget()
+
     def half_close(self) -> None:
         """Tell every client that the server has said its last, and go on carrying what the client says."""
         self._run(self._half_close())
@@ -111,6 +124,7 @@ class Proxy:
         self.delay(0.0)
         self.freeze(False)
         self.jam(False)
+        self.black_hole(False)
         if self._swallows:
             self.swallow(False)
         if not self._listeners:
@@ -151,6 +165,10 @@ class Proxy:
             for writer in pair:
                 _reset(writer)
 
+    async def _forget(self) -> None:
+        for pair in self._connections:
+            self._forgotten.update(pair)
+
     async def _half_close(self) -> None:
         for client, _ in list(self._connections):
             with contextlib.suppress(OSError, RuntimeError):
@@ -187,6 +205,8 @@ class Proxy:
         stream = asyncio.Event()
         stream.set()
         self._connections.add(pair)
+        if self._forgets_new:
+            self._forgotten.update(pair)
         if entered == self._ports[0]:
             self._streams.add(stream)
         try:
@@ -196,6 +216,7 @@ class Proxy:
             )
         finally:
             self._connections.discard(pair)
+            self._forgotten.difference_update(pair)
             self._streams.discard(stream)
             far_writer.transport.abort()
 
@@ -203,17 +224,26 @@ class Proxy:
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *ways: asyncio.Event
     ) -> None:
         """Carry one direction of a connection until it ends."""
-        while chunk := await reader.read(_CHUNK):
+        while chunk := await self._read(reader, writer):
             await asyncio.sleep(self._wait(len(chunk)))
             for way in ways:
                 await way.wait()
-            if not self._swallows:
+            if not self._swallows and writer not in self._forgotten:
                 with contextlib.suppress(RuntimeError):  # half closed: nothing goes that way any more
                     self.carried += len(chunk)
                     writer.write(chunk)
                 await writer.drain()
-        with contextlib.suppress(OSError, RuntimeError):
-            writer.write_eof()
+        if writer not in self._forgotten:
+            with contextlib.suppress(OSError, RuntimeError):
+                writer.write_eof()
+
+    async def _read(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bytes:
+        try:
+            return await reader.read(_CHUNK)
+        except OSError:
+            if writer not in self._forgotten:  # else nobody tells the other end
+                raise
+            return b""
 
     def _wait(self, size: int) -> float:
         now = self._loop.time()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A connecting socket under watch: why it cannot connect, and a new one when ZeroMQ has given up on it."""
+"""A connecting socket under watch: why it cannot connect, and when it is time for a new one."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,6 +11,7 @@ from tsfusion.wire.connection_monitor import ConnectionMonitor
 from tsfusion.wire.curve import ClientKeys
 
 _RETRY_INTERVAL = 2.0  # seconds; an allowed key is let in soon, a forbidden one is no burden
+_MOST_PATIENCE = 16  # times the least: a link that takes so long for one keyframe still carries it
 
 
 class Connection:
@@ -52,6 +53,11 @@ class Connection:
         return self._monitor.connected
 
     @property
+    def made_at(self) -> float:
+        """When it was made (`time.monotonic()`), where it stands."""
+        return self._monitor.connected_since
+
+    @property
     def finds_nobody(self) -> bool:
         """Whether nobody listens, as far as the last attempt to connect shows."""
         return self._monitor.retrying
@@ -68,6 +74,7 @@ class Connection:
 
     def reopen(self) -> None:
         """Replace the socket; what the old connection held is lost."""
+        self._retry_due = 0.0
         self.close()
         self._open()
 
@@ -85,7 +92,6 @@ class Connection:
             news = None
         self.problem = self.problem if news is None else news
         if self._retry_due and now >= self._retry_due:
-            self._retry_due = 0.0
             self.reopen()
         elif self._monitor.gave_up and not self._retry_due:
             self._retry_due = now + _RETRY_INTERVAL
@@ -95,3 +101,34 @@ class Connection:
         """Close it; what was not sent has so long to leave."""
         self._monitor.close()
         self.socket.close(linger_ms)
+
+
+class Patience:
+    """Time to wait for a sign of life before a connection is made anew.
+
+    TCP itself waits a quarter of an hour where a path is no more: the scanner roamed to another address, or a
+    NAT forgot the connection. Each wait in vain doubles the next: a link may be slow, not dead, and what was
+    under way is sent over it again.
+
+    Args:
+        least: seconds.
+    """
+
+    def __init__(self, least: float) -> None:
+        self._least = self._seconds = least
+        self._ended = 0.0
+
+    def has_ended(self, now: float, *, since: float, sign: float) -> bool:
+        """Whether the wait has ended, which then begins anew (all times: `time.monotonic()`).
+
+        Args:
+            since: when there was something to wait for.
+            sign: when the last sign of life came.
+        """
+        if sign > self._ended:
+            self._seconds = self._least
+        if now - max(since, sign, self._ended) <= self._seconds:
+            return False
+        self._seconds = min(2 * self._seconds, _MOST_PATIENCE * self._least)
+        self._ended = now
+        return True

@@ -21,9 +21,29 @@ CONTROL_MAX_BYTES = 64 << 10
 # XPUB keeps a subscription at some fifty times its size; a greeting with keys needs about 330 bytes.
 TOPIC_MAX_BYTES = 512
 _MESH_TOPIC = b"mesh/"
-_ANY: dict[int, int] = {zmq.HANDSHAKE_IVL: 5000}  # ms; then a connection that is not made is closed
-_RECONNECTING: dict[int, int] = {zmq.RECONNECT_IVL: 100, zmq.RECONNECT_IVL_MAX: 1000}  # ms
-_CONNECTING = {**_ANY, **_RECONNECTING, zmq.TCP_KEEPALIVE: 1, zmq.IMMEDIATE: 1}
+# HANDSHAKE_IVL, ms: then a connection that is not made is closed. The others end a connection whose other end
+# has left without a word. Seconds: KEEPALIVE_IDLE and _INTVL between the probes of one that is idle, of which
+# KEEPALIVE_CNT are lost. Milliseconds: TCP_MAXRT without an answer to what is under way.
+_LISTENING: dict[int, int] = {
+    zmq.HANDSHAKE_IVL: 5000,
+    zmq.TCP_MAXRT: 30_000,
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 10,
+    zmq.TCP_KEEPALIVE_INTVL: 5,
+    zmq.TCP_KEEPALIVE_CNT: 3,
+}
+_CONNECTING: dict[int, int] = {
+    zmq.IMMEDIATE: 1,
+    zmq.RECONNECT_IVL: 100,
+    zmq.RECONNECT_IVL_MAX: 1000,  # ms
+    zmq.CONNECT_TIMEOUT: 3000,
+    zmq.HANDSHAKE_IVL: 3000,
+    zmq.TCP_MAXRT: 5000,
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 2,
+    zmq.TCP_KEEPALIVE_INTVL: 1,
+    zmq.TCP_KEEPALIVE_CNT: 3,
+}
 _RANDOM_PORT_TRIES = 32
 LAST_PORT = 65535
 _MAPS_TOPIC = re.compile(rf"mesh/({MAP_NAME}/?)?".encode())  # or its beginning
@@ -47,7 +67,7 @@ def push(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySock
 
 def pull(context: "zmq.Context[Any]", max_frame_bytes: int, keys: ServerKeys | None = None) -> AnySocket:
     """The server's data socket; a larger frame is dropped with its connection before it is in memory."""
-    return _make(context, zmq.PULL, {**_ANY, zmq.RCVHWM: 16, zmq.MAXMSGSIZE: max_frame_bytes}, keys)
+    return _make(context, zmq.PULL, {**_LISTENING, zmq.RCVHWM: 16, zmq.MAXMSGSIZE: max_frame_bytes}, keys)
 
 
 def dealer(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySocket:
@@ -58,13 +78,13 @@ def dealer(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySo
 def router(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySocket:
     """The server's control socket."""
     limits: dict[int, int] = {zmq.SNDHWM: 1000, zmq.RCVHWM: 100, zmq.MAXMSGSIZE: CONTROL_MAX_BYTES}
-    return _make(context, zmq.ROUTER, {**_ANY, **limits}, keys)
+    return _make(context, zmq.ROUTER, {**_LISTENING, **limits}, keys)
 
 
 def publisher(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySocket:
     """The server's mesh updates; a slow viewer misses some, never holds the server up."""
     limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES}
-    return _make(context, zmq.XPUB, {**_ANY, **limits}, keys)
+    return _make(context, zmq.XPUB, {**_LISTENING, **limits}, keys)
 
 
 def mesh_topic(map_name: str) -> bytes:
