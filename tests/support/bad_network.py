@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""A bad network between scanner and server: a TCP proxy that cuts, refuses, throttles, delays and swallows.
+"""A bad network between scanner and server: a TCP proxy that cuts, refuses, delays, forgets, flips, swallows.
 
 It runs in a thread of its own; every method may be called from any other.
 """
 
 import asyncio
 import contextlib
+import random
 import socket
 import struct
 import threading
@@ -28,10 +29,13 @@ class Proxy:
     Attributes:
         address: connect a client here; its control socket is the next port, as with a server.
         carried: bytes passed on, both ways.
+        flipped: bytes that were changed on the way.
     """
 
     def __init__(self) -> None:
-        self.carried = 0
+        self.carried = self.flipped = 0
+        self._flips_every = 0
+        self._rng = random.Random(0)
         self._upstream: dict[int, int | None] = {}
         self._listeners: list[asyncio.Server] = []
         self._connections: set[tuple[asyncio.StreamWriter, asyncio.StreamWriter]] = set()
@@ -114,6 +118,10 @@ class Proxy:
         if begun:
             self.forget()
 
+    def flip(self, every: int) -> None:
+        """Flip a bit of one byte in so many, at random places of both ways; 0 = none."""
+        self._flips_every = every
+
     def half_close(self) -> None:
         """Tell every client that the server has said its last, and go on carrying what the client says."""
         self._run(self._half_close())
@@ -125,6 +133,7 @@ class Proxy:
         self.freeze(False)
         self.jam(False)
         self.black_hole(False)
+        self.flip(0)
         if self._swallows:
             self.swallow(False)
         if not self._listeners:
@@ -231,11 +240,20 @@ class Proxy:
             if not self._swallows and writer not in self._forgotten:
                 with contextlib.suppress(RuntimeError):  # half closed: nothing goes that way any more
                     self.carried += len(chunk)
-                    writer.write(chunk)
+                    writer.write(self._worn(chunk))
                 await writer.drain()
         if writer not in self._forgotten:
             with contextlib.suppress(OSError, RuntimeError):
                 writer.write_eof()
+
+    def _worn(self, chunk: bytes) -> bytes:
+        """The bytes as they come out at the other end."""
+        worn = bytearray(chunk)
+        for place in range(len(worn)) if self._flips_every else ():
+            if self._rng.random() * self._flips_every < 1:
+                worn[place] ^= 1 << self._rng.randrange(8)
+                self.flipped += 1
+        return bytes(worn)
 
     async def _read(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bytes:
         try:

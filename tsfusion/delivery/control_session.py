@@ -87,7 +87,7 @@ class ControlSession:
         if self.welcome is None and now >= self._hello_due:
             self._hello_due = now + self._hello_interval
             self._hello_interval = min(2 * self._hello_interval, _HELLO_INTERVAL[1])
-            self._send(messages.encode(self._hello))
+            self._send(messages.encode_sealed(self._hello))
         if now >= self._ping_due:
             self._ping(now)
         if self._held_until and now >= self._held_until:
@@ -115,7 +115,7 @@ class ControlSession:
             skipped=self._outbox.stats().skipped,
             leaving=leaving,
         )
-        self._send(messages.encode(ping))
+        self._send(messages.encode_sealed(ping))
 
     def greet_again(self, after: float = 0.0) -> None:
         """Ask to be let in (once more), first after so many seconds."""

@@ -2,7 +2,8 @@
 """The client's thread: sends what the spool holds, as far as the server's credit goes.
 
 PUSH loses what is under way when a server dies, silently; so everything is kept until the server says it is
-on its disk, and sent again from there when the server is a new one (epoch) or silent, or nothing moves (stall).
+on its disk, and sent again from there when the server is a new one (epoch) or silent, or nothing moves
+(stall).
 """
 
 import errno

@@ -210,7 +210,7 @@ def _send_until_answered(
         if events & zmq.POLLOUT:
             asked = monitor.made
             with suppress(zmq.Again):  # the connection has ended: the command is sent on the next one
-                link.send(messages.encode(command), zmq.NOBLOCK)
+                link.send(messages.encode_sealed(command), zmq.NOBLOCK)
         news = monitor.problem()
         why = why if news is None else news
         if monitor.gave_up:
