@@ -18,12 +18,12 @@ import zmq
 
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import DecodeError, JournalError
-from tsfusion.delivery.connection import Connection, Patience
 from tsfusion.delivery.control_session import ControlSession
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.refused_keyframes import RefusedFolder
 from tsfusion.delivery.spool import Waiting
 from tsfusion.wire import sockets
+from tsfusion.wire.connection import Connection, Patience
 from tsfusion.wire.curve import ClientKeys
 from tsfusion.wire.record_header import stamp
 

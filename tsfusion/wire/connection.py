@@ -15,7 +15,9 @@ _MOST_PATIENCE = 16  # times the least: a link that takes so long for one keyfra
 
 
 class Connection:
-    """One connection to the server: of the client's control or its data socket. For one thread.
+    """One connection to the server, over one socket after the other. For one thread.
+
+    A name may stand for an IPv4 and an IPv6 address. Where nobody listens at the one, the other is tried.
 
     Args:
         make: `sockets.push` or `sockets.dealer`.
@@ -29,18 +31,21 @@ class Connection:
         keys: ClientKeys | None,
     ) -> None:
         self.problem = ""  # why there is no connection; empty = there is one, or nothing is known
+        self.address = address
         self._context = context
         self._make = make
-        self._address = address
         self._keys = keys
         self._retry_due = 0.0
+        self._made_before = 0  # connections of earlier sockets
+        self._is_name = sockets.is_name(address)
+        self._named_ipv6 = self._tried_both = False  # of a name
         self._open()
 
     def _open(self) -> None:
         self.socket = self._make(self._context, self._keys)
-        self._monitor = ConnectionMonitor(self.socket, self._address, self._keys)
+        self._monitor = ConnectionMonitor(self.socket, self.address, self._keys)
         self._cuts = 0  # connections that ended, and that were made after one
-        self.socket.connect(self._address)
+        sockets.connect(self.socket, self.address, named_ipv6=self._named_ipv6)
 
     @property
     def events(self) -> sockets.AnySocket:
@@ -53,6 +58,16 @@ class Connection:
         return self._monitor.connected
 
     @property
+    def made(self) -> int:
+        """Number of connections made so far: what was sent over earlier ones may be lost."""
+        return self._made_before + self._monitor.made
+
+    @property
+    def gave_up(self) -> bool:
+        """Whether ZeroMQ will not try again: `check` opens a new socket after a while."""
+        return self._monitor.gave_up
+
+    @property
     def made_at(self) -> float:
         """When it was made (`time.monotonic()`), where it stands."""
         return self._monitor.connected_since
@@ -60,7 +75,7 @@ class Connection:
     @property
     def finds_nobody(self) -> bool:
         """Whether nobody listens, as far as the last attempt to connect shows."""
-        return self._monitor.retrying
+        return self._monitor.retrying and (self._tried_both or not self._is_name)
 
     @property
     def refused(self) -> bool:
@@ -75,6 +90,7 @@ class Connection:
     def reopen(self) -> None:
         """Replace the socket; what the old connection held is lost."""
         self._retry_due = 0.0
+        self._made_before = self.made
         self.close()
         self._open()
 
@@ -91,11 +107,23 @@ class Connection:
         if news == self.problem:
             news = None
         self.problem = self.problem if news is None else news
-        if self._retry_due and now >= self._retry_due:
-            self.reopen()
-        elif self._monitor.gave_up and not self._retry_due:
-            self._retry_due = now + _RETRY_INTERVAL
+        if self._monitor.gave_up or (self._is_name and self._monitor.retrying):
+            ended |= self._try_again(now)
+        else:
+            self._retry_due = 0.0
         return news, ended
+
+    def _try_again(self, now: float) -> bool:
+        """Open a new socket when that is due; whether one is replaced that was connected once."""
+        is_unknown = self._monitor.retrying and not self._tried_both
+        if not is_unknown and now < (self._retry_due or now + 1):
+            self._retry_due = self._retry_due or now + _RETRY_INTERVAL
+            return False
+        if self._monitor.retrying:
+            self._tried_both |= self._named_ipv6
+            self._named_ipv6 = not self._named_ipv6
+        self.reopen()
+        return self._made_before > 0
 
     def close(self, linger_ms: int = 0) -> None:
         """Close it; what was not sent has so long to leave."""
