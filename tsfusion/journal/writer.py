@@ -123,7 +123,7 @@ class Journal:
                 counts then.
         """
         self._room.reserve(sum(memoryview(frame).nbytes for frame in frames))
-        now_ns = time.time_ns() if logged_ns is None else logged_ns
+        now_ns = mcap_layout.wall_clock_ns() if logged_ns is None else logged_ns
         position = Position(self._number, 0)
         try:
             file = self._open()
@@ -209,7 +209,7 @@ class Journal:
             self._first = 0
             self._file = segment_path(self.folder, self._number).open("xb")
             self._identity = secrets.token_bytes(mcap_layout.IDENTITY_BYTES)
-            self._writer = mcap_layout.begin_segment(self._file, self._identity, time.time_ns())
+            self._writer = mcap_layout.begin_segment(self._file, self._identity, mcap_layout.wall_clock_ns())
             # Before the first record: what a reader needs to find its way is never the end that a cut takes.
             self._flush()
             if self._sync:
@@ -242,7 +242,7 @@ def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, c
     Raises:
         JournalError: when the disk refuses.
     """
-    identity, now_ns = secrets.token_bytes(mcap_layout.IDENTITY_BYTES), time.time_ns()
+    identity, now_ns = secrets.token_bytes(mcap_layout.IDENTITY_BYTES), mcap_layout.wall_clock_ns()
     try:
         with durable_files.replacing(path) as file:
             writer = mcap_layout.begin_segment(file, identity, now_ns)
