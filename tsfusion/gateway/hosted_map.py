@@ -156,6 +156,8 @@ class HostedMap:
                 self._on_ready(message)
             elif isinstance(message, fuser_messages.Saved):
                 self._checkpoints += message.written
+                if message.written:
+                    self.outcomes.on_checkpoint()
                 self._retention.on_saved(message)
             elif isinstance(message, fuser_messages.Meshed):
                 self.outcomes.on_meshed(message)
