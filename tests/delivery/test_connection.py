@@ -15,9 +15,9 @@ from scripted_server import ScriptedServer, bind, scripted
 from tsfusion import Client
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, InvalidConfig, NotAllowed, ServerUnreachable
-from tsfusion.delivery.connection import Connection
 from tsfusion.delivery.link_state import LinkKind, LinkState
 from tsfusion.wire import key_folder, sockets
+from tsfusion.wire.connection import Connection
 from tsfusion.wire.curve import server_keys
 
 PATIENT = ClientConfig(stall_timeout=1000.0, policy="spool_all")

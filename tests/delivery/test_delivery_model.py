@@ -52,7 +52,7 @@ class Link:
     def __init__(self, meanwhile: Callable[[], None] = lambda: None) -> None:
         self.meanwhile = meanwhile  # what other threads do while this one sends
         self.socket = self
-        self.problem, self.refused, self.due, self.is_made = "", False, 0.0, True
+        self.problem, self.refused, self.due, self.is_made, self.made_at = "", False, 0.0, True, 0.0
         self.finds_nobody = False
         self.there: deque[Any] = deque()
         self.back: deque[Any] = deque()

@@ -198,3 +198,26 @@ def test_half_closed(proxy: Proxy) -> None:
         assert link.recv(1) == b""
         link.sendall(b"still there")
         until(lambda: proxy.carried >= before + len(b"still there"), PATIENCE)
+
+
+def test_what_is_forgotten_says_nothing_ever_again(proxy: Proxy) -> None:
+    with talking(proxy) as before:
+        proxy.forget()
+        before.sendall(b"lost")
+        with connected(proxy) as after:
+            assert echoed(after, b"new") == b"new"
+        assert silent(before)
+
+
+def test_a_black_hole_takes_what_is_connected_while_it_lasts(proxy: Proxy) -> None:
+    with talking(proxy) as before:
+        proxy.black_hole(True)
+        with connected(proxy) as during:
+            for link in (before, during):
+                link.sendall(b"lost")
+            assert silent(before)
+            proxy.heal()
+            with talking(proxy):
+                pass
+            assert silent(during)
+            assert silent(before)

@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: MIT
 """Journaled keyframes: admitted to their sessions, indexed, handed to the fuser in turn, and their delays."""
 
-from typing import cast
+from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
-from tsfusion.fuser.messages import Fuse
+from tsfusion.fuser.messages import Done, Fuse
+from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.fuser_backlog import FuserBacklog
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.keyframe_index import KeyframeIndex
-from tsfusion.gateway.keyframe_outcomes import DelayStatistics
+from tsfusion.gateway.keyframe_outcomes import DelayStatistics, KeyframeOutcomes
+from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.sessions import Sessions
+from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import Position, RecordEntry
+from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire.keyframe_times import Stamps
 
 SESSION = bytes(range(16))
@@ -153,3 +158,33 @@ def test_a_delay_that_cannot_be_does_not_count() -> None:
         *(True, True, False, False, False)
     ]
     assert delays.summary().count == 2
+
+
+class Told:
+    """Routes to clients that note what they are told."""
+
+    def __init__(self) -> None:
+        self.nacks: list[int] = []
+
+    def send(self, session: bytes, message: Any) -> None:
+        self.nacks += [message.seq] if hasattr(message, "reason") else []
+
+
+def test_what_a_checkpoint_holds_of_rejected_keyframes_is_not_remembered(tmp_path: Path) -> None:
+    index, sessions = index_of(*((1, seq, SESSION, seq) for seq in range(1, 5_001)))
+    told = Told()
+    outcomes = KeyframeOutcomes(
+        "default", index, sessions, cast("ClientRoutes", told), Metrics(),
+        journal=tmp_path, quarantine=Quarantine(tmp_path, 1 << 20),
+    )  # fmt: skip
+    most = 0
+    for at in range(len(index)):
+        outcomes.on_done(Done(at, 1, 2, NO_SAMPLES))
+        if at % 100 == 99:
+            outcomes.on_checkpoint()
+        remembered = [one for one in vars(outcomes).values() if isinstance(one, set)]
+        most = max(most, sum(map(len, remembered)))
+    assert most <= 201
+    assert told.nacks == [*range(1, 5_001)]
+    outcomes.on_done(Done(4_950, 1, 2, NO_SAMPLES))  # by a fuser that began with the one before
+    assert len(told.nacks) == 5_000

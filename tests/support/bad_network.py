@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""A bad network between scanner and server: a TCP proxy that cuts, refuses, throttles, delays and swallows.
+"""A bad network between scanner and server: a TCP proxy that cuts, refuses, delays, forgets, flips, swallows.
 
 It runs in a thread of its own; every method may be called from any other.
 """
 
 import asyncio
 import contextlib
+import random
 import socket
 import struct
 import threading
@@ -28,14 +29,19 @@ class Proxy:
     Attributes:
         address: connect a client here; its control socket is the next port, as with a server.
         carried: bytes passed on, both ways.
+        flipped: bytes that were changed on the way.
     """
 
     def __init__(self) -> None:
-        self.carried = 0
+        self.carried = self.flipped = 0
+        self._flips_every = 0
+        self._rng = random.Random(0)
         self._upstream: dict[int, int | None] = {}
         self._listeners: list[asyncio.Server] = []
         self._connections: set[tuple[asyncio.StreamWriter, asyncio.StreamWriter]] = set()
         self._streams: set[asyncio.Event] = set()  # whether a data connection's content comes
+        self._forgotten: set[asyncio.StreamWriter] = set()  # ends of connections over which nothing comes
+        self._forgets_new = False
         self._tasks: set[asyncio.Task[None]] = set()
         self._rate: float | None = None
         self._delay = 0.0
@@ -101,6 +107,21 @@ class Proxy:
         if not swallows:
             self.cut()
 
+    def forget(self) -> None:
+        """Let all that is sent over the present connections vanish, both ways, and say nothing: as a NAT that
+        forgot them, or after a scanner roamed to another address. New connections are carried."""
+        self._run(self._forget())
+
+    def black_hole(self, begun: bool) -> None:
+        """As `forget`, for as long as it lasts also for new connections; none of them ever works again."""
+        self._forgets_new = begun
+        if begun:
+            self.forget()
+
+    def flip(self, every: int) -> None:
+        """Flip a bit of one byte in so many, at random places of both ways; 0 = none."""
+        self._flips_every = every
+
     def half_close(self) -> None:
         """Tell every client that the server has said its last, and go on carrying what the client says."""
         self._run(self._half_close())
@@ -111,6 +132,8 @@ class Proxy:
         self.delay(0.0)
         self.freeze(False)
         self.jam(False)
+        self.black_hole(False)
+        self.flip(0)
         if self._swallows:
             self.swallow(False)
         if not self._listeners:
@@ -151,6 +174,10 @@ class Proxy:
             for writer in pair:
                 _reset(writer)
 
+    async def _forget(self) -> None:
+        for pair in self._connections:
+            self._forgotten.update(pair)
+
     async def _half_close(self) -> None:
         for client, _ in list(self._connections):
             with contextlib.suppress(OSError, RuntimeError):
@@ -187,6 +214,8 @@ class Proxy:
         stream = asyncio.Event()
         stream.set()
         self._connections.add(pair)
+        if self._forgets_new:
+            self._forgotten.update(pair)
         if entered == self._ports[0]:
             self._streams.add(stream)
         try:
@@ -196,6 +225,7 @@ class Proxy:
             )
         finally:
             self._connections.discard(pair)
+            self._forgotten.difference_update(pair)
             self._streams.discard(stream)
             far_writer.transport.abort()
 
@@ -203,17 +233,35 @@ class Proxy:
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, *ways: asyncio.Event
     ) -> None:
         """Carry one direction of a connection until it ends."""
-        while chunk := await reader.read(_CHUNK):
+        while chunk := await self._read(reader, writer):
             await asyncio.sleep(self._wait(len(chunk)))
             for way in ways:
                 await way.wait()
-            if not self._swallows:
+            if not self._swallows and writer not in self._forgotten:
                 with contextlib.suppress(RuntimeError):  # half closed: nothing goes that way any more
                     self.carried += len(chunk)
-                    writer.write(chunk)
+                    writer.write(self._worn(chunk))
                 await writer.drain()
-        with contextlib.suppress(OSError, RuntimeError):
-            writer.write_eof()
+        if writer not in self._forgotten:
+            with contextlib.suppress(OSError, RuntimeError):
+                writer.write_eof()
+
+    def _worn(self, chunk: bytes) -> bytes:
+        """The bytes as they come out at the other end."""
+        worn = bytearray(chunk)
+        for place in range(len(worn)) if self._flips_every else ():
+            if self._rng.random() * self._flips_every < 1:
+                worn[place] ^= 1 << self._rng.randrange(8)
+                self.flipped += 1
+        return bytes(worn)
+
+    async def _read(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bytes:
+        try:
+            return await reader.read(_CHUNK)
+        except OSError:
+            if writer not in self._forgotten:  # else nobody tells the other end
+                raise
+            return b""
 
     def _wait(self, size: int) -> float:
         now = self._loop.time()

@@ -59,11 +59,11 @@ def on_server(rng: random.Random, keyframes: int, kills: int) -> list[Attack]:
 
 def fault(rng: random.Random) -> Fault:
     """A fault that networks have."""
-    kinds = ["cut", "half_close", "refuse", "throttle", "delay", "freeze", "swallow", "mute", *3 * ["jam"]]
-    what = rng.choice(kinds)
+    kinds = ["cut", "forget", "half_close", "refuse", "throttle", "delay", "freeze", "swallow", "mute"]
+    what = rng.choice([*kinds, *3 * ["jam"]])
     value: float | bool | None = True
     lasts, pause = rng.uniform(0.2, 2.0), rng.uniform(0.3, 2.0)
-    if what in ("cut", "half_close"):
+    if what in ("cut", "forget", "half_close"):
         value, lasts = None, 0.0
     elif what == "throttle":
         value = rng.uniform(20e3, 80e3)

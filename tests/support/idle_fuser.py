@@ -32,9 +32,13 @@ fuser_process.COMMAND = (sys.executable, "-c", {_FUSER!r})
 
 
 @contextmanager
-def keeping(state: Path, **settings: object) -> Iterator[Server]:
-    """Start a server that journals and fuses nothing, and end it afterwards whatever happens."""
-    with closing(Server(state, code=_CODE, **{"max_maps": 32, **settings})) as server:  # type: ignore[arg-type]
+def keeping(state: Path, *, code: str = "", **settings: object) -> Iterator[Server]:
+    """Start a server that journals and fuses nothing, and end it afterwards whatever happens.
+
+    Args:
+        code: run before it, in its process.
+    """
+    with closing(Server(state, code=code + _CODE, **{"max_maps": 32, **settings})) as server:  # type: ignore[arg-type]
         if not server.address:
             raise RuntimeError(server.stderr_text())
         yield server

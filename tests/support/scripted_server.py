@@ -11,6 +11,7 @@ from typing import Any
 
 import zmq
 
+from tsfusion.core.errors import TransportError
 from tsfusion.gateway.access_control import ZapHandler
 from tsfusion.wire import codec, messages, sockets
 from tsfusion.wire.curve import ServerKeys
@@ -88,7 +89,7 @@ class ScriptedServer:
         self._data = sockets.pull(self._context, 1 << 20, self.keys)
         self._router = sockets.router(self._context, self.keys)
         for made, address in ((self._data, self.address), (self._router, self.control)):
-            bind(made, address.replace(":0", ":*") if address.endswith(":0") else address)
+            bind(made, address)
         self.address = self._data.getsockopt_string(zmq.LAST_ENDPOINT)
         self.control = self._router.getsockopt_string(zmq.LAST_ENDPOINT)
         self._thread = threading.Thread(target=self._run)
@@ -185,9 +186,9 @@ def bind(made: sockets.AnySocket, address: str) -> None:
     deadline = time.monotonic() + 10
     while True:
         try:
-            made.bind(address)
+            sockets.bind_socket(made, address)
             return
-        except zmq.ZMQError:  # the last life has not quite gone
+        except TransportError:  # the last life has not quite gone
             if time.monotonic() > deadline:
                 raise
             time.sleep(0.01)

@@ -2,16 +2,24 @@
 """Addresses, the sockets that listen at them, and questions that nobody answers."""
 
 import socket
+import time
+from contextlib import closing
 from typing import Any
 
 import pytest
 import zmq
+from keyframes_and_servers import DEADLINE, until, wall
+from scripted_server import scripted
 
+from tsfusion import Client
 from tsfusion.core.errors import InvalidConfig, ServerUnreachable, TransportError
 from tsfusion.wire import sockets
+from tsfusion.wire.connection import Connection
 from tsfusion.wire.messages import Command
 from tsfusion.wire.queries import request
 from tsfusion.wire.sockets import control_address
+
+needs_ipv6 = pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this machine has no IPv6")
 
 
 def test_the_control_socket_is_the_next_port_unless_told() -> None:
@@ -26,6 +34,8 @@ def test_the_control_socket_is_the_next_port_unless_told() -> None:
         *("", "127.0.0.1:5555", "tcp://127.0.0.1", "tcp://:5555", "udp://127.0.0.1:5"),
         *("tcp://127.0.0.1:99999", "tcp://127.0.0.1:5555/x", "tcp://host:port"),
         *("tcp://a b:5555", "tcp://127.0.0.1:5555?x", "tcp://u@127.0.0.1:5", "tcp://\0:5"),
+        *("tcp://::1:5555", "tcp://[::1]", "tcp://[::1:5555", "tcp://[1::2::3]:5555", "tcp://[]:5555"),
+        *("tcp://[host]:5555", "tcp://[127.0.0.1]:5555", "tcp://[::1%]:5555", "tcp://[::1]:99999"),
     ],
 )
 def test_a_malformed_address_is_one_clear_error(address: str) -> None:
@@ -35,18 +45,33 @@ def test_a_malformed_address_is_one_clear_error(address: str) -> None:
         sockets.parse_address(address)
 
 
-@pytest.mark.parametrize("address", ["tcp://0.0.0.0:5555", "tcp://*:5555", "tcp://192.168.1.4:5555"])
+def test_a_link_local_address_names_its_interface() -> None:
+    with pytest.raises(InvalidConfig, match=r"names its interface, as in tcp://\[fe80::1%eth0\]:5555"):
+        sockets.parse_address("tcp://[fe80::2]:5555")
+    assert sockets.parse_address("tcp://[fe80::2%br-lan.1]:5555") == ("fe80::2%br-lan.1", 5555)
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        *("tcp://0.0.0.0:5555", "tcp://*:5555", "tcp://192.168.1.4:5555", "tcp://[::]:5555"),
+        *("tcp://[fe80::1%lo]:5555", "tcp://[2001:db8::1]:5555", "tcp://[::ffff:192.168.1.4]:5555"),
+        "tcp://[::ffff:0.0.0.0]:5555",
+    ],
+)
 def test_without_keys_only_this_machine_may_connect(address: str) -> None:
     for word in ("tsfusion keys new server", "tsfusion keys allow", "--keys", "ssh -L"):
         with pytest.raises(InvalidConfig, match=word):
             sockets.check_reachable(address, has_keys=False)
     sockets.check_reachable(address, has_keys=True)
-    for own in ("tcp://127.0.0.1:5555", "tcp://localhost:5555", "tcp://[::1]:5555"):
-        sockets.check_reachable(own, has_keys=False)
+    for own in ("127.0.0.1", "localhost", "[::1]", "[::ffff:127.0.0.1]", "127.0.0.2"):
+        sockets.check_reachable(f"tcp://{own}:5555", has_keys=False)
 
 
-@pytest.mark.parametrize("host", ["*", "0.0.0.0", "127.0.0.1"])
+@pytest.mark.parametrize("host", ["*", "0.0.0.0", "127.0.0.1", "[::1]", "[::]", "[::ffff:127.0.0.1]"])
 def test_a_server_can_listen_on_every_interface(host: str) -> None:
+    if ":" in host and not socket.has_dualstack_ipv6():
+        pytest.skip("this machine has no IPv6")
     context: zmq.Context[Any] = zmq.Context()
     made = sockets.pull(context, 1024), sockets.router(context), sockets.publisher(context)
     try:
@@ -59,6 +84,57 @@ def test_a_server_can_listen_on_every_interface(host: str) -> None:
         for one in made:
             one.close()
         context.term()
+
+
+@needs_ipv6
+@pytest.mark.parametrize(
+    ("listen", "seen"),
+    [
+        ("[::]", {"[::1]": "::1", "127.0.0.1": "127.0.0.1", "[::ffff:127.0.0.1]": "127.0.0.1"}),
+        ("[::1]", {"[::1]": "::1", "127.0.0.1": ""}),
+        ("*", {"127.0.0.1": "127.0.0.1", "[::1]": ""}),
+    ],
+)
+def test_who_can_connect_over_ipv4_and_ipv6(listen: str, seen: dict[str, str]) -> None:
+    """The address of the other end, as the server sees it; empty = it cannot connect."""
+    with zmq.Context() as context, sockets.pull(context, 1024) as server:
+        port = sockets.bind_socket(server, f"tcp://{listen}:0").rpartition(":")[2]
+        for host, address in seen.items():
+            with sockets.push(context) as client:
+                sockets.connect(client, f"tcp://{host}:{port}")
+                if address:
+                    assert client.poll(10_000, zmq.POLLOUT)
+                    client.send(b"x")
+                    assert sockets.peer_address(server.recv(copy=False)) == address
+                else:
+                    assert not client.poll(100, zmq.POLLOUT)
+
+
+@needs_ipv6
+@pytest.mark.parametrize("listen", ["[::1]", "127.0.0.1"])
+@pytest.mark.parametrize("host", ["localhost", "own"])
+def test_a_client_finds_a_server_at_either_kind_of_address(listen: str, host: str) -> None:
+    anywhere = f"tcp://{listen}:0"
+    with scripted(address=anywhere, control=anywhere) as server:
+        ports = [int(one.rpartition(":")[2]) for one in (server.address, server.control)]
+        data, control = (f"tcp://{listen if host == 'own' else host}:{port}" for port in ports)
+        with Client(data, control=control) as client:
+            client.send(wall())
+            client.flush(DEADLINE)
+            client.connect(DEADLINE)
+        assert server.numbers == [0]
+
+
+@needs_ipv6
+def test_a_name_is_looked_for_at_both_kinds_of_address() -> None:
+    with socket.socket(socket.AF_INET6) as unused, zmq.Context() as context:
+        unused.bind(("::1", 0))
+        address = f"tcp://localhost:{unused.getsockname()[1]}"
+        with closing(Connection(context, sockets.dealer, address, None)) as connection:
+            until(lambda: connection.check(time.monotonic()) is not None and connection.finds_nobody)
+            made = connection.socket
+            assert connection.check(time.monotonic()) == (None, False)
+            assert connection.socket is made  # and not sought again and again at once
 
 
 def test_a_taken_port_is_one_clear_error() -> None:

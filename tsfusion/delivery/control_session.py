@@ -46,7 +46,8 @@ class ControlSession:
         self.welcome: messages.Welcome | None = None  # the server's terms; None = it has not let us in (yet)
         self.clock = ClockOffset()
         self.last_heard = 0.0  # time of the server's last message, `time.monotonic()`; 0 = never
-        self.last_moved = 0.0  # when something last left the spool, or was sent while nothing was on its way
+        self.last_progress = 0.0  # when something last left the spool, or was turned away
+        self.last_moved = 0.0  # the same, or when something was sent while nothing was on its way
         self._outbox = outbox
         self._refused = refused
         self._send = send
@@ -86,7 +87,7 @@ class ControlSession:
         if self.welcome is None and now >= self._hello_due:
             self._hello_due = now + self._hello_interval
             self._hello_interval = min(2 * self._hello_interval, _HELLO_INTERVAL[1])
-            self._send(messages.encode(self._hello))
+            self._send(messages.encode_sealed(self._hello))
         if now >= self._ping_due:
             self._ping(now)
         if self._held_until and now >= self._held_until:
@@ -114,7 +115,7 @@ class ControlSession:
             skipped=self._outbox.stats().skipped,
             leaving=leaving,
         )
-        self._send(messages.encode(ping))
+        self._send(messages.encode_sealed(ping))
 
     def greet_again(self, after: float = 0.0) -> None:
         """Ask to be let in (once more), first after so many seconds."""
@@ -270,7 +271,7 @@ class ControlSession:
         moved = self._outbox.acknowledge(durable, fused, stamps, offset_ns=offset_ns, bound_ns=bound_ns)
         if moved:
             self._outbox.change_link_state(self._outbox.link_state.moved())
-            self.last_moved = self.last_heard
+            self.last_moved = self.last_progress = self.last_heard
         return moved
 
     def _is_foreign(self, durable: int) -> bool:
@@ -284,7 +285,7 @@ class ControlSession:
         return foreign
 
     def _on_nack(self, nack: messages.Nack) -> None:
-        self.last_moved = self.last_heard
+        self.last_moved = self.last_progress = self.last_heard
         if nack.stage == "map":
             kind, is_first = self._outbox.reject(nack.seq, nack.reason, nack.message)
             log.log(  # the others are counted

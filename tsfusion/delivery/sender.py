@@ -2,7 +2,8 @@
 """The client's thread: sends what the spool holds, as far as the server's credit goes.
 
 PUSH loses what is under way when a server dies, silently; so everything is kept until the server says it is
-on its disk, and sent again from there when the server is a new one (epoch) or nothing moves (stall).
+on its disk, and sent again from there when the server is a new one (epoch) or silent, or nothing moves
+(stall).
 """
 
 import errno
@@ -17,12 +18,12 @@ import zmq
 
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import MISSING, DecodeError, JournalError
-from tsfusion.delivery.connection import Connection
 from tsfusion.delivery.control_session import ControlSession
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.refused_keyframes import RefusedFolder
 from tsfusion.delivery.spool import Waiting
 from tsfusion.wire import sockets
+from tsfusion.wire.connection import Connection, Patience
 from tsfusion.wire.curve import ClientKeys
 from tsfusion.wire.record_header import stamp
 
@@ -31,6 +32,7 @@ log = logging.getLogger(__name__)
 _READ_INTERVAL = 0.5  # seconds until a record that could not be read is tried again
 _MAX_READS = 6
 _MAX_READS_AWAY = 120  # the folder may come back
+_LEAST_SILENCE = 2.0  # seconds; a server answers each ping, two a second, and never waits
 _FAREWELL_MS = 100  # for the last message to leave
 _SCARCE = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # what others of this machine will give back
 
@@ -50,6 +52,8 @@ class Sender:
         self._control_session = ControlSession(
             outbox, self._refused, self._send_control, address=control, map_name=config.map
         )
+        self._silence = Patience(max(config.stall_timeout, _LEAST_SILENCE))
+        self._stall = Patience(config.stall_timeout)
         self._stopping = threading.Event()
         self._waker, self._woken = socket.socketpair()
         self._waker.setblocking(False)
@@ -136,15 +140,28 @@ class Sender:
             self._outbox.wake_waiting()
 
     def _watch_for_stall(self, now: float) -> None:
-        patience = self._config.stall_timeout
-        if now - self._control_session.last_heard > patience:
-            self._control_session.on_silence()
-        stalled = now - self._control_session.last_moved > patience
-        if stalled and not self._control_session.held and self._outbox.outstanding:
+        session = self._control_session
+        if now - session.last_heard > self._config.stall_timeout:
+            session.on_silence()
+        if self._control.is_made and self._silence.has_ended(
+            now, since=self._control.made_at, sign=session.last_heard
+        ):
+            log.info("nothing is heard: connecting to %s again", self._control_address)
+            self._connect_again(self._control, self._data)
+        elif (
+            self._outbox.outstanding
+            and not session.held
+            and self._stall.has_ended(now, since=session.last_moved, sign=session.last_progress)
+        ):
             log.info("nothing moves: connecting to %s again", self._data_address)
-            self._data.reopen()
-            self._control_session.greet_again()
-            self._control_session.rewind()
+            self._connect_again(self._data)
+
+    def _connect_again(self, *connections: Connection) -> None:
+        """Make connections anew, and send again what is not acknowledged as soon as the server lets us in."""
+        for connection in connections:
+            connection.reopen()
+        self._control_session.greet_again()
+        self._control_session.rewind()
 
     # --- records ---
 

@@ -36,6 +36,7 @@ class ClientRoute(Struct, eq=False):
     skipped: dict[str, int] = field(default_factory=dict)
     received_bytes: int = 0
     refused: int = 0  # records that were turned away for good
+    damaged: tuple[int, int] = (0, 0)  # seq of the record that came damaged last, and how often in a row
     address: str = ""  # of its machine; empty = not known
     left: bool = False  # whether it said goodbye
     scans: bool = False  # whether a keyframe of the session is in the journal

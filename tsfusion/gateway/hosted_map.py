@@ -187,6 +187,8 @@ class HostedMap:
 
     def _on_saved(self, saved: fuser_messages.Saved) -> None:
         self._checkpoints += saved.written
+        if saved.written:
+            self.outcomes.on_checkpoint()
         self._unsaved = saved.problem
         self._save_at = time.monotonic() + _SAVE_PAUSE
         self._retention.on_saved(saved)

@@ -20,13 +20,14 @@ from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.wire import codec, messages
-from tsfusion.wire.record_header import RecordHeader, Refused, unpack
+from tsfusion.wire.record_header import Damaged, RecordHeader, Refused, unpack
 
 log = logging.getLogger(__name__)
 
 # Seconds for which a client is held off: the keyframes that were under way have to be sent again.
 _SHORTEST_HOLD = 0.25
 _LONGEST_HOLD = 10.0
+_MOST_DAMAGED = 8  # times that a record may come damaged before it is refused for good
 
 
 class KeyframeIntake:
@@ -127,11 +128,31 @@ class KeyframeIntake:
             if (route := self._routes.get(header.session)) is not None:
                 route.fates.taken()
         except Refused as error:
-            self._refuse(error, client, header)
+            if isinstance(error, Damaged) and self._comes_again(header):
+                self._ask_again(error, hosted, header, client)
+            else:
+                self._refuse(error, client, header)
         except JournalError:
             self._hold(
                 header.session, hosted.disk.seconds_left(time.monotonic()), "disk", hosted.disk.problem
             )
+
+    def _comes_again(self, header: RecordHeader) -> bool:
+        """Count that a record came damaged; whether its client, whose copy may be well, sends it again."""
+        route = self._routes.get(header.session)
+        if route is None:
+            return False
+        seq, times = route.damaged
+        route.damaged = (header.seq, times + 1 if seq == header.seq else 1)
+        return route.damaged[1] < _MOST_DAMAGED
+
+    def _ask_again(self, error: Damaged, hosted: HostedMap, header: RecordHeader, client: str) -> None:
+        self._refused[error.reason] += 1
+        subject = logs.about(
+            map=header.map, session=header.session, seq=header.seq, client=client, reason=error.reason
+        )
+        log.warning("a %s is asked for again: %s", header.kind, error, extra=subject)
+        hosted.outcomes.acknowledge(header.session, resend=True)
 
     def _refuse(self, error: Refused, client: str, header: RecordHeader | None = None) -> None:
         """Count a bad message; if its session is known, tell the client not to send it again."""

@@ -52,7 +52,10 @@ class KeyframeOutcomes:
         self._metrics = metrics
         self._journal = journal
         self._quarantine = quarantine
-        self._reported_rejections: set[int] = set()  # indices
+        # Indices of rejected records that were reported: before the last checkpoint, and since then. What a
+        # checkpoint holds is never fused again, but a damaged one makes way for that before it.
+        self._rejected_before: set[int] = set()
+        self._rejected_since: set[int] = set()
         self._without_samples: set[bytes] = set()  # sessions that have been named for a keyframe of that kind
         self._meshed = 0  # keyframes that the present fuser answered and meshed
 
@@ -90,7 +93,7 @@ class KeyframeOutcomes:
         if done.reason is None:
             reported = entry.stamps.fused_ns > 0
         else:
-            reported = done.index in self._reported_rejections
+            reported = done.index in self._rejected_since or done.index in self._rejected_before
         if reported:
             return  # by a fuser that died before it wrote a checkpoint
         if not entry.is_correction:
@@ -120,7 +123,7 @@ class KeyframeOutcomes:
 
     def _on_rejected(self, session: Session, entry: IndexEntry, done: fuser_messages.Done) -> None:
         assert done.reason is not None
-        self._reported_rejections.add(done.index)
+        self._rejected_since.add(done.index)
         seq, is_empty = entry.stamps.seq, done.reason == NO_SAMPLES
         log.log(
             logging.DEBUG if is_empty and session.key in self._without_samples else logging.ERROR,
@@ -142,6 +145,10 @@ class KeyframeOutcomes:
         except JournalError:  # which is why it was rejected
             return
         self._quarantine.keep(frames, session=session.key, seq=seq, client=session.client, reason=done.reason)
+
+    def on_checkpoint(self) -> None:
+        """Note that a new checkpoint holds everything that was answered."""
+        self._rejected_before, self._rejected_since = self._rejected_since, set()
 
     def on_meshed(self, meshed: fuser_messages.Meshed) -> None:
         """Note that the fuser brought the mesh up to date."""

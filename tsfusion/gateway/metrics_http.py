@@ -153,7 +153,7 @@ def _listen(address: str) -> socket.socket:
             f"metrics must be HOST:PORT on this machine, such as 127.0.0.1:9464, got {address!r}; "
             "let others in by a reverse proxy that asks who they are, or by `ssh -L`"
         )
-    host = "127.0.0.1" if host == "localhost" else host
+    host = "127.0.0.1" if host == "localhost" else host.removeprefix("::ffff:")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family)

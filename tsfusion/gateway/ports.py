@@ -67,7 +67,7 @@ class Ports:
 
     def reply(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
         """Send a message to a connection of the control socket, or drop it."""
-        send_now(self.control, [identity, messages.encode(message), *frames])
+        send_now(self.control, [identity, messages.encode_sealed(message), *frames])
 
     def publish(self, topic: bytes, message: bytes, frames: Sequence[zmq.Frame]) -> None:
         """Send a mesh update to the viewers that subscribed to its topic, or drop it."""

@@ -9,6 +9,7 @@ All lengths of a keyframe's chunk stand in it several times over, so a damaged o
 """
 
 import struct
+import time
 import zlib
 from collections.abc import Sequence
 from functools import cache
@@ -135,6 +136,11 @@ class ChunkHead(NamedTuple):
 
 def _index(channel: int, logged_ns: int, offset: int) -> bytes:
     return _INDEX.pack(Opcode.MESSAGE_INDEX, _INDEX.size - _LENGTH_BYTES, channel, 16, logged_ns, offset)
+
+
+def wall_clock_ns() -> int:
+    """The wall clock, for people: nothing depends on it. 0 where it shows a time before 1970."""
+    return max(time.time_ns(), 0)  # MCAP has no earlier times
 
 
 def begin_segment(stream: IO[bytes], identity: bytes, now_ns: int) -> Any:

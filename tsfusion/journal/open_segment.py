@@ -9,7 +9,6 @@ import errno
 import os
 import secrets
 import threading
-import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -49,7 +48,7 @@ class OpenSegment:
 
     def begin(self) -> None:
         """Write what comes before the first record; it is on the disk when this returns."""
-        self._writer = mcap_layout.begin_segment(self._file, self._identity, time.time_ns())
+        self._writer = mcap_layout.begin_segment(self._file, self._identity, mcap_layout.wall_clock_ns())
         # Before the first record: what a reader needs to find its way is never the end that a cut takes.
         self._flush()
         if self._sync:

@@ -6,7 +6,6 @@ import errno
 import logging
 import os
 import secrets
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -150,7 +149,7 @@ class Journal:
         """
         self._room.reserve(sum(memoryview(frame).nbytes for frame in frames))
         self._keep_place()
-        now_ns = time.time_ns() if logged_ns is None else logged_ns
+        now_ns = mcap_layout.wall_clock_ns() if logged_ns is None else logged_ns
         position = Position(self._number, 0)
         try:
             segment = self._begin()
@@ -340,7 +339,7 @@ def write_file(path: Path, frames: Sequence[Any], *, session: bytes, seq: int, c
     Raises:
         JournalError: when the disk refuses.
     """
-    identity, now_ns = secrets.token_bytes(mcap_layout.IDENTITY_BYTES), time.time_ns()
+    identity, now_ns = secrets.token_bytes(mcap_layout.IDENTITY_BYTES), mcap_layout.wall_clock_ns()
     try:
         with durable_files.replacing(path) as file:
             writer = mcap_layout.begin_segment(file, identity, now_ns)

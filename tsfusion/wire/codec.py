@@ -24,6 +24,7 @@ from tsfusion.wire.record_header import (
     ArrayName,
     Buffer,
     CorrectionHeader,
+    Damaged,
     KeyframeHeader,
     RecordHeader,
     Refused,
@@ -141,10 +142,11 @@ def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> Rec
 
     Raises:
         Refused: (a DecodeError) with the `reason` it is counted under: `frames`, `header`, `magic`,
-            `version`, `limits`, `size`, `payload`, `values` or `crc`.
+            `version`, `limits`, `size`, `payload`, `values` or `crc`; Damaged where it is not what its header
+            announces.
     """
     if not MIN_FRAMES <= len(frames) <= MAX_FRAMES:
-        raise Refused("frames", f"a record has {MIN_FRAMES} to {MAX_FRAMES} frames, got {len(frames)}")
+        raise Damaged("frames", f"a record has {MIN_FRAMES} to {MAX_FRAMES} frames, got {len(frames)}")
     header = unpack(frames[0])
     total = sum(memoryview(frame).nbytes for frame in frames)
     if total > max_frame_bytes:
@@ -153,11 +155,9 @@ def check(frames: Sequence[Any], max_frame_bytes: int = _MAX_FRAME_BYTES) -> Rec
         corrections.check(header, frames[1:])
         return header
     _check_limits(header, len(frames))
-    _check_sizes(header, frames)
     _check_values(header)
-    for buffer, frame in zip(header.buffers, frames[1:], strict=True):
-        if zlib.crc32(frame) != buffer.crc32:
-            raise Refused("crc", f"the bytes of {buffer.name} were damaged on their way (CRC-32 differs)")
+    _check_bytes(header, frames)
+    _check_unfolded_sizes(header, frames)
     return header
 
 
@@ -168,8 +168,10 @@ def measurement(header: KeyframeHeader) -> str:
 
 def _check_limits(header: KeyframeHeader, frames: int) -> None:
     names = [buffer.name for buffer in header.buffers]
-    if len(names) != frames - 1 or len(set(names)) != len(names):
-        raise Refused("limits", f"{frames - 1} arrays came, the header announces {', '.join(names)}")
+    if len(names) != frames - 1:
+        raise Damaged("limits", f"{frames - 1} arrays came, the header announces {', '.join(names)}")
+    if len(set(names)) != len(names):
+        raise Refused("limits", f"each array comes once, the header announces {', '.join(names)}")
     kinds = [name for name in names if name in _MEASUREMENTS]
     if len(kinds) != 1:
         raise Refused("limits", f"one of depth, disparity and points is needed, got {len(kinds)}")
@@ -198,11 +200,17 @@ def _expected_shapes(kind: str, shapes: dict[ArrayName, tuple[int, ...]]) -> dic
     return {kind: [shape], "origins": origins, "color": [three], "confidence": [one]}
 
 
-def _check_sizes(header: KeyframeHeader, frames: Sequence[Any]) -> None:
+def _check_bytes(header: KeyframeHeader, frames: Sequence[Any]) -> None:
     for buffer, frame in zip(header.buffers, frames[1:], strict=True):
         size = memoryview(frame).nbytes
         if size != buffer.bytes:
-            raise Refused("size", f"{buffer.name} was announced with {buffer.bytes} bytes, got {size}")
+            raise Damaged("size", f"{buffer.name} was announced with {buffer.bytes} bytes, got {size}")
+    for buffer, frame in zip(header.buffers, frames[1:], strict=True):
+        if zlib.crc32(frame) != buffer.crc32:
+            raise Damaged("crc", f"the bytes of {buffer.name} were damaged on their way (CRC-32 differs)")
+
+
+def _check_unfolded_sizes(header: KeyframeHeader, frames: Sequence[Any]) -> None:
     for buffer, frame in zip(header.buffers, frames[1:], strict=True):
         if buffer.codec in _ZSTD:
             array_encoding.check_zstd(frame, _decoded_bytes(buffer))

@@ -48,6 +48,7 @@ class ConnectionMonitor:
     Attributes:
         socket: becomes readable when something has happened; call `problem` then, and from time to time.
         connected: whether the handshake is done and the connection stands.
+        connected_since: when that was (`time.monotonic()`).
         made: number of connections made so far, this one included. Messages on earlier ones may be lost: send
             them again when this rises; before that they would be lost, too.
         retrying: whether the last attempt to connect found nobody.
@@ -58,6 +59,7 @@ class ConnectionMonitor:
 
     def __init__(self, socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = None) -> None:
         self.connected = False
+        self.connected_since = 0.0
         self.made = 0
         self.retrying = False
         self.lost = 0
@@ -106,6 +108,7 @@ class ConnectionMonitor:
             self._ended_at, self.retrying = 0.0, True
         elif event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
             self.connected, self.refused, self._failures = True, False, 0
+            self.connected_since = time.monotonic()
             self.made += 1
             return ""
         elif event == zmq.EVENT_DISCONNECTED:

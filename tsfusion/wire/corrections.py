@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry.keyframe import MAX_TRANSLATION, check_pose
-from tsfusion.wire.record_header import CorrectionHeader, Refused, pack
+from tsfusion.wire.record_header import CorrectionHeader, Damaged, Refused, pack
 
 MAX_KEYFRAMES = 100_000  # named by one correction
 _NUMBER_BYTES, _POSE_BYTES = 8, 12 * 8
@@ -144,16 +144,16 @@ def check(header: CorrectionHeader, frames: Sequence[Any]) -> None:
             corrected and removed, a pose that is not finite or whose rotation is not exact to 1e-9.
     """
     if len(frames) != 1:
-        raise Refused("frames", f"a correction has 2 frames, got {1 + len(frames)}")
+        raise Damaged("frames", f"a correction has 2 frames, got {1 + len(frames)}")
     count = header.count + header.removed
     if count > MAX_KEYFRAMES:
         raise Refused("limits", f"a correction names at most {MAX_KEYFRAMES} keyframes, got {count}")
     nbytes = memoryview(frames[0]).nbytes
     expected = count * _NUMBER_BYTES + header.count * _POSE_BYTES
     if nbytes != expected:
-        raise Refused("size", f"a correction of {count} keyframes has {expected} bytes, got {nbytes}")
+        raise Damaged("size", f"a correction of {count} keyframes has {expected} bytes, got {nbytes}")
     if zlib.crc32(frames[0]) != header.crc32:
-        raise Refused("crc", "the correction was damaged on its way (CRC-32 differs)")
+        raise Damaged("crc", "the correction was damaged on its way (CRC-32 differs)")
     _check_values(header, *arrays(header, frames[0]))
 
 

@@ -14,6 +14,7 @@ from tsfusion.core.errors import DecodeError
 from tsfusion.wire.health import Health, MeshLayout, Status
 from tsfusion.wire.keyframe_times import Seq, Stamps
 from tsfusion.wire.record_header import SessionId, WorldName
+from tsfusion.wire.seal import is_damaged, seal
 
 PROTOCOL_VERSION = 2  # of these messages and of which kinds of records a server takes
 # Why a client never sends a keyframe: the reasons in `Ping.skipped`, in words
@@ -171,6 +172,11 @@ _TO_CLIENT = msgspec.msgpack.Decoder(ToClient)
 encode = msgspec.msgpack.encode
 
 
+def encode_sealed(message: ToServer | ToClient) -> bytes:
+    """Encode a message for the way, with a seal by which the other end knows that it is whole."""
+    return seal(encode(message))
+
+
 def decode_to_server(frame: Any) -> ToServer:
     """Decode a message to the server; raises DecodeError for anything else."""
     return _decode(_TO_SERVER, frame)  # type: ignore[no-any-return]
@@ -182,6 +188,8 @@ def decode_to_client(frame: Any) -> ToClient:
 
 
 def _decode(decoder: Any, frame: Any) -> Any:
+    if is_damaged(frame):
+        raise DecodeError("a control message was damaged on its way (CRC-32 differs)")
     try:
         return decoder.decode(frame)
     except Exception as error:  # msgspec also raises UnicodeDecodeError and RecursionError

@@ -13,7 +13,7 @@ from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.errors import DecodeError, NotAllowed, ServerUnreachable, TransportError
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.wire import messages, sockets
-from tsfusion.wire.connection_monitor import ConnectionMonitor
+from tsfusion.wire.connection import Connection
 from tsfusion.wire.curve import ClientKeys
 from tsfusion.wire.health import Health, MeshLayout, Status
 from tsfusion.wire.messages import Command, Reply
@@ -176,17 +176,14 @@ def request(
     """
     address, timeout = sockets.connect_address(address), min(timeout, _MAX_TIMEOUT_S)
     context: zmq.Context[Any] = zmq.Context()
-    link = sockets.dealer(context, keys)
-    monitor = ConnectionMonitor(link, address, keys)
+    connection = Connection(context, sockets.dealer, address, keys)
     try:
-        link.connect(address)
-        head, *frames = _send_until_answered(link, monitor, command, timeout)
+        head, *frames = _send_until_answered(connection, command, timeout)
         reply = messages.decode_to_client(head.buffer)
     except DecodeError as error:
         raise TransportError(f"what answers at {address} is no tsfusion server: {error}") from error
     finally:
-        monitor.close()
-        link.close()
+        connection.close()
         context.term()
     if not isinstance(reply, messages.Reply):
         raise TransportError(f"the server at {address} answered a command with a {type(reply).__name__}")
@@ -196,27 +193,28 @@ def request(
 
 
 def _send_until_answered(
-    link: sockets.AnySocket, monitor: ConnectionMonitor, command: messages.Command, timeout: float
+    connection: Connection, command: messages.Command, timeout: float
 ) -> list[zmq.Frame]:
     """Send a command on each connection that is made, until there is an answer; returns its frames."""
     deadline = time.monotonic() + timeout
     why, asked = "", 0  # on which connection
     while (left := deadline - time.monotonic()) > 0:
-        wanted = zmq.POLLIN | (zmq.POLLOUT if monitor.made > asked else 0)
-        polled = [(link, wanted), (monitor.socket, zmq.POLLIN)]
+        link = connection.socket
+        wanted = zmq.POLLIN | (zmq.POLLOUT if connection.made > asked else 0)
+        polled = [(link, wanted), (connection.events, zmq.POLLIN)]
         events = dict(zmq.zmq_poll(polled, int(min(left, _POLL_S) * 1000) + 1)).get(link, 0)
         if events & zmq.POLLIN:
             return link.recv_multipart(copy=False)
         if events & zmq.POLLOUT:
-            asked = monitor.made
+            asked = connection.made
             with suppress(zmq.Again):  # the connection has ended: the command is sent on the next one
-                link.send(messages.encode(command), zmq.NOBLOCK)
-        news = monitor.problem()
+                link.send(messages.encode_sealed(command), zmq.NOBLOCK)
+        news, _ = connection.check(time.monotonic())
         why = why if news is None else news
-        if monitor.gave_up:
-            raise (NotAllowed if monitor.refused else TransportError)(why)
+        if connection.gave_up:
+            raise (NotAllowed if connection.refused else TransportError)(why)
     reason = f": {why}" if why else ""
     raise ServerUnreachable(
-        f"no server answered at {monitor.address} within {timeout:g} s{reason}; is `tsfusion serve` "
+        f"no server answered at {connection.address} within {timeout:g} s{reason}; is `tsfusion serve` "
         "running there, and is the port right?"
     )

@@ -14,6 +14,7 @@ from msgspec import Meta, Struct
 from tsfusion.core.config import MapName
 from tsfusion.core.errors import DecodeError
 from tsfusion.geometry.keyframe import MAX_SENSOR_NAME, Intrinsics
+from tsfusion.wire.seal import is_damaged, seal
 
 MAGIC_BYTES = 3
 VERSION = 1  # of both kinds
@@ -37,6 +38,10 @@ class Refused(DecodeError):
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
         self.reason = reason
+
+
+class Damaged(Refused):
+    """A message that is not what it announces: its bytes changed on the way; what was sent may be well."""
 
 
 class Buffer(Struct, frozen=True, kw_only=True):
@@ -129,7 +134,7 @@ def unpack(frame: Any) -> RecordHeader:
     """Read frame 0 (any bytes-like object) of a keyframe or a correction.
 
     Raises:
-        Refused: `header` (too long, or not such a struct), `magic` or `version`.
+        Refused: `header` (too long, or not such a struct), `magic`, `version` or `crc`.
     """
     view = memoryview(frame)
     if view.nbytes > MAX_HEADER_BYTES:
@@ -139,8 +144,11 @@ def unpack(frame: Any) -> RecordHeader:
         raise Refused("magic", f"a record starts with {' or '.join(map(str, _DECODERS))}, got {magic!r}")
     if version != bytes([VERSION]):
         raise Refused("version", f"this is record format {VERSION}, got {version.hex() or 'nothing'}")
+    content = view[MAGIC_BYTES + 1 :]
+    if is_damaged(content):
+        raise Damaged("crc", "the header was damaged on its way (CRC-32 differs)")
     try:
-        return _DECODERS[magic].decode(view[MAGIC_BYTES + 1 :])  # type: ignore[no-any-return]
+        return _DECODERS[magic].decode(content)  # type: ignore[no-any-return]
     except Exception as error:  # msgspec also raises UnicodeDecodeError and RecursionError
         raise Refused("header", f"the header is malformed: {error}") from error
 
@@ -167,5 +175,6 @@ def world_of(frame: Any) -> str:
 
 
 def stamp(frame: Any, **fields: Any) -> bytes:
-    """Frame 0 again with these fields: what is known only when the record is sent."""
-    return pack(msgspec.structs.replace(unpack(frame), **fields))
+    """Frame 0 again, sealed, with these fields: what is known only when the record is sent."""
+    stamped = pack(msgspec.structs.replace(unpack(frame), **fields))
+    return stamped[: MAGIC_BYTES + 1] + seal(stamped[MAGIC_BYTES + 1 :])

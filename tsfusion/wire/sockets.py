@@ -7,7 +7,7 @@ socket lingers: keyframes that must survive are in the spool.
 
 import re
 import socket
-from ipaddress import ip_address
+from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import Any
 
 import zmq
@@ -21,13 +21,36 @@ CONTROL_MAX_BYTES = 64 << 10
 # XPUB keeps a subscription at some fifty times its size; a greeting with keys needs about 330 bytes.
 TOPIC_MAX_BYTES = 512
 _MESH_TOPIC = b"mesh/"
-_ANY: dict[int, int] = {zmq.HANDSHAKE_IVL: 5000}  # ms; then a connection that is not made is closed
-_RECONNECTING: dict[int, int] = {zmq.RECONNECT_IVL: 100, zmq.RECONNECT_IVL_MAX: 1000}  # ms
-_CONNECTING = {**_ANY, **_RECONNECTING, zmq.TCP_KEEPALIVE: 1, zmq.IMMEDIATE: 1}
+# HANDSHAKE_IVL, ms: then a connection that is not made is closed. The others end a connection whose other end
+# has left without a word. Seconds: KEEPALIVE_IDLE and _INTVL between the probes of one that is idle, of which
+# KEEPALIVE_CNT are lost. Milliseconds: TCP_MAXRT without an answer to what is under way.
+_LISTENING: dict[int, int] = {
+    zmq.HANDSHAKE_IVL: 5000,
+    zmq.TCP_MAXRT: 30_000,
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 10,
+    zmq.TCP_KEEPALIVE_INTVL: 5,
+    zmq.TCP_KEEPALIVE_CNT: 3,
+}
+_CONNECTING: dict[int, int] = {
+    zmq.IMMEDIATE: 1,
+    zmq.RECONNECT_IVL: 100,
+    zmq.RECONNECT_IVL_MAX: 1000,  # ms
+    zmq.CONNECT_TIMEOUT: 3000,
+    zmq.HANDSHAKE_IVL: 3000,
+    zmq.TCP_MAXRT: 5000,
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 2,
+    zmq.TCP_KEEPALIVE_INTVL: 1,
+    zmq.TCP_KEEPALIVE_CNT: 3,
+}
 _RANDOM_PORT_TRIES = 32
 LAST_PORT = 65535
 _MAPS_TOPIC = re.compile(rf"mesh/({MAP_NAME}/?)?".encode())  # or its beginning
-_ADDRESS = re.compile(r"tcp://((?P<host>[\w.*-]+)|\[(?P<host6>[\w:.%]+)\]):(?P<port>[0-9]{1,5}|\*)", re.ASCII)
+_HOST6 = r"[0-9A-Fa-f]*:[0-9A-Fa-f:.]*(%[\w.-]+)?"
+_PORT = r"[0-9]{1,5}|\*"
+_ADDRESS = re.compile(rf"tcp://((?P<host>[\w.*-]+)|\[(?P<host6>{_HOST6})\]):(?P<port>{_PORT})", re.ASCII)
+_MAPPED = "::ffff:"  # in front of an IPv4 address, where a socket takes both
 
 AnySocket = zmq.Socket[Any]
 
@@ -47,7 +70,7 @@ def push(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySock
 
 def pull(context: "zmq.Context[Any]", max_frame_bytes: int, keys: ServerKeys | None = None) -> AnySocket:
     """The server's data socket; a larger frame is dropped with its connection before it is in memory."""
-    return _make(context, zmq.PULL, {**_ANY, zmq.RCVHWM: 16, zmq.MAXMSGSIZE: max_frame_bytes}, keys)
+    return _make(context, zmq.PULL, {**_LISTENING, zmq.RCVHWM: 16, zmq.MAXMSGSIZE: max_frame_bytes}, keys)
 
 
 def dealer(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySocket:
@@ -58,7 +81,7 @@ def dealer(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySo
 def router(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySocket:
     """The server's control socket."""
     limits: dict[int, int] = {zmq.SNDHWM: 1000, zmq.RCVHWM: 100, zmq.MAXMSGSIZE: CONTROL_MAX_BYTES}
-    return _make(context, zmq.ROUTER, {**_ANY, **limits}, keys)
+    return _make(context, zmq.ROUTER, {**_LISTENING, **limits}, keys)
 
 
 def publisher(
@@ -71,7 +94,7 @@ def publisher(
             sender of the message that was received last.
     """
     limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES, zmq.XPUB_MANUAL: int(manual)}
-    return _make(context, zmq.XPUB, {**_ANY, **limits}, keys)
+    return _make(context, zmq.XPUB, {**_LISTENING, **limits}, keys)
 
 
 def mesh_topic(map_name: str) -> bytes:
@@ -89,6 +112,7 @@ def subscriber(
 ) -> AnySocket:
     """A viewer's socket for a map's updates: topic, `Meshed`, cells (n, 3) int32, then a mesh's frames.
 
+    Use `connect`.
     The triangles replace all earlier ones in these cells (blocks of 8³ voxels).
     """
     made = _make(context, zmq.SUB, {**_CONNECTING, zmq.IMMEDIATE: 0, zmq.RCVHWM: 16}, keys)
@@ -127,23 +151,56 @@ def _make(
 def peer_address(frame: zmq.Frame) -> str:
     """Address of the machine that sent a frame; empty where ZeroMQ does not know it."""
     try:
-        return str(frame.get("Peer-Address"))
+        return str(frame.get("Peer-Address")).removeprefix(_MAPPED)
     except zmq.ZMQError:
         return ""
 
 
 def parse_address(address: str) -> tuple[str, int]:
-    """Host and port of `tcp://host:port` (port `*` or 0 = random).
+    """Host and port of `tcp://host:port` (port `*` or 0 = random); an IPv6 address stands in brackets.
 
     Raises:
         InvalidConfig: for anything else.
     """
     match = _ADDRESS.fullmatch(address)
-    if match is not None:
-        port = int(match["port"].replace("*", "0"))
-        if port <= LAST_PORT:
-            return match["host"] or match["host6"], port
-    raise InvalidConfig(f"an address looks like tcp://127.0.0.1:5555, got {address!r}")
+    port = LAST_PORT + 1 if match is None else int(match["port"].replace("*", "0"))
+    if match is None or port > LAST_PORT or (match["host6"] and _ip(match["host6"]) is None):
+        raise InvalidConfig(
+            f"an address looks like tcp://127.0.0.1:5555, of IPv6 tcp://[::1]:5555, got {address!r}"
+        )
+    host = match["host"] or match["host6"]
+    if (found := _ip(host)) is not None and found.version == 6 and found.is_link_local and "%" not in host:
+        raise InvalidConfig(
+            f"a link-local address names its interface, as in tcp://[fe80::1%eth0]:5555, got {address!r}"
+        )
+    return host, port
+
+
+def _ip(host: str) -> IPv4Address | IPv6Address | None:
+    """A host that is a number; None = it is a name. The IPv4 address, where it is one in the form of IPv6."""
+    try:
+        found = ip_address(host)
+    except ValueError:
+        return None
+    return getattr(found, "ipv4_mapped", None) or found
+
+
+def is_name(address: str) -> bool:
+    """Whether the host of an address is a name, which may stand for an IPv4 and an IPv6 address."""
+    return _ip(parse_address(address)[0]) is None
+
+
+def connect(made: AnySocket, address: str, *, named_ipv6: bool = False) -> None:
+    """Connect a socket.
+
+    Args:
+        named_ipv6: of a name, take the IPv6 address; libzmq itself tries one of the two and no other.
+    """
+    host, port = parse_address(address)
+    if named_ipv6 and host == "localhost":
+        host = "::1"  # also where the system's list of names lacks it
+    made.setsockopt(zmq.IPV6, ":" in host or (named_ipv6 and _ip(host) is None))
+    made.connect(format_address(host, port))
 
 
 def format_address(host: str, port: int) -> str:
@@ -196,25 +253,24 @@ def check_own_machine(address: str) -> None:
 
 def is_loopback(host: str) -> bool:
     """Whether a host, name or number, is this machine."""
-    try:
-        return host == "localhost" or ip_address(host).is_loopback
-    except ValueError:
-        return False
+    found = _ip(host)
+    return host == "localhost" if found is None else found.is_loopback
 
 
 def check_free(address: str) -> None:
     """Raise TransportError when a server could not listen on an address; no port is opened for that."""
     host, port = parse_address(address)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host.replace("*", ""), port))
-        except OSError as error:
-            raise TransportError(
-                f"cannot listen on {address}: {error.strerror}; choose another address (--listen), or end "
-                "what has it"
-            ) from error
+    try:
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            place = socket.getaddrinfo(host.replace("*", "0.0.0.0"), port, family)[0][-1]
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(place)
+    except OSError as error:
+        raise TransportError(
+            f"cannot listen on {address}: {error.strerror}; choose another address (--listen), or end "
+            "what has it"
+        ) from error
 
 
 def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, to: str | None) -> Addresses:
@@ -241,9 +297,13 @@ def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, t
 
 
 def bind_socket(made: AnySocket, address: str) -> str:
-    """Bind a socket; returns its address with the real port number. Raises TransportError."""
+    """Bind a socket; returns its address with the real port number. Raises TransportError.
+
+    `[::]` takes connections over IPv6 and IPv4, `*` and `0.0.0.0` over IPv4 alone.
+    """
     host, port = parse_address(address)
     try:
+        made.setsockopt(zmq.IPV6, ":" in host)
         made.bind(format_address(host, port) if port else format_address(host, 0).replace(":0", ":*"))
     except zmq.ZMQError as error:
         raise TransportError(

@@ -197,4 +197,4 @@ class _FeedSocket:
         if self.binds:
             self.endpoint = sockets.bind_socket(self._socket, self._target)
         else:
-            self._socket.connect(self._target)
+            sockets.connect(self._socket, self._target)

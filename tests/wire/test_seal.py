@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: MIT
+"""A sealed message is as it was sent, or is known not to be."""
+
+from collections.abc import Iterator
+
+import msgspec
+import pytest
+from keyframes_and_servers import wall
+
+from tsfusion.core.errors import DecodeError
+from tsfusion.wire import codec, corrections, messages
+from tsfusion.wire.keyframe_times import Stamps
+from tsfusion.wire.record_header import stamp, unpack
+from tsfusion.wire.seal import is_damaged, seal
+
+SESSION = bytes(range(16))
+
+
+def flipped(message: bytes) -> Iterator[bytes]:
+    """The message with each of its bits flipped, one at a time."""
+    for place in range(8 * len(message)):
+        worn = bytearray(message)
+        worn[place // 8] ^= 1 << place % 8
+        yield bytes(worn)
+
+
+@pytest.mark.parametrize("entries", [0, 1, 14, 15, 16, 17, 300])
+def test_a_sealed_map_reads_as_before(entries: int) -> None:
+    content = {f"key{number}": number for number in range(entries)}
+    sealed = seal(msgspec.msgpack.encode(content))
+    read = msgspec.msgpack.decode(sealed)
+    assert len(read.pop("check")) == 4
+    assert read == content
+    assert not is_damaged(sealed)
+    assert not is_damaged(msgspec.msgpack.encode(content))
+
+
+@pytest.mark.parametrize("kind", ["keyframe", "correction"])
+def test_no_flipped_bit_changes_a_header(kind: str) -> None:
+    if kind == "keyframe":
+        frames = codec.encode(wall(3), session=SESSION, seq=7, jpeg_quality=90)
+    else:
+        frames = corrections.encode(corrections.checked({1: wall(2).T_world_camera}), session=SESSION, seq=7)
+    head = stamp(frames[0], previous=5, sent_ns=99)
+    sent = unpack(head)
+    for worn in flipped(head):
+        try:
+            assert unpack(worn) == sent
+        except DecodeError:
+            continue
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        messages.Ack(SESSION, 5, 4, (Stamps(5, 1, 2),)),
+        messages.Pong("epoch", 1, 2, 3, 5, 4),
+        messages.Nack(SESSION, 5, "door", "values", "it will not do"),
+    ],
+    ids=lambda message: type(message).__name__,
+)
+def test_no_flipped_bit_changes_what_a_server_says(message: messages.ToClient) -> None:
+    for worn in flipped(messages.encode_sealed(message)):
+        try:
+            assert messages.decode_to_client(worn) == message
+        except DecodeError:
+            continue
