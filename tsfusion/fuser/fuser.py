@@ -14,7 +14,7 @@ import time
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -33,9 +33,15 @@ from tsfusion.wire import codec, sockets
 from tsfusion.wire.health import MeshLayout
 from tsfusion.wire.record_header import Refused
 
+if TYPE_CHECKING:
+    from tsfusion.tsdf.volume import IntegrateStats
+
 _TAICHI_RESERVES = 2 << 30  # bytes that Taichi asks for and hardly uses
 _KEPT_FREE = 256 << 20  # bytes that keyframes leave to meshes and checkpoints
 _FOR_A_CHECKPOINT = 64 << 20  # bytes beyond the limit: meshes may have taken what was kept free
+_HASHED_BYTES = 96  # that a block takes in the map's hash, at most
+_CARVING = 10  # times `quota_cost` where rays also vote for the free space before them
+_MORE_MS = 50  # milliseconds within which the next record comes, if the gateway said that one waits
 _REFINED_AT_ONCE = 256  # blocks: about 50 ms
 _REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
 
@@ -52,6 +58,7 @@ class Fuser:
         self._since_checkpoint = 0
         self._watched = False
         self._answered = self._meshed = 0  # keyframes of this process
+        self._more_waits = False  # at the gateway
         self._next_mesh = 0.0
         self._unrefined = np.zeros((0, 3), np.int32)  # cells that viewers have with the raw surface
         self._hashes: tuple[int, str, str] | None = None  # keyframes answered, map hash, colour hash
@@ -84,6 +91,11 @@ class Fuser:
             self._checkpoint()
         elif isinstance(message, fuser_messages.Finish):
             self.exit_status = 0 if self._checkpoint() else 1
+
+    @property
+    def idle_after_ms(self) -> int:
+        """Milliseconds without a message after which nothing is to be done but to mesh."""
+        return _MORE_MS if self._more_waits else 0
 
     def mesh_due(self, idle: bool) -> bool:
         """Whether the mesh is behind and it is time for it: at once when idle, otherwise after a pause."""
@@ -149,6 +161,7 @@ class Fuser:
     def _fuse(self, order: fuser_messages.Fuse) -> None:
         start = time.monotonic_ns()
         self._answered += 1
+        self._more_waits = order.more
         before = self._map.done.get(order.session)
         if before is not None and order.seq <= before.seq:
             self._send(fuser_messages.Done(order.index, start, start))
@@ -161,7 +174,7 @@ class Fuser:
                 record = journal.read(self._folder / state_folder.JOURNAL_FOLDER, order.position)
                 found = codec.decode(record.frames)
                 if isinstance(found, Keyframe):  # a correction does not change the map (yet)
-                    stats = self._volume.integrate(found)
+                    stats = self._integrate(found, order.client)
                     if not stats.samples:
                         reason, message = NO_SAMPLES, self._volume.why_no_samples(found)
             except TsfusionError as error:
@@ -181,6 +194,28 @@ class Fuser:
         self._since_checkpoint += 1
         if self._begin.checkpoint_every and self._since_checkpoint >= self._begin.checkpoint_every:
             self._checkpoint()
+
+    def _integrate(self, keyframe: Keyframe, client: str) -> "IntegrateStats":
+        """Add a client's keyframe to the map, within its quota. Without keys all clients are one."""
+        from tsfusion.tsdf.integrator import KeyframeQuota
+
+        taken = self._map.blocks
+        cost = self._begin.quota_cost * (_CARVING if self._volume.config.space_carving else 1)
+        self._volume.quota = KeyframeQuota(cost)
+        if client:
+            share = int(self._begin.quota_map * self._most_blocks)
+            self._volume.quota = KeyframeQuota(cost, share - taken.get(client, 0))
+        stats = self._volume.integrate(keyframe)
+        if client and stats.new_blocks:
+            taken[client] = taken.get(client, 0) + stats.new_blocks
+        return stats
+
+    @property
+    def _most_blocks(self) -> int:
+        """Number of blocks that the map has room for."""
+        free = max(self._begin.memory_bytes - _KEPT_FREE, 0)
+        most = free // (self._volume.stats().bytes_per_block + _HASHED_BYTES)
+        return min(self._volume.config.max_blocks, most)
 
     def _checkpoint(self) -> bool:
         written = False
