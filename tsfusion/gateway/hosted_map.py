@@ -150,7 +150,7 @@ class HostedMap:
         while (received := self.fuser.receive()) is not None:
             message, frames = received
             if isinstance(message, fuser_messages.Done):
-                self._backlog.on_done(message.index)
+                self._backlog.on_done(message.index, (message.fused_ns - message.fuse_start_ns) / 1e9)
                 self.outcomes.on_done(message)
             elif isinstance(message, fuser_messages.Ready):
                 self._on_ready(message)
