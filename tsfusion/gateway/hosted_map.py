@@ -218,7 +218,8 @@ class HostedMap:
         """Losses that a person should know of, though keyframes are taken and fused."""
         damaged = self._journal.damaged
         notices = [f"{damaged} keyframes of its journal are damaged and lost"] if damaged else []
-        return [*notices, self._loss] if self._loss else notices
+        notices += [self._loss] if self._loss else []
+        return [*notices, *self.outcomes.notices.values()]
 
     def health(self) -> MapHealth:
         """How the map is doing, as far as it is known without asking the fuser."""
@@ -242,6 +243,7 @@ class HostedMap:
             delay_bound_ms=outcomes.delays.bound_ms,
             corrections=self._corrections,
             checkpoints=self._checkpoints,
+            fusing_s=self.fuser.seconds_at_work,
         )
 
 

@@ -46,6 +46,7 @@ class MapHealth(Struct, frozen=True, kw_only=True):
     delay_bound_ms: float  # error bound of the delays (half the best round trip of the worst client)
     corrections: int = 0  # records of corrected poses: in the journal at the start, and journaled since
     checkpoints: int = 0  # written since the server began
+    fusing_s: float = 0.0  # seconds since the fuser's last answer, while keyframes wait for one
 
 
 ClientState = Literal["connected", "silent", "gone"]
