@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from tsfusion.core.errors import InvalidKeyframe as InvalidKeyframe
     from tsfusion.core.errors import JournalError as JournalError
     from tsfusion.core.errors import KeyframeRefused as KeyframeRefused
+    from tsfusion.core.errors import KeyframeTooLarge as KeyframeTooLarge
     from tsfusion.core.errors import MapError as MapError
     from tsfusion.core.errors import MapFull as MapFull
+    from tsfusion.core.errors import MapQuota as MapQuota
     from tsfusion.core.errors import MissingDependency as MissingDependency
     from tsfusion.core.errors import NotAllowed as NotAllowed
     from tsfusion.core.errors import OutputError as OutputError
@@ -47,7 +49,8 @@ __version__ = "0.1.0"
 _ERRORS = (
     "CheckpointError", "DamagedCheckpoint", "DatasetError", "DecodeError", "FlushTimeout", "IncompleteRun",
     "InvalidConfig",
-    "InvalidKeyframe", "JournalError", "KeyframeRefused", "MapError", "MapFull", "MissingDependency",
+    "InvalidKeyframe", "JournalError", "KeyframeRefused", "KeyframeTooLarge", "MapError", "MapFull",
+    "MapQuota", "MissingDependency",
     "NotAllowed", "OutputError", "ServerUnreachable", "SourceError",
     "TransportError", "TsfusionError", "WeightOverflow", "WorldRefused",
 )  # fmt: skip

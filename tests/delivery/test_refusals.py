@@ -4,9 +4,10 @@
 import time
 from pathlib import Path
 
+import msgspec
 import pytest
 from clients_and_spools import NOBODY, joined, send_all
-from keyframes_and_servers import DEADLINE, pose, serving, until, wall
+from keyframes_and_servers import DEADLINE, VOLUME, pose, serving, until, wall
 from scripted_server import number, scripted
 
 from tsfusion import Client
@@ -15,7 +16,7 @@ from tsfusion.core.errors import FlushTimeout, InvalidConfig, JournalError, Keyf
 from tsfusion.delivery.spool import Spool
 from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec
-from tsfusion.wire.queries import fetch_status
+from tsfusion.wire.queries import fetch_health, fetch_status
 from tsfusion.wire.record_header import unpack
 
 # --- for a while ---
@@ -137,6 +138,23 @@ def test_a_real_server_refuses_some_and_fuses_the_rest(tmp_path: Path) -> None:
         assert server.terminate() == 0
     kept = [keyframe.timestamp_ns - 10**9 for keyframe in JournalRecording(spool / "refused")]
     assert kept == [3, 4, 11]
+
+
+def test_what_a_full_map_rejects_is_said_at_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    volume = msgspec.structs.replace(VOLUME, max_blocks=100)
+    with serving(tmp_path / "state", volume) as server:
+        with Client(server.address, control=server.control) as client:
+            for i in (0, 0, 100, 200, 300):
+                client.send(wall(i))
+            client.wait_fused()
+            assert (client.stats.fused, client.stats.rejected) == (2, {"MapFull": 3})
+        (problem,) = fetch_health(server.address).problems
+    assert problem.startswith("map default: it is full, keyframes that need more room are rejected")
+    told = [(one.levelname, one.getMessage()) for one in caplog.records if "is not in the map" in one.message]
+    assert [(level, text[:41]) for level, text in told] == [
+        ("ERROR", "keyframe 3 is not in the map (MapFull): t"),
+        ("WARNING", "keyframe 4 is not in the map (MapFull): t"),
+    ]
 
 
 def test_what_is_kept_aside_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,11 +5,14 @@ import errno
 import json
 import os
 import signal
+import struct
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -25,7 +28,7 @@ from tsfusion.fuser.fuser import Fuser
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.journal import Journal, Position
 from tsfusion.journal.state_folder import MAP_FILE, PREVIOUS_FILE
-from tsfusion.wire import codec, corrections
+from tsfusion.wire import codec, corrections, record_header
 from tsfusion.wire.messages import Command
 from tsfusion.wire.queries import fetch_health
 
@@ -70,7 +73,14 @@ def opened(state: Path, volume: VolumeConfig = VOLUME, **settings: Any) -> tuple
     link = Link()
     working = state / "working"
     working.write_bytes(bytes(8))
-    usual = {"mesh_interval": 0.0, "checkpoint_every": 0, "keep_previous": False, "memory_bytes": 1 << 40}
+    usual = {
+        "mesh_interval": 0.0,
+        "checkpoint_every": 0,
+        "keep_previous": False,
+        "memory_bytes": 1 << 40,
+        "quota_cost": 10**8,
+        "quota_map": 0.75,
+    }
     begin = messages.Begin(str(state), volume, working=str(working), **{**usual, **settings})
     return Fuser(link, begin), link  # type: ignore[arg-type]
 
@@ -328,6 +338,84 @@ def test_no_memory_for_a_keyframe_is_no_crash(tmp_path: Path, monkeypatch: pytes
     fuser.handle(order(0, position))
     assert link.last().reason == "memory"
     assert link.last().message == "no memory to fuse it: no room for 9 GB; raise fuser_memory_bytes"
+
+
+def test_a_client_may_fill_its_share_of_the_map_and_no_more(tmp_path: Path) -> None:
+    positions = fill(tmp_path, 2)
+    probe, link = opened(tmp_path)
+    probe.handle(order(0, positions[0]))
+    needed = status(probe, link).blocks
+    volume = msgspec.structs.replace(VOLUME, max_blocks=2 * needed - 2)
+    settings = {"quota_map": 0.5, "checkpoint_every": 1}
+    fuser, link = opened(tmp_path, volume, **settings)
+    before = status(fuser, link).map_hash
+    for again in (fuser, opened(tmp_path, volume, **settings)[0]):  # what was taken outlives the process
+        again._link = link  # type: ignore[assignment]
+        again.handle(msgspec.structs.replace(order(0, positions[0]), session=os.urandom(16)))
+        assert link.done().reason == "MapQuota"
+        assert f"{needed - 1} blocks are left for the keyframe's sender" in link.done().message
+    assert status(fuser, link).map_hash == before
+    nobody = msgspec.structs.replace(order(1, positions[0]), client="", session=b"n" * 16)
+    fuser.handle(nobody)
+    assert link.done().reason is None  # without keys there is only the whole
+
+
+def test_what_a_client_took_of_the_map_is_in_the_checkpoint(tmp_path: Path) -> None:
+    positions = fill(tmp_path, 40)
+    volume = msgspec.structs.replace(VOLUME, max_blocks=1 << 20)
+    fuser, link = opened(tmp_path, volume, checkpoint_every=1)
+    fuser.handle(order(0, positions[0]))
+    blocks = status(fuser, link).blocks
+    again, link = opened(tmp_path, volume, quota_map=blocks / (1 << 20))
+    assert again._map.blocks == {"robot": blocks}
+    again.handle(order(39, positions[39]))  # from elsewhere
+    assert link.done().reason == "MapQuota"
+    assert "0 blocks are left for the keyframe's sender" in link.done().message
+
+
+def test_a_keyframe_that_would_cost_too_much_time_is_rejected(tmp_path: Path) -> None:
+    positions = fill(tmp_path, 1)
+    fuser, link = opened(tmp_path, quota_cost=1000)
+    before = status(fuser, link).map_hash
+    fuser.handle(order(0, positions[0]))
+    assert link.done().reason == "KeyframeTooLarge"
+    assert "cost quota_cost = 1000" in link.done().message
+    assert status(fuser, link).map_hash == before
+
+
+def test_a_png_that_unfolds_to_more_than_its_pixels_is_rejected(tmp_path: Path) -> None:
+    """A decoder would unfold 400 MB."""
+    image = cv2.imencode(".png", wall().measurement)[1].tobytes()
+    at = image.index(b"IDAT") - 4
+    length = int.from_bytes(image[at : at + 4], "big")
+    rows = zlib.decompress(image[at + 8 : at + 8 + length])
+    journal, positions = Journal(tmp_path / "journal", 1 << 20), []
+    for seq, surplus in ((1, 0), (2, 400_000_000)):
+        body = b"IDAT" + zlib.compress(rows + bytes(surplus))
+        chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+        frames = codec.encode(wall(), session=SESSION, seq=seq, jpeg_quality=90)
+        frames[1] = image[:at] + chunk + image[-12:]
+        header = record_header.unpack_keyframe(frames[0])
+        depth = msgspec.structs.replace(
+            header.buffers[0], codec="png", bytes=len(frames[1]), crc32=zlib.crc32(frames[1])
+        )
+        header = msgspec.structs.replace(header, buffers=(depth, *header.buffers[1:]))
+        frames[0] = record_header.pack(header)
+        positions.append(journal.append(frames, session=SESSION, seq=seq))
+    journal.close()
+    fuser, link = opened(tmp_path)
+    for index, position in enumerate(positions):
+        fuser.handle(order(index, position))
+    reasons = [one.reason for one, _ in link.sent if isinstance(one, messages.Done)]
+    assert (reasons, status(fuser, link).keyframes_rejected) == ([None, "limits"], {"limits": 1})
+
+
+def test_no_mesh_is_made_while_another_keyframe_waits_at_the_gateway(tmp_path: Path) -> None:
+    position, fuser, _ = opened_with_one(tmp_path)
+    fuser.handle(msgspec.structs.replace(order(0, position), more=True))
+    assert fuser.idle_after_ms > 0
+    fuser.handle(order(1, position))
+    assert fuser.idle_after_ms == 0
 
 
 @pytest.mark.parametrize("min_weight", [float("nan"), float("inf"), 1e308, 1e20, -1.0])

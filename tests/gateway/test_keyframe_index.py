@@ -10,10 +10,11 @@ from tsfusion.fuser.messages import Done, Fuse
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.fuser_backlog import FuserBacklog
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
+from tsfusion.gateway.fuser_time import FuserTime
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.keyframe_outcomes import DelayStatistics, KeyframeOutcomes
 from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.sessions import Sessions
+from tsfusion.gateway.sessions import Session, Sessions
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import Position, RecordEntry
 from tsfusion.journal.quarantine import Quarantine
@@ -104,11 +105,12 @@ def test_sessions_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Fuser:
-    """Takes a number of keyframes."""
+    """Takes a number of keyframes; `answer` ends the oldest that it has not answered."""
 
     def __init__(self, wanted: int) -> None:
         self.wanted = wanted
         self.orders: list[Fuse] = []
+        self.answered = 0
 
     @property
     def wants_work(self) -> bool:
@@ -118,11 +120,34 @@ class Fuser:
         self.orders.append(order)
         return True
 
+    def answer(self, backlog: FuserBacklog, seconds: float) -> None:
+        backlog.on_done(self.orders[self.answered].index, seconds)
+        self.answered += 1
 
-def handed_out(backlog: FuserBacklog, wanted: int) -> list[tuple[str, int]]:
+
+def handed_out(backlog: FuserBacklog, wanted: int, **seconds: float) -> list[tuple[str, int]]:
+    """What a fuser is given that takes so many seconds for each of a client's keyframes."""
     fuser = Fuser(wanted)
-    backlog.hand_out(cast(FuserSupervisor, fuser))
-    return [(order.client, order.seq) for order in fuser.orders]
+    while True:
+        backlog.hand_out(cast(FuserSupervisor, fuser))
+        if fuser.answered == len(fuser.orders):
+            return [(order.client, order.seq) for order in fuser.orders]
+        fuser.answer(backlog, seconds.get(fuser.orders[fuser.answered].client, 0.02))
+
+
+def backlog_of(**counts: int) -> tuple[FuserBacklog, KeyframeIndex, Sessions]:
+    """So many keyframes of each client."""
+    sessions, index = Sessions(), KeyframeIndex()
+    backlog = FuserBacklog(index, sessions)
+    for client, count in counts.items():
+        for seq in range(1, count + 1):
+            add(backlog, index, sessions.open(client.encode() * 16, client), seq)
+    return backlog, index, sessions
+
+
+def add(backlog: FuserBacklog, index: KeyframeIndex, session: Session, seq: int) -> None:
+    index.add(Position(1, seq), session, seq)
+    backlog.add(session)
 
 
 def test_each_client_gets_its_turn() -> None:
@@ -132,15 +157,61 @@ def test_each_client_gets_its_turn() -> None:
     flood, more, small = (sessions.open(bytes([i]) * 16, client) for i, client in enumerate("aab"))
     for seq in range(1, 7):
         for session in (flood, more):
-            index.add(Position(1, seq), session, seq)
-            backlog.add(session)
+            add(backlog, index, session, seq)
     for seq in (1, 2):
-        index.add(Position(2, seq), small, seq)
-        backlog.add(small)
+        add(backlog, index, small, seq)
     assert (backlog.keyframes, backlog.corrections) == (14, 0)
     assert handed_out(backlog, 4) == [("a", 1), ("b", 1), ("a", 1), ("b", 2)]
     assert len(handed_out(backlog, 100)) == 10
     assert handed_out(backlog, 100) == []
+
+
+def test_the_fusers_time_is_shared_out_not_its_keyframes() -> None:
+    backlog, _, _ = backlog_of(a=20, b=200)
+    order = [client for client, _ in handed_out(backlog, 110, a=1.0, b=0.1)]
+    assert 9 <= order.count("a") <= 11  # half of the time
+    between = "".join(order).strip("b").split("a")[1:-1]
+    assert all(8 <= len(run) <= 12 for run in between[1:])
+
+
+def test_who_was_away_has_saved_nothing_up() -> None:
+    backlog, index, sessions = backlog_of(a=50, b=1)
+    handed_out(backlog, 20)
+    late = sessions.open(b"c" * 16, "c")
+    for seq in range(1, 21):
+        add(backlog, index, late, seq)
+        add(backlog, index, sessions.open(b"b" * 16, "b"), seq + 1)
+    order = "".join(client for client, _ in handed_out(backlog, 30))
+    assert all(8 <= order.count(client) <= 12 for client in "abc")
+
+
+def test_nobody_waits_in_the_fusers_queue_behind_what_takes_long() -> None:
+    backlog, _, _ = backlog_of(a=10, b=10)
+    assert len(handed_out(backlog, 4, a=1.5, b=0.01)) == 4  # now it is known what they take
+    fuser = Fuser(4)
+    backlog.hand_out(cast(FuserSupervisor, fuser))
+    assert len(fuser.orders) == 1 or {order.client for order in fuser.orders} == {"b"}
+    while "a" not in {order.client for order in fuser.orders}:
+        fuser.answer(backlog, 0.01)
+        fuser.wanted = fuser.answered + 4
+        backlog.hand_out(cast(FuserSupervisor, fuser))
+    assert fuser.answered == len(fuser.orders) - 1  # alone
+
+
+def test_a_fuser_that_ended_owes_no_answers() -> None:
+    backlog, _, _ = backlog_of(a=3)
+    backlog.hand_out(cast(FuserSupervisor, Fuser(4)))
+    backlog.restart({})
+    assert handed_out(backlog, 9) == [("a", 1), ("a", 2), ("a", 3)]
+
+
+def test_accounts_of_clients_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tsfusion.gateway.fuser_time._MAX_CLIENTS", 8)
+    time = FuserTime()
+    for index in range(100):
+        time.charge(f"client {index}", index)
+        time.settle(index, 0.01)
+    assert len(time._accounts) == 8
 
 
 def test_delays_are_published_with_their_bound() -> None:

@@ -16,9 +16,20 @@ from formula_scenes import CAMERA, SHAPE, plane_keyframe, sphere_views, volume_o
 from numpy.typing import NDArray
 
 from tsfusion import Keyframe, Volume
-from tsfusion.core.errors import InvalidConfig, InvalidKeyframe, MapError, MapFull, WeightOverflow
+from tsfusion.core.errors import (
+    InvalidConfig,
+    InvalidKeyframe,
+    KeyframeTooLarge,
+    MapError,
+    MapFull,
+    MapQuota,
+    WeightOverflow,
+)
+from tsfusion.kernels import integrate
 from tsfusion.kernels.integrate import QUANTA_PER_VOXEL
+from tsfusion.kernels.voxel_traversal import ADDED, COST, COUNT
 from tsfusion.tsdf.block_store import cells_of, unpack_keys
+from tsfusion.tsdf.integrator import KeyframeQuota
 
 VIEWS = sphere_views(0.4, 8)
 
@@ -324,6 +335,73 @@ def test_a_full_set_of_missing_blocks_is_grown_and_loses_nothing() -> None:
     volume.integrate(VIEWS[0])
     assert len(volume._ray_buffers.missing) > 64
     assert volume.map_hash() == volume_of(VIEWS[:1], voxel_size=0.005).map_hash()
+
+
+def scattered(count: int, spread: float) -> Keyframe:
+    """Points anywhere, each seen from another place: no two rays cross the same blocks."""
+    random = np.random.default_rng(4)
+    points = random.uniform(-spread, spread, (count, 3)).astype(np.float32)
+    origins = points + random.uniform(-1, 1, (count, 3)).astype(np.float32)
+    return Keyframe(points=points, origins=origins, T_world_camera=np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("settings", "blocks", "error"),
+    [
+        ({"max_blocks_per_keyframe": 4096}, 1 << 30, KeyframeTooLarge),
+        ({"max_blocks": 4096}, 1 << 30, MapFull),
+        ({}, 4096, MapQuota),
+    ],
+)
+def test_adding_ends_when_too_many_blocks_are_missing(
+    monkeypatch: pytest.MonkeyPatch, settings: dict[str, int], blocks: int, error: type[MapFull]
+) -> None:
+    volume = volume_of(VIEWS[:1], **settings)
+    before, stats = bytes_of(volume), volume.stats()
+    usual, passes, buffers = integrate.add_rays, [0], volume._ray_buffers
+
+    def counted(*given: object) -> None:
+        passes[0] += 1
+        usual(*given)
+
+    monkeypatch.setattr(integrate, "add_rays", counted)
+    volume.quota = KeyframeQuota(cost=1 << 40, blocks=blocks)
+    with pytest.raises(error):
+        volume.integrate(scattered(100_000, 50.0))
+    assert passes[0] == 2  # it was added, and taken away again
+    assert buffers.bands[:, ADDED].sum() < 0.2 * buffers.bands[:, COUNT].sum()
+    assert bytes_of(volume) == before
+    assert volume.stats().blocks == stats.blocks
+    volume.quota = None
+    volume.integrate(VIEWS[1])
+    assert volume.map_hash() == volume_of(VIEWS[:2]).map_hash()
+
+
+@pytest.mark.parametrize("keyframe", [*VIEWS[:2], scattered(1000, 2.0)])
+def test_a_keyframe_costs_at_least_the_voxels_it_crosses(keyframe: Keyframe) -> None:
+    volume = Volume(voxel_size=0.01, threads=2)
+    updates = volume.integrate(keyframe).updates
+    cost = int(volume._ray_buffers.bands[:, COST].sum())
+    assert updates <= cost <= 8 * updates
+    before = bytes_of(volume)
+    volume.quota = KeyframeQuota(cost=cost - 1)
+    with pytest.raises(KeyframeTooLarge, match=f"cost quota_cost = {cost - 1}, these cost {cost}"):
+        volume.integrate(keyframe)
+    assert bytes_of(volume) == before
+    volume.quota = KeyframeQuota(cost=cost)
+    volume.integrate(keyframe)
+
+
+def test_rays_away_from_each_other_cost_more() -> None:
+    volume, scan = Volume(voxel_size=0.01, threads=2), scattered(1000, 2.0)
+    assert scan.points is not None
+    assert scan.origins is not None
+    together = replace(scan, points=scan.points * 1e-2, origins=scan.points * 1e-2 + [0, 0, 1])
+    costs = []
+    for keyframe in (scan, together):
+        updates = volume.integrate(keyframe).updates
+        costs.append(int(volume._ray_buffers.bands[:, COST].sum()) / updates)
+    assert costs[0] > 3 * costs[1]
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tsfusion.wire import image_headers
+from tsfusion.wire import array_encoding, image_headers
 from tsfusion.wire.record_header import Refused
 
 SHAPE = (48, 64)
@@ -74,7 +74,7 @@ def header_again() -> bytes:
     [
         (lambda: b"", "neither a PNG nor a JPEG"),
         (lambda: b"GIF89a" + bytes(100), "neither a PNG nor a JPEG"),
-        (lambda: PNG[:8] + bytes(16), "a PNG begins with its header"),
+        (lambda: PNG[:8] + bytes(24), "a PNG begins with its header"),
         (header_again, "a PNG begins with its header"),
         (lambda: PNG[:33] + struct.pack(">I", 2**31 - 1) + b"IDAT" + PNG[41:], "cut short"),
         (lambda: PNG[:-12], "cut short"),
@@ -85,6 +85,7 @@ def header_again() -> bytes:
         (lambda: with_chunk(b"acTL", struct.pack(">II", 2, 0)), "acTL"),
         (lambda: with_chunk(b"IHDR", struct.pack(">IIBBBBB", 20_000, 20_000, 16, 0, 0, 0, 0)), "IHDR"),
         (lambda: with_chunk(b"tEXt", b"", 100_000), "too many chunks"),
+        (lambda: PNG[:28] + b"\1" + PNG[29:], "interlaced"),
         (lambda: two_sizes(b"\xff\x01"), "marker 01"),
         (lambda: two_sizes(b"\xff\xd0"), "marker d0"),
         (lambda: two_sizes(b"\xff\xd8"), "marker d8"),
@@ -100,3 +101,50 @@ def test_what_would_cost_more_than_it_announces_is_refused(image: Callable[[], b
     with pytest.raises(Refused, match=problem) as refused:
         image_headers.size(image())
     assert refused.value.reason == "payload"
+
+
+ROWS = b"".join(b"\0" + row.tobytes() for row in (IMAGE.astype(np.uint16) * 200).byteswap())
+
+
+def with_pixels(*parts: bytes) -> bytes:
+    """The PNG with this for its compressed pixels."""
+    return PNG[:33] + b"".join(chunk(b"IDAT", part) for part in parts) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        *(PNG, JPEG, PROGRESSIVE),
+        with_pixels(zlib.compress(ROWS)),
+        with_pixels(zlib.compress(ROWS, 0)),
+        with_pixels(zlib.compress(ROWS)[:100], b"", zlib.compress(ROWS)[100:]),
+        *(
+            cv2.imencode(".png", np.full(shape, 7, dtype))[1].tobytes()
+            for shape in ((1, 1), (33, 7), (5, 6, 3), (5, 6, 4), (700, 900))
+            for dtype in (np.uint8, np.uint16)
+        ),
+    ],
+    ids=str,
+)
+def test_an_image_that_unfolds_to_its_pixels_is_decoded(image: bytes) -> None:
+    image_headers.check_unfolding(image)
+    assert cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_UNCHANGED) is not None
+
+
+@pytest.mark.parametrize(
+    ("image", "problem"),
+    [
+        (lambda: with_pixels(zlib.compress(ROWS + bytes(100))), "more bytes than the 6192"),
+        (lambda: with_pixels(zlib.compress(ROWS + bytes(400_000_000))), "more bytes than the 6192"),
+        (lambda: with_pixels(zlib.compress(ROWS), zlib.compress(bytes(7_000_000))), "more behind its pixels"),
+        (lambda: with_pixels(zlib.compress(ROWS[:-1])), "fewer bytes"),
+        (lambda: with_pixels(zlib.compress(ROWS)[:-30]), "fewer bytes"),
+        (lambda: with_pixels(b"nonsense" * 100), "not compressed"),
+    ],
+)
+def test_a_png_that_unfolds_to_more_is_refused_before_it_is_decoded(
+    monkeypatch: pytest.MonkeyPatch, image: Callable[[], bytes], problem: str
+) -> None:
+    monkeypatch.setattr(cv2, "imdecode", None)
+    with pytest.raises(Refused, match=problem):
+        array_encoding.unpack_image(image(), np.dtype(np.uint16), SHAPE)

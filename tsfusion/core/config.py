@@ -226,6 +226,10 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     quota_bytes: Bytes = 256 << 20  # a second, of each client
     quota_keyframes: Positive = 1000.0  # a second, of each client
     quota_points: Annotated[int, Meta(ge=1)] = 8 << 20  # points or pixels a keyframe
+    # What the rays of a keyframe may cost, in voxels that they cross; five times those of a ray away from the
+    # one before it. Ten times what the densest sensors need, two seconds of one core
+    quota_cost: Annotated[int, Meta(ge=1)] = 100_000_000
+    quota_map: Annotated[float, Meta(gt=0, le=1)] = 0.75  # share of a map's room for each client with a key
     quota_extent: Positive = 100_000.0  # metres from the map's origin to a sensor
     log_format: LogFormat = "text"  # on stderr: lines of text, or one JSON object a line
     log_level: LogLevel = "info"  # less important lines are left out

@@ -10,6 +10,8 @@
     ├── JournalError                       the journal or spool cannot be read or written
     ├── MapError
     │   ├── MapFull                        a keyframe needs more blocks than the limits allow
+    │   │   ├── KeyframeTooLarge           it needs more, or more time, than any keyframe may
+    │   │   └── MapQuota                   its sender has had its share of the map's room
     │   ├── WeightOverflow                 a voxel has taken as many votes as its integers hold
     │   └── CheckpointError                a saved map is missing, unreadable or of another version
     │       └── DamagedCheckpoint          its bytes are not those that were written
@@ -78,6 +80,14 @@ class MapError(TsfusionError):
 
 class MapFull(MapError):
     """A keyframe needs more blocks than the limits allow; the map is as it was before."""
+
+
+class KeyframeTooLarge(MapFull):
+    """A keyframe touches more blocks, or its rays cost more time, than the limits allow any keyframe."""
+
+
+class MapQuota(MapFull):
+    """A keyframe needs more blocks than are left of its sender's share of the map's room."""
 
 
 class WeightOverflow(MapError):

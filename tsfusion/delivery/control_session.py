@@ -11,6 +11,7 @@ from tsfusion.delivery.link_state import LinkState
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.refused_keyframes import RefusedFolder
 from tsfusion.delivery.timing import SAMPLES, ClockOffset
+from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.wire import messages
 from tsfusion.wire.keyframe_times import Stamps
 from tsfusion.wire.messages import PROTOCOL_VERSION
@@ -23,6 +24,7 @@ _FIRST_PINGS_INTERVAL = 0.02  # until the clock estimate stands on all its sampl
 _REWIND_INTERVAL = 0.2  # one gap is reported by every keyframe behind it
 _LATEST = 1 << 62  # nanoseconds; no clock shows more than a century
 _OTHER_WORLD_INTERVAL = 5.0  # seconds; a map's frame changes when the server begins anew
+_WARNING_INTERVAL = 10.0  # seconds between two warnings of rejected records
 _HOLD = (0.05, 60.0)  # seconds: no server may hold a client for less or longer at a time
 
 
@@ -58,6 +60,8 @@ class ControlSession:
         self._hello_due = self._ping_due = self._rewound = self._held_until = 0.0
         self._hello_interval = _HELLO_INTERVAL[0]
         self._asked_again = False
+        self._warning_due = 0.0  # when rejected records may be named again
+        self._unsaid = 0  # records that were rejected since they were
         self._is_lost = False  # whether it was said that the server is gone or silent
 
     @property
@@ -287,13 +291,22 @@ class ControlSession:
     def _on_nack(self, nack: messages.Nack) -> None:
         self.last_moved = self.last_progress = self.last_heard
         if nack.stage == "map":
-            kind, is_first = self._outbox.reject(nack.seq, nack.reason, nack.message)
-            log.log(  # the others are counted
-                logging.ERROR if is_first else logging.DEBUG,
-                "%s %d is not in the map (%s): %s", kind, nack.seq, nack.reason, nack.message,
-            )  # fmt: skip
+            self._on_rejected(nack)
         elif (entry := self._outbox.find_sent(nack.seq)) is not None:
             self._refused.give_up(entry, nack.reason, nack.message)
+
+    def _on_rejected(self, nack: messages.Nack) -> None:
+        """Say at once that the map did not take a record, the first of each reason as an error."""
+        kind, is_first = self._outbox.reject(nack.seq, nack.reason, nack.message)
+        self._unsaid += not is_first and nack.reason != NO_SAMPLES
+        what = (kind, nack.seq, nack.reason, nack.message)
+        if is_first:
+            log.error("%s %d is not in the map (%s): %s", *what)
+        elif self.last_heard >= self._warning_due and nack.reason != NO_SAMPLES:
+            more = f", the last of {self._unsaid} more that are not" if self._unsaid > 1 else ""
+            log.warning("%s %d is not in the map (%s): %s%s", *what, more)
+            self._unsaid = 0
+            self._warning_due = self.last_heard + _WARNING_INTERVAL
 
     def _on_hold(self, hold: messages.Hold) -> None:
         shortest, longest = _HOLD

@@ -52,7 +52,7 @@ def _serve(link: sockets.AnySocket) -> int:
     poller.register(sys.stdin.fileno(), zmq.POLLIN)
     fuser: Fuser | None = None
     while fuser is None or fuser.exit_status is None:
-        idle = not poller.poll(0)
+        idle = not poller.poll(fuser.idle_after_ms if fuser is not None else 0)
         if fuser is not None and fuser.mesh_due(idle):
             fuser.mesh()
             continue

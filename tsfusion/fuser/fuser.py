@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -37,12 +37,17 @@ from tsfusion.wire import codec, sockets
 from tsfusion.wire.health import MeshLayout
 from tsfusion.wire.record_header import Refused
 
+if TYPE_CHECKING:
+    from tsfusion.tsdf.volume import IntegrateStats
+
 _WORKING_MEMORY = 768 << 20  # bytes for keyframes and meshes, beyond those of the map
 _FOR_KEYFRAMES = 256 << 20  # bytes of it that meshes leave free
 _FOR_A_CHECKPOINT = 64 << 20  # bytes beyond both
 LOCK = "fuser.lock"  # in the map's folder
 _PATIENCE_S = 10.0  # for a record that the system refuses to read, or whose segment is not there
 RETRY_MS = 500  # until it is tried again
+_CARVING = 10  # times `quota_cost` where rays also vote for the free space before them
+_MORE_MS = 50  # milliseconds within which the next record comes, if the gateway said that one waits
 _REFINED_AT_ONCE = 256  # blocks: about 50 ms
 _REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
 
@@ -63,6 +68,7 @@ class Fuser:
         self._orders: deque[fuser_messages.Fuse] = deque()  # not answered; the first cannot be read for now
         self._held_since: float | None = None  # time.monotonic(); None = nothing is held
         self._answered = self._meshed = 0  # keyframes of this process
+        self._more_waits = False  # at the gateway
         self._next_mesh = 0.0
         self._unrefined = np.zeros((0, 3), np.int32)  # cells that viewers have with the raw surface
         self._hashes: tuple[int, str, str] | None = None  # keyframes answered, map hash, colour hash
@@ -113,6 +119,11 @@ class Fuser:
         while self._orders and self.exit_status is None and self._fuse(self._orders[0]):
             self._orders.popleft()
             self._held_since = None
+
+    @property
+    def idle_after_ms(self) -> int:
+        """Milliseconds without a message after which nothing is to be done but to mesh."""
+        return _MORE_MS if self._more_waits else 0
 
     def mesh_due(self, idle: bool) -> bool:
         """Whether the mesh is behind and it is time for it: at once when idle, otherwise after a pause."""
@@ -179,6 +190,7 @@ class Fuser:
     def _fuse(self, order: fuser_messages.Fuse) -> bool:
         """Take a record into the map, or reject it; False when it cannot be read for now."""
         start = time.monotonic_ns()
+        self._more_waits = order.more
         before = self._map.done.get(order.session)
         if before is not None and order.seq <= before.seq:
             self._answered += 1
@@ -191,7 +203,7 @@ class Fuser:
                 record = journal.read(self._folder / state_folder.JOURNAL_FOLDER, order.position)
                 found = codec.decode(record.frames)
                 if isinstance(found, Keyframe):  # a correction does not change the map (yet)
-                    stats = self._volume.integrate(found)
+                    stats = self._integrate(found, order.client)
                     if not stats.samples:
                         reason, message = NO_SAMPLES, self._volume.why_no_samples(found)
             except TsfusionError as error:
@@ -243,6 +255,21 @@ class Fuser:
             yield
         finally:
             process.limit_memory(self._memory_limit)
+
+    def _integrate(self, keyframe: Keyframe, client: str) -> "IntegrateStats":
+        """Add a client's keyframe to the map, within its quota. Without keys all clients are one."""
+        from tsfusion.tsdf.integrator import KeyframeQuota
+
+        taken = self._map.blocks
+        cost = self._begin.quota_cost * (_CARVING if self._volume.config.space_carving else 1)
+        self._volume.quota = KeyframeQuota(cost)
+        if client:
+            share = int(self._begin.quota_map * self._volume.most_blocks)
+            self._volume.quota = KeyframeQuota(cost, share - taken.get(client, 0))
+        stats = self._volume.integrate(keyframe)
+        if client and stats.new_blocks:
+            taken[client] = taken.get(client, 0) + stats.new_blocks
+        return stats
 
     def _checkpoint(self) -> bool:
         written, problem = False, ""

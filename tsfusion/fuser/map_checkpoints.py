@@ -49,6 +49,7 @@ class MapCheckpoints:
         self.problem = ""  # why the last checkpoint could not be written; empty = it could
         self.done: dict[bytes, SessionProgress] = {}  # session → how far the map is with it
         self.rejected: dict[str, int] = {}  # reason → number of keyframes that the map could not take
+        self.blocks: dict[str, int] = {}  # client with a key → number of blocks that its keyframes added
         # The map, at first as it was in the last checkpoint
         self.volume = _resume(self._path, config) or _resume(self._previous, config) or Volume(config)
         if meta := self.volume.meta:
@@ -56,6 +57,7 @@ class MapCheckpoints:
                 bytes.fromhex(key): SessionProgress(*progress) for key, progress in meta["done"].items()
             }
             self.rejected = dict(meta["rejected"])
+            self.blocks = dict(meta.get("blocks", {}))
 
     def save(self) -> bool:
         """Write a checkpoint; False when that failed, which is logged.
@@ -64,7 +66,7 @@ class MapCheckpoints:
         new one is on the disk, the old ones keep their names.
         """
         done = {key.hex(): msgspec.structs.astuple(progress) for key, progress in self.done.items()}
-        meta = {"done": done, "rejected": self.rejected}
+        meta = {"done": done, "rejected": self.rejected, "blocks": self.blocks}
         try:
             self.volume.save(self._new, meta=meta)
             if self._keep_previous:

@@ -29,6 +29,7 @@ class Begin(Struct, frozen=True, tag="begin"):
             `NOT_WORKING`. Read when the process has died, so that the right keyframe is blamed.
         keep_previous: whether to keep the checkpoint before the last, too: the journal may be cut.
         memory_bytes: that the process may allocate.
+        quota_cost, quota_map: as in the server's settings.
     """
 
     folder: str
@@ -38,6 +39,8 @@ class Begin(Struct, frozen=True, tag="begin"):
     working: str
     keep_previous: bool
     memory_bytes: int
+    quota_cost: int
+    quota_map: float
 
 
 class SessionProgress(Struct, frozen=True, array_like=True):
@@ -54,7 +57,7 @@ class SessionProgress(Struct, frozen=True, array_like=True):
 class Fuse(Struct, frozen=True, tag="fuse"):
     """Fuse the keyframe, or note the correction, at a journal position, unless the map has it already.
 
-    `skip`: reject it without a try, for this reason.
+    `skip`: reject it without a try, for this reason. `more`: another one waits at the gateway.
     """
 
     index: int
@@ -65,6 +68,7 @@ class Fuse(Struct, frozen=True, tag="fuse"):
     world: str = ""
     skip: str | None = None
     is_correction: bool = False
+    more: bool = False
 
 
 class FuserQuery(Struct, frozen=True, tag="ask"):

@@ -6,17 +6,19 @@ from collections.abc import Mapping
 
 from tsfusion.fuser.messages import Fuse, SessionProgress
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
+from tsfusion.gateway.fuser_time import FuserTime
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.sessions import Session, Sessions
 
 
 class FuserBacklog:
-    """Hand out records of each client in turn, and of each session of a client in turn."""
+    """Hand out records of the client that took least of the fuser's time, of each of its sessions in turn."""
 
     def __init__(self, index: KeyframeIndex, sessions: Sessions) -> None:
         self._index = index
         self._sessions = sessions
-        self._queues: OrderedDict[str, deque[Session]] = OrderedDict()  # by owner, the next one first
+        self._queues: OrderedDict[str, deque[Session]] = OrderedDict()  # by owner, the last one served last
+        self._time = FuserTime()
         self._count()
 
     @property
@@ -36,8 +38,9 @@ class FuserBacklog:
         self.corrections += is_correction
         self._enqueue(session)
 
-    def on_done(self, index: int) -> None:
-        """Take out a record that the fuser answered."""
+    def on_done(self, index: int, seconds: float) -> None:
+        """Take out a record that the fuser answered, after so many seconds of work."""
+        self._time.settle(index, seconds)
         is_correction = self._index[index].is_correction
         self.keyframes -= not is_correction
         self.corrections -= is_correction
@@ -51,6 +54,7 @@ class FuserBacklog:
     def restart(self, done: Mapping[bytes, SessionProgress]) -> None:
         """Begin where a new fuser begins, with `done` of each session: hand out all the rest again."""
         self._queues.clear()
+        self._time.restart()
         for session in self._sessions:
             progress = done.get(session.key)
             session.in_map = progress.seq if progress else 0
@@ -61,7 +65,10 @@ class FuserBacklog:
     def hand_out(self, fuser: FuserSupervisor) -> None:
         """Hand out as many records as the fuser wants."""
         while self._queues and fuser.wants_work:
-            owner, queue = next(iter(self._queues.items()))
+            owner = self._time.next_of(self._queues)
+            if not self._time.has_room_for(owner):
+                return
+            queue = self._queues[owner]
             session = queue[0]
             entry = self._index[session.entries[session.handed]]
             order = Fuse(
@@ -72,9 +79,11 @@ class FuserBacklog:
                 session.client,
                 session.world or "",
                 is_correction=entry.is_correction,
+                more=len(self._queues) > 1 or session.handed + 1 < len(session.entries) or len(queue) > 1,
             )
             if not fuser.fuse(order):
                 return
+            self._time.charge(owner, entry.index)
             session.handed += 1
             queue.popleft()
             if session.handed < len(session.entries):

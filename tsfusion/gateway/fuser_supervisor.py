@@ -54,6 +54,8 @@ class FuserSupervisor:
             "",  # each process has its own
             server.journal_bytes is not None,
             server.fuser_memory_bytes or process.physical_memory_bytes() * 3 // 4,
+            server.quota_cost,
+            server.quota_map,
         )
         self._early_deaths = 0  # in a row, of processes that were not at work on a keyframe
         self._blame: dict[int, int] = {}  # index of a keyframe → weight of the deaths at it
@@ -117,6 +119,11 @@ class FuserSupervisor:
     def idle(self) -> bool:
         """Whether the process is ready and has answered every keyframe that was handed out."""
         return self.ready and not self.in_flight
+
+    @property
+    def seconds_at_work(self) -> float:
+        """Seconds since its last answer, while it has a keyframe to answer; 0 = it has none."""
+        return time.monotonic() - self._last_message if self.ready and self.in_flight else 0.0
 
     @property
     def wants_work(self) -> bool:

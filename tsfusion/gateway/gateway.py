@@ -216,6 +216,8 @@ class Gateway:
             max_frame_bytes=self._server.max_frame_bytes,
         )
         self.ports.reply(identity, welcome)
+        if (hosted := self.maps.get(hello.map)) is not None:
+            hosted.outcomes.on_hello(hello.session)
 
     def _denial(self, identity: bytes, hello: messages.Hello, client: str) -> tuple[str, ...] | None:
         """The fields of the answer to a session that is not opened; None = it is, and its route is made."""

@@ -165,7 +165,7 @@ class HostedMap:
             message, frames = received
             if isinstance(message, fuser_messages.Done):
                 self._moved = time.monotonic()
-                self._backlog.on_done(message.index)
+                self._backlog.on_done(message.index, (message.fused_ns - message.fuse_start_ns) / 1e9)
                 self.outcomes.on_done(message)
             elif isinstance(message, fuser_messages.Ready):
                 self._on_ready(message)
@@ -294,7 +294,8 @@ class HostedMap:
             notices.append(f"no checkpoint can be written: {self._unsaved}")
         if self.state == "restarting" and not self.problem:
             notices.append("its fuser ended, and another one takes over: the log says why")
-        return [*notices, *filter(None, (self._quarantine.problem, self._loss))]
+        notices += filter(None, (self._quarantine.problem, self._loss))
+        return [*notices, *self.outcomes.notices.values()]
 
     def health(self) -> MapHealth:
         """How the map is doing, as far as it is known without asking the fuser."""
@@ -320,6 +321,7 @@ class HostedMap:
             checkpoints=self._checkpoints,
             journal_missing=self._journal.absent + len(self._journal.missing),
             journal_put_back=self._journal.put_back,
+            fusing_s=self.fuser.seconds_at_work,
         )
 
 

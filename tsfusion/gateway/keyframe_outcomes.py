@@ -3,7 +3,7 @@
 
 import logging
 import time
-from collections import Counter, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,6 +24,10 @@ from tsfusion.wire import keyframe_times, messages
 from tsfusion.wire.keyframe_times import Spread
 
 log = logging.getLogger(__name__)
+
+_FULL = ("memory", "MapFull")  # reasons of a fuser: the map has no room for a keyframe
+_OVER_QUOTA = "MapQuota"  # or its client has had its share
+_MAX_UNTOLD = 64  # rejections of a session while it is away, and sessions with some
 
 
 class KeyframeOutcomes:
@@ -56,6 +60,8 @@ class KeyframeOutcomes:
         # checkpoint holds is never fused again, but a damaged one makes way for that before it.
         self._rejected_before: set[int] = set()
         self._rejected_since: set[int] = set()
+        self.notices: dict[str, str] = {}  # what a person must do, by reason and client
+        self._untold: OrderedDict[bytes, deque[messages.Nack]] = OrderedDict()  # session → while it was away
         self._without_samples: set[bytes] = set()  # sessions that have been named for a keyframe of that kind
         self._meshed = 0  # keyframes that the present fuser answered and meshed
 
@@ -69,6 +75,7 @@ class KeyframeOutcomes:
         """Go back to the counts of the checkpoint that a new fuser began with."""
         self.fused, self.rejected = ready.keyframes, Counter(ready.rejected)
         self.blocks, self.map_bytes = ready.blocks, ready.map_bytes
+        self.notices.clear()  # it may have more room now
         self._settle_unmeshed()
 
     def _settle_unmeshed(self) -> None:
@@ -136,7 +143,8 @@ class KeyframeOutcomes:
         )
         if (route := self._routes.get(session.key)) is not None:
             route.fates.turned_away(done.message or done.reason)
-        self._routes.send(session.key, messages.Nack(session.key, seq, "map", done.reason, done.message))
+        self._tell(messages.Nack(session.key, seq, "map", done.reason, done.message))
+        self._note_want_of_room(done.reason, done.message, session.client)
         if is_empty:  # nothing is wrong with the record
             self._without_samples.add(session.key)
             return
@@ -149,6 +157,33 @@ class KeyframeOutcomes:
     def on_checkpoint(self) -> None:
         """Note that a new checkpoint holds everything that was answered."""
         self._rejected_before, self._rejected_since = self._rejected_since, set()
+
+    def _tell(self, nack: messages.Nack) -> None:
+        """Tell a client at once that the map did not take its record, or when it is back."""
+        route = self._routes.get(nack.session)
+        if route is not None and route.state(time.monotonic()) == "connected":
+            self._routes.send(nack.session, nack)
+            return
+        self._untold.setdefault(nack.session, deque(maxlen=_MAX_UNTOLD)).append(nack)
+        if len(self._untold) > _MAX_UNTOLD:
+            self._untold.popitem(last=False)
+
+    def on_hello(self, key: bytes) -> None:
+        """Tell a client what the map did not take while it was away."""
+        for nack in self._untold.pop(key, ()):
+            self._routes.send(key, nack)
+
+    def _note_want_of_room(self, reason: str, message: str, client: str) -> None:
+        if reason in _FULL:
+            self.notices["full"] = (
+                "it is full, keyframes that need more room are rejected: raise max_blocks or "
+                "fuser_memory_bytes, or begin another map"
+            )
+        elif reason == _OVER_QUOTA:
+            self.notices[client] = (
+                f"client {client} has used up its share of the map's room, its keyframes that need more are "
+                "rejected: raise quota_map, or look at what it sends"
+            )
 
     def on_meshed(self, meshed: fuser_messages.Meshed) -> None:
         """Note that the fuser brought the mesh up to date."""

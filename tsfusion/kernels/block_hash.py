@@ -15,8 +15,11 @@ MAX_PROBES = 256
 
 @ti.func
 def set_insert(table: ti.template(), mask, key):
-    """Insert `key` (> 0) into the set; returns 1 when it is too full."""
-    full = 0
+    """Insert `key` (> 0) into the set; returns how much larger it is now, and whether it is too full.
+
+    Of threads that insert one key at the same time, one counts it.
+    """
+    full, grown = 0, 0
     carried = key
     i = hash_key(key) & mask
     probes = 0
@@ -28,13 +31,14 @@ def set_insert(table: ti.template(), mask, key):
             if before == carried:
                 carried = ti.i64(0)
             elif before < carried:
+                grown = ti.cast(before == 0, ti.i32)
                 carried = before
         i = (i + 1) & mask
         probes += 1
         if probes > MAX_PROBES:
             full = 1
             carried = ti.i64(0)
-    return full
+    return grown, full
 
 
 @ti.func

@@ -12,6 +12,7 @@ import taichi as ti
 
 from tsfusion.kernels.block_hash import map_find, set_insert
 from tsfusion.kernels.voxel_traversal import (
+    ADDED,
     COUNT,
     DEFERRED,
     END,
@@ -38,9 +39,13 @@ FREE_SHIFT = 1  # a vote for free space before the band is half of one for a sur
 COLOR_LIMIT = 1 << 15  # votes after which a voxel's colour is settled and takes no more
 CUBE = 512
 
-# `touched`: how many blocks, whether `missing` was too small, whether a colour was taken away that was not
-# there, and then the blocks' slots
-TOUCHED_COUNT, TOUCHED_OVERFLOW, TOUCHED_MISMATCH, TOUCHED_HEADER = 0, 1, 2, 3
+# `touched`: how many blocks, whether more are missing than may be, whether a colour was taken away that was
+# not there, how many blocks are missing, and then the slots of the touched ones
+TOUCHED_COUNT, TOUCHED_OVERFLOW, TOUCHED_MISMATCH, TOUCHED_MISSING, TOUCHED_HEADER = 0, 1, 2, 3, 4
+
+# Which rays of a band are added: all of them, those that cross blocks which were missing, or those that were
+# added before it showed that too many blocks are missing (to take them away again).
+ALL, ONLY_DEFERRED, ONLY_ADDED = 0, 1, 2
 
 
 @ti.func
@@ -96,14 +101,18 @@ def vote_color(
 
 @ti.func
 def enter_block(
-    key, hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(), stamp,
+    key, hash_keys: ti.template(), hash_slots: ti.template(), missing: ti.template(), most_missing, stamp,
     stamps: ti.template(), places: ti.template(), dirty: ti.template(), touched: ti.template(),
 ):  # fmt: skip
     """Slot of a block, which is listed in `touched`; −1, and its key in `missing`, if the map lacks it."""
     slot = map_find(hash_keys, hash_slots, hash_keys.shape[0] - 1, key)
     if slot < 0:
-        if set_insert(missing, missing.shape[0] - 1, key) == 1:
-            touched[TOUCHED_OVERFLOW] = 1
+        if touched[TOUCHED_OVERFLOW] == 0:
+            grown, full = set_insert(missing, missing.shape[0] - 1, key)
+            if grown == 1:
+                full |= ti.cast(ti.atomic_add(touched[TOUCHED_MISSING], 1) >= most_missing, ti.i32)
+            if full == 1:
+                touched[TOUCHED_OVERFLOW] = 1
     else:
         touch(slot, stamp, stamps, places, dirty, touched)
     return slot
@@ -112,9 +121,9 @@ def enter_block(
 @ti.func
 def add_ray(
     rays: ti.template(), r, sign_, oldest, last: ti.template(), slot: ti.template(), hash_keys: ti.template(),
-    hash_slots: ti.template(), missing: ti.template(), stamp, stamps: ti.template(), places: ti.template(),
-    dirty: ti.template(), touched: ti.template(), sums: ti.template(), has_color, color_rgn: ti.template(),
-    color_b: ti.template(),
+    hash_slots: ti.template(), missing: ti.template(), most_missing, stamp, stamps: ti.template(),
+    places: ti.template(), dirty: ti.template(), touched: ti.template(), sums: ti.template(), has_color,
+    color_rgn: ti.template(), color_b: ti.template(),
 ):  # fmt: skip
     """Add a ray to every voxel it crosses. `last` and its `slot`: the block entered last, by any ray.
 
@@ -132,8 +141,9 @@ def add_ray(
         if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
             last = block
             slot = enter_block(
-                block_key(walk.voxel), hash_keys, hash_slots, missing, stamp, stamps, places, dirty, touched
-            )
+                block_key(walk.voxel), hash_keys, hash_slots, missing, most_missing, stamp, stamps, places,
+                dirty, touched,
+            )  # fmt: skip
         step, leaves = next_step(walk.crossing)
         if slot >= oldest:
             o = offset_in_block(walk.voxel)
@@ -160,7 +170,7 @@ def add_rays(
     rays: ti.types.ndarray(dtype=ti.i32, ndim=2),
     bands: ti.types.ndarray(dtype=ti.i32, ndim=2),
     deferred: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    only_deferred: ti.i32,
+    which: ti.i32,
     first_band: ti.i32,
     last_band: ti.i32,
     sign_: ti.i32,
@@ -168,6 +178,7 @@ def add_rays(
     hash_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
     hash_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
     missing: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    most_missing: ti.i32,
     stamp: ti.i32,
     stamps: ti.types.ndarray(dtype=ti.i32, ndim=1),
     places: ti.types.ndarray(dtype=ti.i32, ndim=1),
@@ -181,7 +192,8 @@ def add_rays(
     """Add to every voxel that each ray crosses in its band, in blocks of slot ≥ `oldest`.
 
     Rays that cross blocks the map does not have are listed in `deferred`, the keys in `missing`; when those
-    blocks exist, a second call with `only_deferred` and `oldest` = the first new slot adds the rest.
+    blocks exist, a second call with `ONLY_DEFERRED` and `oldest` = the first new slot adds the rest. With
+    more than `most_missing` of them every band ends after the ray that it is at: `ONLY_ADDED` are those.
     """
     for run in range((last_band - first_band) * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
@@ -189,26 +201,32 @@ def add_rays(
             start = bands[band, START]
             count = bands[band, COUNT]
             updates = 0
-            if only_deferred == 1:
+            if which == ONLY_DEFERRED:
                 count = bands[band, DEFERRED]
                 updates = bands[band, UPDATES]
+            if which == ONLY_ADDED:
+                count = bands[band, ADDED]
             last, slot = vec3i(2147483647), -1
-            postponed = 0
-            for n in range(count):
+            postponed, n = 0, 0
+            while n < count:
                 r = start + n
-                if only_deferred == 1:
+                if which == ONLY_DEFERRED:
                     r = deferred[start + n]
                 added, incomplete = add_ray(
-                    rays, r, sign_, oldest, last, slot, hash_keys, hash_slots, missing, stamp, stamps,
-                    places, dirty, touched, sums, has_color, color_rgn, color_b,
+                    rays, r, sign_, oldest, last, slot, hash_keys, hash_slots, missing, most_missing, stamp,
+                    stamps, places, dirty, touched, sums, has_color, color_rgn, color_b,
                 )  # fmt: skip
                 updates += added
                 if incomplete == 1:
                     deferred[start + postponed] = r
                     postponed += 1
+                    if which == ALL and touched[TOUCHED_OVERFLOW] == 1:
+                        count = n
+                n += 1
             bands[band, UPDATES] = updates
-            if only_deferred == 0:
+            if which == ALL:
                 bands[band, DEFERRED] = postponed
+                bands[band, ADDED] = n
 
 
 @ti.kernel

@@ -250,11 +250,12 @@ def layer_color(
 
 @ti.func
 def write_layer_ray(
-    rays: ti.template(), r, model: ti.template(), camera, plane, unit,
+    rays: ti.template(), r, first, model: ti.template(), camera, plane, unit,
     color: ti.template(), has_color, confidence: ti.template(), has_confidence, depths: ti.template(), band,
     cell, layer,
 ):  # fmt: skip
-    """Write ray `r` through the mean of a layer's samples; returns its weight, 0 if it is out of reach.
+    """Write ray `r` through the mean of a layer's samples; returns its weight, 0 if it is out of reach, and
+    what it costs to add it.
 
     paper eq. 1 (u = column, v = row), in voxels: point = origin + z (u·du + v·dv + corner).
     """
@@ -264,7 +265,7 @@ def write_layer_ray(
     v = cell.top + ti.cast(layer.sum_y, ti.f64) / n
     direction = camera.corner + camera.du * u + camera.dv * v
     p = camera.origin + direction * z
-    weight = 0
+    weight, cost = 0, 0
     if in_reach(p):
         rgb, trust = 0, 255 * n
         if has_confidence == 1 or has_color == 1:
@@ -278,8 +279,8 @@ def write_layer_ray(
         weight = bundle_weight(model, sigma, trust)
         half = half_width(model, sigma)
         before = before_width(model, half, direction.norm() * z)
-        write_ray(rays, r, fixed_point(p), direction, gradient, before, half, weight, rgb)
-    return weight
+        cost = write_ray(rays, r, first, fixed_point(p), direction, gradient, before, half, weight, rgb)
+    return weight, cost
 
 
 @ti.kernel
@@ -312,8 +313,9 @@ def rays_from_image(
             reading = Reading(is_disparity, factor, has_confidence, near, far, per_metre)
             first_tile = ti.cast(ti.cast(band, ti.i64) * tiles // count, ti.i32)
             last_tile = ti.cast(ti.cast(band + 1, ti.i64) * tiles // count, ti.i32)
-            out = first_tile * TILE_SAMPLES
-            samples, total_weight = 0, 0
+            first_ray = first_tile * TILE_SAMPLES
+            out = first_ray
+            samples, total_weight, total_cost = 0, 0, ti.i64(0)
             for tile in range(first_tile, last_tile):
                 left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
                 valid, total = load_tile(image, confidence, reading, left, top, depths, band)
@@ -333,13 +335,14 @@ def rays_from_image(
                         if layer.n == 1 and model[DROPS_LONE_SAMPLES] > 0.0:
                             keep = 1 == is_supported(image, confidence, reading, cell, layer)
                         if keep:
-                            weight = write_layer_ray(
-                                rays, out, model, camera, plane, unit, color, has_color,
+                            weight, cost = write_layer_ray(
+                                rays, out, first_ray, model, camera, plane, unit, color, has_color,
                                 confidence, has_confidence, depths, band, cell, layer,
                             )  # fmt: skip
                             if weight > 0:
                                 total_weight += weight
+                                total_cost += cost
                                 samples += layer.n
                                 out += 1
                         above = ti.select(more, layer.up_to, -1)
-            write_band(bands, band, first_tile * TILE_SAMPLES, out, samples, total_weight)
+            write_band(bands, band, first_ray, out, samples, total_weight, total_cost)

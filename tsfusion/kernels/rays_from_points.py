@@ -71,12 +71,13 @@ def add_point(bundle: ti.template(), q, o, confident, color: ti.template(), has_
 
 
 @ti.func
-def write_bundle_ray(rays: ti.template(), r, model: ti.template(), pose: ti.template(), bundle, start):
-    """Write ray `r` from `start` through the mean of a bundle; returns its weight, 0 if out of reach."""
+def write_bundle_ray(rays: ti.template(), r, first, model: ti.template(), pose: ti.template(), bundle, start):
+    """Write ray `r` from `start` through the mean of a bundle; returns its weight, 0 if out of reach, and
+    what it costs to add it."""
     n = bundle.n
     mean = bundle.sum_q * (1.0 / n)
     origin, end = transform(pose, start), transform(pose, mean)
-    weight = 0
+    weight, cost = 0, 0
     if in_reach(end) and in_reach(origin):
         sigma = noise_sigma(model, (mean - start).norm())
         weight = bundle_weight(model, sigma, bundle.trust)
@@ -84,8 +85,8 @@ def write_bundle_ray(rays: ti.template(), r, model: ti.template(), pose: ti.temp
         rgb = ((bundle.red // n) << 16) | ((bundle.green // n) << 8) | (bundle.blue // n)
         direction, across = end - origin, vec3(0.0)
         before = before_width(model, half, direction.norm())
-        write_ray(rays, r, fixed_point(end), direction, across, before, half, weight, rgb)
-    return weight
+        cost = write_ray(rays, r, first, fixed_point(end), direction, across, before, half, weight, rgb)
+    return weight, cost
 
 
 @ti.kernel
@@ -113,7 +114,7 @@ def rays_from_points(
             band = run // RUN
             first_point = ti.cast(ti.cast(band, ti.i64) * count // bands.shape[0], ti.i32)
             last_point = ti.cast(ti.cast(band + 1, ti.i64) * count // bands.shape[0], ti.i32)
-            out, samples, total_weight = first_point, 0, 0
+            out, samples, total_weight, total_cost = first_point, 0, 0, ti.i64(0)
             anchor = vec3f(0.0)
             common_start = ti.cast(row(starts, 0), ti.f64)
             points_of_ray = Bundle(0, 0, 0, 0, 0, vec3(0.0), vec3(0.0))
@@ -130,9 +131,10 @@ def rays_from_points(
                     start = common_start
                     if own_starts == 1:
                         start = points_of_ray.sum_o * (1.0 / n)
-                    weight = write_bundle_ray(rays, out, model, pose, points_of_ray, start)
+                    weight, cost = write_bundle_ray(rays, out, first_point, model, pose, points_of_ray, start)
                     if weight > 0:
                         total_weight += weight
+                        total_cost += cost
                         samples += n
                         out += 1
                     points_of_ray = Bundle(0, 0, 0, 0, 0, vec3(0.0), vec3(0.0))
@@ -140,4 +142,4 @@ def rays_from_points(
                     if points_of_ray.n == 0:
                         anchor = q
                     add_point(points_of_ray, q, o, confident, color, has_color, i)
-            write_band(bands, band, first_point, out, samples, total_weight)
+            write_band(bands, band, first_point, out, samples, total_weight, total_cost)

@@ -33,7 +33,7 @@ class BlockStore:
         self.voxel_size = voxel_size
         self.color, self.corrected = color, corrected
         self.count = 0
-        self._most_blocks = MAX_ITEMS
+        self.most_blocks = MAX_ITEMS
         self.hash_keys = np.zeros(4 * _FIRST_CAPACITY, np.int64)
         self.hash_slots = np.zeros(4 * _FIRST_CAPACITY, np.int32)
         self._keys = GrowingArray((), np.int64, _FIRST_CAPACITY)
@@ -93,7 +93,7 @@ class BlockStore:
 
         The number of blocks that this allows depends on the layers alone, never on how the map has grown.
         """
-        self._most_blocks = nbytes // (self.bytes_per_block + _HASH_BYTES)
+        self.most_blocks = nbytes // (self.bytes_per_block + _HASH_BYTES)
 
     def reserve(self, count: int) -> None:
         """Make room for `count` blocks in all.
@@ -101,9 +101,9 @@ class BlockStore:
         Raises:
             MemoryError: when there is not enough; the map is as it was.
         """
-        if count > max(self._most_blocks, self.count):
+        if count > max(self.most_blocks, self.count):
             raise MemoryError(
-                f"the map may have {self._most_blocks} blocks in the memory that is set; "
+                f"the map may have {self.most_blocks} blocks in the memory that is set; "
                 f"it has {self.count}, and {count - self.count} more are needed"
             )
         for array in self._arrays():

@@ -9,25 +9,39 @@ which restores every byte, because the sums are integers.
 from collections.abc import Iterator
 
 import numpy as np
+from msgspec import Struct
 
 from tsfusion.core.config import VolumeConfig
-from tsfusion.core.errors import MapError, MapFull, WeightOverflow
+from tsfusion.core.errors import KeyframeTooLarge, MapError, MapFull, MapQuota, WeightOverflow
 from tsfusion.kernels import integrate, ray_smoothing
 from tsfusion.kernels.integrate import (
+    ALL,
+    ONLY_ADDED,
+    ONLY_DEFERRED,
     TOUCHED_COUNT,
     TOUCHED_HEADER,
     TOUCHED_MISMATCH,
+    TOUCHED_MISSING,
     TOUCHED_OVERFLOW,
     WEIGHT_LIMIT,
 )
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
-from tsfusion.kernels.voxel_traversal import DEFERRED, UPDATES, WEIGHT
+from tsfusion.kernels.voxel_traversal import COST, DEFERRED, FAR_COST, UPDATES, WEIGHT
 from tsfusion.tsdf.block_store import BlockStore
 from tsfusion.tsdf.ray_buffers import BANDS, RayBuffers
 
 PART_WEIGHT = WEIGHT_LIMIT  # what a lane has in reserve: no part can make one overflow unnoticed
 
+_NO_LIMIT = 1 << 30  # blocks
+
 Part = tuple[int, int]  # bands first … last - 1
+
+
+class KeyframeQuota(Struct, frozen=True):
+    """What a keyframe may take: what its rays cost (`voxel_traversal.write_ray`), and blocks that it adds."""
+
+    cost: int
+    blocks: int = _NO_LIMIT
 
 
 class Integrator:
@@ -40,14 +54,22 @@ class Integrator:
         self._model = config.model()
         self._stamp = 0
         self._admitted = 0  # blocks of the map that deferred rays have been added to
+        self._room = 0  # blocks that the keyframe may still add to the map
 
-    def apply(self, sign: int) -> int:
+    def apply(self, sign: int, quota: KeyframeQuota | None = None) -> int:
         """Add (+1) or take away (-1) the rays in the buffers; returns the number of voxel updates.
+
+        Args:
+            quota: of a keyframe that is added; None = none but the map's limits.
 
         Raises:
             MapFull, WeightOverflow: when adding; MapError: when taking away what is not there. The map is as
                 it was.
         """
+        self._room = _NO_LIMIT
+        if quota is not None and sign > 0:
+            self._check_cost(quota.cost)
+            self._room = quota.blocks
         before = self._admitted = self._store.count
         self._begin()
         added: list[Part] = []
@@ -71,7 +93,7 @@ class Integrator:
         if self._store.count > self._admitted:  # blocks that nothing was added to yet
             self._store.drop(self._admitted)
         for part in added:
-            self._launch(part, -sign)
+            self._launch(part, -sign, which=ONLY_ADDED)
         self._buffers.forget_missing()
         if self._store.count > before:
             self._store.drop(before)
@@ -93,14 +115,20 @@ class Integrator:
         yield first, BANDS
 
     def _add(self, part: Part, sign: int) -> None:
-        """Add a part to the blocks the map has, and list the missing ones."""
+        """Add a part to the blocks the map has, and list the missing ones, until these are too many."""
         buffers = self._buffers
-        self._launch(part, sign)
-        while buffers.touched[TOUCHED_OVERFLOW]:
-            self._launch(part, -sign)
-            buffers.grow_missing()
-            self._limit(len(buffers.missing) // 8)
-            self._launch(part, sign)
+        most = self._most_missing()
+        self._launch(part, sign, most_missing=min(most, buffers.most_missing))
+        if buffers.touched[TOUCHED_OVERFLOW] and buffers.most_missing < most:
+            self._launch(part, -sign, which=ONLY_ADDED)
+            buffers.grow_missing(most)
+            self._launch(part, sign, most_missing=most)
+
+    def _most_missing(self) -> int:
+        """Blocks that the map may lack for the rest of a keyframe."""
+        config, touched = self._config, int(self._buffers.touched[TOUCHED_COUNT])
+        room = min(config.max_blocks - self._store.count, self._room)
+        return max(min(room, config.max_blocks_per_keyframe - touched), 0)
 
     def _admit(self, part: Part, sign: int) -> None:
         """Insert the missing blocks into the map, and add the deferred rays to them."""
@@ -108,27 +136,50 @@ class Integrator:
         if not buffers.bands[part[0] : part[1], DEFERRED].any():
             self._limit(int(buffers.touched[TOUCHED_COUNT]))
             return
-        keys = buffers.take_missing()
+        touched, missing = (int(buffers.touched[place]) for place in (TOUCHED_COUNT, TOUCHED_MISSING))
         if sign < 0:
             raise MapError(
-                f"cannot retract a keyframe the map does not hold ({len(keys)} blocks are missing)"
+                f"cannot retract a keyframe the map does not hold ({missing} blocks are missing, or more)"
             )
-        self._limit(int(buffers.touched[TOUCHED_COUNT]) + len(keys))
-        if store.count + len(keys) > self._config.max_blocks:
-            raise MapFull(
-                f"the map may hold at most max_blocks = {self._config.max_blocks} blocks; "
-                f"it has {store.count} and this keyframe needs {len(keys)} more"
-            )
+        self._limit(touched + missing)
+        self._check_room(missing)
+        if buffers.touched[TOUCHED_OVERFLOW]:
+            raise KeyframeTooLarge("the keys of this keyframe's blocks collide: it is not of a real sensor")
+        keys = buffers.take_missing()
         oldest = store.count
         buffers.reserve_touched(oldest + len(keys))
         store.insert(keys)
-        self._launch(part, +1, only_deferred=True, oldest=oldest)
+        self._launch(part, +1, which=ONLY_DEFERRED, oldest=oldest)
         self._admitted = store.count
+
+    def _check_cost(self, most: int) -> None:
+        """Refuse a keyframe before it costs more time than one of any real sensor."""
+        cost = int(self._buffers.bands[:, COST].sum(dtype=np.int64))
+        if cost > most:
+            raise KeyframeTooLarge(
+                f"the rays of a keyframe may cost quota_cost = {most}, these cost {cost} (voxels that they "
+                f"cross, {FAR_COST} times those of a ray away from the one before it); use bundle=True, "
+                "raise voxel_size, or send fewer points"
+            )
+
+    def _check_room(self, missing: int) -> None:
+        """Refuse a keyframe that needs more blocks than the map, or its sender, may still add."""
+        count, most = self._store.count, self._config.max_blocks
+        if count + missing > most:
+            raise MapFull(
+                f"the map may hold at most max_blocks = {most} blocks; "
+                f"it has {count} and this keyframe needs {missing} more, or still more"
+            )
+        if missing > self._room:
+            raise MapQuota(
+                f"of this map's room {max(self._room, 0)} blocks are left for the keyframe's sender, and it "
+                f"needs {missing} more, or still more (quota_map)"
+            )
 
     def _limit(self, blocks: int) -> None:
         """Refuse a keyframe that touches too many blocks."""
         if blocks > self._config.max_blocks_per_keyframe:
-            raise MapFull(
+            raise KeyframeTooLarge(
                 f"a keyframe may touch at most max_blocks_per_keyframe = "
                 f"{self._config.max_blocks_per_keyframe} blocks, this one touches {blocks} or more; "
                 "check its depth scale, or raise voxel_size"
@@ -172,11 +223,13 @@ class Integrator:
         )  # fmt: skip
         ray_smoothing.commit_votes(s.touched, store.sums, s.votes, store.correction)
 
-    def _launch(self, part: Part, sign: int, *, only_deferred: bool = False, oldest: int = 0) -> None:
+    def _launch(
+        self, part: Part, sign: int, *, which: int = ALL, oldest: int = 0, most_missing: int = _NO_LIMIT
+    ) -> None:
         """Add a part's rays to the blocks of slot ≥ `oldest`."""
         store, buffers = self._store, self._buffers
         integrate.add_rays(
-            buffers.rays, buffers.bands, buffers.deferred, int(only_deferred), *part, sign, oldest,
-            store.hash_keys, store.hash_slots, buffers.missing, self._stamp, store.stamps, store.places,
+            buffers.rays, buffers.bands, buffers.deferred, which, *part, sign, oldest, store.hash_keys,
+            store.hash_slots, buffers.missing, most_missing, self._stamp, store.stamps, store.places,
             store.dirty, buffers.touched, store.sums, int(buffers.colored), store.color_rgn, store.color_b,
         )  # fmt: skip

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 from tsfusion.core.config import SensorModel, VolumeConfig
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.kernels import ray_smoothing, rays_from_images, rays_from_points, sensor_noise
-from tsfusion.kernels.integrate import CUBE, TOUCHED_COUNT, TOUCHED_HEADER, TOUCHED_OVERFLOW
+from tsfusion.kernels.integrate import CUBE, TOUCHED_COUNT, TOUCHED_HEADER, TOUCHED_MISSING, TOUCHED_OVERFLOW
 from tsfusion.kernels.voxel_traversal import BAND_FIELDS, MAX_CROSSED, RAY_FIELDS, SAMPLES
 from tsfusion.tsdf.growing_array import GrowingArray
 
+_FEW_MISSING = 1 << 15  # entries of the set for the blocks that a usual keyframe finds missing
 BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thread count
 FULL_WEIGHT_SIGMA = 0.25  # voxels: noise below this no longer shows in the map
 _NOTHING = {len(shape): np.zeros(shape, np.uint8) for shape in ((1,), (1, 3), (1, 1, 3))}
@@ -28,7 +29,7 @@ class RayBuffers:
         self.rays = np.zeros((0, RAY_FIELDS), np.int32)
         self.deferred = np.zeros(0, np.int32)
         self.bands = np.zeros((BANDS, BAND_FIELDS), np.int32)
-        self.missing = np.zeros(1 << 15, np.int64)
+        self.missing = np.zeros(_FEW_MISSING, np.int64)
         self._depths = np.zeros((BANDS, rays_from_images.TILE_SAMPLES), np.int32)
         self._touched = GrowingArray((), np.int32, 1024)
         units = BANDS if regularised else 1
@@ -89,20 +90,31 @@ class RayBuffers:
             )  # fmt: skip
         return int(self.bands[:, SAMPLES].sum())
 
+    @property
+    def most_missing(self) -> int:
+        """Keys that `missing` takes: it is to stay half empty."""
+        return len(self.missing) // 2
+
     def take_missing(self) -> NDArray[np.int64]:
-        """Keys of the missing blocks, in an order that only the set of them decides. Empties `missing`."""
+        """Keys of the missing blocks, in an order that only they and the set's size decide.
+
+        Empties `missing`, which becomes small again when it was much too large.
+        """
         keys: NDArray[np.int64] = self.missing[self.missing != 0]
+        if len(self.missing) > max(_FEW_MISSING, 16 * len(keys)):
+            self.missing = np.zeros(_FEW_MISSING, np.int64)
         self.forget_missing()
         return keys
 
     def forget_missing(self) -> None:
         """Empty `missing`; takes no memory."""
         self.missing[:] = 0
+        self.touched[[TOUCHED_OVERFLOW, TOUCHED_MISSING]] = 0
 
-    def grow_missing(self) -> None:
-        """Double the size of `missing` after an overflow, and empty it."""
-        self.missing = np.zeros(2 * len(self.missing), np.int64)
-        self.touched[TOUCHED_OVERFLOW] = 0
+    def grow_missing(self, keys: int) -> None:
+        """Make room for so many keys in `missing`, and empty it."""
+        self.missing = np.zeros(1 << max(2 * keys - 1, 1).bit_length(), np.int64)
+        self.touched[[TOUCHED_OVERFLOW, TOUCHED_MISSING]] = 0
 
     def reserve_votes(self) -> None:
         """Make room for the votes of all touched blocks."""

@@ -33,7 +33,7 @@ from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.voxel_traversal import COUNT
 from tsfusion.tsdf import checkpoint, field_regularizer
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
-from tsfusion.tsdf.integrator import Integrator
+from tsfusion.tsdf.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
 from tsfusion.tsdf.ray_buffers import RayBuffers, keyframes_of_every_kind
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
@@ -92,6 +92,7 @@ class Volume:
         self.meta: dict[str, Any] = {}
         self.keyframes = 0  # with a usable sample
         self.held = HeldSensor()  # their sensors
+        self.quota: KeyframeQuota | None = None  # of the keyframes that are integrated from here on
         self._has_warned = False  # of a keyframe without
         runtime.start(config.threads)
         smooths = model.regularizer != "off"
@@ -118,7 +119,7 @@ class Volume:
 
         Raises:
             InvalidKeyframe: what is given is no keyframe.
-            MapFull: the keyframe or the map would exceed its limit of blocks.
+            MapFull: the keyframe or the map would exceed its limit of blocks, or the keyframe its `quota`.
             WeightOverflow: a voxel has taken as many votes as its integers hold.
         """
         given = _keyframe(keyframe, others, fields)
@@ -294,13 +295,18 @@ class Volume:
         """
         self._store.limit(nbytes)
 
+    @property
+    def most_blocks(self) -> int:
+        """Number of blocks that the map may have, by its settings and by `limit_memory`."""
+        return min(self.config.max_blocks, self._store.most_blocks)
+
     def _apply(self, keyframe: Keyframe, sign: int) -> IntegrateStats:
         if sign < 0 and self.keyframes == 0:
             raise MapError("cannot retract a keyframe from a map that holds none")
         blocks_before = self._store.count
         samples = self._ray_buffers.make_rays(keyframe, self.config)  # paper eq. 1
         with process.uninterrupted():
-            updates = self._integrator.apply(sign)  # paper eq. 2 and 3
+            updates = self._integrator.apply(sign, self.quota)  # paper eq. 2 and 3
             if samples:
                 self.keyframes += sign
                 self._note_held(keyframe, sign)

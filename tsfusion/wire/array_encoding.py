@@ -14,6 +14,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from tsfusion.wire import image_headers
 from tsfusion.wire.record_header import Refused
 
 _ZSTD_LEVEL = 1
@@ -70,8 +71,9 @@ def unpack_image(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> ND
     """A JPEG or PNG whose file header was checked to announce `shape` (see `image_headers.size`).
 
     Raises:
-        Refused: `payload` unless it decodes to exactly that array.
+        Refused: `payload` unless it decodes to exactly that array, `limits` for a PNG that unfolds to more.
     """
+    image_headers.check_unfolding(frame)
     flags = cv2.IMREAD_COLOR if len(shape) == 3 else cv2.IMREAD_UNCHANGED
     try:
         image = cv2.imdecode(np.frombuffer(frame, np.uint8), flags)

@@ -48,6 +48,7 @@ class MapHealth(Struct, frozen=True, kw_only=True):
     checkpoints: int = 0  # written since the server began
     journal_missing: int = 0  # segments of the journal that are gone, at the start or since
     journal_put_back: int = 0  # times that the segment being written was taken away, and written again
+    fusing_s: float = 0.0  # seconds since the fuser's last answer, while keyframes wait for one
 
 
 ClientState = Literal["connected", "silent", "gone"]
