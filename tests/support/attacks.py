@@ -21,6 +21,7 @@ from typing import Any
 import costly_keyframes
 import msgspec
 import numpy as np
+import odd_clients
 import zmq
 from attack_target import Target
 from hostile_messages import Frames, bad_values, bombs, hostile_corrections, lies
@@ -29,6 +30,7 @@ from keyframes_and_servers import connected, wall
 from tsfusion.wire import codec, corrections, messages, sockets
 from tsfusion.wire.curve import ClientKeys
 from tsfusion.wire.messages import PROTOCOL_VERSION, Command
+from tsfusion.wire.sockets import parse_address
 
 _HALF_OPEN = 36_000
 _EMPTY = 2_000_000
@@ -321,21 +323,24 @@ def _empty_frames_by_zmq(target: Target) -> int:
 
 
 def half_open(target: Target) -> int:
-    """Connections that say nothing, or the beginning of a greeting."""
-    with ExitStack() as stack:
-        made = 0
-        _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-        addresses = itertools.cycle((target.data, target.control, target.publish))
-        while not target.over and made < _HALF_OPEN:
-            host, _, port = next(addresses).removeprefix("tcp://").rpartition(":")
-            with contextlib.suppress(OSError):
-                link = stack.enter_context(socket.create_connection((host, int(port)), timeout=5.0))
-                link.sendall(_GREETING[: made % 12])
-                made += 1
-        while not target.over:
-            time.sleep(0.05)
-    return made
+    """Connections that say nothing, or the beginning of a greeting: as many as this user may have."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    most = min(_HALF_OPEN, hard - 100)
+    ports = itertools.cycle(map(parse_address, (target.data, target.control, target.publish)))
+    links: list[socket.socket] = []
+    while not target.over:
+        for _ in range(min(100, most - len(links))):
+            links.append(socket.socket())
+            links[-1].setblocking(False)
+            links[-1].connect_ex(next(ports))
+        time.sleep(0.01)
+        for number, link in enumerate(links[-100:]):
+            with contextlib.suppress(OSError):  # it is not made yet, or it was cut off
+                link.send(_GREETING[: number % 12])
+    for link in links:
+        link.close()
+    return len(links)
 
 
 def slow_loris(target: Target) -> int:
@@ -376,6 +381,7 @@ ATTACKS: dict[str, Callable[[Target], int]] = {
     "empty frames": empty_frames,
     "half open": half_open,
     "slow loris": slow_loris,
+    **odd_clients.ATTACKS,
     "crossings": lambda target: _push_costly(target, lambda _: costly_keyframes.crossings(), 2.0),
     "surplus idat": lambda target: _push_costly(target, lambda _: costly_keyframes.surplus_idat(), 0.5),
     "fill": lambda target: _push_costly(target, costly_keyframes.filling, 0.05),
