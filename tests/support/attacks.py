@@ -33,7 +33,6 @@ from tsfusion.wire.messages import PROTOCOL_VERSION, Command
 from tsfusion.wire.sockets import parse_address
 
 _HALF_OPEN = 36_000
-_EMPTY = 2_000_000
 _UNFINISHED = 400  # parts
 _PART_BYTES = 900_000
 _LORISES = 50
@@ -253,6 +252,9 @@ def raw(address: str, kind: bytes) -> socket.socket:
     made = socket.create_connection((host, int(port)), timeout=5.0)
     ready = _property(b"Socket-Type", kind) + _property(b"Identity", b"")
     made.sendall(_GREETING + _command(b"READY", ready))
+    answer = b""
+    while b"READY" not in answer and (got := made.recv(4096)):  # what comes earlier may be cut off
+        answer += got
     return made
 
 
@@ -291,27 +293,28 @@ def unfinished_control(target: Target) -> int:
     return _parts(target, target.control, b"DEALER", most=10 * _UNFINISHED, size=60_000, links=1)
 
 
+_EMPTY_FRAMES = 2_000_000
+
+
 def empty_frames(target: Target) -> int:
-    """Messages of two million frames each, all of them empty, in turn on the three ports."""
+    """Messages of millions of empty frames, on each port in turn; who is cut off begins anew."""
     if target.server_key:
         return _empty_frames_by_zmq(target)
-    content = b"\x01\x00" * _EMPTY + b"\x00\x00"
-    ports = ((target.data, b"PUSH"), (target.control, b"DEALER"), (target.publish, b"XSUB"))
-    sent = 0
-    with ExitStack() as stack:
-        for address, kind in itertools.cycle(ports):
-            with contextlib.suppress(OSError):
-                link = stack.enter_context(contextlib.closing(raw(address, kind)))
-                link.sendall(content)
-                sent += 1
-            time.sleep(0.5)
-            if target.over:
-                break
+    sent, message = 0, b"\x01\x00" * (_EMPTY_FRAMES - 1) + b"\x00\x00"
+    ports = ((target.data, b"PUSH"), (target.control, b"DEALER"), (target.publish, b"SUB"))
+    for address, kind in itertools.cycle(ports):
+        if target.over:
+            break
+        with contextlib.suppress(OSError), contextlib.closing(raw(address, kind)) as link:
+            link.sendall(message)
+            sent += 1
+            until_cut_off(link)
     return sent
 
 
 def _empty_frames_by_zmq(target: Target) -> int:
-    sent, content = 0, [b""] * (_EMPTY // 10)
+    """The same by a client of the library, which makes a tenth of them in the same time."""
+    sent, content = 0, [b""] * (_EMPTY_FRAMES // 10)
     with target.data_link() as push, target.control_link() as dealer:
         while not target.over:
             for link in (push, dealer):
@@ -320,6 +323,13 @@ def _empty_frames_by_zmq(target: Target) -> int:
                     sent += 1
                 time.sleep(0.1)
     return sent
+
+
+def until_cut_off(link: socket.socket) -> None:
+    """Wait until the server has closed a connection; at most as long as the socket's timeout."""
+    with contextlib.suppress(OSError):
+        while link.recv(4096):
+            pass
 
 
 def half_open(target: Target) -> int:
@@ -377,8 +387,8 @@ ATTACKS: dict[str, Callable[[Target], int]] = {
     "subscriptions": subscriptions,
     "unfinished": unfinished,
     "unfinished control": unfinished_control,
-    "knocking": knocking,
     "empty frames": empty_frames,
+    "knocking": knocking,
     "half open": half_open,
     "slow loris": slow_loris,
     **odd_clients.ATTACKS,

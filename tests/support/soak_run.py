@@ -40,7 +40,7 @@ _SETTINGS = {
 }
 _KILLS_UNTIL, _CALM_FROM = 0.5, 0.6  # of the keyframes
 _FULL_AT = 0.3  # then the disk is full for a while
-_FULL_S = 2.0
+_FULL_S = 1.0
 _INTERVAL = 0.1  # seconds between samples
 _PATIENCE = 600.0  # seconds without a keyframe
 
