@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Nothing is lost by kills and a full disk, and nothing grows afterwards. The long form: `scripts/soak.py`."""
+"""Kills and a full disk lose nothing, and nothing grows afterwards. The long form: `scripts/soak.py`."""
 
 from pathlib import Path
 

@@ -281,6 +281,14 @@ def row(one: Phase) -> str:
     return _line(one.attack, str(one.hostile), *words) + "".join(f"  {said}" for said in seen.problems)
 
 
+def markdown_row(one: Phase) -> str:
+    """The same as a row of docs/delivery.md, in seconds and MB."""
+    seen = one.seen
+    seconds = (one.fused_ms.p99 / 1e3, seen.control_s, one.recovered_s)
+    delay, answer, well = (f"{second:.2f}" if second < 10 else f"{second:.0f}" for second in seconds)
+    return f"| {one.attack} | {delay} / {answer} s | {seen.gateway_mb:.0f} MB | {well} s |"
+
+
 def table(outcome: Outcome) -> str:
     """Table for people, one line an attack."""
     return "\n".join((HEADING, *map(row, outcome.phases)))
