@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Attacks of strangers on a server, each some seconds long in a process of its own; bounded, loopback only.
+"""Attacks of strangers on a server, each some seconds long, in one process; bounded, loopback only.
 
-python tests/support/attacks.py NAME TARGET SECONDS
+python tests/support/attacks.py TARGET
 
-It prints `begun`, and in the end how many messages, connections or bytes it came to.
+It reads lines of seconds and the name of an attack, and answers each with `begun`, and in the end how many
+messages, connections or bytes it came to.
 """
 
 import contextlib
@@ -23,7 +24,7 @@ import msgspec
 import numpy as np
 import odd_clients
 import zmq
-from attack_target import Target
+from attack_target import Access, Target
 from hostile_messages import Frames, bad_values, bombs, hostile_corrections, lies
 from keyframes_and_servers import connected, wall
 
@@ -397,9 +398,24 @@ ATTACKS: dict[str, Callable[[Target], int]] = {
     "fill": lambda target: _push_costly(target, costly_keyframes.filling, 0.05),
 }
 
+# What gets as far as a server's keys; and what does so without any, so that no key helps with it.
+AS_STRANGERS = ("lies", "tiny", "unfinished", "knocking", "half open", "slow loris")
+_WITHOUT_KEYS = ("unfinished", "unfinished control", "half open", "slow loris")
+ATTACKS_OF: dict[Access, tuple[str, ...]] = {
+    "open": tuple(ATTACKS),
+    "stranger": AS_STRANGERS,
+    "allowed": tuple(name for name in ATTACKS if name not in _WITHOUT_KEYS),
+}
+
+
+def main() -> None:
+    target = msgspec.json.decode(sys.argv[1], type=Target)
+    for line in sys.stdin:
+        seconds, name = line.strip().split(" ", 1)
+        print("begun", flush=True)
+        attacked = msgspec.structs.replace(target, end=time.monotonic() + float(seconds))
+        print(ATTACKS[name](attacked), flush=True)
+
 
 if __name__ == "__main__":
-    name, where, seconds = sys.argv[1:]
-    print("begun", flush=True)
-    target = msgspec.json.decode(where, type=Target)
-    print(ATTACKS[name](msgspec.structs.replace(target, end=time.monotonic() + float(seconds))))
+    main()
