@@ -67,11 +67,11 @@ def oversized(target: Target) -> int:
 
 
 def _push_costly(target: Target, made: Callable[[int], Frames], interval: float) -> int:
-    """Keyframes at intervals, each of a session of its own."""
+    """Keyframes at intervals."""
     sent = 0
     with target.data_link() as push:
         while push.poll(1000, zmq.POLLOUT):
-            push.send_multipart(costly_keyframes.fresh(made(sent)))
+            push.send_multipart(costly_keyframes.following(target, made(sent), sent))
             sent += 1
             time.sleep(interval)
             if target.over:

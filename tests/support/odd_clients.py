@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 import zmq
 from attack_target import Target
-from costly_keyframes import fresh
+from costly_keyframes import following, fresh
 from hostile_messages import Frames, good, with_depth, with_header
 from keyframes_and_servers import CAMERA, connected, pose, wall
 
@@ -192,7 +192,7 @@ def _random_depth(seed: int) -> Frames:
 
 def random_depths(target: Target) -> int:
     """Depth images of random numbers."""
-    return _data_flood(target, lambda sent: fresh(_random_depth(sent % 4)), 0.1)
+    return _data_flood(target, lambda sent: following(target, _random_depth(sent % 4), sent), 0.1)
 
 
 @cache
@@ -204,7 +204,7 @@ def _one_point() -> Frames:
 
 def one_point(target: Target) -> int:
     """Two million equal points a keyframe, on the wall that the other scanner sees."""
-    return _data_flood(target, lambda _: fresh(_one_point()), 0.3)
+    return _data_flood(target, lambda sent: following(target, _one_point(), sent), 0.3)
 
 
 def cameras(target: Target) -> int:
@@ -220,7 +220,11 @@ def cameras(target: Target) -> int:
     changes += [{"timestamp_ns": (1 << 63) - 1}, {"captured_ns": (1 << 63) - 1}, {"sent_ns": (1 << 63) - 1}]
     assert math.isfinite(CAMERA.fx)
     frames = good()
-    return _data_flood(target, lambda sent: fresh(with_header(frames, **changes[sent % len(changes)])), 0.02)
+    return _data_flood(
+        target,
+        lambda sent: following(target, with_header(frames, **changes[sent % len(changes)]), sent),
+        0.02,
+    )
 
 
 def sizes(target: Target) -> int:
@@ -236,7 +240,7 @@ def sizes(target: Target) -> int:
     first = msgspec.structs.replace(header.buffers[0], shape=(0, 0), bytes=0, crc32=zlib.crc32(b""))
     made.append(with_header([frames[0], b""], buffers=(first,)))
     made.append(codec.encode(wall(), session=bytes(16), seq=1, jpeg_quality=1))
-    return _data_flood(target, lambda sent: fresh(made[sent % len(made)]), 0.1)
+    return _data_flood(target, lambda sent: following(target, made[sent % len(made)], sent), 0.1)
 
 
 def refusals(target: Target) -> int:
