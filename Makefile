@@ -17,11 +17,12 @@ bench:  ## one JSON line a case
 accuracy:  ## every row, then the tables and plots of docs/accuracy.md
 	$(PYTHON) scripts/accuracy.py --output out/accuracy --write-docs $(ARGS)
 
-nightly:  ## the long forms of what the tests try: about an hour; a JSON line each
+nightly:  ## the long forms of what the tests try: about two hours
 	$(PYTHON) -m pytest --nightly -m nightly
 	$(PYTHON) scripts/chaos.py --seeds 20
-	$(PYTHON) scripts/hostile.py --seconds 10
-	$(PYTHON) scripts/hostile.py --seconds 10 --keys
+	$(PYTHON) scripts/hostile.py
+	$(PYTHON) scripts/hostile.py --access stranger
+	$(PYTHON) scripts/hostile.py --access allowed
 	$(PYTHON) scripts/fuzz.py --cases 1000000
-	$(PYTHON) scripts/soak.py --keyframes 10000
+	$(PYTHON) scripts/soak.py --keyframes 10000 --kills 12
 	$(PYTHON) scripts/delivery.py

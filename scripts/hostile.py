@@ -2,7 +2,8 @@
 """Attack a server in many ways and show what a well-behaved scanner notices of it.
 
     python scripts/hostile.py                     each attack for 5 s, each at a server of its own; a table
-    python scripts/hostile.py --seconds 20 --json the same as a JSON line an attack
+    python scripts/hostile.py --seconds 20 --form json
+                                                  a JSON line an attack, longer attacks
     python scripts/hostile.py --only unfinished tiny
 
 Each line is one attack and the time until everything is as before: the delay of the scanner's keyframes from
@@ -22,8 +23,9 @@ from pathlib import Path
 import msgspec
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
-from attacks import ATTACKS
-from hostile_run import ACCESS, HEADING, MEMORY_BYTES, Bounds, Outcome, row, run
+from attack_target import ACCESS
+from attacks import ATTACKS, ATTACKS_OF
+from hostile_run import HEADING, MEMORY_BYTES, Bounds, Outcome, markdown_row, row, run
 
 _MB = 1 << 20
 
@@ -32,10 +34,8 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--seconds", type=float, default=5.0, help="of each attack, and of peace before and after"
-    )
-    parser.add_argument("--only", nargs="+", choices=list(ATTACKS), default=list(ATTACKS), metavar="ATTACK")
+    parser.add_argument("--seconds", type=float, default=5.0, help="of each attack")
+    parser.add_argument("--only", nargs="+", choices=list(ATTACKS), metavar="ATTACK")
     parser.add_argument(
         "--access", choices=ACCESS, default="open",
         help="open: there are no keys; stranger: the server asks for keys, attackers have none; allowed: "
@@ -44,15 +44,18 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--delay", type=float, default=1.0, help="bound on the 99th percentile, s")
     parser.add_argument("--control", type=float, default=1.0, help="bound on the longest answer, s")
     parser.add_argument("--slack", type=float, default=0.0, help="MB of the gateway above its own bound")
-    parser.add_argument("--json", action="store_true", help="lines of JSON instead of a table")
+    parser.add_argument(
+        "--form", choices=("table", "json", "markdown"), default="table", help="markdown: docs/delivery.md's"
+    )
     return parser.parse_args()
 
 
-def _show(outcome: Outcome, as_json: bool) -> None:
-    if as_json:
+def _show(outcome: Outcome, form: str) -> None:
+    attacks = [one for one in outcome.phases if one.attack != "none"]
+    if form == "json":
         print(msgspec.json.encode(outcome).decode(), flush=True)
     else:
-        print("\n".join(row(one) for one in outcome.phases if one.attack != "none"), flush=True)
+        print("\n".join(map(markdown_row if form == "markdown" else row, attacks)), flush=True)
     for problem in outcome.problems:
         print(f"  {problem}", file=sys.stderr, flush=True)
 
@@ -60,15 +63,16 @@ def _show(outcome: Outcome, as_json: bool) -> None:
 def main() -> int:
     options = _options()
     bounds = Bounds(delay_s=options.delay, control_s=options.control, slack_bytes=int(options.slack * _MB))
-    if not options.json:
+    if options.form == "table":
         print(f"the gateway's bound is {MEMORY_BYTES / 1e6:.0f} MB\n{HEADING}", flush=True)
     harmed = 0
-    for attack in options.only:
+    attacks = options.only or ATTACKS_OF[options.access]
+    for attack in attacks:
         with tempfile.TemporaryDirectory(prefix="tsfusion-hostile-") as folder:
             outcome = run(Path(folder), options.seconds, (attack,), access=options.access, bounds=bounds)
-        _show(outcome, options.json)
+        _show(outcome, options.form)
         harmed += bool(outcome.problems)
-    print(f"{len(options.only) - harmed} of {len(options.only)} attacks harmed nobody", file=sys.stderr)
+    print(f"{len(attacks) - harmed} of {len(attacks)} attacks harmed nobody", file=sys.stderr)
     return 1 if harmed else 0
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import small_disks
 from command_processes import Here
 
 from tsfusion.cli import main
@@ -142,17 +143,11 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 def small_disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
     """`small_disk(24)`: mount a file system of 24 MiB, and give its folder."""
     folder = tmp_path / "disk"
-    folder.mkdir()
 
     def mount(mib: int) -> Path:
-        if os.geteuid():
-            pytest.skip("mounting a small file system takes root")
-        command = ["mount", "-t", "tmpfs", "-o", f"size={mib}m", "none", folder]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            pytest.skip(f"no small file system can be mounted here: {done.stderr.strip()}")
+        if reason := small_disks.mount(folder, mib):
+            pytest.skip(reason)
         return folder
 
     yield mount
-    if os.path.ismount(folder):
-        subprocess.run(["umount", "-l", folder], check=True)
+    small_disks.unmount(folder)

@@ -3,12 +3,16 @@
 
 import time
 from contextlib import AbstractContextManager
+from typing import Literal, get_args
 
 import msgspec
 from keyframes_and_servers import connected
 
 from tsfusion.wire import sockets
 from tsfusion.wire.curve import ClientKeys
+
+Access = Literal["open", "stranger", "allowed"]  # no keys; attackers without one; attackers with their own
+ACCESS: tuple[Access, ...] = get_args(Access)
 
 
 class Target(msgspec.Struct, frozen=True):

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Attacks of strangers on a server, each some seconds long in a process of its own; bounded, loopback only.
+"""Attacks of strangers on a server, each some seconds long, in one process; bounded, loopback only.
 
-python tests/support/attacks.py NAME TARGET SECONDS
+python tests/support/attacks.py TARGET
 
-It prints `begun`, and in the end how many messages, connections or bytes it came to.
+It reads lines of seconds and the name of an attack, and answers each with `begun`, and in the end how many
+messages, connections or bytes it came to.
 """
 
 import contextlib
@@ -21,17 +22,18 @@ from typing import Any
 import costly_keyframes
 import msgspec
 import numpy as np
+import odd_clients
 import zmq
-from attack_target import Target
+from attack_target import Access, Target
 from hostile_messages import Frames, bad_values, bombs, hostile_corrections, lies
 from keyframes_and_servers import connected, wall
 
 from tsfusion.wire import codec, corrections, messages, sockets
 from tsfusion.wire.curve import ClientKeys
 from tsfusion.wire.messages import PROTOCOL_VERSION, Command
+from tsfusion.wire.sockets import parse_address
 
 _HALF_OPEN = 36_000
-_EMPTY = 2_000_000
 _UNFINISHED = 400  # parts
 _PART_BYTES = 900_000
 _LORISES = 50
@@ -65,11 +67,11 @@ def oversized(target: Target) -> int:
 
 
 def _push_costly(target: Target, made: Callable[[int], Frames], interval: float) -> int:
-    """Keyframes at intervals, each of a session of its own."""
+    """Keyframes at intervals."""
     sent = 0
     with target.data_link() as push:
         while push.poll(1000, zmq.POLLOUT):
-            push.send_multipart(costly_keyframes.fresh(made(sent)))
+            push.send_multipart(costly_keyframes.following(target, made(sent), sent))
             sent += 1
             time.sleep(interval)
             if target.over:
@@ -251,6 +253,9 @@ def raw(address: str, kind: bytes) -> socket.socket:
     made = socket.create_connection((host, int(port)), timeout=5.0)
     ready = _property(b"Socket-Type", kind) + _property(b"Identity", b"")
     made.sendall(_GREETING + _command(b"READY", ready))
+    answer = b""
+    while b"READY" not in answer and (got := made.recv(4096)):  # what comes earlier may be cut off
+        answer += got
     return made
 
 
@@ -289,27 +294,28 @@ def unfinished_control(target: Target) -> int:
     return _parts(target, target.control, b"DEALER", most=10 * _UNFINISHED, size=60_000, links=1)
 
 
+_EMPTY_FRAMES = 2_000_000
+
+
 def empty_frames(target: Target) -> int:
-    """Messages of two million frames each, all of them empty, in turn on the three ports."""
+    """Messages of millions of empty frames, on each port in turn; who is cut off begins anew."""
     if target.server_key:
         return _empty_frames_by_zmq(target)
-    content = b"\x01\x00" * _EMPTY + b"\x00\x00"
-    ports = ((target.data, b"PUSH"), (target.control, b"DEALER"), (target.publish, b"XSUB"))
-    sent = 0
-    with ExitStack() as stack:
-        for address, kind in itertools.cycle(ports):
-            with contextlib.suppress(OSError):
-                link = stack.enter_context(contextlib.closing(raw(address, kind)))
-                link.sendall(content)
-                sent += 1
-            time.sleep(0.5)
-            if target.over:
-                break
+    sent, message = 0, b"\x01\x00" * (_EMPTY_FRAMES - 1) + b"\x00\x00"
+    ports = ((target.data, b"PUSH"), (target.control, b"DEALER"), (target.publish, b"SUB"))
+    for address, kind in itertools.cycle(ports):
+        if target.over:
+            break
+        with contextlib.suppress(OSError), contextlib.closing(raw(address, kind)) as link:
+            link.sendall(message)
+            sent += 1
+            until_cut_off(link)
     return sent
 
 
 def _empty_frames_by_zmq(target: Target) -> int:
-    sent, content = 0, [b""] * (_EMPTY // 10)
+    """The same by a client of the library, which makes a tenth of them in the same time."""
+    sent, content = 0, [b""] * (_EMPTY_FRAMES // 10)
     with target.data_link() as push, target.control_link() as dealer:
         while not target.over:
             for link in (push, dealer):
@@ -320,22 +326,32 @@ def _empty_frames_by_zmq(target: Target) -> int:
     return sent
 
 
+def until_cut_off(link: socket.socket) -> None:
+    """Wait until the server has closed a connection; at most as long as the socket's timeout."""
+    with contextlib.suppress(OSError):
+        while link.recv(4096):
+            pass
+
+
 def half_open(target: Target) -> int:
-    """Connections that say nothing, or the beginning of a greeting."""
-    with ExitStack() as stack:
-        made = 0
-        _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-        addresses = itertools.cycle((target.data, target.control, target.publish))
-        while not target.over and made < _HALF_OPEN:
-            host, _, port = next(addresses).removeprefix("tcp://").rpartition(":")
-            with contextlib.suppress(OSError):
-                link = stack.enter_context(socket.create_connection((host, int(port)), timeout=5.0))
-                link.sendall(_GREETING[: made % 12])
-                made += 1
-        while not target.over:
-            time.sleep(0.05)
-    return made
+    """Connections that say nothing, or the beginning of a greeting: as many as this user may have."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    most = min(_HALF_OPEN, hard - 100)
+    ports = itertools.cycle(map(parse_address, (target.data, target.control, target.publish)))
+    links: list[socket.socket] = []
+    while not target.over:
+        for _ in range(min(100, most - len(links))):
+            links.append(socket.socket())
+            links[-1].setblocking(False)
+            links[-1].connect_ex(next(ports))
+        time.sleep(0.01)
+        for number, link in enumerate(links[-100:]):
+            with contextlib.suppress(OSError):  # it is not made yet, or it was cut off
+                link.send(_GREETING[: number % 12])
+    for link in links:
+        link.close()
+    return len(links)
 
 
 def slow_loris(target: Target) -> int:
@@ -372,18 +388,34 @@ ATTACKS: dict[str, Callable[[Target], int]] = {
     "subscriptions": subscriptions,
     "unfinished": unfinished,
     "unfinished control": unfinished_control,
-    "knocking": knocking,
     "empty frames": empty_frames,
+    "knocking": knocking,
     "half open": half_open,
     "slow loris": slow_loris,
+    **odd_clients.ATTACKS,
     "crossings": lambda target: _push_costly(target, lambda _: costly_keyframes.crossings(), 2.0),
     "surplus idat": lambda target: _push_costly(target, lambda _: costly_keyframes.surplus_idat(), 0.5),
     "fill": lambda target: _push_costly(target, costly_keyframes.filling, 0.05),
 }
 
+# What gets as far as a server's keys; and what does so without any, so that no key helps with it.
+AS_STRANGERS = ("lies", "tiny", "unfinished", "knocking", "half open", "slow loris")
+_WITHOUT_KEYS = ("unfinished", "unfinished control", "half open", "slow loris")
+ATTACKS_OF: dict[Access, tuple[str, ...]] = {
+    "open": tuple(ATTACKS),
+    "stranger": AS_STRANGERS,
+    "allowed": tuple(name for name in ATTACKS if name not in _WITHOUT_KEYS),
+}
+
+
+def main() -> None:
+    target = msgspec.json.decode(sys.argv[1], type=Target)
+    for line in sys.stdin:
+        seconds, name = line.strip().split(" ", 1)
+        print("begun", flush=True)
+        attacked = msgspec.structs.replace(target, end=time.monotonic() + float(seconds))
+        print(ATTACKS[name](attacked), flush=True)
+
 
 if __name__ == "__main__":
-    name, where, seconds = sys.argv[1:]
-    print("begun", flush=True)
-    target = msgspec.json.decode(where, type=Target)
-    print(ATTACKS[name](msgspec.structs.replace(target, end=time.monotonic() + float(seconds))))
+    main()

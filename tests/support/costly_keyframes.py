@@ -7,6 +7,7 @@ import zlib
 from functools import cache
 
 import numpy as np
+from attack_target import Target
 from hostile_messages import Frames, with_depth, with_header
 from keyframes_and_servers import pose
 
@@ -55,3 +56,14 @@ def surplus_idat(nbytes: int = 4 << 30) -> Frames:
 def fresh(frames: Frames) -> Frames:
     """The same keyframe as the first of a session of its own."""
     return with_header(frames, session=os.urandom(16), seq=1, previous=0)
+
+
+def following(target: Target, frames: Frames, sent: int) -> Frames:
+    """The same keyframe as the next one: of another session each, where these are all one client's.
+
+    Without keys each session gets its turn, and who opens many gets many: docs/delivery.md.
+    """
+    if target.public:
+        return fresh(frames)
+    session = str(target.end).encode().ljust(16)[:16]
+    return with_header(frames, session=session, seq=sent + 1, previous=0)  # others may have been refused

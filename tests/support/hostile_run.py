@@ -7,11 +7,11 @@ import resource
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, get_args
 
 import msgspec
-from attack_target import Target
+from attack_target import Access, Target
 from attacks import ATTACKS
 from hostile_watch import Seen, Watch
 from keyframes_and_servers import (
@@ -37,14 +37,13 @@ from tsfusion.wire.keyframe_times import KeyframeTimes, Spread
 from tsfusion.wire.queries import fetch_status
 from tsfusion.wire.record_header import unpack_keyframe
 
-Access = Literal["open", "stranger", "allowed"]  # no keys; attackers without one; attackers with their own
-ACCESS: tuple[Access, ...] = get_args(Access)
 RATE = 8.0  # keyframes a second of the well-behaved one
 MEMORY_BYTES = 192 << 20  # the bound on the gateway
 FUSER_MEMORY_BYTES = 2 << 30
-_ATTACK = Path(__file__).with_name("attacks.py")
+_ATTACKS = Path(__file__).with_name("attacks.py")
 _FILES = 8192
 _MORE_FILES = 30  # of maps that were opened meanwhile
+_PEACE_S = 2.0
 _HANGS_S = 120.0  # after an attack; a server that is not well by then stays as it is
 
 
@@ -102,7 +101,7 @@ def run(
     access: Access = "open",
     bounds: Bounds = Bounds(),  # noqa: B008  frozen
 ) -> Outcome:
-    """`seconds` of peace, so many of each attack, and the same of peace again, at one server."""
+    """A little peace, `seconds` of each attack, and a little peace again, at one server."""
     given, target = _secured(folder / "keys", access)
     names = ("", *attacks, "")
     _raise_file_limit()
@@ -119,7 +118,8 @@ def run(
         files = _files(server)
         watch = Watch(server, given)
         stack.callback(watch.close)
-        spans = [_attack(server, target, name, seconds, watch) for name in names]
+        attacker = stack.enter_context(_attacker(target))
+        spans = [_attack(server, attacker, name, seconds, watch) for name in names]
         watch.close()
         (folder / "enough").touch()
         problems = []
@@ -151,6 +151,16 @@ def _secured(folder: Path, access: Access) -> tuple[Secured, Target]:
     return given, Target(server_key=given.keys.server, public=own.public, secret=own.secret)
 
 
+@contextlib.contextmanager
+def _attacker(target: Target) -> Iterator["subprocess.Popen[str]"]:
+    command = [sys.executable, str(_ATTACKS), msgspec.json.encode(target).decode()]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
 def _files(server: Server) -> int:
     return len(os.listdir(f"/proc/{server.process.pid}/fd"))
 
@@ -169,19 +179,21 @@ def _plan(folder: Path, server: Server, given: Secured) -> Plan:
     )
 
 
-def _attack(server: Server, target: Target, name: str, seconds: float, watch: Watch) -> _Span:
+def _attack(
+    server: Server, attacker: "subprocess.Popen[str]", name: str, seconds: float, watch: Watch
+) -> _Span:
     hostile = 0
     if name:
-        command = [sys.executable, str(_ATTACK), name, msgspec.json.encode(target).decode(), str(seconds)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-            process.stdout.readline()
-            started = watch.begin()
-            hostile = int(process.stdout.read() or 0)
-        if process.returncode:
+        attacker.stdin.write(f"{seconds} {name}\n")
+        attacker.stdin.flush()
+        attacker.stdout.readline()
+        started = watch.begin()
+        if not (count := attacker.stdout.readline()):
             raise RuntimeError(f"the attack {name!r} failed")
+        hostile = int(count)
     else:
         started = watch.begin()
-        time.sleep(seconds)
+        time.sleep(min(seconds, _PEACE_S))
     ended = time.monotonic()
     with contextlib.suppress(AssertionError):
         until(lambda: watch.well(ended) or server.process.poll() is not None, _HANGS_S)
@@ -197,7 +209,7 @@ def _outcome(
     problems += [problem for phase in phases for problem in _exceeded(phase, bounds)]
     if report is None:
         return Outcome(problems=problems, phases=phases)
-    status = fetch_status(server.address, keys=given.keys)
+    status = fetch_status(server.address, keys=given.keys, timeout=PATIENCE)
     if (report.durable, report.fused, report.refused, report.rejected) != (report.sent, report.sent, {}, {}):
         lost = {**report.refused, **report.rejected}
         problems.append(f"of {report.sent} keyframes {report.fused} are in the map: {lost}")
@@ -279,6 +291,14 @@ def row(one: Phase) -> str:
     figures = (delay.p50, delay.p99, delay.max, 1e3 * seen.control_s, seen.gateway_mb, seen.fuser_mb)
     words = (*(f"{figure:.0f}" for figure in figures), str(seen.restarts), f"{one.recovered_s:.1f}")
     return _line(one.attack, str(one.hostile), *words) + "".join(f"  {said}" for said in seen.problems)
+
+
+def markdown_row(one: Phase) -> str:
+    """The same as a row of docs/delivery.md, in seconds and MB."""
+    seen = one.seen
+    seconds = (one.fused_ms.p99 / 1e3, seen.control_s, one.recovered_s)
+    delay, answer, well = (f"{second:.2f}" if second < 10 else f"{second:.0f}" for second in seconds)
+    return f"| {one.attack} | {delay} / {answer} s | {seen.gateway_mb:.0f} MB | {well} s |"
 
 
 def table(outcome: Outcome) -> str:

@@ -14,6 +14,7 @@ from tsfusion.wire.health import Health
 
 _LOOK_S, _ASK_S, _HEALTH_S = 0.02, 0.05, 0.25  # between two looks, questions, questions for the health
 _AGAIN_MS = 250  # without an answer for so long: the connection may be another one now
+_LAG = 2  # keyframes under way
 _ANSWERED_S = 0.25  # the wait for an answer of a server that is well
 
 
@@ -76,13 +77,17 @@ class Watch:
         )
 
     def well(self, since: float) -> bool:
-        """Whether the server answers at once, is ready, and has fused what came, all of it after a time."""
+        """Whether the server answers at once, is ready, and has fused what the first client sent."""
         healths = [one for one in self._answers if one.asked >= since and one.health]
         if not healths or (self._asked and time.monotonic() - self._asked > _ANSWERED_S):
             return False
         last = healths[-1]
-        found = last.health.maps.get("default")
-        return last.waited <= _ANSWERED_S and last.health.ready and found is not None and found.waiting <= 1
+        first = next(
+            (client.session for one in self._answers if one.health for client in one.health.clients), ""
+        )
+        own = [one for one in last.health.clients if one.session == first]
+        lag = [one.durable - one.fused + one.waiting for one in own]
+        return last.waited <= _ANSWERED_S and last.health.ready and bool(lag) and lag[0] <= _LAG
 
     def _pids(self) -> list[int]:
         with contextlib.suppress(OSError):

@@ -40,6 +40,7 @@ class Plan(Struct, kw_only=True):
         correct_every: after each keyframe whose number is a multiple of this comes a correction that carries
             the number in its `T_map_odometry`; 0 = none.
         log: a line is on the disk here for each `send` that returned.
+        trimmed: the server deletes old parts of its journal: what is logged was taken, wherever it is now.
         report: where the `Report` goes when all is fused.
         room: a file of `save_room`, seen again and again; None = `wire.wall`s, each elsewhere.
         until: sends no more once this file is there.
@@ -56,6 +57,7 @@ class Plan(Struct, kw_only=True):
     rate: float | None = None
     correct_every: int = 0
     log: str | None = None
+    trimmed: bool = False
     report: str | None = None
     room: str | None = None
     until: str | None = None
@@ -159,8 +161,8 @@ def unsent(plan: Plan) -> range:
     taken = set(numbers(Path(plan.spool))) if Path(plan.spool).is_dir() else set()
     for folder in journals(Path(plan.state)):
         taken.update(numbers(folder))
-    taken &= set(own)
     logged = {int(line) for line in _lines(plan.log)}
+    taken = (taken | logged if plan.trimmed else taken) & set(own)
     if logged - taken or taken != set(own[: len(taken)]):
         sys.stderr.write(f"taken {sorted(taken)}, but logged {sorted(logged)}\n")
         sys.exit(LOST)

@@ -20,9 +20,13 @@ PATIENCE = 180.0  # seconds; for everything to be fused after all
 
 
 class Daemon:
-    """Keeps a server running, as an init system would, and shows the proxy where it is."""
+    """Keeps a server running, as an init system would, and shows the proxy where it is.
 
-    def __init__(self, state: Path, proxy: Proxy, **settings: Any) -> None:
+    Args:
+        proxy: None = the settings name an address that lasts.
+    """
+
+    def __init__(self, state: Path, proxy: Proxy | None, **settings: Any) -> None:
         self.exits: list[str] = []
         self.ready = False
         self.state, self._proxy, self._settings = state, proxy, settings
@@ -38,11 +42,11 @@ class Daemon:
     def _keep(self) -> None:
         while True:
             if self.server.wait_ready():
-                self._proxy.target(self.server.address, self.server.control)
+                self._show(self.server.address, self.server.control)
                 self.ready = True
                 self.server.process.wait()
             self.ready = False
-            self._proxy.target(None)
+            self._show(None)
             if self._ended:
                 return
             if not self._killed:
@@ -50,6 +54,10 @@ class Daemon:
             self._killed = False
             self.server.close()
             self.server = self._start()
+
+    def _show(self, data: str | None, control: str | None = None) -> None:
+        if self._proxy is not None:
+            self._proxy.target(data, control)
 
     def kill(self) -> None:
         """SIGKILL, ready or not. A fuser that still runs dies with it."""
@@ -133,6 +141,11 @@ class Scanner:
         """Wait until everything is fused or something is wrong."""
         if not self._done.wait(PATIENCE):
             self.problem = f"not everything was fused in {PATIENCE:.0f} s"
+
+    @property
+    def pid(self) -> int:
+        """The process that runs now, or ran last."""
+        return self._process.pid
 
     def report(self) -> Report:
         """Report of the process that saw everything fused."""
