@@ -8,6 +8,7 @@ message is checked, journaled and acknowledged in one step; a map's fuser gets o
 import logging
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import zmq
@@ -27,7 +28,7 @@ from tsfusion.gateway.keyframe_intake import KeyframeIntake
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.memory_guard import MemoryGuard
 from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.ports import Ports, Subscriptions, receive_some
+from tsfusion.gateway.ports import Flood, Ports, Subscriptions, receive_some
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.health import Health
 from tsfusion.wire.sockets import mesh_topic
@@ -97,7 +98,7 @@ class Gateway:
         if not self._drop_connections():
             for socket, handle in handlers.items():
                 if socket in events:
-                    receive_some(socket, handle)
+                    receive_some(socket, handle, partial(self._on_flood, socket))
         self.ports.step()
         for hosted, message in self.maps.step():
             self._pass_to_people(hosted, message)
@@ -114,6 +115,27 @@ class Gateway:
         elif self._stopped:
             self.ports.keyframes.close()
         return handlers
+
+    def _on_flood(self, socket: sockets.AnySocket, flood: Flood) -> None:
+        """Cut off who sent a message of frames without end, and with it, where that takes long, its port.
+
+        The others of the port are back at once; the client, where it has a name, after a while.
+        """
+        self._refused["frames"] += 1
+        client = self._access.keep_out(flood.first)
+        address = sockets.peer_address(flood.first) or "somewhere"
+        log.warning(
+            "a message from %s has more than %d frames: its connection is cut off%s",
+            address,
+            flood.discarded,
+            ", and the others of that port are made anew" if flood.goes_on else "",
+            extra=logs.about(client=client, reason="frames"),
+        )
+        self.ports.cut_off(flood.first)
+        if flood.goes_on:
+            if socket is self.ports.viewers:
+                self._subscriptions.clear()
+            self.ports.renew(socket)
 
     def _drop_connections(self) -> bool:
         """Drop all connections if a key was revoked, or if they hold too much memory; whether that was done.

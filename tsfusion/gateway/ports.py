@@ -4,21 +4,37 @@
 import logging
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TypeAlias
+from contextlib import suppress
+from socket import AF_INET, SHUT_RDWR, SOCK_STREAM, fromfd
+from typing import Any, NamedTuple, TypeAlias
 
 import zmq
 
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import TransportError
 from tsfusion.wire import messages, sockets
+from tsfusion.wire.codec import MAX_FRAMES
 from tsfusion.wire.curve import ServerKeys
 from tsfusion.wire.sockets import Addresses
 
 log = logging.getLogger(__name__)
 
 _MESSAGES_A_STEP = 16
+_MANY_FRAMES = 1000  # surplus ones, which no mistake explains
+_MOST_DISCARDED = 50_000  # frames of one message that are read and forgotten: some 50 ms
 _REBIND_INTERVAL = 0.01  # seconds
 Handler: TypeAlias = Callable[[list[zmq.Frame]], None]
+
+
+class Flood(NamedTuple):
+    """A message with many more frames than any may have.
+
+    ZeroMQ has all of them in memory, and gives what others sent to the socket only behind the last one.
+    """
+
+    first: zmq.Frame
+    discarded: int  # number of frames that were read and forgotten
+    goes_on: bool  # whether there are more: only a new socket gets rid of them soon
 
 
 class Ports:
@@ -30,15 +46,32 @@ class Ports:
         self._context = context
         self._server = server
         self._keys = keys
-        self._addresses: Addresses | None = None
+        self._addresses: dict[str, str] = {}  # of the sockets, once they are bound
+        self._unbound: list[str] = []  # sockets that are being made anew
         self._next_bind = 0.0
         self.problem = ""  # why nobody can connect; empty = clients can
-        self._open()
+        self._sockets = {name: self._make(name) for name in ("keyframes", "control", "viewers")}
 
-    def _open(self) -> None:
-        self.keyframes = sockets.pull(self._context, self._server.max_frame_bytes, keys=self._keys)
-        self.control = sockets.router(self._context, keys=self._keys)
-        self.viewers = sockets.publisher(self._context, keys=self._keys)
+    def _make(self, name: str) -> sockets.AnySocket:
+        if name == "keyframes":
+            return sockets.pull(self._context, self._server.max_frame_bytes, keys=self._keys)
+        make = sockets.router if name == "control" else sockets.publisher
+        return make(self._context, keys=self._keys)
+
+    @property
+    def keyframes(self) -> sockets.AnySocket:
+        """Records come in here."""
+        return self._sockets["keyframes"]
+
+    @property
+    def control(self) -> sockets.AnySocket:
+        """Greetings, pings and commands come in here, and their answers leave."""
+        return self._sockets["control"]
+
+    @property
+    def viewers(self) -> sockets.AnySocket:
+        """Mesh updates leave here, and subscriptions come in."""
+        return self._sockets["viewers"]
 
     def bind(self) -> Addresses:
         """Bind the sockets, so that clients can connect.
@@ -47,8 +80,9 @@ class Ports:
             TransportError: when a port is taken.
         """
         listen, control = self._server.listen, self._server.control
-        self._addresses = sockets.bind(self.keyframes, self.control, self.viewers, listen, control)
-        return self._addresses
+        found = sockets.bind(self.keyframes, self.control, self.viewers, listen, control)
+        self._addresses = {"keyframes": found.data, "control": found.control, "viewers": found.publish}
+        return found
 
     def reply(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
         """Send a message to a connection of the control socket, or drop it."""
@@ -58,45 +92,79 @@ class Ports:
         """Send a mesh update to the viewers that subscribed to its topic, or drop it."""
         send_now(self.viewers, [topic, message, *frames])
 
-    def renew(self) -> None:
-        """Drop every connection, with all that it holds in memory; `step` listens at the same ports again."""
-        self.close()
-        self.problem = "every connection is made anew"
+    def renew(self, only: sockets.AnySocket | None = None) -> None:
+        """Drop every connection, with all that it holds in memory; `step` listens at the same ports again.
+
+        Args:
+            only: the socket whose connections are meant; None = those of all.
+        """
+        for name, socket in self._sockets.items():
+            if only in (None, socket):
+                socket.close()
+                self._unbound.append(name)
+        self.problem = "connections are made anew"
         self.step()
 
     def step(self) -> None:
         """Listen again, as soon as ZeroMQ's threads have given the ports back. Never waits."""
         now = time.monotonic()
-        if not self.problem or now < self._next_bind:
+        if not self._unbound or now < self._next_bind:
             return
         self._next_bind = now + _REBIND_INTERVAL
         try:
-            if self.control.closed:
-                self._open()
-            if self._addresses is not None:
-                addresses = self._addresses
-                sockets.bind(self.keyframes, self.control, self.viewers, addresses.data, addresses.control)
+            for name in tuple(dict.fromkeys(self._unbound)):
+                if self._sockets[name].closed:
+                    self._sockets[name] = self._make(name)
+                if self._addresses:
+                    sockets.bind_socket(self._sockets[name], self._addresses[name])
+                self._unbound = [one for one in self._unbound if one != name]
         except (TransportError, zmq.ZMQError) as error:
-            if self.control.closed:
-                self.close()  # no room for all three
             self.problem = f"cannot listen any more, and will try again: {error}"
         else:
             self.problem = ""
 
+    def cut_off(self, frame: zmq.Frame) -> None:
+        """End the connection over which a frame came, if it still stands. Others of the same port stay."""
+        ports = {sockets.parse_address(address)[1] for address in self._addresses.values()}
+        with suppress(OSError, zmq.ZMQError), fromfd(int(frame.get(zmq.SRCFD)), AF_INET, SOCK_STREAM) as link:
+            # A connection that has ended may have left its number to another file.
+            if isinstance(name := link.getsockname(), tuple) and name[1] in ports:
+                link.shutdown(SHUT_RDWR)
+
     def close(self) -> None:
         """Close the sockets at once, with whatever they have not sent."""
-        for socket in (self.keyframes, self.control, self.viewers):
+        for socket in self._sockets.values():
             socket.close()
 
 
-def receive_some(socket: sockets.AnySocket, handle: Handler) -> None:
-    """Handle the messages that a socket holds, up to a limit: then the other sockets get their turn."""
+def receive_some(socket: sockets.AnySocket, handle: Handler, on_flood: Callable[[Flood], None]) -> None:
+    """Handle the messages that a socket holds, up to a limit: then the other sockets get their turn.
+
+    Args:
+        on_flood: told of a message with many more frames than any may have, which is not handled.
+    """
     for _ in range(_MESSAGES_A_STEP):
         try:
-            frames = socket.recv_multipart(zmq.NOBLOCK, copy=False)
+            frames = [socket.recv(zmq.NOBLOCK, copy=False)]
         except zmq.Again:
             return
+        while frames[-1].more and len(frames) <= MAX_FRAMES:  # one too many shows that the message is none
+            frames.append(socket.recv(zmq.NOBLOCK, copy=False))
+        discarded = _discard(socket) if frames[-1].more else 0
+        if discarded > _MANY_FRAMES:
+            on_flood(Flood(frames[0], discarded, socket.getsockopt(zmq.RCVMORE) == 1))
+            return
         handle(frames)
+
+
+def _discard(socket: sockets.AnySocket) -> int:
+    """Read and forget the rest of a message, up to a limit; the number of frames."""
+    discarded, more = 0, True
+    while more and discarded < _MOST_DISCARDED:
+        socket.recv(zmq.NOBLOCK)
+        more = socket.getsockopt(zmq.RCVMORE) == 1
+        discarded += 1
+    return discarded
 
 
 def send_now(socket: sockets.AnySocket, frames: list[Any]) -> None:
