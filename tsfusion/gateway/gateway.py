@@ -29,6 +29,7 @@ from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.memory_guard import MemoryGuard
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Flood, Ports, Subscriptions, receive_some
+from tsfusion.gateway.sessions import Sessions
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.health import Health
 from tsfusion.wire.sockets import mesh_topic
@@ -237,20 +238,21 @@ class Gateway:
         if hello.version != messages.PROTOCOL_VERSION:
             speaks = f"the server speaks version {messages.PROTOCOL_VERSION} of the wire format"
             return "version", f"{speaks}, this client {hello.version}"
-        hosted = self.maps.open_for_client(hello.map)
-        if hosted is None:
-            return "map", f"map {hello.map} cannot be opened: {self.maps.why_not(hello.map)}"
-        if not hosted.warm:
+        hosted = self.maps.greet(hello.map)
+        if hosted is None and (why := self.maps.why_not(hello.map)):
+            return "map", f"map {hello.map} cannot be opened: {why}"
+        if hosted is not None and not hosted.warm:
             return "opening", f"map {hello.map} is being opened"
-        if not self._admission.owns(hosted.sessions, hello.session, client):
+        sessions = Sessions() if hosted is None else hosted.sessions
+        if not self._admission.owns(sessions, hello.session, client):
             return "session", "the session of this spool is another client's: use another spool folder"
-        if not hosted.sessions.room_for(hello.session):
-            return "session", f"map {hello.map} has {len(hosted.sessions)} sessions and takes no new one"
-        if other := self.maps.denial_of_world(hosted, hello):
+        if not sessions.room_for(hello.session):
+            return "session", f"map {hello.map} has {len(sessions)} sessions and takes no new one"
+        if hosted is not None and (other := self.maps.denial_of_world(hosted, hello)):
             self._refused["world"] += 1
             log.warning("%s", other.message, extra=logs.about(session=hello.session, client=client))
             return other.reason, other.message, other.free_map
-        scans = hosted.sessions.get(hello.session) is not None
+        scans = sessions.get(hello.session) is not None
         self._routes.connect(hello.session, hello.map, identity, client, scans=scans)
         return None
 

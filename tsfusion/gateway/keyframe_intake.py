@@ -57,7 +57,9 @@ class KeyframeIntake:
             self._refuse(error, client)
             return
         hosted = self._maps.get(header.map)
-        if hosted is None or not hosted.warm:  # its client will say hello, and send it again
+        if hosted is None:
+            self._make_map(header, buffers, client)
+        elif not hosted.warm:  # its client will say hello, and send it again
             self._refused["map"] += 1
         elif not hosted.sessions.room_for(header.session):  # its client is told when it says hello
             self._refused["session"] += 1
@@ -72,6 +74,24 @@ class KeyframeIntake:
             self._routes.send(header.session, denied)
         elif not self._has_to_wait(hosted, header.session, client, nbytes):
             self._on_checked(hosted, header, buffers, client, received_ns)
+
+    def _make_map(self, header: RecordHeader, buffers: list[Any], client: str) -> None:
+        """Open the map that a client was let into for its first record, which is to come again then."""
+        self._refused["map"] += 1
+        route = self._routes.get(header.session)
+        if route is None or (route.client, route.map) != (client, header.map):
+            return  # its client will say hello
+        try:
+            codec.check(buffers, self._server.max_frame_bytes)
+        except Refused as error:
+            self._refuse(error, client, header)
+            return
+        if self._maps.open_for_client(header.map) is None:
+            why = f"map {header.map} cannot be opened: {self._maps.why_not(header.map)}"
+            self._routes.send(header.session, messages.Denied(header.session, "map", why))
+        else:
+            why = f"map {header.map} is being opened"
+            self._routes.send(header.session, messages.Denied(header.session, "opening", why))
 
     def _has_to_wait(self, hosted: HostedMap, key: bytes, client: str, nbytes: int) -> bool:
         route = self._routes.get(key)

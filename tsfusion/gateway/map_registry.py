@@ -6,18 +6,20 @@ import re
 import time
 from collections.abc import Iterator, Mapping
 from itertools import count
+from pathlib import Path
 from typing import Any
 
 import zmq
 
 from tsfusion.core import logs
 from tsfusion.core.config import DEFAULT_MAP, MAP_NAME_LENGTH, ServerConfig, VolumeConfig
-from tsfusion.core.errors import TsfusionError
+from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.sessions import Session
 from tsfusion.journal import state_folder
+from tsfusion.journal.record_scan import journal_error
 from tsfusion.wire.health import MapHealth
 from tsfusion.wire.messages import Denied, Hello
 from tsfusion.wire.record_header import RecordHeader
@@ -77,13 +79,24 @@ class MapRegistry:
         """Go on when a map cannot be opened, from here on; before, that is an error of the server."""
         self._started = True
 
+    def greet(self, name: str) -> HostedMap | None:
+        """A map by name, opened when it is on the disk; None = there is none, or `why_not` says why.
+
+        A greeting alone makes no map: the first record does.
+        """
+        try:
+            is_there = name in self._open or state_folder.holds_a_map(self._folder(name))
+        except JournalError as error:
+            self._give_up(name, error)
+            return None
+        return self.open_for_client(name) if is_there else None
+
     def open_for_client(self, name: str) -> HostedMap | None:
-        """A map by name, opened when need be; None when it cannot be, and `why_not` says why."""
+        """A map by name, opened or made when need be; None when it cannot be, and `why_not` says why."""
         hosted = self._open.get(name)
         if hosted is not None:
             return hosted
-        _, failed = self._unopened.get(name, ("", -_RETRY_INTERVAL))
-        if len(self._open) >= self._server.max_maps or time.monotonic() - failed < _RETRY_INTERVAL:
+        if self.why_not(name):
             return None
         try:
             return self._open_map(name)
@@ -92,9 +105,11 @@ class MapRegistry:
             return None
 
     def why_not(self, name: str) -> str:
-        """Why a map cannot be opened."""
-        why, _ = self._unopened.get(name, (self.why_full, 0.0))
-        return why
+        """Why a map that is not open cannot be opened now; empty = it can be."""
+        why, failed = self._unopened.get(name, ("", -_RETRY_INTERVAL))
+        if time.monotonic() - failed < _RETRY_INTERVAL:
+            return why
+        return self.why_full if len(self._open) >= self._server.max_maps else ""
 
     @property
     def why_full(self) -> str:
@@ -121,13 +136,20 @@ class MapRegistry:
         """The first of NAME, NAME-2, NAME-3, … that is no map's yet and was given to nobody just now."""
         now = time.monotonic()
         in_use = {one.name for one in self if len(one.sessions)} | {route.map for route in self._routes}
-        on_disk = {name for name in state_folder.map_names(self._server.state) if name not in self._open}
+        on_disk = self._names_on_disk() - self._open.keys()
         kept = {name for name, since in self._kept.items() if now - since < _KEPT_SECONDS}
         taken = in_use | on_disk | kept | set(self._unopened)
         stem = re.sub(r"-[0-9]+$", "", like)
         stem = stem if stem in taken else like
         names = (stem if number == 1 else _numbered(stem, number) for number in count(1))
         return next(name for name in names if name not in taken)
+
+    def _names_on_disk(self) -> set[str]:
+        try:
+            return set(state_folder.map_names(self._server.state))
+        except OSError as error:  # who is given the name of a map then is denied by its frame
+            log.error("the maps on the disk cannot be listed: %s", error)
+            return set()
 
     def keep_free_name(self, like: str) -> str | None:
         """A free name that nobody else is given; None = there is no room for another map."""
@@ -141,11 +163,18 @@ class MapRegistry:
 
     def _open_map(self, name: str) -> HostedMap:
         volume = self._volumes.get(name) or self._volumes[DEFAULT_MAP]
-        hosted = self._open[name] = HostedMap(
-            self._context, name, self._server, volume, routes=self._routes, metrics=self._metrics
-        )
+        try:
+            hosted = HostedMap(
+                self._context, name, self._server, volume, routes=self._routes, metrics=self._metrics
+            )
+        except OSError as error:
+            raise journal_error("open", self._folder(name), error) from error
+        self._open[name] = hosted
         self._unopened.pop(name, None)
         return hosted
+
+    def _folder(self, name: str) -> Path:
+        return state_folder.map_folder(self._server.state, name)
 
     def _give_up(self, name: str, error: TsfusionError) -> None:
         log.error("the map cannot be opened: %s", error, extra=logs.about(map=name))
