@@ -2,68 +2,26 @@
 """The ports of a gateway under messages and connections that nobody should send; in this process."""
 
 import contextlib
+import os
 import socket
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import zmq
-from attacks import raw
-from idle_fuser import COMMAND
-from keyframes_and_servers import connected, until, wall
+from attacks import part, raw
+from keyframes_and_servers import connected
+from served_gateway import Served, record, serving_here
 
-from tsfusion.core.config import ServerConfig, VolumeConfig
-from tsfusion.gateway import fuser_process, fuser_supervisor
-from tsfusion.gateway.access_control import AccessControl
-from tsfusion.gateway.gateway import Gateway
-from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.ports import Ports
-from tsfusion.wire import codec, messages, sockets
+from tsfusion.wire import messages, sockets
 
 FRAMES = 300_000  # of a hostile message: read one by one they take half a second
 
 
-class Served:
-    """A gateway that listens, with a fuser that fuses nothing. Call `until` instead of waiting."""
-
-    def __init__(self, gateway: Gateway) -> None:
-        self.gateway = gateway
-        self.addresses = gateway.ports.bind()
-        self.longest = 0.0  # CPU seconds of a step
-        gateway.accept()
-
-    def step(self) -> None:
-        began = time.thread_time()
-        self.gateway.step()
-        self.longest = max(self.longest, time.thread_time() - began)
-
-    @property
-    def durable(self) -> int:
-        """Keyframes in the journal."""
-        return self.gateway.health().maps["default"].keyframes_durable
-
-    def until(self, reached: Any) -> None:
-        """Step until that is true."""
-        until(lambda: self.step() or reached())
-
-
 @pytest.fixture
-def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
-    monkeypatch.setattr(fuser_process, "COMMAND", COMMAND)
-    monkeypatch.setattr(fuser_supervisor, "_END_DEADLINE", 0.0)
-    with contextlib.ExitStack() as stack:
-        server = ServerConfig(listen="tcp://127.0.0.1:0", state=str(tmp_path))
-        context: zmq.Context[Any] = zmq.Context()
-        stack.callback(context.term)
-        ports = Ports(context, server)
-        stack.callback(ports.close)
-        gateway = Gateway(context, server, ports, AccessControl(context, None), Metrics(server))
-        stack.callback(gateway.maps.close)
-        gateway.maps.open_at_start({"default": VolumeConfig()})
-        until(lambda: gateway.step() or gateway.maps.warm)
-        yield Served(gateway)
+def served(tmp_path: Path) -> Iterator[Served]:
+    with serving_here(tmp_path) as made:
+        yield made
 
 
 def is_cut_off(link: socket.socket) -> bool:
@@ -77,10 +35,6 @@ def is_cut_off(link: socket.socket) -> bool:
     return False
 
 
-def record(seq: int) -> list[bytes]:
-    return codec.encode(wall(seq), session=bytes(16), seq=seq, previous=seq - 1, jpeg_quality=90)
-
-
 PORTS = {"data": b"PUSH", "control": b"DEALER", "publish": b"SUB"}
 
 
@@ -90,19 +44,20 @@ def test_a_message_of_frames_without_end_is_not_read_to_its_end(served: Served, 
     address = getattr(served.addresses, port)
     with contextlib.closing(raw(address, PORTS[port])) as stranger:
         stranger.sendall(b"\x01\x00" * (FRAMES - 1) + b"\x00\x00")
-        served.until(lambda: served.gateway.health().refused.get("frames"))
+        served.until(lambda: sum(served.gateway.health().refused.values()))
         assert served.longest < 0.15
         served.until(lambda: is_cut_off(stranger))
     with (
         connected(sockets.dealer, served.addresses.control) as client,
         connected(sockets.push, served.addresses.data) as push,
-        connected(sockets.subscriber, served.addresses.publish),
+        connected(sockets.subscriber, served.addresses.publish) as viewer,
     ):
         client.send(messages.encode(messages.Hello(bytes(16), messages.PROTOCOL_VERSION)))
         served.until(lambda: client.poll(0))
         push.send_multipart(record(1))
         served.until(lambda: served.durable)
-        served.until(lambda: len(served.gateway._subscriptions) == 1)
+        # `poll`: ZeroMQ subscribes again in the thread of whoever reads.
+        served.until(lambda: viewer.poll(0) or len(served.gateway._subscriptions) == 1)
 
 
 @pytest.mark.parametrize("surplus", [500, 5000])
@@ -122,3 +77,45 @@ def test_frames_too_many_cost_nobody_else_a_connection(served: Served, surplus: 
             served.until(lambda: is_cut_off(stranger))
         push.send_multipart(record(2))
         served.until(lambda: served.durable == 2)
+
+
+def test_connections_that_say_nothing_give_way(served: Served) -> None:
+    """Those that have not even sent a greeting, the oldest first; a client's connections stay."""
+    served.gateway.ports.connections.most = 60
+    with contextlib.ExitStack() as stack:
+        push = stack.enter_context(connected(sockets.push, served.addresses.data))
+        push.setsockopt(zmq.RECONNECT_IVL, -1)
+        push.send_multipart(record(1))
+        served.until(lambda: served.durable == 1)
+        host, port = sockets.parse_address(served.addresses.data)
+        strangers = []
+        for _ in range(150):
+            strangers.append(stack.enter_context(socket.create_connection((host, port))))
+            served.step()
+        served.until(lambda: is_cut_off(strangers[0]))
+        assert served.gateway.health().refused["connection"] >= 90
+        assert len(os.listdir("/proc/self/fd")) < 100 + 150
+        push.send_multipart(record(2))
+        served.until(lambda: served.durable == 2)
+
+
+def test_who_fills_the_memory_is_cut_off_alone(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """ZeroMQ keeps the parts of a message until its last one, as many as come."""
+    with (
+        connected(sockets.push, served.addresses.data) as push,
+        contextlib.closing(raw(served.addresses.data, b"PUSH")) as stranger,
+    ):
+        push.setsockopt(zmq.RECONNECT_IVL, -1)
+        push.send_multipart(record(1))
+        served.until(lambda: served.durable == 1)
+        for _ in range(40):
+            stranger.sendall(part(bytes(100_000)))
+        alarms = [1 << 30]
+        monkeypatch.setattr(served.gateway._memory, "excess", lambda _: alarms.pop() if alarms else 0)
+        epoch = served.gateway.epoch
+        served.until(lambda: is_cut_off(stranger))
+        push.send_multipart(record(2))
+        served.until(lambda: served.durable == 2)
+        assert (served.gateway.epoch, served.gateway.health().refused) == (epoch, {"memory": 1})
+        monkeypatch.setattr(served.gateway._memory, "excess", lambda _: 1 << 30)
+        served.until(lambda: served.gateway.epoch != epoch)  # nobody stands out: all have to go

@@ -39,6 +39,7 @@ log = logging.getLogger(__name__)
 _TICK_MS = 100  # within which a signal or a fuser's death is noticed
 _RENEW_TICK_MS = 10  # while the sockets are made anew
 _SNAPSHOT_INTERVAL = 1.0  # seconds
+_CUT_HELPS_WITHIN = 1.0  # seconds: more memory after that is a new attack
 _MESHES_SHARE = 4  # one fourth of the memory is for meshes that wait to be read
 Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
@@ -71,6 +72,7 @@ class Gateway:
         self._accepting = self._stopped = False
         self._started = time.monotonic()
         self._next_snapshot = 0.0
+        self._hoarders_cut = -_CUT_HELPS_WITHIN  # time.monotonic()
         self._new_epoch()
 
     def _new_epoch(self) -> None:
@@ -99,8 +101,11 @@ class Gateway:
         if not self._drop_connections():
             for socket, handle in handlers.items():
                 if socket in events:
-                    receive_some(socket, handle, partial(self._on_flood, socket))
+                    receive_some(
+                        socket, handle, partial(self._on_flood, socket), self.ports.connections.note_read
+                    )
         self.ports.step()
+        self._limit_connections()
         for hosted, message in self.maps.step():
             self._pass_to_people(hosted, message)
         self._update_fusers()
@@ -148,7 +153,7 @@ class Gateway:
             self._refused["revoked"] += 1
         else:
             held = self._memory.excess(self._queries.nbytes)
-            if not held:
+            if not held or self._cut_hoarders(held):
                 return False
             log.error(
                 "the gateway holds %d MB, more than memory_bytes: every connection is made anew", held >> 20
@@ -159,6 +164,30 @@ class Gateway:
         self._subscriptions.clear()
         self._new_epoch()
         return True
+
+    def _cut_hoarders(self, held: int) -> bool:
+        """Cut off the connections that fill the memory, if they can be told; all go if that does not help."""
+        now = time.monotonic()
+        if now - self._hoarders_cut < _CUT_HELPS_WITHIN:
+            return False
+        hoarders = self.ports.connections.cut_hoarders()
+        for one, nbytes in hoarders:
+            self._hoarders_cut = now
+            self._refused["memory"] += 1
+            log.warning(
+                "the gateway holds %d MB, more than memory_bytes: the connection from %s, with %.1f MB of "
+                "messages that are not whole, is cut off",
+                held >> 20,
+                one.peer,
+                nbytes / 1e6,
+            )
+        return bool(hoarders)
+
+    def _limit_connections(self) -> None:
+        """Cut off some connections where there are too many, and what only says it is a viewer."""
+        if surplus := self.ports.connections.step():
+            self._refused["connection"] += surplus
+            log.warning("%d connections are cut off: there are too many, or viewers send messages", surplus)
 
     def _snapshot(self) -> None:
         """Give the metrics a new health snapshot, about once a second."""

@@ -4,14 +4,13 @@
 import logging
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
-from socket import AF_INET, SHUT_RDWR, SOCK_STREAM, fromfd
 from typing import Any, NamedTuple, TypeAlias
 
 import zmq
 
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import TransportError
+from tsfusion.gateway.connections import Connections
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.codec import MAX_FRAMES
 from tsfusion.wire.curve import ServerKeys
@@ -50,6 +49,7 @@ class Ports:
         self._unbound: list[str] = []  # sockets that are being made anew
         self._next_bind = 0.0
         self.problem = ""  # why nobody can connect; empty = clients can
+        self.connections = Connections(server.memory_bytes)
         self._sockets = {name: self._make(name) for name in ("keyframes", "control", "viewers")}
 
     def _make(self, name: str) -> sockets.AnySocket:
@@ -82,6 +82,8 @@ class Ports:
         listen, control = self._server.listen, self._server.control
         found = sockets.bind(self.keyframes, self.control, self.viewers, listen, control)
         self._addresses = {"keyframes": found.data, "control": found.control, "viewers": found.publish}
+        listening = (sockets.parse_address(one)[1] for one in self._addresses.values())
+        self.connections.listen_at(*listening)
         return found
 
     def reply(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
@@ -125,11 +127,8 @@ class Ports:
 
     def cut_off(self, frame: zmq.Frame) -> None:
         """End the connection over which a frame came, if it still stands. Others of the same port stay."""
-        ports = {sockets.parse_address(address)[1] for address in self._addresses.values()}
-        with suppress(OSError, zmq.ZMQError), fromfd(int(frame.get(zmq.SRCFD)), AF_INET, SOCK_STREAM) as link:
-            # A connection that has ended may have left its number to another file.
-            if isinstance(name := link.getsockname(), tuple) and name[1] in ports:
-                link.shutdown(SHUT_RDWR)
+        if (fd := sockets.file_of(frame)) is not None:
+            self.connections.cut(fd)
 
     def close(self) -> None:
         """Close the sockets at once, with whatever they have not sent."""
@@ -137,10 +136,16 @@ class Ports:
             socket.close()
 
 
-def receive_some(socket: sockets.AnySocket, handle: Handler, on_flood: Callable[[Flood], None]) -> None:
+def receive_some(
+    socket: sockets.AnySocket,
+    handle: Handler,
+    on_flood: Callable[[Flood], None],
+    note_read: Callable[[int, int], None],
+) -> None:
     """Handle the messages that a socket holds, up to a limit: then the other sockets get their turn.
 
     Args:
+        note_read: told the file number of the connection, and the bytes of a message that is handled.
         on_flood: told of a message with many more frames than any may have, which is not handled.
     """
     for _ in range(_MESSAGES_A_STEP):
@@ -154,6 +159,8 @@ def receive_some(socket: sockets.AnySocket, handle: Handler, on_flood: Callable[
         if discarded > _MANY_FRAMES:
             on_flood(Flood(frames[0], discarded, socket.getsockopt(zmq.RCVMORE) == 1))
             return
+        if (fd := sockets.file_of(frames[-1])) is not None:
+            note_read(fd, sum(map(len, frames)))
         handle(frames)
 
 
