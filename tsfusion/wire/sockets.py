@@ -22,10 +22,6 @@ CONTROL_MAX_BYTES = 64 << 10
 TOPIC_MAX_BYTES = 512
 _MESH_TOPIC = b"mesh/"
 _ANY: dict[int, int] = {zmq.HANDSHAKE_IVL: 5000}  # ms; then a connection that is not made is closed
-_LISTENING = {
-    **_ANY,
-    zmq.BACKLOG: 1024,
-}  # more connections that wait to be taken are tried again a second later
 _RECONNECTING: dict[int, int] = {zmq.RECONNECT_IVL: 100, zmq.RECONNECT_IVL_MAX: 1000}  # ms
 _CONNECTING = {**_ANY, **_RECONNECTING, zmq.TCP_KEEPALIVE: 1, zmq.IMMEDIATE: 1}
 _RANDOM_PORT_TRIES = 32
@@ -51,7 +47,7 @@ def push(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySock
 
 def pull(context: "zmq.Context[Any]", max_frame_bytes: int, keys: ServerKeys | None = None) -> AnySocket:
     """The server's data socket; a larger frame is dropped with its connection before it is in memory."""
-    return _make(context, zmq.PULL, {**_LISTENING, zmq.RCVHWM: 16, zmq.MAXMSGSIZE: max_frame_bytes}, keys)
+    return _make(context, zmq.PULL, {**_ANY, zmq.RCVHWM: 16, zmq.MAXMSGSIZE: max_frame_bytes}, keys)
 
 
 def dealer(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySocket:
@@ -62,13 +58,13 @@ def dealer(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySo
 def router(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySocket:
     """The server's control socket."""
     limits: dict[int, int] = {zmq.SNDHWM: 1000, zmq.RCVHWM: 100, zmq.MAXMSGSIZE: CONTROL_MAX_BYTES}
-    return _make(context, zmq.ROUTER, {**_LISTENING, **limits}, keys)
+    return _make(context, zmq.ROUTER, {**_ANY, **limits}, keys)
 
 
 def publisher(context: "zmq.Context[Any]", keys: ServerKeys | None = None) -> AnySocket:
     """The server's mesh updates; a slow viewer misses some, never holds the server up."""
     limits: dict[int, int] = {zmq.SNDHWM: 16, zmq.MAXMSGSIZE: TOPIC_MAX_BYTES}
-    return _make(context, zmq.XPUB, {**_LISTENING, **limits}, keys)
+    return _make(context, zmq.XPUB, {**_ANY, **limits}, keys)
 
 
 def mesh_topic(map_name: str) -> bytes:
