@@ -251,6 +251,9 @@ def raw(address: str, kind: bytes) -> socket.socket:
     made = socket.create_connection((host, int(port)), timeout=5.0)
     ready = _property(b"Socket-Type", kind) + _property(b"Identity", b"")
     made.sendall(_GREETING + _command(b"READY", ready))
+    answer = b""
+    while b"READY" not in answer and (got := made.recv(4096)):  # what comes earlier may be cut off
+        answer += got
     return made
 
 

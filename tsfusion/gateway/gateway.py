@@ -270,7 +270,7 @@ class Gateway:
         hosted = self.maps.greet(hello.map)
         if hosted is None and (why := self.maps.why_not(hello.map)):
             return "map", f"map {hello.map} cannot be opened: {why}"
-        if hosted is not None and not hosted.warm:
+        if hosted is not None and not hosted.takes_records:
             return "opening", f"map {hello.map} is being opened"
         sessions = Sessions() if hosted is None else hosted.sessions
         if not self._admission.owns(sessions, hello.session, client):

@@ -55,6 +55,7 @@ class HostedMap:
         self._last_keyframe: float | None = None  # time.monotonic()
         self._loss = ""
         self._checkpoints = 0  # written since the map was opened
+        self._is_new = not state_folder.holds_a_map(self.folder)
         self._journal = _open_journal(self.folder, server)
         self.disk = DiskPause(self._journal, server.min_free_bytes, name)
         self._quarantine = Quarantine(self.folder / state_folder.QUARANTINE_FOLDER, server.quarantine_bytes)
@@ -75,6 +76,11 @@ class HostedMap:
         self._retention = JournalRetention(self._journal, self._index, self.sessions, server.journal_bytes)
         _warn_of_old_corrections(self.folder)
         self.fuser = FuserSupervisor(context, self.folder, server, volume)
+
+    @property
+    def takes_records(self) -> bool:
+        """Whether it is known what the map has: its fuser has read that, or there was nothing."""
+        return self.warm or self._is_new
 
     @property
     def drained(self) -> bool:

@@ -56,10 +56,8 @@ class KeyframeIntake:
         except Refused as error:
             self._refuse(error, client)
             return
-        hosted = self._maps.get(header.map)
-        if hosted is None:
-            self._make_map(header, buffers, client)
-        elif not hosted.warm:  # its client will say hello, and send it again
+        hosted = self._maps.get(header.map) or self._make_map(header, buffers, client)
+        if hosted is None or not hosted.takes_records:  # its client will say hello, and send it again
             self._refused["map"] += 1
         elif not hosted.sessions.room_for(header.session):  # its client is told when it says hello
             self._refused["session"] += 1
@@ -75,23 +73,22 @@ class KeyframeIntake:
         elif not self._has_to_wait(hosted, header.session, client, nbytes):
             self._on_checked(hosted, header, buffers, client, received_ns)
 
-    def _make_map(self, header: RecordHeader, buffers: list[Any], client: str) -> None:
-        """Open the map that a client was let into for its first record, which is to come again then."""
-        self._refused["map"] += 1
+    def _make_map(self, header: RecordHeader, buffers: list[Any], client: str) -> HostedMap | None:
+        """The map that a client was let into, made for its first record; None = it is not, or cannot be."""
         route = self._routes.get(header.session)
         if route is None or (route.client, route.map) != (client, header.map):
-            return  # its client will say hello
+            return None
         try:
             codec.check(buffers, self._server.max_frame_bytes)
+            self._quotas.check(header, buffers)
         except Refused as error:
             self._refuse(error, client, header)
-            return
-        if self._maps.open_for_client(header.map) is None:
+            return None
+        hosted = self._maps.open_for_client(header.map)
+        if hosted is None:
             why = f"map {header.map} cannot be opened: {self._maps.why_not(header.map)}"
             self._routes.send(header.session, messages.Denied(header.session, "map", why))
-        else:
-            why = f"map {header.map} is being opened"
-            self._routes.send(header.session, messages.Denied(header.session, "opening", why))
+        return hosted
 
     def _has_to_wait(self, hosted: HostedMap, key: bytes, client: str, nbytes: int) -> bool:
         route = self._routes.get(key)
