@@ -85,7 +85,7 @@ def _open(
     state = Path(server.state)
     stack.enter_context(lock_folder(state, "state", "server"))
     for name in state_folder.map_names(state):
-        if len(volumes) < server.max_maps:
+        if len(volumes) < server.max_maps and state_folder.holds_a_map(state_folder.map_folder(state, name)):
             volumes.setdefault(name, volumes[DEFAULT_MAP])
     context: zmq.Context[Any] = zmq.Context()
     stack.callback(context.term)

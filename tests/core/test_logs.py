@@ -143,10 +143,13 @@ def test_a_flood_is_cut_short_and_counted() -> None:
     assert list(limiter.finished_periods(everything=True)) == []
 
 
-def test_errors_are_never_left_out() -> None:
+def test_errors_are_cut_short_too_and_what_ends_the_process_is_not() -> None:
+    """A peer can bring errors about as fast as it likes."""
     limiter = logs.Limiter(most=1)
-    assert all(limiter.allows(record(level=level)) for level in (logging.ERROR, logging.CRITICAL) * 50)
-    assert list(limiter.finished_periods(everything=True)) == []
+    assert [limiter.allows(record(level=logging.ERROR)) for _ in range(3)] == [True, False, False]
+    assert all(limiter.allows(record(level=logging.CRITICAL)) for _ in range(50))
+    (summary,) = limiter.finished_periods(everything=True)
+    assert summary.levelno == logging.ERROR
 
 
 def test_left_out_lines_are_counted_though_nothing_follows(lines: ReadLines) -> None:

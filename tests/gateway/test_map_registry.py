@@ -1,17 +1,97 @@
 # SPDX-License-Identifier: MIT
-"""Free names of maps, for clients that may use all names or some."""
+"""Maps that clients ask for: made by their first record, and no error of the disk ends the gateway."""
 
+import errno
+import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
+import pytest
 import zmq
+from failures import refuse
+from keyframes_and_servers import connected
+from served_gateway import Served, record, serving_here
 
 from tsfusion.core.config import ServerConfig
+from tsfusion.gateway import map_registry
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.metrics import Metrics
-from tsfusion.journal import state_folder
+from tsfusion.journal import quarantine, state_folder
+from tsfusion.wire import messages, sockets
 from tsfusion.wire.allowed_maps import AllowedMaps
+from tsfusion.wire.messages import Command, Denied, Welcome
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Served]:
+    with serving_here(tmp_path, max_maps=2) as made:
+        yield made
+
+
+def test_a_greeting_makes_no_map_and_a_record_does(served: Served, tmp_path: Path) -> None:
+    with (
+        connected(sockets.dealer, served.addresses.control) as link,
+        connected(sockets.push, served.addresses.data) as push,
+    ):
+        for number in range(5):
+            session = number.to_bytes(16, "big")
+            assert isinstance(served.greet(link, f"yard{number}", session), Welcome)
+        assert list(served.gateway.health().maps) == state_folder.map_names(tmp_path) == ["default"]
+        push.send_multipart(record(1, "yard0"))
+        served.until(lambda: served.gateway.health().maps["yard0"].keyframes_durable == 1)
+        second = (1).to_bytes(16, "big")
+        push.send_multipart(record(1, "yard1", second))
+        answer = served.heard(link, Denied)
+        assert (answer.session, answer.reason) == (second, "map")
+        assert "2 are open" in answer.message
+        assert served.greet(link, "yard2").reason == "map"
+
+
+def test_a_record_of_nobody_or_a_bad_one_makes_no_map(served: Served, tmp_path: Path) -> None:
+    with (
+        connected(sockets.dealer, served.addresses.control) as link,
+        connected(sockets.push, served.addresses.data) as push,
+    ):
+        push.send_multipart(record(1, "yard"))
+        served.until(lambda: served.gateway.health().refused.get("map") == 1)
+        served.greet(link, "yard")
+        head, *rest = record(1, "yard")
+        push.send_multipart([head, *rest[:-1], b"x"])
+        assert served.heard(link, messages.Nack)
+    assert state_folder.map_names(tmp_path) == ["default"]
+
+
+@pytest.mark.parametrize("code", [errno.EIO, errno.ENOENT, errno.EMFILE])
+def test_an_error_of_the_disk_while_a_map_is_opened_is_a_denial(
+    served: Served, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    with (
+        connected(sockets.dealer, served.addresses.control) as link,
+        connected(sockets.push, served.addresses.data) as push,
+    ):
+        served.greet(link, "yard")
+        with monkeypatch.context() as broken:
+            broken.setattr(quarantine, "_by_age", refuse(code))
+            push.send_multipart(record(1, "yard"))
+            answer = served.heard(link, Denied)
+            assert answer.reason == "map"
+            assert "map yard cannot be opened: " in answer.message
+            assert os.strerror(code) in answer.message
+        monkeypatch.setattr(map_registry, "_RETRY_INTERVAL", 0.0)
+        push.send_multipart(record(1, "yard"))
+        served.until(lambda: "yard" in served.gateway.health().maps)
+        assert served.heard(link, messages.Ack).durable == 1
+
+
+def test_maps_that_cannot_be_listed_are_no_end(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    with connected(sockets.dealer, served.addresses.control) as link:
+        monkeypatch.setattr(state_folder, "map_names", refuse(errno.EIO))
+        link.send(messages.encode(Command(name="new_map", map="yard")))
+        assert served.heard(link, messages.Reply).map == "yard"
+        monkeypatch.setattr(state_folder.os, "walk", refuse(errno.EIO))
+        assert served.greet(link, "shed").reason == "map"
 
 
 def test_a_free_name_is_one_that_the_client_may_use(tmp_path: Path) -> None:

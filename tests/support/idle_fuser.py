@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A server whose maps open at once: its fusers take every keyframe and fuse none."""
 
+import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -24,10 +25,10 @@ while True:
     elif isinstance(message, fuser_messages.Finish):
         sys.exit(0)
 """
+COMMAND = (sys.executable, "-c", _FUSER)
 _CODE = f"""
-import sys
 from tsfusion.gateway import fuser_process
-fuser_process.COMMAND = (sys.executable, "-c", {_FUSER!r})
+fuser_process.COMMAND = {COMMAND!r}
 """
 
 

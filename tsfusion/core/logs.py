@@ -160,7 +160,7 @@ class Stderr(_Handler):
 class Limiter:
     """Limit of `most` lines in each period from each place in the code; further lines are counted.
 
-    Errors always pass: they may report lost data.
+    Errors too: a peer can bring them about, or a disk. What ends the process always passes.
     """
 
     def __init__(
@@ -172,7 +172,7 @@ class Limiter:
 
     def allows(self, record: logging.LogRecord) -> bool:
         """Whether to write a record; if not, it is counted."""
-        if record.levelno >= logging.ERROR:
+        if record.levelno >= logging.CRITICAL:
             return True
         place = self._places.setdefault((record.pathname, record.lineno), _Place(self._clock()))
         place.count += 1

@@ -19,6 +19,9 @@ from tsfusion.wire.key_folder import AllowList
 log = logging.getLogger(__name__)
 
 
+KEPT_OUT = 60.0  # seconds; then a client that was kept out may try again
+
+
 class AccessControl:
     """The allow-list of one server; without a folder of keys everybody who can reach the server may connect.
 
@@ -34,12 +37,13 @@ class AccessControl:
         self._allowed: AllowList | None = None
         self._zap: ZapHandler | None = None
         self._revoked = False
+        self._kept_out: dict[str, float] = {}  # client → until when (`time.monotonic()`)
         if folder is not None:
             self.keys = server_keys(folder)
             self._allowed = AllowList(Path(folder))
             if self._allowed.problem:  # an error at the start; later, nobody is let in
                 raise InvalidConfig(self._allowed.problem)
-            self._zap = ZapHandler(context, self._allowed.name_of, self._allowed.rejection_reason)
+            self._zap = ZapHandler(context, self._name_of, self._why_not)
         self.poll = [] if self._zap is None else [self._zap.socket]  # the sockets to poll before `step`
 
     @property
@@ -67,7 +71,25 @@ class AccessControl:
             return ""
         self._revoked |= self._allowed.refresh()  # the file may have changed since the last step
         key = sender_of(frame)
-        return None if key is None else self._allowed.name_of(key)
+        return None if key is None else self._name_of(key)
+
+    def keep_out(self, frame: zmq.Frame) -> str:
+        """Let the client that sent a frame make no connection for a while; its name, empty without keys."""
+        client = self.client_of(frame) or ""
+        if client:
+            self._kept_out[client] = time.monotonic() + KEPT_OUT
+        return client
+
+    def _name_of(self, key: str) -> str | None:
+        name = None if self._allowed is None else self._allowed.name_of(key)
+        return None if name is not None and self._is_kept_out(name) else name
+
+    def _is_kept_out(self, name: str) -> bool:
+        return time.monotonic() < self._kept_out.get(name, 0.0)
+
+    def _why_not(self, key: str) -> str:
+        assert self._allowed is not None
+        return _KEPT_OUT_WORD if self._allowed.name_of(key) else self._allowed.rejection_reason(key)
 
     @property
     def limits_maps(self) -> bool:
@@ -89,6 +111,7 @@ _REQUESTS_A_STEP = 100
 _LOG_EVERY = 60.0  # seconds, in which a refusal is logged once, and few are: keys cost nothing to make
 _LOGGED_AT_MOST = 20
 _KEY_BYTES = 32
+_KEPT_OUT_WORD = "kept out"
 Allow = Callable[[str], str | None]
 
 
@@ -139,7 +162,8 @@ class ZapHandler:
             key, reason = self._judge(request)
         if reason:
             self._note(key, reason, request[1] if len(request) > 1 else b"")
-        verdict = [b"400", reason.encode(), b"", b""] if reason else [b"200", b"OK", key.encode(), b""]
+        status = b"300" if reason == _KEPT_OUT_WORD else b"400"  # 300: it may try again, without a word
+        verdict = [status, reason.encode(), b"", b""] if reason else [b"200", b"OK", key.encode(), b""]
         try:
             self.socket.send_multipart([peer, b"", b"1.0", number, *verdict], zmq.NOBLOCK)
         except zmq.ZMQError as error:  # the connection has ended meanwhile

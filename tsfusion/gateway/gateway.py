@@ -8,6 +8,7 @@ message is checked, journaled and acknowledged in one step; a map's fuser gets o
 import logging
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import zmq
@@ -27,8 +28,9 @@ from tsfusion.gateway.keyframe_intake import KeyframeIntake
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.memory_guard import MemoryGuard
 from tsfusion.gateway.metrics import Metrics
-from tsfusion.gateway.ports import Ports, Subscriptions, receive_some
+from tsfusion.gateway.ports import Flood, Ports, Subscriptions, receive_some
 from tsfusion.gateway.problems import Problem, ProblemTimes
+from tsfusion.gateway.sessions import Sessions
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
 from tsfusion.wire.health import Health, MapHealth
@@ -40,6 +42,7 @@ _TICK_MS = 100  # within which a signal or a fuser's death is noticed
 _RENEW_TICK_MS = 10  # while the sockets are made anew
 _SNAPSHOT_INTERVAL = 1.0  # seconds
 _CLIENT_PROBLEMS = 10  # lines about single clients
+_CUT_HELPS_WITHIN = 1.0  # seconds: more memory after that is a new attack
 _MESHES_SHARE = 4  # one fourth of the memory is for meshes that wait to be read
 Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
@@ -73,6 +76,7 @@ class Gateway:
         self._accepting = self._stopped = False
         self._started = time.monotonic()
         self._next_snapshot = 0.0
+        self._hoarders_cut = -_CUT_HELPS_WITHIN  # time.monotonic()
         self._new_epoch()
 
     def _new_epoch(self) -> None:
@@ -101,8 +105,11 @@ class Gateway:
         if not self._drop_connections():
             for socket, handle in handlers.items():
                 if socket in events:
-                    receive_some(socket, handle)
+                    receive_some(
+                        socket, handle, partial(self._on_flood, socket), self.ports.connections.note_read
+                    )
         self.ports.step()
+        self._limit_connections()
         for hosted, message in self.maps.step():
             self._pass_to_people(hosted, message)
         self._update_fusers()
@@ -112,14 +119,33 @@ class Gateway:
         """The handler of each socket's messages; none while the sockets are made anew."""
         if self.ports.problem:
             return {}
-        handlers: Handlers = {self.ports.control: self._on_control}
-        if not self.ports.viewers.closed:
-            handlers[self.ports.viewers] = self._on_subscription
+        handlers: Handlers = {self.ports.control: self._on_control, self.ports.viewers: self._on_subscription}
         if self._accepting:
             handlers[self.ports.keyframes] = self._intake.handle
         elif self._stopped:
             self.ports.keyframes.close()
         return handlers
+
+    def _on_flood(self, socket: sockets.AnySocket, flood: Flood) -> None:
+        """Cut off who sent a message of frames without end, and with it, where that takes long, its port.
+
+        The others of the port are back at once; the client, where it has a name, after a while.
+        """
+        self._refused["frames"] += 1
+        client = self._access.keep_out(flood.first)
+        address = sockets.peer_address(flood.first) or "somewhere"
+        log.warning(
+            "a message from %s has more than %d frames: its connection is cut off%s",
+            address,
+            flood.discarded,
+            ", and the others of that port are made anew" if flood.goes_on else "",
+            extra=logs.about(client=client, reason="frames"),
+        )
+        self.ports.cut_off(flood.first)
+        if flood.goes_on:
+            if socket is self.ports.viewers:
+                self._subscriptions.clear()
+            self.ports.renew(socket)
 
     def _drop_connections(self) -> bool:
         """Drop all connections if a key was revoked, or if they hold too much memory; whether that was done.
@@ -131,7 +157,7 @@ class Gateway:
             self._refused["revoked"] += 1
         else:
             held = self._memory.excess(self._queries.nbytes)
-            if not held:
+            if not held or self._cut_hoarders(held):
                 return False
             log.error(
                 "the gateway holds %d MB, more than memory_bytes: every connection is made anew", held >> 20
@@ -142,6 +168,30 @@ class Gateway:
         self._subscriptions.clear()
         self._new_epoch()
         return True
+
+    def _cut_hoarders(self, held: int) -> bool:
+        """Cut off the connections that fill the memory, if they can be told; all go if that does not help."""
+        now = time.monotonic()
+        if now - self._hoarders_cut < _CUT_HELPS_WITHIN:
+            return False
+        hoarders = self.ports.connections.cut_hoarders()
+        for one, nbytes in hoarders:
+            self._hoarders_cut = now
+            self._refused["memory"] += 1
+            log.warning(
+                "the gateway holds %d MB, more than memory_bytes: the connection from %s, with %.1f MB of "
+                "messages that are not whole, is cut off",
+                held >> 20,
+                one.peer,
+                nbytes / 1e6,
+            )
+        return bool(hoarders)
+
+    def _limit_connections(self) -> None:
+        """Cut off some connections where there are too many, and what only says it is a viewer."""
+        if surplus := self.ports.connections.step():
+            self._refused["connection"] += surplus
+            log.warning("%d connections are cut off: there are too many, or viewers send messages", surplus)
 
     def _snapshot(self) -> None:
         """Give the metrics a new health snapshot, about once a second."""
@@ -226,20 +276,22 @@ class Gateway:
             return "version", f"{speaks}, this client {hello.version}"
         if forbidden := self._admission.denial_of_map(client, hello.map):
             return "map", forbidden
-        hosted = self.maps.open_for_client(hello.map)
-        if hosted is None:
-            return "map", f"map {hello.map} cannot be opened: {self.maps.why_not(hello.map)}"
-        if not hosted.warm:
+        hosted = self.maps.greet(hello.map)
+        if hosted is None and (why := self.maps.why_not(hello.map)):
+            return "map", f"map {hello.map} cannot be opened: {why}"
+        if hosted is not None and not hosted.takes_records:
             return "opening", f"map {hello.map} is being opened"
-        if not self._admission.owns(hosted.sessions, hello.session, client):
+        sessions = Sessions() if hosted is None else hosted.sessions
+        if not self._admission.owns(sessions, hello.session, client):
             return "session", "the session of this spool is another client's: use another spool folder"
-        if not hosted.sessions.room_for(hello.session):
-            return "session", f"map {hello.map} has {len(hosted.sessions)} sessions and takes no new one"
-        if other := self.maps.denial_of_world(hosted, hello, self._admission.maps_of(client)):
+        if not sessions.room_for(hello.session):
+            return "session", f"map {hello.map} has {len(sessions)} sessions and takes no new one"
+        may_use = self._admission.maps_of(client)
+        if hosted is not None and (other := self.maps.denial_of_world(hosted, hello, may_use)):
             self._refused["world"] += 1
             log.warning("%s", other.message, extra=logs.about(session=hello.session, client=client))
             return other.reason, other.message, other.free_map
-        scans = hosted.sessions.get(hello.session) is not None
+        scans = sessions.get(hello.session) is not None
         self._routes.connect(hello.session, hello.map, identity, client, scans=scans)
         return None
 

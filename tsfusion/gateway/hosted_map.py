@@ -67,6 +67,7 @@ class HostedMap:
         self._unsaved = ""  # why no checkpoint can be written; empty = it can
         self._save_at = 0.0  # time.monotonic()
         self._missing = 0  # segments of the journal that were missing when a checkpoint was asked for
+        self._is_new = not state_folder.holds_a_map(self.folder)
         self._journal = _open_journal(self.folder, server, watch)
         self.disk = DiskPause(self._journal, name)
         self._quarantine = Quarantine(self.folder / state_folder.QUARANTINE_FOLDER, server.quarantine_bytes)
@@ -87,6 +88,11 @@ class HostedMap:
         self._retention = JournalRetention(self._journal, self._index, self.sessions, server.journal_bytes)
         _warn_of_old_corrections(self.folder)
         self.fuser = FuserSupervisor(context, self.folder, server, volume)
+
+    @property
+    def takes_records(self) -> bool:
+        """Whether it is known what the map has: its fuser has read that, or there was nothing."""
+        return self.warm or self._is_new
 
     @property
     def drained(self) -> bool:

@@ -57,11 +57,13 @@ class KeyframeIntake:
         except Refused as error:
             self._refuse(error, client)
             return
-        hosted = self._maps.get(header.map)
         if forbidden := self._admission.denial_of_map(client, header.map):
+            self._refused["map"] += 1
             subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
             log.warning("a %s is refused: %s", header.kind, forbidden, extra=subject)
-        elif hosted is None or not hosted.warm:  # its client will say hello, and send it again
+            return
+        hosted = self._maps.get(header.map) or self._make_map(header, buffers, client)
+        if hosted is None or not hosted.takes_records:  # its client will say hello, and send it again
             self._refused["map"] += 1
         elif not hosted.sessions.room_for(header.session):  # its client is told when it says hello
             self._refused["session"] += 1
@@ -76,6 +78,23 @@ class KeyframeIntake:
             self._routes.send(header.session, denied)
         elif not self._has_to_wait(hosted, header.session, client, nbytes):
             self._on_checked(hosted, header, buffers, client, received_ns)
+
+    def _make_map(self, header: RecordHeader, buffers: list[Any], client: str) -> HostedMap | None:
+        """The map that a client was let into, made for its first record; None = it is not, or cannot be."""
+        route = self._routes.get(header.session)
+        if route is None or (route.client, route.map) != (client, header.map):
+            return None
+        try:
+            codec.check(buffers, self._server.max_frame_bytes)
+            self._quotas.check(header, buffers)
+        except Refused as error:
+            self._refuse(error, client, header)
+            return None
+        hosted = self._maps.open_for_client(header.map)
+        if hosted is None:
+            why = f"map {header.map} cannot be opened: {self._maps.why_not(header.map)}"
+            self._routes.send(header.session, messages.Denied(header.session, "map", why))
+        return hosted
 
     def _has_to_wait(self, hosted: HostedMap, key: bytes, client: str, nbytes: int) -> bool:
         route = self._routes.get(key)

@@ -5,21 +5,22 @@ import logging
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import zmq
 
 from tsfusion.core import logs
 from tsfusion.core.config import DEFAULT_MAP, MAP_NAME_LENGTH, ServerConfig, VolumeConfig
-from tsfusion.core.errors import TsfusionError
+from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.problems import Problem
 from tsfusion.gateway.sessions import Session
 from tsfusion.journal import state_folder
+from tsfusion.journal.record_scan import journal_error
 from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
 from tsfusion.wire.health import MapHealth
 from tsfusion.wire.messages import Denied, Hello
@@ -90,13 +91,24 @@ class MapRegistry:
         """Go on when a map cannot be opened, from here on; before, that is an error of the server."""
         self._started = True
 
+    def greet(self, name: str) -> HostedMap | None:
+        """A map by name, opened when it is on the disk; None = there is none, or `why_not` says why.
+
+        A greeting alone makes no map: the first record does.
+        """
+        try:
+            is_there = name in self._open or state_folder.holds_a_map(self._folder(name))
+        except JournalError as error:
+            self._give_up(name, error)
+            return None
+        return self.open_for_client(name) if is_there else None
+
     def open_for_client(self, name: str) -> HostedMap | None:
-        """A map by name, opened when need be; None when it cannot be, and `why_not` says why."""
+        """A map by name, opened or made when need be; None when it cannot be, and `why_not` says why."""
         hosted = self._open.get(name)
         if hosted is not None:
             return hosted
-        _, failed = self._unopened.get(name, ("", -_RETRY_INTERVAL))
-        if len(self._open) >= self._server.max_maps or time.monotonic() - failed < _RETRY_INTERVAL:
+        if self.why_not(name):
             return None
         try:
             return self._open_map(name)
@@ -105,9 +117,11 @@ class MapRegistry:
             return None
 
     def why_not(self, name: str) -> str:
-        """Why a map cannot be opened."""
-        why, _ = self._unopened.get(name, (self.why_full, 0.0))
-        return why
+        """Why a map that is not open cannot be opened now; empty = it can be."""
+        why, failed = self._unopened.get(name, ("", -_RETRY_INTERVAL))
+        if time.monotonic() - failed < _RETRY_INTERVAL:
+            return why
+        return self.why_full if len(self._open) >= self._server.max_maps else ""
 
     @property
     def why_full(self) -> str:
@@ -150,10 +164,7 @@ class MapRegistry:
         """
         now = time.monotonic()
         in_use = {one.name for one in self if len(one.sessions)} | {route.map for route in self._routes}
-        on_disk: set[str] = set()
-        with suppress(OSError):  # a name that is taken after all is denied at the greeting
-            on_disk.update(state_folder.map_names(self._server.state))
-        on_disk.difference_update(self._open)
+        on_disk = self._names_on_disk() - self._open.keys()
         kept = {name for name, since in self._kept.items() if now - since < _KEPT_SECONDS}
         taken = in_use | on_disk | kept | set(self._unopened)
         stem = re.sub(r"-[0-9]+$", "", like)
@@ -162,6 +173,13 @@ class MapRegistry:
         # Of so many names one is not taken.
         numbered = (_numbered(one, number) for one in stems if one for number in range(1, len(taken) + 3))
         return next((name for name in numbered if name not in taken and name in maps), None)
+
+    def _names_on_disk(self) -> set[str]:
+        try:
+            return set(state_folder.map_names(self._server.state))
+        except OSError as error:  # who is given the name of a map then is denied by its frame
+            log.error("the maps on the disk cannot be listed: %s", error)
+            return set()
 
     def keep_free_name(self, like: str, maps: AllowedMaps = ALL_MAPS) -> str | None:
         """A free name that nobody else is given; None = there is none, or no room for another map."""
@@ -177,17 +195,24 @@ class MapRegistry:
 
     def _open_map(self, name: str) -> HostedMap:
         volume = self._volumes.get(name) or self._volumes[DEFAULT_MAP]
-        hosted = self._open[name] = HostedMap(
-            self._context,
-            name,
-            self._server,
-            volume,
-            routes=self._routes,
-            metrics=self._metrics,
-            watch=partial(self._watch, name),
-        )
+        try:
+            hosted = HostedMap(
+                self._context,
+                name,
+                self._server,
+                volume,
+                routes=self._routes,
+                metrics=self._metrics,
+                watch=partial(self._watch, name),
+            )
+        except OSError as error:
+            raise journal_error("open", self._folder(name), error) from error
+        self._open[name] = hosted
         self._unopened.pop(name, None)
         return hosted
+
+    def _folder(self, name: str) -> Path:
+        return state_folder.map_folder(self._server.state, name)
 
     def _give_up(self, name: str, error: Exception) -> None:
         log.error("the map cannot be opened: %s", error, extra=logs.about(map=name))

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Limits on the gateway's memory: what connections hold in all, and large replies that nobody reads."""
 
+import time
 from collections.abc import Sequence
 
 import zmq
 
 from tsfusion.core import process
+
+_RETURN_INTERVAL = 1.0  # seconds
 
 
 class MemoryGuard:
@@ -20,6 +23,7 @@ class MemoryGuard:
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = self._bound = max_bytes
+        self._next_return = 0.0  # time.monotonic()
 
     def excess(self, uncounted: int) -> int:
         """Bytes that this process holds, when they are too many; otherwise 0.
@@ -28,7 +32,10 @@ class MemoryGuard:
             uncounted: bytes of this process that are no connection's fault.
         """
         held = process.rss_bytes() - uncounted
-        if held > self._bound:  # perhaps freed already, and only kept for later
+        now = time.monotonic()
+        # Perhaps freed already, and only kept for later.
+        if held > self._bound or (held > self._max_bytes and now >= self._next_return):
+            self._next_return = now + _RETURN_INTERVAL
             process.give_back_memory()
             held = process.rss_bytes() - uncounted
         exceeded = held > self._bound

@@ -5,21 +5,37 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import zmq
 
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import TransportError
+from tsfusion.gateway.connections import Connections
 from tsfusion.wire import messages, sockets
+from tsfusion.wire.codec import MAX_FRAMES
 from tsfusion.wire.curve import ServerKeys
 from tsfusion.wire.sockets import Addresses
 
 log = logging.getLogger(__name__)
 
 _MESSAGES_A_STEP = 16
+_SECONDS_A_STEP = 0.05
+_MANY_FRAMES = 1000  # surplus ones, which no mistake explains
+_MOST_DISCARDED = 50_000  # frames of one message that are read and forgotten: some 50 ms
 _REBIND_INTERVAL = 0.01  # seconds
 Handler: TypeAlias = Callable[[list[zmq.Frame]], None]
+
+
+class Flood(NamedTuple):
+    """A message with many more frames than any may have.
+
+    ZeroMQ has all of them in memory, and gives what others sent to the socket only behind the last one.
+    """
+
+    first: zmq.Frame
+    discarded: int  # number of frames that were read and forgotten
+    goes_on: bool  # whether there are more: only a new socket gets rid of them soon
 
 
 class Ports:
@@ -41,19 +57,36 @@ class Ports:
         self._server = server
         self._keys = keys
         self._grants_topics = grants_topics
-        self._addresses: Addresses | None = None
+        self._is_manual = False
+        self._addresses: dict[str, str] = {}  # of the sockets, once they are bound
+        self._unbound: list[str] = []  # sockets that are being made anew
         self._next_bind = 0.0
         self.problem = ""  # why nobody can connect; empty = clients can
-        self._open()
+        self.connections = Connections(server.memory_bytes)
+        self._sockets = {name: self._make(name) for name in ("keyframes", "control", "viewers")}
 
-    def _open(self) -> None:
-        self.keyframes = sockets.pull(self._context, self._server.max_frame_bytes, keys=self._keys)
-        self.control = sockets.router(self._context, keys=self._keys)
-        self._open_viewers()
-
-    def _open_viewers(self) -> None:
+    def _make(self, name: str) -> sockets.AnySocket:
+        if name == "keyframes":
+            return sockets.pull(self._context, self._server.max_frame_bytes, keys=self._keys)
+        if name == "control":
+            return sockets.router(self._context, keys=self._keys)
         self._is_manual = self._grants_topics()
-        self.viewers = sockets.publisher(self._context, keys=self._keys, manual=self._is_manual)
+        return sockets.publisher(self._context, keys=self._keys, manual=self._is_manual)
+
+    @property
+    def keyframes(self) -> sockets.AnySocket:
+        """Records come in here."""
+        return self._sockets["keyframes"]
+
+    @property
+    def control(self) -> sockets.AnySocket:
+        """Greetings, pings and commands come in here, and their answers leave."""
+        return self._sockets["control"]
+
+    @property
+    def viewers(self) -> sockets.AnySocket:
+        """Mesh updates leave here, and subscriptions come in."""
+        return self._sockets["viewers"]
 
     def bind(self) -> Addresses:
         """Bind the sockets, so that clients can connect.
@@ -62,8 +95,11 @@ class Ports:
             TransportError: when a port is taken.
         """
         listen, control = self._server.listen, self._server.control
-        self._addresses = sockets.bind(self.keyframes, self.control, self.viewers, listen, control)
-        return self._addresses
+        found = sockets.bind(self.keyframes, self.control, self.viewers, listen, control)
+        self._addresses = {"keyframes": found.data, "control": found.control, "viewers": found.publish}
+        listening = (sockets.parse_address(one)[1] for one in self._addresses.values())
+        self.connections.listen_at(*listening)
+        return found
 
     def reply(self, identity: bytes, message: messages.ToClient, frames: Sequence[zmq.Frame] = ()) -> None:
         """Send a message to a connection of the control socket, or drop it."""
@@ -96,64 +132,90 @@ class Ports:
             if self.viewers.recv_multipart(copy=False)[0].bytes[:1] in (b"\x00", b"\x01"):
                 break
         if self._is_manual:
-            self.viewers.close()
+            self.renew(self.viewers)
         return self._is_manual
 
-    def renew(self) -> None:
-        """Drop every connection, with all that it holds in memory; `step` listens at the same ports again."""
-        self.close()
-        self.problem = "every connection is made anew"
+    def renew(self, only: sockets.AnySocket | None = None) -> None:
+        """Drop every connection, with all that it holds in memory; `step` listens at the same ports again.
+
+        Args:
+            only: the socket whose connections are meant; None = those of all.
+        """
+        for name, socket in self._sockets.items():
+            if only in (None, socket):
+                socket.close()
+                self._unbound.append(name)
+        self.problem = "connections are made anew"
         self.step()
 
     def step(self) -> None:
         """Listen again, as soon as ZeroMQ's threads have given the ports back. Never waits."""
         now = time.monotonic()
-        if now < self._next_bind:
-            return
-        if not self.problem and self.viewers.closed:
-            self._next_bind = now + _REBIND_INTERVAL
-            self._listen_for_viewers()
-        if not self.problem:
+        if not self._unbound or now < self._next_bind:
             return
         self._next_bind = now + _REBIND_INTERVAL
         try:
-            if self.control.closed:
-                self._open()
-            if self._addresses is not None:
-                addresses = self._addresses
-                sockets.bind(self.keyframes, self.control, self.viewers, addresses.data, addresses.control)
+            for name in tuple(dict.fromkeys(self._unbound)):
+                if self._sockets[name].closed:
+                    self._sockets[name] = self._make(name)
+                if self._addresses:
+                    sockets.bind_socket(self._sockets[name], self._addresses[name])
+                self._unbound = [one for one in self._unbound if one != name]
         except (TransportError, zmq.ZMQError) as error:
-            if self.control.closed:
-                self.close()  # no room for all three
             self.problem = f"cannot listen any more, and will try again: {error}"
         else:
             self.problem = ""
 
-    def _listen_for_viewers(self) -> None:
-        try:
-            self._open_viewers()
-            if self._addresses is not None:
-                sockets.bind_socket(self.viewers, self._addresses.publish)
-        except (TransportError, zmq.ZMQError) as error:
-            log.debug("viewers cannot connect yet: %s", error)
-            self.viewers.close()
+    def cut_off(self, frame: zmq.Frame) -> None:
+        """End the connection over which a frame came, if it still stands. Others of the same port stay."""
+        if (fd := sockets.file_of(frame)) is not None:
+            self.connections.cut(fd)
 
     def close(self) -> None:
         """Close the sockets at once, with whatever they have not sent."""
-        for socket in (self.keyframes, self.control, self.viewers):
+        for socket in self._sockets.values():
             socket.close()
 
 
-def receive_some(socket: sockets.AnySocket, handle: Handler) -> None:
-    """Handle the messages that a socket holds, up to a limit: then the other sockets get their turn."""
+def receive_some(
+    socket: sockets.AnySocket,
+    handle: Handler,
+    on_flood: Callable[[Flood], None],
+    note_read: Callable[[int, int], None],
+) -> None:
+    """Handle the messages that a socket holds, up to a limit: then the other sockets get their turn.
+
+    Args:
+        note_read: told the file number of the connection, and the bytes of a message that is handled.
+        on_flood: told of a message with many more frames than any may have, which is not handled.
+    """
+    until = time.monotonic() + _SECONDS_A_STEP
     for _ in range(_MESSAGES_A_STEP):
-        if socket.closed:  # by the handler
+        if socket.closed or time.monotonic() > until:  # the handler closed it, or the disk is slow
             return
         try:
-            frames = socket.recv_multipart(zmq.NOBLOCK, copy=False)
+            frames = [socket.recv(zmq.NOBLOCK, copy=False)]
         except zmq.Again:
             return
+        while frames[-1].more and len(frames) <= MAX_FRAMES:  # one too many shows that the message is none
+            frames.append(socket.recv(zmq.NOBLOCK, copy=False))
+        discarded = _discard(socket) if frames[-1].more else 0
+        if discarded > _MANY_FRAMES:
+            on_flood(Flood(frames[0], discarded, socket.getsockopt(zmq.RCVMORE) == 1))
+            return
+        if (fd := sockets.file_of(frames[-1])) is not None:
+            note_read(fd, sum(map(len, frames)))
         handle(frames)
+
+
+def _discard(socket: sockets.AnySocket) -> int:
+    """Read and forget the rest of a message, up to a limit; the number of frames."""
+    discarded, more = 0, True
+    while more and discarded < _MOST_DISCARDED:
+        socket.recv(zmq.NOBLOCK)
+        more = socket.getsockopt(zmq.RCVMORE) == 1
+        discarded += 1
+    return discarded
 
 
 def send_now(socket: sockets.AnySocket, frames: list[Any]) -> None:

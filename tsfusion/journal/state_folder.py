@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The folders of a server's maps, `STATE/maps/NAME/`, and the journals in them."""
 
+import os
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +20,7 @@ MAPS_FOLDER = "maps"
 JOURNAL_FOLDER = "journal"
 QUARANTINE_FOLDER = "quarantine"
 MAP_FILE = "map.tsf"
+LOCK_FILE = "fuser.lock"
 PREVIOUS_FILE = "map.previous.tsf"
 
 
@@ -34,6 +36,24 @@ def map_names(state: str | Path) -> list[str]:
         for path in (Path(state) / MAPS_FOLDER).glob("*")
         if path.is_dir() and re.fullmatch(MAP_NAME, path.name)
     )
+
+
+def holds_a_map(folder: Path) -> bool:
+    """Whether a map's folder holds more than its lock: a record, a checkpoint, or what a person put there.
+
+    Raises:
+        JournalError: when it cannot be listed.
+    """
+    try:
+        return any(name != LOCK_FILE for _, _, names in os.walk(folder, onerror=_fail) for name in names)
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise journal_error("list", folder, error) from error
+
+
+def _fail(error: OSError) -> None:
+    raise error
 
 
 def is_state_folder(path: Path) -> bool:

@@ -156,6 +156,14 @@ def peer_address(frame: zmq.Frame) -> str:
         return ""
 
 
+def file_of(frame: zmq.Frame) -> int | None:
+    """File number of the connection over which a frame came; None where ZeroMQ does not know it."""
+    try:
+        return int(frame.get(zmq.SRCFD))
+    except (zmq.ZMQError, ValueError):
+        return None
+
+
 def parse_address(address: str) -> tuple[str, int]:
     """Host and port of `tcp://host:port` (port `*` or 0 = random); an IPv6 address stands in brackets.
 

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: MIT
+"""No stranger fills the log: what anybody can bring about goes through its limiter, errors too."""
+
+import http.client
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from attacks import raw
+from keyframes_and_servers import connected
+from served_gateway import Served, record, serving_here
+
+from tsfusion.core import logs
+from tsfusion.gateway.metrics_http import HttpResponse, MetricsPage
+from tsfusion.wire import sockets
+
+MANY = 3 * logs.MOST
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Served]:
+    with serving_here(tmp_path) as made:
+        yield made
+
+
+def test_messages_that_are_refused(served: Served, capsys: pytest.CaptureFixture[str]) -> None:
+    logs.configure("text", "info")
+    with (
+        connected(sockets.dealer, served.addresses.control) as link,
+        connected(sockets.push, served.addresses.data) as push,
+    ):
+        served.greet(link, "default")
+        head, *rest = record(1)
+        for _ in range(MANY):
+            push.send_multipart([b"rubbish"])
+            push.send_multipart([head, *rest[:-1], b"x"])
+        served.until(lambda: sum(served.gateway.health().refused.values()) == 2 * MANY)
+    assert len(capsys.readouterr().err.splitlines()) <= 2 * logs.MOST + 2
+
+
+def test_connections_that_are_cut_off(served: Served, capsys: pytest.CaptureFixture[str]) -> None:
+    logs.configure("text", "info")
+    for number in range(MANY):
+        with raw(served.addresses.data, b"PUSH") as stranger:
+            stranger.sendall(b"\x01\x00" * 2000 + b"\x00\x00")
+            served.until(lambda: served.gateway.health().refused.get("frames") == number + 1)  # noqa: B023
+    assert len(capsys.readouterr().err.splitlines()) <= logs.MOST + 2
+
+
+def test_memory_that_is_filled_again_and_again(
+    served: Served, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logs.configure("text", "info")
+    monkeypatch.setattr(served.gateway._memory, "excess", lambda _: 1 << 30)
+    served.until(lambda: served.gateway.health().refused.get("memory", 0) >= MANY)
+    assert len(capsys.readouterr().err.splitlines()) <= logs.MOST + 2
+
+
+def test_answers_that_nobody_reads(served: Served, capsys: pytest.CaptureFixture[str]) -> None:
+    logs.configure("text", "info")
+    ports = served.gateway.ports
+    ports.control.close()
+    for _ in range(MANY):
+        ports.reply(b"nobody", b"")  # type: ignore[arg-type]
+    assert len(capsys.readouterr().err.splitlines()) <= logs.MOST + 2
+
+
+def test_pages_that_fail(capsys: pytest.CaptureFixture[str]) -> None:
+    def fail() -> HttpResponse:
+        raise ValueError("broken")
+
+    logs.configure("text", "info")
+    page = MetricsPage("127.0.0.1:0", {"/": fail})
+    try:
+        for _ in range(MANY):
+            link = http.client.HTTPConnection(page.address, timeout=10)
+            link.request("GET", "/")
+            assert link.getresponse().status == 500
+            link.close()
+    finally:
+        page.close()
+    assert capsys.readouterr().err.count("cannot be shown") <= logs.MOST + 1

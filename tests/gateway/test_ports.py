@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: MIT
+"""The ports of a gateway under messages and connections that nobody should send; in this process."""
+
+import contextlib
+import os
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+from attacks import part, raw
+from keyframes_and_servers import connected, secured
+from served_gateway import Served, record, serving_here
+
+from tsfusion.gateway import access_control
+from tsfusion.wire import messages, sockets
+
+FRAMES = 300_000  # of a hostile message: read one by one they take half a second
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Served]:
+    with serving_here(tmp_path) as made:
+        yield made
+
+
+def is_cut_off(link: socket.socket) -> bool:
+    """Whether the other side has ended a connection."""
+    link.settimeout(0.01)
+    with contextlib.suppress(TimeoutError):
+        try:
+            return not link.recv(4096)
+        except ConnectionResetError:
+            return True
+    return False
+
+
+def sent(link: sockets.AnySocket, frames: list[bytes]) -> None:
+    """Send a message if there is a connection; what is on its way when that ends is lost."""
+    with contextlib.suppress(zmq.Again):
+        link.send_multipart(frames, zmq.NOBLOCK)
+
+
+PORTS = {"data": b"PUSH", "control": b"DEALER", "publish": b"SUB"}
+
+
+@pytest.mark.parametrize("port", PORTS)
+def test_a_message_of_frames_without_end_is_not_read_to_its_end(served: Served, port: str) -> None:
+    """ZeroMQ gives others' messages only behind its last frame; reading them all takes seconds."""
+    address = getattr(served.addresses, port)
+    with contextlib.closing(raw(address, PORTS[port])) as stranger:
+        stranger.sendall(b"\x01\x00" * (FRAMES - 1) + b"\x00\x00")
+        served.until(lambda: sum(served.gateway.health().refused.values()))
+        assert served.longest < 0.15
+        served.until(lambda: is_cut_off(stranger))
+    with (
+        connected(sockets.dealer, served.addresses.control) as client,
+        connected(sockets.push, served.addresses.data) as push,
+        connected(sockets.subscriber, served.addresses.publish) as viewer,
+    ):
+        hello = messages.encode(messages.Hello(bytes(16), messages.PROTOCOL_VERSION))
+        served.until(lambda: client.poll(0) or sent(client, [hello]))
+        served.until(lambda: served.durable or sent(push, record(1)))
+        # `poll`: ZeroMQ subscribes again in the thread of whoever reads.
+        served.until(lambda: viewer.poll(0) or len(served.gateway._subscriptions) == 1)
+
+
+@pytest.mark.parametrize("surplus", [500, 5000])
+def test_frames_too_many_cost_nobody_else_a_connection(served: Served, surplus: int) -> None:
+    """Only who sends very many is cut off."""
+    with (
+        connected(sockets.push, served.addresses.data) as push,
+        contextlib.closing(raw(served.addresses.data, b"PUSH")) as stranger,
+    ):
+        push.setsockopt(zmq.RECONNECT_IVL, -1)
+        push.send_multipart(record(1))
+        served.until(lambda: served.durable == 1)
+        stranger.sendall(b"\x01\x00" * surplus + b"\x00\x00")
+        served.until(lambda: sum(served.gateway.health().refused.values()))
+        if surplus > 1000:
+            assert served.gateway.health().refused == {"frames": 1}
+            served.until(lambda: is_cut_off(stranger))
+        push.send_multipart(record(2))
+        served.until(lambda: served.durable == 2)
+
+
+def test_connections_that_say_nothing_give_way(served: Served) -> None:
+    """Those that have not even sent a greeting, the oldest first; a client's connections stay."""
+    served.gateway.ports.connections.most = 60
+    with contextlib.ExitStack() as stack:
+        push = stack.enter_context(connected(sockets.push, served.addresses.data))
+        push.setsockopt(zmq.RECONNECT_IVL, -1)
+        push.send_multipart(record(1))
+        served.until(lambda: served.durable == 1)
+        host, port = sockets.parse_address(served.addresses.data)
+        strangers = [stack.enter_context(socket.create_connection((host, port))) for _ in range(150)]
+        served.until(lambda: is_cut_off(strangers[0]))
+        assert served.gateway.health().refused["connection"] >= 100
+        assert len(os.listdir("/proc/self/fd")) < 100 + 150
+        push.send_multipart(record(2))
+        served.until(lambda: served.durable == 2)
+
+
+def test_who_fills_the_memory_is_cut_off_alone(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """ZeroMQ keeps the parts of a message until its last one, as many as come."""
+    with (
+        connected(sockets.push, served.addresses.data) as push,
+        contextlib.closing(raw(served.addresses.data, b"PUSH")) as stranger,
+    ):
+        push.setsockopt(zmq.RECONNECT_IVL, -1)
+        push.send_multipart(record(1))
+        served.until(lambda: served.durable == 1)
+        for _ in range(40):
+            stranger.sendall(part(bytes(100_000)))
+        alarms = [1 << 30]
+        monkeypatch.setattr(served.gateway._memory, "excess", lambda _: alarms.pop() if alarms else 0)
+        epoch = served.gateway.epoch
+        served.until(lambda: is_cut_off(stranger))
+        push.send_multipart(record(2))
+        served.until(lambda: served.durable == 2)
+        assert (served.gateway.epoch, served.gateway.health().refused) == (epoch, {"memory": 1})
+        monkeypatch.setattr(served.gateway._memory, "excess", lambda _: 1 << 30)
+        served.until(lambda: served.gateway.epoch != epoch)  # nobody stands out: all have to go
+
+
+def test_a_client_that_floods_is_kept_out_for_a_while(tmp_path: Path) -> None:
+    """With keys it has a name; ZeroMQ connects again by itself, in vain."""
+    given = secured(tmp_path / "keys")
+    with (
+        serving_here(tmp_path / "state", **given.server) as served,
+        connected(sockets.push, served.addresses.data, given.keys) as push,
+    ):
+        served.until(lambda: push.poll(0, zmq.POLLOUT))
+        push.send_multipart([b""] * 3000)
+        served.until(lambda: served.gateway.health().refused.get("frames"))
+        served.until(lambda: served.gateway.health().refused.get("kept out"))
+        access = served.gateway._access
+        assert access._name_of(given.keys.public) is None
+        access._kept_out["robot"] -= access_control.KEPT_OUT
+        assert access._name_of(given.keys.public) == "robot"
