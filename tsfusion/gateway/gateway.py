@@ -14,7 +14,7 @@ import zmq
 
 from tsfusion.core import logs, process
 from tsfusion.core.config import ServerConfig
-from tsfusion.core.errors import DecodeError
+from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import fuser_queries
 from tsfusion.gateway.access_control import AccessControl
@@ -248,8 +248,11 @@ class Gateway:
         elif command.name == "health":
             self.ports.reply(identity, messages.Reply(name="health", health=self.health()))
         elif command.name == "new_map":
-            name = self.maps.keep_free_name(command.map)
-            error = None if name else f"no room for another map: {self.maps.why_full}"
+            try:
+                name = self.maps.keep_free_name(command.map)
+                error = None if name else f"no room for another map: {self.maps.why_full}"
+            except JournalError as refusal:
+                name, error = None, str(refusal)
             self.ports.reply(identity, messages.Reply(name="new_map", map=name, error=error))
         else:
             self._queries.submit(identity, command, self.maps.get(command.map), client)

@@ -12,7 +12,7 @@ import zmq
 
 from tsfusion.core import logs
 from tsfusion.core.config import DEFAULT_MAP, MAP_NAME_LENGTH, ServerConfig, VolumeConfig
-from tsfusion.core.errors import TsfusionError
+from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.metrics import Metrics
@@ -115,10 +115,18 @@ class MapRegistry:
             return None
         keyframes = hosted.health().keyframes_durable
         why = f"map {hosted.name} has {keyframes} keyframes of another session, in another coordinate frame"
-        return Denied(record.session, "world", why, self.free_name(hosted.name))
+        try:
+            free = self.free_name(hosted.name)
+        except JournalError:
+            free = ""
+        return Denied(record.session, "world", why, free)
 
     def free_name(self, like: str) -> str:
-        """The first of NAME, NAME-2, NAME-3, … that is no map's yet and was given to nobody just now."""
+        """The first of NAME, NAME-2, NAME-3, … that is no map's yet and was given to nobody just now.
+
+        Raises:
+            JournalError: when the state folder cannot be listed.
+        """
         now = time.monotonic()
         in_use = {one.name for one in self if len(one.sessions)} | {route.map for route in self._routes}
         on_disk = {name for name in state_folder.map_names(self._server.state) if name not in self._open}
@@ -130,7 +138,11 @@ class MapRegistry:
         return next(name for name in names if name not in taken)
 
     def keep_free_name(self, like: str) -> str | None:
-        """A free name that nobody else is given; None = there is no room for another map."""
+        """A free name that nobody else is given; None = there is no room for another map.
+
+        Raises:
+            JournalError: as `free_name`.
+        """
         name = self.free_name(like)
         if name not in self._open and len(self._open) >= self._server.max_maps:
             return None
