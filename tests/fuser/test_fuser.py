@@ -3,6 +3,7 @@
 
 import errno
 import json
+import mmap
 import os
 import signal
 import subprocess
@@ -21,7 +22,7 @@ import tsfusion
 from tsfusion import VolumeConfig
 from tsfusion.core import errors
 from tsfusion.fuser import messages
-from tsfusion.fuser.fuser import Fuser
+from tsfusion.fuser.fuser import CurrentKeyframe, Fuser
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.journal import Journal, Position
 from tsfusion.journal.state_folder import MAP_FILE, PREVIOUS_FILE
@@ -300,6 +301,17 @@ def test_what_it_works_at_shows_from_outside(tmp_path: Path, monkeypatch: pytest
     fuser.handle(order(0, position))
     assert link.last().reason is None
     assert (tmp_path / "working").read_bytes() == b"\xff" * 8
+
+
+def test_no_memory_to_share_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    working = tmp_path / "working"
+    working.write_bytes(bytes(4))
+    with pytest.raises(errors.MapError, match="cannot share memory with the gateway: mmap length"):
+        CurrentKeyframe(str(working))
+    working.write_bytes(bytes(8))
+    monkeypatch.setattr(mmap, "mmap", refuse(errno.ENOMEM))
+    with pytest.raises(errors.MapError, match=r"cannot share memory .*: .*Cannot allocate memory"):
+        CurrentKeyframe(str(working))
 
 
 @pytest.mark.parametrize("code", [errno.EIO, errno.EMFILE, errno.ENOMEM])
