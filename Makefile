@@ -24,4 +24,5 @@ nightly:  ## the long forms of what the tests try: about an hour; a JSON line ea
 	$(PYTHON) scripts/hostile.py --seconds 10 --keys
 	$(PYTHON) scripts/fuzz.py --cases 1000000
 	$(PYTHON) scripts/soak.py --keyframes 10000
+	$(PYTHON) scripts/faults.py
 	$(PYTHON) scripts/delivery.py
