@@ -9,7 +9,8 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -21,6 +22,7 @@ from keyframes_and_servers import VOLUME, pose, serving, until, wall
 import tsfusion
 from tsfusion import VolumeConfig
 from tsfusion.core import errors
+from tsfusion.fuser import __main__ as fuser_main
 from tsfusion.fuser import messages
 from tsfusion.fuser.fuser import CurrentKeyframe, Fuser
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
@@ -398,6 +400,18 @@ def test_a_process_at_work_ends_with_the_one_that_started_it() -> None:
     with parent:
         parent.kill()
         until(lambda: not alive(int(word)))
+
+
+def test_a_system_that_refuses_while_a_map_is_opened_is_one_clear_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent: list[bytes] = []
+    monkeypatch.setattr(fuser_main, "Fuser", refuse(errno.EIO))
+    begin = messages.Begin(str(tmp_path), VOLUME, 1.0, 0, "", False, 1 << 30)
+    assert fuser_main._open_map(cast("Any", SimpleNamespace(send=sent.append)), begin) is None
+    failed = messages.to_gateway.decode(sent[0])
+    assert isinstance(failed, messages.Failed)
+    assert str(failed.error()) == "the map cannot be opened: [Errno 5] Input/output error"
 
 
 @pytest.mark.parametrize(

@@ -83,8 +83,9 @@ def _open_map(link: sockets.AnySocket, message: fuser_messages.Begin) -> Fuser |
             Path(message.folder), "map", "fuser", name="fuser.lock", wait=_LOCK_WAIT_S, error_type=MapError
         )
         fuser = Fuser(link, message)
-    except TsfusionError as error:
-        link.send(fuser_messages.encode(fuser_messages.Failed.of(error)))
+    except (TsfusionError, OSError) as error:
+        known = error if isinstance(error, TsfusionError) else MapError(f"the map cannot be opened: {error}")
+        link.send(fuser_messages.encode(fuser_messages.Failed.of(known)))
         return None
     link.send(fuser_messages.encode(fuser.ready()))
     return fuser
