@@ -14,6 +14,7 @@ CASES = [
     "server listdir state/maps 1 EIO",
     "server open state/maps/default/corrections 1 EIO",
     "server open state/maps/default/quarantine 2 EIO",
+    "fuser stat state/maps/default 1 EIO",
     "fuser mmap tmp/* 1 EAGAIN",
     "fuser pread state/maps/default/journal/N.mcap 1 EIO for a while",
     "fuser open state/maps/default/journal/N.mcap 1 ENOENT",
