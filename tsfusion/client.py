@@ -78,6 +78,7 @@ class Client:
         InvalidConfig: for a malformed address or setting, or a key file that is of no use.
         JournalError: when the spool cannot be used, another client uses it, or what waits in it is for
             another map or of another world.
+        TransportError: when no socket can be opened.
     """
 
     def __init__(
@@ -113,7 +114,11 @@ class Client:
         self._outbox = Outbox(spool)
         self.logs_refusal = True  # of its world; a run that ends with `check_world` says it itself
         self._pressure = Backpressure(self._outbox, self._config)
-        self._sender = Sender(address, self._control, self._outbox, self._config, connection_keys)
+        try:
+            self._sender = Sender(address, self._control, self._outbox, self._config, connection_keys)
+        except OSError as error:
+            self._outbox.close()  # another client can have the spool
+            raise TransportError(f"cannot open a socket: {error.strerror}") from error
         self._sending = threading.Lock()
         self._closed = self._began_sending = False
         self._began = time.monotonic()

@@ -6,6 +6,7 @@ import logging
 import os
 import resource
 import signal
+import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +21,7 @@ from scripted_server import scripted
 
 from tsfusion import Client, Keyframe, journal
 from tsfusion.core.config import ClientConfig
-from tsfusion.core.errors import FlushTimeout, JournalError
+from tsfusion.core.errors import FlushTimeout, JournalError, TransportError
 from tsfusion.delivery import backpressure
 from tsfusion.delivery.spool import Spool
 
@@ -164,6 +165,17 @@ def test_a_failing_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number:
             taken += [i] * (client.send(wall(i)) is not None)
         assert client.stats.skipped == {"disk": 4}
     assert delivered(tmp_path, 16) == taken == [i for i in range(20) if i % 5 != 3]
+
+
+def test_a_client_that_cannot_begin_leaves_its_spool_to_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(socket, "socketpair", refuse(errno.EMFILE))
+        with pytest.raises(TransportError, match="cannot open a socket: Too many open files"):
+            Client(NOBODY, spool=tmp_path)
+    with Client(NOBODY, spool=tmp_path) as client:
+        assert client.send(wall(0)) == 1
 
 
 def test_a_record_that_cannot_be_taken_back_does_not_pass_for_another(

@@ -3,6 +3,7 @@
 
 import errno
 import json
+import mmap
 import os
 import signal
 import struct
@@ -10,7 +11,8 @@ import subprocess
 import sys
 import zlib
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import cv2
 import msgspec
@@ -23,8 +25,9 @@ from keyframes_and_servers import VOLUME, pose, serving, until, wall
 import tsfusion
 from tsfusion import VolumeConfig
 from tsfusion.core import errors
+from tsfusion.fuser import __main__ as fuser_main
 from tsfusion.fuser import messages
-from tsfusion.fuser.fuser import Fuser
+from tsfusion.fuser.fuser import CurrentKeyframe, Fuser
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.journal import Journal, Position
 from tsfusion.journal.state_folder import MAP_FILE, PREVIOUS_FILE
@@ -312,6 +315,17 @@ def test_what_it_works_at_shows_from_outside(tmp_path: Path, monkeypatch: pytest
     assert (tmp_path / "working").read_bytes() == b"\xff" * 8
 
 
+def test_no_memory_to_share_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    working = tmp_path / "working"
+    working.write_bytes(bytes(4))
+    with pytest.raises(errors.MapError, match="cannot share memory with the gateway: mmap length"):
+        CurrentKeyframe(str(working))
+    working.write_bytes(bytes(8))
+    monkeypatch.setattr(mmap, "mmap", refuse(errno.ENOMEM))
+    with pytest.raises(errors.MapError, match=r"cannot share memory .*: .*Cannot allocate memory"):
+        CurrentKeyframe(str(working))
+
+
 @pytest.mark.parametrize("code", [errno.EIO, errno.EMFILE, errno.ENOMEM])
 def test_a_record_that_cannot_be_read_now_is_left_to_another_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
@@ -498,6 +512,18 @@ def test_a_process_at_work_ends_with_the_one_that_started_it() -> None:
     with parent:
         parent.kill()
         until(lambda: not alive(int(word)))
+
+
+def test_a_system_that_refuses_while_a_map_is_opened_is_one_clear_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent: list[bytes] = []
+    monkeypatch.setattr(fuser_main, "Fuser", refuse(errno.EIO))
+    begin = messages.Begin(str(tmp_path), VOLUME, 1.0, 0, "", False, 1 << 30)
+    assert fuser_main._open_map(cast("Any", SimpleNamespace(send=sent.append)), begin) is None
+    failed = messages.to_gateway.decode(sent[0])
+    assert isinstance(failed, messages.Failed)
+    assert str(failed.error()) == "the map cannot be opened: [Errno 5] Input/output error"
 
 
 @pytest.mark.parametrize(

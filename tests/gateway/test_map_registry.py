@@ -5,6 +5,7 @@ import errno
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -14,6 +15,7 @@ from keyframes_and_servers import connected
 from served_gateway import Served, record, serving_here
 
 from tsfusion.core.config import ServerConfig
+from tsfusion.core.errors import JournalError
 from tsfusion.gateway import map_registry
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.map_registry import MapRegistry
@@ -87,9 +89,10 @@ def test_an_error_of_the_disk_while_a_map_is_opened_is_a_denial(
 
 def test_maps_that_cannot_be_listed_are_no_end(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     with connected(sockets.dealer, served.addresses.control) as link:
-        monkeypatch.setattr(state_folder, "map_names", refuse(errno.EIO))
-        link.send(messages.encode(Command(name="new_map", map="yard")))
-        assert served.heard(link, messages.Reply).map == "yard"
+        with monkeypatch.context() as broken:
+            broken.setattr(state_folder.os, "listdir", refuse(errno.EIO))
+            link.send(messages.encode(Command(name="new_map", map="yard")))
+            assert "cannot list" in (served.heard(link, messages.Reply).error or "")
         monkeypatch.setattr(state_folder.os, "walk", refuse(errno.EIO))
         assert served.greet(link, "shed").reason == "map"
 
@@ -111,3 +114,22 @@ def test_a_free_name_is_one_that_the_client_may_use(tmp_path: Path) -> None:
     assert maps.keep_free_name("default", AllowedMaps(("house",))) is None
     why = maps.why_none_free("default", AllowedMaps(("house",)))
     assert why == "no name is free of the maps that this key may use: house"
+
+
+def test_no_free_name_is_guessed_where_the_maps_cannot_be_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nothing = cast("Any", ())
+    registry = MapRegistry(nothing, ServerConfig(state=str(tmp_path)), nothing, nothing)
+    hosted = SimpleNamespace(
+        name="hall",
+        sessions=SimpleNamespace(shares_frame=lambda *_: False),
+        health=lambda: SimpleNamespace(keyframes_durable=1),
+    )
+    (tmp_path / "maps").mkdir()
+    monkeypatch.setattr(os, "listdir", refuse(errno.EIO))
+    with pytest.raises(JournalError, match=r"cannot list .*maps: Input/output error"):
+        registry.keep_free_name("hall")
+    denied = registry.denial_of_world(cast("Any", hosted), cast("Any", SimpleNamespace(session=b"")))
+    assert denied is not None  # a scanner of another world is turned away all the same
+    assert denied.free_map == ""

@@ -371,6 +371,16 @@ def test_a_folder_that_cannot_be_listed_is_one_clear_error(
         Journal(tmp_path, BIG)
 
 
+def test_maps_that_cannot_be_listed_are_one_clear_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert state_folder.map_names(tmp_path) == []  # there is none yet
+    (tmp_path / "maps").mkdir()
+    monkeypatch.setattr(os, "listdir", refuse(errno.EIO))
+    with pytest.raises(JournalError, match=r"cannot list .*maps: Input/output error"):
+        state_folder.map_names(tmp_path)
+
+
 def test_a_name_that_is_too_long_is_not_cut_to_another_one(tmp_path: Path) -> None:
     log = Journal(tmp_path, BIG)
     with pytest.raises(JournalError, match="at most 32 bytes"):

@@ -92,7 +92,7 @@ class Spool:
         self.world, self.same_frame = world or "", same_frame
         self.folder = _temporary_folder() if folder is None else Path(folder)
         self._lock = lock_folder(self.folder, "spool", "scanner", wait=_LOOK_SECONDS)
-        if (old := self.folder / "corrections.tsc").exists():
+        if os.path.exists(old := self.folder / "corrections.tsc"):
             log.warning(
                 "%s holds corrected poses as an earlier development version kept them: it is not read; "
                 "delete it to silence this",

@@ -89,10 +89,14 @@ def _open_map(link: sockets.AnySocket, message: fuser_messages.Begin) -> Fuser |
             make=False,  # one that is away must not be made in its place
         )  # fmt: skip
         fuser = Fuser(link, message)
-    except (TsfusionError, MemoryError) as error:
+    except (TsfusionError, OSError, MemoryError) as error:
         if isinstance(error, MemoryError):
-            error = MapError(f"no memory to open the map: {error}; raise fuser_memory_bytes")
-        link.send(fuser_messages.encode(fuser_messages.Failed.of(error)))
+            known: TsfusionError = MapError(f"no memory to open the map: {error}; raise fuser_memory_bytes")
+        elif isinstance(error, OSError):
+            known = MapError(f"the map cannot be opened: {error}")
+        else:
+            known = error
+        link.send(fuser_messages.encode(fuser_messages.Failed.of(known)))
         return None
     link.send(fuser_messages.encode(fuser.ready()))
     return fuser

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from tsfusion import journal
 from tsfusion.core import process
-from tsfusion.core.errors import JournalError, TsfusionError
+from tsfusion.core.errors import JournalError, MapError, TsfusionError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.geometry.keyframe import Keyframe
@@ -335,8 +335,11 @@ class CurrentKeyframe:
     """The file that says which keyframe the process is at, also after its death."""
 
     def __init__(self, path: str) -> None:
-        with Path(path).open("r+b") as file:
-            self._word = mmap.mmap(file.fileno(), 8)
+        try:
+            with Path(path).open("r+b") as file:
+                self._word = mmap.mmap(file.fileno(), 8)
+        except (OSError, ValueError) as error:  # ValueError: the file is too short
+            raise MapError(f"cannot share memory with the gateway: {error}") from error
 
     def set(self, index: int) -> None:
         """Write the index of the keyframe; `messages.NOT_WORKING` = none."""

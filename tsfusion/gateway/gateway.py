@@ -15,7 +15,7 @@ import zmq
 
 from tsfusion.core import logs, process
 from tsfusion.core.config import ServerConfig
-from tsfusion.core.errors import DecodeError
+from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import fuser_queries
 from tsfusion.gateway.access_control import AccessControl
@@ -312,8 +312,11 @@ class Gateway:
         elif command.name == "health":
             self.ports.reply(identity, messages.Reply(name="health", health=self.health(maps)))
         elif command.name == "new_map":
-            name = self.maps.keep_free_name(command.map, maps)
-            error = None if name else self.maps.why_none_free(command.map, maps)
+            try:
+                name = self.maps.keep_free_name(command.map, maps)
+                error = None if name else self.maps.why_none_free(command.map, maps)
+            except JournalError as refusal:
+                name, error = None, str(refusal)
             self.ports.reply(identity, messages.Reply(name="new_map", map=name, error=error))
         elif forbidden := self._admission.denial_of_map(client, command.map):
             self.ports.reply(identity, messages.Reply(name=command.name, error=forbidden))

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """One map of a server: its journal, its sessions, and the fuser that works through the journal."""
 
+import glob
 import logging
 import time
 from collections.abc import Sequence
@@ -346,7 +347,7 @@ def _open_journal(folder: Path, server: ServerConfig, watch: ReadingWatcher) -> 
 
 def _warn_of_old_corrections(folder: Path) -> None:
     old = folder / "corrections"
-    if any(old.glob("*.tsc")):
+    if glob.glob("*.tsc", root_dir=old):  # nothing where the disk does not say
         log.warning(
             "%s holds corrected poses as an earlier development version kept them: they are not read; "
             "delete the folder to silence this",

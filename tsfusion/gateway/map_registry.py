@@ -152,7 +152,11 @@ class MapRegistry:
             return None
         keyframes = hosted.health().keyframes_durable
         why = f"map {hosted.name} has {keyframes} keyframes of another session, in another coordinate frame"
-        return Denied(record.session, "world", why, self.free_name(hosted.name, maps) or "")
+        try:
+            free = self.free_name(hosted.name, maps)
+        except JournalError:
+            free = None
+        return Denied(record.session, "world", why, free or "")
 
     def free_name(self, like: str, maps: AllowedMaps = ALL_MAPS) -> str | None:
         """The first of NAME, NAME-2, NAME-3, … that is no map's yet and was given to nobody just now.
@@ -161,10 +165,13 @@ class MapRegistry:
 
         Args:
             maps: that the client may use; None of their names may be free.
+
+        Raises:
+            JournalError: when the state folder cannot be listed.
         """
         now = time.monotonic()
         in_use = {one.name for one in self if len(one.sessions)} | {route.map for route in self._routes}
-        on_disk = self._names_on_disk() - self._open.keys()
+        on_disk = set(state_folder.map_names(self._server.state)) - self._open.keys()
         kept = {name for name, since in self._kept.items() if now - since < _KEPT_SECONDS}
         taken = in_use | on_disk | kept | set(self._unopened)
         stem = re.sub(r"-[0-9]+$", "", like)
@@ -174,15 +181,12 @@ class MapRegistry:
         numbered = (_numbered(one, number) for one in stems if one for number in range(1, len(taken) + 3))
         return next((name for name in numbered if name not in taken and name in maps), None)
 
-    def _names_on_disk(self) -> set[str]:
-        try:
-            return set(state_folder.map_names(self._server.state))
-        except OSError as error:  # who is given the name of a map then is denied by its frame
-            log.error("the maps on the disk cannot be listed: %s", error)
-            return set()
-
     def keep_free_name(self, like: str, maps: AllowedMaps = ALL_MAPS) -> str | None:
-        """A free name that nobody else is given; None = there is none, or no room for another map."""
+        """A free name that nobody else is given; None = there is none, or no room for another map.
+
+        Raises:
+            JournalError: as `free_name`.
+        """
         name = self.free_name(like, maps)
         if name is None:
             return None

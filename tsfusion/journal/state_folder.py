@@ -30,12 +30,19 @@ def map_folder(state: str | Path, name: str) -> Path:
 
 
 def map_names(state: str | Path) -> list[str]:
-    """Names of the maps in a state folder."""
-    return sorted(
-        path.name
-        for path in (Path(state) / MAPS_FOLDER).glob("*")
-        if path.is_dir() and re.fullmatch(MAP_NAME, path.name)
-    )
+    """Names of the maps in a state folder.
+
+    Raises:
+        JournalError: when it cannot be listed.
+    """
+    folder = Path(state) / MAPS_FOLDER
+    try:
+        names = [name for name in os.listdir(folder) if re.fullmatch(MAP_NAME, name)]
+        return sorted(name for name in names if (folder / name).is_dir())
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise journal_error("list", folder, error) from error
 
 
 def holds_a_map(folder: Path) -> bool:
