@@ -11,7 +11,7 @@ from clients_and_spools import NOBODY, joined, noise, send_all
 from keyframes_and_servers import DEADLINE, until, wall
 from scripted_server import scripted
 
-from tsfusion import Client
+from tsfusion import Client, journal
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.delivery import backpressure
@@ -127,3 +127,14 @@ def test_the_spools_limit_is_a_problem_too(tmp_path: Path) -> None:
     with Client(NOBODY, spool=tmp_path, config=config) as client:
         until(lambda: client.send(noise(0)) is None)
         assert "it has reached its limit of 1048576 bytes (spool_bytes)" in client.problem
+
+
+def test_a_spool_whose_folder_goes_between_two_looks_is_taken_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Client(NOBODY, spool=tmp_path, config=SMALL) as client:
+        send_all(client, range(2))
+    monkeypatch.setattr(journal, "segments", lambda _: [])  # what a look finds while the folder is away
+    spool = Spool(tmp_path, 1 << 16)
+    assert len(spool.waiting) == 2
+    spool.close()

@@ -14,6 +14,7 @@ from failures import refuse
 from tsfusion import journal
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import Journal, Position, segment_path
+from tsfusion.journal.open_segment import OpenSegment
 from tsfusion.journal.quarantine import Quarantine
 
 BIG = 1 << 30
@@ -89,6 +90,22 @@ def test_a_record_is_not_acknowledged_in_a_file_that_vanished_meanwhile(
     (position,) = fill(log, 2)
     assert journal.read(tmp_path, position).seq == 2
     assert seqs(tmp_path) == [1, 2]
+
+
+def test_a_record_of_a_file_whose_place_is_not_known_is_taken_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was reported as not written: nobody may find it beside the one that comes again."""
+    log = Journal(tmp_path, BIG)
+    fill(log, 1)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fdatasync", lambda _: patched.setattr(OpenSegment, "is_in_place", refused))
+        refused = property(refuse(errno.EIO))
+        with pytest.raises(JournalError, match="Input/output error"):
+            fill(log, 2)
+    fill(log, 2, 3)
+    log.close()
+    assert seqs(tmp_path) == [1, 2, 3]
 
 
 def test_a_disk_that_cannot_take_it_back_now_loses_nothing(

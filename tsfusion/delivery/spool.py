@@ -115,9 +115,9 @@ class Spool:
         self.session = sessions.pop()
         self._tombstones = Tombstones(self.folder, self.session)
         self._compact_at = 2 * self._tombstones.written + _MANY_TOMBSTONES
+        numbers = {*journal.segments(self.folder), *(record.position.segment for record in found)}
         self._segments = {
-            number: Segment(size_of(journal.segment_path(self.folder, number)))
-            for number in journal.segments(self.folder)
+            number: Segment(size_of(journal.segment_path(self.folder, number))) for number in sorted(numbers)
         }
         self.waiting: deque[Waiting] = deque()  # oldest first
         for record in found:

@@ -38,6 +38,7 @@ class OpenSegment:
     def __init__(self, path: Path, *, sync: bool) -> None:
         self.path = path
         self.first = 0  # where the first record starts; 0 = the segment is not begun
+        self.is_over = False  # a record was taken back: another segment has to be begun
         self._sync = sync
         self._identity = secrets.token_bytes(mcap_layout.IDENTITY_BYTES)
         self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
@@ -72,8 +73,17 @@ class OpenSegment:
         mcap_layout.write_record(self._writer, payload, seq, now_ns)
         self._flush()
 
+    def take_back(self, at: int) -> None:
+        """Cut off the records from this place on, as far as the disk allows. None can be written any more."""
+        self.is_over = True
+        with suppress(OSError):
+            os.ftruncate(self._descriptor, at)
+            os.fsync(self._descriptor)
+
     def finish(self) -> None:
-        """Write the index."""
+        """Write the index; a segment from which a record was taken back has none."""
+        if self.is_over:
+            return
         self._writer.finish()
         self._flush()
 

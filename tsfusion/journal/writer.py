@@ -161,12 +161,18 @@ class Journal:
         except BaseException:  # interrupted in between
             self._abandon(position.offset)
             raise
-        self._keep_place()  # nothing is acknowledged in a file that nobody finds
+        try:
+            self._keep_place()  # nothing is acknowledged in a file that nobody finds
+        except BaseException:
+            segment.take_back(position.offset)  # it comes again
+            raise
         if self._open is not None and segment.nbytes >= self._segment_bytes:
             self._rotate_or_abandon()
         return position
 
     def _begin(self) -> OpenSegment:
+        if self._open is not None and self._open.is_over:
+            self._abandon()
         if self._open is None:
             self.look()
             while self._open is None:
