@@ -33,6 +33,7 @@ from tsfusion import journal
 from tsfusion.core.config import ClientConfig, override
 from tsfusion.pipelines import latency_ledger
 from tsfusion.wire import key_folder, keyframe_times
+from tsfusion.wire.curve import client_keys
 from tsfusion.wire.keyframe_times import KeyframeTimes, Spread
 from tsfusion.wire.queries import fetch_status
 from tsfusion.wire.record_header import unpack_keyframe
@@ -146,9 +147,11 @@ def _secured(folder: Path, access: Access) -> tuple[Secured, Target]:
     assert given.keys is not None
     if access == "stranger":
         return given, Target(server_key=given.keys.server)
-    own = key_folder.create_pair(folder / "attacker", "attacker")
-    key_folder.allow(folder / "server", "attacker", own.public)
-    return given, Target(server_key=given.keys.server, public=own.public, secret=own.secret)
+    public = key_folder.create_pair(folder / "attacker", "attacker").public
+    key_folder.allow(folder / "server", "attacker", public)
+    own = client_keys(str(folder / "attacker" / "attacker.key_secret"), given.keys.server)
+    assert own is not None
+    return given, Target(server_key=own.server, public=own.public, secret=own.secret)
 
 
 @contextlib.contextmanager
