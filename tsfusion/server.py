@@ -88,7 +88,7 @@ def _open(
         if len(volumes) < server.max_maps and state_folder.holds_a_map(state_folder.map_folder(state, name)):
             volumes.setdefault(name, volumes[DEFAULT_MAP])
     context: zmq.Context[Any] = zmq.Context()
-    stack.callback(context.term)
+    stack.callback(context.destroy, 0)  # an error in between must not wait for a socket that was left open
     access = AccessControl(context, server.keys)
     stack.callback(access.close)
     ports = Ports(context, server, access.keys, grants_topics=lambda: access.limits_maps)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A spool whose files or folder somebody deletes or moves while a scan goes on."""
 
+import errno
 import logging
 import os
 import shutil
@@ -138,3 +139,30 @@ def test_a_spool_whose_folder_goes_between_two_looks_is_taken_over(
     spool = Spool(tmp_path, 1 << 16)
     assert len(spool.waiting) == 2
     spool.close()
+
+
+def test_no_newer_file_is_deleted_before_an_older_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next scanner goes on behind the last number that is there: the server may know a higher one."""
+    first, last = Spool(tmp_path, 1), 0
+    for _ in range(4):
+        entry = first.write([b"a record", b"of a file of its own"])
+        first.add(entry)
+        last = entry.seq
+    unlink = Path.unlink
+
+    def refuse_the_first(path: Path, missing_ok: bool = False) -> None:
+        if path.name == "000001.mcap":
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        unlink(path, missing_ok)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Path, "unlink", refuse_the_first)
+        first.drop(last)
+        first.close()
+    second = Spool(tmp_path, 1)
+    assert (second.session, second.left) == (first.session, last)
+    second.drop(last)
+    second.close()
+    assert not list(tmp_path.glob("*.mcap"))

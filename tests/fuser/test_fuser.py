@@ -519,7 +519,7 @@ def test_a_system_that_refuses_while_a_map_is_opened_is_one_clear_error(
 ) -> None:
     sent: list[bytes] = []
     monkeypatch.setattr(fuser_main, "Fuser", refuse(errno.EIO))
-    begin = messages.Begin(str(tmp_path), VOLUME, 1.0, 0, "", False, 1 << 30)
+    begin = messages.Begin(str(tmp_path), VOLUME, 1.0, 0, "", False, 1 << 30, quota_cost=1, quota_map=1.0)
     assert fuser_main._open_map(cast("Any", SimpleNamespace(send=sent.append)), begin) is None
     failed = messages.to_gateway.decode(sent[0])
     assert isinstance(failed, messages.Failed)

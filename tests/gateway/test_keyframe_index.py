@@ -2,6 +2,7 @@
 """Journaled keyframes: admitted to their sessions, indexed, handed to the fuser in turn, and their delays."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -14,6 +15,7 @@ from tsfusion.gateway.fuser_time import FuserTime
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.keyframe_outcomes import DelayStatistics, KeyframeOutcomes
 from tsfusion.gateway.metrics import Metrics
+from tsfusion.gateway.recent_fates import RecentFates
 from tsfusion.gateway.sessions import Session, Sessions
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import Position, RecordEntry
@@ -232,10 +234,13 @@ def test_a_delay_that_cannot_be_does_not_count() -> None:
 
 
 class Told:
-    """Routes to clients that note what they are told."""
+    """Routes to a client that is connected, which note what it is told."""
 
     def __init__(self) -> None:
         self.nacks: list[int] = []
+
+    def get(self, session: bytes) -> Any:
+        return SimpleNamespace(state=lambda _: "connected", fates=RecentFates())
 
     def send(self, session: bytes, message: Any) -> None:
         self.nacks += [message.seq] if hasattr(message, "reason") else []

@@ -83,7 +83,7 @@ def test_what_waits_to_be_said_is_bounded(here: Map) -> None:
 @pytest.mark.parametrize(
     ("reason", "notice"),
     [
-        ("MapFull", "it is full, keyframes that need more room are rejected (the map may hold"),
+        ("MapFull", "it is full, keyframes that need more room are rejected: raise max_blocks"),
         ("memory", "it is full"),
         ("MapQuota", "client robot has used up its share of the map's room"),
         ("KeyframeTooLarge", ""),

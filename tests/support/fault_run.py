@@ -411,7 +411,7 @@ class ForkedFuser:
         self._process = Forked(main, folder, f"fuser{count}", stdin=reading, kept=kept)
         os.close(reading)
         self.stdin = os.fdopen(writing, "wb")
-        self.poll, self.kill = self._process.poll, self._process.kill
+        self.poll, self.kill, self.pid = self._process.poll, self._process.kill, self._process.pid
 
     def wait(self, timeout: float = PATIENCE) -> int:
         """The exit status."""

@@ -64,6 +64,7 @@ def serving_here(state: Path, **settings: Any) -> Iterator[Served]:
     with contextlib.ExitStack() as stack:
         stack.enter_context(mock.patch.object(fuser_process, "COMMAND", COMMAND))
         stack.enter_context(mock.patch.object(fuser_supervisor, "_END_DEADLINE", 0.0))
+        settings = {"memory_bytes": 1 << 40, **settings}  # the tests of this process may hold much
         server = ServerConfig(listen="tcp://127.0.0.1:0", state=str(state), **settings)
         context: zmq.Context[Any] = zmq.Context()
         stack.callback(context.term)

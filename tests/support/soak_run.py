@@ -219,7 +219,7 @@ def _sample(daemon: Daemon, scanners: list[Scanner], seconds: float) -> Sample |
         pids = [server.process.pid, server.fuser_pid()]
     except (TsfusionError, OSError, AssertionError, KeyError):
         return None
-    if not daemon.ready or any(scanner.finished for scanner in scanners):
+    if not daemon.ready or health.state not in ("idle", "busy") or any(one.finished for one in scanners):
         return None
     gateway, fuser, *own = map(_process, [*pids, *(scanner.pid for scanner in scanners)])
     largest = Process(*(max(values) for values in zip(*map(_figures, own), strict=True)))

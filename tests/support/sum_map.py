@@ -52,6 +52,8 @@ class SumMap:
     """As much of `Volume` as the fuser uses."""
 
     model = SimpleNamespace(surface="raw")
+    most_blocks = 1
+    quota = None  # nothing of it is used up
 
     def __init__(self, config: VolumeConfig) -> None:
         self.config = config
@@ -62,12 +64,15 @@ class SumMap:
     def warm_up(self) -> None:
         """There is nothing to compile."""
 
+    def limit_memory(self, nbytes: int) -> None:
+        """It takes none."""
+
     def integrate(self, keyframe: Keyframe) -> Any:
         if keyframe.captured_ns == TOO_MUCH:
             raise MapFull("the keyframe asks to be rejected")
         self._total += digest(keyframe)
         self.keyframes += 1
-        return SimpleNamespace(samples=1)
+        return SimpleNamespace(samples=1, new_blocks=0)
 
     def take_dirty(self) -> Any:
         return _NOTHING
@@ -110,7 +115,12 @@ class SumMap:
 
 def take_the_place_of_volume() -> None:
     """Have this process's fuser make such maps."""
-    volume, block_store = ModuleType("volume"), ModuleType("block_store")
-    volume.Volume = SumMap  # type: ignore[attr-defined]
-    block_store.cells_of = lambda blocks: blocks  # type: ignore[attr-defined]
-    sys.modules["tsfusion.tsdf.volume"], sys.modules["tsfusion.tsdf.block_store"] = volume, block_store
+    for name, its in (
+        ("tsdf.volume", {"Volume": SumMap}),
+        ("tsdf.block_store", {"cells_of": lambda blocks: blocks}),
+        ("tsdf.integrator", {"KeyframeQuota": lambda *limits: limits}),
+        ("kernels.runtime", {"start": lambda _: None}),
+    ):
+        module = ModuleType(name)
+        vars(module).update(its)
+        sys.modules[f"tsfusion.{name}"] = module

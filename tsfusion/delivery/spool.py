@@ -12,6 +12,7 @@ import secrets
 import shutil
 import tempfile
 from collections import deque
+from collections.abc import Iterable
 from pathlib import Path
 
 from msgspec import Struct
@@ -244,18 +245,24 @@ class Spool:
     def _delete_segments(self, below: int | None = None) -> None:
         # The newest stays: a record that `write` has just put there may not be queued yet.
         newest = next(reversed(self._segments), 0)
-        for number in [n for n in self._idle if n < (newest if below is None else below)]:
-            self._forget(number)
+        self._forget(n for n in self._idle if n < (newest if below is None else below))
 
-    def _forget(self, number: int) -> None:
-        """Delete a segment; one that stays is only sent once more, and recognised."""
-        self.used_bytes -= self._segments.pop(number).nbytes
-        self._idle.discard(number)
-        try:
-            self._journal.forget(number)
-        except JournalError as error:
-            if error.errno not in MISSING:  # it is gone with its folder
-                log.warning("%s", error)
+    def _forget(self, numbers: Iterable[int]) -> bool:
+        """Delete segments, the oldest first, up to one that cannot be deleted now; whether there was none.
+
+        Its records are only sent once more, and recognised. Were newer ones deleted, the next scanner would
+        take its last number for the last of all.
+        """
+        for number in sorted(numbers):
+            try:
+                self._journal.forget(number)
+            except JournalError as error:
+                if error.errno not in MISSING:  # it is gone with its folder
+                    log.warning("%s", error)
+                    return False
+            self.used_bytes -= self._segments.pop(number).nbytes
+            self._idle.discard(number)
+        return True
 
     def close(self) -> None:
         """Release the folder. An empty spool takes its files with it: the next starts a new session."""
@@ -268,9 +275,7 @@ class Spool:
                 log.warning("%s", error)
         if self.temporary:
             shutil.rmtree(self.folder, ignore_errors=True)
-        elif not self.waiting:
-            for number in list(self._segments):
-                self._forget(number)
+        elif not self.waiting and self._forget(self._segments):
             self._tombstones.clear()
         self._lock.close()
 
