@@ -16,6 +16,8 @@ from contextlib import suppress
 
 from msgspec import Struct
 
+from tsfusion.wire import sockets
+
 _MOST = 4096  # connections at once
 _BYTES_EACH = 48 << 10  # of memory, roughly
 _GREETING_BYTES = 64  # of ZMTP; who has sent no more has made no connection yet
@@ -34,7 +36,6 @@ class Connection(Struct, frozen=True):
 
     fd: int
     port: int  # of this process
-    peer: str  # address
     silent_ms: int
     received_bytes: int
 
@@ -52,6 +53,7 @@ class Connections:
         self._ports: Collection[int] = ()
         self._viewers_port = 0
         self._next_look = self._next_full_look = 0.0  # time.monotonic()
+        self._others = 0  # files of this process that are no connections, at the last full look
         self._read: Counter[int] = Counter()  # fd → bytes of the messages that the gateway got
 
     def listen_at(self, data: int, control: int, viewers: int) -> None:
@@ -73,11 +75,12 @@ class Connections:
         if now < self._next_look:
             return 0
         self._next_look = now + _INTERVAL
-        is_crowded = len(_files()) > self.most
-        if not is_crowded and now < self._next_full_look:
+        files = len(_files())
+        if files - self._others <= self.most and now < self._next_full_look:
             return 0
         began = time.thread_time()
-        found = list(self._all())
+        found = self._look()
+        self._others = files - len(found)
         self._next_full_look = now + min(_SHARE * (time.thread_time() - began), _LONGEST_INTERVAL)
         talk = [one for one in found if one.port == self._viewers_port and one.received_bytes > _VIEWER_BYTES]
         if len(found) > self.most:
@@ -85,17 +88,22 @@ class Connections:
             talk += found[: len(found) - self.most * 3 // 4]
         return sum(self.cut(one.fd) for one in talk)
 
-    def cut_hoarders(self) -> list[tuple[Connection, int]]:
-        """Cut off the connections over which most came that is no whole message yet, with these bytes."""
-        found = list(self._all())
-        self._read = Counter({one.fd: self._read[one.fd] for one in found})
-        unread = [(one, self._unread_of(one)) for one in found]
-        least = max(max((nbytes for _, nbytes in unread), default=0) // 2, _UNREAD_BYTES)
-        return [(one, nbytes) for one, nbytes in unread if nbytes > least and self.cut(one.fd)]
+    def cut_hoarders(self) -> list[tuple[str, int]]:
+        """Cut off the connections over which most came that is no whole message yet.
 
-    def _unread_of(self, one: Connection) -> int:
-        read = self._read[one.fd]  # more than came was read over another, which had the number before
-        return one.received_bytes - (read if read <= one.received_bytes else 0)
+        Returns:
+            For each the address of its other end, and these bytes.
+        """
+        unread = [(one.fd, one.received_bytes - self._read[one.fd]) for one in self._look()]
+        least = max(max((nbytes for _, nbytes in unread), default=0) // 2, _UNREAD_BYTES)
+        hoarders = [(fd, _peer_of(fd), nbytes) for fd, nbytes in unread if nbytes > least]
+        return [(peer, nbytes) for fd, peer, nbytes in hoarders if self.cut(fd)]
+
+    def _look(self) -> list[Connection]:
+        """The connections that stand. More than came over one was read over another of its number, before."""
+        found = list(self._all())
+        self._read = Counter({one.fd: min(self._read[one.fd], one.received_bytes) for one in found})
+        return found
 
     def _all(self) -> Iterator[Connection]:
         for name in _files():
@@ -104,9 +112,7 @@ class Connections:
                     link.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size)
                 )
                 if state != _TCP_LISTEN and self._is_ours(link):
-                    yield Connection(
-                        int(name), link.getsockname()[1], link.getpeername()[0], silent_ms, received
-                    )
+                    yield Connection(int(name), link.getsockname()[1], silent_ms, received)
 
     def cut(self, fd: int) -> bool:
         """Cut a connection off; False when it is none (any more)."""
@@ -129,8 +135,18 @@ def _files() -> list[str]:
         return []
 
 
+def _peer_of(fd: int) -> str:
+    """Address of a connection's other end; empty where it has none any more."""
+    with suppress(OSError), socket.socket(fileno=os.dup(fd)) as link:
+        return str(link.getpeername()[0]).removeprefix(sockets.MAPPED)
+    return ""
+
+
 def _shared(fd: int) -> socket.socket:
-    """The socket of an open file, held open meanwhile; raises OSError where it is none."""
+    """The socket of an open file, held open meanwhile; raises OSError where it is none.
+
+    It is taken for one of IPv4, which is faster than to ask: of others, its ports alone are right.
+    """
     copy = os.dup(fd)
     try:
         return socket.socket(socket.AF_INET, socket.SOCK_STREAM, fileno=copy)

@@ -175,14 +175,14 @@ class Gateway:
         if now - self._hoarders_cut < _CUT_HELPS_WITHIN:
             return False
         hoarders = self.ports.connections.cut_hoarders()
-        for one, nbytes in hoarders:
+        for peer, nbytes in hoarders:
             self._hoarders_cut = now
             self._refused["memory"] += 1
             log.warning(
                 "the gateway holds %d MB, more than memory_bytes: the connection from %s, with %.1f MB of "
                 "messages that are not whole, is cut off",
                 held >> 20,
-                one.peer,
+                peer,
                 nbytes / 1e6,
             )
         return bool(hoarders)

@@ -50,7 +50,7 @@ _MAPS_TOPIC = re.compile(rf"mesh/({MAP_NAME}/?)?".encode())  # or its beginning
 _HOST6 = r"[0-9A-Fa-f]*:[0-9A-Fa-f:.]*(%[\w.-]+)?"
 _PORT = r"[0-9]{1,5}|\*"
 _ADDRESS = re.compile(rf"tcp://((?P<host>[\w.*-]+)|\[(?P<host6>{_HOST6})\]):(?P<port>{_PORT})", re.ASCII)
-_MAPPED = "::ffff:"  # in front of an IPv4 address, where a socket takes both
+MAPPED = "::ffff:"  # in front of an IPv4 address, where a socket takes both
 
 AnySocket = zmq.Socket[Any]
 
@@ -151,7 +151,7 @@ def _make(
 def peer_address(frame: zmq.Frame) -> str:
     """Address of the machine that sent a frame; empty where ZeroMQ does not know it."""
     try:
-        return str(frame.get("Peer-Address")).removeprefix(_MAPPED)
+        return str(frame.get("Peer-Address")).removeprefix(MAPPED)
     except zmq.ZMQError:
         return ""
 
