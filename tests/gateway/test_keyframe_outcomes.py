@@ -56,7 +56,7 @@ def test_a_rejection_is_said_at_once(here: Map) -> None:
     here.reject("MapFull")
     assert [type(one) for one in here.told] == [Nack, Ack]
     assert here.nacks() == [(1, "map", "MapFull")]
-    here.outcomes.on_hello(SESSION)
+    here.outcomes.tell_untold(SESSION)
     assert len(here.nacks()) == 1
 
 
@@ -67,8 +67,8 @@ def test_who_was_away_is_told_when_it_is_back(here: Map) -> None:
     here.reject("memory")
     assert here.nacks() == []
     here.routes.connect(SESSION, "yard", b"2", "robot")
-    here.outcomes.on_hello(SESSION)
-    here.outcomes.on_hello(SESSION)
+    here.outcomes.tell_untold(SESSION)
+    here.outcomes.tell_untold(SESSION)
     assert here.nacks() == [(1, "map", "MapFull"), (2, "map", "memory")]
 
 
@@ -76,7 +76,7 @@ def test_what_waits_to_be_said_is_bounded(here: Map) -> None:
     for _ in range(200):
         here.reject("crash")
     here.routes.connect(SESSION, "yard", b"1", "robot")
-    here.outcomes.on_hello(SESSION)
+    here.outcomes.tell_untold(SESSION)
     assert [seq for seq, _, _ in here.nacks()] == list(range(137, 201))
 
 

@@ -267,7 +267,7 @@ class Gateway:
         )
         self.ports.reply(identity, welcome)
         if (hosted := self.maps.get(hello.map)) is not None:
-            hosted.outcomes.on_hello(hello.session)
+            hosted.outcomes.tell_untold(hello.session)
 
     def _denial(self, identity: bytes, hello: messages.Hello, client: str) -> tuple[str, ...] | None:
         """The fields of the answer to a session that is not opened; None = it is, and its route is made."""
@@ -300,8 +300,11 @@ class Gateway:
         progress = (0, 0)
         route = self._routes.mark_alive(ping.session, client)
         if route is not None:
+            route.identity = identity  # of several connections the one that is heard is the one that stands
             route.update(ping)
             progress = self.maps.progress(route.map, ping.session)
+            if (hosted := self.maps.get(route.map)) is not None:
+                hosted.outcomes.tell_untold(ping.session)
         pong = messages.Pong(self.epoch, ping.sent_ns, received_ns, time.monotonic_ns(), *progress)
         self.ports.reply(identity, pong)
 

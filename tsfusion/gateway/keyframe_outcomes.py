@@ -168,8 +168,8 @@ class KeyframeOutcomes:
         if len(self._untold) > _MAX_UNTOLD:
             self._untold.popitem(last=False)
 
-    def on_hello(self, key: bytes) -> None:
-        """Tell a client what the map did not take while it was away."""
+    def tell_untold(self, key: bytes) -> None:
+        """Tell a client that is back what the map did not take while it was away."""
         for nack in self._untold.pop(key, ()):
             self._routes.send(key, nack)
 
@@ -180,7 +180,7 @@ class KeyframeOutcomes:
                 "fuser_memory_bytes, or begin another map"
             )
         elif reason == _OVER_QUOTA:
-            self.notices[client] = (
+            self.notices[f"client {client}"] = (
                 f"client {client} has used up its share of the map's room, its keyframes that need more are "
                 "rejected: raise quota_map, or look at what it sends"
             )
