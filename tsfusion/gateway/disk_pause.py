@@ -22,6 +22,7 @@ class DiskPause:
         self._journal = journal
         self._map = map_name
         self._until = self._look_at = 0.0  # time.monotonic()
+        self._shows = False  # whether a look at the disk shows the problem, and so its end
 
     def seconds_left(self, now: float) -> float:
         """Seconds until a keyframe is tried again; 0 = none has to wait."""
@@ -33,13 +34,14 @@ class DiskPause:
             log.error("no keyframes are taken: %s", error, extra=logs.about(map=self._map))
         self.problem = str(error)
         self.is_away = error.errno in MISSING
+        self._shows = self.is_away or error.errno is None
         self._until = self._look_at = time.monotonic() + _DISK_PAUSE
 
     def end(self) -> None:
         """Take keyframes (again)."""
         if self.problem:
             log.warning("keyframes are taken again", extra=logs.about(map=self._map))
-            self.problem, self.is_away = "", False
+            self.problem, self.is_away, self._shows = "", False, False
 
     def step(self) -> None:
         """Look once a second whether the disk would take a keyframe, though none comes.
@@ -54,6 +56,8 @@ class DiskPause:
             self._journal.check()
         except JournalError as error:
             self.begin(error)
+            self._shows = True
         else:
             self._until = 0.0
-            self.end()
+            if self._shows:  # else only the next keyframe can tell
+                self.end()
