@@ -52,7 +52,7 @@ def test_memory_that_is_filled_again_and_again(
     served: Served, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     logs.configure("text", "info")
-    monkeypatch.setattr(served.gateway._memory, "excess", lambda _: 1 << 30)
+    monkeypatch.setattr(served.gateway._limits._memory, "excess", lambda _: 1 << 30)
     served.until(lambda: served.gateway.health().refused.get("memory", 0) >= MANY)
     assert len(capsys.readouterr().err.splitlines()) <= logs.MOST + 2
 

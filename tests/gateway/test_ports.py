@@ -66,6 +66,19 @@ def test_a_message_of_frames_without_end_is_not_read_to_its_end(served: Served, 
         served.until(lambda: viewer.poll(0) or len(served.gateway._subscriptions) == 1)
 
 
+def test_viewers_that_connect_anew_are_counted_anew(served: Served) -> None:
+    """A viewer that did not come back would have its map meshed for nobody."""
+    with (
+        connected(sockets.subscriber, served.addresses.publish) as viewer,
+        contextlib.closing(raw(served.addresses.publish, b"SUB")) as stranger,
+    ):
+        served.until(lambda: len(served.gateway._subscriptions) == 1)
+        viewer.setsockopt(zmq.RECONNECT_IVL, -1)
+        stranger.sendall(b"\x01\x00" * (FRAMES - 1) + b"\x00\x00")
+        served.until(lambda: served.gateway.health().refused.get("frames"))
+        assert len(served.gateway._subscriptions) == 0
+
+
 @pytest.mark.parametrize("surplus", [500, 5000])
 def test_frames_too_many_cost_nobody_else_a_connection(served: Served, surplus: int) -> None:
     """Only who sends very many is cut off."""
@@ -115,13 +128,13 @@ def test_who_fills_the_memory_is_cut_off_alone(served: Served, monkeypatch: pyte
         for _ in range(40):
             stranger.sendall(part(bytes(100_000)))
         alarms = [1 << 30]
-        monkeypatch.setattr(served.gateway._memory, "excess", lambda _: alarms.pop() if alarms else 0)
+        monkeypatch.setattr(served.gateway._limits._memory, "excess", lambda _: alarms.pop() if alarms else 0)
         epoch = served.gateway.epoch
         served.until(lambda: is_cut_off(stranger))
         push.send_multipart(record(2))
         served.until(lambda: served.durable == 2)
         assert (served.gateway.epoch, served.gateway.health().refused) == (epoch, {"memory": 1})
-        monkeypatch.setattr(served.gateway._memory, "excess", lambda _: 1 << 30)
+        monkeypatch.setattr(served.gateway._limits._memory, "excess", lambda _: 1 << 30)
         served.until(lambda: served.gateway.epoch != epoch)  # nobody stands out: all have to go
 
 

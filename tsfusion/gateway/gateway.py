@@ -22,11 +22,11 @@ from tsfusion.gateway.access_control import AccessControl
 from tsfusion.gateway.activity_log import ActivityLog
 from tsfusion.gateway.admission import Admission
 from tsfusion.gateway.client_routes import ClientRoutes
+from tsfusion.gateway.connection_limits import ConnectionLimits
 from tsfusion.gateway.fuser_queries import FuserQueries
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.keyframe_intake import KeyframeIntake
 from tsfusion.gateway.map_registry import MapRegistry
-from tsfusion.gateway.memory_guard import MemoryGuard
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Flood, Ports, Subscriptions, receive_some
 from tsfusion.gateway.problems import Problem, ProblemTimes
@@ -42,7 +42,6 @@ _TICK_MS = 100  # within which a signal or a fuser's death is noticed
 _RENEW_TICK_MS = 10  # while the sockets are made anew
 _SNAPSHOT_INTERVAL = 1.0  # seconds
 _CLIENT_PROBLEMS = 10  # lines about single clients
-_CUT_HELPS_WITHIN = 1.0  # seconds: more memory after that is a new attack
 _MESHES_SHARE = 4  # one fourth of the memory is for meshes that wait to be read
 Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
@@ -70,13 +69,12 @@ class Gateway:
         self._queries = FuserQueries(ports, server.memory_bytes // _MESHES_SHARE)
         self._subscriptions = Subscriptions()
         self._publishing: dict[str, bool] = {}  # map → whether its fuser was told to send triangles
-        self._memory = MemoryGuard(server.memory_bytes)
+        self._limits = ConnectionLimits(ports, access, self._refused, server.memory_bytes)
         self._activity = ActivityLog()
         self._problems = ProblemTimes()
         self._accepting = self._stopped = False
         self._started = time.monotonic()
         self._next_snapshot = 0.0
-        self._hoarders_cut = -_CUT_HELPS_WITHIN  # time.monotonic()
         self._new_epoch()
 
     def _new_epoch(self) -> None:
@@ -109,7 +107,7 @@ class Gateway:
                         socket, handle, partial(self._on_flood, socket), self.ports.connections.note_read
                     )
         self.ports.step()
-        self._limit_connections()
+        self._limits.step()
         for hosted, message in self.maps.step():
             self._pass_to_people(hosted, message)
         self._update_fusers()
@@ -127,71 +125,19 @@ class Gateway:
         return handlers
 
     def _on_flood(self, socket: sockets.AnySocket, flood: Flood) -> None:
-        """Cut off who sent a message of frames without end, and with it, where that takes long, its port.
-
-        The others of the port are back at once; the client, where it has a name, after a while.
-        """
-        self._refused["frames"] += 1
-        client = self._access.keep_out(flood.first)
-        address = sockets.peer_address(flood.first) or "somewhere"
-        log.warning(
-            "a message from %s has more than %d frames: its connection is cut off%s",
-            address,
-            flood.discarded,
-            ", and the others of that port are made anew" if flood.goes_on else "",
-            extra=logs.about(client=client, reason="frames"),
-        )
-        self.ports.cut_off(flood.first)
-        if flood.goes_on:
-            if socket is self.ports.viewers:
-                self._subscriptions.clear()
-            self.ports.renew(socket)
+        is_viewers = socket is self.ports.viewers
+        if self._limits.on_flood(socket, flood) and is_viewers:
+            self._subscriptions.clear()
 
     def _drop_connections(self) -> bool:
-        """Drop all connections if a key was revoked, or if they hold too much memory; whether that was done.
-
-        ZeroMQ limits a frame and a queue of whole messages, not a message that never ends.
-        """
-        if self._access.step():
-            log.warning("a key was revoked, or may use other maps: every connection is made anew")
-            self._refused["revoked"] += 1
-        else:
-            held = self._memory.excess(self._queries.nbytes)
-            if not held or self._cut_hoarders(held):
-                return False
-            log.error(
-                "the gateway holds %d MB, more than memory_bytes: every connection is made anew", held >> 20
-            )
-            self._refused["memory"] += 1
+        """Drop all connections if that has to be; whether it was done."""
+        if not self._limits.all_must_go(self._queries.nbytes):
+            return False
         self.ports.renew()
         self._routes.clear()
         self._subscriptions.clear()
         self._new_epoch()
         return True
-
-    def _cut_hoarders(self, held: int) -> bool:
-        """Cut off the connections that fill the memory, if they can be told; all go if that does not help."""
-        now = time.monotonic()
-        if now - self._hoarders_cut < _CUT_HELPS_WITHIN:
-            return False
-        hoarders = self.ports.connections.cut_hoarders()
-        for peer, nbytes in hoarders:
-            self._hoarders_cut = now
-            self._refused["memory"] += 1
-            log.warning(
-                "the gateway holds %d MB, more than memory_bytes: the connection from %s, with %.1f MB of "
-                "messages that are not whole, is cut off",
-                held >> 20,
-                peer,
-                nbytes / 1e6,
-            )
-        return bool(hoarders)
-
-    def _limit_connections(self) -> None:
-        """Cut off some connections where there are too many, and what only says it is a viewer."""
-        if surplus := self.ports.connections.step():
-            self._refused["connection"] += surplus
-            log.warning("%d connections are cut off: there are too many, or viewers send messages", surplus)
 
     def _snapshot(self) -> None:
         """Give the metrics a new health snapshot, about once a second."""
@@ -338,9 +284,7 @@ class Gateway:
                 log.warning("a viewer sends what is no subscription: all viewers connect anew")
                 self._subscriptions.clear()
             return
-        client = self._access.client_of(
-            frames[0]
-        )  # None also of a subscription that ends with its connection
+        client = self._access.client_of(frames[0])  # None also where it ends with its connection
         allowed = [] if client is None else self._admission.maps_of(client).topics(topic)
         if change == b"\x00":
             self._subscriptions.discard(topic, granted=None if client is None else bool(allowed))
