@@ -48,10 +48,12 @@ class DiskPause:
 
         Clients may wait for the end of a pause, and a person is to be told before the next scan.
         """
-        now = time.monotonic()
-        if now < self._look_at:
-            return
-        self._look_at = now + _DISK_PAUSE
+        if time.monotonic() >= self._look_at:
+            self.look()
+
+    def look(self) -> None:
+        """Look now whether the disk would take a keyframe."""
+        self._look_at = time.monotonic() + _DISK_PAUSE
         try:
             self._journal.check()
         except JournalError as error:

@@ -183,8 +183,10 @@ class HostedMap:
                 for_people.append((message, frames))
             elif isinstance(message, fuser_messages.FuserReply):
                 for_people.append((message, frames))
-        if ended and not self.fuser.finishing and not self.disk.is_away:  # it would find an empty map
-            self.fuser.restart()
+        if ended and not self.fuser.finishing:
+            self.disk.look()
+            if not self.disk.is_away:  # another one would find an empty map
+                self.fuser.restart()
         self._backlog.hand_out(self.fuser)
         self.disk.step()
         if not self.disk.is_away:
