@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 import zmq
 from attacks import part, raw
-from keyframes_and_servers import connected, secured
+from keyframes_and_servers import connected, secured, wall
 from served_gateway import Served, record, serving_here
 
+from tsfusion import Client
 from tsfusion.gateway import access_control
 from tsfusion.wire import messages, sockets
 
@@ -153,3 +154,26 @@ def test_a_client_that_floods_is_kept_out_for_a_while(tmp_path: Path) -> None:
         assert access._name_of(given.keys.public) is None
         access._kept_out["robot"] -= access_control.KEPT_OUT
         assert access._name_of(given.keys.public) == "robot"
+
+
+def test_a_scanner_whose_key_a_flood_came_with_goes_on_by_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing that it has is lost meanwhile, though its standing connections are not heard either."""
+    monkeypatch.setattr(access_control, "KEPT_OUT", 3.0)
+    given = secured(tmp_path / "keys")
+    with (
+        serving_here(tmp_path / "state", **given.server) as served,
+        Client(
+            served.addresses.data, key=given.client["key"], server_key=given.client["server_key"]
+        ) as client,
+        connected(sockets.push, served.addresses.data, given.keys) as push,
+    ):
+        client.send(wall(1))
+        served.until(lambda: served.durable == 1)
+        served.until(lambda: push.poll(0, zmq.POLLOUT))
+        push.send_multipart([b""] * 3000)
+        served.until(lambda: served.gateway.health().refused.get("frames"))
+        client.send(wall(2))
+        served.until(lambda: served.durable == 2)
+        assert client.stats.refused == {}
