@@ -27,7 +27,8 @@ from tsfusion import VolumeConfig
 from tsfusion.core import errors
 from tsfusion.fuser import __main__ as fuser_main
 from tsfusion.fuser import messages
-from tsfusion.fuser.fuser import CurrentKeyframe, Fuser
+from tsfusion.fuser.current_keyframe import CurrentKeyframe
+from tsfusion.fuser.fuser import Fuser
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.journal import Journal, Position
 from tsfusion.journal.state_folder import MAP_FILE, PREVIOUS_FILE

@@ -19,9 +19,9 @@ from command_processes import Here, tsfusion
 from failures import refuse
 
 from tsfusion.core.errors import InvalidConfig, OutputError
-from tsfusion.wire import curve, key_folder
+from tsfusion.wire import allow_list, curve, key_folder
+from tsfusion.wire.allow_list import AllowList
 from tsfusion.wire.curve import client_keys
-from tsfusion.wire.key_folder import AllowList
 
 Run = Callable[..., str]
 
@@ -375,7 +375,7 @@ def test_the_list_is_read_again_only_when_it_changes(server: Path, monkeypatch: 
         reads.append(folder)
         return real(folder)
 
-    monkeypatch.setattr(key_folder, "read_allow_list", counted)
+    monkeypatch.setattr(allow_list, "read_allow_list", counted)
     assert not allowed.refresh()
     assert not reads
     key_folder.allow(server, "robot1", one)

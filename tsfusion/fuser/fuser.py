@@ -8,10 +8,8 @@ the system ends it (Linux), however long the work would take.
 
 import errno
 import logging
-import mmap
 import os
 import platform
-import struct
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -26,8 +24,9 @@ from numpy.typing import NDArray
 
 from tsfusion import journal
 from tsfusion.core import process
-from tsfusion.core.errors import JournalError, MapError, TsfusionError
+from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.fuser import messages as fuser_messages
+from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.mesh import Mesh
@@ -329,21 +328,6 @@ class Fuser:
 
     def _send(self, message: Any, frames: list[Any] | None = None) -> None:
         self._link.send_multipart([fuser_messages.encode(message), *(frames or [])], copy=False)
-
-
-class CurrentKeyframe:
-    """The file that says which keyframe the process is at, also after its death."""
-
-    def __init__(self, path: str) -> None:
-        try:
-            with Path(path).open("r+b") as file:
-                self._word = mmap.mmap(file.fileno(), 8)
-        except (OSError, ValueError) as error:  # ValueError: the file is too short
-            raise MapError(f"cannot share memory with the gateway: {error}") from error
-
-    def set(self, index: int) -> None:
-        """Write the index of the keyframe; `messages.NOT_WORKING` = none."""
-        struct.pack_into("<q", self._word, 0, index)
 
 
 def _mesh_frames(mesh: Mesh) -> tuple[MeshLayout, list[Any]]:

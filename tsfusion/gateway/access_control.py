@@ -12,9 +12,9 @@ import zmq
 from zmq.utils import z85
 
 from tsfusion.core.errors import InvalidConfig
+from tsfusion.wire.allow_list import AllowList
 from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
 from tsfusion.wire.curve import DOMAIN, ServerKeys, server_keys
-from tsfusion.wire.key_folder import AllowList
 
 log = logging.getLogger(__name__)
 
