@@ -144,7 +144,7 @@ class KeyframeOutcomes:
         if (route := self._routes.get(session.key)) is not None:
             route.fates.turned_away(done.message or done.reason)
         self._tell(messages.Nack(session.key, seq, "map", done.reason, done.message))
-        self._note_want_of_room(done.reason, done.message, session.client)
+        self._note_want_of_room(done.reason, session.client)
         if is_empty:  # nothing is wrong with the record
             self._without_samples.add(session.key)
             return
@@ -173,7 +173,7 @@ class KeyframeOutcomes:
         for nack in self._untold.pop(key, ()):
             self._routes.send(key, nack)
 
-    def _note_want_of_room(self, reason: str, message: str, client: str) -> None:
+    def _note_want_of_room(self, reason: str, client: str) -> None:
         if reason in _FULL:
             self.notices["full"] = (
                 "it is full, keyframes that need more room are rejected: raise max_blocks or "
