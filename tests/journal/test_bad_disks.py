@@ -144,8 +144,12 @@ def test_what_was_refused_is_cut_off_on_the_disk_as_well(
         if when == "while it is written":
             patched.setattr(os, "fdatasync", refused)
         else:
-            seen = [refused, lambda *_: True]
-            patched.setattr(OpenSegment, "is_in_place", property(lambda one: seen.pop()(one)))
+            looks = [refused, lambda *_: True]
+
+            def is_in_place(segment: OpenSegment) -> bool:
+                return bool(looks.pop()(segment))
+
+            patched.setattr(OpenSegment, "is_in_place", property(is_in_place))
         patched.setattr(os, "fsync", lambda descriptor: synced.append(os.fstat(descriptor).st_size))
         with pytest.raises(JournalError, match=os.strerror(errno.EIO)):
             fill(log, 1, first=2)
