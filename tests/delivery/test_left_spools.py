@@ -84,6 +84,7 @@ def test_what_left_a_spool_stays_out_of_it_and_few_numbers_are_kept(
     spool.close()
     again = Spool(tmp_path, 5000)
     assert [entry.seq for entry in again.waiting] == [1]
+    assert again.used_bytes == sum(path.stat().st_size for path in tmp_path.glob("*.mcap"))
     again.close()
 
 
