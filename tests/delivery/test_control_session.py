@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What a client takes from a server's messages, one by one."""
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.refused_keyframes import RefusedFolder
 from tsfusion.delivery.spool import Spool
 from tsfusion.wire import codec, messages
-from tsfusion.wire.messages import Ack, Nack, ToClient, Welcome
+from tsfusion.wire.messages import Ack, Nack, Pong, ToClient, Welcome
 
 
 class Side:
@@ -46,6 +47,10 @@ class Side:
 
     def welcome(self) -> None:
         self.hear(Welcome("epoch", messages.PROTOCOL_VERSION, 0, 0, 8, 1 << 20, 1 << 20))
+
+    def pong(self, epoch: str) -> None:
+        now = time.monotonic_ns()
+        self.hear(Pong(epoch, now, now, now))
 
 
 @pytest.fixture
@@ -87,3 +92,24 @@ def test_a_server_of_another_version_gets_nothing(side: Side) -> None:
     side.hear(Welcome("epoch", messages.PROTOCOL_VERSION + 1, 2, 0, 8, 1 << 20, 1 << 20))
     assert (side.outbox.link_state.kind, side.control.terms) == ("refused", None)
     assert side.waiting == [1, 2, 3]
+
+
+def test_nothing_is_sent_before_the_clocks_are_compared_nor_to_another_server(side: Side) -> None:
+    side.welcome()
+    assert side.control.terms is None
+    side.pong("epoch")
+    assert side.control.terms is not None
+    side.pong("another")  # in its place: what was under way is lost, and its clock is another one
+    assert (side.control.terms, side.control.welcome, side.control.clock.count) == (None, None, 0)
+
+
+def test_a_gap_that_every_keyframe_reports_is_filled_once(side: Side) -> None:
+    side.welcome()
+    claimed = side.outbox.claim(8, 1 << 20)
+    assert claimed is not None
+    side.outbox.sent(claimed[0], 1)
+    side.hear(Ack(side.key, 0, 0, resend=True))
+    side.control.tick(side.control._rewound + 0.01)
+    assert side.outbox.outstanding == 1
+    side.control.tick(side.control._rewound + 1.0)
+    assert side.outbox.outstanding == 0
