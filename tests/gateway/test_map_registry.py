@@ -18,6 +18,7 @@ from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.gateway import map_registry
 from tsfusion.gateway.client_routes import ClientRoutes
+from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.journal import quarantine, state_folder
@@ -63,6 +64,22 @@ def test_a_record_of_nobody_or_a_bad_one_makes_no_map(served: Served, tmp_path: 
         push.send_multipart([head, *rest[:-1], b"x"])
         assert served.heard(link, messages.Nack)
     assert state_folder.map_names(tmp_path) == ["default"]
+
+
+def test_a_map_that_is_being_opened_takes_nothing(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What its checkpoint holds is not known yet: a keyframe that it has could count twice."""
+    with (
+        connected(sockets.dealer, served.addresses.control) as link,
+        connected(sockets.push, served.addresses.data) as push,
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(HostedMap, "takes_records", property(lambda _: False))
+            push.send_multipart(record(1))
+            served.until(lambda: served.gateway.health().refused.get("map") == 1)
+            assert served.greet(link, "default").reason == "opening"
+        assert served.durable == 0
+        push.send_multipart(record(1))
+        served.until(lambda: served.durable == 1)
 
 
 @pytest.mark.parametrize("code", [errno.EIO, errno.ENOENT, errno.EMFILE])
