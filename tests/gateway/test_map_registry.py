@@ -3,6 +3,7 @@
 
 import errno
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -59,6 +60,9 @@ def test_a_record_of_nobody_or_a_bad_one_makes_no_map(served: Served, tmp_path: 
     ):
         push.send_multipart(record(1, "yard"))
         served.until(lambda: served.gateway.health().refused.get("map") == 1)
+        served.greet(link, "garden")
+        push.send_multipart(record(1, "yard"))  # of a client that was let into another map
+        served.until(lambda: served.gateway.health().refused.get("map") == 2)
         served.greet(link, "yard")
         head, *rest = record(1, "yard")
         push.send_multipart([head, *rest[:-1], b"x"])
@@ -80,6 +84,22 @@ def test_a_map_that_is_being_opened_takes_nothing(served: Served, monkeypatch: p
         assert served.durable == 0
         push.send_multipart(record(1))
         served.until(lambda: served.durable == 1)
+
+
+def test_who_is_held_off_is_turned_away_whatever_it_sends(served: Served) -> None:
+    with (
+        connected(sockets.dealer, served.addresses.control) as link,
+        connected(sockets.push, served.addresses.data) as push,
+    ):
+        served.greet(link, "default")
+        (route,) = served.gateway._routes
+        route.held_until = time.monotonic() + 1000.0
+        push.send_multipart(record(1))
+        served.until(lambda: served.gateway.health().refused.get("held") == 1)
+        assert served.durable == 0
+        for wanted, told in ((1e9, 10.0), (0.0, 0.25)):  # seconds; neither for ever nor in a frenzy
+            served.gateway._intake._hold(bytes(16), wanted, "disk", "it is full")
+            assert served.heard(link, messages.Hold).seconds == told
 
 
 @pytest.mark.parametrize("code", [errno.EIO, errno.ENOENT, errno.EMFILE])
