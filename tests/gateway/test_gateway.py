@@ -2,6 +2,7 @@
 """The gateway with fusers that misbehave, in this process; and real scans by file and by socket."""
 
 import errno
+import itertools
 import os
 import signal
 import subprocess
@@ -20,6 +21,7 @@ from failures import refuse
 from keyframes_and_servers import map_hash, serving, until
 
 from tsfusion import Client, VolumeConfig, journal
+from tsfusion.core import process
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.datasets import open_dataset
@@ -177,6 +179,15 @@ def test_a_fuser_that_is_killed_is_not_the_keyframes_fault(start: Start, tmp_pat
     )
     health = default(drained(start(body)))
     assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (3, {}, 5)
+
+
+def test_a_fuser_that_takes_all_memory_at_a_keyframe_crashes_at_it(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The system kills it, and counts that."""
+    monkeypatch.setattr(process, "oom_kills", itertools.count().__next__)
+    health = default(drained(start(fusing("if message.index == 2: os.kill(os.getpid(), 9)"))))
+    assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (2, {"crash": 1}, 4)
 
 
 def test_a_fuser_that_is_stopped_is_not_the_keyframes_fault(start: Start, tmp_path: Path) -> None:
