@@ -22,7 +22,7 @@ from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.metrics import Metrics
-from tsfusion.journal import quarantine, state_folder
+from tsfusion.journal import Journal, quarantine, state_folder
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.allowed_maps import AllowedMaps
 from tsfusion.wire.messages import Command, Denied, Welcome
@@ -100,6 +100,30 @@ def test_who_is_held_off_is_turned_away_whatever_it_sends(served: Served) -> Non
         for wanted, told in ((1e9, 10.0), (0.0, 0.25)):  # seconds; neither for ever nor in a frenzy
             served.gateway._intake._hold(bytes(16), wanted, "disk", "it is full")
             assert served.heard(link, messages.Hold).seconds == told
+
+
+def test_a_disk_that_refuses_is_said_at_once_and_then_left_alone(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried = []
+
+    def append(*_: object, **__: object) -> None:
+        tried.append(1)
+        raise JournalError("the disk is full", errno.ENOSPC)
+
+    monkeypatch.setattr(Journal, "append", append)
+    with (
+        connected(sockets.dealer, served.addresses.control) as link,
+        connected(sockets.push, served.addresses.data) as push,
+    ):
+        served.greet(link, "default")
+        for _ in range(2):
+            push.send_multipart(record(1))
+            assert served.heard(link, messages.Hold).reason == "disk"
+            (route,), (hosted,) = served.gateway._routes, served.gateway.maps
+            route.held_until = 0.0
+            hosted.disk._until = hosted.disk._look_at = time.monotonic() + 1000.0
+        assert len(tried) == 1
 
 
 @pytest.mark.parametrize("code", [errno.EIO, errno.ENOENT, errno.EMFILE])
