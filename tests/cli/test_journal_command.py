@@ -2,6 +2,7 @@
 """`tsfusion journal`: what it finds, what it saves, its exit status, and that it changes nothing."""
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -310,6 +311,23 @@ def test_a_keyframe_that_stands_there_twice_is_saved_once(tmp_path: Path, run: R
     status, out, _ = run("recover", tmp_path, tmp_path / "saved", "--json")
     done = json.loads(out)
     assert (status, done["keyframes"], done["copies"]) == (0, 2, 1)
+
+
+def test_what_is_saved_is_on_the_disk_before_it_has_its_name(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one_by_one(tmp_path / "journal", [(ANNA, 1, encoded(1)), (ANNA, 2, encoded(2))])
+    happened: list[str] = []
+    real = os.fsync
+
+    def watched(descriptor: int) -> None:
+        path = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+        happened.append(path.name if (tmp_path / "saved").exists() else path.suffix or "folder")
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", watched)
+    assert run("recover", tmp_path, tmp_path / "saved")[0] == 0
+    assert happened[-3:] == [".mcap", "folder", tmp_path.name]
 
 
 def test_nothing_is_written_over_or_into_the_source(state: Path, tmp_path: Path, run: Run) -> None:

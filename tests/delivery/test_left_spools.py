@@ -10,7 +10,9 @@ from keyframes_and_servers import pose
 
 from tsfusion import Client
 from tsfusion.core.errors import JournalError
-from tsfusion.delivery import left_spools
+from tsfusion.delivery import left_spools, tombstones
+from tsfusion.delivery import spool as spool_module
+from tsfusion.delivery.spool import Spool
 
 
 def left(folder: Path, count: int = 2, **settings: object) -> None:
@@ -67,3 +69,26 @@ def test_a_spool_in_use_is_neither_taken_nor_deleted(tmp_path: Path) -> None:
     left_spools.drop(found)
     assert left_spools.find(tmp_path) == []
     assert not list((tmp_path / "default").glob("*.mcap"))
+
+
+def test_what_left_a_spool_stays_out_of_it_and_few_numbers_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(spool_module, "_MANY_TOMBSTONES", 8)
+    spool = Spool(tmp_path, 5000)
+    for _ in range(100):
+        spool.add(spool.write([bytes(1000)]))
+        if len(spool.waiting) > 1:
+            spool.remove(1)
+    assert (tmp_path / tombstones.NAME).stat().st_size < 16 + 8 * 50
+    spool.close()
+    again = Spool(tmp_path, 5000)
+    assert [entry.seq for entry in again.waiting] == [1]
+    assert again.used_bytes == sum(path.stat().st_size for path in tmp_path.glob("*.mcap"))
+    again.close()
+
+
+def test_numbers_that_another_session_left_mean_nothing(tmp_path: Path) -> None:
+    tombstones.Tombstones(tmp_path, bytes(16)).add(1)
+    for _ in range(2):
+        assert tombstones.Tombstones(tmp_path, bytes(range(16))).numbers == set()

@@ -36,6 +36,16 @@ def test_a_held_client_waits_says_why_and_goes_on() -> None:
         assert server.numbers == [0, 1, 2]
 
 
+def test_a_held_client_sends_nothing() -> None:
+    with scripted(hold=(60.0, "disk", "the disk is full")) as server, joined(server) as client:
+        client.send(wall(0))
+        until(lambda: client._sender._control_session.held)
+        client.send(wall(1))
+        pings = len(server.pings)
+        until(lambda: len(server.pings) > pings + 1)
+        assert server.held == 1
+
+
 @pytest.mark.parametrize("seconds", [float("nan"), float("inf"), 1e300, -5.0, 0.0])
 def test_no_server_holds_a_client_for_ever_or_in_a_frenzy(seconds: float) -> None:
     with scripted(hold=(seconds, "quota", "slower")) as server, joined(server) as client:

@@ -187,12 +187,12 @@ def test_a_record_that_cannot_be_taken_back_does_not_pass_for_another(
         assert client.send(wall(0)) == 1
         with monkeypatch.context() as patch:
             patch.setattr(os, "fdatasync", refuse(errno.EIO))
-            patch.setattr(os, "truncate", refuse(errno.EIO))
+            patch.setattr(os, "ftruncate", refuse(errno.EIO))
             assert client.send(wall(1)) is None
         assert client.send(wall(2)) == 3
     with scripted() as server, joined(server, spool=tmp_path) as client:
         client.flush(DEADLINE)
-        assert server.numbers in ([0, 2], [0, 1, 2])  # never 1 in the place of 2
+        assert server.numbers == [0, 2]  # and not 1, which was reported as not kept
 
 
 def test_a_mistake_of_ours_is_not_blamed_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -342,11 +342,13 @@ def test_a_shortage_of_descriptors_loses_nothing(tmp_path: Path, monkeypatch: py
             raise JournalError("cannot read", errno.EMFILE)
         return read(folder, position)
 
+    monkeypatch.setattr("tsfusion.delivery.sender._MAX_READS", 1)  # of a disk that fails
     with scripted() as server, joined(server, spool=tmp_path) as client:
         monkeypatch.setattr(journal, "read", scarce)
         send_all(client, range(3))
         with pytest.raises(FlushTimeout):
             client.flush(0.2)
+        until(lambda: client._outbox._claimed == 0)  # it may still be dropped
         failing[0] = False
         client.flush(DEADLINE)
         assert server.numbers == [0, 1, 2]

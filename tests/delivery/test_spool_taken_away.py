@@ -15,7 +15,7 @@ from scripted_server import scripted
 from tsfusion import Client, journal
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import JournalError
-from tsfusion.delivery import backpressure
+from tsfusion.delivery import backpressure, sender
 from tsfusion.delivery.spool import Spool
 from tsfusion.delivery.tombstones import NAME, Tombstones
 
@@ -66,7 +66,10 @@ def test_a_spool_that_is_away_for_a_while_costs_what_comes_meanwhile_and_no_more
         assert server.numbers == [0, 1, 2, 4]
 
 
-def test_what_a_dead_scanner_left_is_waited_for_while_its_folder_is_away(tmp_path: Path) -> None:
+def test_what_a_dead_scanner_left_is_waited_for_while_its_folder_is_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sender, "_MAX_READS", 1)  # of a file that is there
     spool, aside = tmp_path / "spool", tmp_path / "aside"
     with Client(NOBODY, spool=spool, config=SMALL) as client:
         send_all(client, range(3))

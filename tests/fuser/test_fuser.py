@@ -679,3 +679,10 @@ def test_parts_of_a_killed_checkpoint_are_swept_and_nothing_else(tmp_path: Path)
         (tmp_path / name).write_bytes(b"half")
     MapCheckpoints(tmp_path, VOLUME, keep_previous=False)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map.damaged", "notes.partial"]
+
+
+def test_a_map_that_was_not_saved_by_a_server_is_one_clear_error(tmp_path: Path) -> None:
+    tsfusion.Volume(VOLUME).save(tmp_path / MAP_FILE)
+    with pytest.raises(errors.CheckpointError, match="it does not say which keyframes it holds"):
+        MapCheckpoints(tmp_path, VOLUME, keep_previous=False)
+    assert (tmp_path / MAP_FILE).exists()

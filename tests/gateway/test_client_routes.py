@@ -5,6 +5,8 @@ from typing import cast
 
 import pytest
 
+from tsfusion.gateway.access_control import AccessControl
+from tsfusion.gateway.admission import Admission
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.ports import Ports, Subscriptions
 from tsfusion.gateway.sessions import Sessions
@@ -43,6 +45,15 @@ def test_a_live_session_is_not_taken_over() -> None:
     assert route.open_to("heir")
     assert routes.connect(SESSION, "default", b"4", "heir") is not route
     assert len(list(routes)) == 1
+
+
+def test_a_session_is_its_clients_in_the_journal_and_before() -> None:
+    routes, sessions = ClientRoutes(cast(Ports, None)), Sessions()
+    admission = Admission(cast(AccessControl, None), routes)
+    sessions.open(key_of(1), "anna")  # its records are journaled; she has left
+    routes.connect(key_of(2), "default", b"1", "anna")  # she has just said hello
+    for key in (key_of(1), key_of(2)):
+        assert [admission.owns(sessions, key, client) for client in ("anna", "bob")] == [True, False]
 
 
 def test_a_flood_of_greetings_pushes_out_those_of_its_own_name_only() -> None:

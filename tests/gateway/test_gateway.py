@@ -2,6 +2,7 @@
 """The gateway with fusers that misbehave, in this process; and real scans by file and by socket."""
 
 import errno
+import itertools
 import os
 import signal
 import subprocess
@@ -20,6 +21,7 @@ from failures import refuse
 from keyframes_and_servers import map_hash, serving, until
 
 from tsfusion import Client, VolumeConfig, journal
+from tsfusion.core import process
 from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import InvalidConfig, JournalError, MapError
 from tsfusion.datasets import open_dataset
@@ -175,12 +177,46 @@ def test_a_fuser_that_is_killed_is_not_the_keyframes_fault(start: Start, tmp_pat
                     os.kill(os.getpid(), 9)
         """.strip()
     )
-    health = default(drained(start(body)))
+    gateway = drained(start(body))
+    health, (hosted,) = default(gateway), gateway.maps
     assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (3, {}, 5)
+    assert hosted.fuser._blame == {}  # it is fused
 
 
-def test_a_fuser_that_is_stopped_is_not_the_keyframes_fault(start: Start, tmp_path: Path) -> None:
+def test_a_fuser_that_goes_on_for_long_is_steady_and_gets_few_keyframes_at_once(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fuser_supervisor, "_STEADY_AFTER", -1.0)
+    gateway = start(fusing("pass"))
+    (hosted,) = gateway.maps
+    hosted.fuser._early_deaths = 3
+    drained(gateway)
+    assert hosted.fuser._early_deaths == 0
+    assert hosted.fuser.wants_work
+    hosted.fuser.in_flight.extend(range(4))
+    assert not hosted.fuser.wants_work
+
+
+def test_what_is_done_between_keyframes_may_take_longer(start: Start) -> None:
+    """A mesh, a checkpoint."""
+    body = fusing("(at(-1), time.sleep(1.2)) if message.index == 1 else None")
+    assert default(drained(start(body, fuser_timeout=0.6))).fuser_restarts == 0
+
+
+def test_a_fuser_that_takes_all_memory_at_a_keyframe_crashes_at_it(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The system kills it, and counts that."""
+    monkeypatch.setattr(process, "oom_kills", itertools.count().__next__)
+    health = default(drained(start(fusing("if message.index == 2: os.kill(os.getpid(), 9)"))))
+    assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (2, {"crash": 1}, 4)
+
+
+def test_a_fuser_that_is_stopped_is_not_the_keyframes_fault(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Somebody stops it three times at the same keyframe, and never lets it go on."""
+    monkeypatch.setattr(fuser_supervisor, "KILL_WEIGHT", fuser_supervisor.GIVE_UP_AT)
     body = fusing(
         f"""
             with open({str(tmp_path / "stops")!r}, "a+") as stops:

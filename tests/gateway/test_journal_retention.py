@@ -81,3 +81,14 @@ def test_what_a_dead_fuser_had_covers_nothing() -> None:
     session.in_map = 5
     retention.on_saved(fuser_messages.Saved(written=True))
     assert let_go(retention, folder, Fuser()) == 5
+
+
+def test_a_checkpoint_that_a_dead_fuser_was_asked_for_is_asked_for_again() -> None:
+    retention, folder, _ = ten_segments()
+    fuser = Fuser()
+    for asked in (1, 1):
+        let_go(retention, folder, fuser)
+        assert len(fuser.asked) == asked
+    retention.on_ready()
+    let_go(retention, folder, fuser)
+    assert len(fuser.asked) == 2

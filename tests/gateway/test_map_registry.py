@@ -3,6 +3,7 @@
 
 import errno
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,9 +19,10 @@ from tsfusion.core.config import ServerConfig
 from tsfusion.core.errors import JournalError
 from tsfusion.gateway import map_registry
 from tsfusion.gateway.client_routes import ClientRoutes
+from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.metrics import Metrics
-from tsfusion.journal import quarantine, state_folder
+from tsfusion.journal import Journal, quarantine, state_folder
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.allowed_maps import AllowedMaps
 from tsfusion.wire.messages import Command, Denied, Welcome
@@ -58,11 +60,70 @@ def test_a_record_of_nobody_or_a_bad_one_makes_no_map(served: Served, tmp_path: 
     ):
         push.send_multipart(record(1, "yard"))
         served.until(lambda: served.gateway.health().refused.get("map") == 1)
+        served.greet(link, "garden")
+        push.send_multipart(record(1, "yard"))  # of a client that was let into another map
+        served.until(lambda: served.gateway.health().refused.get("map") == 2)
         served.greet(link, "yard")
         head, *rest = record(1, "yard")
         push.send_multipart([head, *rest[:-1], b"x"])
         assert served.heard(link, messages.Nack)
     assert state_folder.map_names(tmp_path) == ["default"]
+
+
+def test_a_map_that_is_being_opened_takes_nothing(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What its checkpoint holds is not known yet: a keyframe that it has could count twice."""
+    with (
+        connected(sockets.dealer, served.addresses.control) as link,
+        connected(sockets.push, served.addresses.data) as push,
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(HostedMap, "takes_records", property(lambda _: False))
+            push.send_multipart(record(1))
+            served.until(lambda: served.gateway.health().refused.get("map") == 1)
+            assert served.greet(link, "default").reason == "opening"
+        assert served.durable == 0
+        push.send_multipart(record(1))
+        served.until(lambda: served.durable == 1)
+
+
+def test_who_is_held_off_is_turned_away_whatever_it_sends(served: Served) -> None:
+    with (
+        connected(sockets.dealer, served.addresses.control) as link,
+        connected(sockets.push, served.addresses.data) as push,
+    ):
+        served.greet(link, "default")
+        (route,) = served.gateway._routes
+        route.held_until = time.monotonic() + 1000.0
+        push.send_multipart(record(1))
+        served.until(lambda: served.gateway.health().refused.get("held") == 1)
+        assert served.durable == 0
+        for wanted, told in ((1e9, 10.0), (0.0, 0.25)):  # seconds; neither for ever nor in a frenzy
+            served.gateway._intake._hold(bytes(16), wanted, "disk", "it is full")
+            assert served.heard(link, messages.Hold).seconds == told
+
+
+def test_a_disk_that_refuses_is_said_at_once_and_then_left_alone(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried = []
+
+    def append(*_: object, **__: object) -> None:
+        tried.append(1)
+        raise JournalError("the disk is full", errno.ENOSPC)
+
+    monkeypatch.setattr(Journal, "append", append)
+    with (
+        connected(sockets.dealer, served.addresses.control) as link,
+        connected(sockets.push, served.addresses.data) as push,
+    ):
+        served.greet(link, "default")
+        for _ in range(2):
+            push.send_multipart(record(1))
+            assert served.heard(link, messages.Hold).reason == "disk"
+            (route,), (hosted,) = served.gateway._routes, served.gateway.maps
+            route.held_until = 0.0
+            hosted.disk._until = hosted.disk._look_at = time.monotonic() + 1000.0
+        assert len(tried) == 1
 
 
 @pytest.mark.parametrize("code", [errno.EIO, errno.ENOENT, errno.EMFILE])

@@ -15,6 +15,7 @@ from served_gateway import Served, record, serving_here
 
 from tsfusion import Client
 from tsfusion.gateway import access_control
+from tsfusion.gateway.connections import Connection, Connections
 from tsfusion.wire import messages, sockets
 
 FRAMES = 300_000  # of a hostile message: read one by one they take half a second
@@ -137,6 +138,20 @@ def test_who_fills_the_memory_is_cut_off_alone(served: Served, monkeypatch: pyte
         assert (served.gateway.epoch, served.gateway.health().refused) == (epoch, {"memory": 1})
         monkeypatch.setattr(served.gateway._limits._memory, "excess", lambda _: 1 << 30)
         served.until(lambda: served.gateway.epoch != epoch)  # nobody stands out: all have to go
+
+
+def test_the_number_of_a_connection_that_ended_may_be_another_files() -> None:
+    """What was read over the one before does not hide what the next one holds, and others are not cut off."""
+    connections = Connections(1 << 30)
+    here, there = socket.socketpair()
+    with here, there:
+        assert not connections.cut(here.fileno())
+        there.sendall(b"x")
+        assert here.recv(1) == b"x"
+    connections.note_read(7, 1 << 30)
+    assert connections._unread_of(Connection(7, 1, "", 0, 5 << 20)) == 5 << 20
+    connections._read[7] = 3 << 20
+    assert connections._unread_of(Connection(7, 1, "", 0, 5 << 20)) == 2 << 20
 
 
 def test_a_client_that_floods_is_kept_out_for_a_while(tmp_path: Path) -> None:

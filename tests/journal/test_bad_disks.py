@@ -18,6 +18,7 @@ from tsfusion import journal
 from tsfusion.core import durable_files
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import Journal, Position, inspection, mcap_layout, segment_path, state_folder
+from tsfusion.journal.open_segment import OpenSegment
 
 BIG = 1 << 30
 SESSION = bytes(range(16))
@@ -128,6 +129,32 @@ def test_a_disk_that_refuses_is_an_error_and_not_the_end(
     assert journal.read(tmp_path, position).seq == 4
     log.close()
     assert seqs(tmp_path) == [1, 2, 4]
+
+
+@pytest.mark.parametrize("when", ["while it is written", "when it is there"])
+def test_what_was_refused_is_cut_off_on_the_disk_as_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    """A power cut must not bring back a record that was reported as not written."""
+    log, path = Journal(tmp_path, BIG), segment_path(tmp_path, 1)
+    fill(log, 1)
+    size, synced = path.stat().st_size, list[int]()
+    with monkeypatch.context() as patched:
+        refused = refuse(errno.EIO)
+        if when == "while it is written":
+            patched.setattr(os, "fdatasync", refused)
+        else:
+            looks = [refused, lambda *_: True]
+
+            def is_in_place(segment: OpenSegment) -> bool:
+                return bool(looks.pop()(segment))
+
+            patched.setattr(OpenSegment, "is_in_place", property(is_in_place))
+        patched.setattr(os, "fsync", lambda descriptor: synced.append(os.fstat(descriptor).st_size))
+        with pytest.raises(JournalError, match=os.strerror(errno.EIO)):
+            fill(log, 1, first=2)
+    assert synced[-1:] == [size]
+    assert path.stat().st_size == size
 
 
 def test_an_interrupted_append_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -361,6 +388,18 @@ def test_a_segment_that_cannot_be_read_is_not_passed_over(
         bad.unlink() if bad.is_symlink() else bad.rmdir()
         aside.rename(bad)
     assert Journal(tmp_path, BIG).found == before
+
+
+def test_only_bad_sectors_are_read_as_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What the system refuses for want of memory may be there the next time."""
+    write(tmp_path, 3)
+    monkeypatch.setattr(os, "pread", refuse(errno.ENOMEM))
+    with pytest.raises(JournalError) as raised:
+        journal.list_records(segment_path(tmp_path, 1))
+    assert raised.value.errno == errno.ENOMEM
+    assert "the disk cannot read all of it" not in caplog.text
 
 
 def test_a_folder_that_cannot_be_listed_is_one_clear_error(

@@ -66,6 +66,25 @@ def test_an_open_segment_that_is_taken_away_is_put_back_with_every_record(
     assert seqs(folder) == [1, 2, 3, 4, 5]
 
 
+def test_what_lies_in_its_place_is_kept(tmp_path: Path) -> None:
+    log, path = Journal(tmp_path, BIG), segment_path(tmp_path, 1)
+    fill(log, 1)
+    path.unlink()
+    path.write_bytes(b"somebody's")
+    fill(log, 2)
+    assert path.with_name("000001.mcap.replaced").read_bytes() == b"somebody's"
+    assert seqs(tmp_path) == [1, 2]
+
+
+def test_a_file_system_that_draws_inode_numbers_moves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os.path, "samestat", lambda *_: False)  # some network file systems
+    log = Journal(tmp_path, BIG)
+    fill(log, 1, 2, 3)
+    assert (log.put_back, log.segment) == (0, 1)
+
+
 @pytest.mark.parametrize("end", ["check", "close"])
 def test_it_is_put_back_although_nothing_more_is_written(tmp_path: Path, end: str) -> None:
     log = Journal(tmp_path, BIG)

@@ -265,6 +265,13 @@ def test_the_quarantine_keeps_to_its_limits(tmp_path: Path, monkeypatch: pytest.
     assert (len(kept), seqs()) == (1, [12])
 
 
+def test_a_keyframe_that_is_put_aside_again_counts_once(tmp_path: Path) -> None:
+    kept = Quarantine(tmp_path, 35_000)
+    for seq in (1, 2, 2, 2, 2):
+        kept.keep([bytes(10_000)], session=SESSION, seq=seq, reason="crc")
+    assert len(list(tmp_path.glob("*.mcap"))) == 2
+
+
 def test_the_quarantine_does_not_look_at_every_file_for_each(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

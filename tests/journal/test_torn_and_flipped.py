@@ -4,6 +4,7 @@
 import errno
 import os
 import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -212,7 +213,22 @@ def test_no_length_makes_a_reader_ask_for_more_than_the_file(
     assert max(asked) <= len(segment.whole)
 
 
-def test_a_file_of_heads_that_lie_is_read_in_bounded_time(tmp_path: Path) -> None:
+def test_frames_that_do_not_fill_their_record_make_it_none(tmp_path: Path) -> None:
+    """Its CRC is right: somebody made it up."""
+    segment = Segment(tmp_path, closed=False)
+    place = segment.places[0]
+    raw = bytearray(segment.whole[place.offset : segment.ends[0]])
+    assert mcap_layout.parse_record(bytes(raw), place) is not None
+    (length,) = struct.unpack_from("<I", raw, mcap_layout.HEAD_BYTES)
+    for lie in (length - 1, length + 1):
+        struct.pack_into("<I", raw, mcap_layout.HEAD_BYTES, lie)
+        struct.pack_into("<I", raw, 41 - 8, zlib.crc32(raw[49:]))
+        assert mcap_layout.parse_record(bytes(raw), place) is None
+
+
+def test_a_file_of_heads_that_lie_is_read_in_bounded_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each byte could begin a record that reaches to the end of the file: the search gives up in time."""
     segment = Segment(tmp_path, closed=False)
     start = segment.places[0].offset
@@ -227,6 +243,15 @@ def test_a_file_of_heads_that_lie_is_read_in_bounded_time(tmp_path: Path) -> Non
         struct.pack_into("<Q", head, 50, stored - 9)
         content += head
     segment.path.write_bytes(content + bytes(size - len(content)))
+    asked, real = 0, os.pread
+
+    def watched(descriptor: int, count: int, at: int) -> bytes:
+        nonlocal asked
+        asked += count
+        assert asked < 100 * size
+        return real(descriptor, count, at)
+
+    monkeypatch.setattr(os, "pread", watched)
     assert [step for step in scan_records(segment.path) if isinstance(step, Record)] == []
 
 
@@ -255,11 +280,14 @@ def test_a_bad_sector_costs_the_records_in_it(tmp_path: Path, monkeypatch: pytes
 
 
 def test_an_unreadable_end_is_no_torn_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    segment = Segment(tmp_path, closed=False)
-    monkeypatch.setattr(os, "pread", failing_sectors(range(segment.places[-1].offset, len(segment.whole))))
-    damages = [step for step in scan_records(segment.path) if isinstance(step, Damage)]
-    assert sum(damage.lost for damage in damages) >= 1
-    assert not any(damage.torn for damage in damages)
+    log = Journal(tmp_path, BIG, sync=False)
+    places = [log.append([bytes(100_000)], session=bytes(16), seq=seq) for seq in (1, 2)]
+    log._abandon()
+    path = segment_path(tmp_path, 1)
+    monkeypatch.setattr(os, "pread", failing_sectors(range(places[-1].offset, path.stat().st_size)))
+    found = list(scan_records(path))
+    assert [(step.lost, step.torn) for step in found if isinstance(step, Damage)] == [(1, False)]
+    assert [step.seq for step in found if isinstance(step, Record)] == [1]
 
 
 # --- anything at all ---

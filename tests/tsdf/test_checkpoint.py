@@ -167,6 +167,48 @@ def test_a_forged_file_is_refused_before_it_asks_for_memory(saved: Path, tmp_pat
         Volume.load(path)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit memory")
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ("blocks", "it claims .* blocks"),
+        ("layers", "is of another version: it has layers"),
+        ("fewer blocks", "a chunk is not of the .* bytes expected"),
+        ("cut chunk", "a chunk ends .* bytes early"),
+        ("length", "is cut short"),
+        ("window", "is damaged: .*memory"),
+    ],
+)
+def test_each_part_of_a_forged_file_is_checked(saved: Path, tmp_path: Path, part: str, message: str) -> None:
+    whole, path = saved.read_bytes()[:-16], tmp_path / "map.tsf"
+    size = int.from_bytes(whole[8:12], "little")
+    header = msgspec.msgpack.decode(whole[12 : 12 + size], type=checkpoint.CheckpointHeader)
+    frame = bytearray(whole[16 + size :])
+    length = len(frame)
+    assert not frame[4] & 0x20  # else it has no window of its own
+    if part == "blocks":
+        header.blocks = header.config.max_blocks + 1
+    elif part == "layers":
+        header.layers = ["sums", "sums2"]
+    elif part == "fewer blocks":
+        header.blocks -= 1
+    elif part == "cut chunk":
+        del frame[-1000:]
+        length = len(frame)
+    elif part == "length":
+        length = 2**32 - 1
+    else:
+        frame[5] = 27 - 10 << 3  # 128 MB
+    altered = msgspec.msgpack.encode(header)
+    forge(path, b"".join([whole[:8], _lengthy(altered), struct.pack("<I", length), frame]))
+    with memory_limited(256 << 20), pytest.raises(CheckpointError, match=message):
+        Volume.load(path)
+
+
+def _lengthy(content: bytes) -> bytes:
+    return struct.pack("<I", len(content)) + content
+
+
 def test_a_map_of_another_version_or_that_cannot_be_read_now_is_not_damaged(
     saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

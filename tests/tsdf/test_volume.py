@@ -6,6 +6,7 @@ import signal
 import sys
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 import kernel_twins
 import numpy as np
@@ -100,9 +101,11 @@ def test_a_moved_keyframe_is_a_retraction_and_an_addition() -> None:
 def test_what_the_map_does_not_hold_cannot_be_retracted() -> None:
     volume = volume_of(VIEWS[:2])
     before = bytes_of(volume)
-    with pytest.raises(MapError, match="does not hold"):
+    with pytest.raises(MapError, match="blocks are missing"):
         volume.retract(VIEWS[5])
     assert bytes_of(volume) == before
+    volume.integrate(VIEWS[5])
+    assert volume.map_hash() == volume_of([*VIEWS[:2], VIEWS[5]]).map_hash()
 
 
 def test_colour_that_was_never_added_cannot_be_retracted() -> None:
@@ -204,6 +207,33 @@ def test_the_limits_hold_and_leave_the_map_alone() -> None:
         volume_of(VIEWS[:1], max_blocks_per_keyframe=3)
 
 
+def test_a_keyframe_of_blocks_that_the_map_has_may_not_touch_too_many_either(tmp_path: Path) -> None:
+    path = volume_of(VIEWS[:1]).save(tmp_path / "map.tsf")
+    volume = Volume.load(path, max_blocks_per_keyframe=3)
+    before = bytes_of(volume)
+    with pytest.raises(KeyframeTooLarge, match="max_blocks_per_keyframe"):
+        volume.integrate(VIEWS[0])
+    assert bytes_of(volume) == before
+
+
+def test_keys_that_collide_are_no_keyframe(monkeypatch: pytest.MonkeyPatch) -> None:
+    volume = volume_of(VIEWS[:1])
+    before, usual = bytes_of(volume), integrate.add_rays
+
+    def collide(*given: object) -> None:
+        usual(*given)
+        if given[3] == integrate.ALL:
+            volume._ray_buffers.touched[integrate.TOUCHED_OVERFLOW] = 1
+
+    with monkeypatch.context() as patched:
+        patched.setattr(integrate, "add_rays", collide)
+        with pytest.raises(KeyframeTooLarge, match="collide"):
+            volume.integrate(VIEWS[4])
+    assert bytes_of(volume) == before
+    volume.integrate(VIEWS[4])
+    assert volume.map_hash() == volume_of([VIEWS[0], VIEWS[4]]).map_hash()
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit memory")
 @pytest.mark.parametrize("regularizer", ["off", "ray"])
 def test_without_memory_a_keyframe_fits_or_leaves_the_map_alone(regularizer: str) -> None:
@@ -269,7 +299,7 @@ def test_settled_colours_do_not_stop_a_retraction() -> None:
     assert (volume._store.color_rgn[: len(voted)][voted] == settled).all()
 
 
-@pytest.mark.parametrize("where", ["_smooth", "reserve_touched", "largest_weights"])
+@pytest.mark.parametrize("where", ["_smooth", "reserve_touched", "largest_weights", "ONLY_DEFERRED"])
 def test_whatever_fails_leaves_the_map_as_it_was(monkeypatch: pytest.MonkeyPatch, where: str) -> None:
     volume = volume_of(VIEWS[:2], regularizer="ray")
     before, stats = bytes_of(volume), volume.stats()
@@ -286,6 +316,13 @@ def test_whatever_fails_leaves_the_map_as_it_was(monkeypatch: pytest.MonkeyPatch
             usual = buffers.reserve_touched
             patched.setattr(buffers, "reserve_touched", lambda n: usual(n) if first.pop() else fail())
             first.insert(0, False)
+        elif where == "ONLY_DEFERRED":  # the blocks are there, and nothing is added to them
+            usual_add = integrate.add_rays
+            patched.setattr(
+                integrate,
+                "add_rays",
+                lambda *given: fail() if given[3] == integrate.ONLY_DEFERRED else usual_add(*given),
+            )
         else:
             patched.setattr("tsfusion.kernels.integrate.largest_weights", fail)
         with pytest.raises(MemoryError):

@@ -249,6 +249,25 @@ def test_limits_are_the_servers() -> None:
         codec.check(frames, max_frame_bytes=total - 1)
 
 
+def test_the_first_limit_that_is_passed_is_named() -> None:
+    """Each has to hold by itself: what comes behind it may change."""
+    good = encode(wall())
+    fields = msgspec.msgpack.decode(good[0][4:])
+    fields["buffers"].append(fields["buffers"][1])
+    twice = [good[0][:4] + msgspec.msgpack.encode(fields), *good[1:], good[2]]
+    huge = rewrite(rewrite(good, 0, shape=[8192, 8192]), 1, shape=[8192, 8192, 3])
+    for frames, message in ((twice, "each array comes once"), (huge, "unfold to more than")):
+        with pytest.raises(Refused, match=message):
+            codec.check(frames)
+
+
+def test_an_image_of_other_numbers_than_announced_is_refused() -> None:
+    frames = encode(wall())
+    png = bytes(cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1])
+    with pytest.raises(Refused, match=r"was announced, got \(48, 64\) uint8"):
+        codec.decode(rewrite([frames[0], png, frames[2]], 0, codec="png"))
+
+
 def test_no_server_takes_a_message_that_no_fuser_decodes() -> None:
     most = ServerConfig().max_frame_bytes
     assert inspect.signature(codec.check).parameters["max_frame_bytes"].default == most

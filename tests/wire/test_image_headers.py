@@ -131,6 +131,29 @@ def test_an_image_that_unfolds_to_its_pixels_is_decoded(image: bytes) -> None:
     assert cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_UNCHANGED) is not None
 
 
+def test_no_more_is_unfolded_than_shows_that_it_is_too_much(monkeypatch: pytest.MonkeyPatch) -> None:
+    unfolded = 0
+
+    class Inflater:
+        def __init__(self) -> None:
+            self._real = real()
+
+        def decompress(self, content: bytes, most: int) -> bytes:
+            nonlocal unfolded
+            content = self._real.decompress(content, most)
+            unfolded += len(content)
+            return content
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self._real, name)
+
+    real = zlib.decompressobj
+    monkeypatch.setattr(zlib, "decompressobj", Inflater)
+    with pytest.raises(Refused, match="more bytes"):
+        image_headers.check_unfolding(with_pixels(zlib.compress(ROWS + bytes(4_000_000))))
+    assert unfolded <= len(ROWS) + 1
+
+
 @pytest.mark.parametrize(
     ("image", "problem"),
     [

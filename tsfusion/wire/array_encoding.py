@@ -18,7 +18,6 @@ from tsfusion.wire import image_headers
 from tsfusion.wire.record_header import Refused
 
 _ZSTD_LEVEL = 1
-_MAX_WINDOW_BYTES = 1 << 24
 _SAMPLE = 512
 _CV_NO_MEMORY = -4  # cv::Error::StsNoMem
 _MM_LIMIT = 2**31 - 1
@@ -39,7 +38,7 @@ def unpack(frame: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[
     size = math.prod(shape) * dtype.itemsize
     check_zstd(frame, size)
     try:
-        planes = zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW_BYTES).decompress(
+        planes = zstandard.ZstdDecompressor().decompress(
             frame, max_output_size=max(size, 1), allow_extra_data=False
         )
     except zstandard.ZstdError as error:

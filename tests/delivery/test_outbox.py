@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: MIT
+"""The records of a client and what became of each: what may be dropped, and what counts once."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from keyframes_and_servers import wall
+
+from tsfusion.delivery import outbox as outbox_module
+from tsfusion.delivery.outbox import Outbox
+from tsfusion.delivery.spool import Spool
+from tsfusion.wire import codec
+
+
+def put(outbox: Outbox, count: int) -> None:
+    for i in range(count):
+        frames = codec.encode(wall(i), session=outbox.session, seq=outbox.next_seq, jpeg_quality=90)
+        outbox.add(outbox.write(frames), wall(i))
+
+
+@pytest.fixture
+def outbox(tmp_path: Path) -> Iterator[Outbox]:
+    """Three keyframes, numbered from 1; none was sent."""
+    outbox = Outbox(Spool(tmp_path, 1 << 20))
+    put(outbox, 3)
+    yield outbox
+    outbox.close()
+
+
+def send(outbox: Outbox) -> None:
+    claimed = outbox.claim(8, 1 << 20)
+    assert claimed is not None
+    outbox.sent(claimed[0], 1)
+
+
+def waiting(outbox: Outbox) -> list[int]:
+    return [entry.seq for entry in outbox._spool.waiting]
+
+
+def test_what_is_being_sent_is_not_dropped_unless_it_was_not(outbox: Outbox) -> None:
+    assert outbox.claim(8, 1 << 20) is not None
+    assert outbox.drop_oldest()
+    assert waiting(outbox) == [1, 3]
+    outbox.unclaim()
+    assert outbox.drop_oldest()
+    assert waiting(outbox) == [3]
+
+
+def test_of_what_a_dead_scanner_left_a_windows_worth_may_be_journaled(outbox: Outbox, tmp_path: Path) -> None:
+    outbox.close()
+    again = Outbox(Spool(tmp_path, 1 << 20))
+    assert not again.drop_oldest()  # any may have been sent
+    again.welcome(durable=0, window_keyframes=2)
+    assert again.drop_oldest()
+    assert waiting(again) == [1, 2]
+    again.close()
+
+
+def test_a_rejection_counts_once_and_few_are_remembered(
+    outbox: Outbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for _ in range(2):
+        outbox.reject(1, "crash")
+    assert outbox.stats().rejected == {"crash": 1}
+    monkeypatch.setattr(outbox_module, "_MOST_REMEMBERED", 2)
+    for seq in range(2, 9):
+        outbox.reject(seq, "crash")
+    assert list(outbox._rejected_seqs) == [7, 8]
+
+
+def test_credit_is_bytes_as_well_as_keyframes(outbox: Outbox) -> None:
+    send(outbox)
+    assert outbox.claim(1, 1 << 20) is None
+    assert outbox.claim(8, 1) is None
+    outbox.rewind()
+    assert outbox.claim(0, 0) is not None  # one is always allowed
