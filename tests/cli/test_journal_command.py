@@ -322,12 +322,12 @@ def test_what_is_saved_is_on_the_disk_before_it_has_its_name(
 
     def watched(descriptor: int) -> None:
         path = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
-        happened.append(path.name if (tmp_path / "saved").exists() else path.suffix or "folder")
+        happened.append(path.name if path == tmp_path or path.is_file() else "folder")
         real(descriptor)
 
     monkeypatch.setattr(os, "fsync", watched)
     assert run("recover", tmp_path, tmp_path / "saved")[0] == 0
-    assert happened[-3:] == [".mcap", "folder", tmp_path.name]
+    assert happened[-3:] == ["000001.mcap", "folder", tmp_path.name]
 
 
 def test_nothing_is_written_over_or_into_the_source(state: Path, tmp_path: Path, run: Run) -> None:
