@@ -75,7 +75,9 @@ class Outbox:
     """The spool, the fate of what passed through it, and the state of the link. For any thread."""
 
     def __init__(self, spool: Spool, clock: Callable[[], float] = time.monotonic) -> None:
-        self._changed = threading.Condition()
+        # The condition's own `with` may be left by Ctrl-C with the lock taken: it is written in Python.
+        self._lock = threading.RLock()
+        self._changed = threading.Condition(self._lock)
         self._spool = spool
         self.clock = clock  # seconds, of the rates
         self._rate = TakingRate()
@@ -118,7 +120,7 @@ class Outbox:
             check: called in between; ends the wait when it raises.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
-        with self._changed:
+        with self._lock:
             while not reached():
                 check()
                 left = _CHECK_INTERVAL if deadline is None else deadline - time.monotonic()
@@ -129,12 +131,12 @@ class Outbox:
 
     def wake_waiting(self) -> None:
         """Have everybody who waits look again."""
-        with self._changed:
+        with self._lock:
             self._changed.notify_all()
 
     def change_link_state(self, state: LinkState) -> bool:
         """Replace the link's state; whether that is another one."""
-        with self._changed:
+        with self._lock:
             is_new = state != self.link_state
             self.link_state = state
             if state.kind != "connected":
@@ -148,19 +150,19 @@ class Outbox:
     @property
     def behind(self) -> int:
         """Number of keyframes that the map has yet to get: in the spool, or durable and unfused."""
-        with self._changed:
+        with self._lock:
             return len(self._spool.waiting) + len(self._unfused) - len(self._corrections)
 
     @property
     def lag(self) -> "Lag":
         """How far the map is behind."""
-        with self._changed:
+        with self._lock:
             return Lag(self.behind, self._rate.per_second)
 
     @property
     def keyframes_waiting(self) -> int:
         """Number of keyframes in the spool."""
-        with self._changed:
+        with self._lock:
             waiting = self._spool.waiting
             oldest = waiting[0].seq if waiting else 0
             return len(waiting) - sum(bool(waiting) and seq >= oldest for seq in self._corrections)
@@ -180,7 +182,7 @@ class Outbox:
 
     def add(self, entry: Waiting, keyframe: Keyframe | None) -> None:
         """Queue a keyframe, or a correction (None), that was written."""
-        with self._changed:
+        with self._lock:
             if not self.behind:
                 self._rate.rest()
             self._spool.add(entry)
@@ -193,7 +195,7 @@ class Outbox:
 
     def skip(self, reason: str, *, is_correction: bool = False) -> None:
         """Count a record that is not sent."""
-        with self._changed:
+        with self._lock:
             (self._corrections_refused if is_correction else self._skipped)[reason] += 1
 
     @property
@@ -203,17 +205,17 @@ class Outbox:
 
     def usage(self) -> tuple[int, int]:
         """Bytes of the disk that the spool takes, and records in it."""
-        with self._changed:
+        with self._lock:
             return self._spool.used_bytes, len(self._spool.waiting)
 
     def waiting(self) -> tuple[int, int]:
         """Records in the spool, and their bytes."""
-        with self._changed:
+        with self._lock:
             return len(self._spool.waiting), self._spool.waiting_bytes
 
     def tidy(self) -> None:
         """Delete files that hold nothing any more. For the one thread that writes."""
-        with self._changed:
+        with self._lock:
             self._spool.tidy()
 
     def drop_oldest(self, newest: int | None = None) -> bool:
@@ -222,7 +224,7 @@ class Outbox:
         One that was sent may be in the server's journal by now, though no answer came: it stays.
         Corrections stay, too.
         """
-        with self._changed:
+        with self._lock:
             sent = max(self._perhaps_sent, self._claimed)
             for place, entry in enumerate(self._spool.waiting):
                 if entry.seq > sent and not entry.is_correction:
@@ -237,13 +239,13 @@ class Outbox:
 
     def drop_to(self, backlog: int, newest: int) -> None:
         """Drop the oldest until no more than `backlog` are behind; the keyframe `newest` stays."""
-        with self._changed:
+        with self._lock:
             while self.behind > backlog and self.drop_oldest(newest):
                 pass
 
     def check_known(self, seqs: NDArray[np.int64]) -> None:
         """Raise InvalidKeyframe unless each is the number of a record of this session, now or before."""
-        with self._changed:
+        with self._lock:
             known = (seqs <= self._spool.left) | ((seqs > self._used_before) & (seqs < self._spool.next_seq))
         if not known.all():
             raise InvalidKeyframe(f"keyframe {seqs[np.argmin(known)]} was never sent from here")
@@ -253,7 +255,7 @@ class Outbox:
     @property
     def outstanding(self) -> int:
         """Number of records on their way."""
-        with self._changed:
+        with self._lock:
             return self._outstanding
 
     def claim(
@@ -267,7 +269,7 @@ class Outbox:
         Args:
             ahead: so many may be on their way or unfused; None = any number.
         """
-        with self._changed:
+        with self._lock:
             waiting, count = self._spool.waiting, self._outstanding
             if count >= min(max(window_keyframes, 1), len(waiting)):
                 return None
@@ -282,7 +284,7 @@ class Outbox:
 
     def unclaim(self) -> None:
         """Note that the claimed record was not sent after all."""
-        with self._changed:
+        with self._lock:
             self._claimed = 0
 
     def read(self, entry: Waiting) -> list[memoryview]:
@@ -295,7 +297,7 @@ class Outbox:
 
     def sent(self, entry: Waiting, sent_ns: int) -> bool:
         """Note that the claimed record is on its way; whether it is the only one."""
-        with self._changed:
+        with self._lock:
             self._outstanding += 1
             self._perhaps_sent = max(self._perhaps_sent, entry.seq)
             self._claimed = 0
@@ -304,7 +306,7 @@ class Outbox:
 
     def rewind(self) -> None:
         """Count nothing as on its way: all that is not acknowledged is sent once more."""
-        with self._changed:
+        with self._lock:
             self._outstanding = 0
 
     # --- at the server ---
@@ -315,7 +317,7 @@ class Outbox:
         Of what a dead scanner left, only a window's worth can have been sent and not be durable yet.
         (Were that server's window larger, one that is dropped now might be in the journal all the same.)
         """
-        with self._changed:
+        with self._lock:
             if not self._welcomed and self._spool.waiting:
                 left = [entry.seq for entry in self._spool.waiting if entry.seq > durable]
                 window = left[: max(window_keyframes, 1)]
@@ -325,7 +327,7 @@ class Outbox:
 
     def is_foreign(self, durable: int) -> bool:
         """Whether the server has records of this session that were never sent from here."""
-        with self._changed:
+        with self._lock:
             return durable > max(self._perhaps_sent, self._used_before)
 
     def acknowledge(
@@ -342,7 +344,7 @@ class Outbox:
         Args:
             offset_ns, bound_ns: the server's clock minus ours, and how wrong that may be.
         """
-        with self._changed:
+        with self._lock:
             dropped = self._spool.drop(durable)
             self._outstanding = max(self._outstanding - len(dropped), 0)
             corrections = len(self._corrections.intersection(dropped))
@@ -370,7 +372,7 @@ class Outbox:
 
     def note_meshed(self, seq: int) -> None:
         """Note that the mesh shows everything up to `seq`."""
-        with self._changed:
+        with self._lock:
             while self._unmeshed and self._unmeshed[0] <= seq:
                 self._unmeshed.popleft()
             self._changed.notify_all()
@@ -382,7 +384,7 @@ class Outbox:
 
         Returns its kind in words, and whether it is the first of this session for that reason.
         """
-        with self._changed:
+        with self._lock:
             is_correction = seq in self._corrections
             counts = self._corrections_refused if is_correction else self._rejected
             is_first = not counts[reason]
@@ -397,12 +399,12 @@ class Outbox:
     @property
     def first_rejection(self) -> str:
         """Why the map did not take the first record that it rejected; empty = it took all."""
-        with self._changed:
+        with self._lock:
             return self._first_rejection
 
     def find_sent(self, seq: int) -> Waiting | None:
         """The record of this number, if it waits and was sent."""
-        with self._changed:
+        with self._lock:
             if seq <= self._perhaps_sent:
                 for entry in self._spool.waiting:
                     if entry.seq >= seq:
@@ -411,7 +413,7 @@ class Outbox:
 
     def refuse(self, entry: Waiting, reason: str, message: str) -> None:
         """Give a record up. What was sent behind it has to be sent again: the server saw a gap there."""
-        with self._changed:
+        with self._lock:
             place = self._spool.waiting.index(entry)
             self._outstanding = min(self._outstanding, place)
             self._spool.remove(place)
@@ -428,24 +430,24 @@ class Outbox:
     @property
     def is_durable(self) -> bool:
         """Whether everything sent is on the server's disk, or was given up."""
-        with self._changed:
+        with self._lock:
             return not self._spool.waiting
 
     @property
     def is_fused(self) -> bool:
         """Whether the map has answered for everything sent."""
-        with self._changed:
+        with self._lock:
             return not self._spool.waiting and not self._unfused
 
     @property
     def is_meshed(self) -> bool:
         """Whether the mesh shows everything sent."""
-        with self._changed:
+        with self._lock:
             return not (self._spool.waiting or self._unfused or self._unmeshed)
 
     def describe_waiting(self) -> str:
         """The records in the spool, counted: `3 keyframes and 1 corrections`."""
-        with self._changed:
+        with self._lock:
             corrections = sum(entry.is_correction for entry in self._spool.waiting)
             keyframes = len(self._spool.waiting) - corrections
         counts = [f"{keyframes} keyframes"] if keyframes or not corrections else []
@@ -453,24 +455,24 @@ class Outbox:
 
     def take_refusals(self) -> str:
         """The records given up since the last call, in words; empty = none."""
-        with self._changed:
+        with self._lock:
             count, self._refusal_count = self._refusal_count, 0
             more = f" (and {count - 1} more)" if count > 1 else ""
             return f"{self._first_refusal}{more}" if count else ""
 
     def times(self) -> list[KeyframeTimes]:
         """When each keyframe passed each stage, oldest first, as far as it is known."""
-        with self._changed:
+        with self._lock:
             return self._times.copy()
 
     def newest_fused(self) -> KeyframeTimes | None:
         """The stamps of the newest keyframe that is in the map; None = none is."""
-        with self._changed:
+        with self._lock:
             return self._times.newest_fused()
 
     def stats(self) -> ClientStats:
         """A copy of the counts."""
-        with self._changed:
+        with self._lock:
             return ClientStats(
                 sent=self._sent,
                 durable=self._durable,
@@ -488,7 +490,7 @@ class Outbox:
 
     def close(self) -> bool:
         """Release the spool; whether that loses what a temporary one still holds."""
-        with self._changed:
+        with self._lock:
             loses = self.is_temporary and bool(self._spool.waiting)
             self._spool.close()
             return loses
