@@ -203,6 +203,9 @@ def test_each_part_of_a_forged_file_is_checked(saved: Path, tmp_path: Path, part
     forge(path, b"".join([whole[:8], _lengthy(altered), struct.pack("<I", length), frame]))
     with memory_limited(256 << 20), pytest.raises(CheckpointError, match=message):
         Volume.load(path)
+    if part in ("blocks", "layers"):  # of the header: before anything is made of it
+        with pytest.raises(CheckpointError, match=message), checkpoint.reading(path):
+            pass
 
 
 def _lengthy(content: bytes) -> bytes:

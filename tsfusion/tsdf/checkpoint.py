@@ -151,6 +151,8 @@ def _read_header(file: BinaryIO, path: Path) -> CheckpointHeader:
         raise CheckpointError(f"{path} is of another version: {error}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise DamagedCheckpoint(f"{path} is malformed: {error}") from error
+    if not set(header.layers) <= set(LAYER_DTYPES):
+        raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
     if not 0 <= header.blocks <= header.config.max_blocks:
         raise DamagedCheckpoint(f"{path} is malformed: it claims {header.blocks} blocks")
     return header
