@@ -220,7 +220,7 @@ def test_a_full_disk_with_room_again(small_disk: Callable[[int], Path]) -> None:
         until(noticed)
         filler.unlink()
         client.wait_fused(timeout=DEADLINE)
-        assert fetch_health(server.address).ready
+        until(lambda: fetch_health(server.address).ready)  # the disk is looked at once a second
         assert fetch_status(server.address).map_hash == map_hash(map(wall, range(sent)))
         assert server.terminate() == 0
 
