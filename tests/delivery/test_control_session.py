@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a client takes from a server's messages, one by one."""
+"""The client's side of the control socket: each message of a server and its effect."""
 
 import time
 from collections.abc import Iterator

@@ -67,7 +67,7 @@ def test_a_hoarder_is_named_by_its_address(
 
 
 def test_a_number_that_is_used_again_makes_nobody_a_hoarder(stack: ExitStack) -> None:
-    """Of what came over a connection, what was read over an earlier one of its number says nothing."""
+    """A connection that gets the file number of an earlier one begins with nothing read."""
     port = Port(stack, socket.AF_INET, "127.0.0.1")
     client, server = port.connect("127.0.0.1")
     port.limits.note_read(server.fileno(), 10 << 20)  # over an earlier one

@@ -128,7 +128,7 @@ class Fuser:
 
 
 def handed_out(backlog: FuserBacklog, wanted: int, **seconds: float) -> list[tuple[str, int]]:
-    """What a fuser is given that takes so many seconds for each of a client's keyframes."""
+    """The order in which keyframes go to a fuser that takes so many seconds for each of a client's."""
     fuser = Fuser(wanted)
     while True:
         backlog.hand_out(cast(FuserSupervisor, fuser))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a map did not take is said to its sender at once, or when it is back; a full map is a problem."""
+"""Rejections are told to their sender at once, or when it is back; a full map is a problem."""
 
 from pathlib import Path
 from typing import cast
@@ -37,7 +37,7 @@ class Map:
         self.told.append(message)
 
     def nacks(self) -> list[tuple[int, str, str]]:
-        """Of every refusal number, stage and reason."""
+        """Number, stage and reason of every refusal that the client was told."""
         return [(one.seq, one.stage, one.reason) for one in self.told if isinstance(one, Nack)]
 
     def reject(self, reason: str, message: str = "") -> None:

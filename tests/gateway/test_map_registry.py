@@ -71,7 +71,7 @@ def test_a_record_of_nobody_or_a_bad_one_makes_no_map(served: Served, tmp_path: 
 
 
 def test_a_map_that_is_being_opened_takes_nothing(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What its checkpoint holds is not known yet: a keyframe that it has could count twice."""
+    """The checkpoint's content is not known yet: a keyframe that it has could count twice."""
     with (
         connected(sockets.dealer, served.addresses.control) as link,
         connected(sockets.push, served.addresses.data) as push,

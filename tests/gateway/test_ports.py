@@ -101,7 +101,7 @@ def test_frames_too_many_cost_nobody_else_a_connection(served: Served, surplus: 
 
 
 def test_connections_that_say_nothing_give_way(served: Served) -> None:
-    """Those that have not even sent a greeting, the oldest first; a client's connections stay."""
+    """Connections without a greeting go, the oldest first; a client's connections stay."""
     served.gateway.ports.connections.most = 60
     with contextlib.ExitStack() as stack:
         push = stack.enter_context(connected(sockets.push, served.addresses.data))
@@ -141,7 +141,7 @@ def test_who_fills_the_memory_is_cut_off_alone(served: Served, monkeypatch: pyte
 
 
 def test_the_number_of_a_connection_that_ended_may_be_another_files() -> None:
-    """What was read over the one before hides no more than the next one brought; others are not cut off."""
+    """A new connection's bytes are counted from its own beginning; others are not cut off."""
     connections = Connections(1 << 30)
     here, there = socket.socketpair()
     with here, there:
