@@ -475,6 +475,29 @@ def test_the_last_words_of_a_dead_fuser_are_not_heard(start: Start, monkeypatch:
         late.close(linger=0)
 
 
+def test_an_answer_is_of_the_moment_at_which_it_was_given(start: Start, tmp_path: Path) -> None:
+    """A map that is idle now was not, when its fuser answered before it fused the last keyframe."""
+    go, said = tmp_path / "go", tmp_path / "said"
+    wait = f"while not os.path.exists({str(go)!r}): time.sleep(0.001)"
+    answer = f"""if message.index == 4:
+                {wait}
+                say(fuser_messages.FuserReply(7))"""
+    end = f"""    if isinstance(message, fuser_messages.Fuse) and message.index == 4:
+        open({str(said)!r}, "w").close()
+"""
+    gateway = start(fusing(answer) + end)
+    stepped(gateway, lambda: default(gateway).keyframes_fused == 4)
+    (hosted,) = gateway.maps
+    go.touch()
+    until(said.exists)
+    until(lambda: hosted.fuser.socket.poll(10) > 0)
+    ((reply, _),) = hosted.step()
+    assert isinstance(reply, fuser_messages.FuserReply)
+    assert not hosted.drained
+    assert hosted.step() == []
+    stepped(gateway, lambda: hosted.drained)
+
+
 def test_orders_that_find_no_room_are_given_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go = tmp_path / "go"  # it reads nothing before
     monkeypatch.setattr(fuser_process, "COMMAND", fuser_running(_SLOW.replace("GO", repr(str(go)))))

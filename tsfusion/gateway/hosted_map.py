@@ -183,6 +183,8 @@ class HostedMap:
                 for_people.append((message, frames))
             elif isinstance(message, fuser_messages.FuserReply):
                 for_people.append((message, frames))
+                if not ended:
+                    break  # it is passed on before what was fused after it is counted
         if ended and not self.fuser.finishing:
             self.disk.look()
             if not self.disk.is_away:  # another one would find an empty map
