@@ -30,9 +30,8 @@ def peak_rss_bytes() -> int:
 
 def rss_bytes() -> int:
     """Resident memory of this process now, bytes; 0 where the system does not tell."""
-    with suppress(OSError):
-        pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
-        return int(pages) * resource.getpagesize()
+    with suppress(OSError), open("/proc/self/statm", "rb") as file:  # by far quicker than a Path
+        return int(file.read().split()[1]) * resource.getpagesize()
     return 0
 
 
@@ -63,10 +62,9 @@ def state(pid: int) -> str:
 
     R = runs, S = sleeps, D = waits for a disk and cannot even be killed, T and t = stopped.
     """
-    with suppress(OSError, IndexError):
+    with suppress(OSError, IndexError), open(f"/proc/{pid}/stat", "rb") as file:
         # Not at the first bracket: the name before the state may hold one.
-        stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-        return stat.rpartition(")")[2].split()[0]
+        return file.read().rpartition(b")")[2].split()[0].decode()
     return ""
 
 

@@ -8,6 +8,7 @@ and how long it is silent. Elsewhere than on Linux nothing is found, and the mem
 import os
 import resource
 import socket
+import stat
 import struct
 import time
 from collections import Counter
@@ -106,13 +107,16 @@ class Connections:
         return found
 
     def _all(self) -> Iterator[Connection]:
-        for name in _files():
-            with suppress(OSError), _shared(int(name)) as link:
-                state, silent_ms, received = _TCP_INFO.unpack(
-                    link.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size)
-                )
-                if state != _TCP_LISTEN and self._is_ours(link):
-                    yield Connection(int(name), link.getsockname()[1], silent_ms, received)
+        for fd in map(int, _files()):
+            with suppress(OSError):
+                if not stat.S_ISSOCK(os.fstat(fd).st_mode):
+                    continue
+                with _shared(fd) as link:
+                    state, silent_ms, received = _TCP_INFO.unpack(
+                        link.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO.size)
+                    )
+                    if state != _TCP_LISTEN and self._is_ours(link):
+                        yield Connection(fd, link.getsockname()[1], silent_ms, received)
 
     def cut(self, fd: int) -> bool:
         """Cut a connection off; False when it is none (any more)."""

@@ -5,7 +5,7 @@ import time
 
 from tsfusion.core import process
 
-_INTERVAL = 0.1  # seconds between two looks
+_INTERVAL = 0.25  # seconds between two looks
 _LONGEST_STEP = 1.0  # seconds that one look counts: what is beyond them, the gateway itself stood still
 
 
