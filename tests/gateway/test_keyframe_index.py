@@ -216,6 +216,25 @@ def test_accounts_of_clients_are_bounded(monkeypatch: pytest.MonkeyPatch) -> Non
     assert len(time._accounts) == 8
 
 
+def test_who_comes_anew_each_time_does_not_go_before_who_was_there() -> None:
+    """Without keys a session counts as a client, and each of these sends one costly keyframe."""
+    time = FuserTime()
+    waiting = ["scanner"]
+    seconds = {"scanner": 0.01}
+    served: list[str] = []
+    for index in range(60):
+        if index % 3 == 0:  # as fast as one is served
+            waiting = [name for name in waiting if name != "scanner"]
+            waiting.append("scanner")
+        waiting.append(f"stranger {index}")
+        name = time.next_of(waiting)
+        waiting.remove(name)
+        time.charge(name, index)
+        time.settle(index, seconds.get(name, 1.0))
+        served.append(name)
+    assert [at for at, name in enumerate(served) if name == "scanner"] == list(range(0, 60, 3))
+
+
 def test_delays_are_published_with_their_bound() -> None:
     delays = DelayStatistics()
     assert (delays.summary().count, delays.bound_ms) == (0, 0.0)

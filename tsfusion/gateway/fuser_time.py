@@ -3,7 +3,8 @@
 
 Start-time fair queueing (Goyal, Vin and Cheng 1996), in seconds: a record is charged to its client with what
 it is expected to take, and, when the fuser has answered, with what it took. A client that was away has saved
-nothing up: it begins where the one that was served last began.
+nothing up: it begins where the one that was served last began. A new one begins later by the longest of the
+last records: without keys each session counts as a client, and who opens many must not go before all others.
 """
 
 from collections import OrderedDict
@@ -12,7 +13,7 @@ from collections.abc import Iterable
 from msgspec import Struct
 
 _AHEAD = 0.1  # seconds of work that the fuser may have in its queue: whoever comes next waits so long
-_FADING = 0.8  # of what a client's records are expected to take, each time that one took less
+_FADING = 0.8  # of what records are expected to take, each time that one took less
 _MAX_CLIENTS = 4096
 
 
@@ -28,10 +29,15 @@ class FuserTime:
         self._accounts: OrderedDict[str, _Account] = OrderedDict()
         self._charged: dict[int, tuple[str, float]] = {}  # index of a record under way → client, seconds
         self._now = 0.0  # what the client that was served last had taken before
+        self._longest = 0.0  # seconds that one of the last records took
 
     def next_of(self, clients: Iterable[str]) -> str:
-        """The client that took least; of equals the first."""
-        return min(clients, key=lambda name: max(self._account(name).taken, self._now))
+        """The client that took least; of equals the one whose record is expected to take least."""
+        return min(clients, key=self._place_of)
+
+    def _place_of(self, client: str) -> tuple[float, float]:
+        account = self._account(client)
+        return max(account.taken, self._now), account.expected
 
     def has_room_for(self, client: str) -> bool:
         """Whether a record of a client may wait in the fuser's queue."""
@@ -52,6 +58,7 @@ class FuserTime:
             account = self._account(client)
             account.taken += seconds - charged
             account.expected = max(seconds, _FADING * account.expected)
+            self._longest = max(seconds, _FADING * self._longest)
 
     def restart(self) -> None:
         """Forget what was under way: the fuser has ended. It stays charged."""
@@ -60,7 +67,7 @@ class FuserTime:
     def _account(self, client: str) -> _Account:
         account = self._accounts.get(client)
         if account is None:
-            account = self._accounts[client] = _Account(self._now)
+            account = self._accounts[client] = _Account(self._now + self._longest)
             if len(self._accounts) > _MAX_CLIENTS:
                 self._accounts.popitem(last=False)
         self._accounts.move_to_end(client)
