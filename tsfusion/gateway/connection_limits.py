@@ -14,6 +14,7 @@ from tsfusion.wire import sockets
 log = logging.getLogger(__name__)
 
 _CUT_HELPS_WITHIN = 1.0  # seconds: more memory after that is a new attack
+_UNNOTICED = 4  # one part in so many of the memory is for what comes in until it is noticed
 
 
 class ConnectionLimits:
@@ -28,7 +29,7 @@ class ConnectionLimits:
         self._ports = ports
         self._access = access
         self._refused = refused
-        self._memory = MemoryGuard(memory_bytes)
+        self._memory = MemoryGuard(memory_bytes - memory_bytes // _UNNOTICED)
         self._hoarders_cut = -_CUT_HELPS_WITHIN  # time.monotonic()
 
     def step(self) -> None:
@@ -75,7 +76,7 @@ class ConnectionLimits:
         if not held or self._cut_hoarders(held):
             return False
         log.error(
-            "the gateway holds %d MB, more than memory_bytes: every connection is made anew", held >> 20
+            "the gateway holds %d MB, too near to memory_bytes: every connection is made anew", held >> 20
         )
         self._refused["memory"] += 1
         return True
@@ -90,7 +91,7 @@ class ConnectionLimits:
             self._hoarders_cut = now
             self._refused["memory"] += 1
             log.warning(
-                "the gateway holds %d MB, more than memory_bytes: the connection from %s, with %.1f MB of "
+                "the gateway holds %d MB, too near to memory_bytes: the connection from %s, with %.1f MB of "
                 "messages that are not whole, is cut off",
                 held >> 20,
                 peer,

@@ -50,7 +50,7 @@ class Connections:
 
     def __init__(self, memory_bytes: int) -> None:
         files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-        self.most = min(_MOST, files // 2, max(memory_bytes // 2 // _BYTES_EACH, 1))
+        self.most = min(_MOST, files // 2, max(memory_bytes // 4 // _BYTES_EACH, 1))
         self._ports: Collection[int] = ()
         self._viewers_port = 0
         self._next_look = self._next_full_look = 0.0  # time.monotonic()
