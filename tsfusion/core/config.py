@@ -218,7 +218,7 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     journal_bytes: Bytes | None = None  # per map; the oldest keyframes are deleted first; None = keep all
     min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left free on the disk; keyframes wait for that
     quarantine_bytes: Bytes = 256 << 20  # per map; keyframes that could not be fused, the newest ones
-    memory_bytes: Bytes = 512 << 20  # of the gateway; with more, all connections are dropped and made anew
+    memory_bytes: Bytes = 512 << 20  # of the gateway; near it, connections are cut off, then all of them
     fuser_memory_bytes: Annotated[int, Meta(ge=1 << 28)] | None = (
         None  # of each fuser; None = three quarters of the machine's
     )
@@ -227,8 +227,8 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     quota_keyframes: Positive = 1000.0  # a second, of each client
     quota_points: Annotated[int, Meta(ge=1)] = 8 << 20  # points or pixels a keyframe
     # What the rays of a keyframe may cost, in voxels that they cross; five times those of a ray away from the
-    # one before it. Ten times what the densest sensors need, two seconds of one core
-    quota_cost: Annotated[int, Meta(ge=1)] = 100_000_000
+    # one before it. Six times what the densest recordings need, a second and a half of one core
+    quota_cost: Annotated[int, Meta(ge=1)] = 50_000_000
     quota_map: Annotated[float, Meta(gt=0, le=1)] = 0.75  # share of a map's room for each client with a key
     quota_extent: Positive = 100_000.0  # metres from the map's origin to a sensor
     log_format: LogFormat = "text"  # on stderr: lines of text, or one JSON object a line
