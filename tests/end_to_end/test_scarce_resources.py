@@ -1,20 +1,27 @@
 # SPDX-License-Identifier: MIT
 """Servers and clients without file descriptors, without room on the disk, without files they had."""
 
+import os
 import resource
+import subprocess
+import sys
 import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import zmq
-from clients_and_spools import NOBODY, QUICK, deliver, send_all
+from clients_and_spools import NOBODY, QUICK, deliver, joined, send_all
 from command_processes import alive
 from keyframes_and_servers import DEADLINE, Server, connected, map_hash, serving, until, wall
+from scripted_server import scripted
 
 from tsfusion import Client, Volume, VolumeConfig
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import InvalidKeyframe, KeyframeRefused
 from tsfusion.datasets import Synthetic
+from tsfusion.delivery import sender
 from tsfusion.delivery.spool import Spool
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.messages import Command
@@ -42,6 +49,93 @@ def test_a_server_out_of_file_descriptors_lives(tmp_path: Path) -> None:
         client.send(wall(1))
         client.wait_fused(timeout=DEADLINE)
         assert server.terminate() == 0
+
+
+@contextmanager
+def files_numbered_from(first: int) -> Iterator[tuple[Callable[[], None], Callable[[], None]]]:
+    """Give new files such numbers; of the two functions the one lets none be opened, the other any."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+
+    def allow(count: int) -> None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (count, hard))
+
+    held = [os.dup(0)]
+    while held[-1] < first - 1:
+        held.append(os.dup(0))
+    try:
+        yield lambda: allow(first), lambda: allow(soft)
+    finally:
+        allow(soft)
+        for one in held:
+            os.close(one)
+
+
+def test_a_client_out_of_file_descriptors_waits_for_some(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sender, "_LEAST_SILENCE", 0.5)
+    with files_numbered_from(64) as (take_rest, give_back), scripted() as server, joined(server) as client:
+        deliver(client, map(wall, range(3)))
+        take_rest()
+        server.deaf = True  # the client makes its connections anew
+        until(lambda: "cannot open a socket: Too many open files" in client.problem)
+        assert send_all(client, range(3, 5)) == [3, 4]
+        give_back()
+        server.deaf = False
+        client.flush(DEADLINE)
+        assert (client.problem, server.numbers) == ("", [*range(5)])
+
+
+_FEW_FILES = """
+import os, resource, signal, sys, zmq
+from tsfusion import Client
+from tsfusion.core.errors import JournalError, TransportError
+from tsfusion.wire import sockets
+from tsfusion.wire.connection import Connection
+
+def leave(free):
+    resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))
+    held = []
+    try:
+        while True:
+            held.append(os.dup(0))
+    except OSError:
+        for one in held[:free]:
+            os.close(one)
+
+def client(free):
+    leave(free)
+    Client("tcp://127.0.0.1:1", spool=sys.argv[1]).close()
+
+def connection(free):
+    context = zmq.Context()
+    context.socket(zmq.PAIR).close()
+    leave(free)
+    try:
+        Connection(context, sockets.push, "tcp://127.0.0.1:1", None).close()
+    finally:
+        context.term()
+
+for work, most in ((client, 24), (connection, 6)):
+    for free in range(most):
+        if not (child := os.fork()):
+            signal.alarm(5)
+            try:
+                work(free)
+                print("made", flush=True)
+            except (TransportError, JournalError, zmq.ZMQError) as error:
+                print(error, flush=True)
+            os._exit(0)
+        if status := os.waitpid(child, 0)[1]:
+            print(f"{work.__name__}, {free} left: status {status}", flush=True)
+"""
+
+
+def test_too_few_file_descriptors_are_a_clear_error(tmp_path: Path) -> None:
+    """Where libzmq gets too few for its threads, it ends the process: that must not come about."""
+    command = [sys.executable, "-c", _FEW_FILES, str(tmp_path / "spool")]
+    said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=DEADLINE).stdout
+    assert [line for line in said.splitlines() if line != "made" and "Too many open files" not in line] == []
+    assert said.count("cannot open a socket") > 3
+    assert said.endswith("made\n")
 
 
 def test_a_client_survives_the_loss_of_its_spool_files(shared: Server, tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ class LinkState(Struct, frozen=True):
     # --- the transport ---
 
     def unreachable(self, why: str) -> "LinkState":
-        """The state when no connection can be made and no server ever answered."""
+        """The state when no connection can be made: no server ever answered, or no socket opens."""
         return LinkState("connecting", why)
 
     def reachable(self, problem: str) -> "LinkState":

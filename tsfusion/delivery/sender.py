@@ -11,7 +11,7 @@ import logging
 import socket
 import threading
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 from typing import Any
 
 import zmq
@@ -34,11 +34,16 @@ _MAX_READS = 6
 _MAX_READS_AWAY = 120  # the folder may come back
 _LEAST_SILENCE = 2.0  # seconds; a server answers each ping, two a second, and never waits
 _FAREWELL_MS = 100  # for the last message to leave
+_SOCKET_INTERVAL = 0.5  # seconds until a socket that could not be opened is tried again
 _SCARCE = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # what others of this machine will give back
 
 
 class Sender:
-    """Owns the sockets; `run` is the thread's body."""
+    """Owns the sockets; `run` is the thread's body.
+
+    Raises:
+        OSError: when too few files can be opened.
+    """
 
     def __init__(
         self, address: str, control: str, outbox: Outbox, config: ClientConfig, keys: ClientKeys | None = None
@@ -55,11 +60,13 @@ class Sender:
         self._silence = Patience(max(config.stall_timeout, _LEAST_SILENCE))
         self._stall = Patience(config.stall_timeout)
         self._stopping = threading.Event()
+        sockets.check_context()
         self._waker, self._woken = socket.socketpair()
         self._waker.setblocking(False)
         self._woken.setblocking(False)
         self._ahead = config.backlog if config.policy == "drop_oldest" else None
         self.finds_nobody = False  # nobody listens at the control address, as far as is known; for any thread
+        self._no_socket = ""  # why none could be opened at the last failure
         self._blocked = False  # the data socket takes no more for now
         self._unread = 0  # times that the next record could not be read
         self._read_due = 0.0
@@ -81,19 +88,40 @@ class Sender:
 
     def run(self) -> None:
         """Exchange messages with the server until stopped."""
-        context: zmq.Context[Any] = zmq.Context()
-        self._control = Connection(context, sockets.dealer, self._control_address, self._keys)
-        self._data = Connection(context, sockets.push, self._data_address, self._keys)
         try:
+            while not self._stopping.is_set():
+                try:
+                    self._exchange()
+                except (OSError, zmq.ZMQError) as error:
+                    if error.errno not in _SCARCE:
+                        raise
+                    self._wait_for_files(str(error.strerror))
+        finally:
+            self._waker.close()
+            self._woken.close()
+
+    def _exchange(self) -> None:
+        sockets.check_context()
+        with (
+            zmq.Context() as context,
+            closing(Connection(context, sockets.dealer, self._control_address, self._keys)) as control,
+            closing(Connection(context, sockets.push, self._data_address, self._keys)) as data,
+        ):
+            self._control, self._data = control, data
+            self._outbox.change_link_state(self._outbox.link_state.reachable(self._no_socket))
             while not self._stopping.is_set():
                 self._step()
             self._control_session.take_leave()
-        finally:
-            self._control.close(_FAREWELL_MS)
-            self._data.close()
-            self._waker.close()
-            self._woken.close()
-            context.term()
+            control.close(_FAREWELL_MS)
+
+    def _wait_for_files(self, reason: str) -> None:
+        """Say that no socket can be opened, and pause; what is not acknowledged is sent again then."""
+        self._no_socket = f"cannot open a socket: {reason}; it is tried again, and keyframes wait for it"
+        if self._outbox.change_link_state(self._outbox.link_state.unreachable(self._no_socket)):
+            log.error("%s", self._no_socket)
+        self._control_session.greet_again()
+        self._control_session.rewind()
+        self._stopping.wait(_SOCKET_INTERVAL)
 
     def _step(self) -> None:
         for _ in range(64):

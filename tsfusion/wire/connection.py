@@ -21,6 +21,9 @@ class Connection:
 
     Args:
         make: `sockets.push` or `sockets.dealer`.
+
+    Raises:
+        zmq.ZMQError: when no socket can be opened, here and where one is replaced: close it then.
     """
 
     def __init__(
@@ -43,7 +46,11 @@ class Connection:
 
     def _open(self) -> None:
         self.socket = self._make(self._context, self._keys)
-        self._monitor = ConnectionMonitor(self.socket, self.address, self._keys)
+        try:
+            self._monitor = ConnectionMonitor(self.socket, self.address, self._keys)
+        except zmq.ZMQError:
+            self.socket.close()
+            raise
         self._cuts = 0  # connections that ended, and that were made after one
         sockets.connect(self.socket, self.address, named_ipv6=self._named_ipv6)
 

@@ -5,8 +5,10 @@ No ZeroMQ heartbeats: a full PULL stops reading them and drops live connections 
 socket lingers: keyframes that must survive are in the spool.
 """
 
+import os
 import re
 import socket
+from contextlib import ExitStack
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from typing import Any
 
@@ -44,6 +46,7 @@ _CONNECTING: dict[int, int] = {
     zmq.TCP_KEEPALIVE_INTVL: 1,
     zmq.TCP_KEEPALIVE_CNT: 3,
 }
+_CONTEXT_FILES = 8  # that libzmq opens for a context, and a few for others
 _RANDOM_PORT_TRIES = 32
 LAST_PORT = 65535
 _MAPS_TOPIC = re.compile(rf"mesh/({MAP_NAME}/?)?".encode())  # or its beginning
@@ -61,6 +64,13 @@ class Addresses(Struct, frozen=True):
     data: str
     control: str
     publish: str  # mesh updates
+
+
+def check_context() -> None:
+    """Raise OSError when too few files can be opened for a context; libzmq would end this process then."""
+    with ExitStack() as tried:
+        for _ in range(_CONTEXT_FILES):
+            tried.enter_context(open(os.devnull))
 
 
 def push(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySocket:
