@@ -177,7 +177,7 @@ def test_a_client_that_floods_is_kept_out_for_a_while(tmp_path: Path) -> None:
 def test_a_scanner_whose_key_a_flood_came_with_goes_on_by_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing that it has is lost meanwhile, though its standing connections are not heard either."""
+    """Nothing that it has is lost meanwhile, and it says why nothing of the server is heard."""
     monkeypatch.setattr(access_control, "KEPT_OUT", 3.0)
     given = secured(tmp_path / "keys")
     with (
@@ -193,5 +193,6 @@ def test_a_scanner_whose_key_a_flood_came_with_goes_on_by_itself(
         push.send_multipart([b""] * 3000)
         served.until(lambda: served.gateway.health().refused.get("frames"))
         client.send(wall(2))
+        served.until(lambda: "it keeps this client out for a minute" in client.problem)
         served.until(lambda: served.durable == 2)
         assert client.stats.refused == {}

@@ -207,6 +207,16 @@ def test_who_is_not_let_in_is_told_why(
         assert not at.control
 
 
+def test_who_is_kept_out_for_a_while_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """ZeroMQ does not tell the client: it looks like a server that is stuck, or has another key."""
+    with door(allowed={}) as at:
+        monkeypatch.setattr(at.zap, "_why_not", lambda _: "kept out")
+        with closing(Caller(sockets.dealer, at.addresses.control, ROBOT)) as robot:
+            until(lambda: bool(robot.heard()))
+            assert "it keeps this client out for a minute (its log says why)" in str(robot.said)
+            assert (robot.monitor.refused, robot.monitor.gave_up) == (False, False)
+
+
 def test_keys_for_a_server_without_are_told_so() -> None:
     with (
         door(None, guarded=False) as at,

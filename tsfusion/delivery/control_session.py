@@ -142,9 +142,9 @@ class ControlSession:
         elif not self.last_heard:
             self._outbox.change_link_state(self._outbox.link_state.unreachable(problem))
 
-    def on_silence(self) -> None:
-        """Note that no message of the server came for too long."""
-        if self._outbox.change_link_state(self._outbox.link_state.silent()):
+    def on_silence(self, why: str = "") -> None:
+        """Note that no message of the server came for too long, and why no connection stands."""
+        if self._outbox.change_link_state(self._outbox.link_state.silent(why)):
             self._note_loss("is silent")
 
     def on_cut(self) -> None:

@@ -60,9 +60,10 @@ class LinkState(Struct, frozen=True):
         """The state after a refused handshake."""
         return LinkState("locked_out", why)
 
-    def silent(self) -> "LinkState":
-        """The state when no message of the server came for too long."""
-        return LinkState("silent") if self.is_connected or self.kind == "opening" else self
+    def silent(self, why: str = "") -> "LinkState":
+        """The state when no message of the server came for too long; empty = the connection stands."""
+        is_so = self.is_connected or self.kind in ("opening", "silent")
+        return LinkState("silent", why) if is_so else self
 
     # --- the server's messages ---
 

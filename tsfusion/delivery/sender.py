@@ -170,7 +170,7 @@ class Sender:
     def _watch_for_stall(self, now: float) -> None:
         session = self._control_session
         if now - session.last_heard > self._config.stall_timeout:
-            session.on_silence()
+            session.on_silence(self._control.problem)
         if self._control.is_made and self._silence.has_ended(
             now, since=self._control.made_at, sign=session.last_heard
         ):

@@ -8,6 +8,7 @@ Measured with libzmq 4.3.5:
 |---|---|
 | the server does not know the key, or it was revoked | HANDSHAKE_FAILED_AUTH, and no further try, ever |
 | only one side has keys | HANDSHAKE_FAILED_NO_DETAIL a few times, then .._PROTOCOL, and no further try |
+| the server keeps this client out for a while | as another key, or a frozen server |
 | another server key than the server's | HANDSHAKE_FAILED_NO_DETAIL, again and again |
 | nobody listens behind a tunnel | HANDSHAKE_FAILED_NO_DETAIL, again and again |
 | a frozen server | HANDSHAKE_FAILED_NO_DETAIL after HANDSHAKE_IVL, again and again |
@@ -39,6 +40,7 @@ _MISMATCH = 0x11000002  # ZMQ_PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
 _REFUSAL_S = 1.0  # a server that closes the connection later than this has not refused it, but is stuck
 _MIN_FAILURES = 2  # one may be a server that ends
 _RETRY_S = 0.5  # libzmq reports at once when it is going to try again
+_KEEPS_OUT = "it keeps this client out for a minute (its log says why)"
 _numbers = itertools.count()
 
 
@@ -130,14 +132,16 @@ class ConnectionMonitor:
 
     def _handshake_failed(self) -> str | None:
         if time.monotonic() - self._connected_at > _REFUSAL_S:
-            return f"the server at {self.address} takes the connection, but says nothing"
+            stuck = f"the server at {self.address} takes the connection, but says nothing"
+            return f"{stuck}: it is stuck, or {_KEEPS_OUT}" if self._key else stuck
         self._failures += 1
         if self._failures < _MIN_FAILURES:
             return None
         if self._key:
             return (
                 f"{self.address} ends the connection before the keys are agreed on: the server's key is not "
-                "the one given (`tsfusion keys list` shows it there), or nobody listens behind a tunnel"
+                f"the one given (`tsfusion keys list` shows it there), {_KEEPS_OUT}, "
+                "or nobody listens behind a tunnel"
             )
         return (
             f"{self.address} ends the connection at once: nobody listens behind a tunnel, or the server asks "
