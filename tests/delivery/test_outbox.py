@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: MIT
 """The records of a client and what became of each: what may be dropped, and what counts once."""
 
-import signal
-import threading
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from keyframes_and_servers import DEADLINE, wall
+from interrupts import is_free_after_interrupts
+from keyframes_and_servers import wall
 
 from tsfusion.delivery import outbox as outbox_module
 from tsfusion.delivery.outbox import Outbox
@@ -80,35 +78,6 @@ def test_credit_is_bytes_as_well_as_keyframes(outbox: Outbox) -> None:
     assert outbox.claim(0, 0) is not None  # one is always allowed
 
 
-class _Interrupt(BaseException):
-    """Raised by a signal, at any place."""
-
-
 def test_an_interrupt_leaves_it_free_for_others(outbox: Outbox) -> None:
     """Ctrl-C may come when the lock is just taken: the sending thread must not wait for it for ever."""
-    armed, over = threading.Event(), threading.Event()
-
-    def interrupt(*_: object) -> None:
-        if armed.is_set():
-            armed.clear()
-            raise _Interrupt
-
-    def bother(main: int) -> None:
-        while not over.wait(2e-4):
-            signal.pthread_kill(main, signal.SIGUSR1)
-
-    before = signal.signal(signal.SIGUSR1, interrupt)
-    bothering = threading.Thread(target=bother, args=[threading.get_ident()])
-    bothering.start()
-    for _ in range(200):
-        with suppress(_Interrupt):
-            armed.set()
-            while True:
-                assert outbox.keyframes_waiting == 3
-    over.set()
-    bothering.join()
-    signal.signal(signal.SIGUSR1, before)
-    other = threading.Thread(target=lambda: outbox.keyframes_waiting, daemon=True)
-    other.start()
-    other.join(DEADLINE / 6)
-    assert not other.is_alive()
+    assert is_free_after_interrupts(lambda: outbox.keyframes_waiting)

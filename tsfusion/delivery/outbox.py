@@ -5,7 +5,6 @@ Every method locks by itself and gives out copies, so callers cannot hold the lo
 `write`, `read` and `tidy` use the disk and are outside the lock.
 """
 
-import threading
 import time
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable
@@ -14,6 +13,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from tsfusion.core import process
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.delivery.link_state import LinkState
 from tsfusion.delivery.spool import Spool, Waiting
@@ -75,9 +75,7 @@ class Outbox:
     """The spool, the fate of what passed through it, and the state of the link. For any thread."""
 
     def __init__(self, spool: Spool, clock: Callable[[], float] = time.monotonic) -> None:
-        # The condition's own `with` may be left by Ctrl-C with the lock taken: it is written in Python.
-        self._lock = threading.RLock()
-        self._changed = threading.Condition(self._lock)
+        self._lock, self._changed = process.condition()
         self._spool = spool
         self.clock = clock  # seconds, of the rates
         self._rate = TakingRate()

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from command_processes import python
+from interrupts import is_free_after_interrupts
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, SourceError
@@ -21,7 +22,7 @@ from tsfusion.geometry.calibration import Rectifier
 from tsfusion.geometry.calibration_files import read_rig
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.scanner.sources.source import Source
-from tsfusion.scanner.sources.stereo_video import StereoVideo
+from tsfusion.scanner.sources.stereo_video import CameraThread, StereoVideo
 
 H, W = 48, 64
 CAMERA = Intrinsics(60.0, 60.0, 31.5, 23.5)
@@ -262,3 +263,25 @@ def no_thread_is_left() -> Iterator[None]:
     while any(thread.name == "camera" for thread in threading.enumerate()):
         assert time.monotonic() < deadline, "a camera's thread is left"
         time.sleep(0.05)
+
+
+class SlowCamera:
+    """A camera that shows nothing yet."""
+
+    def grab(self) -> bool:
+        time.sleep(0.01)
+        return True
+
+    def retrieve(self) -> tuple[bool, None]:
+        return False, None
+
+    def release(self) -> None:
+        pass
+
+
+def test_an_interrupt_leaves_the_camera_free_to_end() -> None:
+    """Ctrl-C may come when the lock is just taken: the camera's thread must not wait for it for ever."""
+    thread = CameraThread(SlowCamera())
+    assert is_free_after_interrupts(lambda: thread.newest(0.0))
+    thread.close()
+    assert not thread._thread.is_alive()

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core import process
 from tsfusion.core.errors import InvalidConfig, SourceError
 from tsfusion.geometry.calibration import Size
 from tsfusion.geometry.frame import Frame
@@ -167,20 +168,21 @@ class CameraThread:
         self.ended = False  # the camera has stopped
         self._capture = capture
         self._newest: VideoPicture | None = None
-        self._changed, self._closed = threading.Condition(), False
+        self._lock, self._changed = process.condition()
+        self._closed = False
         self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
         self._thread.start()
 
     def newest(self, timeout: float) -> VideoPicture | None:
         """Remove and return the newest picture; None if there is none in time."""
-        with self._changed:
+        with self._lock:
             self._changed.wait_for(lambda: self._newest or self.ended or self._closed, timeout)
             picture, self._newest = self._newest, None
             return picture
 
     def close(self) -> None:
         """Stop the thread, which releases the camera: while it reads, no other thread may."""
-        with self._changed:
+        with self._lock:
             self._closed = True
             self._changed.notify_all()
         self._thread.join(_JOIN_S)
@@ -195,13 +197,13 @@ class CameraThread:
         except cv2.error as error:
             log.warning("a camera's picture cannot be read: %s", error)
         finally:
-            with self._changed:
+            with self._lock:
                 self.ended = True
                 self._changed.notify_all()
             self._capture.release()
 
     def _put(self, picture: VideoPicture) -> None:
-        with self._changed:
+        with self._lock:
             self.dropped += self._newest is not None
             self._newest = picture
             self._changed.notify_all()
