@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The records of a client and what became of each: what may be dropped, and what counts once."""
 
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +11,8 @@ from keyframes_and_servers import wall
 
 from tsfusion.delivery import outbox as outbox_module
 from tsfusion.delivery.outbox import Outbox
-from tsfusion.delivery.spool import Spool
+from tsfusion.delivery.spool import Spool, Waiting
+from tsfusion.journal import Position
 from tsfusion.wire import codec
 
 
@@ -68,6 +70,29 @@ def test_a_rejection_counts_once_and_few_are_remembered(
     for seq in range(2, 9):
         outbox.reject(seq, "crash")
     assert list(outbox._rejected_seqs) == [7, 8]
+
+
+def test_what_the_map_has_not_answered_takes_no_room(tmp_path: Path) -> None:
+    """The map may stand for a night: the client goes on, and knows of each keyframe in the end."""
+    spool = Spool(tmp_path, 1 << 20)
+    outbox, count = Outbox(spool), 20_000
+    numbers = [seq for seq in range(1, count + 1) if seq % 5000]  # some were refused
+    tracemalloc.start()
+    for seq in numbers:
+        spool.add(Waiting(seq, Position(1, 0), 100))
+        outbox.acknowledge(seq, 0)
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert held < 2 * count  # bytes; a queue of their numbers takes 8 to 40 for each
+    assert (outbox.behind, outbox.is_fused) == (len(numbers), False)
+    outbox.reject(7, "memory")
+    outbox.acknowledge(count, 12_345)
+    assert (outbox.behind, outbox.stats().fused) == (count - 12_345 - 2, 12_345 - 2 - 1)
+    outbox.acknowledge(count, count)
+    assert (outbox.behind, outbox.is_fused, outbox.is_meshed) == (0, True, False)
+    outbox.note_meshed(count - 1)
+    assert outbox.is_meshed
+    outbox.close()
 
 
 def test_credit_is_bytes_as_well_as_keyframes(outbox: Outbox) -> None:

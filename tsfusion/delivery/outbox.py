@@ -7,7 +7,7 @@ Every method locks by itself and gives out copies, so callers cannot hold the lo
 
 import time
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from msgspec import Struct
@@ -21,7 +21,7 @@ from tsfusion.delivery.timing import KeyframeTimesTable, TakingRate
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.wire.keyframe_times import KeyframeTimes, Stamps
 
-_MOST_REMEMBERED = 65536  # numbers: of rejected keyframes, and of fused ones that no mesh shows yet
+_MOST_REMEMBERED = 65536  # numbers of rejected keyframes
 _CHECK_INTERVAL = 0.5  # seconds between two calls of what `wait` was given to check
 
 
@@ -71,6 +71,34 @@ class Lag(Struct, frozen=True):
         return self.keyframes / self.rate if self.rate else 0.0
 
 
+class NumberRuns:
+    """Rising numbers in a queue, kept as runs without a gap: however many, they take the room of a few."""
+
+    def __init__(self) -> None:
+        self._runs: deque[range] = deque()
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def append(self, number: int) -> None:
+        """Put a number behind the others."""
+        follows = bool(self._runs) and self._runs[-1].stop == number
+        first = self._runs.pop().start if follows else number
+        self._runs.append(range(first, number + 1))
+        self._count += 1
+
+    def take(self, most: int) -> Iterator[int]:
+        """Remove the numbers up to `most`, and yield them."""
+        while self._runs and self._runs[0].start <= most:
+            run = self._runs.popleft()
+            taken = range(run.start, min(run.stop, most + 1))
+            if taken.stop < run.stop:
+                self._runs.appendleft(range(taken.stop, run.stop))
+            self._count -= len(taken)
+            yield from taken
+
+
 class Outbox:
     """The spool, the fate of what passed through it, and the state of the link. For any thread."""
 
@@ -88,8 +116,8 @@ class Outbox:
         self.state = "ok"  # of the spool, as in `ClientStats`; set by the one thread that writes to it
         self.spool_problem = ""  # why the spool cannot keep what comes; empty = it can
         self._outstanding = 0  # of the oldest in the spool, so many are on their way
-        self._unfused: deque[int] = deque()  # durable, and not answered by the map
-        self._unmeshed: deque[int] = deque(maxlen=_MOST_REMEMBERED)
+        self._unfused = NumberRuns()  # durable, and not answered by the map
+        self._last_fused = self._last_meshed = 0  # numbers
         self._skipped: Counter[str] = Counter()
         self._times = KeyframeTimesTable()
         self._sent = self._durable = self._fused = 0
@@ -348,16 +376,16 @@ class Outbox:
             corrections = len(self._corrections.intersection(dropped))
             self._corrections_durable += corrections
             self._durable += len(dropped) - corrections
-            self._unfused.extend(dropped)
+            for seq in dropped:
+                self._unfused.append(seq)
             taken = 0
-            while self._unfused and self._unfused[0] <= fused:
-                seq = self._unfused.popleft()
+            for seq in self._unfused.take(fused):
+                self._last_fused = seq
                 if seq in self._corrections:
                     self._corrections.remove(seq)
                 else:
                     taken += 1
                     self._fused += seq not in self._rejected_seqs
-                self._unmeshed.append(seq)
             if taken:
                 self._rate.note(self.clock(), taken, is_more_waiting=self.behind > 0)
             for one in stamps:
@@ -371,8 +399,7 @@ class Outbox:
     def note_meshed(self, seq: int) -> None:
         """Note that the mesh shows everything up to `seq`."""
         with self._lock:
-            while self._unmeshed and self._unmeshed[0] <= seq:
-                self._unmeshed.popleft()
+            self._last_meshed = max(self._last_meshed, seq)
             self._changed.notify_all()
 
     # --- turned away ---
@@ -441,7 +468,7 @@ class Outbox:
     def is_meshed(self) -> bool:
         """Whether the mesh shows everything sent."""
         with self._lock:
-            return not (self._spool.waiting or self._unfused or self._unmeshed)
+            return self.is_fused and self._last_fused <= self._last_meshed
 
     def describe_waiting(self) -> str:
         """The records in the spool, counted: `3 keyframes and 1 corrections`."""
