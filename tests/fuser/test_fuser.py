@@ -650,25 +650,13 @@ def test_a_disk_that_refuses_a_checkpoint_is_said(tmp_path: Path, monkeypatch: p
 
 
 def test_a_checkpoint_is_on_the_disk_before_it_has_its_name_and_then_the_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, disk_calls: list[str]
 ) -> None:
     written = MapCheckpoints(tmp_path, VOLUME, keep_previous=True)
     assert written.save()
-    happened: list[str] = []
-    sync, rename = os.fsync, os.replace
-
-    def synced(descriptor: int) -> None:
-        happened.append(f"sync {Path(os.readlink(f'/proc/self/fd/{descriptor}')).name}")
-        sync(descriptor)
-
-    def renamed(old: Path, new: Path) -> None:
-        happened.append(f"{Path(old).name} > {Path(new).name}")
-        rename(old, new)
-
-    monkeypatch.setattr(os, "fsync", synced)
-    monkeypatch.setattr(os, "replace", renamed)
+    disk_calls.clear()
     assert written.save()
-    assert happened == [
+    assert disk_calls == [
         *("sync .map.new.tsf.partial", ".map.new.tsf.partial > map.new.tsf", f"sync {tmp_path.name}"),
         *("map.tsf > map.previous.tsf", "map.new.tsf > map.tsf", f"sync {tmp_path.name}"),
     ]
