@@ -258,7 +258,7 @@ class Client:
         if not done:
             waiting = self._outbox.describe_waiting()
             kept = "" if self._outbox.is_temporary else f"; they stay in {self._outbox.spool_folder}"
-            raise FlushTimeout(f"{waiting} are not acknowledged after {timeout:g} s: {self._why()}{kept}")
+            raise FlushTimeout(f"{waiting} not acknowledged after {timeout:g} s: {self._why()}{kept}")
 
     def wait_fused(self, timeout: float = 60.0) -> None:
         """Wait until the map has taken or rejected everything sent (`stats.rejected` counts the latter).
@@ -327,7 +327,7 @@ class Client:
             self._thread.join()
             waiting = self._outbox.describe_waiting()
             if self._outbox.close():
-                log.error("%s are lost: not acknowledged, and the spool was temporary", waiting)
+                log.error("%s lost: not acknowledged, and the spool was temporary", waiting)
 
     def __enter__(self) -> "Client":
         return self

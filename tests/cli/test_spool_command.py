@@ -75,7 +75,7 @@ def test_what_an_older_version_left_joins_no_map_by_itself(server: Server, here:
     left("old", map="old")
     refused = here("spool", "send", "--connect", server.address)
     assert refused.returncode == 1
-    assert "map old has 1 keyframes of another session" in refused.stderr
+    assert "map old has 1 keyframe of another session" in refused.stderr
     assert here("spool", "send", "--connect", server.address, "--same-frame").returncode == 0
 
 

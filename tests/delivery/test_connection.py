@@ -155,7 +155,7 @@ def test_an_unknown_key_is_told_and_let_in_when_it_is_known(
         client.send(wall())
         with pytest.raises(NotAllowed, match=r"does not know this client's key .* run `tsfusion keys allow"):
             client.connect(DEADLINE)  # at once
-        with pytest.raises(FlushTimeout, match=r"1 keyframes are not acknowledged .* does not know this"):
+        with pytest.raises(FlushTimeout, match=r"1 keyframe not acknowledged .* does not know this"):
             client.flush(0.1)
         keyed.allowed[other.public] = "other"
         client.flush(DEADLINE)

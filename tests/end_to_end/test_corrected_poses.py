@@ -223,7 +223,7 @@ def test_a_server_that_dies_before_it_answers(tmp_path: Path, writes: bool) -> N
             assert len(journaled_corrections(state)) == writes
             client.correct({seqs[1]: pose(3)})
             client.send(wall(3))
-            with pytest.raises(FlushTimeout, match="1 keyframes and 2 corrections are not acknowledged"):
+            with pytest.raises(FlushTimeout, match="1 keyframe and 2 corrections not acknowledged"):
                 client.flush(0.1)
             assert client.stats.corrections_acknowledged == 0
             with serving(state, listen=address):

@@ -103,7 +103,7 @@ def test_a_killed_server_loses_nothing_acknowledged(tmp_path: Path, offline_hash
             early.connect(timeout=0.1)
         early.send(wall(0))
         with pytest.raises(
-            FlushTimeout, match=r"1 keyframes are not acknowledged after 0\.1 s: no server answers"
+            FlushTimeout, match=r"1 keyframe not acknowledged after 0\.1 s: no server answers"
         ):
             early.flush(timeout=0.1)
     with (

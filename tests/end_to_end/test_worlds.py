@@ -19,7 +19,7 @@ from tsfusion.wire import codec, messages, sockets
 from tsfusion.wire.queries import fetch_health, fetch_new_map
 from tsfusion.wire.record_header import unpack
 
-REFUSED = r"map {} has [0-9]+ keyframes of another session, .*: use --map \S+ or --map auto, or --same-frame"
+REFUSED = r"map {} has [0-9]+ keyframes? of another session, .*: use --map \S+ or --map auto, or --same-frame"
 
 
 @pytest.fixture(scope="module")

@@ -387,7 +387,7 @@ def test_segments_that_vanish_are_named_and_the_map_is_saved_at_once(start: Star
     segment.rename(tmp_path / "aside")
     stepped(gateway, (tmp_path / "saved").exists)
     (problem,) = gateway.health().problems
-    assert "map default: 1 segments of its journal are gone, first 000001.mcap" in problem
+    assert "map default: 1 segment of its journal is gone, first 000001.mcap" in problem
     (tmp_path / "aside").rename(segment)
     stepped(gateway, lambda: not gateway.health().problems)
 
@@ -416,9 +416,7 @@ def test_a_gap_in_the_journal_is_said_from_the_start(start: Start, tmp_path: Pat
     journal.segment_path(journal_folder(tmp_path), 2).unlink()
     gateway = start(fusing("pass"))
     stepped(gateway, lambda: gateway.maps.warm)
-    assert (
-        "map default: 1 segments of its journal were not there at the start" in gateway.health().problems[0]
-    )
+    assert "map default: 1 segment of its journal was not there at the start" in gateway.health().problems[0]
 
 
 def test_a_checkpoint_that_cannot_be_written_is_a_problem_and_tried_again(
@@ -454,7 +452,7 @@ def test_a_journal_that_ends_before_its_checkpoint_is_said(
     ready = "fuser_messages.Ready({bytes(16): fuser_messages.SessionProgress(9, '')})"
     gateway = start(fusing("pass").replace("fuser_messages.Ready({})", ready))
     stepped(gateway, lambda: gateway.maps.warm)
-    assert "its checkpoint holds keyframes of 1 sessions that its journal" in caplog.text
+    assert "its checkpoint holds keyframes of 1 session that its journal" in caplog.text
 
 
 def test_the_last_words_of_a_dead_fuser_are_not_heard(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:

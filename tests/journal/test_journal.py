@@ -87,7 +87,7 @@ def test_closed_segments_open_in_mcap_tools(tmp_path: Path) -> None:
     ("at", "value", "message"),
     [
         (500, 4, "keyframe 3 of session 00000000 is damaged"),
-        (5, 255, "nothing can be read here; 1 keyframes are lost"),
+        (5, 255, "nothing can be read here; 1 keyframe is lost"),
     ],
     ids=["a bit", "the length"],
 )

@@ -24,12 +24,12 @@ STATS = ClientStats(
         ({"rejected": {"no_samples": 5}}, ""),
         (
             {"waiting": 3},
-            "3 keyframes are not at the server (no server answers): they wait in SPOOL; check",
+            "3 keyframes are not at the server (no server answers), but in SPOOL; check",
         ),
         ({"refused": {"quota": 2}}, "2 keyframes will never be at the server (2 × quota)"),
         (
             {"skipped": {"disk": 1}},
-            "1 keyframes will never be at the server (1 × disk): the disk",
+            "1 keyframe will never be at the server (1 × disk): the disk",
         ),
         ({"rejected": {"no_samples": 6}}, "the map took 4 of 10 keyframes only: all too far"),
     ],

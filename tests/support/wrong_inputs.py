@@ -204,7 +204,7 @@ serve --max-range 0.01 | got 0.01 m | max_range must be larger than min_range
 {scan} synthetic:room --spool s | --spool has no effect | without --connect
 {scan} synthetic:room --voxel-size 0.0001 | too small here | use 0.005 or more
 {scan} tum --connect {nobody} --spool file | cannot write the spool folder | choose another
-{scan} synthetic:room --option count=2 --connect {nobody} | keyframes are not at the server (no server answers | they wait in tsfusion-spool
+{scan} synthetic:room --option count=2 --connect {nobody} | not at the server (no server answers | but in tsfusion-spool
 {scan} synthetic:corridor --option count=12 --connect {nobody} | of 12 frames were localised | move more slowly
 {scan} scenes_blank --connect {nobody} | not localised in any of 2 frames | check the camera
 {scan} camera:0 --rate 2 | --rate is for recordings | leave it out
@@ -283,19 +283,19 @@ replay tum --out full | full holds files already (file) | name a new folder
 scan tum --out full | full holds files already (file) | name a new folder
 # worlds and spools
 scan tum --same-frame | --same-frame has no effect | without --connect
-scan tum --connect {server} | has 1 keyframes of another session, in another coordinate frame | or --same-frame
-replay tum --connect {server} | has 1 keyframes of another session | or --map auto
+scan tum --connect {server} | has 1 keyframe of another session, in another coordinate frame | or --same-frame
+replay tum --connect {server} | has 1 keyframe of another session | or --map auto
 scan tum --connect {server} --map auto | no room for another map: 1 are open | with a larger max_maps
 replay tum --connect {server} --map other --config quick.toml | 1 are open | use one of them
 replay tum --connect {nobody} --map auto | no server answered | is the port right?
 spool list --spool missing | missing is no folder | expected the one that a scan had as --spool
 spool send --spool missing | missing is no folder | expected the one that a scan had as --spool
 spool send other --spool left | no keyframes wait in a spool other of left | spools there: default
-spool send --spool left --connect {nobody} --config quick.toml | 1 keyframes did not get through | is `tsfusion serve` running at
+spool send --spool left --connect {nobody} --config quick.toml | 1 keyframe did not get through | is `tsfusion serve` running at
 spool send --spool left --connect {server} | in another coordinate frame | or --same-frame
 spool send default --map "My Map" --spool left --connect {server} | got 'My Map' | 1 to 32 of a-z
 spool send default --map auto --spool left --connect {server} | no room for another map | with a larger max_maps
-spool drop default --spool left | 1 keyframes for the map default in left/default would be deleted | say --yes
+spool drop default --spool left | 1 keyframe for the map default in left/default would be deleted | say --yes
 spool drop other --spool left | no keyframes wait in a spool other | spools there: default
 """
 

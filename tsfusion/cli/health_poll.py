@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
+from tsfusion.core.counts import count_of
 from tsfusion.core.errors import ServerUnreachable, TransportError
 from tsfusion.wire.health import Health, MapHealth, Status
 from tsfusion.wire.queries import CommandRefused, fetch_health, fetch_status
@@ -38,8 +39,8 @@ class ServerSnapshot(Struct, frozen=True, kw_only=True):
         if self.missing:
             found.append(f"no map {self.missing} is open here, but {', '.join(self.health.maps) or 'none'}")
         for name, seconds in self.stalled.items():
-            waiting = self.health.maps[name].waiting
-            found.append(f"map {name}: {waiting} keyframes wait, and none was fused for {seconds:.0f} s")
+            waiting = count_of(self.health.maps[name].waiting, "keyframe waits", "keyframes wait")
+            found.append(f"map {name}: {waiting}, and none was fused for {seconds:.0f} s")
         if not self.health.ready and not found:
             found.append("not ready")
         return found

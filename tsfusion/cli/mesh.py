@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tsfusion.cli import options
+from tsfusion.core.counts import count_of
 
 if TYPE_CHECKING:
     from tsfusion.core.config import VolumeConfig
@@ -130,7 +131,7 @@ def _fuse(recording: "JournalRecording", volume: "Volume", quiet: bool) -> "Volu
                 left_out[str(error)] += 1
             display.update(index, volume.keyframes, len(recording))
     for reason, count in left_out.items():
-        typer.echo(f"left out {count} keyframes: {reason}", err=True)
+        typer.echo(f"left out {count_of(count, 'keyframe')}: {reason}", err=True)
     return volume
 
 

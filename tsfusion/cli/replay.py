@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tsfusion.cli import options
+from tsfusion.core.counts import count_of
 
 if TYPE_CHECKING:
     from tsfusion.datasets import Dataset
@@ -69,7 +70,7 @@ def replay(
     if start or stride > 1 or max_frames is not None:
         dataset = select(dataset, start=start, stride=stride, limit=max_frames)
     for reason, count in dataset.skipped.items():
-        typer.echo(f"left out {count} frames {reason}", err=True)
+        typer.echo(f"left out {count_of(count, 'frame')} {reason}", err=True)
     wrong = _warn_of_disagreement(dataset) if check_ and not _is_synthetic(path) else None
     client = options.client_settings(
         chosen, connect, control=control, map=map_, key=key, server_key=server_key

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from tsfusion.cli.output import counted, grouped, size
+from tsfusion.core.counts import count_of
 from tsfusion.wire.messages import SKIP_REASONS
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
     if result.left:
         why = f" ({result.link})" if result.link else ""
         lines.append(
-            f"spool      {result.left} keyframes are not acknowledged{why}: "
+            f"spool      {count_of(result.left, 'keyframe is', 'keyframes are')} not acknowledged{why}: "
             f"`tsfusion spool send --spool {spool}` or the next scan sends them"
         )
     lines.append(_results(result.folder))

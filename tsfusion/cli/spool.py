@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tsfusion.cli import options, verbs
+from tsfusion.core.counts import count_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -117,7 +118,11 @@ def send(
     if not chosen:
         typer.echo(f"no keyframes wait in {spool}", err=True)
     if reasons:
-        kept = f"{left} keyframes did not get through and stay where they are"
+        kept = count_of(
+            left,
+            "keyframe did not get through and stays where it is",
+            "keyframes did not get through and stay where they are",
+        )
         raise TransportError(f"{kept}: {'; '.join(reasons)}")
 
 
@@ -200,7 +205,7 @@ def drop(
 
     (left,) = _choose(spool, [name])
     keyframes, _, _ = left.count()
-    what = f"{keyframes} keyframes for the map {left.map} in {left.folder}"
+    what = f"{count_of(keyframes, 'keyframe')} for the map {left.map} in {left.folder}"
     if not yes:
         if not sys.stdin.isatty():
             raise InvalidConfig(f"{what} would be deleted: say --yes")

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable
 
+from tsfusion.core.counts import count_of
 from tsfusion.core.errors import DecodeError
 from tsfusion.delivery.link_state import LinkState
 from tsfusion.delivery.outbox import Outbox
@@ -164,8 +165,8 @@ class ControlSession:
     def _note_answer(self) -> None:
         if self._is_lost and self._outbox.link_state.is_connected:
             self._is_lost = False
-            waiting = self._outbox.keyframes_waiting
-            log.info("the server at %s answers again; %d keyframes wait for it", self._address, waiting)
+            waiting = count_of(self._outbox.keyframes_waiting, "keyframe waits", "keyframes wait")
+            log.info("the server at %s answers again; %s for it", self._address, waiting)
 
     # --- messages of the server ---
 

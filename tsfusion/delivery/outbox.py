@@ -14,6 +14,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from tsfusion.core import process
+from tsfusion.core.counts import count_of
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.delivery.link_state import LinkState
 from tsfusion.delivery.spool import Spool, Waiting
@@ -471,12 +472,12 @@ class Outbox:
             return self.is_fused and self._last_fused <= self._last_meshed
 
     def describe_waiting(self) -> str:
-        """The records in the spool, counted: `3 keyframes and 1 corrections`."""
+        """The records in the spool, counted: `3 keyframes and 1 correction`."""
         with self._lock:
             corrections = sum(entry.is_correction for entry in self._spool.waiting)
             keyframes = len(self._spool.waiting) - corrections
-        counts = [f"{keyframes} keyframes"] if keyframes or not corrections else []
-        return " and ".join([*counts, *([f"{corrections} corrections"] if corrections else [])])
+        counts = [count_of(keyframes, "keyframe")] if keyframes or not corrections else []
+        return " and ".join([*counts, *([count_of(corrections, "correction")] if corrections else [])])
 
     def take_refusals(self) -> str:
         """The records given up since the last call, in words; empty = none."""

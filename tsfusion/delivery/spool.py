@@ -19,6 +19,7 @@ from msgspec import Struct
 
 from tsfusion import journal
 from tsfusion.core.config import DEFAULT_MAP
+from tsfusion.core.counts import count_of
 from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import MISSING, DecodeError, JournalError
 from tsfusion.core.folder_lock import lock_folder
@@ -139,7 +140,7 @@ class Spool:
 
     def _take_over(self, left: RecordHeader, world: str | None, *, elsewhere: bool) -> None:
         """Go on with what a dead scanner left, or raise JournalError when that must not be."""
-        held = f"{self.folder} holds {len(self.waiting)} keyframes"
+        held = f"{self.folder} holds {count_of(len(self.waiting), 'keyframe')}"
         if left.map != self.map_name and not elsewhere:
             raise JournalError(
                 f"{held} for the map {left.map}, not for {self.map_name}: send them first "
@@ -270,7 +271,8 @@ class Spool:
             self._journal.close()
         except JournalError as error:
             if self.waiting and self.is_away:
-                log.error("%d records are not in the spool any more: %s", len(self.waiting), error)
+                lost = count_of(len(self.waiting), "record is", "records are")
+                log.error("%s not in the spool any more: %s", lost, error)
             else:  # the last file lacks only its index
                 log.warning("%s", error)
         if self.temporary:

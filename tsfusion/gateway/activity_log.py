@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 
 from tsfusion.core import logs
+from tsfusion.core.counts import count_of
 from tsfusion.gateway.client_routes import ABANDONED_AFTER
 from tsfusion.wire.health import ClientHealth, Health, MapHealth
 from tsfusion.wire.messages import SKIP_REASONS
@@ -64,10 +65,10 @@ class ActivityLog:
         if any(lines):
             clients = sum(one.state == "connected" for one in health.clients)
             log.info(
-                "in %.0f s: %s; %d clients connected, gateway %.0f MB",
+                "in %.0f s: %s; %s connected, gateway %.0f MB",
                 seconds,
                 "; ".join(filter(None, lines)),
-                clients,
+                count_of(clients, "client"),
                 health.rss_bytes / 1e6,
             )
 
@@ -82,14 +83,14 @@ def _progress(name: str, one: MapHealth, before: MapHealth, seconds: float) -> s
     took = f", delay p50 {delay.p50:.0f} ms, p95 {delay.p95:.0f} ms" if delay.count else ""
     saved = ", checkpoint written" if one.checkpoints > before.checkpoints else ""
     return (
-        f"map {name}: {received} keyframes received, {fused} fused ({fused / seconds:.1f}/s){took}, "
-        f"{one.waiting} wait, {one.map_bytes / 1e6:.0f} MB{saved}"
+        f"map {name}: {count_of(received, 'keyframe')} received, {fused} fused ({fused / seconds:.1f}/s)"
+        f"{took}, {one.waiting} wait, {one.map_bytes / 1e6:.0f} MB{saved}"
     )
 
 
 def _balance(one: ClientHealth) -> str:
     """The fates of a client's keyframes."""
-    words = [f"{one.durable} keyframes received, {one.fused} of them in the map"]
+    words = [f"{count_of(one.durable, 'keyframe')} received, {one.fused} of them in the map"]
     counts = {"rejected by it": one.rejected, "refused": one.refused, "still in its spool": one.waiting}
     words += [f"{count} {what}" for what, count in counts.items() if count]
     if one.skipped:

@@ -6,6 +6,7 @@ import time
 from collections import Counter
 
 from tsfusion.core import logs
+from tsfusion.core.counts import count_of
 from tsfusion.gateway.access_control import AccessControl
 from tsfusion.gateway.memory_guard import MemoryGuard
 from tsfusion.gateway.ports import Flood, Ports
@@ -36,7 +37,8 @@ class ConnectionLimits:
         """Cut off some connections where there are too many, and what only says it is a viewer."""
         if surplus := self._ports.connections.step():
             self._refused["connection"] += surplus
-            log.warning("%d connections are cut off: there are too many, or viewers send messages", surplus)
+            cut = count_of(surplus, "connection is", "connections are")
+            log.warning("%s cut off: there are too many, or viewers send messages", cut)
 
     def on_flood(self, socket: sockets.AnySocket, flood: Flood) -> bool:
         """Cut off who sent a message of frames without end, and with it, where that takes long, its port.

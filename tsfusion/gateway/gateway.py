@@ -15,6 +15,7 @@ import zmq
 
 from tsfusion.core import logs, process
 from tsfusion.core.config import ServerConfig
+from tsfusion.core.counts import count_of
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway import fuser_queries
@@ -331,8 +332,8 @@ class Gateway:
         found += (one for one in self.maps.problems() if one.map in shown)
         of_clients = [one for route in self._routes if route.map in shown and (one := route.problem)]
         if len(of_clients) > _CLIENT_PROBLEMS:
-            rest = len(of_clients) - _CLIENT_PROBLEMS
-            of_clients[_CLIENT_PROBLEMS:] = [Problem(f"{rest} more clients have problems of this kind")]
+            rest = count_of(len(of_clients) - _CLIENT_PROBLEMS, "more client has", "more clients have")
+            of_clients[_CLIENT_PROBLEMS:] = [Problem(f"{rest} problems of this kind")]
         return found + of_clients
 
 

@@ -12,6 +12,7 @@ import zmq
 
 from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.core.counts import count_of
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.client_routes import ClientRoutes
@@ -240,9 +241,9 @@ class HostedMap:
         shorter = [key for key, done in ready.done.items() if self.sessions.progress(key)[0] < done.seq]
         if shorter and self._journal.first == 1:
             log.warning(
-                "its checkpoint holds keyframes of %d sessions that its journal %s lacks: was the journal "
+                "its checkpoint holds keyframes of %s that its journal %s lacks: was the journal "
                 "deleted, or is its disk not mounted? The map cannot be built again from it",
-                len(shorter),
+                count_of(len(shorter), "session"),
                 self._journal.folder,
                 extra=logs.about(map=self.name),
             )
@@ -253,7 +254,7 @@ class HostedMap:
         if not ready.done and not waiting:
             return "a new map is open"
         rest = f"; {waiting} more are fused from its journal" if waiting else ""
-        return f"the map is open, with {ready.keyframes} keyframes{rest}"
+        return f"the map is open, with {count_of(ready.keyframes, 'keyframe')}{rest}"
 
     def _check_checkpoint(self, ready: fuser_messages.Ready) -> None:
         """Report keyframes that are neither in a checkpoint nor in the journal."""
@@ -290,16 +291,19 @@ class HostedMap:
     def notices(self) -> list[str]:
         """What a person should know of, though keyframes are taken and will be fused."""
         damaged, put_back = self._journal.damaged, self._journal.put_back
-        notices = [f"{damaged} keyframes of its journal are damaged and lost"] if damaged else []
+        lost = count_of(damaged, "keyframe of its journal is", "keyframes of its journal are")
+        notices = [f"{lost} damaged and lost"] if damaged else []
         if absent := self._journal.absent:
-            notices.append(f"{absent} segments of its journal were not there at the start: {_FOR_GONE}")
+            gone = count_of(absent, "segment of its journal was", "segments of its journal were")
+            notices.append(f"{gone} not there at the start: {_FOR_GONE}")
         if missing := self._journal.missing:
             first = f"{missing[0]:06d}.mcap"
-            notices.append(f"{len(missing)} segments of its journal are gone, first {first}: {_FOR_GONE}")
+            gone = count_of(len(missing), "segment of its journal is", "segments of its journal are")
+            notices.append(f"{gone} gone, first {first}: {_FOR_GONE}")
         if put_back:
             notices.append(
-                f"its journal was taken away while it was written to, {put_back} times, and was put back "
-                "with every keyframe: find out who deletes or moves files there"
+                f"its journal was taken away while it was written to, {count_of(put_back, 'time')}, and was "
+                "put back with every keyframe: find out who deletes or moves files there"
             )
         if self._unsaved:
             notices.append(f"no checkpoint can be written: {self._unsaved}")

@@ -13,6 +13,7 @@ import zmq
 
 from tsfusion.core import logs
 from tsfusion.core.config import DEFAULT_MAP, MAP_NAME_LENGTH, ServerConfig, VolumeConfig
+from tsfusion.core.counts import count_of
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
@@ -150,8 +151,8 @@ class MapRegistry:
         """
         if hosted.sessions.shares_frame(record.session, record):
             return None
-        keyframes = hosted.health().keyframes_durable
-        why = f"map {hosted.name} has {keyframes} keyframes of another session, in another coordinate frame"
+        keyframes = count_of(hosted.health().keyframes_durable, "keyframe")
+        why = f"map {hosted.name} has {keyframes} of another session, in another coordinate frame"
         try:
             free = self.free_name(hosted.name, maps)
         except JournalError:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
+from tsfusion.core.counts import count_of
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import mcap_layout, segment_file
 from tsfusion.journal.mcap_layout import Position, Record
@@ -139,7 +140,8 @@ def describe(path: Path, damage: Damage) -> str:
     if damage.torn:
         outcome = "; nothing that was acknowledged is lost"
     else:
-        outcome = f"; {damage.lost} keyframes are lost" if damage.lost else "; no keyframe is lost"
+        lost = count_of(damage.lost, "keyframe is", "keyframes are")
+        outcome = f"; {lost} lost" if damage.lost else "; no keyframe is lost"
     return f"{path}, byte {damage.position.offset}: {damage.what}{outcome}"
 
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from tsfusion.client import ClientStats
 from tsfusion.core import process
 from tsfusion.core.config import ClientConfig, ServerConfig, VolumeConfig
+from tsfusion.core.counts import count_of
 from tsfusion.core.errors import OutputError
 from tsfusion.core.output_folder import results
 from tsfusion.datasets import Dataset
@@ -116,9 +117,9 @@ def _warn_of_keyframes_there(target: Target, *, same_frame: bool) -> None:
     there = target.status(target.link.map).keyframes_durable
     if there and not same_frame:
         log.warning(
-            "the map %s has %d keyframes already, and these are added to them: their poses must be in the "
+            "the map %s has %s already, and these are added to them: their poses must be in the "
             "same coordinate frame (--map NAME names another map, --same-frame says that they are)",
-            target.link.map, there,
+            target.link.map, count_of(there, "keyframe"),
         )  # fmt: skip
 
 

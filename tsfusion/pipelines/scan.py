@@ -16,6 +16,7 @@ import numpy as np
 from tsfusion.client import Client, ClientStats
 from tsfusion.core import process
 from tsfusion.core.config import ClientConfig, ScanConfig, ServerConfig, VolumeConfig
+from tsfusion.core.counts import count_of
 from tsfusion.core.errors import DatasetError, OutputError, SourceError, TsfusionError, WorldRefused
 from tsfusion.core.output_folder import results
 from tsfusion.datasets.cameras import described
@@ -256,7 +257,8 @@ def _refused_worlds(clients: list[Client]) -> list[Exception]:
         try:
             client.check_world()
         except WorldRefused as error:
-            kept = f"{client.stats.waiting} keyframes wait in {client.spool_folder} (`tsfusion spool list`)"
+            waiting = count_of(client.stats.waiting, "keyframe waits", "keyframes wait")
+            kept = f"{waiting} in {client.spool_folder} (`tsfusion spool list`)"
             return [WorldRefused(f"{error}; {kept}")]
     return []
 

@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterable
 
 from tsfusion.client import ClientStats
+from tsfusion.core.counts import count_of
 
 _LOST = ("spool", "disk")  # reasons of skipping that no policy asks for
 
@@ -27,8 +28,8 @@ def of_delivery(stats: ClientStats, *, spool: str | os.PathLike[str], link: str,
     if stats.waiting:
         unnamed = "it is behind" if stats.durable else "no server answers so far"
         return (
-            f"{stats.waiting} keyframes are not at the server ({link or unnamed}): they wait in "
-            f"{spool}; check the address with `tsfusion status --connect`, then "
+            f"{count_of(stats.waiting, 'keyframe is', 'keyframes are')} not at the server "
+            f"({link or unnamed}), but in {spool}; check the address with `tsfusion status --connect`, then "
             f"`tsfusion spool send --spool {spool}`"
         )
     if lost := of_disk(stats):
@@ -83,4 +84,4 @@ def together(shortfalls: Iterable[str]) -> str:
 
 def _never(counts: dict[str, int]) -> str:
     reasons = ", ".join(f"{count} × {reason}" for reason, count in counts.items())
-    return f"{sum(counts.values())} keyframes will never be at the server ({reasons})"
+    return f"{count_of(sum(counts.values()), 'keyframe')} will never be at the server ({reasons})"

@@ -16,6 +16,7 @@ import msgspec
 
 from tsfusion.client import Client
 from tsfusion.core.config import MAP_NAME_LENGTH, ScanConfig
+from tsfusion.core.counts import count_of
 from tsfusion.delivery.outbox import ClientStats
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.keyframe_selection import KeyframeSelector
@@ -210,7 +211,7 @@ class Scanner:
         before = submap.corrections.loops if submap.corrections else 0
         submap.corrections = corrections
         if corrections.loops > before:
-            log.info("a place was seen again: %d loops closed", corrections.loops)
+            log.info("a place was seen again: %s closed", count_of(corrections.loops, "loop"))
         submap.correct()
 
 
