@@ -81,6 +81,19 @@ def test_viewers_that_connect_anew_are_counted_anew(served: Served) -> None:
         assert len(served.gateway._subscriptions) == 0
 
 
+def test_ports_are_served_while_another_cannot_be_bound_again(served: Served) -> None:
+    """Somebody else may take a port in the moment in which it is given back."""
+    with contextlib.closing(socket.create_server(("127.0.0.1", 0))) as thief:
+        served.gateway.ports._addresses["keyframes"] = f"tcp://127.0.0.1:{thief.getsockname()[1]}"
+        served.gateway.ports.renew()
+        with connected(sockets.dealer, served.addresses.control) as client:
+            hello = messages.encode(messages.Hello(bytes(16), messages.PROTOCOL_VERSION))
+            served.until(lambda: client.poll(0) or sent(client, [hello]))
+        assert "cannot listen any more" in served.gateway.health().problems[0]
+        assert not served.gateway.health().ready
+    served.until(lambda: served.gateway.health().ready)
+
+
 @pytest.mark.parametrize("surplus", [500, 5000])
 def test_frames_too_many_cost_nobody_else_a_connection(served: Served, surplus: int) -> None:
     """Only who sends very many is cut off."""

@@ -99,7 +99,7 @@ class Gateway:
         handlers = self._handlers()
         fusers = [hosted.fuser.socket for hosted in self.maps]
         polled = [(socket, zmq.POLLIN) for socket in (*self._access.poll, *fusers, *handlers)]
-        events = dict(zmq.zmq_poll(polled, _TICK_MS if handlers else _RENEW_TICK_MS))
+        events = dict(zmq.zmq_poll(polled, _RENEW_TICK_MS if self.ports.problem else _TICK_MS))
         if not self._drop_connections():
             for socket, handle in handlers.items():
                 if socket in events:
@@ -114,15 +114,14 @@ class Gateway:
         self._snapshot()
 
     def _handlers(self) -> Handlers:
-        """The handler of each socket's messages; none while the sockets are made anew."""
-        if self.ports.problem:
-            return {}
-        handlers: Handlers = {self.ports.control: self._on_control, self.ports.viewers: self._on_subscription}
+        """The handler of each socket's messages; none of a socket that is made anew."""
+        ports = self.ports
+        handlers: Handlers = {ports.control: self._on_control, ports.viewers: self._on_subscription}
         if self._accepting:
-            handlers[self.ports.keyframes] = self._intake.handle
-        elif self._stopped:
-            self.ports.keyframes.close()
-        return handlers
+            handlers[ports.keyframes] = self._intake.handle
+        elif self._stopped and ports.is_served(ports.keyframes):
+            ports.keyframes.close()
+        return {socket: handle for socket, handle in handlers.items() if ports.is_served(socket)}
 
     def _on_flood(self, socket: sockets.AnySocket, flood: Flood) -> None:
         is_viewers = socket is self.ports.viewers

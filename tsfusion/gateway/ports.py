@@ -59,7 +59,7 @@ class Ports:
         self._grants_topics = grants_topics
         self._is_manual = False
         self._addresses: dict[str, str] = {}  # of the sockets, once they are bound
-        self._unbound: list[str] = []  # sockets that are being made anew
+        self._unbound: set[str] = set()  # sockets that are being made anew
         self._next_bind = 0.0
         self.problem = ""  # why nobody can connect; empty = clients can
         self.connections = Connections(server.memory_bytes)
@@ -87,6 +87,10 @@ class Ports:
     def viewers(self) -> sockets.AnySocket:
         """Mesh updates leave here, and subscriptions come in."""
         return self._sockets["viewers"]
+
+    def is_served(self, socket: sockets.AnySocket) -> bool:
+        """Whether a socket of these is not being made anew."""
+        return all(self._sockets[name] is not socket for name in self._unbound)
 
     def bind(self) -> Addresses:
         """Bind the sockets, so that clients can connect.
@@ -144,7 +148,7 @@ class Ports:
         for name, socket in self._sockets.items():
             if only in (None, socket):
                 socket.close()
-                self._unbound.append(name)
+                self._unbound.add(name)
         self.problem = "connections are made anew"
         self.step()
 
@@ -154,17 +158,16 @@ class Ports:
         if not self._unbound or now < self._next_bind:
             return
         self._next_bind = now + _REBIND_INTERVAL
-        try:
-            for name in tuple(dict.fromkeys(self._unbound)):
+        self.problem = ""
+        for name in [one for one in self._sockets if one in self._unbound]:
+            try:
                 if self._sockets[name].closed:
                     self._sockets[name] = self._make(name)
                 if self._addresses:
                     sockets.bind_socket(self._sockets[name], self._addresses[name])
-                self._unbound = [one for one in self._unbound if one != name]
-        except (TransportError, zmq.ZMQError) as error:
-            self.problem = f"cannot listen any more, and will try again: {error}"
-        else:
-            self.problem = ""
+                self._unbound.remove(name)
+            except (TransportError, zmq.ZMQError) as error:
+                self.problem = f"cannot listen any more, and will try again: {error}"
 
     def cut_off(self, frame: zmq.Frame) -> None:
         """End the connection over which a frame came, if it still stands. Others of the same port stay."""
