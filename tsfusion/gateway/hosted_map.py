@@ -109,9 +109,13 @@ class HostedMap:
         """Whether no keyframe waits, nor came since then (`time.monotonic()`)."""
         return self.drained and (self._last_keyframe is None or self._last_keyframe < since)
 
-    def close(self) -> None:
-        """End the fuser and finish the journal. A journal that cannot be finished is logged."""
-        self.fuser.close()
+    def close(self, *, wait: bool = True) -> None:
+        """End the fuser and finish the journal. A journal that cannot be finished is logged.
+
+        Args:
+            wait: until the fuser has ended, for some seconds.
+        """
+        self.fuser.close(wait=wait)
         try:
             self._journal.close()
         except JournalError as error:  # its index only: every keyframe is on the disk
