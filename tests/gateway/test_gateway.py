@@ -284,7 +284,7 @@ def test_a_fuser_that_does_not_die_yet_holds_nobody_up(start: Start, monkeypatch
     gateway = start(fusing("if message.index == 1: time.sleep(3600)"), fuser_timeout=0.3)
     (hosted,) = gateway.maps
     with monkeypatch.context() as patched:
-        patched.setattr(subprocess.Popen, "kill", lambda process: killed.append(process))
+        patched.setattr(subprocess.Popen, "kill", lambda process: killed.extend([process]))
         longest = 0.0
         while not killed:
             began = time.monotonic()

@@ -95,7 +95,7 @@ def test_a_map_that_cannot_be_opened_waits_for_no_process(
     hosted = served.gateway.maps.open_for_client("yard")
     assert hosted is not None
     with monkeypatch.context() as patched:
-        patched.setattr(subprocess.Popen, "kill", lambda process: killed.append(process))
+        patched.setattr(subprocess.Popen, "kill", lambda process: killed.extend([process]))
         began = time.monotonic()
         served.gateway.maps._give_up("yard", JournalError("no such disk"))
         seconds = time.monotonic() - began
