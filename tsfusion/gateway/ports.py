@@ -57,7 +57,7 @@ class Ports:
         self._server = server
         self._keys = keys
         self._grants_topics = grants_topics
-        self._is_manual = False
+        self._is_manual = self._is_mixed_up = False
         self._addresses: dict[str, str] = {}  # of the sockets, once they are bound
         self._unbound: set[str] = set()  # sockets that are being made anew
         self._next_bind = 0.0
@@ -70,7 +70,7 @@ class Ports:
             return sockets.pull(self._context, self._server.max_frame_bytes, keys=self._keys)
         if name == "control":
             return sockets.router(self._context, keys=self._keys)
-        self._is_manual = self._grants_topics()
+        self._is_manual, self._is_mixed_up = self._grants_topics(), False
         return sockets.publisher(self._context, keys=self._keys, manual=self._is_manual)
 
     @property
@@ -114,6 +114,11 @@ class Ports:
         if not self.viewers.closed:
             send_now(self.viewers, [topic, message, *frames])
 
+    @property
+    def grants_topics(self) -> bool:
+        """Whether viewers get only what `grant_topics` says."""
+        return self._is_manual
+
     def grant_topics(self, topics: Iterable[bytes]) -> None:
         """Send these topics' updates to the viewer whose message was received last."""
         for topic in topics if self._is_manual else ():
@@ -124,20 +129,19 @@ class Ports:
         for topic in topics if self._is_manual else ():
             self.viewers.setsockopt(zmq.UNSUBSCRIBE, topic)
 
-    def pass_over_rubbish(self) -> bool:
-        """Pass over what a viewer sent that is no subscription; whether all viewers have to connect anew.
+    def knows_viewer(self, *, after_rubbish: bool = False) -> bool:
+        """Whether topics would be granted to the viewer whose message was received last.
 
-        Where topics are granted, ZeroMQ takes subscriptions that wait behind it for other viewers' than those
-        that sent them.
+        ZeroMQ takes subscriptions that wait behind rubbish for others' than those that sent them, until none
+        waits.
+
+        Args:
+            after_rubbish: the message is no subscription.
         """
-        for _ in range(_MESSAGES_A_STEP if self._is_manual else 0):
-            if not int(self.viewers.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
-                return False
-            if self.viewers.recv_multipart(copy=False)[0].bytes[:1] in (b"\x00", b"\x01"):
-                break
-        if self._is_manual:
-            self.renew(self.viewers)
-        return self._is_manual
+        self._is_mixed_up |= after_rubbish and self._is_manual
+        if self._is_mixed_up and not int(self.viewers.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            self._is_mixed_up = False
+        return not self._is_mixed_up
 
     def renew(self, only: sockets.AnySocket | None = None) -> None:
         """Drop every connection, with all that it holds in memory; `step` listens at the same ports again.
