@@ -34,6 +34,7 @@ log = logging.getLogger(__name__)
 _SEGMENTS_KEPT = 4  # a journal with a limit is deleted in quarters of that limit
 _FOR_GONE = "what no checkpoint holds of them is lost, unless they are put back"
 _SAVE_PAUSE = 10.0  # seconds until a checkpoint is tried again that could not be written
+_LONGEST_WAIT = 0.2  # seconds of a step, for a segment of the journal that is put back
 _STALLED_AFTER = 10.0  # seconds in which keyframes wait and none is fused
 ForPeople = tuple[fuser_messages.Meshed | fuser_messages.FuserReply, Sequence[zmq.Frame]]
 
@@ -349,6 +350,7 @@ def _open_journal(folder: Path, server: ServerConfig, watch: ReadingWatcher) -> 
         folder / state_folder.JOURNAL_FOLDER,
         segment_bytes,
         min_free_bytes=server.min_free_bytes,
+        longest_wait=_LONGEST_WAIT,
         watch=watch,
     )
 
