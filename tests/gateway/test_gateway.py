@@ -227,7 +227,7 @@ def test_a_fuser_that_is_stopped_is_not_the_keyframes_fault(
                     os.kill(os.getpid(), 19)
         """.strip()
     )
-    gateway = start(body, fuser_timeout=0.3)
+    gateway = start(body, fuser_timeout=1.5)
     gateway.accept()
     stepped(gateway, lambda: "is stopped from outside" in default(gateway).problem)
     assert not gateway.health().ready
