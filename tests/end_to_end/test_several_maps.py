@@ -169,6 +169,13 @@ def test_too_many_points_or_too_far_is_refused() -> None:
         Quotas(ServerConfig(quota_extent=100.0)).check(codec.check(frames), frames)
 
 
+def test_a_sensor_that_no_map_knows_is_refused_before_it_is_journaled() -> None:
+    frames = codec.encode(wall(sensor="sonar"), session=bytes(16), seq=1, jpeg_quality=90)
+    with pytest.raises(Refused, match=r"sensor must be one of kinect, .*, got 'sonar'") as refused:
+        Quotas(ServerConfig()).check(codec.check(frames), frames)
+    assert refused.value.reason == "values"
+
+
 def test_quotas_are_of_each_client_and_forget_strangers() -> None:
     quotas = Quotas(ServerConfig(quota_keyframes=10.0, quota_bytes=1 << 20))
     assert [quotas.wait("a", 1000, 0.0) for _ in range(20)] == [0.0] * 20

@@ -10,6 +10,7 @@ import struct
 import subprocess
 import sys
 import zlib
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -119,6 +120,16 @@ def test_keyframes_are_fused_meshed_and_checkpointed(tmp_path: Path) -> None:
     again, link_again = opened(tmp_path)
     assert again.ready().done == {SESSION: messages.SessionProgress(3, "robot")}
     assert status(again, link_again) == status(fuser, link)
+
+
+def test_a_sensor_that_no_map_knows_is_rejected_where_an_older_server_journaled_it(tmp_path: Path) -> None:
+    with closing(Journal(tmp_path / "journal", 1 << 20)) as journal:
+        frames = codec.encode(wall(0, sensor="sonar"), session=SESSION, seq=1, jpeg_quality=90)
+        position = journal.append(frames, session=SESSION, seq=1)
+    fuser, link = opened(tmp_path)
+    fuser.handle(order(0, position))
+    assert (link.last().index, link.last().reason) == (0, "InvalidConfig")
+    assert status(fuser, link).keyframes_rejected == {"InvalidConfig": 1}
 
 
 def test_watchers_get_the_triangles(tmp_path: Path) -> None:

@@ -46,6 +46,21 @@ def test_what_only_writing_shows_is_a_problem_until_something_is_written(
     assert not pause.problem
 
 
+def test_a_problem_is_logged_once_whatever_its_figures(
+    disk: Disk, pause: DiskPause, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The room on a disk that others write to is another one at each look."""
+    for free in ("0.1 MB", "12.7 MB", "3.0 MB"):
+        disk.problem = f"its disk has {free} free, and 268.4 MB must stay so"
+        pause.step()
+        assert pause.problem == disk.problem
+    pause.begin(JournalError("cannot write: Input/output error", errno.EIO))
+    assert [one.getMessage() for one in caplog.records] == [
+        "no keyframes are taken: its disk has 0.1 MB free, and 268.4 MB must stay so",
+        "no keyframes are taken: cannot write: Input/output error",
+    ]
+
+
 def test_what_a_look_shows_is_over_when_the_next_one_shows_nothing(disk: Disk, pause: DiskPause) -> None:
     disk.problem = "its disk has 0.1 MB free"
     pause.step()

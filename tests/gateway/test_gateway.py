@@ -227,7 +227,7 @@ def test_a_fuser_that_is_stopped_is_not_the_keyframes_fault(
                     os.kill(os.getpid(), 19)
         """.strip()
     )
-    gateway = start(body, fuser_timeout=0.3)
+    gateway = start(body, fuser_timeout=1.5)
     gateway.accept()
     stepped(gateway, lambda: "is stopped from outside" in default(gateway).problem)
     assert not gateway.health().ready
@@ -275,6 +275,27 @@ def test_a_death_between_keyframes_is_nobodys_fault(start: Start, tmp_path: Path
 
 def test_a_fuser_that_hangs_at_a_keyframe_is_replaced(start: Start) -> None:
     health = default(drained(start(fusing("if message.index == 1: time.sleep(3600)"), fuser_timeout=0.3)))
+    assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (2, {"crash": 1}, 4)
+
+
+def test_a_fuser_that_does_not_die_yet_holds_nobody_up(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A killed process that waits for a disk ends when the disk answers: no other may begin before that."""
+    killed: list[subprocess.Popen[bytes]] = []
+    gateway = start(fusing("if message.index == 1: time.sleep(3600)"), fuser_timeout=0.3)
+    (hosted,) = gateway.maps
+    with monkeypatch.context() as patched:
+        patched.setattr(subprocess.Popen, "kill", lambda process: killed.extend([process]))
+        longest = 0.0
+        while not killed:
+            began = time.monotonic()
+            gateway.step()
+            longest = max(longest, time.monotonic() - began)
+        gateway.step()
+        fuser = killed[0]
+        assert (fuser.pid, fuser.poll(), default(gateway).fuser_restarts) == (hosted.fuser.pid, None, 0)
+    fuser.kill()
+    assert longest < 3.0  # a step waits 0.1 s for messages
+    health = default(drained(gateway))
     assert (health.fuser_restarts, health.rejected, health.keyframes_fused) == (2, {"crash": 1}, 4)
 
 

@@ -3,6 +3,7 @@
 
 import errno
 import os
+import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any, cast
 import pytest
 import zmq
 from failures import refuse
-from keyframes_and_servers import connected
+from keyframes_and_servers import connected, until
 from served_gateway import Served, record, serving_here
 
 from tsfusion.core.config import ServerConfig
@@ -84,6 +85,24 @@ def test_a_map_that_is_being_opened_takes_nothing(served: Served, monkeypatch: p
         assert served.durable == 0
         push.send_multipart(record(1))
         served.until(lambda: served.durable == 1)
+
+
+def test_a_map_that_cannot_be_opened_waits_for_no_process(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A killed fuser that waits for a disk ends when the disk answers, and is reaped then."""
+    killed: list[subprocess.Popen[bytes]] = []
+    hosted = served.gateway.maps.open_for_client("yard")
+    assert hosted is not None
+    with monkeypatch.context() as patched:
+        patched.setattr(subprocess.Popen, "kill", lambda process: killed.extend([process]))
+        began = time.monotonic()
+        served.gateway.maps._give_up("yard", JournalError("no such disk"))
+        seconds = time.monotonic() - began
+    (fuser,) = killed
+    fuser.kill()
+    until(lambda: fuser.returncode is not None)  # nobody asks for it here
+    assert seconds < 3.0
 
 
 def test_who_is_held_off_is_turned_away_whatever_it_sends(served: Served) -> None:

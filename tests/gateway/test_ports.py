@@ -6,6 +6,7 @@ import os
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zmq
@@ -16,7 +17,8 @@ from served_gateway import Served, record, serving_here
 from tsfusion import Client
 from tsfusion.gateway import access_control
 from tsfusion.gateway.connections import Connection, Connections
-from tsfusion.wire import messages, sockets
+from tsfusion.wire import key_folder, messages, sockets
+from tsfusion.wire.curve import ClientKeys, client_keys
 
 FRAMES = 300_000  # of a hostile message: read one by one they take half a second
 
@@ -42,6 +44,15 @@ def sent(link: sockets.AnySocket, frames: list[bytes]) -> None:
     """Send a message if there is a connection; what is on its way when that ends is lost."""
     with contextlib.suppress(zmq.Again):
         link.send_multipart(frames, zmq.NOBLOCK)
+
+
+def xsub(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> sockets.AnySocket:
+    """A viewer's socket that sends whatever it is given."""
+    made: sockets.AnySocket = context.socket(zmq.XSUB)
+    made.setsockopt(zmq.LINGER, 0)
+    if keys:
+        keys.secure(made)
+    return made
 
 
 PORTS = {"data": b"PUSH", "control": b"DEALER", "publish": b"SUB"}
@@ -79,6 +90,19 @@ def test_viewers_that_connect_anew_are_counted_anew(served: Served) -> None:
         stranger.sendall(b"\x01\x00" * (FRAMES - 1) + b"\x00\x00")
         served.until(lambda: served.gateway.health().refused.get("frames"))
         assert len(served.gateway._subscriptions) == 0
+
+
+def test_ports_are_served_while_another_cannot_be_bound_again(served: Served) -> None:
+    """Somebody else may take a port in the moment in which it is given back."""
+    with contextlib.closing(socket.create_server(("127.0.0.1", 0))) as thief:
+        served.gateway.ports._addresses["keyframes"] = f"tcp://127.0.0.1:{thief.getsockname()[1]}"
+        served.gateway.ports.renew()
+        with connected(sockets.dealer, served.addresses.control) as client:
+            hello = messages.encode(messages.Hello(bytes(16), messages.PROTOCOL_VERSION))
+            served.until(lambda: client.poll(0) or sent(client, [hello]))
+        assert "cannot listen any more" in served.gateway.health().problems[0]
+        assert not served.gateway.health().ready
+    served.until(lambda: served.gateway.health().ready)
 
 
 @pytest.mark.parametrize("surplus", [500, 5000])
@@ -172,6 +196,30 @@ def test_a_client_that_floods_is_kept_out_for_a_while(tmp_path: Path) -> None:
         assert access._name_of(given.keys.public) is None
         access._kept_out["robot"] -= access_control.KEPT_OUT
         assert access._name_of(given.keys.public) == "robot"
+
+
+@pytest.mark.parametrize("rubbish", [[b"rubbish"], [b"\x01mesh/", b"\x05"], [b"x"] * 3000])
+def test_who_sends_what_is_no_subscription_is_cut_off_alone(tmp_path: Path, rubbish: list[bytes]) -> None:
+    """Other viewers keep their connections and subscriptions, where topics are granted too."""
+    given, vandal = secured(tmp_path / "keys"), tmp_path / "vandal"
+    public = key_folder.create_pair(vandal, "vandal").public
+    key_folder.allow(Path(given.server["keys"]), "vandal", public)
+    key_folder.allow(Path(given.server["keys"]), "robot", maps=["default"])
+    vandals = client_keys(str(vandal / "vandal.key_secret"), given.client["server_key"])
+    with (
+        serving_here(tmp_path / "state", **given.server) as served,
+        connected(sockets.subscriber, served.addresses.publish, given.keys) as viewer,
+        connected(xsub, served.addresses.publish, vandals) as stranger,
+    ):
+        counts = served.gateway._subscriptions
+        served.until(lambda: viewer.poll(0) or counts._granted[b"mesh/default/"] == 1)
+        viewer.setsockopt(zmq.RECONNECT_IVL, -1)  # else it would be back soon
+        served.until(lambda: stranger.poll(0, zmq.POLLOUT))
+        stranger.send_multipart(rubbish)
+        served.until(lambda: served.gateway.health().refused.get("kept out"))
+        assert counts._granted[b"mesh/default/"] == 1
+        served.gateway.ports.publish(b"mesh/default/", b"meshed", [])
+        served.until(lambda: viewer.poll(0))
 
 
 def test_a_scanner_whose_key_a_flood_came_with_goes_on_by_itself(

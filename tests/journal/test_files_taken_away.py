@@ -6,7 +6,9 @@ import logging
 import os
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from failures import refuse
@@ -64,6 +66,65 @@ def test_an_open_segment_that_is_taken_away_is_put_back_with_every_record(
     fill(log, 5)
     log.close()
     assert seqs(folder) == [1, 2, 3, 4, 5]
+
+
+def test_a_large_segment_is_put_back_piece_by_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever waits for the same process waits for a piece at most; nothing is written meanwhile."""
+    monkeypatch.setattr("tsfusion.journal.open_segment._COPY_BYTES", 1 << 10)
+    log, path = Journal(tmp_path, BIG, longest_wait=-1.0), segment_path(tmp_path, 1)
+    fill(log, 1, 2, 3, 4)
+    path.unlink()
+    for call in (log.check, lambda: fill(log, 5)):
+        with pytest.raises(JournalError, match=r"000001.mcap was taken away and is being put back") as raised:
+            call()
+        assert raised.value.temporary
+    assert not path.exists()
+    while not path.exists():
+        with suppress(JournalError):
+            log.check()
+    fill(log, 5)
+    path.rename(tmp_path / "aside")  # a closed one now
+    segment_path(tmp_path, 2).unlink()
+    log.close()  # does not end before it is whole
+    (tmp_path / "aside").rename(path)
+    assert (seqs(tmp_path), log.put_back) == ([1, 2, 3, 4, 5], 2)
+
+
+def test_a_record_that_was_taken_back_is_not_put_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was reported as not written when the copy had it: nobody may find it twice."""
+    log = Journal(tmp_path, BIG, longest_wait=-1.0)
+    fill(log, 1)
+    with monkeypatch.context() as patched:
+        append = OpenSegment.append
+
+        def too_late(segment: OpenSegment, *record: Any) -> None:
+            append(segment, *record)
+            segment.path.unlink()
+
+        patched.setattr(OpenSegment, "append", too_late)
+        with pytest.raises(JournalError, match="is being put back"):
+            fill(log, 2)
+    fill(log, 2, 3)
+    log.close()
+    assert seqs(tmp_path) == [1, 2, 3]
+
+
+def test_a_segment_that_comes_back_by_itself_is_not_put_back_any_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tsfusion.journal.open_segment._COPY_BYTES", 1 << 10)
+    log, path = Journal(tmp_path, BIG, longest_wait=-1.0), segment_path(tmp_path, 1)
+    fill(log, 1, 2, 3, 4)
+    path.rename(tmp_path / "aside")
+    with pytest.raises(JournalError, match="is being put back"):
+        log.check()
+    (tmp_path / "aside").rename(path)
+    fill(log, 5)
+    log.close()
+    assert (seqs(tmp_path), log.put_back) == ([1, 2, 3, 4, 5], 0)
+    assert [one.name for one in tmp_path.iterdir()] == [path.name]
 
 
 def test_what_lies_in_its_place_is_kept(tmp_path: Path) -> None:

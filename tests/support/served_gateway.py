@@ -70,7 +70,7 @@ def serving_here(state: Path, **settings: Any) -> Iterator[Served]:
         stack.callback(context.term)
         access = AccessControl(context, server.keys)
         stack.callback(access.close)
-        ports = Ports(context, server, access.keys)
+        ports = Ports(context, server, access.keys, grants_topics=lambda: access.limits_maps)
         stack.callback(ports.close)
         gateway = Gateway(context, server, ports, access, Metrics(server))
         stack.callback(gateway.maps.close)

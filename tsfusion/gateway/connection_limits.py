@@ -5,6 +5,8 @@ import logging
 import time
 from collections import Counter
 
+import zmq
+
 from tsfusion.core import logs
 from tsfusion.core.counts import count_of
 from tsfusion.gateway.access_control import AccessControl
@@ -61,6 +63,16 @@ class ConnectionLimits:
         if flood.goes_on:
             self._ports.renew(socket)
         return flood.goes_on
+
+    def on_rubbish(self, first: zmq.Frame) -> None:
+        """Cut off a viewer that sent what is no subscription; it may connect again after a while."""
+        client = self._access.keep_out(first)
+        if client:  # else it is kept out already
+            log.warning(
+                "a viewer sends what is no subscription: it is cut off",
+                extra=logs.about(client=client, reason="subscription"),
+            )
+        self._ports.cut_off(first)
 
     def all_must_go(self, uncounted: int) -> bool:
         """Whether every connection has to be made anew: a key was revoked, or they hold too much memory.

@@ -6,6 +6,7 @@ import time
 
 from tsfusion.core import logs
 from tsfusion.core.errors import MISSING, JournalError
+from tsfusion.gateway.problems import Problem
 from tsfusion.journal import Journal
 
 log = logging.getLogger(__name__)
@@ -30,7 +31,7 @@ class DiskPause:
 
     def begin(self, error: JournalError) -> None:
         """Pause because of an error."""
-        if str(error) != self.problem:  # the same one is logged once
+        if Problem(str(error)).key != Problem(self.problem).key:  # the same one is logged once
             log.error("no keyframes are taken: %s", error, extra=logs.about(map=self._map))
         self.problem = str(error)
         self.is_away = error.errno in MISSING

@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import tempfile
+import threading
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -85,13 +86,15 @@ class FuserProcess:
         shutil.rmtree(self._scratch, ignore_errors=True)
 
     def kill(self) -> None:
-        """Kill the process, and wait until it has ended: for some seconds, for one that waits for a disk."""
+        """Kill the process: it ends at once, or, where it waits for a disk, when that answers."""
         self._process.kill()
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(_KILL_DEADLINE)
 
-    def close(self, timeout: float = 0.0) -> None:
-        """End the process and clear up. It may end by itself within so many seconds; then it is killed."""
+    def close(self, timeout: float = 0.0, *, wait: bool = True) -> None:
+        """End the process and clear up. It may end by itself within so many seconds; then it is killed.
+
+        Args:
+            wait: some seconds until a killed one has ended. It is reaped in any case.
+        """
         assert self._process.stdin is not None
         with suppress(OSError):
             self._process.stdin.close()  # it ends when it sees that
@@ -99,6 +102,9 @@ class FuserProcess:
             self._process.wait(timeout)
         except subprocess.TimeoutExpired:
             self.kill()
+            reaper = threading.Thread(target=self._process.wait, daemon=True)
+            reaper.start()
+            reaper.join(_KILL_DEADLINE if wait else 0.0)
         self._clear_up()
 
     def _clear_up(self) -> None:

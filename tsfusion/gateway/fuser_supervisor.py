@@ -203,7 +203,7 @@ class FuserSupervisor:
         return False
 
     def _replace(self, why: str, *, blame: int) -> bool:
-        """Kill a process that stands still; whether it has ended (one that waits for a disk may not)."""
+        """Kill a process that stands still; whether it has ended yet: no other one begins before that."""
         log.error("%s: it is killed", why, extra=logs.about(map=self._map))
         self._blame_current_keyframe(blame)
         self._silence.answered()
@@ -280,6 +280,10 @@ class FuserSupervisor:
         """Whether the process has ended with its checkpoint on the disk."""
         return self.finishing and self._process.status == 0
 
-    def close(self) -> None:
-        """End the process, at once if need be. The next one fuses what it had not saved from the journal."""
-        self._process.close(_END_DEADLINE if self.ready else 0.0)
+    def close(self, *, wait: bool = True) -> None:
+        """End the process. The next one fuses what it had not saved from the journal.
+
+        Args:
+            wait: some seconds until it has ended; else the next one waits for the lock of the map's folder.
+        """
+        self._process.close(_END_DEADLINE if self.ready and wait else 0.0, wait=wait)

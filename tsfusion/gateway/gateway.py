@@ -100,7 +100,7 @@ class Gateway:
         handlers = self._handlers()
         fusers = [hosted.fuser.socket for hosted in self.maps]
         polled = [(socket, zmq.POLLIN) for socket in (*self._access.poll, *fusers, *handlers)]
-        events = dict(zmq.zmq_poll(polled, _TICK_MS if handlers else _RENEW_TICK_MS))
+        events = dict(zmq.zmq_poll(polled, _RENEW_TICK_MS if self.ports.problem else _TICK_MS))
         if not self._drop_connections():
             for socket, handle in handlers.items():
                 if socket in events:
@@ -115,20 +115,21 @@ class Gateway:
         self._snapshot()
 
     def _handlers(self) -> Handlers:
-        """The handler of each socket's messages; none while the sockets are made anew."""
-        if self.ports.problem:
-            return {}
-        handlers: Handlers = {self.ports.control: self._on_control, self.ports.viewers: self._on_subscription}
+        """The handler of each socket's messages; none of a socket that is made anew."""
+        ports = self.ports
+        handlers: Handlers = {ports.control: self._on_control, ports.viewers: self._on_subscription}
         if self._accepting:
-            handlers[self.ports.keyframes] = self._intake.handle
-        elif self._stopped:
-            self.ports.keyframes.close()
-        return handlers
+            handlers[ports.keyframes] = self._intake.handle
+        elif self._stopped and ports.is_served(ports.keyframes):
+            ports.keyframes.close()
+        return {socket: handle for socket, handle in handlers.items() if ports.is_served(socket)}
 
     def _on_flood(self, socket: sockets.AnySocket, flood: Flood) -> None:
         is_viewers = socket is self.ports.viewers
         if self._limits.on_flood(socket, flood) and is_viewers:
             self._subscriptions.clear()
+        elif is_viewers:
+            self.ports.knows_viewer(after_rubbish=True)
 
     def _drop_connections(self) -> bool:
         """Drop all connections if that has to be; whether it was done."""
@@ -281,18 +282,23 @@ class Gateway:
         change, topic = frames[0].bytes[:1], frames[0].bytes[1:]
         if len(frames) > 1 or change not in (b"\x00", b"\x01"):
             self._refused["subscription"] += 1
-            if self.ports.pass_over_rubbish():
-                log.warning("a viewer sends what is no subscription: all viewers connect anew")
-                self._subscriptions.clear()
+            self.ports.knows_viewer(after_rubbish=True)
+            if self.ports.grants_topics:
+                self._limits.on_rubbish(frames[0])
             return
         client = self._access.client_of(frames[0])  # None also where it ends with its connection
         allowed = [] if client is None else self._admission.maps_of(client).topics(topic)
+        is_known = self.ports.knows_viewer()
+        if not is_known:  # it connects again, and subscribes anew
+            self.ports.cut_off(frames[0])
         if change == b"\x00":
             self._subscriptions.discard(topic, granted=None if client is None else bool(allowed))
-            self.ports.revoke_topics(allowed)
+            self.ports.revoke_topics(allowed if is_known else [])
         elif client is None:
             self._refused["key"] += 1
-        elif not self._subscriptions.add(topic, (one.name for one in self.maps), granted=bool(allowed)):
+        elif not self._subscriptions.add(
+            topic, (one.name for one in self.maps), granted=is_known and bool(allowed)
+        ):
             self._refused["subscription" if allowed else "forbidden"] += 1
         else:
             self.ports.grant_topics(allowed)

@@ -35,6 +35,7 @@ log = logging.getLogger(__name__)
 _SEGMENTS_KEPT = 4  # a journal with a limit is deleted in quarters of that limit
 _FOR_GONE = "what no checkpoint holds of them is lost, unless they are put back"
 _SAVE_PAUSE = 10.0  # seconds until a checkpoint is tried again that could not be written
+_LONGEST_WAIT = 0.2  # seconds of a step, for a segment of the journal that is put back
 _STALLED_AFTER = 10.0  # seconds in which keyframes wait and none is fused
 ForPeople = tuple[fuser_messages.Meshed | fuser_messages.FuserReply, Sequence[zmq.Frame]]
 
@@ -110,9 +111,13 @@ class HostedMap:
         """Whether no keyframe waits, nor came since then (`time.monotonic()`)."""
         return self.drained and (self._last_keyframe is None or self._last_keyframe < since)
 
-    def close(self) -> None:
-        """End the fuser and finish the journal. A journal that cannot be finished is logged."""
-        self.fuser.close()
+    def close(self, *, wait: bool = True) -> None:
+        """End the fuser and finish the journal. A journal that cannot be finished is logged.
+
+        Args:
+            wait: until the fuser has ended, for some seconds.
+        """
+        self.fuser.close(wait=wait)
         try:
             self._journal.close()
         except JournalError as error:  # its index only: every keyframe is on the disk
@@ -349,6 +354,7 @@ def _open_journal(folder: Path, server: ServerConfig, watch: ReadingWatcher) -> 
         folder / state_folder.JOURNAL_FOLDER,
         segment_bytes,
         min_free_bytes=server.min_free_bytes,
+        longest_wait=_LONGEST_WAIT,
         watch=watch,
     )
 

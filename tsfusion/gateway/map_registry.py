@@ -226,7 +226,7 @@ class MapRegistry:
             self._unopened.pop(next(iter(self._unopened)))
         hosted = self._open.pop(name, None)
         if hosted is not None:
-            hosted.close()
+            hosted.close(wait=False)
 
     def step(self) -> list[tuple[HostedMap, ForPeople]]:
         """Step every map.

@@ -57,9 +57,9 @@ class Ports:
         self._server = server
         self._keys = keys
         self._grants_topics = grants_topics
-        self._is_manual = False
+        self._is_manual = self._is_mixed_up = False
         self._addresses: dict[str, str] = {}  # of the sockets, once they are bound
-        self._unbound: list[str] = []  # sockets that are being made anew
+        self._unbound: set[str] = set()  # sockets that are being made anew
         self._next_bind = 0.0
         self.problem = ""  # why nobody can connect; empty = clients can
         self.connections = Connections(server.memory_bytes)
@@ -70,7 +70,7 @@ class Ports:
             return sockets.pull(self._context, self._server.max_frame_bytes, keys=self._keys)
         if name == "control":
             return sockets.router(self._context, keys=self._keys)
-        self._is_manual = self._grants_topics()
+        self._is_manual, self._is_mixed_up = self._grants_topics(), False
         return sockets.publisher(self._context, keys=self._keys, manual=self._is_manual)
 
     @property
@@ -87,6 +87,10 @@ class Ports:
     def viewers(self) -> sockets.AnySocket:
         """Mesh updates leave here, and subscriptions come in."""
         return self._sockets["viewers"]
+
+    def is_served(self, socket: sockets.AnySocket) -> bool:
+        """Whether a socket of these is not being made anew."""
+        return all(self._sockets[name] is not socket for name in self._unbound)
 
     def bind(self) -> Addresses:
         """Bind the sockets, so that clients can connect.
@@ -110,6 +114,11 @@ class Ports:
         if not self.viewers.closed:
             send_now(self.viewers, [topic, message, *frames])
 
+    @property
+    def grants_topics(self) -> bool:
+        """Whether viewers get only what `grant_topics` says."""
+        return self._is_manual
+
     def grant_topics(self, topics: Iterable[bytes]) -> None:
         """Send these topics' updates to the viewer whose message was received last."""
         for topic in topics if self._is_manual else ():
@@ -120,20 +129,19 @@ class Ports:
         for topic in topics if self._is_manual else ():
             self.viewers.setsockopt(zmq.UNSUBSCRIBE, topic)
 
-    def pass_over_rubbish(self) -> bool:
-        """Pass over what a viewer sent that is no subscription; whether all viewers have to connect anew.
+    def knows_viewer(self, *, after_rubbish: bool = False) -> bool:
+        """Whether topics would be granted to the viewer whose message was received last.
 
-        Where topics are granted, ZeroMQ takes subscriptions that wait behind it for other viewers' than those
-        that sent them.
+        ZeroMQ takes subscriptions that wait behind rubbish for others' than those that sent them, until none
+        waits.
+
+        Args:
+            after_rubbish: the message is no subscription.
         """
-        for _ in range(_MESSAGES_A_STEP if self._is_manual else 0):
-            if not int(self.viewers.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
-                return False
-            if self.viewers.recv_multipart(copy=False)[0].bytes[:1] in (b"\x00", b"\x01"):
-                break
-        if self._is_manual:
-            self.renew(self.viewers)
-        return self._is_manual
+        self._is_mixed_up |= after_rubbish and self._is_manual
+        if self._is_mixed_up and not int(self.viewers.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            self._is_mixed_up = False
+        return not self._is_mixed_up
 
     def renew(self, only: sockets.AnySocket | None = None) -> None:
         """Drop every connection, with all that it holds in memory; `step` listens at the same ports again.
@@ -144,7 +152,7 @@ class Ports:
         for name, socket in self._sockets.items():
             if only in (None, socket):
                 socket.close()
-                self._unbound.append(name)
+                self._unbound.add(name)
         self.problem = "connections are made anew"
         self.step()
 
@@ -154,17 +162,16 @@ class Ports:
         if not self._unbound or now < self._next_bind:
             return
         self._next_bind = now + _REBIND_INTERVAL
-        try:
-            for name in tuple(dict.fromkeys(self._unbound)):
+        self.problem = ""
+        for name in [one for one in self._sockets if one in self._unbound]:
+            try:
                 if self._sockets[name].closed:
                     self._sockets[name] = self._make(name)
                 if self._addresses:
                     sockets.bind_socket(self._sockets[name], self._addresses[name])
-                self._unbound = [one for one in self._unbound if one != name]
-        except (TransportError, zmq.ZMQError) as error:
-            self.problem = f"cannot listen any more, and will try again: {error}"
-        else:
-            self.problem = ""
+                self._unbound.remove(name)
+            except (TransportError, zmq.ZMQError) as error:
+                self.problem = f"cannot listen any more, and will try again: {error}"
 
     def cut_off(self, frame: zmq.Frame) -> None:
         """End the connection over which a frame came, if it still stands. Others of the same port stay."""

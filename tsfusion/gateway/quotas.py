@@ -8,13 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from tsfusion.core.config import ServerConfig
+from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.core.errors import InvalidConfig
 from tsfusion.wire import corrections
 from tsfusion.wire.codec import measurement
 from tsfusion.wire.record_header import CorrectionHeader, KeyframeHeader, RecordHeader, Refused
 
 _BURST = 2.0  # seconds' worth that may come at once
 _MAX_CLIENTS = 4096
+_ANY_MAP = VolumeConfig()
 
 
 class Bucket:
@@ -71,8 +73,8 @@ class Quotas:
         """Raise Refused for a checked record that asks too much.
 
         Raises:
-            Refused: `quota` for too many points or a place too far away, `values` for a correction of
-                keyframes that cannot have come before it.
+            Refused: `quota` for too many points or a place too far away, `values` for a sensor that no
+                map knows, and a correction of keyframes that cannot have come before it.
         """
         if isinstance(header, CorrectionHeader):
             self._check_correction(header, frames[1])
@@ -86,6 +88,10 @@ class Quotas:
         if points > server.quota_points:
             raise Refused("quota", f"a keyframe may have {server.quota_points} points, got {points}")
         self._check_place(math.dist(header.pose[3::4], (0.0, 0.0, 0.0)))
+        try:
+            _ANY_MAP.model(header.sensor)
+        except InvalidConfig as error:
+            raise Refused("values", str(error)) from error
 
     def _check_correction(self, header: CorrectionHeader, body: Any) -> None:
         seqs, rows, removed = corrections.arrays(header, body)

@@ -9,7 +9,7 @@ import errno
 import os
 import secrets
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.segment_file import SegmentFile
 from tsfusion.journal.segments import record_at
 
-_COPY_BYTES = 1 << 20
+_COPY_BYTES = 4 << 20
 
 
 class OpenSegment:
@@ -108,19 +108,23 @@ class OpenSegment:
         """Whether no path at all leads to it any more."""
         return os.fstat(self._descriptor).st_nlink == 0
 
-    def put_back(self) -> None:
-        """Write the file again where it was. What lies there now keeps its content as NAME.replaced.
+    def put_back(self) -> Iterator[None]:
+        """Write the file again where it was, a piece a step. What lies there then is kept as NAME.replaced.
 
         Raises:
             OSError: when the disk refuses; nothing has changed then, and it can be tried again.
         """
-        with suppress(FileNotFoundError):
-            self.path.rename(self.path.with_name(f"{self.path.name}.replaced"))
         with durable_files.replacing(self.path) as copy:
             at = 0
             while part := os.pread(self._descriptor, _COPY_BYTES, at):
                 copy.write(part)
+                copy.flush()
+                os.fdatasync(copy.fileno())  # so that the end has to wait for no more than a piece either
                 at += len(part)
+                yield
+            copy.truncate(os.fstat(self._descriptor).st_size)  # a record may have been taken back meanwhile
+            with suppress(FileNotFoundError):
+                self.path.rename(self.path.with_name(f"{self.path.name}.replaced"))
 
     def read(self, number: int, offset: int) -> Record:
         """One record by its descriptor, wherever the file is.

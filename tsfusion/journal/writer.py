@@ -4,9 +4,11 @@
 import contextlib
 import errno
 import logging
+import math
 import os
 import secrets
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,8 @@ class Journal:
         min_free_bytes: what `append` leaves free on the disk.
         keep_open: keep the files of closed segments open, so that `read_kept` finds their records although
             somebody has deleted the folder.
+        longest_wait: seconds that a call may take to put back a segment that somebody has taken away; then it
+            raises JournalError, and the next call goes on.
         watch: called again and again while the segments of earlier runs are read; what it raises ends that.
 
     Attributes:
@@ -59,6 +63,7 @@ class Journal:
         sync: bool = True,
         min_free_bytes: int = 0,
         keep_open: bool = False,
+        longest_wait: float = math.inf,
         watch: ReadingWatcher = lambda _done, _all, _records: None,
     ) -> None:
         self.folder = Path(folder)
@@ -66,6 +71,8 @@ class Journal:
         self._sync = sync
         self._room = FreeSpace(self.folder, min_free_bytes)
         self._keep_open = keep_open
+        self._longest_wait = longest_wait
+        self._putting_back: Iterator[None] | None = None  # the open segment, piece by piece
         self._open: OpenSegment | None = None
         self._kept: dict[int, OpenSegment] = {}  # by number, oldest first; the open one among them
         self._closed: dict[int, int] = {}  # bytes by number, oldest first
@@ -205,6 +212,7 @@ class Journal:
         Raises:
             JournalError: when the disk refuses, or the open segment was taken away and cannot be put back.
         """
+        self._longest_wait = math.inf
         try:
             self._keep_place()
             self.rotate()
@@ -260,13 +268,16 @@ class Journal:
             return
         try:
             if segment.is_in_place:
+                self._putting_back = None
                 return
             here = os.stat(self.folder)
             if not segment.is_deleted and self.is_away:
                 raise self._strange_folder()  # the segment is with its folder, elsewhere
-            segment.put_back()
+            self._put_back_some(segment)
         except OSError as error:
+            self._putting_back = None
             raise journal_error("write", self.folder, error) from error
+        self._putting_back = None
         self._home = here
         self.put_back += 1
         log.error(
@@ -274,6 +285,17 @@ class Journal:
             segment.path,
         )
         self._abandon()
+
+    def _put_back_some(self, segment: OpenSegment) -> None:
+        """Go on to put a segment back; raises JournalError when that takes longer, so that others wait."""
+        until = time.monotonic() + self._longest_wait
+        self._putting_back = self._putting_back or segment.put_back()
+        for _ in self._putting_back:
+            if time.monotonic() > until:
+                raise JournalError(
+                    f"{segment.path} was taken away and is being put back: records wait until it is whole",
+                    errno.EAGAIN,
+                )
 
     def read_kept(self, position: Position) -> Record | None:
         """A record by its open file, wherever that is; None = it is not open. From any thread.
