@@ -25,8 +25,9 @@ from keyframes_and_servers import VOLUME, pose, serving, until, wall
 
 import tsfusion
 from tsfusion import VolumeConfig
-from tsfusion.core import errors
+from tsfusion.core import errors, process
 from tsfusion.fuser import __main__ as fuser_main
+from tsfusion.fuser import fuser as fuser_module
 from tsfusion.fuser import messages
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.fuser import Fuser
@@ -319,10 +320,10 @@ def test_what_it_works_at_shows_from_outside(tmp_path: Path, monkeypatch: pytest
 
     monkeypatch.setattr(codec, "decode", raising(RuntimeError("a bug")))
     with pytest.raises(RuntimeError):
-        fuser.handle(order(0, position))
-    assert (tmp_path / "working").read_bytes() == bytes(8)
+        fuser.handle(order(5, position))
+    assert (tmp_path / "working").read_bytes() == struct.pack("<q", 5)
     monkeypatch.undo()
-    fuser.handle(order(0, position))
+    fuser.handle(order(5, position))
     assert link.last().reason is None
     assert (tmp_path / "working").read_bytes() == b"\xff" * 8
 
@@ -364,6 +365,17 @@ def test_no_memory_for_a_keyframe_is_no_crash(tmp_path: Path, monkeypatch: pytes
     fuser.handle(order(0, position))
     assert link.last().reason == "memory"
     assert link.last().message == "no memory to fuse it: no room for 9 GB; raise fuser_memory_bytes"
+
+
+def test_a_process_and_its_map_keep_to_their_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limits: list[int] = []
+    monkeypatch.setattr(process, "data_bytes", lambda: 1000)
+    monkeypatch.setattr(process, "limit_memory", limits.append)
+    fill(tmp_path, 1)
+    fuser, _ = opened(tmp_path, memory_bytes=1 << 30)
+    assert limits == [1000 + fuser_module._WORKING_MEMORY + (1 << 30)]
+    most = fuser._volume.most_blocks
+    assert opened(tmp_path, memory_bytes=1 << 29)[0]._volume.most_blocks < most
 
 
 def test_a_client_may_fill_its_share_of_the_map_and_no_more(tmp_path: Path) -> None:
@@ -450,6 +462,16 @@ def test_no_question_ends_the_fuser(tmp_path: Path, min_weight: float) -> None:
     fuser.handle(order(0, position))
     fuser.handle(messages.FuserQuery(1, Command(name="mesh", min_weight=min_weight)))
     assert "min_weight must be" in link.last().error
+
+
+@pytest.mark.parametrize("error", [OverflowError("too large"), ValueError("no such shape")])
+def test_a_question_that_fails_in_the_arithmetic_is_answered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    fuser, link = opened(tmp_path)
+    monkeypatch.setattr(tsfusion.Volume, "extract_mesh", raising(error))
+    fuser.handle(messages.FuserQuery(1, Command(name="mesh")))
+    assert link.last().error == str(error)
 
 
 def test_a_mesh_that_there_is_no_memory_for_is_an_answer(
@@ -655,9 +677,12 @@ def test_a_disk_that_refuses_a_checkpoint_is_said(tmp_path: Path, monkeypatch: p
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", refuse(errno.ENOSPC))
         fuser.handle(messages.Save())
-    assert "No space left" in link.last().problem
-    fuser.handle(messages.Save())
+        assert "No space left" in link.last().problem
+        fuser.handle(messages.Finish())
+        assert fuser.exit_status == 1
+    fuser.handle(messages.Finish())
     assert (link.last().written, link.last().problem) == (True, "")
+    assert fuser.exit_status == 0
 
 
 def test_a_checkpoint_is_on_the_disk_before_it_has_its_name_and_then_the_name(
