@@ -17,6 +17,7 @@ from keyframes_and_servers import until
 from zmq.utils import z85
 
 from tsfusion.core.errors import NotAllowed, ServerUnreachable, TransportError
+from tsfusion.gateway import access_control
 from tsfusion.gateway.access_control import ZapHandler, sender_of
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.connection_monitor import ConnectionMonitor
@@ -469,6 +470,29 @@ def test_an_asker_that_is_gone_disturbs_nobody() -> None:
 
         until(answer)
         assert asker.recv_multipart()[3] == b"200"
+
+
+def test_no_flood_of_connections_takes_a_whole_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(access_control, "_REQUESTS_A_STEP", 3)
+    with handler(lambda _: None) as (made, asker):
+        for _ in range(8):
+            asker.send_multipart(ASKED)
+        for answered in (3, 6, 8):
+            made.answer_all()
+            assert made.refused == {"unknown": answered}
+
+
+def test_few_of_many_refused_keys_are_logged(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Keys cost nothing to make."""
+    monkeypatch.setattr(access_control, "_LOGGED_AT_MOST", 2)
+    with handler(lambda _: None) as (made, asker):
+        for number in range(5):
+            asker.send_multipart(question(key=bytes([number]) * 32))
+        made.answer_all()
+        assert made.refused == {"unknown": 5}
+    assert len(caplog.records) == 2
 
 
 # --- one-shot commands ---
