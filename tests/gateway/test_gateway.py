@@ -394,6 +394,24 @@ def test_a_journal_that_is_away_is_said_although_no_keyframe_comes_until_it_is_b
     assert default(drained(gateway)).keyframes_fused == 4
 
 
+def test_nothing_is_deleted_from_a_journal_that_is_away(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With an empty folder in its place its segments would count as deleted, and nobody would miss them."""
+    monkeypatch.setattr("tsfusion.gateway.disk_pause._DISK_PAUSE", 0.01)
+    gateway = drained(start(fusing("pass")))
+    (hosted,) = gateway.maps
+    journal_folder(tmp_path).rename(tmp_path / "aside")
+    journal_folder(tmp_path).mkdir()
+    stepped(gateway, lambda: hosted.disk.is_away)
+    hosted._retention._max_bytes, hosted._retention._in_previous = 1, 2
+    gateway.step()
+    assert hosted._journal.first == 1
+    journal_folder(tmp_path).rmdir()
+    (tmp_path / "aside").rename(journal_folder(tmp_path))
+    stepped(gateway, lambda: hosted._journal.first == 2)
+
+
 def test_segments_that_vanish_are_named_and_the_map_is_saved_at_once(start: Start, tmp_path: Path) -> None:
     saved = f"""{fusing("pass")}
     if isinstance(message, fuser_messages.Save):

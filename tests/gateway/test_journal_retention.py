@@ -29,7 +29,7 @@ class Fuser:
     """Takes what it is told."""
 
     ready = True
-    in_flight = ()
+    in_flight: tuple[int, ...] = ()
 
     def __init__(self) -> None:
         self.asked: list[Any] = []
@@ -67,6 +67,18 @@ def test_what_two_checkpoints_hold_may_go() -> None:
     assert let_go(retention, folder, fuser) == 1  # nothing was written
     retention.on_saved(fuser_messages.Saved(written=True))
     assert let_go(retention, folder, fuser) == 5
+
+
+def test_a_keyframe_that_somebody_asks_for_stays_in_the_index() -> None:
+    """Its segment may go: one that the fuser is at, or that no mesh shows yet."""
+    retention, folder, session = ten_segments()
+    session.handed, folder.first = 10, 11
+    fuser = Fuser()
+    fuser.in_flight = (6,)
+    for needed, first in (([3], 3), ([8], 6)):
+        retention.step(cast(FuserSupervisor, fuser), needed)
+        assert session.entries[0] == first
+        assert retention._index[first].stamps.seq == first + 1
 
 
 def test_what_a_dead_fuser_had_covers_nothing() -> None:

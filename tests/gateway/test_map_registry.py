@@ -138,7 +138,8 @@ def test_a_disk_that_refuses_is_said_at_once_and_then_left_alone(
         served.greet(link, "default")
         for _ in range(2):
             push.send_multipart(record(1))
-            assert served.heard(link, messages.Hold).reason == "disk"
+            hold = served.heard(link, messages.Hold)
+            assert (hold.reason, hold.message) == ("disk", "the disk is full")
             (route,), (hosted,) = served.gateway._routes, served.gateway.maps
             route.held_until = 0.0
             hosted.disk._until = hosted.disk._look_at = time.monotonic() + 1000.0

@@ -6,6 +6,7 @@ import os
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from keyframes_and_servers import connected, secured, wall
 from served_gateway import Served, record, serving_here
 
 from tsfusion import Client
-from tsfusion.gateway import access_control
+from tsfusion.gateway import access_control, ports
 from tsfusion.gateway.connections import Connection, Connections
 from tsfusion.wire import key_folder, messages, sockets
 from tsfusion.wire.curve import ClientKeys, client_keys
@@ -179,6 +180,38 @@ def test_the_number_of_a_connection_that_ended_may_be_another_files() -> None:
         connections.note_read(7, before)
         connections._look()
         assert connections._read[7] == kept
+
+
+def test_a_step_ends_when_its_time_is_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each message may cost a write to a slow disk; other sockets get their turn in between."""
+    now = [0.0]
+    monkeypatch.setattr(ports, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    handled: list[int] = []
+
+    def handle(frames: list[zmq.Frame]) -> None:
+        handled.append(len(frames))
+        now[0] += 0.6 * ports._SECONDS_A_STEP
+
+    inbox: Any = SimpleNamespace(closed=False, recv=lambda *_, **__: zmq.Frame(b"x"))
+    ports.receive_some(inbox, handle, lambda _: None, lambda *_: None)
+    assert len(handled) == 2
+
+
+def test_who_may_not_connect_any_more_is_heard_and_served_no_more(tmp_path: Path) -> None:
+    given = secured(tmp_path / "keys")
+    with (
+        serving_here(tmp_path / "state", **given.server) as served,
+        connected(sockets.subscriber, served.addresses.publish, given.keys) as viewer,
+    ):
+        served.until(lambda: viewer.poll(0) or len(served.gateway._subscriptions) == 1)
+        access, epoch = served.gateway._access, served.gateway.epoch
+        frame: Any = SimpleNamespace(get=lambda _: given.keys.public)
+        assert access.client_of(frame) == "robot"
+        key_folder.revoke(given.server["keys"], "robot")
+        assert access.client_of(frame) is None  # not "", which is anybody's name without keys
+        served.until(lambda: served.gateway.epoch != epoch)  # every connection is made anew
+        served.until(lambda: access.refused["revoked"])
+        assert len(served.gateway._subscriptions) == 0
 
 
 def test_a_client_that_floods_is_kept_out_for_a_while(tmp_path: Path) -> None:

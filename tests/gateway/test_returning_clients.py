@@ -32,6 +32,18 @@ def test_a_client_that_was_silent_is_told_what_was_rejected_at_its_next_ping(ser
         assert served.heard(link, messages.Nack).seq == 1
 
 
+def test_a_client_is_asked_for_what_was_lost_on_the_way(served: Served) -> None:
+    with (
+        connected(sockets.dealer, served.addresses.control) as link,
+        connected(sockets.push, served.addresses.data) as push,
+    ):
+        served.greet(link, "default")
+        for number, answer in ((2, (0, True)), (1, (1, False))):
+            push.send_multipart(record(number))
+            ack = served.heard(link, messages.Ack)
+            assert (ack.durable, ack.resend) == answer
+
+
 def test_answers_go_over_the_connection_that_was_heard_last(served: Served) -> None:
     """Greetings of ended connections may be read behind those of the one that stands."""
     with (
