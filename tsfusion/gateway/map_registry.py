@@ -113,7 +113,7 @@ class MapRegistry:
             return None
         try:
             return self._open_map(name)
-        except (TsfusionError, OSError) as error:  # OSError: the disk fails where nobody expects it
+        except TsfusionError as error:
             self._give_up(name, error)
             return None
 
