@@ -32,6 +32,17 @@ def test_a_client_that_was_silent_is_told_what_was_rejected_at_its_next_ping(ser
         assert served.heard(link, messages.Nack).seq == 1
 
 
+def test_what_was_rejected_meanwhile_is_told_before_how_far_the_map_is(served: Served) -> None:
+    """A client counts as fused what a Welcome covers, unless it was told otherwise."""
+    hosted = served.gateway.maps.get("default")
+    assert hosted is not None
+    hosted.outcomes._tell(messages.Nack(SESSION, 1, "map", "MapFull", ""))
+    with connected(sockets.dealer, served.addresses.control) as link:
+        link.send(messages.encode(messages.Hello(SESSION, messages.PROTOCOL_VERSION)))
+        kinds = (messages.Nack, messages.Welcome)
+        assert [type(served.heard(link, *kinds)) for _ in kinds] == [*kinds]
+
+
 def test_a_client_is_asked_for_what_was_lost_on_the_way(served: Served) -> None:
     with (
         connected(sockets.dealer, served.addresses.control) as link,

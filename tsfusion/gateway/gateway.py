@@ -213,9 +213,9 @@ class Gateway:
             window_bytes=self._server.window_bytes,
             max_frame_bytes=self._server.max_frame_bytes,
         )
-        self.ports.reply(identity, welcome)
         if (hosted := self.maps.get(hello.map)) is not None:
-            hosted.outcomes.tell_untold(hello.session)
+            hosted.outcomes.tell_untold(hello.session)  # before it is told that these are answered
+        self.ports.reply(identity, welcome)
 
     def _denial(self, identity: bytes, hello: messages.Hello, client: str) -> tuple[str, ...] | None:
         """The fields of the answer to a session that is not opened; None = it is, and its route is made."""
