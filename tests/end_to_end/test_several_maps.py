@@ -184,6 +184,8 @@ def test_quotas_are_of_each_client_and_forget_strangers() -> None:
     assert quotas.wait("a", 1000, 0.2) == 0.0
     assert quotas.wait("c", 1 << 30, 0.0) == 0.0  # more than the bucket holds passes when it is full
     assert quotas.wait("c", 1, 0.0) > 0
+    assert [quotas.wait("a", 1000, 1000.0) for _ in range(20)] == [0.0] * 20
+    assert quotas.wait("a", 1000, 1000.0) > 0  # nobody saves up for a flood
     for i in range(5000):
         quotas.wait(str(i), 1, 0.0)
     assert len(quotas._clients) == 4096

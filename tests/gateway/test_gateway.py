@@ -492,6 +492,19 @@ def test_a_journal_that_ends_before_its_checkpoint_is_said(
     gateway = start(fusing("pass").replace("fuser_messages.Ready({})", ready))
     stepped(gateway, lambda: gateway.maps.warm)
     assert "its checkpoint holds keyframes of 1 session that its journal" in caplog.text
+    assert gateway.maps.progress("default", bytes(16)) == (9, 9)  # they are not taken once more
+
+
+def test_checkpoints_that_are_lost_with_what_only_they_held_are_said(start: Start, tmp_path: Path) -> None:
+    begin = Journal(journal_folder(tmp_path), 1)
+    for seq in (8, 9):
+        begin.append([b"head"], session=bytes(16), seq=seq)
+    journal.segment_path(journal_folder(tmp_path), 1).unlink()
+    begin.close()
+    gateway = start(fusing("pass"))
+    stepped(gateway, lambda: gateway.maps.warm)
+    (problem,) = gateway.health().problems
+    assert "its checkpoints are lost, and with them what was journaled before segment 2" in problem
 
 
 def test_the_last_words_of_a_dead_fuser_are_not_heard(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
