@@ -150,6 +150,16 @@ def test_a_spool_that_runs_short_is_thinned_before_it_is_full(
     assert [record.levelname for record in caplog.records] == ["WARNING", "ERROR"]
 
 
+def test_a_spool_holds_so_many_records_and_no_more(
+    sensor: Callable[..., Sensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Small ones would fill the memory before the disk."""
+    monkeypatch.setattr("tsfusion.delivery.backpressure._MAX_WAITING", 3)
+    everything = sensor(policy="spool_all")
+    assert everything.sense(5, 10) == [True] * 3 + [False] * 2
+    assert everything.outbox.stats().skipped == {"spool": 2}
+
+
 def test_block_waits_for_the_map(tmp_path: Path) -> None:
     with scripted(fuse_to=0) as server, joined(server, policy="block") as client:
         assert len(send_all(client, range(8))) == 8

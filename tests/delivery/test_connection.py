@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 import zmq
@@ -16,9 +17,13 @@ from tsfusion import Client
 from tsfusion.core.config import ClientConfig
 from tsfusion.core.errors import FlushTimeout, InvalidConfig, NotAllowed, ServerUnreachable
 from tsfusion.delivery.link_state import LinkKind, LinkState
-from tsfusion.wire import key_folder, sockets
+from tsfusion.delivery.outbox import Outbox
+from tsfusion.delivery.sender import Sender
+from tsfusion.delivery.spool import Spool
+from tsfusion.wire import codec, key_folder, sockets
 from tsfusion.wire.connection import Connection
 from tsfusion.wire.curve import server_keys
+from tsfusion.wire.messages import PROTOCOL_VERSION, Welcome
 
 PATIENT = ClientConfig(stall_timeout=1000.0, policy="spool_all")
 
@@ -62,6 +67,66 @@ def test_what_a_cut_took_is_sent_again_at_once() -> None:
         client.flush(DEADLINE)
         client.wait_fused(DEADLINE)
         assert server.numbers == [*range(20)]
+
+
+class Carrier:
+    """A connection of a sender, in a state that a test gives it."""
+
+    problem, refused, is_made, finds_nobody = "", False, True, False
+    ended = False
+
+    def __init__(self) -> None:
+        self.socket = self
+        self.sent: list[list[Any]] = []
+        self.is_full = False
+
+    def check(self, _now: float) -> tuple[None, bool]:
+        return None, self.ended
+
+    def send_multipart(self, frames: list[Any], *_: object, **__: object) -> None:
+        if self.is_full:
+            raise zmq.Again
+        self.sent.append(frames)
+
+
+@pytest.fixture
+def sender(tmp_path: Path) -> Iterator[tuple[Sender, Outbox, Carrier]]:
+    """A sender with three keyframes, let in; its outbox; its connection for them."""
+    outbox = Outbox(Spool(tmp_path, 1 << 20))
+    for i in range(3):
+        frames = codec.encode(wall(i), session=outbox.session, seq=outbox.next_seq, jpeg_quality=90)
+        outbox.add(outbox.write(frames), wall(i))
+    sender, carrier = Sender("", "", outbox, PATIENT), Carrier()
+    sender._control, sender._data = cast("Any", Carrier()), cast("Any", carrier)
+    sender._control_session.welcome = Welcome("epoch", PROTOCOL_VERSION, 0, 0, 2, 1 << 20, 1 << 20)
+    sender._control_session.clock.add(1, 2, 2, 3)
+    yield sender, outbox, carrier
+    sender._waker.close()
+    sender._woken.close()
+    outbox.close()
+
+
+def test_what_was_under_way_over_the_keyframes_connection_alone_is_sent_again(
+    sender: tuple[Sender, Outbox, Carrier],
+) -> None:
+    """A server may make that one anew, and nothing tells what it took of it."""
+    its, outbox, carrier = sender
+    its._pump(1.0)
+    assert (len(carrier.sent), outbox.outstanding) == (2, 2)
+    its._watch_connections(1.0)
+    assert outbox.outstanding == 2
+    carrier.ended = True
+    its._watch_connections(1.0)
+    assert outbox.outstanding == 0
+
+
+def test_what_a_full_connection_does_not_take_may_be_dropped(sender: tuple[Sender, Outbox, Carrier]) -> None:
+    its, outbox, carrier = sender
+    carrier.is_full = True
+    its._pump(1.0)
+    assert its._blocked
+    assert outbox.drop_oldest()
+    assert [entry.seq for entry in outbox._spool.waiting] == [2, 3]
 
 
 def test_the_connection_after_a_cut_is_news_as_well() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from clients_and_spools import NOBODY, send_all
+from failures import raising
 from keyframes_and_servers import pose
 
 from tsfusion import Client
@@ -13,6 +14,7 @@ from tsfusion.core.errors import JournalError
 from tsfusion.delivery import left_spools, tombstones
 from tsfusion.delivery import spool as spool_module
 from tsfusion.delivery.spool import Spool
+from tsfusion.journal import Journal
 
 
 def left(folder: Path, count: int = 2, **settings: object) -> None:
@@ -85,6 +87,34 @@ def test_what_left_a_spool_stays_out_of_it_and_few_numbers_are_kept(
     again = Spool(tmp_path, 5000)
     assert [entry.seq for entry in again.waiting] == [1]
     assert again.used_bytes == sum(path.stat().st_size for path in tmp_path.glob("*.mcap"))
+    again.close()
+
+
+def test_a_folder_of_two_sessions_is_no_spool(tmp_path: Path) -> None:
+    """Both would be sent as one, and of two records with one number the second would count as sent."""
+    for number in range(2):
+        writer = Journal(tmp_path, 1 << 16)
+        writer.append([b"head"], session=bytes([number]) * 16, seq=1)
+        writer.close()
+    with pytest.raises(JournalError, match="holds keyframes of 2 sessions: not one spool"):
+        Spool(tmp_path, 1 << 16)
+
+
+def test_a_number_that_nobody_may_find_is_not_used_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its tombstone would hide the record that gets it."""
+    spool = Spool(tmp_path, 1 << 16)
+    spool.add(spool.write([b"head"]))
+    with monkeypatch.context() as broken:
+        broken.setattr(Journal, "append", raising(JournalError("the disk fails")))
+        with pytest.raises(JournalError):
+            spool.write([b"head"])
+    spool.close()
+    monkeypatch.setattr(spool_module, "_RESTART_GAP", 1)
+    monkeypatch.setattr(spool_module, "_RESTART_SPREAD", 1)
+    again = Spool(tmp_path, 1 << 16)
+    assert (again.left, again.next_seq) == (2, 3)
     again.close()
 
 

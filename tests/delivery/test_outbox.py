@@ -5,10 +5,12 @@ import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from interrupts import is_free_after_interrupts
 from keyframes_and_servers import wall
 
+from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.delivery import outbox as outbox_module
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.spool import Spool, Waiting
@@ -57,6 +59,19 @@ def test_of_what_a_dead_scanner_left_a_windows_worth_may_be_journaled(outbox: Ou
     again.welcome(durable=0, window_keyframes=2)
     assert again.drop_oldest()
     assert waiting(again) == [1, 2]
+    again.close()
+
+
+def test_only_what_was_sent_can_be_corrected(outbox: Outbox, tmp_path: Path) -> None:
+    """Between what a dead scanner left and what the next one sends, numbers are skipped."""
+    outbox.close()
+    again = Outbox(Spool(tmp_path, 1 << 20))
+    put(again, 1)
+    last = again.next_seq - 1
+    again.check_known(np.array([1, 3, last]))
+    for never in (4, last - 1, last + 1):
+        with pytest.raises(InvalidKeyframe, match=f"keyframe {never} was never sent from here"):
+            again.check_known(np.array([1, never]))
     again.close()
 
 

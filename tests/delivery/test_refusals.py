@@ -6,7 +6,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from clients_and_spools import NOBODY, joined, send_all
+from clients_and_spools import NOBODY, joined, noise, send_all
 from keyframes_and_servers import DEADLINE, VOLUME, pose, serving, until, wall
 from scripted_server import number, scripted
 
@@ -127,6 +127,20 @@ def test_refused_keyframes_are_kept_aside_and_the_rest_arrives(tmp_path: Path) -
         assert server.numbers == [0, 2, 3, 5, 6, 8, 9]
     kept = [keyframe.timestamp_ns - 10**9 for keyframe in JournalRecording(tmp_path / "refused")]
     assert kept == [1, 4, 7]
+
+
+def test_what_is_larger_than_the_server_takes_is_not_sent(tmp_path: Path) -> None:
+    """The server would end the connection, again and again."""
+    with (
+        scripted(max_frame_bytes=20_000) as server,
+        joined(server, spool=tmp_path, policy="spool_all") as client,
+    ):
+        client.send(noise(0))
+        client.send(wall(1))
+        with pytest.raises(KeyframeRefused, match=r"\(size\): \d+ bytes, the server takes 20000"):
+            client.flush(DEADLINE)
+        client.flush(DEADLINE)
+        assert (client.stats.refused, server.numbers) == ({"size": 1}, [1])
 
 
 def test_a_real_server_refuses_some_and_fuses_the_rest(tmp_path: Path) -> None:

@@ -43,6 +43,7 @@ class ScriptedServer:
         hold: what it answers a keyframe with, once each, instead of taking it.
         denial: what it answers a Hello with.
         keys, allowed: its own keys, and whom it knows by theirs; None = no keys.
+        window, max_frame_bytes: its terms, as it says them in Welcome.
         same_epoch: a second `start` is the same process: only the connections were cut.
         clock: its own, nanoseconds.
         refuses: whether a keyframe is turned away at the door.
@@ -64,6 +65,7 @@ class ScriptedServer:
         self.epoch = ""
         self.clock = time.monotonic_ns
         self.window = 8
+        self.max_frame_bytes = 1 << 20
         self.taken: list[tuple[bytes, int]] = []
         self.corrections: list[int] = []
         self.refused: list[int] = []
@@ -139,7 +141,7 @@ class ScriptedServer:
                     session.fused,
                     self.window,
                     16 << 20,
-                    1 << 20,
+                    self.max_frame_bytes,
                 ),
             )
         elif isinstance(message, messages.Ping):
