@@ -72,6 +72,15 @@ def test_who_was_away_is_told_when_it_is_back(here: Map) -> None:
     assert here.nacks() == [(1, "map", "MapFull"), (2, "map", "memory")]
 
 
+def test_who_is_silent_is_told_before_the_acknowledgement_and_again_when_it_is_heard(here: Map) -> None:
+    """It may only stand still, and reads the one behind the other: what is acknowledged counts as fused."""
+    here.routes.connect(SESSION, "yard", b"1", "robot").last_message -= 10.0
+    here.reject("MapFull")
+    assert [type(one) for one in here.told] == [Nack, Ack]
+    here.outcomes.tell_untold(SESSION)
+    assert here.nacks() == [(1, "map", "MapFull")] * 2
+
+
 def test_what_waits_to_be_said_is_bounded(here: Map) -> None:
     for _ in range(200):
         here.reject("crash")

@@ -159,11 +159,12 @@ class KeyframeOutcomes:
         self._rejected_before, self._rejected_since = self._rejected_since, set()
 
     def _tell(self, nack: messages.Nack) -> None:
-        """Tell a client at once that the map did not take its record, or when it is back."""
+        """Tell a client at once that the map did not take its record; one that is not heard, when it is back."""
         route = self._routes.get(nack.session)
-        if route is not None and route.state(time.monotonic()) == "connected":
+        if route is not None and not route.left:
             self._routes.send(nack.session, nack)
-            return
+            if route.state(time.monotonic()) == "connected":
+                return
         self._untold.setdefault(nack.session, deque(maxlen=_MAX_UNTOLD)).append(nack)
         if len(self._untold) > _MAX_UNTOLD:
             self._untold.popitem(last=False)
