@@ -88,6 +88,14 @@ def test_only_what_was_sent_can_be_refused(side: Side) -> None:
     assert side.waiting == [1, 3]
 
 
+def test_a_rejection_that_is_told_twice_is_said_once(side: Side, caplog: pytest.LogCaptureFixture) -> None:
+    for seq in (1, 1, 2):
+        side.hear(Nack(side.key, seq, "map", "MapFull", "it is full"))
+    said = [record.getMessage().partition(":")[0] for record in caplog.records]
+    assert said == [f"keyframe {seq} is not in the map (MapFull)" for seq in (1, 2)]
+    assert "more that are not" not in caplog.text
+
+
 def test_a_server_of_another_version_gets_nothing(side: Side) -> None:
     side.hear(Welcome("epoch", messages.PROTOCOL_VERSION + 1, 2, 0, 8, 1 << 20, 1 << 20))
     assert (side.outbox.link_state.kind, side.control.terms) == ("refused", None)

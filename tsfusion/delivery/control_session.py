@@ -298,7 +298,10 @@ class ControlSession:
 
     def _on_rejected(self, nack: messages.Nack) -> None:
         """Say at once that the map did not take a record, the first of each reason as an error."""
-        kind, is_first = self._outbox.reject(nack.seq, nack.reason, nack.message)
+        counted = self._outbox.reject(nack.seq, nack.reason, nack.message)
+        if counted is None:  # it was told twice
+            return
+        kind, is_first = counted
         self._unsaid += not is_first and nack.reason != NO_SAMPLES
         what = (kind, nack.seq, nack.reason, nack.message)
         if is_first:

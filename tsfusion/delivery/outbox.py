@@ -405,22 +405,23 @@ class Outbox:
 
     # --- turned away ---
 
-    def reject(self, seq: int, reason: str, message: str = "") -> tuple[str, bool]:
+    def reject(self, seq: int, reason: str, message: str = "") -> tuple[str, bool] | None:
         """Count a record that the server has and the map will not take.
 
-        Returns its kind in words, and whether it is the first of this session for that reason.
+        Returns its kind in words, and whether it is the first of this session for that reason; None = it was
+        counted before.
         """
         with self._lock:
+            if seq in self._rejected_seqs:
+                return None
             is_correction = seq in self._corrections
             counts = self._corrections_refused if is_correction else self._rejected
-            is_first = not counts[reason]
-            if seq not in self._rejected_seqs:
-                counts[reason] += 1
-                self._rejected_seqs[seq] = None
-                self._first_rejection = self._first_rejection or message or reason
-                if len(self._rejected_seqs) > _MOST_REMEMBERED:
-                    self._rejected_seqs.popitem(last=False)
-            return "correction" if is_correction else "keyframe", is_first
+            counts[reason] += 1
+            self._rejected_seqs[seq] = None
+            self._first_rejection = self._first_rejection or message or reason
+            if len(self._rejected_seqs) > _MOST_REMEMBERED:
+                self._rejected_seqs.popitem(last=False)
+            return "correction" if is_correction else "keyframe", counts[reason] == 1
 
     @property
     def first_rejection(self) -> str:

@@ -159,7 +159,7 @@ class KeyframeOutcomes:
         self._rejected_before, self._rejected_since = self._rejected_since, set()
 
     def _tell(self, nack: messages.Nack) -> None:
-        """Tell a client at once that the map did not take its record; one that is not heard, when it is back."""
+        """Tell a client at once that the map did not take its record, and one that was not heard again."""
         route = self._routes.get(nack.session)
         if route is not None and not route.left:
             self._routes.send(nack.session, nack)
