@@ -25,7 +25,7 @@ from keyframes_and_servers import VOLUME, pose, serving, until, wall
 
 import tsfusion
 from tsfusion import VolumeConfig
-from tsfusion.core import errors, process
+from tsfusion.core import errors, folder_lock, process
 from tsfusion.fuser import __main__ as fuser_main
 from tsfusion.fuser import fuser as fuser_module
 from tsfusion.fuser import messages
@@ -546,6 +546,18 @@ def test_a_process_at_work_ends_with_the_one_that_started_it() -> None:
     with parent:
         parent.kill()
         until(lambda: not alive(int(word)))
+
+
+def test_a_map_has_one_fuser_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that was killed, and waits for a disk, may still be there when the next one begins."""
+    sent: list[bytes] = []
+    monkeypatch.setattr(fuser_main, "_LOCK_WAIT_S", 0.0)
+    begin = messages.Begin(str(tmp_path), VOLUME, 1.0, 0, "", False, 1 << 30, quota_cost=1, quota_map=1.0)
+    with folder_lock.hold(tmp_path, fuser_main.LOCK):
+        assert fuser_main._open_map(cast("Any", SimpleNamespace(send=sent.append)), begin) is None
+    failed = messages.to_gateway.decode(sent[0])
+    assert isinstance(failed, messages.Failed)
+    assert "fuser" in str(failed.error())
 
 
 def test_a_system_that_refuses_while_a_map_is_opened_is_one_clear_error(

@@ -8,6 +8,7 @@ from contextlib import ExitStack, closing
 from unittest import mock
 
 import pytest
+from keyframes_and_servers import until
 
 from tsfusion.gateway import connections
 from tsfusion.gateway.connections import Connections
@@ -75,6 +76,21 @@ def test_a_number_that_is_used_again_makes_nobody_a_hoarder(stack: ExitStack) ->
     send(client, server, 4 << 20)
     port.limits.note_read(server.fileno(), 4 << 20)
     assert port.limits.cut_hoarders() == []
+
+
+def test_a_viewer_that_talks_is_cut_off(stack: ExitStack) -> None:
+    """ZeroMQ reads at once what viewers send, however much it is: nobody else would stop them."""
+    port = Port(stack, socket.AF_INET, "127.0.0.1")
+    talks, quiet = port.connect("127.0.0.1"), port.connect("127.0.0.1")
+    port.limits.listen_at(1, 2, talks[1].getsockname()[1])
+    send(*quiet, _PIECE)
+    assert port.limits.step() == 0
+    send(*talks, 2 * _PIECE)
+    with mock.patch.object(connections, "_INTERVAL", 0.0):
+        until(lambda: port.limits.step() == 1)
+    assert talks[0].recv(1) == b""
+    quiet[1].sendall(b"x")
+    assert quiet[0].recv(1) == b"x"
 
 
 def test_other_files_are_no_crowd(stack: ExitStack) -> None:

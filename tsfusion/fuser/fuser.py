@@ -274,6 +274,7 @@ class Fuser:
         written, problem = False, ""
         if self._since_checkpoint and not self._is_home:
             problem = f"the folder {self._folder} is not there, or is another one"
+            log.error("no checkpoint: %s", problem)
         elif self._since_checkpoint:
             with self._memory_beyond(_FOR_A_CHECKPOINT):
                 written = self._map.save()
