@@ -26,7 +26,7 @@ from tsfusion.gateway.metrics import Metrics
 from tsfusion.journal import Journal, quarantine, state_folder
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.allowed_maps import AllowedMaps
-from tsfusion.wire.messages import Command, Denied, Welcome
+from tsfusion.wire.messages import Command, Denied, Nack, Welcome
 
 
 @pytest.fixture
@@ -52,6 +52,27 @@ def test_a_greeting_makes_no_map_and_a_record_does(served: Served, tmp_path: Pat
         assert (answer.session, answer.reason) == (second, "map")
         assert "2 are open" in answer.message
         assert served.greet(link, "yard2").reason == "map"
+
+
+def test_a_record_whose_frames_are_too_large_together_is_refused(tmp_path: Path) -> None:
+    """ZeroMQ limits a single frame. Nor does such a record make a map."""
+    frames = record(1)
+    nbytes = sum(map(len, frames))
+    assert max(map(len, frames)) < nbytes - 1
+    with (
+        serving_here(tmp_path, max_frame_bytes=nbytes - 1) as served,
+        connected(sockets.dealer, served.addresses.control) as link,
+        connected(sockets.push, served.addresses.data) as push,
+    ):
+        for count, map_name in enumerate(("default", "yard"), 1):
+            session = map_name.encode().ljust(16)
+            served.greet(link, map_name, session)
+            push.send_multipart(record(1, map_name, session))
+            nack = served.heard(link, Nack)
+            assert (nack.session, nack.stage, nack.reason) == (session, "door", "size")
+            assert served.gateway.health().refused["size"] == count
+        assert list(served.gateway.health().maps) == ["default"]
+        assert served.durable == 0
 
 
 def test_a_record_of_nobody_or_a_bad_one_makes_no_map(served: Served, tmp_path: Path) -> None:
