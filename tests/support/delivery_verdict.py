@@ -19,7 +19,7 @@ def server_problems(status: Status, keyframes: int) -> list[str]:
     counted = (status.keyframes_durable, status.keyframes_fused)
     if counted != (keyframes, keyframes):
         problems.append(f"durable and fused are {counted}, not {keyframes}")
-    if status.keyframes_rejected or set(status.messages_refused) - {"gap"}:
+    if status.keyframes_rejected or set(status.messages_refused) - {"gap", "held"}:
         problems.append(f"rejected {status.keyframes_rejected}, refused {status.messages_refused}")
     if status.journal_damaged:
         problems.append(f"{status.journal_damaged} records are damaged")
