@@ -89,15 +89,6 @@ def raise_file_limit() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
-def condition() -> tuple[threading.RLock, threading.Condition]:
-    """A lock, and a condition on it: take the lock itself, not the condition.
-
-    The condition's own `with` is written in Python: Ctrl-C may leave it with the lock taken, for ever.
-    """
-    lock = threading.RLock()
-    return lock, threading.Condition(lock)
-
-
 def physical_memory_bytes() -> int:
     """Memory of the machine, or the part of it that this container or service may use, bytes."""
     limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]

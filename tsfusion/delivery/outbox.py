@@ -5,6 +5,7 @@ Every method locks by itself and gives out copies, so callers cannot hold the lo
 `write`, `read` and `tidy` use the disk and are outside the lock.
 """
 
+import threading
 import time
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterator
@@ -13,7 +14,6 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from tsfusion.core import process
 from tsfusion.core.counts import count_of
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.delivery.link_state import LinkState
@@ -104,7 +104,9 @@ class Outbox:
     """The spool, the fate of what passed through it, and the state of the link. For any thread."""
 
     def __init__(self, spool: Spool, clock: Callable[[], float] = time.monotonic) -> None:
-        self._lock, self._changed = process.condition()
+        # The condition's own `with` may be left by Ctrl-C with the lock taken: it is written in Python.
+        self._lock = threading.RLock()
+        self._changed = threading.Condition(self._lock)
         self._spool = spool
         self.clock = clock  # seconds, of the rates
         self._rate = TakingRate()

@@ -3,9 +3,11 @@
 
 import logging
 import os
+import queue
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core import process
 from tsfusion.core.errors import InvalidConfig, SourceError
 from tsfusion.geometry.calibration import Size
 from tsfusion.geometry.frame import Frame
@@ -167,24 +168,23 @@ class CameraThread:
         self.dropped = 0  # pictures replaced by a newer one
         self.ended = False  # the camera has stopped
         self._capture = capture
-        self._newest: VideoPicture | None = None
-        self._lock, self._changed = process.condition()
+        # The newest, and None where there is something else to see. Ctrl-C leaves this queue as it was; a
+        # `Condition` is written in Python, and may be left locked.
+        self._pictures: queue.SimpleQueue[VideoPicture | None] = queue.SimpleQueue()
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
         self._thread.start()
 
     def newest(self, timeout: float) -> VideoPicture | None:
         """Remove and return the newest picture; None if there is none in time."""
-        with self._lock:
-            self._changed.wait_for(lambda: self._newest or self.ended or self._closed, timeout)
-            picture, self._newest = self._newest, None
-            return picture
+        with suppress(queue.Empty):
+            return self._pictures.get(timeout=timeout)
+        return None
 
     def close(self) -> None:
         """Stop the thread, which releases the camera: while it reads, no other thread may."""
-        with self._lock:
-            self._closed = True
-            self._changed.notify_all()
+        self._closed = True
+        self._pictures.put(None)
         self._thread.join(_JOIN_S)
 
     def _run(self) -> None:
@@ -197,16 +197,14 @@ class CameraThread:
         except cv2.error as error:
             log.warning("a camera's picture cannot be read: %s", error)
         finally:
-            with self._lock:
-                self.ended = True
-                self._changed.notify_all()
+            self.ended = True
+            self._pictures.put(None)
             self._capture.release()
 
     def _put(self, picture: VideoPicture) -> None:
-        with self._lock:
-            self.dropped += self._newest is not None
-            self._newest = picture
-            self._changed.notify_all()
+        with suppress(queue.Empty):
+            self.dropped += self._pictures.get_nowait() is not None
+        self._pictures.put(picture)
 
 
 def _rectifier_of_known_size(calibration: str | Path, size: Size | None) -> PairRectifier | None:
