@@ -162,6 +162,9 @@ def unsent(plan: Plan) -> range:
     for folder in journals(Path(plan.state)):
         taken.update(numbers(folder))
     logged = {int(line) for line in _lines(plan.log)}
+    if plan.trimmed and plan.log is not None:  # what was not logged for a kill may be found no more, later
+        with Path(plan.log).open("a") as log:
+            log.writelines(f"\n{i}\n" for i in sorted(taken & set(own) - logged))
     taken = (taken | logged if plan.trimmed else taken) & set(own)
     if logged - taken or taken != set(own[: len(taken)]):
         sys.stderr.write(f"taken {sorted(taken)}, but logged {sorted(logged)}\n")

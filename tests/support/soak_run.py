@@ -106,7 +106,8 @@ def run(folder: Path, keyframes: int, *, kills: int = 3, tolerance_mb: float = T
         worker = threading.Thread(target=trouble.work, args=(keyframes, kills), daemon=True)
         worker.start()
         samples = list(_samples(daemon, scanners, trouble, started))
-        worker.join()
+        if not any(scanner.problem for scanner in scanners):
+            worker.join()
         seconds = time.monotonic() - started
         problems = [scanner.problem for scanner in scanners if scanner.problem] + trouble.problems
         status = fetch_status(address, timeout=60.0)
@@ -259,6 +260,8 @@ def _lost(status: Status, scanners: list[Scanner], keyframes: int, room: Path) -
     if counts != (keyframes, keyframes, 0):
         problems.append(f"of {keyframes} keyframes (durable, fused, rejected) are {counts}")
     for scanner in scanners:
+        if scanner.problem:
+            continue
         report = scanner.report()
         if lost := {**report.refused, **report.rejected, **report.skipped}:
             problems.append(f"a scanner counts lost keyframes: {lost}")
