@@ -269,6 +269,25 @@ class Client:
         if not self._wait(lambda: self._outbox.is_fused, timeout):
             raise FlushTimeout(f"the map does not have every keyframe after {timeout:g} s: {self._why()}")
 
+    def wait_settled(self, timeout: float = 60.0) -> None:
+        """Wait until the map has everything sent, and each keyframe at its newest pose (`correct`).
+
+        The map is then the one that the keyframes make at these poses, to the bit. What other clients correct
+        in it is waited for, too.
+
+        Raises:
+            FlushTimeout: after `timeout` seconds; the server goes on.
+        """
+        if not self._wait(lambda: self._outbox.is_settled, timeout):
+            left = self._outbox.stats().corrections_waiting
+            moves = f"{left} keyframes are to be moved" if left else self._why()
+            raise FlushTimeout(f"the map is not settled after {timeout:g} s: {moves}")
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the map has everything sent, and each keyframe at its newest pose (`wait_settled`)."""
+        return self._outbox.is_settled
+
     def wait_meshed(self, timeout: float = 60.0) -> None:
         """Wait until the server's mesh shows everything sent.
 

@@ -83,6 +83,11 @@ def test_a_screen_shows_it_all() -> None:
     assert "map shed: hash and settings are not known now: the fuser restarts; ask again" in text
 
 
+def test_a_screen_says_what_corrections_have_to_move() -> None:
+    text = screen(health(maps={"default": map_health(corrections_waiting=31, corrections_unavailable=2)}))
+    assert "31 keyframes still to be moved to corrected poses, 2 corrected keyframes that cannot be" in text
+
+
 def test_a_server_that_is_well_says_little() -> None:
     text = screen(health(maps={"default": map_health(rejected={}, quarantined=0)}))
     assert "ready" in text

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Corrections from a scanner to a server's journal, whoever dies on the way or would rather not have them."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -10,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from clients_and_spools import NOBODY, QUICK
+from corrected_maps import fresh_map
+from delivery_verdict import VOXEL_SIZE
 from hostile_messages import hostile_corrections
 from keyframes_and_servers import (
     DEADLINE,
@@ -54,6 +57,10 @@ def records(state: Path, session: bytes) -> list[tuple[int, bool]]:
     return [(record.seq, record.is_correction) for record in found if record.session == session]
 
 
+def fresh_hash(state: Path) -> str:
+    return fresh_map(state_folder.find_journal(state).path, VOXEL_SIZE).map_hash()
+
+
 def test_corrections_stand_in_the_journal_between_keyframes(shared: Server, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     first = [se3.exp(rng.normal(size=6)) for _ in range(3)]
@@ -68,13 +75,17 @@ def test_corrections_stand_in_the_journal_between_keyframes(shared: Server, tmp_
         assert (stats.sent, stats.durable, stats.fused, stats.waiting) == (4, 4, 4, 0)
         assert (stats.corrections_sent, stats.corrections_acknowledged) == (2, 2)
         assert [one.seq for one in client.records] == [1, 2, 3, 5]
+        client.wait_settled(DEADLINE)
         client.wait_meshed(DEADLINE)
         health = fetch_health(shared.address)
         (own,) = [one for one in health.clients if one.session == session.hex()[:8]]
         assert (own.corrections, own.durable, own.fused) == (2, 4, 4)
         told = health.maps["default"]
         assert told.corrections >= 2
-        assert (told.waiting, told.keyframes_durable) == (0, told.keyframes_fused)
+        assert (told.waiting, told.corrections_waiting, told.corrections_unavailable) == (0, 0, 0)
+        assert told.keyframes_moved > 0
+        assert told.keyframes_durable > told.keyframes_fused  # one was taken out
+    assert fetch_status(shared.address).map_hash == fresh_hash(shared.state)
     assert records(shared.state, session) == [(seq, seq in (4, 6)) for seq in range(1, 7)]
     older, newer = journaled_corrections(shared.state)[-2:]
     assert older.poses.tobytes() == np.array(first).tobytes()
@@ -87,6 +98,40 @@ def test_corrections_stand_in_the_journal_between_keyframes(shared: Server, tmp_
     moves = [se3.inverse(pose(0.03 * i)) @ T for i, T in enumerate(newest)]
     assert shown.moved_m == pytest.approx(max(map(se3.distance, moves)))
     assert shown.turned_deg == pytest.approx(np.degrees(max(map(se3.angle, moves))))
+
+
+def test_a_fuser_that_dies_while_it_moves_keyframes(tmp_path: Path) -> None:
+    count = 40
+    with serving(tmp_path, checkpoint_every=15) as server:
+        with Client(server.address) as client:
+            seqs = scan(client, count)
+            client.correct({seq: pose(0.1 * seq, 0.05) for seq in seqs})
+            until(lambda: 0 < fetch_health(server.address).maps["default"].corrections_waiting < count - 5)
+            os.kill(server.fuser_pid(), signal.SIGKILL)
+            client.send(wall(count))
+            client.wait_settled(DEADLINE)
+            assert client.is_settled
+        told = fetch_status(server.address)
+        assert (told.keyframes_fused, told.fuser_restarts) == (count + 1, 1)
+        assert told.map_hash == fresh_hash(tmp_path)
+        server.process.terminate()
+        assert server.process.wait(DEADLINE) == 0
+    with serving(tmp_path) as server:
+        assert fetch_status(server.address).map_hash == told.map_hash
+        own = fetch_health(server.address).maps["default"]
+        assert (own.corrections_waiting, own.keyframes_moved) == (0, 0)
+
+
+def test_a_server_that_ends_moves_what_waits_first(tmp_path: Path) -> None:
+    with serving(tmp_path) as server, Client(server.address) as client:
+        client.correct({seq: pose(1.0 * seq) for seq in scan(client, 10)}, T_map_odometry=pose(0, 0.3))
+        client.flush(DEADLINE)
+        server.process.terminate()
+        assert server.process.wait(DEADLINE) == 0
+    with serving(tmp_path) as server:
+        own = fetch_health(server.address).maps["default"]
+        assert (own.corrections_waiting, own.keyframes_moved) == (0, 0)
+        assert fetch_status(server.address).map_hash == fresh_hash(tmp_path)
 
 
 def test_only_what_was_sent_can_be_corrected(shared: Server, tmp_path: Path) -> None:

@@ -147,7 +147,7 @@ def test_watchers_get_the_triangles(tmp_path: Path) -> None:
 def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tsfusion.fuser.fuser._REFINED_AT_ONCE", 10)
+    monkeypatch.setattr("tsfusion.fuser.live_mesh._REFINED_AT_ONCE", 10)
     position, fuser, link = opened_with_one(tmp_path)
     fuser.handle(messages.Publish(True))
     fuser.handle(order(0, position))
@@ -178,7 +178,7 @@ def test_what_cannot_be_fused_is_counted_also_after_a_restart(tmp_path: Path) ->
     assert status(*opened(tmp_path)).keyframes_rejected == rejected
 
 
-def test_corrections_are_noted_and_leave_the_map_as_it_is(tmp_path: Path) -> None:
+def test_corrections_are_answered_before_they_move_the_map(tmp_path: Path) -> None:
     positions = fill(tmp_path, 1)
     log = Journal(tmp_path / "journal", 1 << 20)
     good = corrections.encode(corrections.checked({1: pose(1)}, removed=[2]), session=SESSION, seq=2)

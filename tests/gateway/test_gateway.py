@@ -525,6 +525,28 @@ def test_the_last_words_of_a_dead_fuser_are_not_heard(start: Start, monkeypatch:
         late.close(linger=0)
 
 
+_DIES_MOVING = """
+    if isinstance(message, fuser_messages.Begin):
+        waiting = 3 if message.moves else 0
+        moves = fuser_messages.CorrectionProgress(0, 0, waiting, 3 - waiting, 0, 0.0)
+        say(fuser_messages.Ready({}, moves=moves))
+    if isinstance(message, fuser_messages.Fuse):
+        say(fuser_messages.Done(message.index, 1, 2))
+        if begin.moves and message.index == 4:
+            at(fuser_messages.MOVING)
+            sys.exit(7)
+"""
+
+
+def test_corrections_that_kill_the_fuser_twice_are_given_up(
+    start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    health = default(drained(start(_DIES_MOVING)))
+    assert (health.fuser_restarts, health.keyframes_fused, health.rejected) == (2, 5, {})
+    assert (health.corrections_waiting, health.corrections_unavailable) == (0, 3)
+    assert "they stay where they were fused until the server starts anew" in caplog.text
+
+
 def test_an_answer_is_of_the_moment_at_which_it_was_given(start: Start, tmp_path: Path) -> None:
     """A map that is idle now was not, when its fuser answered before it fused the last keyframe."""
     go, said = tmp_path / "go", tmp_path / "said"

@@ -109,6 +109,8 @@ def _notes(name: str, one: MapHealth) -> list[Text]:
     counts = {
         "quarantined": one.quarantined, "× the fuser restarted": one.fuser_restarts,
         "damaged records": one.journal_damaged,
+        "keyframes still to be moved to corrected poses": one.corrections_waiting,
+        "corrected keyframes that cannot be moved": one.corrections_unavailable,
     }  # fmt: skip
     notes = [f"{count} {what}" for what, count in counts.items() if count]
     if one.rejected:

@@ -263,6 +263,8 @@ class ControlSession:
         self._outbox.change_link_state(self._outbox.link_state.answered())
         self._note_answer()
         self._on_progress(pong.durable, pong.fused)
+        if pong.corrections_waiting is not None:
+            self._outbox.note_moves(pong.fused, pong.corrections_waiting)
 
     def _on_ack(self, ack: messages.Ack) -> None:
         moved = self._on_progress(ack.durable, ack.fused, ack.stamps)

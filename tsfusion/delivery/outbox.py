@@ -44,6 +44,7 @@ class ClientStats(Struct, frozen=True):
         corrections_sent: corrections that `correct` took.
         corrections_acknowledged: corrections on the server's disk.
         corrections_refused: corrections that were skipped, refused or rejected: reason → count.
+        corrections_waiting: keyframes of the map whose newest pose is not fused yet, as last heard.
     """
 
     sent: int
@@ -58,6 +59,7 @@ class ClientStats(Struct, frozen=True):
     corrections_sent: int = 0
     corrections_acknowledged: int = 0
     corrections_refused: dict[str, int] = {}
+    corrections_waiting: int = 0
 
 
 class Lag(Struct, frozen=True):
@@ -121,6 +123,8 @@ class Outbox:
         self._outstanding = 0  # of the oldest in the spool, so many are on their way
         self._unfused = NumberRuns()  # durable, and not answered by the map
         self._last_fused = self._last_meshed = 0  # numbers
+        self._settled = 0  # the map has everything up to this number, each keyframe at its newest pose
+        self._corrections_waiting = 0
         self._skipped: Counter[str] = Counter()
         self._times = KeyframeTimesTable()
         self._sent = self._durable = self._fused = 0
@@ -405,6 +409,14 @@ class Outbox:
             self._last_meshed = max(self._last_meshed, seq)
             self._changed.notify_all()
 
+    def note_moves(self, fused: int, waiting: int) -> None:
+        """Note how many keyframes of the map were to be moved when it had everything up to `fused`."""
+        with self._lock:
+            self._corrections_waiting = waiting
+            if not waiting:
+                self._settled = fused
+            self._changed.notify_all()
+
     # --- turned away ---
 
     def reject(self, seq: int, reason: str, message: str = "") -> tuple[str, bool] | None:
@@ -469,6 +481,12 @@ class Outbox:
             return not self._spool.waiting and not self._unfused
 
     @property
+    def is_settled(self) -> bool:
+        """Whether the map has everything sent, and each keyframe at its newest pose."""
+        with self._lock:
+            return self.is_fused and self._settled >= self._last_fused
+
+    @property
     def is_meshed(self) -> bool:
         """Whether the mesh shows everything sent."""
         with self._lock:
@@ -515,6 +533,7 @@ class Outbox:
                 corrections_sent=self._corrections_sent,
                 corrections_acknowledged=self._corrections_durable,
                 corrections_refused=dict(self._corrections_refused),
+                corrections_waiting=self._corrections_waiting,
             )
 
     def close(self) -> bool:

@@ -16,7 +16,7 @@ from tsfusion.core.config import LogFormat, LogLevel
 from tsfusion.core.errors import MapError, TsfusionError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.fuser import messages as fuser_messages
-from tsfusion.fuser.fuser import LOCK, RETRY_MS, Fuser
+from tsfusion.fuser.fuser import LOCK, Fuser
 from tsfusion.wire import sockets
 
 _LOCK_WAIT_S = 60.0  # for another fuser to end: it may be reading a large map
@@ -56,12 +56,14 @@ def _serve(link: sockets.AnySocket) -> int:
         if fuser is not None and fuser.mesh_due(idle):
             fuser.mesh()
             continue
+        if fuser is not None and fuser.move_due(idle):
+            fuser.move()
+            continue
         if idle and fuser is not None and fuser.refine_due:
             fuser.refine()
             continue
         process.on_parent_end(signal.SIGCONT)  # a stopped process would not notice the gateway's end
-        is_held = fuser is not None and fuser.is_held
-        events = dict(poller.poll(RETRY_MS if is_held else None))
+        events = dict(poller.poll(fuser.wait_ms if fuser is not None else None))
         if sys.stdin.fileno() in events:  # nothing is ever written there: the gateway has ended
             return 1
         if not events and fuser is not None:

@@ -19,21 +19,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from tsfusion import journal
 from tsfusion.core import process
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
+from tsfusion.fuser.live_mesh import LiveMesh, mesh_frames
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
+from tsfusion.fuser.pose_mover import PoseMover
 from tsfusion.geometry.keyframe import Keyframe
-from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import state_folder
 from tsfusion.wire import codec, sockets
-from tsfusion.wire.health import MeshLayout
 from tsfusion.wire.record_header import Refused
 
 if TYPE_CHECKING:
@@ -44,11 +42,9 @@ _FOR_KEYFRAMES = 256 << 20  # bytes of it that meshes leave free
 _FOR_A_CHECKPOINT = 64 << 20  # bytes beyond both
 LOCK = "fuser.lock"  # in the map's folder
 _PATIENCE_S = 10.0  # for a record that the system refuses to read, or whose segment is not there
-RETRY_MS = 500  # until it is tried again
+_RETRY_MS = 500  # until it is tried again
 _CARVING = 10  # times `quota_cost` where rays also vote for the free space before them
 _MORE_MS = 50  # milliseconds within which the next record comes, if the gateway said that one waits
-_REFINED_AT_ONCE = 256  # blocks: about 50 ms
-_REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
 
 log = logging.getLogger(__name__)
 
@@ -63,14 +59,11 @@ class Fuser:
         self._begin = begin
         self._folder = Path(begin.folder)
         self._since_checkpoint = 0
-        self._watched = False
         self._orders: deque[fuser_messages.Fuse] = deque()  # not answered; the first cannot be read for now
         self._held_since: float | None = None  # time.monotonic(); None = nothing is held
-        self._answered = self._meshed = 0  # keyframes of this process
+        self._answered = 0  # records of this process
         self._more_waits = False  # at the gateway
-        self._next_mesh = 0.0
-        self._unrefined = np.zeros((0, 3), np.int32)  # cells that viewers have with the raw surface
-        self._hashes: tuple[int, str, str] | None = None  # keyframes answered, map hash, colour hash
+        self._hashes: tuple[int, str, str] | None = None  # changes, map hash, colour hash
         self._current = CurrentKeyframe(begin.working)
         runtime.start(begin.volume.threads)  # it reserves a GB, and more for each thread, and hardly uses it
         self._memory_limit = process.data_bytes() + _WORKING_MEMORY + begin.memory_bytes
@@ -84,12 +77,32 @@ class Fuser:
         self._volume = self._map.volume
         self._volume.warm_up()
         self._volume.limit_memory(begin.memory_bytes)
+        self._live_mesh = LiveMesh(
+            self._volume,
+            interval=begin.mesh_interval,
+            sparing=lambda: self._memory_beyond(-_FOR_KEYFRAMES),
+            send=self._send,
+        )
+        self._mover = PoseMover(
+            self._volume,
+            self._map.poses,
+            self._folder / state_folder.JOURNAL_FOLDER,
+            integrate=lambda keyframe, session: self._integrate(keyframe, self._map.done[session].client),
+            is_away=self._journal_is_away,
+            say=self._send,
+            moves=begin.moves,
+        )
 
     def ready(self) -> fuser_messages.Ready:
         """The message that the map is open, and how far it is."""
         stats = self._volume.stats()
         return fuser_messages.Ready(
-            self._map.done, self._volume.keyframes, self._map.rejected, stats.blocks, stats.bytes
+            self._map.done,
+            self._volume.keyframes,
+            self._map.rejected,
+            stats.blocks,
+            stats.bytes,
+            self._mover.progress(),
         )
 
     def handle(self, message: fuser_messages.ToFuser) -> None:
@@ -100,9 +113,7 @@ class Fuser:
         elif isinstance(message, fuser_messages.FuserQuery):
             self._answer(message)
         elif isinstance(message, fuser_messages.Publish):
-            self._watched = message.wanted
-            if not self._watched:
-                self._unrefined = self._unrefined[:0]
+            self._live_mesh.watch(message.wanted)
         elif isinstance(message, fuser_messages.Save):
             self._checkpoint()
         elif isinstance(message, fuser_messages.Finish):
@@ -110,7 +121,7 @@ class Fuser:
 
     @property
     def is_held(self) -> bool:
-        """Whether records wait for one that cannot be read for now: call `go_on` every `RETRY_MS`."""
+        """Whether records wait for one that cannot be read for now: call `go_on` again and again."""
         return bool(self._orders)
 
     def go_on(self) -> None:
@@ -120,71 +131,46 @@ class Fuser:
             self._held_since = None
 
     @property
+    def wait_ms(self) -> int | None:
+        """Milliseconds to wait for a message at most; None = for ever."""
+        if self.is_held:
+            return _RETRY_MS
+        return round(1000 * self._mover.seconds_left) + 1 if self._mover.waiting else None
+
+    @property
     def idle_after_ms(self) -> int:
         """Milliseconds without a message after which nothing is to be done but to mesh."""
         return _MORE_MS if self._more_waits else 0
 
     def mesh_due(self, idle: bool) -> bool:
-        """Whether the mesh is behind and it is time for it: at once when idle, otherwise after a pause."""
-        behind = self._answered > self._meshed
-        return behind and (idle or time.monotonic() >= self._next_mesh)
+        """Whether it is time to call `mesh`: at once when there is nothing else to do."""
+        return self._live_mesh.is_due(idle=idle and not self._mover.waiting)
 
     def mesh(self) -> None:
-        """Bring the mesh up to date with the raw surface: it is fast, and the next keyframe may be near.
-
-        Without enough memory, viewers miss a part; a mesh on request is whole, once there is enough.
-        """
-        try:
-            with self._memory_beyond(-_FOR_KEYFRAMES):
-                self._mesh()
-        except MemoryError as error:
-            log.error("no memory to mesh the changed part of the map: %s", error)
-            self._meshed = self._answered
-            self._send(self._meshed_message(time.monotonic_ns()))
-
-    def _mesh(self) -> None:
-        from tsfusion.tsdf.block_store import cells_of
-
-        started = time.monotonic()
-        blocks = self._volume.take_dirty()
-        cells = cells_of(blocks)
-        mesh = self._volume.extract_mesh(blocks=cells, surface="raw")
-        self._meshed = self._answered
-        pause = max(self._begin.mesh_interval, _REST_FACTOR * (time.monotonic() - started))
-        self._next_mesh = time.monotonic() + pause
-        meshed_ns = time.monotonic_ns()
-        if self._watched:
-            self._publish(meshed_ns, len(blocks), cells, mesh)
-            if self._volume.model.surface != "raw":
-                unrefined = np.concatenate([self._unrefined, self._volume.cells_to_mesh(blocks)])
-                self._unrefined = np.unique(unrefined, axis=0)
-        else:
-            self._send(self._meshed_message(meshed_ns))
+        """Bring the mesh up to date."""
+        self._live_mesh.update()
 
     @property
     def refine_due(self) -> bool:
         """Whether viewers have cells that do not yet show the surface that the settings ask for."""
-        return len(self._unrefined) > 0
+        return self._live_mesh.refine_due
 
     def refine(self) -> None:
-        """Mesh some cells again, with the surface that the settings ask for.
+        """Mesh some cells again. Call it only while there is nothing else to do."""
+        self._live_mesh.refine()
 
-        Call it only while there is nothing else to do: a keyframe that comes meanwhile waits.
-        """
-        cells, self._unrefined = self._unrefined[:_REFINED_AT_ONCE], self._unrefined[_REFINED_AT_ONCE:]
-        with suppress(MemoryError), self._memory_beyond(-_FOR_KEYFRAMES):  # the raw surface stays
-            self._publish(time.monotonic_ns(), 0, cells, self._volume.extract_mesh(blocks=cells))
+    def move_due(self, idle: bool) -> bool:
+        """Whether a corrected keyframe is to be fused at its new pose now."""
+        return self._mover.is_due(idle=idle)
 
-    def _publish(self, meshed_ns: int, blocks: int, cells: NDArray[np.int32], mesh: Mesh) -> None:
-        layout, frames = _mesh_frames(mesh)
-        frames.insert(0, np.ascontiguousarray(cells).data)
-        self._send(self._meshed_message(meshed_ns, blocks, layout), frames)
-
-    def _meshed_message(
-        self, meshed_ns: int, blocks: int = 0, layout: MeshLayout | None = None
-    ) -> fuser_messages.Meshed:
-        stats = self._volume.stats()
-        return fuser_messages.Meshed(self._meshed, meshed_ns, blocks, stats.blocks, stats.bytes, layout)
+    def move(self) -> None:
+        """Fuse a corrected keyframe at its new pose."""
+        self._current.set(fuser_messages.MOVING)
+        is_done = self._mover.move()
+        self._current.set(fuser_messages.NOT_WORKING)
+        if is_done:
+            self._live_mesh.note_move()
+            self._note_change()
 
     def _fuse(self, order: fuser_messages.Fuse) -> bool:
         """Take a record into the map, or reject it; False when it cannot be read for now."""
@@ -192,7 +178,7 @@ class Fuser:
         self._more_waits = order.more
         before = self._map.done.get(order.session)
         if before is not None and order.seq <= before.seq:
-            self._answered += 1
+            self._note_answer()
             self._send(fuser_messages.Done(order.index, start, start))
             return True
         reason, message = order.skip, ""
@@ -201,10 +187,16 @@ class Fuser:
             try:
                 record = journal.read(self._folder / state_folder.JOURNAL_FOLDER, order.position)
                 found = codec.decode(record.frames)
-                if isinstance(found, Keyframe):  # a correction does not change the map (yet)
+                if isinstance(found, Keyframe):
+                    found = self._map.poses.placed(order.session, found)
                     stats = self._integrate(found, order.client)
-                    if not stats.samples:
+                    if stats.samples:
+                        self._map.poses.add(order.session, order.seq, order.position, found)
+                    else:
                         reason, message = NO_SAMPLES, self._volume.why_no_samples(found)
+                else:
+                    self._map.poses.correct(order.session, found)
+                    self._mover.say()
             except TsfusionError as error:
                 if isinstance(error, JournalError) and self._hold(error):
                     return False
@@ -214,13 +206,20 @@ class Fuser:
             self._current.set(fuser_messages.NOT_WORKING)  # not reached if the keyframe ended the process
         if reason is not None and not order.is_correction:
             self._map.rejected[reason] = self._map.rejected.get(reason, 0) + 1
-        self._answered += 1
+        self._note_answer()
         self._map.done[order.session] = fuser_messages.SessionProgress(order.seq, order.client, order.world)
         self._send(fuser_messages.Done(order.index, start, time.monotonic_ns(), reason, message))
+        self._note_change()
+        return True
+
+    def _note_answer(self) -> None:
+        self._answered += 1
+        self._live_mesh.note_answer()
+
+    def _note_change(self) -> None:
         self._since_checkpoint += 1
         if self._begin.checkpoint_every and self._since_checkpoint >= self._begin.checkpoint_every:
             self._checkpoint()
-        return True
 
     def _hold(self, error: JournalError) -> bool:
         """Whether to wait with a record that cannot be read: its folder, its file or the disk may come back.
@@ -235,7 +234,7 @@ class Fuser:
             log.warning("%s; it is tried again", error)
             self._held_since = now
         is_over = now - self._held_since >= _PATIENCE_S
-        is_away = journal.is_away(self._folder / state_folder.JOURNAL_FOLDER, self._journal_home)
+        is_away = self._journal_is_away()
         if is_over and not is_away and error.errno == errno.ENOENT:
             return False
         if is_over and not is_away:
@@ -245,6 +244,9 @@ class Fuser:
         self._current.set(fuser_messages.NOT_WORKING)
         self._send(fuser_messages.Held(str(error)))
         return True
+
+    def _journal_is_away(self) -> bool:
+        return journal.is_away(self._folder / state_folder.JOURNAL_FOLDER, self._journal_home)
 
     @contextmanager
     def _memory_beyond(self, nbytes: int) -> Iterator[None]:
@@ -296,7 +298,7 @@ class Fuser:
             if query.command.name == "mesh":
                 with self._memory_beyond(-_FOR_KEYFRAMES):
                     mesh = self._volume.extract_mesh(query.command.min_weight)
-                layout, frames = _mesh_frames(mesh)
+                layout, frames = mesh_frames(mesh)
                 self._send(fuser_messages.FuserReply(query.number, layout=layout), frames)
             else:
                 self._send(fuser_messages.FuserReply(query.number, status=self._status()))
@@ -309,8 +311,9 @@ class Fuser:
 
     def _status(self) -> fuser_messages.FuserStatus:
         stats = self._volume.stats()
-        if self._hashes is None or self._hashes[0] != self._answered:
-            self._hashes = (self._answered, self._volume.map_hash(), self._volume.color_hash())
+        changes = self._answered + self._mover.moved
+        if self._hashes is None or self._hashes[0] != changes:
+            self._hashes = (changes, self._volume.map_hash(), self._volume.color_hash())
         return fuser_messages.FuserStatus(
             keyframes_fused=self._volume.keyframes,
             keyframes_rejected=self._map.rejected,
@@ -329,15 +332,6 @@ class Fuser:
 
     def _send(self, message: Any, frames: list[Any] | None = None) -> None:
         self._link.send_multipart([fuser_messages.encode(message), *(frames or [])], copy=False)
-
-
-def _mesh_frames(mesh: Mesh) -> tuple[MeshLayout, list[Any]]:
-    arrays: list[NDArray[Any]] = [mesh.vertices, mesh.faces, mesh.normals]
-    if mesh.colors is not None:
-        arrays.append(mesh.colors)
-    counts = {"vertices": len(mesh.vertices), "faces": len(mesh.faces)}
-    layout = MeshLayout(**counts, colors=mesh.colors is not None, up=mesh.up)
-    return layout, [np.ascontiguousarray(array).data for array in arrays]
 
 
 def _reason(error: TsfusionError) -> str:

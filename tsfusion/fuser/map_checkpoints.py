@@ -12,6 +12,7 @@ import msgspec
 from tsfusion.core import durable_files
 from tsfusion.core.config import LIMIT_SETTINGS, VIEW_SETTINGS, VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, TsfusionError
+from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.fuser.messages import SessionProgress
 from tsfusion.journal import state_folder
 
@@ -58,6 +59,7 @@ class MapCheckpoints:
             }
             self.rejected = dict(meta["rejected"])
             self.blocks = dict(meta.get("blocks", {}))
+        self.poses = KeyframePoses(meta.get("poses"), {key: one.seq for key, one in self.done.items()})
 
     def save(self) -> bool:
         """Write a checkpoint; False when that failed, which is logged.
@@ -66,7 +68,7 @@ class MapCheckpoints:
         new one is on the disk, the old ones keep their names.
         """
         done = {key.hex(): msgspec.structs.astuple(progress) for key, progress in self.done.items()}
-        meta = {"done": done, "rejected": self.rejected, "blocks": self.blocks}
+        meta = {"done": done, "rejected": self.rejected, "blocks": self.blocks, "poses": self.poses.saved()}
         try:
             self.volume.save(self._new, meta=meta)
             if self._keep_previous:

@@ -17,6 +17,7 @@ from tsfusion.wire.health import MeshLayout
 from tsfusion.wire.messages import Command
 
 NOT_WORKING = -1  # instead of a keyframe's index
+MOVING = -2  # likewise: at a keyframe that a correction moves
 
 
 class Begin(Struct, frozen=True, tag="begin"):
@@ -26,10 +27,11 @@ class Begin(Struct, frozen=True, tag="begin"):
         mesh_interval: seconds between two meshes, at least.
         checkpoint_every: keyframes; 0 = only on request and at the end.
         working: a file of 8 bytes: the index of the keyframe that is being fused, little-endian, or
-            `NOT_WORKING`. Read when the process has died, so that the right keyframe is blamed.
+            `NOT_WORKING` or `MOVING`. Read when the process has died, so that the right keyframe is blamed.
         keep_previous: whether to keep the checkpoint before the last, too: the journal may be cut.
         memory_bytes: that the process may allocate.
         quota_cost, quota_map: as in the server's settings.
+        moves: whether to fuse keyframes where corrections say; False = others died of that.
     """
 
     folder: str
@@ -41,6 +43,7 @@ class Begin(Struct, frozen=True, tag="begin"):
     memory_bytes: int
     quota_cost: int
     quota_map: float
+    moves: bool = True
 
 
 class SessionProgress(Struct, frozen=True, array_like=True):
@@ -104,6 +107,27 @@ class Ready(Struct, frozen=True, tag="ready"):
     rejected: dict[str, int] = {}
     blocks: int = 0
     map_bytes: int = 0
+    moves: "CorrectionProgress | None" = None
+
+
+class CorrectionProgress(Struct, frozen=True, tag="corrected"):
+    """How far the map is with corrected poses.
+
+    Attributes:
+        keyframes: in the map, now.
+        removed: keyframes that corrections took out of it.
+        waiting: keyframes whose newest pose is not fused yet.
+        unavailable: keyframes that stay where they were fused, because the journal has them no more.
+        moved: keyframes that were fused at another pose, or taken out, by this process.
+        seconds: of work for that.
+    """
+
+    keyframes: int
+    removed: int
+    waiting: int
+    unavailable: int
+    moved: int
+    seconds: float
 
 
 class Saved(Struct, frozen=True, tag="saved"):
@@ -149,7 +173,7 @@ class Failed(Struct, frozen=True, tag="failed"):
 
 
 class Done(Struct, frozen=True, tag="done"):
-    """A keyframe is in the map or a correction is noted, or `reason` says why it never will be."""
+    """A keyframe is in the map, or a correction is noted; or `reason` says why it never will be."""
 
     index: int
     fuse_start_ns: int
@@ -197,7 +221,7 @@ class FuserReply(Struct, frozen=True, tag="answer"):
 
 
 ToFuser = Begin | Fuse | FuserQuery | Publish | Save | Finish
-ToGateway = Started | Ready | Failed | Done | Saved | Held | Meshed | FuserReply
+ToGateway = Started | Ready | Failed | Done | CorrectionProgress | Saved | Held | Meshed | FuserReply
 to_fuser: "msgspec.msgpack.Decoder[ToFuser]" = msgspec.msgpack.Decoder(ToFuser)
 to_gateway: "msgspec.msgpack.Decoder[ToGateway]" = msgspec.msgpack.Decoder(ToGateway)
 encode = msgspec.msgpack.encode

@@ -176,4 +176,8 @@ def status(
         delay_bound_ms=own.delay_bound_ms,
         config={"server": msgspec.to_builtins(server), "volume": fuser.config},
         versions=fuser.versions,
+        corrections_waiting=own.corrections_waiting,
+        corrections_unavailable=own.corrections_unavailable,
+        keyframes_moved=own.keyframes_moved,
+        moving_s=own.moving_s,
     )

@@ -185,6 +185,7 @@ class FuserSupervisor:
             self.held = message.message
         elif isinstance(message, fuser_messages.Saved) and message.written:
             self._early_deaths = 0
+            self._blame.pop(fuser_messages.MOVING, None)
         return message, frames
 
     def ended(self) -> bool:
@@ -264,6 +265,13 @@ class FuserSupervisor:
         if index == fuser_messages.NOT_WORKING:
             return False
         self._blame[index] = self._blame.get(index, 0) + weight
+        if index == fuser_messages.MOVING and self._blame[index] >= GIVE_UP_AT and self._begin.moves:
+            self._begin = msgspec.structs.replace(self._begin, moves=False)
+            log.error(
+                "the fuser process died again and again while it moved corrected keyframes: they stay where "
+                "they were fused until the server starts anew",
+                extra=logs.about(map=self._map),
+            )
         with suppress(OSError):
             self._process.clear_current_keyframe()
         return True

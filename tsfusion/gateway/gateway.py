@@ -245,7 +245,8 @@ class Gateway:
 
     def _on_ping(self, identity: bytes, ping: messages.Ping, client: str) -> None:
         received_ns = time.monotonic_ns()
-        progress = (0, 0)
+        progress: tuple[int, int] = (0, 0)
+        waiting = None
         route = self._routes.mark_alive(ping.session, client)
         if route is not None:
             route.identity = identity  # of several connections the one that is heard is the one that stands
@@ -253,7 +254,8 @@ class Gateway:
             progress = self.maps.progress(route.map, ping.session)
             if (hosted := self.maps.get(route.map)) is not None:
                 hosted.outcomes.tell_untold(ping.session)
-        pong = messages.Pong(self.epoch, ping.sent_ns, received_ns, time.monotonic_ns(), *progress)
+                waiting = hosted.outcomes.moves.waiting
+        pong = messages.Pong(self.epoch, ping.sent_ns, received_ns, time.monotonic_ns(), *progress, waiting)
         self.ports.reply(identity, pong)
 
     def _on_command(self, identity: bytes, command: messages.Command, client: str) -> None:

@@ -99,8 +99,8 @@ class HostedMap:
 
     @property
     def drained(self) -> bool:
-        """Whether the map has every keyframe of the journal."""
-        return self.fuser.idle and self._backlog.is_empty
+        """Whether the map has every keyframe of the journal, where the newest correction of it says."""
+        return self.fuser.idle and self._backlog.is_empty and not self.outcomes.moves.waiting
 
     @property
     def settled(self) -> bool:
@@ -150,7 +150,7 @@ class HostedMap:
             durable_ns=durable_ns,
             is_correction=is_correction,
         )
-        if self.drained:
+        if self._backlog.is_empty:
             self._moved = time.monotonic()
         self._backlog.add(session, is_correction=is_correction)
         if is_correction:
@@ -180,6 +180,8 @@ class HostedMap:
                 self._moved = time.monotonic()
                 self._backlog.on_done(message.index, (message.fused_ns - message.fuse_start_ns) / 1e9)
                 self.outcomes.on_done(message)
+            elif isinstance(message, fuser_messages.CorrectionProgress):
+                self.outcomes.on_moves(message)
             elif isinstance(message, fuser_messages.Ready):
                 self._on_ready(message)
             elif isinstance(message, fuser_messages.Saved):
@@ -323,7 +325,7 @@ class HostedMap:
         return MapHealth(
             state=self.state,
             problem=self.problem,
-            keyframes_durable=outcomes.fused + outcomes.rejected.total() + self._backlog.keyframes,
+            keyframes_durable=outcomes.taken + outcomes.rejected.total() + self._backlog.keyframes,
             keyframes_fused=outcomes.fused,
             waiting=self._backlog.keyframes,
             rejected=dict(outcomes.rejected),
@@ -338,6 +340,10 @@ class HostedMap:
             delay_ms=outcomes.delays.summary(),
             delay_bound_ms=outcomes.delays.bound_ms,
             corrections=self._corrections,
+            corrections_waiting=outcomes.moves.waiting,
+            corrections_unavailable=outcomes.moves.unavailable,
+            keyframes_moved=outcomes.moves.moved,
+            moving_s=outcomes.moves.seconds,
             checkpoints=self._checkpoints,
             journal_missing=self._journal.absent + len(self._journal.missing),
             journal_put_back=self._journal.put_back,

@@ -30,6 +30,9 @@ _OVER_QUOTA = "MapQuota"  # or its client has had its share
 _MAX_UNTOLD = 64  # rejections of a session while it is away, and sessions with some
 
 
+_NO_MOVES = fuser_messages.CorrectionProgress(0, 0, 0, 0, 0, 0.0)
+
+
 class KeyframeOutcomes:
     """The outcomes of one map's keyframes, over all its fuser processes."""
 
@@ -45,6 +48,7 @@ class KeyframeOutcomes:
         quarantine: Quarantine,
     ) -> None:
         self.fused = 0  # keyframes in the map
+        self.moves = _NO_MOVES  # what corrections make of them
         self.rejected: Counter[str] = Counter()  # by reason
         self.unmeshed: deque[int] = deque()  # indices; answered by the present fuser, oldest first
         self.blocks = self.map_bytes = 0  # at the fuser's last message about them
@@ -76,6 +80,7 @@ class KeyframeOutcomes:
         self.fused, self.rejected = ready.keyframes, Counter(ready.rejected)
         self.blocks, self.map_bytes = ready.blocks, ready.map_bytes
         self.notices.clear()  # it may have more room now
+        self.on_moves(ready.moves or msgspec.structs.replace(_NO_MOVES, keyframes=ready.keyframes))
         self._settle_unmeshed()
 
     def _settle_unmeshed(self) -> None:
@@ -153,6 +158,18 @@ class KeyframeOutcomes:
         except JournalError:  # which is why it was rejected
             return
         self._quarantine.keep(frames, session=session.key, seq=seq, client=session.client, reason=done.reason)
+
+    @property
+    def taken(self) -> int:
+        """Number of keyframes that the map took, those that a correction took out of it included."""
+        return self.fused + self.moves.removed
+
+    def on_moves(self, moves: fuser_messages.CorrectionProgress) -> None:
+        """Note how far the map is with corrected poses."""
+        self.moves, self.fused = moves, moves.keyframes
+        if moves.unavailable:
+            stay = f"{moves.unavailable} corrected keyframe{'s' * (moves.unavailable > 1)}"
+            self.notices["unmoved"] = f"{stay} cannot be moved and left where fused: the log says why"
 
     def on_checkpoint(self) -> None:
         """Note that a new checkpoint holds everything that was answered."""

@@ -29,6 +29,16 @@ _OF_MAPS: tuple[tuple[str, str, Callable[[MapHealth], float]], ...] = (
     ("keyframes_durable", "Keyframes that were journaled.", lambda one: one.keyframes_durable),
     ("keyframes_fused", "Keyframes in the map.", lambda one: one.keyframes_fused),
     ("keyframes_waiting", "Keyframes journaled and not yet fused.", lambda one: one.waiting),
+    (
+        "corrections_waiting",
+        "Keyframes not yet at their new pose.",
+        lambda one: one.corrections_waiting,
+    ),
+    (
+        "corrections_unavailable",
+        "Keyframes that a correction cannot move any more.",
+        lambda one: one.corrections_unavailable,
+    ),
     ("keyframes_quarantined", "Keyframes kept aside for inspection.", lambda one: one.quarantined),
     ("sessions", "Sessions that sent keyframes.", lambda one: one.sessions),
     ("journal_bytes", "Bytes of the journal.", lambda one: one.journal_bytes),

@@ -81,6 +81,11 @@ class Engine:
         """Wait until each keyframe is in the map or turned away; raise TransportError when nothing moves."""
         self._wait_map(lambda stats: not stats.waiting and _settled(stats) >= stats.sent)
 
+    def wait_settled(self, clients: Iterable[Client]) -> None:
+        """Wait until each keyframe is at its newest pose; raise TransportError when nothing moves."""
+        for client in clients:
+            self._wait_map(lambda _, client=client: client.is_settled)  # type: ignore[misc]
+
     def wait_meshed(self, clients: Iterable[Client]) -> None:
         """Wait until the mesh shows every keyframe: the last stamp of the ledger, which may be missing."""
         for client in clients:
@@ -106,12 +111,13 @@ class Engine:
 
     def _wait(self, reached: Callable[[ClientStats], bool], timeout: float) -> bool:
         """Whether it was reached; False = nothing has moved for `timeout` seconds. Logs why, once."""
-        last, moved, logged = (-1, -1), time.monotonic(), False
+        last, moved, logged = (-1, -1, -1), time.monotonic(), False
         while True:
             stats = self.check()
             if reached(stats):
                 return True
-            if (now := (stats.waiting, stats.durable + _settled(stats))) != last:
+            now = (stats.waiting, stats.durable + _settled(stats), stats.corrections_waiting)
+            if now != last:
                 last, moved, logged = now, time.monotonic(), False
             elif time.monotonic() - moved > timeout:
                 return False

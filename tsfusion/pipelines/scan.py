@@ -183,6 +183,9 @@ def _settle(
     if own:
         progress.stage("fusing what is on its way")
         running.wait_fused()
+        if any(submap.corrections for submap in scanner.submaps):
+            progress.stage("moving keyframes to their corrected poses")
+            running.wait_settled(clients)
         running.wait_meshed(clients)
         return []
     progress.stage("sending what is on its way")
@@ -279,7 +282,8 @@ def _write(
         return scan_results.describe(submap, None)
     target.keep_map(submap.name, work / f"map{suffix}.tsf")
     held = HeldSensor()
-    for T, force in zip(submap.located.poses(), submap.located.forces(), strict=True):
+    poses = submap.located.poses(submap.corrections)
+    for T, force in zip(poses, submap.located.forces(), strict=True):
         held.add(T, sensor, force)
     written = run_files.write_map(work, target, submap.name, held, suffix=suffix, **options)
     return scan_results.describe(submap, written)

@@ -29,6 +29,8 @@ class MapResult(msgspec.Struct, frozen=True, kw_only=True):
     trajectory_error: TrajectoryError | None  # as tracked, against the source's own poses; None = it has none
     corrected_error: TrajectoryError | None  # after loop closure; None = there were no corrections
     map_hash: str = ""
+    keyframes_moved: int = 0  # times that one was fused anew at a corrected pose
+    moving_s: float = 0.0  # seconds for that
     blocks: int = 0
     mesh: dict[str, Any] = {}  # `Mesh.figures`, and what `mesh_files.write` left out
 
@@ -86,7 +88,8 @@ def describe(submap: Submap, in_map: WrittenMap | None) -> MapResult:
     figures: dict[str, Any] = {}
     if in_map is not None:
         status = in_map.status
-        figures = {"map_hash": status.map_hash, "blocks": status.blocks, "mesh": in_map.figures}
+        names = ("map_hash", "keyframes_moved", "moving_s", "blocks")
+        figures = {**{name: getattr(status, name) for name in names}, "mesh": in_map.figures}
     corrections = submap.corrections
     return MapResult(
         name=submap.name,

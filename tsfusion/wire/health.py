@@ -49,6 +49,12 @@ class MapHealth(Struct, frozen=True, kw_only=True):
     journal_missing: int = 0  # segments of the journal that are gone, at the start or since
     journal_put_back: int = 0  # times that the segment being written was taken away, and written again
     fusing_s: float = 0.0  # seconds since the fuser's last answer, while keyframes wait for one
+    corrections_waiting: int = 0  # keyframes whose newest pose is not fused yet; 0 = the map is settled
+    corrections_unavailable: int = (
+        0  # keyframes that stay where they were fused: the journal has them no more
+    )
+    keyframes_moved: int = 0  # fused at a corrected pose, or taken out, since the fuser began
+    moving_s: float = 0.0  # seconds of the fuser for that
 
 
 ClientState = Literal["connected", "silent", "gone"]
@@ -125,3 +131,7 @@ class Status(Struct, frozen=True, kw_only=True):
     delay_bound_ms: float  # error bound of the delay
     config: dict[str, Any]  # server and volume settings
     versions: dict[str, str]
+    corrections_waiting: int = 0  # as in MapHealth, with what follows
+    corrections_unavailable: int = 0
+    keyframes_moved: int = 0
+    moving_s: float = 0.0

@@ -135,7 +135,11 @@ class Ping(Struct, frozen=True, tag="ping", omit_defaults=True):
 
 
 class Pong(Struct, frozen=True, tag="pong"):
-    """The answer to a Ping."""
+    """The answer to a Ping.
+
+    `corrections_waiting`: as in `MapHealth`, when the map had everything up to `fused`; None = not known, or
+    the server is of an earlier version.
+    """
 
     epoch: str
     ping_sent_ns: int
@@ -143,6 +147,7 @@ class Pong(Struct, frozen=True, tag="pong"):
     sent_ns: int
     durable: Seq = 0
     fused: Seq = 0
+    corrections_waiting: int | None = None
 
 
 class Command(Struct, frozen=True, tag="command", kw_only=True):

@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: MIT
+"""Corrections move the map: settled, it is the one that its keyframes make at their final poses."""
+
+import errno
+from collections.abc import Iterator
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import pytest
+from corrected_maps import final_keyframes, fresh_map
+from formula_scenes import volume_of
+from hypothesis import settings as given_settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
+from keyframes_and_servers import VOLUME, pose, wall
+from test_fuser import Link, opened
+
+from tsfusion import Volume
+from tsfusion.fuser import messages
+from tsfusion.fuser.fuser import Fuser
+from tsfusion.journal import Journal
+from tsfusion.wire import codec, corrections
+
+SESSIONS = (b"a" * 16, b"b" * 16)
+
+
+class Recorded:
+    """A journal, and the orders to fuse it."""
+
+    def __init__(self, state: Path, segment_bytes: int = 1 << 20) -> None:
+        self.state = state
+        self.journal = Journal(state / "journal", segment_bytes)
+        self.orders: list[messages.Fuse] = []
+        self.keyframes: dict[bytes, list[int]] = {session: [] for session in SESSIONS}
+        self._seqs = dict.fromkeys(SESSIONS, 0)
+
+    def add(self, session: bytes = SESSIONS[0]) -> None:
+        keyframe = wall(sum(map(len, self.keyframes.values())))
+        encode = partial(codec.encode, keyframe, jpeg_quality=90)
+        self.keyframes[session].append(self._append(session, encode))
+
+    def correct(
+        self,
+        moves: dict[int, Any],
+        removed: tuple[int, ...] = (),
+        T: Any = None,
+        session: bytes = SESSIONS[0],
+    ) -> None:
+        correction = corrections.checked(moves, removed=removed, T_map_odometry=T)
+        self._append(session, partial(corrections.encode, correction))
+
+    def _append(self, session: bytes, encode: Any) -> int:
+        self._seqs[session] = seq = self._seqs[session] + 1
+        position = self.journal.append(encode(session=session, seq=seq), session=session, seq=seq)
+        self.orders.append(messages.Fuse(len(self.orders), position, session, seq, ""))
+        return seq
+
+    def fresh(self) -> Volume:
+        return fresh_map(self.state / "journal", VOLUME.voxel_size)
+
+
+def settle(fuser: Fuser) -> int:
+    """Move what waits; the number of moves."""
+    moves = 0
+    while fuser.move_due(idle=True):
+        fuser.move()
+        moves += 1
+    return moves
+
+
+def progress(link: Link) -> messages.CorrectionProgress:
+    return [message for message, _ in link.sent if isinstance(message, messages.CorrectionProgress)][-1]
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Iterator[Recorded]:
+    found = Recorded(tmp_path)
+    for _ in range(4):
+        found.add()
+    yield found
+    found.journal.close()
+
+
+def fused(recorded: Recorded, first: int = 0, **begin: Any) -> tuple[Fuser, Link]:
+    fuser, link = opened(recorded.state, **begin)
+    for order in recorded.orders[first:]:
+        fuser.handle(order)
+    return fuser, link
+
+
+def test_corrected_keyframes_are_fused_where_they_were_taken(recorded: Recorded) -> None:
+    recorded.correct({1: pose(0.5), 3: pose(-0.2)}, removed=(2,), T=pose(0.1))
+    recorded.add()
+    fuser, link = fused(recorded)
+    assert (progress(link).waiting, progress(link).keyframes) == (3, 4)
+    assert settle(fuser) == 3
+    last = progress(link)
+    assert (last.waiting, last.keyframes, last.removed, last.moved) == (0, 4, 1, 3)
+    assert fuser._volume.map_hash() == recorded.fresh().map_hash()
+    assert fuser._volume.color_hash() == recorded.fresh().color_hash()
+    assert fuser.mesh_due(idle=True)
+
+
+def test_what_was_removed_comes_back_where_a_later_correction_says(recorded: Recorded) -> None:
+    recorded.correct({}, removed=(1, 2))
+    fuser, link = fused(recorded)
+    settle(fuser)
+    recorded.correct({2: pose(0.3)})
+    fuser.handle(recorded.orders[-1])
+    settle(fuser)
+    assert progress(link).removed == 1
+    assert fuser._volume.map_hash() == recorded.fresh().map_hash()
+
+
+def test_the_farthest_move_first_and_none_that_is_none(recorded: Recorded) -> None:
+    recorded.correct({1: wall(0).T_world_camera, 2: pose(0.05), 3: pose(3.0), 4: pose(1.0)})
+    fuser, _ = fused(recorded)
+    order = []
+    while (move := fuser._map.poses.next()) is not None:
+        order.append(move.seq)
+        fuser.move()
+    assert order == [3, 4, 2]
+
+
+def test_a_checkpoint_knows_where_each_keyframe_was_fused(recorded: Recorded) -> None:
+    recorded.correct({1: pose(0.5), 2: pose(0.7), 4: pose(-0.4)}, removed=(3,), T=pose(0, 1.0))
+    fuser, _ = fused(recorded)
+    fuser.move()
+    fuser.handle(messages.Save())
+    fuser.move()  # this one is lost
+    recorded.add()
+    again, _ = fused(recorded, first=5)
+    assert again.ready().moves is not None
+    assert again.ready().moves.waiting == 3
+    assert settle(again) == 3
+    assert again._volume.map_hash() == recorded.fresh().map_hash()
+
+
+def test_moves_wait_for_keyframes_and_take_a_part_of_the_time(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded.correct({1: pose(0.5), 2: pose(0.7)})
+    fuser, _ = fused(recorded)
+    now = 1000.0
+    monkeypatch.setattr("tsfusion.fuser.pose_mover.time.monotonic", lambda: now)
+    fuser.move()
+    monkeypatch.setattr("tsfusion.fuser.pose_mover.time.monotonic", lambda: now + 100.0)
+    assert fuser.move_due(idle=False)
+
+
+def test_a_keyframe_that_left_the_journal_stays_and_is_counted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    recorded = Recorded(tmp_path, segment_bytes=1)
+    for _ in range(4):
+        recorded.add()
+    recorded.correct({1: pose(0.5), 2: pose(0.6), 4: pose(0.7)})
+    fuser, link = fused(recorded)
+    recorded.journal.close()
+    for number in (1, 2):
+        (tmp_path / "journal" / f"{number:06d}.mcap").unlink()
+    settle(fuser)
+    last = progress(link)
+    assert (last.waiting, last.unavailable, last.keyframes) == (0, 2, 4)
+    assert caplog.text.count("stays where it was fused") == 1
+    stays = volume_of(
+        [wall(0), wall(1), wall(2), wall(3, T_world_camera=pose(0.7))], voxel_size=0.04, threads=1
+    )
+    assert fuser._volume.map_hash() == stays.map_hash()
+
+
+def test_a_journal_that_cannot_be_read_for_now_is_waited_for(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from tsfusion import journal
+
+    recorded.correct({1: pose(0.5)})
+    fuser, link = fused(recorded)
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            journal.segments_module if hasattr(journal, "segments_module") else journal, "read", _eio
+        )
+        fuser.move()
+    assert not fuser.move_due(idle=True)
+    assert fuser.wait_ms is not None
+    assert 0 < fuser.wait_ms < 1000
+    monkeypatch.setattr("tsfusion.fuser.pose_mover._RETRY_S", 0.0)
+    fuser._mover._next = 0.0
+    assert settle(fuser) == 1
+    assert progress(link).unavailable == 0
+
+
+def _eio(*_: object) -> Any:
+    from tsfusion.core.errors import JournalError
+
+    raise JournalError("cannot read", errno.EIO)
+
+
+def test_a_full_map_keeps_the_keyframe_where_it_is(
+    recorded: Recorded, caplog: pytest.LogCaptureFixture
+) -> None:
+    fuser, link = fused(recorded)
+    before = fuser._volume.map_hash()
+    fuser._volume.limit_memory(fuser._volume.stats().bytes)
+    recorded.correct({1: pose(50.0)})
+    fuser.handle(recorded.orders[-1])
+    settle(fuser)
+    assert (progress(link).waiting, progress(link).unavailable) == (0, 1)
+    assert fuser._volume.map_hash() == before
+    assert "stays where it was fused, though a correction moves it" in caplog.text
+
+
+def test_an_earlier_version_did_not_write_down_where_keyframes_were_fused(recorded: Recorded) -> None:
+    fuser, _ = fused(recorded)
+    fuser._map.poses.saved = lambda: None  # type: ignore[method-assign, assignment, return-value]
+    fuser.handle(messages.Save())
+    recorded.correct({1: pose(0.5), 2: pose(0.5)})
+    recorded.add()
+    recorded.correct({6: pose(0.5)})
+    again, link = fused(recorded, first=4)
+    settle(again)
+    last = progress(link)
+    assert (last.waiting, last.unavailable, last.moved) == (0, 2, 1)
+    again.handle(messages.Save())
+    assert opened(recorded.state)[0].ready().moves.unavailable == 2  # type: ignore[union-attr]
+
+
+class Life(RuleBasedStateMachine):
+    """A map whose server is killed and started again while keyframes and corrections come."""
+
+    @initialize()
+    def begin(self) -> None:
+        self.stack = ExitStack()
+        self.recorded = Recorded(Path(self.stack.enter_context(TemporaryDirectory())))
+        self.stack.callback(self.recorded.journal.close)
+        self.fuser, self.link = opened(self.recorded.state)
+
+    def _fuse(self) -> None:
+        self.fuser.handle(self.recorded.orders[-1])
+
+    @rule(session=st.sampled_from(SESSIONS))
+    def keyframe(self, session: bytes) -> None:
+        if len(self.recorded.orders) < 30:
+            self.recorded.add(session)
+            self._fuse()
+
+    @rule(session=st.sampled_from(SESSIONS), draw=st.data())
+    def correct(self, session: bytes, draw: st.DataObject) -> None:
+        known = self.recorded.keyframes[session]
+        if not known:
+            return
+        fates = draw.draw(st.dictionaries(st.sampled_from(known), st.integers(-4, 12)))
+        moves = {seq: pose(0.05 * fate, 0.02 * fate) for seq, fate in fates.items() if fate <= 9}
+        T = draw.draw(st.sampled_from([None, pose(0.1), pose(0.0, -0.1)]))
+        self.recorded.correct(moves, tuple(seq for seq in fates if seq not in moves), T, session)
+        self._fuse()
+
+    @rule(count=st.integers(1, 3))
+    def move(self, count: int) -> None:
+        for _ in range(count):
+            if self.fuser.move_due(idle=True):
+                self.fuser.move()
+
+    @rule()
+    def save(self) -> None:
+        self.fuser.handle(messages.Save())
+
+    @rule(saved=st.booleans())
+    def restart(self, saved: bool) -> None:
+        if saved:
+            self.fuser.handle(messages.Finish())
+        self.fuser, self.link = opened(self.recorded.state)
+        done = self.fuser.ready().done
+        for order in self.recorded.orders:
+            if order.session not in done or order.seq > done[order.session].seq:
+                self.fuser.handle(order)
+
+    def teardown(self) -> None:
+        if not hasattr(self, "recorded"):
+            return
+        settle(self.fuser)
+        assert self.fuser._volume.map_hash() == self.recorded.fresh().map_hash()
+        assert self.fuser._volume.color_hash() == self.recorded.fresh().color_hash()
+        assert self.fuser._volume.keyframes == len(final_keyframes(self.recorded.state / "journal"))
+        self.stack.close()
+
+
+@pytest.mark.parametrize(
+    "examples", [20, pytest.param(600, marks=pytest.mark.nightly)], ids=["short", "nightly"]
+)
+def test_a_settled_map_is_that_of_the_final_poses(examples: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Volume, "warm_up", lambda _: None)
+    run_state_machine_as_test(
+        Life, settings=given_settings(max_examples=examples, stateful_step_count=14, deadline=None)
+    )

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: MIT
+"""Where each keyframe of a map was fused, and where the newest corrections say that it was taken.
+
+The map is settled when nothing is different: then it is the map that these keyframes make at their final
+poses, to the bit. A keyframe's pose is that of the newest correction that names it. Without one it is the
+pose that it came with, multiplied from the left by the newest `T_map_odometry` of its session before it.
+"""
+
+from array import array
+from collections.abc import Mapping
+from dataclasses import replace
+from heapq import heapify, heappop, heappush
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.geometry.keyframe import Keyframe, check_pose
+from tsfusion.journal import Position
+from tsfusion.wire.corrections import Correction
+
+_POSE = 12  # numbers: the upper three rows
+_LEVER = 2.0  # metres from a sensor at which a turn of it counts
+_ABSENT = np.full(_POSE, np.nan)  # instead of the pose of a keyframe that is not in the map
+_SPARE = 1024
+
+Rows = NDArray[np.float64]  # (12,): the upper three rows of a pose; NaN = not in the map
+
+
+class Move(NamedTuple):
+    """A keyframe that is to be fused elsewhere, or to leave or come back.
+
+    `fused`, `wanted`: (4, 4) float64 `T_world_camera`; None = not in the map.
+    """
+
+    session: bytes
+    seq: int
+    position: Position
+    fused: NDArray[np.float64] | None
+    wanted: NDArray[np.float64] | None
+
+
+class _SessionPoses:
+    """The keyframes of one session that the map took, in the order of their numbers."""
+
+    def __init__(self) -> None:
+        self.seqs = array("q")
+        self.segments = array("q")
+        self.offsets = array("q")
+        self.fused = array("d")  # 12 numbers each
+        self.T_map_odometry: NDArray[np.float64] | None = None  # (4, 4)
+        self.unknown = 0  # up to this number an earlier version fused them, and did not write down where
+        self.missed: set[int] = set()  # numbers of those that corrections name
+
+    def rows(self, at: int) -> Rows:
+        return np.array(self.fused[_POSE * at : _POSE * (at + 1)])
+
+    def saved(self) -> dict[str, Any]:
+        T = self.T_map_odometry
+        columns = {name: getattr(self, name).tobytes() for name in ("seqs", "segments", "offsets", "fused")}
+        return {
+            **columns,
+            "T": b"" if T is None else T.tobytes(),
+            "unknown": self.unknown,
+            "missed": sorted(self.missed),
+        }
+
+    @classmethod
+    def of(cls, saved: Mapping[str, Any]) -> "_SessionPoses":
+        poses = cls()
+        for name in ("seqs", "segments", "offsets", "fused"):
+            getattr(poses, name).frombytes(saved[name])
+        if saved["T"]:
+            poses.T_map_odometry = np.frombuffer(saved["T"]).reshape(4, 4).copy()
+        poses.unknown, poses.missed = saved["unknown"], set(saved["missed"])
+        return poses
+
+
+class KeyframePoses:
+    """The poses of a map's keyframes, 120 bytes each, and the moves that are left to do.
+
+    Args:
+        saved: what `saved` gave when the map was written.
+        done: session → highest number in the map, of a map that was written without.
+    """
+
+    def __init__(self, saved: Mapping[str, Any] | None, done: Mapping[bytes, int]) -> None:
+        self._sessions: dict[bytes, _SessionPoses] = {}
+        self._waiting: dict[tuple[bytes, int], tuple[int, Rows]] = {}  # session, place → ticket, wanted
+        self._heap: list[tuple[float, int, bytes, int]] = []  # minus metres, ticket, session, place
+        self._tickets = 0
+        self._stuck: set[tuple[bytes, int]] = set()  # of those that wait, the ones that cannot be moved
+        for key, seq in ({} if saved else done).items():
+            self._session(key).unknown = seq
+        for name, one in (saved or {}).get("sessions", {}).items():
+            self._sessions[bytes.fromhex(name)] = _SessionPoses.of(one)
+        self.removed = sum(int(np.isnan(one.fused[::_POSE]).sum()) for one in self._sessions.values())
+        for name, at, rows in (saved or {}).get("waiting", ()):
+            self._want(bytes.fromhex(name), at, np.frombuffer(rows))
+
+    def saved(self) -> dict[str, Any]:
+        """All of it, for the file of a map: dicts, lists, numbers and bytes."""
+        sessions = {key.hex(): poses.saved() for key, poses in self._sessions.items()}
+        waiting = [(key.hex(), at, rows.tobytes()) for (key, at), (_, rows) in self._waiting.items()]
+        return {"sessions": sessions, "waiting": waiting}
+
+    @property
+    def waiting(self) -> int:
+        """Number of keyframes whose newest pose is not fused yet."""
+        return len(self._waiting) - len(self._stuck)
+
+    @property
+    def unavailable(self) -> int:
+        """Number of keyframes that stay where they were fused, though a correction names another place."""
+        return len(self._stuck) + sum(len(poses.missed) for poses in self._sessions.values())
+
+    def placed(self, session: bytes, keyframe: Keyframe) -> Keyframe:
+        """A keyframe that comes in, at its place in the map.
+
+        Raises:
+            InvalidKeyframe: when that is farther away than any pose may be.
+        """
+        poses = self._sessions.get(session)
+        if poses is None or poses.T_map_odometry is None:
+            return keyframe
+        return replace(keyframe, T_world_camera=check_pose(poses.T_map_odometry @ keyframe.T_world_camera))
+
+    def add(self, session: bytes, seq: int, position: Position, keyframe: Keyframe) -> None:
+        """Note that the session's next keyframe was fused."""
+        poses = self._session(session)
+        poses.seqs.append(seq)
+        poses.segments.append(position.segment)
+        poses.offsets.append(position.offset)
+        poses.fused.extend(keyframe.T_world_camera[:3].ravel())
+
+    def correct(self, session: bytes, correction: Correction) -> None:
+        """Note where keyframes are to be. Those that the map did not take stay out of it."""
+        poses = self._session(session)
+        if correction.T_map_odometry is not None:
+            poses.T_map_odometry = correction.T_map_odometry
+        rows = correction.poses[:, :3].reshape(-1, _POSE)
+        for seqs, wanted in (
+            (correction.seqs, rows),
+            (correction.removed, np.tile(_ABSENT, (len(correction.removed), 1))),
+        ):
+            known = np.array(poses.seqs)
+            places = np.searchsorted(known, seqs)
+            for at, seq, one in zip(places.tolist(), seqs.tolist(), wanted, strict=True):
+                if at < len(known) and known[at] == seq:
+                    self._want(session, at, one)
+                elif seq <= poses.unknown:
+                    poses.missed.add(seq)
+        if len(self._heap) > 2 * len(self._waiting) + _SPARE:
+            self._heap = [one for one in self._heap if self._is_valid(one)]
+            heapify(self._heap)
+
+    def next(self) -> Move | None:
+        """The move that is farthest; removals come first. None = there is none."""
+        while self._heap and not self._is_valid(self._heap[0]):
+            heappop(self._heap)
+        if not self._heap:
+            return None
+        _, _, session, at = self._heap[0]
+        poses = self._sessions[session]
+        position = Position(poses.segments[at], poses.offsets[at])
+        _, wanted = self._waiting[session, at]
+        return Move(session, poses.seqs[at], position, _pose(poses.rows(at)), _pose(wanted))
+
+    def moved(self) -> None:
+        """Note that the move that is `next` was done."""
+        _, _, session, at = heappop(self._heap)
+        _, wanted = self._waiting.pop((session, at))
+        fused = self._sessions[session].fused
+        self.removed += int(np.isnan(wanted[0])) - int(np.isnan(fused[_POSE * at]))
+        fused[_POSE * at : _POSE * (at + 1)] = array("d", wanted)
+
+    def give_up(self) -> None:
+        """Note that the move that is `next` cannot be done: the keyframe stays where it is."""
+        _, _, session, at = heappop(self._heap)
+        self._stuck.add((session, at))
+
+    def _session(self, key: bytes) -> _SessionPoses:
+        return self._sessions.setdefault(key, _SessionPoses())
+
+    def _want(self, session: bytes, at: int, wanted: Rows) -> None:
+        fused = self._sessions[session].rows(at)
+        self._waiting.pop((session, at), None)
+        self._stuck.discard((session, at))
+        if np.array_equal(fused, wanted, equal_nan=True):
+            return
+        self._tickets += 1
+        self._waiting[session, at] = self._tickets, wanted
+        heappush(self._heap, (-_metres(fused, wanted), self._tickets, session, at))
+
+    def _is_valid(self, entry: tuple[float, int, bytes, int]) -> bool:
+        _, ticket, session, at = entry
+        waits = self._waiting.get((session, at))
+        return waits is not None and waits[0] == ticket
+
+
+def _metres(fused: Rows, wanted: Rows) -> float:
+    """Roughly how far a keyframe's surface moves; infinite where it comes or goes."""
+    apart = (fused - wanted).reshape(3, 4)
+    metres = float(np.linalg.norm(apart[:, 3]) + _LEVER * np.linalg.norm(apart[:, :3]) / np.sqrt(2))
+    return metres if np.isfinite(metres) else np.inf
+
+
+def _pose(rows: Rows) -> NDArray[np.float64] | None:
+    return None if np.isnan(rows[0]) else np.vstack([rows.reshape(3, 4), (0.0, 0.0, 0.0, 1.0)])

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: MIT
+"""Fuse keyframes anew where corrections say that they were taken, between the keyframes that come in."""
+
+import errno
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tsfusion import journal
+from tsfusion.core.errors import JournalError, TsfusionError
+from tsfusion.fuser.keyframe_poses import KeyframePoses, Move
+from tsfusion.fuser.messages import CorrectionProgress
+from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.wire import codec
+
+if TYPE_CHECKING:
+    from tsfusion.tsdf.volume import Volume
+
+_REST_FACTOR = 3  # no move for three times as long as the last took: a quarter of a busy fuser's time
+_RETRY_S = 0.5  # until a record that the system refuses to read, or whose folder is away, is tried again
+_PATIENCE_S = 10.0  # for it; then the keyframe stays where it is
+_SAY_INTERVAL = 0.2  # seconds between two messages of progress
+
+log = logging.getLogger(__name__)
+
+
+class PoseMover:
+    """The work that corrections make. Call `move` when it is `is_due`.
+
+    Args:
+        integrate: adds a keyframe of a session to the map, within the bounds of its client.
+        is_away: whether the journal's folder is not to be found.
+        say: takes each message of progress.
+        moves: False = none is moved; those that wait for it count as unavailable.
+    """
+
+    def __init__(
+        self,
+        volume: "Volume",
+        poses: KeyframePoses,
+        folder: Path,
+        *,
+        integrate: Callable[[Keyframe, bytes], Any],
+        is_away: Callable[[], bool],
+        say: Callable[[CorrectionProgress], None],
+        moves: bool = True,
+    ) -> None:
+        self.moved = 0  # keyframes
+        self._volume, self._poses, self._folder = volume, poses, folder
+        self._integrate, self._is_away, self._say = integrate, is_away, say
+        self._moves = moves
+        self._seconds = 0.0
+        self._next = 0.0  # time.monotonic()
+        self._held_since: float | None = None
+        self._said = 0.0
+        self._given_up: Counter[str] = Counter()  # by reason
+
+    @property
+    def waiting(self) -> int:
+        """Number of keyframes whose newest pose is not fused yet."""
+        return self._poses.waiting if self._moves else 0
+
+    def is_due(self, *, idle: bool) -> bool:
+        """Whether there is a move to do now: at once when idle, otherwise after a pause."""
+        if not self.waiting:
+            return False
+        return (idle and self._held_since is None) or time.monotonic() >= self._next
+
+    @property
+    def seconds_left(self) -> float:
+        """Seconds until `is_due` has to be asked again although nothing comes."""
+        return max(self._next - time.monotonic(), 0.0)
+
+    def progress(self) -> CorrectionProgress:
+        """How far the map is with corrected poses."""
+        return CorrectionProgress(
+            self._volume.keyframes,
+            self._poses.removed,
+            self.waiting,
+            self._poses.unavailable + self._poses.waiting - self.waiting,
+            self.moved,
+            self._seconds,
+        )
+
+    def say(self) -> None:
+        """Tell how far the map is."""
+        self._said = time.monotonic()
+        self._say(self.progress())
+
+    def move(self) -> bool:
+        """Do the farthest move, or give it up; False when it is to be tried again later."""
+        move = self._poses.next()
+        if move is None:
+            return False
+        began = time.monotonic()
+        try:
+            self._fuse_elsewhere(move)
+        except (TsfusionError, MemoryError) as error:
+            if isinstance(error, JournalError) and self._waits_for(error, move):
+                self._next = time.monotonic() + _RETRY_S
+                return False
+            self._give_up(move, error)
+        else:
+            self._poses.moved()
+            self.moved += 1
+        self._held_since = None
+        now = time.monotonic()
+        self._seconds += now - began
+        self._next = now + _REST_FACTOR * (now - began)
+        if not self.waiting or now - self._said > _SAY_INTERVAL:
+            self.say()
+        return True
+
+    def _fuse_elsewhere(self, move: Move) -> None:
+        """Add the keyframe where it is wanted and take it away where it was; on an error nothing changes."""
+        found = codec.decode(journal.read(self._folder, move.position).frames)
+        if not isinstance(found, Keyframe):
+            raise JournalError(f"{self._folder} holds no keyframe where number {move.seq} was")
+        if move.wanted is not None:
+            wanted = replace(found, T_world_camera=move.wanted)
+            self._integrate(wanted, move.session)
+        if move.fused is not None:
+            try:
+                self._volume.retract(replace(found, T_world_camera=move.fused))
+            except (TsfusionError, MemoryError):
+                if move.wanted is not None:
+                    self._volume.retract(wanted)
+                raise
+
+    def _waits_for(self, error: JournalError, move: Move) -> bool:
+        """Whether a record that cannot be read may be, later: its folder, file or disk may come back."""
+        if not error.temporary:
+            return False
+        now = time.monotonic()
+        if self._is_away():
+            self._held_since = self._held_since or now
+            return True
+        if error.errno == errno.ENOENT and move.position.segment < min(journal.segments(self._folder)):
+            return False  # it was deleted to keep the journal to its limit
+        if self._held_since is None:
+            log.warning("%s; it is tried again", error)
+            self._held_since = now
+        return now - self._held_since < _PATIENCE_S
+
+    def _give_up(self, move: Move, error: Exception) -> None:
+        self._poses.give_up()
+        reason = type(error).__name__
+        self._given_up[reason] += 1
+        if self._given_up[reason] == 1:
+            log.error(
+                "keyframe %d stays where it was fused, though a correction moves it: %s (others for this "
+                "reason are only counted)",
+                move.seq,
+                error,
+            )
