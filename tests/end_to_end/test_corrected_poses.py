@@ -34,6 +34,7 @@ from tsfusion.geometry import se3
 from tsfusion.journal import state_folder
 from tsfusion.journal.inspection import summarize
 from tsfusion.wire import codec, corrections, key_folder, sockets
+from tsfusion.wire.health import MapHealth
 from tsfusion.wire.queries import fetch_health, fetch_status
 
 SESSION = bytes(range(16))
@@ -55,6 +56,10 @@ def records(state: Path, session: bytes) -> list[tuple[int, bool]]:
     paths = state_folder.find_journal(state).files()
     found = [record for path in paths for record in journal.records(path)]
     return [(record.seq, record.is_correction) for record in found if record.session == session]
+
+
+def health_of(server: Server) -> MapHealth:
+    return fetch_health(server.address).maps["default"]
 
 
 def fresh_hash(state: Path) -> str:
@@ -106,7 +111,7 @@ def test_a_fuser_that_dies_while_it_moves_keyframes(tmp_path: Path) -> None:
         with Client(server.address) as client:
             seqs = scan(client, count)
             client.correct({seq: pose(0.1 * seq, 0.05) for seq in seqs})
-            until(lambda: 0 < fetch_health(server.address).maps["default"].corrections_waiting < count - 5)
+            until(lambda: (own := health_of(server)).corrections_waiting or own.keyframes_moved)
             os.kill(server.fuser_pid(), signal.SIGKILL)
             client.send(wall(count))
             client.wait_settled(DEADLINE)
@@ -118,7 +123,7 @@ def test_a_fuser_that_dies_while_it_moves_keyframes(tmp_path: Path) -> None:
         assert server.process.wait(DEADLINE) == 0
     with serving(tmp_path) as server:
         assert fetch_status(server.address).map_hash == told.map_hash
-        own = fetch_health(server.address).maps["default"]
+        own = health_of(server)
         assert (own.corrections_waiting, own.keyframes_moved) == (0, 0)
 
 
@@ -129,7 +134,7 @@ def test_a_server_that_ends_moves_what_waits_first(tmp_path: Path) -> None:
         server.process.terminate()
         assert server.process.wait(DEADLINE) == 0
     with serving(tmp_path) as server:
-        own = fetch_health(server.address).maps["default"]
+        own = health_of(server)
         assert (own.corrections_waiting, own.keyframes_moved) == (0, 0)
         assert fetch_status(server.address).map_hash == fresh_hash(tmp_path)
 

@@ -259,7 +259,7 @@ class Told:
         self.nacks: list[int] = []
 
     def get(self, session: bytes) -> Any:
-        return SimpleNamespace(state=lambda _: "connected", fates=RecentFates())
+        return SimpleNamespace(state=lambda _: "connected", left=False, fates=RecentFates())
 
     def send(self, session: bytes, message: Any) -> None:
         self.nacks += [message.seq] if hasattr(message, "reason") else []

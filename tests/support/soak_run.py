@@ -114,7 +114,8 @@ def run(folder: Path, keyframes: int, *, kills: int = 3, tolerance_mb: float = T
         if stopped := daemon.stop():
             problems.append(f"the server ended with status {stopped}")
         problems += [f"the server ended by itself: {words}" for words in daemon.exits]
-    problems += _lost(status, scanners, keyframes, room) + _growth(samples, keyframes, tolerance_mb)
+    calm = _calm(samples, keyframes, trouble.events)
+    problems += _lost(status, scanners, keyframes, room) + _growth(calm, tolerance_mb)
     return Outcome(
         problems=problems,
         keyframes=keyframes,
@@ -123,7 +124,7 @@ def run(folder: Path, keyframes: int, *, kills: int = 3, tolerance_mb: float = T
         blocks=status.blocks,
         kills=sum("killed" in event.what for event in trouble.events),
         disk_filled=not unfillable,
-        rise_mb=_rises(samples, keyframes),
+        rise_mb=_rises(calm),
         events=trouble.events,
         samples=samples,
     )
@@ -270,13 +271,14 @@ def _lost(status: Status, scanners: list[Scanner], keyframes: int, room: Path) -
     return problems
 
 
-def _calm(samples: list[Sample], keyframes: int) -> list[Sample]:
-    return [one for one in samples if one.durable >= _CALM_FROM * keyframes]
+def _calm(samples: list[Sample], keyframes: int, events: list[Event]) -> list[Sample]:
+    """The samples of the calm part. Keyframes are journaled while a killed fuser starts again."""
+    last = max((event.seconds for event in events), default=0.0)
+    return [one for one in samples if one.durable >= _CALM_FROM * keyframes and one.seconds > last]
 
 
-def _rises(samples: list[Sample], keyframes: int) -> dict[str, float]:
+def _rises(calm: list[Sample]) -> dict[str, float]:
     """Growth in the calm part, MB: the slope over the keyframes, times the keyframes of that part."""
-    calm = _calm(samples, keyframes)
     if len(calm) < 3:
         return {}
     at = np.array([one.durable for one in calm], dtype=float)
@@ -286,8 +288,7 @@ def _rises(samples: list[Sample], keyframes: int) -> dict[str, float]:
     return {name: round(slope * float(np.ptp(at)), 2) for name, slope in slopes.items()}
 
 
-def _growth(samples: list[Sample], keyframes: int, tolerance_mb: float) -> list[str]:
-    calm = _calm(samples, keyframes)
+def _growth(calm: list[Sample], tolerance_mb: float) -> list[str]:
     third = len(calm) // 3
     if third < 2:
         return [f"only {len(calm)} samples were taken: more keyframes are needed"]
@@ -295,7 +296,7 @@ def _growth(samples: list[Sample], keyframes: int, tolerance_mb: float) -> list[
     problems = []
     if calm[0].blocks != late[-1].blocks:
         problems.append(f"the map still grew: {calm[0].blocks} → {late[-1].blocks} blocks")
-    for name, rise in _rises(samples, keyframes).items():
+    for name, rise in _rises(calm).items():
         if rise > tolerance_mb:
             problems.append(f"{name}: {rise} MB more in the end")
     for name in calm[0].processes:
