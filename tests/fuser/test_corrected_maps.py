@@ -9,6 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import msgspec
 import pytest
 from corrected_maps import final_keyframes, fresh_map
 from formula_scenes import volume_of
@@ -170,6 +171,27 @@ def test_a_keyframe_that_left_the_journal_stays_and_is_counted(
         [wall(0), wall(1), wall(2), wall(3, T_world_camera=pose(0.7))], voxel_size=0.04, threads=1
     )
     assert fuser._volume.map_hash() == stays.map_hash()
+
+
+def test_what_the_journal_deleted_takes_no_room(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path, segment_bytes=1)
+    for _ in range(6):
+        recorded.add()
+    recorded.correct({1: pose(0.5), 2: pose(0.6)}, removed=(3,))
+    fuser, link = fused(recorded)
+    fuser.move()
+    recorded.journal.close()
+    for number in range(1, 5):
+        (tmp_path / "journal" / f"{number:06d}.mcap").unlink()
+    fuser.handle(messages.Save())
+    poses = fuser._map.poses
+    assert poses._sessions[SESSIONS[0]].seqs.tolist() == [5, 6]
+    assert (poses.waiting, poses.unavailable, poses.removed, poses.next()) == (0, 2, 1, None)
+    assert not fuser.move_due(idle=True)
+    again, _ = opened(tmp_path)
+    assert again.ready().moves == msgspec.structs.replace(progress(link), moved=0, seconds=0.0)
+    again._map.poses.correct(SESSIONS[0], corrections.checked({4: pose(1.0), 5: pose(1.0)}))
+    assert (again._map.poses.waiting, again._map.poses.unavailable) == (1, 3)
 
 
 def test_a_journal_that_cannot_be_read_for_now_is_waited_for(

@@ -278,6 +278,7 @@ class Fuser:
             problem = f"the folder {self._folder} is not there, or is another one"
             log.error("no checkpoint: %s", problem)
         elif self._since_checkpoint:
+            self._mover.forget_deleted()
             with self._memory_beyond(_FOR_A_CHECKPOINT):
                 written = self._map.save()
             self._since_checkpoint = 0 if written else 1

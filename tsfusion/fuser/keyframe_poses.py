@@ -7,6 +7,7 @@ pose that it came with, multiplied from the left by the newest `T_map_odometry` 
 """
 
 from array import array
+from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import replace
 from heapq import heapify, heappop, heappush
@@ -49,11 +50,25 @@ class _SessionPoses:
         self.offsets = array("q")
         self.fused = array("d")  # 12 numbers each
         self.T_map_odometry: NDArray[np.float64] | None = None  # (4, 4)
-        self.unknown = 0  # up to this number an earlier version fused them, and did not write down where
+        self.unknown = 0  # up to this number nothing is known of them: an earlier version fused them, or
+        # the journal has them no more
         self.missed: set[int] = set()  # numbers of those that corrections name
 
     def rows(self, at: int) -> Rows:
         return np.array(self.fused[_POSE * at : _POSE * (at + 1)])
+
+    def place_of(self, seq: int) -> int:
+        """The place of a keyframe that is known."""
+        return bisect_left(self.seqs, seq)
+
+    def forget(self, before_segment: int) -> "array[int]":
+        """Forget the keyframes of segments below this number; these."""
+        count = bisect_left(self.segments, before_segment)
+        gone = self.seqs[:count]
+        if count:
+            self.unknown = gone[-1]
+            del self.seqs[:count], self.segments[:count], self.offsets[:count], self.fused[: _POSE * count]
+        return gone
 
     def saved(self) -> dict[str, Any]:
         T = self.T_map_odometry
@@ -86,23 +101,23 @@ class KeyframePoses:
 
     def __init__(self, saved: Mapping[str, Any] | None, done: Mapping[bytes, int]) -> None:
         self._sessions: dict[bytes, _SessionPoses] = {}
-        self._waiting: dict[tuple[bytes, int], tuple[int, Rows]] = {}  # session, place → ticket, wanted
-        self._heap: list[tuple[float, int, bytes, int]] = []  # minus metres, ticket, session, place
+        self._waiting: dict[tuple[bytes, int], tuple[int, Rows]] = {}  # session, number → ticket, wanted
+        self._heap: list[tuple[float, int, bytes, int]] = []  # minus metres, ticket, session, number
         self._tickets = 0
         self._stuck: set[tuple[bytes, int]] = set()  # of those that wait, the ones that cannot be moved
         for key, seq in ({} if saved else done).items():
             self._session(key).unknown = seq
         for name, one in (saved or {}).get("sessions", {}).items():
             self._sessions[bytes.fromhex(name)] = _SessionPoses.of(one)
-        self.removed = sum(int(np.isnan(one.fused[::_POSE]).sum()) for one in self._sessions.values())
-        for name, at, rows in (saved or {}).get("waiting", ()):
-            self._want(bytes.fromhex(name), at, np.frombuffer(rows))
+        self.removed = (saved or {}).get("removed", 0)  # keyframes that corrections took out of the map
+        for name, seq, rows in (saved or {}).get("waiting", ()):
+            self._want(bytes.fromhex(name), seq, np.frombuffer(rows))
 
     def saved(self) -> dict[str, Any]:
         """All of it, for the file of a map: dicts, lists, numbers and bytes."""
         sessions = {key.hex(): poses.saved() for key, poses in self._sessions.items()}
-        waiting = [(key.hex(), at, rows.tobytes()) for (key, at), (_, rows) in self._waiting.items()]
-        return {"sessions": sessions, "waiting": waiting}
+        waiting = [(key.hex(), seq, rows.tobytes()) for (key, seq), (_, rows) in self._waiting.items()]
+        return {"sessions": sessions, "waiting": waiting, "removed": self.removed}
 
     @property
     def waiting(self) -> int:
@@ -147,7 +162,7 @@ class KeyframePoses:
             places = np.searchsorted(known, seqs)
             for at, seq, one in zip(places.tolist(), seqs.tolist(), wanted, strict=True):
                 if at < len(known) and known[at] == seq:
-                    self._want(session, at, one)
+                    self._want(session, seq, one)
                 elif seq <= poses.unknown:
                     poses.missed.add(seq)
         if len(self._heap) > 2 * len(self._waiting) + _SPARE:
@@ -160,41 +175,52 @@ class KeyframePoses:
             heappop(self._heap)
         if not self._heap:
             return None
-        _, _, session, at = self._heap[0]
+        _, _, session, seq = self._heap[0]
         poses = self._sessions[session]
+        at = poses.place_of(seq)
         position = Position(poses.segments[at], poses.offsets[at])
-        _, wanted = self._waiting[session, at]
-        return Move(session, poses.seqs[at], position, _pose(poses.rows(at)), _pose(wanted))
+        _, wanted = self._waiting[session, seq]
+        return Move(session, seq, position, _pose(poses.rows(at)), _pose(wanted))
 
     def moved(self) -> None:
         """Note that the move that is `next` was done."""
-        _, _, session, at = heappop(self._heap)
-        _, wanted = self._waiting.pop((session, at))
-        fused = self._sessions[session].fused
+        _, _, session, seq = heappop(self._heap)
+        _, wanted = self._waiting.pop((session, seq))
+        at, fused = self._sessions[session].place_of(seq), self._sessions[session].fused
         self.removed += int(np.isnan(wanted[0])) - int(np.isnan(fused[_POSE * at]))
         fused[_POSE * at : _POSE * (at + 1)] = array("d", wanted)
 
     def give_up(self) -> None:
         """Note that the move that is `next` cannot be done: the keyframe stays where it is."""
-        _, _, session, at = heappop(self._heap)
-        self._stuck.add((session, at))
+        _, _, session, seq = heappop(self._heap)
+        self._stuck.add((session, seq))
+
+    def forget(self, before_segment: int) -> None:
+        """Forget the keyframes that were deleted from the journal: they can be moved no more."""
+        for key, poses in self._sessions.items():
+            gone = poses.forget(before_segment)
+            for seq in gone:
+                if self._waiting.pop((key, seq), None) is not None:
+                    self._stuck.discard((key, seq))
+                    poses.missed.add(seq)
 
     def _session(self, key: bytes) -> _SessionPoses:
         return self._sessions.setdefault(key, _SessionPoses())
 
-    def _want(self, session: bytes, at: int, wanted: Rows) -> None:
-        fused = self._sessions[session].rows(at)
-        self._waiting.pop((session, at), None)
-        self._stuck.discard((session, at))
+    def _want(self, session: bytes, seq: int, wanted: Rows) -> None:
+        poses = self._sessions[session]
+        fused = poses.rows(poses.place_of(seq))
+        self._waiting.pop((session, seq), None)
+        self._stuck.discard((session, seq))
         if np.array_equal(fused, wanted, equal_nan=True):
             return
         self._tickets += 1
-        self._waiting[session, at] = self._tickets, wanted
-        heappush(self._heap, (-_metres(fused, wanted), self._tickets, session, at))
+        self._waiting[session, seq] = self._tickets, wanted
+        heappush(self._heap, (-_metres(fused, wanted), self._tickets, session, seq))
 
     def _is_valid(self, entry: tuple[float, int, bytes, int]) -> bool:
-        _, ticket, session, at = entry
-        waits = self._waiting.get((session, at))
+        _, ticket, session, seq = entry
+        waits = self._waiting.get((session, seq))
         return waits is not None and waits[0] == ticket
 
 

@@ -6,6 +6,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -114,6 +115,15 @@ class PoseMover:
         if not self.waiting or now - self._said > _SAY_INTERVAL:
             self.say()
         return True
+
+    def forget_deleted(self) -> None:
+        """Forget keyframes that were deleted to keep the journal to its limit: it holds them no more."""
+        waiting = self.waiting
+        with suppress(JournalError):
+            if segments := journal.segments(self._folder):
+                self._poses.forget(min(segments))
+        if self.waiting != waiting:
+            self.say()
 
     def _fuse_elsewhere(self, move: Move) -> None:
         """Add the keyframe where it is wanted and take it away where it was; on an error nothing changes."""
