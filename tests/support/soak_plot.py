@@ -29,10 +29,10 @@ def plot(outcome: Outcome, path: Path) -> None:
     progress.set_xlabel("seconds")
     for axis in (memory, progress):
         _mark(axis, outcome)
-        axis.set_ylim(0, None)
+        axis.set_ylim(0, 1.35 * axis.get_ylim()[1])  # the legend stands above the curves
         axis.spines[["top", "right"]].set_visible(False)
         axis.tick_params(labelsize=8)
-        axis.legend(fontsize=7, frameon=False, loc="upper left", ncols=3)
+        axis.legend(fontsize=7, framealpha=1, edgecolor="none", loc="upper left", ncols=3)
     figure.suptitle(
         f"{outcome.keyframes:,} keyframes of three scanners, {outcome.kills} kills, a full disk", fontsize=10
     )
