@@ -251,11 +251,12 @@ def raw(address: str, kind: bytes) -> socket.socket:
     """A connection over which a handshake as a socket of this kind was made."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     made = socket.create_connection((host, int(port)), timeout=5.0)
-    ready = _property(b"Socket-Type", kind) + _property(b"Identity", b"")
-    made.sendall(_GREETING + _command(b"READY", ready))
     answer = b""
-    while b"READY" not in answer and (got := made.recv(4096)):  # what comes earlier may be cut off
-        answer += got
+    ready = _property(b"Socket-Type", kind) + _property(b"Identity", b"")
+    with contextlib.suppress(ConnectionError):  # it is cut off where the server wants keys
+        made.sendall(_GREETING + _command(b"READY", ready))
+        while b"READY" not in answer and (got := made.recv(4096)):  # what comes earlier may be cut off
+            answer += got
     return made
 
 

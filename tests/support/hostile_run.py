@@ -30,7 +30,7 @@ from scanner_process import Plan, Report, journals, plan_in
 from supervisors import PATIENCE, SCANNER
 
 from tsfusion import journal
-from tsfusion.core.config import ClientConfig, override
+from tsfusion.core.config import ClientConfig, ServerConfig, override
 from tsfusion.pipelines import latency_ledger
 from tsfusion.wire import key_folder, keyframe_times
 from tsfusion.wire.curve import client_keys
@@ -39,7 +39,7 @@ from tsfusion.wire.queries import fetch_status
 from tsfusion.wire.record_header import unpack_keyframe
 
 RATE = 8.0  # keyframes a second of the well-behaved one
-MEMORY_BYTES = 192 << 20  # the bound on the gateway
+MEMORY_BYTES = ServerConfig().memory_bytes  # the bound on the gateway
 FUSER_MEMORY_BYTES = 2 << 30
 _ATTACKS = Path(__file__).with_name("attacks.py")
 _FILES = 8192
