@@ -176,6 +176,23 @@ def test_a_sensor_that_no_map_knows_is_refused_before_it_is_journaled() -> None:
     assert refused.value.reason == "values"
 
 
+def test_without_keys_a_connection_has_its_part_whatever_others_send() -> None:
+    quotas = Quotas(ServerConfig(quota_keyframes=160.0, quota_bytes=1 << 30))
+    quotas.wait("", 1000, 0.0, 7)  # the scanner is there first
+    passed = {7: 0, 8: 0}
+    for step in range(10_000):
+        now = step / 1000
+        passed[8] += not quotas.wait("", 1000, now, 8)
+        if step % 125 == 0:
+            passed[7] += not quotas.wait("", 1000, now, 7)
+    assert passed[7] == 80  # eight a second, all of them
+    assert passed[8] <= 320 + 1600 + 20 + 100
+    for connection in range(100):
+        quotas.wait("", 1000, 10.0, connection)
+    assert len(quotas._shares) == 16
+    assert quotas.wait("robot", 1000, 10.0, 7) == 0.0
+
+
 def test_quotas_are_of_each_client_and_forget_strangers() -> None:
     quotas = Quotas(ServerConfig(quota_keyframes=10.0, quota_bytes=1 << 20))
     assert [quotas.wait("a", 1000, 0.0) for _ in range(20)] == [0.0] * 20

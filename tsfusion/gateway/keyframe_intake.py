@@ -19,7 +19,7 @@ from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.quotas import Quotas
-from tsfusion.wire import codec, messages
+from tsfusion.wire import codec, messages, sockets
 from tsfusion.wire.record_header import Damaged, RecordHeader, Refused, unpack
 
 log = logging.getLogger(__name__)
@@ -76,7 +76,7 @@ class KeyframeIntake:
             subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
             log.warning("a %s is refused: %s", header.kind, denied.message, extra=subject)
             self._routes.send(header.session, denied)
-        elif not self._has_to_wait(hosted, header.session, client, nbytes):
+        elif not self._has_to_wait(hosted, header.session, client, nbytes, sockets.file_of(frames[0])):
             self._on_checked(hosted, header, buffers, client, received_ns)
 
     def _make_map(self, header: RecordHeader, buffers: list[Any], client: str) -> HostedMap | None:
@@ -96,7 +96,9 @@ class KeyframeIntake:
             self._routes.send(header.session, messages.Denied(header.session, "map", why))
         return hosted
 
-    def _has_to_wait(self, hosted: HostedMap, key: bytes, client: str, nbytes: int) -> bool:
+    def _has_to_wait(
+        self, hosted: HostedMap, key: bytes, client: str, nbytes: int, connection: int | None
+    ) -> bool:
         route = self._routes.get(key)
         now = time.monotonic()
         if route is not None:
@@ -107,7 +109,7 @@ class KeyframeIntake:
         if seconds := hosted.disk.seconds_left(now):
             self._hold(key, seconds, "disk", hosted.disk.problem)
             return True
-        if seconds := self._quotas.wait(client, nbytes, now):
+        if seconds := self._quotas.wait(client, nbytes, now, connection):
             rates = f"{self._server.quota_keyframes:g} keyframes and {self._server.quota_bytes >> 20} MB"
             self._hold(
                 key,

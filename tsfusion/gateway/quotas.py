@@ -16,6 +16,10 @@ from tsfusion.wire.record_header import CorrectionHeader, KeyframeHeader, Record
 
 _BURST = 2.0  # seconds' worth that may come at once
 _MAX_CLIENTS = 4096
+# Without keys all share one quota, and each of so many connections has at least one part in so many of it,
+# whatever others send. A connection that is silent for so long loses it.
+_SHARES = 16
+_SHARE_KEPT_S = 10.0
 _ANY_MAP = VolumeConfig()
 
 
@@ -38,36 +42,64 @@ class Bucket:
         self._level -= amount
 
 
+class Allowance:
+    """The keyframes and bytes that may come in a second.
+
+    Args:
+        part: the divisor of both rates.
+    """
+
+    def __init__(self, server: ServerConfig, now: float, part: int = 1) -> None:
+        self._keyframes = Bucket(server.quota_keyframes / part, now)
+        self._bytes = Bucket(server.quota_bytes / part, now)
+        self.asked = now
+
+    def wait(self, nbytes: int, now: float) -> float:
+        """Seconds until a message may pass; 0 = it does, and is counted."""
+        self.asked = now
+        seconds = max(self._keyframes.wait(1.0, now), self._bytes.wait(nbytes, now))
+        if not seconds:
+            self._keyframes.spend(1.0)
+            self._bytes.spend(nbytes)
+        return seconds
+
+
 class Quotas:
-    """The buckets of every client."""
+    """The allowance of every client."""
 
     def __init__(self, server: ServerConfig) -> None:
         self._server = server
-        self._clients: OrderedDict[str, tuple[Bucket, Bucket]] = OrderedDict()
+        self._clients: OrderedDict[str, Allowance] = OrderedDict()
+        self._shares: dict[int, Allowance] = {}  # by connection, where there are no keys
 
-    def wait(self, owner: str, nbytes: int, now: float) -> float:
+    def wait(self, owner: str, nbytes: int, now: float, connection: int | None = None) -> float:
         """Seconds that a client has to wait before it may send a message; 0 = it passes, and is counted.
 
         Args:
             owner: the client's name. Without keys all clients are one: new sessions cost nothing.
             now: `time.monotonic()`.
+            connection: over which the message came; None = that is not known.
         """
-        buckets = self._clients.get(owner)
-        if buckets is None:
-            server = self._server
-            buckets = self._clients[owner] = (
-                Bucket(server.quota_keyframes, now),
-                Bucket(server.quota_bytes, now),
-            )
+        allowance = self._clients.get(owner)
+        if allowance is None:
+            allowance = self._clients[owner] = Allowance(self._server, now)
             if len(self._clients) > _MAX_CLIENTS:
                 self._clients.popitem(last=False)
         self._clients.move_to_end(owner)
-        keyframes, data = buckets
-        seconds = max(keyframes.wait(1.0, now), data.wait(nbytes, now))
-        if not seconds:
-            keyframes.spend(1.0)
-            data.spend(nbytes)
-        return seconds
+        share = None if owner or connection is None else self._share_of(connection, now)
+        seconds = allowance.wait(nbytes, now)
+        return 0.0 if seconds and share is not None and not share.wait(nbytes, now) else seconds
+
+    def _share_of(self, connection: int, now: float) -> Allowance | None:
+        """The part of the quota that nobody else may use up; None = others have all parts."""
+        share = self._shares.get(connection)
+        if share is None and len(self._shares) >= _SHARES:
+            self._shares = {fd: one for fd, one in self._shares.items() if now - one.asked < _SHARE_KEPT_S}
+        if share is None and len(self._shares) < _SHARES:
+            share = self._shares[connection] = Allowance(self._server, now, _SHARES)
+        if share is not None:
+            share.asked = now
+        return share
 
     def check(self, header: RecordHeader, frames: Sequence[Any]) -> None:
         """Raise Refused for a checked record that asks too much.
