@@ -141,7 +141,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 @pytest.fixture
 def disk_calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What is made durable, in order: `sync NAME` of a file or folder, `OLD > NEW` of one that is renamed."""
+    """Calls that make files durable, in order: `sync NAME` of a file or folder, `OLD > NEW` of a rename."""
     calls: list[str] = []
     sync, rename = os.fsync, os.replace
 

@@ -103,7 +103,7 @@ def test_a_folder_of_two_sessions_is_no_spool(tmp_path: Path) -> None:
 def test_a_number_that_nobody_may_find_is_not_used_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its tombstone would hide the record that gets it."""
+    """The tombstone of a number would hide the record that gets that number again."""
     spool = Spool(tmp_path, 1 << 16)
     spool.add(spool.write([b"head"]))
     with monkeypatch.context() as broken:

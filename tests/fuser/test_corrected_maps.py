@@ -173,6 +173,20 @@ def test_a_keyframe_that_left_the_journal_stays_and_is_counted(
     assert fuser._volume.map_hash() == stays.map_hash()
 
 
+def test_a_journal_folder_without_any_segment_is_waited_for_and_then_given_up(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded.correct({1: pose(0.5)})
+    fuser, link = fused(recorded)
+    for path in (recorded.state / "journal").iterdir():
+        path.unlink()
+    fuser.move()
+    assert fuser._mover.waiting == 1
+    monkeypatch.setattr("tsfusion.fuser.pose_mover._PATIENCE_S", 0.0)
+    fuser.move()
+    assert (progress(link).waiting, progress(link).unavailable) == (0, 1)
+
+
 def test_what_the_journal_deleted_takes_no_room(tmp_path: Path) -> None:
     recorded = Recorded(tmp_path, segment_bytes=1)
     for _ in range(6):

@@ -549,7 +549,7 @@ def test_a_process_at_work_ends_with_the_one_that_started_it() -> None:
 
 
 def test_a_map_has_one_fuser_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that was killed, and waits for a disk, may still be there when the next one begins."""
+    """A killed fuser that waits for a disk may still be there when the next one begins."""
     sent: list[bytes] = []
     monkeypatch.setattr(fuser_main, "_LOCK_WAIT_S", 0.0)
     begin = messages.Begin(str(tmp_path), VOLUME, 1.0, 0, "", False, 1 << 30, quota_cost=1, quota_map=1.0)

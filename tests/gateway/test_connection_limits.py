@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is cut off when connections hold too much memory."""
+"""Connections that are cut off because they hold too much memory."""
 
 from collections import Counter
 from types import SimpleNamespace

@@ -70,7 +70,7 @@ def test_what_two_checkpoints_hold_may_go() -> None:
 
 
 def test_a_keyframe_that_somebody_asks_for_stays_in_the_index() -> None:
-    """Its segment may go: one that the fuser is at, or that no mesh shows yet."""
+    """The segment of a keyframe may go while the fuser is at it, or while no mesh shows it yet."""
     retention, folder, session = ten_segments()
     session.handed, folder.first = 10, 11
     fuser = Fuser()

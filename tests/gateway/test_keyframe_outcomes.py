@@ -73,7 +73,7 @@ def test_who_was_away_is_told_when_it_is_back(here: Map) -> None:
 
 
 def test_who_is_silent_is_told_before_the_acknowledgement_and_again_when_it_is_heard(here: Map) -> None:
-    """It may only stand still, and reads the one behind the other: what is acknowledged counts as fused."""
+    """A silent client may only stand still; what is acknowledged first, it counts as fused."""
     here.routes.connect(SESSION, "yard", b"1", "robot").last_message -= 10.0
     here.reject("MapFull")
     assert [type(one) for one in here.told] == [Nack, Ack]

@@ -21,7 +21,7 @@ def served(tmp_path: Path) -> Iterator[Served]:
 
 
 def test_a_client_that_was_silent_is_told_what_was_rejected_at_its_next_ping(served: Served) -> None:
-    """It may not know that it was: a server that stands still hears nobody."""
+    """A client may not know that it was silent: a server that stands still hears nobody."""
     with connected(sockets.dealer, served.addresses.control) as link:
         served.greet(link, "default")
         (route,), hosted = served.gateway._routes, served.gateway.maps.get("default")

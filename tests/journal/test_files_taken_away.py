@@ -93,7 +93,7 @@ def test_a_large_segment_is_put_back_piece_by_piece(tmp_path: Path, monkeypatch:
 def test_a_record_that_was_taken_back_is_not_put_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was reported as not written when the copy had it: nobody may find it twice."""
+    """The record was reported as not written when the copy had it: nobody may find it twice."""
     log = Journal(tmp_path, BIG, longest_wait=-1.0)
     fill(log, 1)
     with monkeypatch.context() as patched:

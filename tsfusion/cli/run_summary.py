@@ -127,6 +127,10 @@ def _map_lines(found: "MapResult", *, given: bool) -> list[str]:
         lines.append(f"ATE        {_ate(found.trajectory_error)}")
     if found.corrected_error is not None:
         lines.append(f"  loops    {_ate(found.corrected_error)} ({found.loops} loops)")
+    if stuck := found.corrections_unavailable:
+        lines.append(
+            f"  not moved {count_of(stuck, 'corrected keyframe')}: the map has them where they were sent"
+        )
     if found.keyframes_moved:
         lines.append(f"  moved    {found.keyframes_moved} times a keyframe, in {found.moving_s:.1f} s")
     return lines

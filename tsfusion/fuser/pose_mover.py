@@ -149,12 +149,19 @@ class PoseMover:
         if self._is_away():
             self._held_since = self._held_since or now
             return True
-        if error.errno == errno.ENOENT and move.position.segment < min(journal.segments(self._folder)):
-            return False  # it was deleted to keep the journal to its limit
+        if error.errno == errno.ENOENT and self._is_deleted(move.position.segment):
+            return False
         if self._held_since is None:
             log.warning("%s; it is tried again", error)
             self._held_since = now
         return now - self._held_since < _PATIENCE_S
+
+    def _is_deleted(self, segment: int) -> bool:
+        """Whether a segment was deleted to keep the journal to its limit: then a later one is the first."""
+        try:
+            return any(number > segment for number in journal.segments(self._folder)[:1])
+        except JournalError:
+            return False
 
     def _give_up(self, move: Move, error: Exception) -> None:
         self._poses.give_up()

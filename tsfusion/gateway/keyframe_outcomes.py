@@ -167,6 +167,7 @@ class KeyframeOutcomes:
     def on_moves(self, moves: fuser_messages.CorrectionProgress) -> None:
         """Note how far the map is with corrected poses."""
         self.moves, self.fused = moves, moves.keyframes
+        self.notices.pop("unmoved", None)
         if moves.unavailable:
             stay = f"{moves.unavailable} corrected keyframe{'s' * (moves.unavailable > 1)}"
             self.notices["unmoved"] = f"{stay} cannot be moved and left where fused: the log says why"

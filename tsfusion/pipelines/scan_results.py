@@ -31,6 +31,7 @@ class MapResult(msgspec.Struct, frozen=True, kw_only=True):
     map_hash: str = ""
     keyframes_moved: int = 0  # times that one was fused anew at a corrected pose
     moving_s: float = 0.0  # seconds for that
+    corrections_unavailable: int = 0  # corrected keyframes that could not be moved: the log says why
     blocks: int = 0
     mesh: dict[str, Any] = {}  # `Mesh.figures`, and what `mesh_files.write` left out
 
@@ -88,7 +89,7 @@ def describe(submap: Submap, in_map: WrittenMap | None) -> MapResult:
     figures: dict[str, Any] = {}
     if in_map is not None:
         status = in_map.status
-        names = ("map_hash", "keyframes_moved", "moving_s", "blocks")
+        names = ("map_hash", "keyframes_moved", "moving_s", "corrections_unavailable", "blocks")
         figures = {**{name: getattr(status, name) for name in names}, "mesh": in_map.figures}
     corrections = submap.corrections
     return MapResult(
