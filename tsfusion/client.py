@@ -36,7 +36,8 @@ from tsfusion.core.errors import (
 )
 from tsfusion.delivery.backpressure import Backpressure
 from tsfusion.delivery.link_state import LinkState
-from tsfusion.delivery.outbox import ClientStats, Outbox
+from tsfusion.delivery.outbox import Outbox
+from tsfusion.delivery.outcomes import ClientStats
 from tsfusion.delivery.sender import Sender
 from tsfusion.delivery.spool import Spool
 from tsfusion.geometry.keyframe import Keyframe, keyframe_of

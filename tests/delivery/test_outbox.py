@@ -11,7 +11,7 @@ from interrupts import is_free_after_interrupts
 from keyframes_and_servers import wall
 
 from tsfusion.core.errors import InvalidKeyframe
-from tsfusion.delivery import outbox as outbox_module
+from tsfusion.delivery import outcomes
 from tsfusion.delivery.outbox import Outbox
 from tsfusion.delivery.spool import Spool, Waiting
 from tsfusion.journal import Position
@@ -81,10 +81,10 @@ def test_a_rejection_counts_once_and_few_are_remembered(
     for _ in range(2):
         outbox.reject(1, "crash")
     assert outbox.stats().rejected == {"crash": 1}
-    monkeypatch.setattr(outbox_module, "_MOST_REMEMBERED", 2)
+    monkeypatch.setattr(outcomes, "_MOST_REMEMBERED", 2)
     for seq in range(2, 9):
         outbox.reject(seq, "crash")
-    assert list(outbox._rejected_seqs) == [7, 8]
+    assert list(outbox._outcomes._rejected_seqs) == [7, 8]
 
 
 def test_what_the_map_has_not_answered_takes_no_room(tmp_path: Path) -> None:
@@ -120,4 +120,17 @@ def test_credit_is_bytes_as_well_as_keyframes(outbox: Outbox) -> None:
 
 def test_an_interrupt_leaves_it_free_for_others(outbox: Outbox) -> None:
     """Ctrl-C may come when the lock is just taken: the sending thread must not wait for it for ever."""
+    assert is_free_after_interrupts(lambda: outbox.keyframes_waiting)
+
+
+def test_an_interrupt_while_the_lock_is_taken_again_stays_one(
+    outbox: Outbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def wait(_timeout: float) -> None:
+        outbox._lock.release()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(outbox._changed, "wait", wait)
+    with pytest.raises(KeyboardInterrupt):
+        outbox.wait(lambda: False, 5.0, lambda: None)
     assert is_free_after_interrupts(lambda: outbox.keyframes_waiting)

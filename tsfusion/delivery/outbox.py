@@ -7,99 +7,22 @@ Every method locks by itself and gives out copies, so callers cannot hold the lo
 
 import threading
 import time
-from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
-from msgspec import Struct
 from numpy.typing import NDArray
 
 from tsfusion.core.counts import count_of
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.delivery.link_state import LinkState
+from tsfusion.delivery.number_runs import NumberRuns
+from tsfusion.delivery.outcomes import ClientStats, Outcomes
 from tsfusion.delivery.spool import Spool, Waiting
-from tsfusion.delivery.timing import KeyframeTimesTable, TakingRate
+from tsfusion.delivery.timing import KeyframeTimesTable, Lag, TakingRate
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.wire.keyframe_times import KeyframeTimes, Stamps
 
-_MOST_REMEMBERED = 65536  # numbers of rejected keyframes
 _CHECK_INTERVAL = 0.5  # seconds between two calls of what `wait` was given to check
-
-
-class ClientStats(Struct, frozen=True):
-    """Counts since the client began; leftovers of an earlier one count from `durable` on.
-
-    Attributes:
-        sent: keyframes that `send` took.
-        durable: keyframes on the server's disk.
-        fused: keyframes in the server's map.
-        refused: keyframes that the server turned away (or that are unreadable here) for good: reason → count.
-        rejected: keyframes on the server's disk that the map could not take: reason → count.
-        skipped: keyframes that were never sent: reason → count. by the policy `thinned` (the map was too
-            far behind), `room` (the spool's ran short) and `dropped` (it was taken before); `spool` (it has
-            reached `spool_bytes`), `disk` (full, failing or read-only).
-        waiting: keyframes and corrections in the spool.
-        waiting_bytes: the bytes of those.
-        state: of the spool: `ok`, or the reason why it cannot keep all that comes: `spool` or `disk`.
-        corrections_sent: corrections that `correct` took.
-        corrections_acknowledged: corrections on the server's disk.
-        corrections_refused: corrections that were skipped, refused or rejected: reason → count.
-        corrections_waiting: keyframes of the map whose newest pose is not fused yet, as last heard.
-    """
-
-    sent: int
-    durable: int
-    fused: int
-    refused: dict[str, int]
-    rejected: dict[str, int]
-    skipped: dict[str, int]
-    waiting: int
-    waiting_bytes: int
-    state: str
-    corrections_sent: int = 0
-    corrections_acknowledged: int = 0
-    corrections_refused: dict[str, int] = {}
-    corrections_waiting: int = 0
-
-
-class Lag(Struct, frozen=True):
-    """How far the map is behind the sensor."""
-
-    keyframes: int  # that it has yet to get
-    rate: float | None  # keyframes a second that it takes; None = not known, as while the link is down
-
-    @property
-    def seconds(self) -> float:
-        """Time to catch up with what was sent up to now; 0 where the rate is not known."""
-        return self.keyframes / self.rate if self.rate else 0.0
-
-
-class NumberRuns:
-    """Rising numbers in a queue, kept as runs without a gap: however many, they take the room of a few."""
-
-    def __init__(self) -> None:
-        self._runs: deque[range] = deque()
-        self._count = 0
-
-    def __len__(self) -> int:
-        return self._count
-
-    def append(self, number: int) -> None:
-        """Put a number behind the others."""
-        follows = bool(self._runs) and self._runs[-1].stop == number
-        first = self._runs.pop().start if follows else number
-        self._runs.append(range(first, number + 1))
-        self._count += 1
-
-    def take(self, most: int) -> Iterator[int]:
-        """Remove the numbers up to `most`, and yield them."""
-        while self._runs and self._runs[0].start <= most:
-            run = self._runs.popleft()
-            taken = range(run.start, min(run.stop, most + 1))
-            if taken.stop < run.stop:
-                self._runs.appendleft(range(taken.stop, run.stop))
-            self._count -= len(taken)
-            yield from taken
 
 
 class Outbox:
@@ -125,18 +48,9 @@ class Outbox:
         self._last_fused = self._last_meshed = 0  # numbers
         self._settled = 0  # the map has everything up to this number, each keyframe at its newest pose
         self._corrections_waiting = 0
-        self._skipped: Counter[str] = Counter()
         self._times = KeyframeTimesTable()
-        self._sent = self._durable = self._fused = 0
-        self._corrections_sent = self._corrections_durable = 0
+        self._outcomes = Outcomes()
         self._corrections = {entry.seq for entry in spool.waiting if entry.is_correction}  # not noted yet
-        self._refused: Counter[str] = Counter()
-        self._corrections_refused: Counter[str] = Counter()
-        self._refusal_count = 0  # of which `flush` has not complained yet
-        self._first_refusal = ""  # of those, in words
-        self._rejected: Counter[str] = Counter()
-        self._first_rejection = ""
-        self._rejected_seqs: OrderedDict[int, None] = OrderedDict()
         # Of what a dead scanner left, any may have been sent; and what a power cut took of it, too.
         self._perhaps_sent = spool.waiting[-1].seq if spool.waiting else 0
         self._used_before = spool.next_seq - 1
@@ -153,13 +67,18 @@ class Outbox:
             check: called in between; ends the wait when it raises.
         """
         deadline = None if timeout is None else time.monotonic() + timeout
-        with self._lock:
-            while not reached():
-                check()
-                left = _CHECK_INTERVAL if deadline is None else deadline - time.monotonic()
-                if left <= 0:
-                    return False
-                self._changed.wait(min(left, _CHECK_INTERVAL))
+        try:
+            with self._lock:
+                while not reached():
+                    check()
+                    left = _CHECK_INTERVAL if deadline is None else deadline - time.monotonic()
+                    if left <= 0:
+                        return False
+                    self._changed.wait(min(left, _CHECK_INTERVAL))
+        except RuntimeError as error:  # Ctrl-C came while `wait` was taking the lock again: it is not taken
+            if isinstance(error.__context__, KeyboardInterrupt):
+                raise error.__context__ from None
+            raise
         return True
 
     def wake_waiting(self) -> None:
@@ -187,7 +106,7 @@ class Outbox:
             return len(self._spool.waiting) + len(self._unfused) - len(self._corrections)
 
     @property
-    def lag(self) -> "Lag":
+    def lag(self) -> Lag:
         """How far the map is behind."""
         with self._lock:
             return Lag(self.behind, self._rate.per_second)
@@ -220,16 +139,16 @@ class Outbox:
                 self._rate.rest()
             self._spool.add(entry)
             if keyframe is None:
-                self._corrections_sent += 1
+                self._outcomes.corrections_sent += 1
                 self._corrections.add(entry.seq)
                 return
-            self._sent += 1
+            self._outcomes.sent += 1
             self._times.add(entry.seq, timestamp_ns=keyframe.timestamp_ns, captured_ns=keyframe.captured_ns)
 
     def skip(self, reason: str, *, is_correction: bool = False) -> None:
         """Count a record that is not sent."""
         with self._lock:
-            (self._corrections_refused if is_correction else self._skipped)[reason] += 1
+            self._outcomes.skip(reason, is_correction=is_correction)
 
     @property
     def spool_is_away(self) -> bool:
@@ -265,7 +184,7 @@ class Outbox:
                         return False
                     self._spool.remove(place)
                     self._times.remove(entry.seq)
-                    self._skipped["dropped"] += 1
+                    self._outcomes.skip("dropped")
                     self._changed.notify_all()
                     return True
         return False
@@ -381,8 +300,8 @@ class Outbox:
             dropped = self._spool.drop(durable)
             self._outstanding = max(self._outstanding - len(dropped), 0)
             corrections = len(self._corrections.intersection(dropped))
-            self._corrections_durable += corrections
-            self._durable += len(dropped) - corrections
+            self._outcomes.corrections_durable += corrections
+            self._outcomes.durable += len(dropped) - corrections
             for seq in dropped:
                 self._unfused.append(seq)
             taken = 0
@@ -392,11 +311,11 @@ class Outbox:
                     self._corrections.remove(seq)
                 else:
                     taken += 1
-                    self._fused += seq not in self._rejected_seqs
+                    self._outcomes.fused += not self._outcomes.is_rejected(seq)
             if taken:
                 self._rate.note(self.clock(), taken, is_more_waiting=self.behind > 0)
             for one in stamps:
-                if one.seq not in self._rejected_seqs:
+                if not self._outcomes.is_rejected(one.seq):
                     self._times.stamp(one, offset_ns, bound_ns)
                 if one.meshed_ns:
                     self.note_meshed(one.seq)
@@ -426,22 +345,15 @@ class Outbox:
         counted before.
         """
         with self._lock:
-            if seq in self._rejected_seqs:
-                return None
             is_correction = seq in self._corrections
-            counts = self._corrections_refused if is_correction else self._rejected
-            counts[reason] += 1
-            self._rejected_seqs[seq] = None
-            self._first_rejection = self._first_rejection or message or reason
-            if len(self._rejected_seqs) > _MOST_REMEMBERED:
-                self._rejected_seqs.popitem(last=False)
-            return "correction" if is_correction else "keyframe", counts[reason] == 1
+            is_first = self._outcomes.reject(seq, reason, message, is_correction=is_correction)
+            return None if is_first is None else ("correction" if is_correction else "keyframe", is_first)
 
     @property
     def first_rejection(self) -> str:
         """Why the map did not take the first record that it rejected; empty = it took all."""
         with self._lock:
-            return self._first_rejection
+            return self._outcomes.first_rejection
 
     def find_sent(self, seq: int) -> Waiting | None:
         """The record of this number, if it waits and was sent."""
@@ -460,10 +372,7 @@ class Outbox:
             self._spool.remove(place)
             self._corrections.discard(entry.seq)
             self._claimed = 0
-            (self._corrections_refused if entry.is_correction else self._refused)[reason] += 1
-            if not self._refusal_count:
-                self._first_refusal = f"{entry.kind} {entry.seq} was refused ({reason}): {message}"
-            self._refusal_count += 1
+            self._outcomes.refuse(entry, reason, message)
             self._changed.notify_all()
 
     # --- snapshots ---
@@ -503,9 +412,7 @@ class Outbox:
     def take_refusals(self) -> str:
         """The records given up since the last call, in words; empty = none."""
         with self._lock:
-            count, self._refusal_count = self._refusal_count, 0
-            more = f" (and {count - 1} more)" if count > 1 else ""
-            return f"{self._first_refusal}{more}" if count else ""
+            return self._outcomes.take_refusals()
 
     def times(self) -> list[KeyframeTimes]:
         """When each keyframe passed each stage, oldest first, as far as it is known."""
@@ -520,19 +427,10 @@ class Outbox:
     def stats(self) -> ClientStats:
         """A copy of the counts."""
         with self._lock:
-            return ClientStats(
-                sent=self._sent,
-                durable=self._durable,
-                fused=self._fused,
-                refused=dict(self._refused),
-                rejected=dict(self._rejected),
-                skipped=dict(self._skipped),
+            return self._outcomes.stats(
                 waiting=len(self._spool.waiting),
                 waiting_bytes=self._spool.waiting_bytes,
                 state=self.state,
-                corrections_sent=self._corrections_sent,
-                corrections_acknowledged=self._corrections_durable,
-                corrections_refused=dict(self._corrections_refused),
                 corrections_waiting=self._corrections_waiting,
             )
 

@@ -4,6 +4,7 @@
 from collections import deque
 
 import numpy as np
+from msgspec import Struct
 
 from tsfusion.wire.keyframe_times import KeyframeTimes, Stamps
 
@@ -144,3 +145,15 @@ class ClockOffset:
     def bound_ns(self) -> int:
         """The estimate is right to within ± this; 0 before the first ping."""
         return (min(self._samples)[0] + 1) // 2 if self._samples else 0
+
+
+class Lag(Struct, frozen=True):
+    """How far the map is behind the sensor."""
+
+    keyframes: int  # that it has yet to get
+    rate: float | None  # keyframes a second that it takes; None = not known, as while the link is down
+
+    @property
+    def seconds(self) -> float:
+        """Time to catch up with what was sent up to now; 0 where the rate is not known."""
+        return self.keyframes / self.rate if self.rate else 0.0

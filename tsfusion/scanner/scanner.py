@@ -17,7 +17,7 @@ import msgspec
 from tsfusion.client import Client
 from tsfusion.core.config import MAP_NAME_LENGTH, ScanConfig
 from tsfusion.core.counts import count_of
-from tsfusion.delivery.outbox import ClientStats
+from tsfusion.delivery.outcomes import ClientStats
 from tsfusion.geometry.frame import Frame
 from tsfusion.scanner.keyframe_selection import KeyframeSelector
 from tsfusion.scanner.localization.localizer import Localizer, Lost, Pose, PoseCorrections

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: MIT
+"""What became of a client's records: counts, and the first of those that were turned away, in words."""
+
+from collections import Counter, OrderedDict
+
+from msgspec import Struct
+
+from tsfusion.delivery.spool import Waiting
+
+_MOST_REMEMBERED = 65536  # numbers of rejected records
+
+
+class ClientStats(Struct, frozen=True):
+    """Counts since the client began; leftovers of an earlier one count from `durable` on.
+
+    Attributes:
+        sent: keyframes that `send` took.
+        durable: keyframes on the server's disk.
+        fused: keyframes in the server's map.
+        refused: keyframes that the server turned away (or that are unreadable here) for good: reason → count.
+        rejected: keyframes on the server's disk that the map could not take: reason → count.
+        skipped: keyframes that were never sent: reason → count. by the policy `thinned` (the map was too
+            far behind), `room` (the spool's ran short) and `dropped` (it was taken before); `spool` (it has
+            reached `spool_bytes`), `disk` (full, failing or read-only).
+        waiting: keyframes and corrections in the spool.
+        waiting_bytes: the bytes of those.
+        state: of the spool: `ok`, or the reason why it cannot keep all that comes: `spool` or `disk`.
+        corrections_sent: corrections that `correct` took.
+        corrections_acknowledged: corrections on the server's disk.
+        corrections_refused: corrections that were skipped, refused or rejected: reason → count.
+        corrections_waiting: keyframes of the map whose newest pose is not fused yet, as last heard.
+    """
+
+    sent: int
+    durable: int
+    fused: int
+    refused: dict[str, int]
+    rejected: dict[str, int]
+    skipped: dict[str, int]
+    waiting: int
+    waiting_bytes: int
+    state: str
+    corrections_sent: int = 0
+    corrections_acknowledged: int = 0
+    corrections_refused: dict[str, int] = {}
+    corrections_waiting: int = 0
+
+
+class Outcomes:
+    """Counts of records by what became of them. For one thread at a time."""
+
+    def __init__(self) -> None:
+        self.sent = self.durable = self.fused = 0  # keyframes
+        self.corrections_sent = self.corrections_durable = 0
+        self.first_rejection = ""  # why the map did not take the first of them; empty = it took all
+        self._skipped: Counter[str] = Counter()
+        self._refused: Counter[str] = Counter()
+        self._rejected: Counter[str] = Counter()
+        self._corrections_refused: Counter[str] = Counter()
+        self._rejected_seqs: OrderedDict[int, None] = OrderedDict()
+        self._refusal_count = 0  # of which `take_refusals` has not told yet
+        self._first_refusal = ""  # of those, in words
+
+    def skip(self, reason: str, *, is_correction: bool = False) -> None:
+        """Count a record that is not sent."""
+        (self._corrections_refused if is_correction else self._skipped)[reason] += 1
+
+    def refuse(self, entry: Waiting, reason: str, message: str) -> None:
+        """Count a record that was given up."""
+        (self._corrections_refused if entry.is_correction else self._refused)[reason] += 1
+        if not self._refusal_count:
+            self._first_refusal = f"{entry.kind} {entry.seq} was refused ({reason}): {message}"
+        self._refusal_count += 1
+
+    def take_refusals(self) -> str:
+        """The records given up since the last call, in words; empty = none."""
+        count, self._refusal_count = self._refusal_count, 0
+        more = f" (and {count - 1} more)" if count > 1 else ""
+        return f"{self._first_refusal}{more}" if count else ""
+
+    def reject(self, seq: int, reason: str, message: str, *, is_correction: bool) -> bool | None:
+        """Count a record that the map will not take.
+
+        Returns whether it is the first for that reason; None = it was counted before.
+        """
+        if seq in self._rejected_seqs:
+            return None
+        counts = self._corrections_refused if is_correction else self._rejected
+        counts[reason] += 1
+        self._rejected_seqs[seq] = None
+        self.first_rejection = self.first_rejection or message or reason
+        if len(self._rejected_seqs) > _MOST_REMEMBERED:
+            self._rejected_seqs.popitem(last=False)
+        return counts[reason] == 1
+
+    def is_rejected(self, seq: int) -> bool:
+        """Whether the map did not take a record, one of the last that it did not take."""
+        return seq in self._rejected_seqs
+
+    def stats(self, *, waiting: int, waiting_bytes: int, state: str, corrections_waiting: int) -> ClientStats:
+        """A copy of the counts, with how it stands."""
+        return ClientStats(
+            sent=self.sent,
+            durable=self.durable,
+            fused=self.fused,
+            refused=dict(self._refused),
+            rejected=dict(self._rejected),
+            skipped=dict(self._skipped),
+            waiting=waiting,
+            waiting_bytes=waiting_bytes,
+            state=state,
+            corrections_sent=self.corrections_sent,
+            corrections_acknowledged=self.corrections_durable,
+            corrections_refused=dict(self._corrections_refused),
+            corrections_waiting=corrections_waiting,
+        )
