@@ -429,6 +429,21 @@ def test_a_keyframe_costs_at_least_the_voxels_it_crosses(keyframe: Keyframe) -> 
     volume.integrate(keyframe)
 
 
+def test_a_keyframe_costs_the_blocks_that_it_adds() -> None:
+    """Memory that is touched for the first time takes longer than any ray."""
+    volume, keyframe = volume_of(VIEWS[:1]), scattered(1000, 20.0)
+    before = bytes_of(volume)
+    added = volume.integrate(keyframe).new_blocks
+    cost = int(volume._ray_buffers.bands[:, COST].sum()) + 1000 * added
+    volume = volume_of(VIEWS[:1])
+    volume.quota = KeyframeQuota(cost=cost - 1)
+    with pytest.raises(KeyframeTooLarge, match=r"\d+ new blocks or more take longer to add"):
+        volume.integrate(keyframe)
+    assert bytes_of(volume) == before
+    volume.quota = KeyframeQuota(cost=cost)
+    assert volume.integrate(keyframe).new_blocks == added
+
+
 def test_rays_away_from_each_other_cost_more() -> None:
     volume, scan = Volume(voxel_size=0.01, threads=2), scattered(1000, 2.0)
     assert scan.points is not None

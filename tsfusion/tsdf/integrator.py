@@ -33,12 +33,18 @@ from tsfusion.tsdf.ray_buffers import BANDS, RayBuffers
 PART_WEIGHT = WEIGHT_LIMIT  # what a lane has in reserve: no part can make one overflow unnoticed
 
 _NO_LIMIT = 1 << 30  # blocks
+_BLOCK_COST = 1000  # of a block that is added: it takes 9 µs where memory is touched for the first time
 
 Part = tuple[int, int]  # bands first … last - 1
 
 
 class KeyframeQuota(Struct, frozen=True):
-    """What a keyframe may take: what its rays cost (`voxel_traversal.write_ray`), and blocks that it adds."""
+    """What a keyframe may take.
+
+    Attributes:
+        cost: what its rays cost (`voxel_traversal.write_ray`), and 1000 for each block that it adds.
+        blocks: that it adds.
+    """
 
     cost: int
     blocks: int = _NO_LIMIT
@@ -54,7 +60,8 @@ class Integrator:
         self._model = config.model()
         self._stamp = 0
         self._admitted = 0  # blocks of the map that deferred rays have been added to
-        self._room = 0  # blocks that the keyframe may still add to the map
+        self._room = 0  # blocks that the keyframe may still add to the map, for its sender's share of it
+        self._affordable = 0  # blocks that it may still add, for what they cost
 
     def apply(self, sign: int, quota: KeyframeQuota | None = None) -> int:
         """Add (+1) or take away (-1) the rays in the buffers; returns the number of voxel updates.
@@ -66,9 +73,9 @@ class Integrator:
             MapFull, WeightOverflow: when adding; MapError: when taking away what is not there. The map is as
                 it was.
         """
-        self._room = _NO_LIMIT
+        self._room = self._affordable = _NO_LIMIT
         if quota is not None and sign > 0:
-            self._check_cost(quota.cost)
+            self._affordable = (quota.cost - self._check_cost(quota.cost)) // _BLOCK_COST
             self._room = quota.blocks
         before = self._admitted = self._store.count
         self._begin()
@@ -127,7 +134,7 @@ class Integrator:
     def _most_missing(self) -> int:
         """Blocks that the map may lack for the rest of a keyframe."""
         config, touched = self._config, int(self._buffers.touched[TOUCHED_COUNT])
-        room = min(config.max_blocks - self._store.count, self._room)
+        room = min(config.max_blocks - self._store.count, self._room, self._affordable)
         return max(min(room, config.max_blocks_per_keyframe - touched), 0)
 
     def _admit(self, part: Part, sign: int) -> None:
@@ -151,9 +158,11 @@ class Integrator:
         store.insert(keys)
         self._launch(part, +1, which=ONLY_DEFERRED, oldest=oldest)
         self._admitted = store.count
+        self._room -= len(keys)
+        self._affordable -= len(keys)
 
-    def _check_cost(self, most: int) -> None:
-        """Refuse a keyframe before it costs more time than one of any real sensor."""
+    def _check_cost(self, most: int) -> int:
+        """What the rays cost; a keyframe that takes more time than one of any real sensor is refused."""
         cost = int(self._buffers.bands[:, COST].sum(dtype=np.int64))
         if cost > most:
             raise KeyframeTooLarge(
@@ -161,6 +170,7 @@ class Integrator:
                 f"cross, {FAR_COST} times those of a ray away from the one before it); use bundle=True, "
                 "raise voxel_size, or send fewer points"
             )
+        return cost
 
     def _check_room(self, missing: int) -> None:
         """Refuse a keyframe that needs more blocks than the map, or its sender, may still add."""
@@ -169,6 +179,11 @@ class Integrator:
             raise MapFull(
                 f"the map may hold at most max_blocks = {most} blocks; "
                 f"it has {count} and this keyframe needs {missing} more, or still more"
+            )
+        if missing > self._affordable:
+            raise KeyframeTooLarge(
+                f"{missing} new blocks or more take longer to add than a keyframe may (quota_cost, of which "
+                f"a block takes {_BLOCK_COST}); raise voxel_size or quota_cost, or send fewer points"
             )
         if missing > self._room:
             raise MapQuota(
