@@ -87,9 +87,10 @@ def test_a_client_out_of_file_descriptors_waits_for_some(monkeypatch: pytest.Mon
 _FEW_FILES = """
 import os, resource, signal, sys, zmq
 from tsfusion import Client
-from tsfusion.core.errors import JournalError, TransportError
+from tsfusion.core.errors import JournalError, ServerUnreachable, TransportError
 from tsfusion.wire import sockets
 from tsfusion.wire.connection import Connection
+from tsfusion.wire.queries import fetch_health
 
 def leave(free):
     resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))
@@ -105,6 +106,13 @@ def client(free):
     leave(free)
     Client("tcp://127.0.0.1:1", spool=sys.argv[1]).close()
 
+def query(free):
+    leave(free)
+    try:
+        fetch_health("tcp://127.0.0.1:1", timeout=0.1)
+    except ServerUnreachable:
+        pass
+
 def connection(free):
     context = zmq.Context()
     context.socket(zmq.PAIR).close()
@@ -114,7 +122,7 @@ def connection(free):
     finally:
         context.term()
 
-for work, most in ((client, 24), (connection, 6)):
+for work, most in ((client, 24), (query, 16), (connection, 6)):
     for free in range(most):
         if not (child := os.fork()):
             signal.alarm(5)

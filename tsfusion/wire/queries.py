@@ -2,7 +2,7 @@
 """Queries to a running server: its health, the status of a map, the mesh of a map."""
 
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 from typing import Any
 
 import numpy as np
@@ -172,24 +172,27 @@ def request(
         NotAllowed: as soon as the server turns the connection away.
         ServerUnreachable: when nobody answered within `timeout` seconds.
         CommandRefused: when the server answered that it cannot.
-        TransportError: when what answers is no tsfusion server.
+        TransportError: when what answers is no tsfusion server, or too few files can be opened.
     """
     address, timeout = sockets.connect_address(address), min(timeout, _MAX_TIMEOUT_S)
-    context: zmq.Context[Any] = zmq.Context()
-    connection = Connection(context, sockets.dealer, address, keys)
-    try:
-        head, *frames = _send_until_answered(connection, command, timeout)
-        reply = messages.decode_to_client(head.buffer)
-    except DecodeError as error:
-        raise TransportError(f"what answers at {address} is no tsfusion server: {error}") from error
-    finally:
-        connection.close()
-        context.term()
+    with sockets.open_context() as context, closing(_connection(context, address, keys)) as connection:
+        try:
+            head, *frames = _send_until_answered(connection, command, timeout)
+            reply = messages.decode_to_client(head.buffer)
+        except DecodeError as error:
+            raise TransportError(f"what answers at {address} is no tsfusion server: {error}") from error
     if not isinstance(reply, messages.Reply):
         raise TransportError(f"the server at {address} answered a command with a {type(reply).__name__}")
     if reply.error is not None:
         raise CommandRefused(address, reply.error, retry=reply.retry)
     return reply, [frame.buffer for frame in frames]
+
+
+def _connection(context: "zmq.Context[Any]", address: str, keys: ClientKeys | None) -> Connection:
+    try:
+        return Connection(context, sockets.dealer, address, keys)
+    except zmq.ZMQError as error:
+        raise TransportError(f"cannot open a socket: {error.strerror}") from error
 
 
 def _send_until_answered(

@@ -73,6 +73,19 @@ def check_context() -> None:
             tried.enter_context(open(os.devnull))
 
 
+def open_context() -> "zmq.Context[Any]":
+    """A context for a few sockets.
+
+    Raises:
+        TransportError: when too few files can be opened for it.
+    """
+    try:
+        check_context()
+        return zmq.Context()
+    except OSError as error:
+        raise TransportError(f"cannot open a socket: {error.strerror}") from error
+
+
 def push(context: "zmq.Context[Any]", keys: ClientKeys | None = None) -> AnySocket:
     """The scanner's data socket. IMMEDIATE: nothing is queued for a server that is not there."""
     return _make(context, zmq.PUSH, {**_CONNECTING, zmq.SNDHWM: 10}, keys)

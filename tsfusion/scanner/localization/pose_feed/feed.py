@@ -9,9 +9,6 @@ import re
 import time
 import weakref
 from collections import Counter
-from typing import Any
-
-import zmq
 
 from tsfusion.core.errors import DecodeError, InvalidConfig, TransportError
 from tsfusion.geometry.frame import Frame
@@ -169,7 +166,7 @@ class _FeedSocket:
         if self.binds:
             sockets.check_own_machine(plain)
         self._target = plain if self.binds else sockets.connect_address(plain)
-        self._context: zmq.Context[Any] = zmq.Context()
+        self._context = sockets.open_context()
         self._socket = sockets.pose_feed(self._context, MAX_BYTES)
         self.endpoint = self._target
         try:
