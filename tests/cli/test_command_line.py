@@ -23,7 +23,7 @@ from tsfusion.datasets import Dataset
 NOBODY = "tcp://127.0.0.1:9"  # the discard port: nobody listens there, and nobody may without being root
 VERBS = [
     "demo", "replay", "scan", "check", "serve", "mesh", "status", "ate", "doctor", "download", "keys",
-    "spool", "journal", "config", "datasets",
+    "spool", "journal", "map", "config", "datasets",
 ]  # fmt: skip
 
 

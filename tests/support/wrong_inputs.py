@@ -227,6 +227,9 @@ ate tum/groundtruth.txt tum/groundtruth.txt --max-difference -1 | '--max-differe
 ate short.txt short.txt | got 1 and 1 | two positions or more
 download kitchen | no recording 'kitchen' is known | known are tum-fr1-xyz
 download --check --to empty | no archives of these recordings in empty | --to
+map info missing | missing does not exist | expected a map (.tsf) or a state folder
+map hash empty | no map in empty | expected a map (.tsf) or a state folder
+map hash file | file is not a tsfusion map | expected the map.tsf
 journal info missing | missing does not exist | expected a state folder
 journal info empty | no journal in empty | expected a state folder
 journal info file | file is no journal | expected a folder or an .mcap file

@@ -22,6 +22,7 @@ from tsfusion.cli import (
     download,
     journal,
     keys,
+    map,
     mesh,
     replay,
     scan,
@@ -65,6 +66,7 @@ verbs.verb(
     app, "tsfusion mesh out/latest/map.tsf room.glb", "tsfusion mesh tcp://server:5555 yard.ply --map yard",
     panel=OWN,
 )(mesh.mesh)  # fmt: skip
+app.add_typer(map.app, name="map", rich_help_panel=OWN)
 verbs.verb(
     app, "tsfusion ate out/latest/trajectory.txt groundtruth.txt",
     "tsfusion ate estimate.txt my-recording --plot error.png", panel=OWN,

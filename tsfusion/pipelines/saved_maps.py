@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: MIT
+"""Saved maps on the disk: a file, or the last checkpoint in a server's state folder, and what they hold."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from tsfusion import journal
+from tsfusion.core.durable_files import size_of
+from tsfusion.core.errors import CheckpointError
+from tsfusion.journal import state_folder
+from tsfusion.tsdf import checkpoint, map_history
+from tsfusion.tsdf.block_store import unpack_keys
+from tsfusion.tsdf.checkpoint import CUBE
+
+
+class SavedMap(Struct, frozen=True):
+    """A map's file. `folder`: of the map in a server's state folder; None = the file stands alone."""
+
+    path: Path
+    folder: Path | None = None
+
+
+class SessionSummary(Struct, frozen=True):
+    """A session of a map. `listed`: keyframes that the map knows by number and pose."""
+
+    session: str
+    client: str
+    world: str
+    last: int
+    listed: int
+    unlisted_up_to: int
+
+
+class MapSummary(Struct, frozen=True):
+    """What is known of a saved map without opening it.
+
+    Attributes:
+        nbytes: of the file; `voxel_bytes`: of its voxels in memory.
+        box: x0, y0, z0, x1, y1, z1 of its blocks, metres; None = it is empty.
+        corrections_waiting: keyframes whose newest pose is not fused yet.
+        keyframes_after: in the journal behind this checkpoint, and `corrections_after` likewise; None =
+            there is no journal.
+    """
+
+    path: str
+    nbytes: int
+    map_hash: str
+    keyframes: int
+    blocks: int
+    voxels: int
+    voxel_bytes: int
+    layers: list[str]
+    box: list[float] | None
+    sessions: list[SessionSummary]
+    rejected: dict[str, int]
+    corrections_waiting: int
+    keyframes_after: int | None
+    corrections_after: int | None
+    settings: dict[str, Any]
+    meta: dict[str, Any]
+
+
+def find(path: Path, map_name: str | None = None) -> SavedMap:
+    """The saved map at a path: a file, a state folder, or the folder of one of its maps.
+
+    Args:
+        map_name: of the map, where the state folder has several.
+
+    Raises:
+        CheckpointError: when there is none; JournalError: when no single one is meant.
+    """
+    if not path.exists():
+        raise CheckpointError(f"{path} does not exist; expected a map (.tsf) or a state folder", missing=True)
+    folder = state_folder.resolve_map(path, map_name)
+    if not folder.is_dir():
+        return SavedMap(folder)
+    file = folder / state_folder.MAP_FILE
+    if not file.exists():
+        expected = f"no map in {folder}; expected a map (.tsf) or a state folder"
+        unsaved = (
+            f"{folder} has no {state_folder.MAP_FILE} yet: a server saves it now and then, and at its end"
+        )
+        is_a_maps = (folder / state_folder.JOURNAL_FOLDER).is_dir()
+        raise CheckpointError(unsaved if is_a_maps else expected, missing=True)
+    return SavedMap(file, folder)
+
+
+def summarise(saved: SavedMap) -> MapSummary:
+    """Describe a saved map; every byte of the file is checked, no voxel is read.
+
+    Raises:
+        CheckpointError: when the file is missing, damaged or of another version.
+    """
+    with checkpoint.reading(saved.path) as (header, chunks):
+        keys = np.empty(header.blocks, np.int64)
+        for chunk in chunks:
+            chunk.fill(keys[chunk.first : chunk.first + chunk.blocks])
+    voxel_bytes = sum(np.dtype(checkpoint.LAYER_DTYPES[name]).itemsize for name in header.layers)
+    histories = map_history.sessions(header.meta)
+    after = (None, None) if saved.folder is None else _after(saved.folder, histories)
+    return MapSummary(
+        path=str(saved.path),
+        nbytes=size_of(saved.path),
+        map_hash=header.map_hash,
+        keyframes=header.keyframes,
+        blocks=header.blocks,
+        voxels=CUBE * header.blocks,
+        voxel_bytes=CUBE * header.blocks * voxel_bytes,
+        layers=header.layers,
+        box=_box(keys, 8 * header.config.voxel_size),
+        sessions=[
+            SessionSummary(one.session, one.client, one.world, one.last, len(one.seqs), one.unlisted)
+            for one in histories
+        ],
+        rejected=header.meta.get("rejected", {}),
+        corrections_waiting=sum(one.waiting for one in histories),
+        keyframes_after=after[0],
+        corrections_after=after[1],
+        settings=msgspec.to_builtins(header.config),
+        meta={name: value for name, value in header.meta.items() if name not in _SERVERS},
+    )
+
+
+_SERVERS = ("done", "rejected", "blocks", "poses", "held")  # in a checkpoint's meta
+
+
+def _box(keys: "np.ndarray[Any, np.dtype[np.int64]]", block_size: float) -> list[float] | None:
+    if not len(keys):
+        return None
+    blocks = unpack_keys(keys)
+    corners = np.concatenate([blocks.min(axis=0), blocks.max(axis=0) + 1]) * block_size
+    return [round(float(metres), 6) for metres in corners]
+
+
+def _after(folder: Path, histories: list[map_history.SessionHistory]) -> tuple[int, int]:
+    """Number of keyframes, and of corrections, that the journal has and the checkpoint does not."""
+    last = {bytes.fromhex(one.session): one.last for one in histories}
+    keyframes = corrections = 0
+    path = folder / state_folder.JOURNAL_FOLDER
+    for number in journal.segments(path) if path.is_dir() else ():
+        found, _ = journal.list_records(journal.segment_path(path, number))
+        for record in found:
+            if record.seq > last.get(record.session, 0):
+                last[record.session] = record.seq
+                keyframes += not record.is_correction
+                corrections += record.is_correction
+    return keyframes, corrections
