@@ -82,11 +82,13 @@ def test_replay_over_sockets_is_the_map_of_the_library(run_folder: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_journal_replays_to_the_same_map(run_folder: Path, tmp_path: Path) -> None:
+def test_a_journal_replays_to_the_same_map_under_a_new_name(run_folder: Path, tmp_path: Path) -> None:
     done = tsfusion(
-        "replay", run_folder / "state", "--voxel-size", VOXEL, "--out", tmp_path / "again", "--json"
-    )
+        "replay", run_folder / "state", "--voxel-size", VOXEL, "--out", tmp_path / "again", "--json",
+        "--state", tmp_path / "kept", "--map", "new",
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
+    assert (tmp_path / "kept" / "maps" / "new" / "map.tsf").is_file()
     first = json.loads((run_folder / "out" / "run.json").read_text())
     assert json.loads(done.stdout)["map_hash"] == first["map_hash"]
     assert {path.name for path in (tmp_path / "again").iterdir()} == RESULTS

@@ -114,12 +114,13 @@ def replay(
 
 def _warn_of_keyframes_there(target: Target, *, same_frame: bool) -> None:
     """Warn that given poses are taken for poses in the frame of a map that has keyframes."""
-    there = target.status(target.link.map).keyframes_durable
+    name = target.link.map
+    there = target.status(name).keyframes_durable if target.has_map(name) else 0
     if there and not same_frame:
         log.warning(
             "the map %s has %s already, and these are added to them: their poses must be in the "
             "same coordinate frame (--map NAME names another map, --same-frame says that they are)",
-            target.link.map, count_of(there, "keyframe"),
+            name, count_of(there, "keyframe"),
         )  # fmt: skip
 
 

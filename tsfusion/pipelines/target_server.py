@@ -35,7 +35,7 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.journal import state_folder
 from tsfusion.wire.curve import ClientKeys, client_keys
 from tsfusion.wire.health import Status
-from tsfusion.wire.queries import fetch_mesh, fetch_new_map, fetch_status
+from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_new_map, fetch_status
 
 START_DEADLINE = 180.0  # seconds; a cold kernel compilation on a slow machine
 STOP_DEADLINE = 60.0  # seconds; draining and the checkpoint
@@ -193,6 +193,11 @@ class Target:
         """Raise TransportError when the server started for this run has ended."""
         if self.child is not None:
             self.child.check()
+
+    def has_map(self, map_name: str) -> bool:
+        """Whether a map is open; a new one is made for its first record."""
+        address, control, keys = self.link.address, self.link.control, self.keys
+        return map_name in fetch_health(address, control=control, keys=keys).maps
 
     def status(self, map_name: str, *, timeout: float = 10.0) -> Status:
         """The status of a map; see `fetch_status`."""
