@@ -114,6 +114,10 @@ class HeldSensor:
         rounded = np.round(np.array(rows) / _GRAIN) * _GRAIN
         self._sums[: len(rows)] += times * np.column_stack((rounded, np.ones(len(rows))))
 
+    def merge(self, other: "HeldSensor") -> None:
+        """Take the keyframes of another into account."""
+        self._sums += other._sums
+
     @property
     def up(self) -> NDArray[np.float64]:
         """(3,) mean of the directions away from the ground, if they were held upright: 0 to 1 long."""

@@ -6,12 +6,16 @@ ones must not be added. Its poses are in one coordinate frame, the session's wor
 are not added either, unless somebody knows better.
 """
 
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
+
+from tsfusion.core.counts import count_of
+from tsfusion.core.errors import MapError
 
 _POSE = 12  # numbers: the upper three rows
 
@@ -64,3 +68,96 @@ def sessions(meta: Mapping[str, Any]) -> list[SessionHistory]:
         )
         found.append(history)
     return found
+
+
+def check_addable(here: Mapping[str, Any], there: Mapping[str, Any], *, same_frame: bool) -> None:
+    """Raise MapError where two maps hold the same keyframes, or are not known to be in one coordinate frame.
+
+    Args:
+        here, there: `meta` of each map.
+        same_frame: they are in one, whatever their worlds.
+    """
+    ours, theirs = ({one.session: one for one in sessions(meta)} for meta in (here, there))
+    for name in ours.keys() & theirs.keys():
+        _check_distinct(ours[name], theirs[name])
+    worlds = [{one.world for one in each.values()} or {""} for each in (ours, theirs)]
+    if not same_frame and worlds[0].isdisjoint(worlds[1]):
+        raise MapError(
+            "the maps are of scans that found their poses themselves, each in a coordinate frame of its own; "
+            "merge them only if they are known to be in one (same_frame), or after they were aligned"
+        )
+
+
+def _check_distinct(ours: SessionHistory, theirs: SessionHistory) -> None:
+    name = f"session {ours.session[:8]}" + (f" of {ours.client}" if ours.client else "")
+    if ours.unlisted or theirs.unlisted:
+        raise MapError(
+            f"both maps have keyframes of {name}, and it is not known of all of them which: they could "
+            "count twice; merge the maps that these were made from, or fuse their journals"
+        )
+    shared = np.intersect1d(ours.seqs, theirs.seqs)
+    if len(shared):
+        raise MapError(
+            f"both maps hold {count_of(len(shared), 'keyframe')} of {name} (first number {shared[0]}): they "
+            "would count twice"
+        )
+
+
+def shared_poses(here: Mapping[str, Any], there: Mapping[str, Any]) -> int:
+    """Number of keyframes of `there` with exactly the pose of one in `here`: likely one recording, twice."""
+    ours, theirs = ([row.tobytes() for one in sessions(meta) for row in one.poses] for meta in (here, there))
+    known = set(ours)
+    return sum(row in known for row in theirs)
+
+
+def without_journal(meta: Mapping[str, Any]) -> dict[str, Any]:
+    """The meta of a map that leaves its journal behind, or no longer is the sum of whole keyframes.
+
+    None of its keyframes can be moved or listed any more. Those whose corrections wait stay where they are.
+    """
+    if "done" not in meta:
+        return dict(meta)
+    poses = meta.get("poses") or {}
+    waiting: dict[str, set[int]] = {}
+    for name, seq, _ in poses.get("waiting", ()):
+        waiting.setdefault(name, set()).add(seq)
+    listed = {
+        name: {
+            **dict.fromkeys(("seqs", "segments", "offsets", "fused"), b""),
+            "T": poses.get("sessions", {}).get(name, {}).get("T", b""),
+            "unknown": last,
+            "missed": sorted(
+                waiting.get(name, set()).union(poses.get("sessions", {}).get(name, {}).get("missed", ()))
+            ),
+        }
+        for name, (last, *_) in meta["done"].items()
+    }
+    return {**meta, "poses": {"sessions": listed, "waiting": [], "removed": poses.get("removed", 0)}}
+
+
+def added(here: Mapping[str, Any], there: Mapping[str, Any]) -> dict[str, Any]:
+    """The meta of two maps' sum; each session goes on from where it was later."""
+    one, other = without_journal(here), without_journal(there)
+    together = {**other, **one}
+    if "done" not in together:
+        return together
+    for name, progress in other.get("done", {}).items():
+        if progress[0] > together["done"].get(name, [0])[0]:
+            together["done"] = {**together["done"], name: progress}
+    parts = [each.get("poses", {}).get("sessions", {}) for each in (one, other)]
+    together["poses"] = {
+        "sessions": {
+            name: _later([part[name] for part in parts if name in part]) for name in together["done"]
+        },
+        "waiting": [],
+        "removed": sum(each.get("poses", {}).get("removed", 0) for each in (one, other)),
+    }
+    for counts in ("rejected", "blocks"):
+        together[counts] = dict(sum((Counter(each.get(counts, {})) for each in (one, other)), Counter[str]()))
+    return together
+
+
+def _later(parts: list[dict[str, Any]]) -> dict[str, Any]:
+    """A session of two maps, as the one that is farther has it."""
+    latest = max(parts, key=lambda part: part["unknown"])
+    return {**latest, "missed": sorted({seq for part in parts for seq in part["missed"]})}

@@ -11,6 +11,7 @@ import hashlib
 import logging
 import os
 import struct
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -31,7 +32,7 @@ from tsfusion.kernels import integrate, runtime
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.voxel_traversal import COUNT
-from tsfusion.tsdf import checkpoint, field_regularizer
+from tsfusion.tsdf import checkpoint, field_regularizer, map_addition, map_crop, map_history
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
@@ -144,6 +145,63 @@ class Volume:
                 away. A keyframe never integrated goes unnoticed where others left votes enough.
         """
         return self._apply(_keyframe(keyframe, others, fields), -1)
+
+    def merge(self, other: "Volume", *, same_frame: bool = False) -> None:
+        """Add another map of the same coordinate frame: the map of all keyframes of both, to the last bit.
+
+        Settled colours (32768 votes) are averaged. Smoothed values fall back to the raw ones in blocks that
+        both have. Each journal keeps its own keyframes: a server that goes on with the merged map can add
+        keyframes, and move or remove none of those that are in it.
+
+        Args:
+            same_frame: the maps are in one frame, although their scans found their poses each for itself.
+
+        Raises:
+            MapError: when the voxels or layers differ, when both hold the same keyframes, as far as a server
+                wrote down which, or are of different worlds; MapFull, WeightOverflow, MemoryError: when the
+                sum has no room. After each of them the map is as it was.
+        """
+        if other is self:
+            raise MapError("a map cannot be merged with itself: each keyframe would count twice")
+        self._check_like(other)
+        if self.keyframes and other.keyframes:
+            map_history.check_addable(self.meta, other.meta, same_frame=same_frame)
+        map_addition.add(self._store, other._store, self.config.max_blocks)
+        self.keyframes += other.keyframes
+        self.held.merge(other.held)
+        self.meta = map_history.added(self.meta, other.meta)
+
+    def crop(self, box: Sequence[float]) -> "Volume":
+        """A new map of the voxels whose centres lie in a box, with their sums, colours and smoothed values.
+
+        It can be merged, meshed and saved, and takes keyframes, anywhere. A keyframe that was cut can no
+        longer be retracted; `keyframes` counts all that the map was made from.
+
+        Args:
+            box: x0, y0, z0, x1, y1, z1 in metres; a centre on the upper side is outside, so that maps of
+                boxes side by side add up to that of both.
+
+        Raises:
+            InvalidConfig: for another box; MemoryError: when there is no room for both maps.
+        """
+        first, end = map_crop.voxel_range(box, self.config.voxel_size)
+        cropped = Volume(self.config)
+        map_crop.copy(self._store, cropped._store, first, end)
+        cropped.keyframes = self.keyframes if cropped._store.count else 0
+        cropped.held = HeldSensor(self.held.numbers)
+        cropped.meta = map_history.without_journal(self.meta)
+        return cropped
+
+    def _check_like(self, other: "Volume") -> None:
+        """Raise MapError unless voxels and layers are those of another map."""
+        ours, theirs = ((one.config.voxel_size, sorted(one._store.layers())) for one in (self, other))
+        if ours[0] != theirs[0]:
+            raise MapError(f"the maps have voxels of {ours[0]:g} m and {theirs[0]:g} m: fuse one anew")
+        if ours[1] != theirs[1]:
+            raise MapError(
+                f"the maps have different layers, {', '.join(ours[1])} and {', '.join(theirs[1])} (colour, "
+                "smoothing along rays): fuse one anew"
+            )
 
     def take_dirty(self) -> NDArray[np.int32]:
         """Coordinates of the blocks changed since the last call: (n, 3) int32, in units of 8 voxels."""
