@@ -15,6 +15,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from tsfusion import Volume, open_dataset
 from tsfusion.core import process
 from tsfusion.tsdf.block_store import pack_keys, unpack_keys
 from tsfusion.tsdf.checkpoint import CUBE
+
+Seconds = dict[str, float]  # of wall clock and of CPU
 
 
 def large_map(source: str, blocks: int, frames: int, voxel_size: float) -> Volume:
@@ -49,11 +52,27 @@ def large_map(source: str, blocks: int, frames: int, voxel_size: float) -> Volum
     return volume
 
 
-def timed(call: Callable[[], Any]) -> tuple[Any, dict[str, float]]:
+def timed(call: Callable[[], Any]) -> tuple[Any, Seconds]:
     """The result of a call, with seconds of wall clock and of CPU."""
     wall, cpu = time.perf_counter(), time.process_time()
     result = call()
     return result, {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
+
+
+def measured(volume: Volume, folder: Path | None) -> tuple[dict[str, float], Seconds, Seconds]:
+    """Sizes, and the time of a save and of a load."""
+    blocks, map_hash = volume.stats().blocks, volume.map_hash()
+    nbytes = blocks * CUBE * sum(layer.itemsize for layer in volume._store.layers().values())
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        path = Path(scratch) / "map.tsf"
+        _, saved = timed(partial(volume.save, path))
+        size = path.stat().st_size
+        loaded, read = timed(partial(Volume.load, path))
+    if loaded.map_hash() != map_hash:
+        raise SystemExit("the map came back as another")
+    cores = len(os.sched_getaffinity(0))
+    about = {"blocks": blocks, "voxel_mb": nbytes / 1e6, "file_of_raw": size / nbytes, "cores": cores}
+    return about, saved, read
 
 
 def main() -> None:
@@ -66,22 +85,13 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="where the file is written; default: a temporary folder")
     options = parser.parse_args()
     volume = large_map(options.source, options.blocks, options.frames, options.voxel_size)
-    blocks = volume.stats().blocks
-    nbytes = blocks * CUBE * sum(layer.itemsize for layer in volume._store.layers().values())
-    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-        path = Path(folder) / "map.tsf"
-        _, saved = timed(lambda: volume.save(path))
-        size, map_hash = path.stat().st_size, volume.map_hash()
-        del volume
-        loaded, read = timed(lambda: Volume.load(path))
-    if loaded.map_hash() != map_hash:
-        raise SystemExit("the map came back as another")
-    about = {"blocks": blocks, "voxel_mb": nbytes / 1e6, "file_of_raw": size / nbytes}
-    about["cores"] = len(os.sched_getaffinity(0))
+    about, saved, read = measured(volume, options.folder)
     for verb, took in (("save", saved), ("load", read)):
-        rates = {f"mb_per_{name}": nbytes / 1e6 / seconds for name, seconds in took.items()}
+        rates = {f"mb_per_{name}": about["voxel_mb"] / seconds for name, seconds in took.items()}
         row = {"verb": verb, **about, **took, **rates, "peak_rss_mb": process.peak_rss_bytes() / 1e6}
-        print(json.dumps({key: round(value, 3) if isinstance(value, float) else value for key, value in row.items()}))
+        print(
+            json.dumps({key: round(value, 3) for key, value in row.items() if key != "verb"} | {"verb": verb})
+        )
 
 
 if __name__ == "__main__":

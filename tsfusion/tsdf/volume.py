@@ -9,6 +9,7 @@ the sums and never change them.
 
 import hashlib
 import logging
+import math
 import os
 import struct
 from collections.abc import Sequence
@@ -32,9 +33,10 @@ from tsfusion.kernels import integrate, runtime
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.voxel_traversal import COUNT
-from tsfusion.tsdf import checkpoint, field_regularizer, map_addition, map_crop, map_history
+from tsfusion.tsdf import checkpoint, field_regularizer, map_addition, map_crop, map_difference, map_history
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.integrator import Integrator, KeyframeQuota
+from tsfusion.tsdf.map_difference import MapDifference
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
 from tsfusion.tsdf.ray_buffers import RayBuffers, keyframes_of_every_kind
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
@@ -192,15 +194,40 @@ class Volume:
         cropped.meta = map_history.without_journal(self.meta)
         return cropped
 
+    def diff(self, later: "Volume", *, tolerance: float | None = None) -> MapDifference:
+        """What is different in a later map of the same frame, in numbers and as a coloured mesh.
+
+        Args:
+            tolerance: metres between two surfaces that count as the same; default two voxels.
+
+        Raises:
+            MapError: when the maps have voxels of different sizes.
+            InvalidConfig: for a tolerance that is none.
+        """
+        self._check_voxels(later)
+        metres = 2 * self.config.voxel_size if tolerance is None else tolerance
+        if not 0 <= metres < math.inf:
+            raise InvalidConfig(f"tolerance must be 0 metres or more, got {tolerance}")
+        blocks, voxels = map_difference.count(self._store, later._store)
+        earlier, other = (
+            map_difference.Side(one.extract_mesh().without_islands(), one._store, one.model.min_weight)
+            for one in (self, later)
+        )
+        return MapDifference(blocks, voxels, *map_difference.surfaces(earlier, other, metres))
+
+    def _check_voxels(self, other: "Volume") -> None:
+        ours, theirs = self.config.voxel_size, other.config.voxel_size
+        if ours != theirs:
+            raise MapError(f"the maps have voxels of {ours:g} m and {theirs:g} m: fuse one anew")
+
     def _check_like(self, other: "Volume") -> None:
         """Raise MapError unless voxels and layers are those of another map."""
-        ours, theirs = ((one.config.voxel_size, sorted(one._store.layers())) for one in (self, other))
-        if ours[0] != theirs[0]:
-            raise MapError(f"the maps have voxels of {ours[0]:g} m and {theirs[0]:g} m: fuse one anew")
-        if ours[1] != theirs[1]:
+        self._check_voxels(other)
+        ours, theirs = (", ".join(sorted(one._store.layers())) for one in (self, other))
+        if ours != theirs:
             raise MapError(
-                f"the maps have different layers, {', '.join(ours[1])} and {', '.join(theirs[1])} (colour, "
-                "smoothing along rays): fuse one anew"
+                f"the maps have different layers, {ours} and {theirs} (colour, smoothing along rays): "
+                "fuse one anew"
             )
 
     def take_dirty(self) -> NDArray[np.int32]:
