@@ -6,7 +6,10 @@ from pathlib import Path
 
 import pytest
 from command_processes import Here
-from saved_maps import ANNA, BOB, make_map
+from corrected_maps import fresh_map
+from formula_scenes import volume_of
+from keyframes_and_servers import pose, wall
+from saved_maps import ANNA, BOB, correct, decoded, make_map
 
 from tsfusion import Volume
 from tsfusion.journal import state_folder
@@ -49,10 +52,20 @@ def test_info_says_what_a_map_holds(here: Here, state: Path) -> None:
     assert "world bbbbbbbb" in text
 
 
-def test_hash_is_a_line_and_says_what_the_map_is_without(here: Here, state: Path) -> None:
+def test_hash_is_a_line_and_has_all_that_the_journal_holds(here: Here, state: Path) -> None:
     whole = here("map", "hash", file_of(state, "yard"))
     assert (whole.stdout, whole.stderr) == (Volume.load(file_of(state, "yard")).map_hash() + "\n", "")
-    behind = here("map", "hash", state, "--map", "house")
-    assert behind.returncode == 0
-    assert behind.stdout == Volume.load(file_of(state, "house")).map_hash() + "\n"
-    assert "without 1 keyframe of the journal" in behind.stderr
+    before = {path: path.read_bytes() for path in state.rglob("*") if path.is_file()}
+    info = json.loads(here("map", "info", state, "--map", "house", "--json").stdout)
+    assert (info["keyframes"], info["keyframes_after"]) == (3, 1)
+    behind = json.loads(here("map", "hash", state, "--map", "house", "--json").stdout)
+    fused = volume_of((decoded(wall(i)) for i in range(10, 14)), voxel_size=0.04).map_hash()
+    assert (behind["map_hash"], behind["keyframes"]) == (fused, 4)
+    assert {path: path.read_bytes() for path in state.rglob("*") if path.is_file()} == before
+
+
+def test_hash_moves_what_was_corrected(here: Here, tmp_path: Path) -> None:
+    folder = make_map(tmp_path / "state" / "maps" / "default", range(4), behind=2)
+    correct(folder, ANNA, 5, {1: pose(0.5), 4: pose(0.7)}, removed=(2,))
+    found = here("map", "hash", tmp_path / "state")
+    assert found.stdout == fresh_map(folder / "journal", 0.04).map_hash() + "\n"

@@ -3,14 +3,15 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from keyframes_and_servers import VOLUME, wall
 
-from tsfusion import VolumeConfig
+from tsfusion import Keyframe, VolumeConfig
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.fuser.messages import SessionProgress
 from tsfusion.journal import Journal, state_folder
-from tsfusion.wire import codec
+from tsfusion.wire import codec, corrections
 from tsfusion.wire.codec import decode_keyframe
 
 ANNA, BOB = b"a" * 16, b"b" * 16
@@ -46,3 +47,18 @@ def make_map(
     journal.close()
     assert saved.save()
     return folder
+
+
+def correct(
+    folder: Path, session: bytes, seq: int, moves: dict[int, Any], removed: Sequence[int] = ()
+) -> None:
+    """Write a correction to a map's journal, of which no checkpoint has anything."""
+    journal = Journal(folder / state_folder.JOURNAL_FOLDER, 1 << 20, sync=False)
+    frames = corrections.encode(corrections.checked(moves, removed=removed), session=session, seq=seq)
+    journal.append(frames, session=session, seq=seq)
+    journal.close()
+
+
+def decoded(keyframe: Keyframe) -> Keyframe:
+    """A keyframe as it comes out of a journal."""
+    return decode_keyframe(codec.encode(keyframe, session=ANNA, seq=1, jpeg_quality=90))

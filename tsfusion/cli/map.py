@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """`tsfusion map`: saved maps, described and compared without a server."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -48,22 +50,40 @@ def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
 
 @verbs.verb(app, "tsfusion map hash out/latest/map.tsf", "tsfusion map hash my-maps --map yard", name="hash")
 def hash_(path: Where, map_: Map = None, json: options.Json = False) -> None:
-    """Print the hash of a saved map: equal for the same keyframes at the same poses.
+    """Print the hash of a map: equal for the same keyframes at the same poses.
 
     Neither their order nor how often the server was restarted changes it;
-    colour is not part of it. Of a state folder it is the hash of the last
-    checkpoint; a note on stderr counts what the journal has beyond it.
+    colour is not part of it. Of a state folder it is the hash with all that
+    the journal holds: what its checkpoint lacks is fused first.
     """
     from tsfusion.cli import output
     from tsfusion.pipelines import saved_maps
 
-    found = saved_maps.summarise(saved_maps.find(path, map_))
-    if note := _behind(found):
-        typer.echo(f"note: {note}", err=True)
+    with _opened(path, map_, quiet=json) as file:
+        found = saved_maps.summarise(saved_maps.SavedMap(file))
     if json:
-        output.as_json({"path": found.path, "map_hash": found.map_hash, "keyframes": found.keyframes})
+        output.as_json({"path": str(path), "map_hash": found.map_hash, "keyframes": found.keyframes})
     else:
         typer.echo(found.map_hash)
+
+
+@contextmanager
+def _opened(path: Path, map_name: str | None = None, *, quiet: bool) -> Iterator[Path]:
+    """The file of a map; one of a state folder is brought up to date in a copy, with progress on stderr."""
+    from tsfusion.cli import progress
+    from tsfusion.pipelines import saved_maps
+
+    with progress.shown(quiet=quiet) as display:
+
+        def watch(done: int, total: int) -> None:
+            if done == 1:
+                display.stage(f"fusing what the checkpoint of {path} lacks")
+            display.update(done, done, total)
+
+        with saved_maps.opened(saved_maps.find(path, map_name), watch) as (file, left_out):
+            for reason, count in left_out.items():
+                typer.echo(f"left out {count_of(count, 'keyframe')}: {reason}", err=True)
+            yield file
 
 
 def _describe(found: "MapSummary") -> str:
@@ -123,6 +143,6 @@ def _behind(found: "MapSummary") -> str:
     if not words:
         return ""
     return (
-        f"this checkpoint is without {' and '.join(words)}: a server that is told to end (Ctrl-C, SIGTERM) "
-        "saves the map with all of it"
+        f"this checkpoint is without {' and '.join(words)}; a server saves the map with all of it when it is "
+        "told to end, and the other verbs of `tsfusion map` fuse it first"
     )

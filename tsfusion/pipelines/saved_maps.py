@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Saved maps on the disk: a file, or the last checkpoint in a server's state folder, and what they hold."""
 
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +11,10 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from tsfusion import journal
 from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import CheckpointError
 from tsfusion.journal import state_folder
+from tsfusion.pipelines import settled_maps
 from tsfusion.tsdf import checkpoint, map_history
 from tsfusion.tsdf.block_store import unpack_keys
 from tsfusion.tsdf.checkpoint import CUBE
@@ -89,6 +92,32 @@ def find(path: Path, map_name: str | None = None) -> SavedMap:
     return SavedMap(file, folder)
 
 
+@contextmanager
+def opened(
+    saved: SavedMap, watch: settled_maps.Watch = lambda _done, _all: None
+) -> Iterator[tuple[Path, dict[str, int]]]:
+    """The file of a map with all that its journal holds, which is there during the block.
+
+    Where the checkpoint in a state folder is behind the journal, as after a crash or while the server runs,
+    what it lacks is fused into a copy.
+
+    Yields:
+        The file; reason → number of the journal's keyframes that the map could not take.
+
+    Raises:
+        CheckpointError, JournalError: when the map or its journal cannot be read.
+    """
+    if saved.folder is not None:
+        with checkpoint.reading(saved.path) as (header, _):
+            histories, config = map_history.sessions(header.meta), header.config
+        records = settled_maps.records_after(saved.folder, histories)
+        if records or any(one.waiting for one in histories):
+            with settled_maps.settled(saved.folder, records, config, watch) as found:
+                yield found
+            return
+    yield saved.path, {}
+
+
 def summarise(saved: SavedMap) -> MapSummary:
     """Describe a saved map; every byte of the file is checked, no voxel is read.
 
@@ -101,7 +130,9 @@ def summarise(saved: SavedMap) -> MapSummary:
             chunk.fill(keys[chunk.first : chunk.first + chunk.blocks])
     voxel_bytes = sum(np.dtype(checkpoint.LAYER_DTYPES[name]).itemsize for name in header.layers)
     histories = map_history.sessions(header.meta)
-    after = (None, None) if saved.folder is None else _after(saved.folder, histories)
+    after = None
+    if saved.folder is not None:
+        after = Counter(one.is_correction for one in settled_maps.records_after(saved.folder, histories))
     return MapSummary(
         path=str(saved.path),
         nbytes=size_of(saved.path),
@@ -118,8 +149,8 @@ def summarise(saved: SavedMap) -> MapSummary:
         ],
         rejected=header.meta.get("rejected", {}),
         corrections_waiting=sum(one.waiting for one in histories),
-        keyframes_after=after[0],
-        corrections_after=after[1],
+        keyframes_after=None if after is None else after[False],
+        corrections_after=None if after is None else after[True],
         settings=msgspec.to_builtins(header.config),
         meta={name: value for name, value in header.meta.items() if name not in _SERVERS},
     )
@@ -134,18 +165,3 @@ def _box(keys: "np.ndarray[Any, np.dtype[np.int64]]", block_size: float) -> list
     blocks = unpack_keys(keys)
     corners = np.concatenate([blocks.min(axis=0), blocks.max(axis=0) + 1]) * block_size
     return [round(float(metres), 6) for metres in corners]
-
-
-def _after(folder: Path, histories: list[map_history.SessionHistory]) -> tuple[int, int]:
-    """Number of keyframes, and of corrections, that the journal has and the checkpoint does not."""
-    last = {bytes.fromhex(one.session): one.last for one in histories}
-    keyframes = corrections = 0
-    path = folder / state_folder.JOURNAL_FOLDER
-    for number in journal.segments(path) if path.is_dir() else ():
-        found, _ = journal.list_records(journal.segment_path(path, number))
-        for record in found:
-            if record.seq > last.get(record.session, 0):
-                last[record.session] = record.seq
-                keyframes += not record.is_correction
-                corrections += record.is_correction
-    return keyframes, corrections

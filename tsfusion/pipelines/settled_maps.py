@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: MIT
+"""The map of a state folder with all that its journal holds, as a server would have it after a restart.
+
+The fuser itself does the work, in a scratch folder that shows it the checkpoint and the journal: nothing of
+the state folder is changed, and a server may run there.
+"""
+
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tsfusion import journal
+from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.core.errors import JournalError
+from tsfusion.fuser import messages
+from tsfusion.fuser.fuser import Fuser
+from tsfusion.journal import state_folder
+from tsfusion.tsdf import map_history
+
+Watch = Callable[[int, int], None]  # records and moves done, of how many
+_POLL_S = 0.1
+
+
+class _Answers:
+    """Takes what the fuser would tell the gateway, and counts the keyframes that it could not take."""
+
+    def __init__(self) -> None:
+        self.left_out = Counter[str]()
+
+    def send_multipart(self, frames: list[Any], copy: bool) -> None:
+        message = messages.to_gateway.decode(frames[0])
+        if isinstance(message, messages.Done) and message.reason is not None:
+            self.left_out[message.message or message.reason] += 1
+
+
+def records_after(folder: Path, histories: list[map_history.SessionHistory]) -> list[journal.RecordEntry]:
+    """The records of a map's journal that a checkpoint with these sessions does not have, in order.
+
+    Raises:
+        JournalError: when the journal cannot be read.
+    """
+    last = {bytes.fromhex(one.session): one.last for one in histories}
+    found = []
+    path = folder / state_folder.JOURNAL_FOLDER
+    for number in journal.segments(path) if path.is_dir() else ():
+        for record in journal.list_records(journal.segment_path(path, number))[0]:
+            if record.seq > last.get(record.session, 0):
+                last[record.session] = record.seq
+                found.append(record)
+    return found
+
+
+@contextmanager
+def settled(
+    folder: Path,
+    records: list[journal.RecordEntry],
+    config: VolumeConfig,
+    watch: Watch = lambda _done, _all: None,
+) -> Iterator[tuple[Path, dict[str, int]]]:
+    """A file with the settled map of a folder, which is there during the block, and what was left out.
+
+    Args:
+        records: those that its checkpoint does not have.
+        config: settings of the checkpoint.
+
+    Yields:
+        The file; reason → number of keyframes that the map could not take.
+
+    Raises:
+        JournalError: when a record cannot be read.
+        TsfusionError: as the fuser, when it opens the map.
+    """
+    with tempfile.TemporaryDirectory(prefix="tsfusion-") as name:
+        scratch, answers = Path(name), _Answers()
+        for part in (state_folder.MAP_FILE, state_folder.JOURNAL_FOLDER):
+            (scratch / part).symlink_to((folder / part).resolve())
+        (scratch / "working").write_bytes(bytes(8))
+        fuser = Fuser(answers, _begin(scratch, config))  # type: ignore[arg-type]
+        _catch_up(fuser, records, watch)
+        fuser.handle(messages.Finish())
+        if fuser.exit_status != 0:
+            raise JournalError(f"the map of {folder} cannot be brought up to date in {scratch}: is it full?")
+        del fuser
+        yield scratch / state_folder.MAP_FILE, dict(answers.left_out)
+
+
+def _begin(scratch: Path, config: VolumeConfig) -> messages.Begin:
+    server = ServerConfig()
+    return messages.Begin(
+        str(scratch),
+        config,
+        mesh_interval=0.0,
+        checkpoint_every=0,
+        working=str(scratch / "working"),
+        keep_previous=False,
+        memory_bytes=1 << 60,
+        quota_cost=server.quota_cost,
+        quota_map=1.0,
+    )
+
+
+def _catch_up(fuser: Fuser, records: list[journal.RecordEntry], watch: Watch) -> None:
+    """Let the fuser take the records, and move what corrections move."""
+    for index, record in enumerate(records):
+        place = (record.position, record.session, record.seq, record.client, record.world)
+        fuser.handle(messages.Fuse(index, *place, is_correction=record.is_correction))
+        while fuser.is_held and fuser.exit_status is None:
+            time.sleep(_POLL_S)
+            fuser.go_on()
+        if fuser.exit_status is not None:
+            raise JournalError(f"a record of session {record.session.hex()[:8]} cannot be read: try again")
+        watch(index + 1, len(records))
+    waiting = fuser.ready().moves
+    total = moved = waiting.waiting if waiting is not None else 0
+    while fuser.move_due(idle=True) or fuser.wait_ms is not None:
+        if not fuser.move_due(idle=True):
+            time.sleep(_POLL_S)
+            continue
+        fuser.move()
+        moves = fuser.ready().moves
+        moved = total - (moves.waiting if moves is not None else 0)
+        watch(len(records) + moved, len(records) + total)
