@@ -88,10 +88,8 @@ def main() -> None:
     about, saved, read = measured(volume, options.folder)
     for verb, took in (("save", saved), ("load", read)):
         rates = {f"mb_per_{name}": about["voxel_mb"] / seconds for name, seconds in took.items()}
-        row = {"verb": verb, **about, **took, **rates, "peak_rss_mb": process.peak_rss_bytes() / 1e6}
-        print(
-            json.dumps({key: round(value, 3) for key, value in row.items() if key != "verb"} | {"verb": verb})
-        )
+        row: dict[str, float] = {**about, **took, **rates, "peak_rss_mb": process.peak_rss_bytes() / 1e6}
+        print(json.dumps({"verb": verb, **{key: round(value, 3) for key, value in row.items()}}))
 
 
 if __name__ == "__main__":

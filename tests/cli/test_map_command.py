@@ -2,16 +2,20 @@
 """`tsfusion map`: what it says of saved maps, what it makes of them, and what it refuses."""
 
 import json
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 from command_processes import Here
 from corrected_maps import fresh_map
 from formula_scenes import volume_of
-from keyframes_and_servers import pose, wall
+from keyframes_and_servers import DEADLINE, pose, serving, wall
 from saved_maps import ANNA, BOB, correct, decoded, make_map
 
-from tsfusion import Volume
+from tsfusion import Client, Volume
 from tsfusion.journal import state_folder
 
 
@@ -69,3 +73,136 @@ def test_hash_moves_what_was_corrected(here: Here, tmp_path: Path) -> None:
     correct(folder, ANNA, 5, {1: pose(0.5), 4: pose(0.7)}, removed=(2,))
     found = here("map", "hash", tmp_path / "state")
     assert found.stdout == fresh_map(folder / "journal", 0.04).map_hash() + "\n"
+
+
+FAR = 50
+
+
+def hash_of(keyframes: Iterable[int]) -> str:
+    return volume_of((decoded(wall(i)) for i in keyframes), voxel_size=0.04).map_hash()
+
+
+def test_merge_is_the_map_of_all(here: Here, state: Path, tmp_path: Path) -> None:
+    third = make_map(tmp_path / "third", range(20, 22), session=b"c" * 16, world="b" * 32)
+    done = here("map", "merge", state_folder.map_folder(state, "yard"), third, "--out", "all.tsf", "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    found = json.loads(done.stdout)
+    assert (found["map_hash"], found["keyframes"]) == (hash_of([*range(5), 20, 21]), 7)
+    assert here("map", "hash", "all.tsf").stdout.strip() == found["map_hash"]
+    sessions = json.loads(here("map", "info", "all.tsf", "--json").stdout)["sessions"]
+    assert [(one["last"], one["listed"], one["unlisted_up_to"]) for one in sessions] == [
+        (3, 0, 3), (2, 0, 2), (2, 0, 2),
+    ]  # fmt: skip
+
+
+def test_merge_refuses_what_would_count_twice_or_lie_elsewhere(
+    here: Here, state: Path, tmp_path: Path
+) -> None:
+    yard = file_of(state, "yard")
+    for maps, words in (
+        ((yard, yard), "both maps hold 3 keyframes of session 61616161 of anna"),
+        ((yard,), "two maps or more"),
+        ((yard, make_map(tmp_path / "c", [30], session=b"c" * 16, world="elsewhere")), "of its own"),
+    ):
+        done = here("map", "merge", *maps, "--out", "all.tsf")
+        assert (done.returncode, done.stdout) == (1, "")
+        assert words in done.stderr
+        assert not Path("all.tsf").exists()
+    again = make_map(tmp_path / "d", [0, 40], session=b"d" * 16)
+    done = here("map", "merge", yard, again, tmp_path / "c", "--same-frame", "--out", "all.tsf")
+    assert done.returncode == 0
+    assert "1 keyframe has a pose of the other maps" in done.stderr
+    assert f"hash {hash_of([*range(5), 0, 40, 30])}" in done.stdout
+
+
+def test_crop_and_merge_back(here: Here, state: Path) -> None:
+    house = state_folder.map_folder(state, "house")
+    for name, low, high in (("left.tsf", -FAR, 0.4), ("right.tsf", 0.4, FAR)):
+        done = here("map", "crop", house, "--box", low, -FAR, -FAR, high, FAR, FAR, "--out", name)
+        assert done.returncode == 0
+    left = Volume.load("left.tsf")
+    assert left.map_hash() != hash_of(range(10, 14))
+    left.meta = {}  # which says that both were made of the same keyframes
+    left.merge(Volume.load("right.tsf"))
+    assert left.map_hash() == hash_of(range(10, 14))
+    refused = here("map", "merge", "left.tsf", "right.tsf", "--out", "all.tsf")
+    assert "they could count twice" in refused.stderr
+    empty = here("map", "crop", "left.tsf", "--box", 8, 8, 8, 9, 9, 9, "--out", "none.tsf")
+    assert (empty.returncode, Volume.load("none.tsf").stats().blocks) == (0, 0)
+    assert "nothing of the map lies in this box" in empty.stderr
+    assert "x0 y0 z0" in here("map", "crop", house, "--box", 1, 0, 0, 0, 1, 1, "--out", "no.tsf").stderr
+
+
+def test_diff_counts_and_paints(here: Here, state: Path) -> None:
+    yard, house = file_of(state, "yard"), state_folder.map_folder(state, "house")
+    same = here("map", "diff", yard, yard)
+    assert (same.returncode, "the maps are the same" in same.stdout) == (0, True)
+    found = json.loads(here("map", "diff", yard, house, "--out", "changes.ply", "--json").stdout)
+    assert found["area_m2"]["new"] > 0.1
+    assert found["voxels"]["only_later"] > 100
+    assert not found["same"]
+    assert len(trimesh.load("changes.ply", process=False).faces) > 100
+    text = here("map", "diff", yard, house, "--tolerance", 0.5).stdout
+    assert "not seen again" in text
+    assert here("map", "diff", yard, house, "--out", "changes.txt").returncode == 1
+
+
+def test_convert_writes_voxels_meshes_and_maps(here: Here, state: Path) -> None:
+    yard, volume = file_of(state, "yard"), Volume.load(file_of(state, "yard"))
+    for name in ("voxels.npz", "mesh.ply", "map.tsf"):
+        done = json.loads(here("map", "convert", state, name, "--map", "yard", "--json").stdout)
+        assert (done["path"], done["map_hash"]) == (name, volume.map_hash())
+    assert Volume.load("map.tsf").map_hash() == volume.map_hash()
+    assert len(trimesh.load("mesh.ply", process=False).faces) == len(volume.extract_mesh().faces)
+    assert np.load("voxels.npz")["blocks"].shape == (volume.stats().blocks, 3)
+    assert here("map", "convert", yard, "dense.npz", "--dense").returncode == 0
+    assert np.load("dense.npz")["tsdf"].ndim == 3
+    assert "--dense has no effect" in here("map", "convert", yard, "mesh.glb", "--dense").stderr
+    assert here("map", "convert", state_folder.map_folder(state, "house"), "house.tsf").returncode == 0
+    assert Volume.load("house.tsf").map_hash() == hash_of(range(10, 14))
+
+
+def test_a_resumed_map_takes_keyframes(here: Here, state: Path, tmp_path: Path) -> None:
+    done = here("map", "resume", file_of(state, "yard"), "--state", "own", "--map", "yard")
+    assert done.returncode == 0
+    assert "tsfusion serve --state own --voxel-size 0.04\n" in done.stdout
+    again = here("map", "resume", file_of(state, "yard"), "--state", "own", "--map", "yard")
+    assert (again.returncode, "holds a map already" in again.stderr) == (1, True)
+    assert here("map", "hash", "own").stdout.strip() == hash_of(range(5))
+    folder = Path("own").resolve() / "maps" / "yard"
+    moved = [decoded(wall(i)) for i in (*range(5), 50, 51, 52)]
+    moved[6] = replace(moved[6], T_world_camera=pose(0.9))
+    hash_of_moved = volume_of(moved, voxel_size=0.04).map_hash()
+    with serving(Path("own").resolve()) as server, Client(server.address, map="yard") as client:
+        for i in range(50, 53):
+            client.send(wall(i))
+        client.correct({2: pose(0.9)})
+        client.wait_settled(DEADLINE)
+        refused = here("map", "resume", file_of(state, "house"), "--state", "own", "--map", "house")
+        assert "in use by another server" in refused.stderr
+        server.terminate()
+        client.close()
+        assert server.terminate() == 0
+    info = json.loads(here("map", "info", folder, "--json").stdout)
+    assert (info["map_hash"], info["keyframes"], info["keyframes_after"]) == (hash_of_moved, 8, 0)
+
+
+def test_an_old_keyframe_of_a_resumed_map_stays_where_it_was(here: Here, state: Path) -> None:
+    """Its new journal has other keyframes where the old one had it."""
+    here("map", "resume", file_of(state, "yard"), "--state", "own")
+    folder = Path("own").resolve() / "maps" / "default"
+    make_map(folder, range(60, 62), session=ANNA, client="anna", behind=2)
+    correct(folder, ANNA, 6, {1: pose(0.5), 4: pose(0.7)})
+    found = json.loads(here("map", "hash", "own", "--json").stdout)
+    kept = [decoded(wall(i)) for i in (*range(5), 60, 61)]
+    kept[5] = replace(kept[5], T_world_camera=pose(0.7))
+    assert found["map_hash"] == volume_of(kept, voxel_size=0.04).map_hash()
+
+
+def test_a_map_of_no_server_is_resumed_for_given_poses(here: Here, tmp_path: Path) -> None:
+    volume_of((wall(i) for i in range(3)), voxel_size=0.04).save(tmp_path / "map.tsf")
+    assert here("map", "resume", "map.tsf", "--state", "own").returncode == 0
+    (session,) = json.loads(here("map", "info", "own", "--json").stdout)["sessions"]
+    assert (session["last"], session["world"]) == (0, "")
+    assert "--map" not in here("map", "resume", "map.tsf", "--state", "own", "--map", "No/Name").stdout
+    assert not Path("own/maps/No").exists()

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""`tsfusion map`: saved maps, described and compared without a server."""
+"""`tsfusion map`: saved maps, described, compared, put together and taken apart without a server."""
 
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -8,17 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tsfusion.cli import options, verbs
+from tsfusion.cli import map_view, options, verbs
 from tsfusion.core.counts import count_of
 
 if TYPE_CHECKING:
-    from tsfusion.pipelines.saved_maps import MapSummary, SessionSummary
+    from tsfusion.tsdf.volume import Volume
 
-_MOST_LINES = 20  # printed of one kind; --json has all
+_TWICE = "a recording that was sent twice counts twice"
 
 app = typer.Typer(
     cls=verbs.Group,
-    help="Describe and compare saved maps.\n\n"
+    help="Describe, compare, merge, crop, convert and resume saved maps.\n\n"
     "A saved map is a file (.tsf), or the last checkpoint of a server: its state folder, or the folder of "
     "one map in it. All of this works while the server runs, and changes nothing of what it reads.",
 )
@@ -26,6 +27,7 @@ app = typer.Typer(
 Where = Annotated[
     Path, typer.Argument(metavar="MAP", help="A .tsf file, a state folder, or a map's folder in it.")
 ]
+Out = Annotated[Path, typer.Option("--out", metavar="FILE", help="The map to write (.tsf); replaced.")]
 Map = Annotated[
     str | None, typer.Option("--map", metavar="NAME", help="Which map of a state folder with several.")
 ]
@@ -45,7 +47,7 @@ def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
     if json:
         output.as_json(found)
     else:
-        typer.echo(_describe(found))
+        typer.echo(map_view.summary(found))
 
 
 @verbs.verb(app, "tsfusion map hash out/latest/map.tsf", "tsfusion map hash my-maps --map yard", name="hash")
@@ -67,6 +69,240 @@ def hash_(path: Where, map_: Map = None, json: options.Json = False) -> None:
         typer.echo(found.map_hash)
 
 
+@verbs.verb(
+    app, "tsfusion map merge ground.tsf upstairs.tsf --out house.tsf",
+    "tsfusion map merge monday-maps tuesday.tsf --out both.tsf --same-frame",
+)  # fmt: skip
+def merge(
+    maps: Annotated[
+        list[Path], typer.Argument(metavar="MAP MAP…", help="Files (.tsf), state folders, maps' folders.")
+    ],
+    *,
+    out: Out,
+    same_frame: Annotated[
+        bool, typer.Option("--same-frame", help="They are in one frame, though found by scans each.")
+    ] = False,
+    json: options.Json = False,
+) -> None:
+    """Add maps of one coordinate frame: the map of all their keyframes, to the last bit.
+
+    Voxel size and layers must be the same. Refused: maps that hold the same
+    keyframes, as far as a server wrote down which, and maps of scans that
+    found their poses themselves, each in a frame of its own, unless
+    --same-frame. A recording that was sent twice counts twice; equal poses
+    are noted.
+
+    What is lost: journals stay where they are. In the merged map keyframes
+    can be neither corrected nor removed, and mesh --until and --only know
+    nothing of them. It takes new ones: `tsfusion map resume`.
+    """
+    from tsfusion.cli import output
+    from tsfusion.core.errors import InvalidConfig
+    from tsfusion.core.output_folder import check_writable
+    from tsfusion.tsdf import map_history
+
+    check_writable(out, (".tsf",))
+    if len(maps) < 2:
+        raise InvalidConfig(f"merging takes two maps or more, got {len(maps)}")
+    merged = _load(maps[0], quiet=json)
+    poses = map_history.poses(merged.meta)
+    for path in maps[1:]:
+        other = _load(path, quiet=json)
+        theirs = map_history.poses(other.meta)
+        merged.merge(other, same_frame=same_frame)
+        if count := len(poses & theirs):
+            have = count_of(count, "keyframe has", "keyframes have")
+            typer.echo(f"note: {path}: {have} a pose of the other maps; {_TWICE}", err=True)
+        poses |= theirs
+        del other
+    merged.save(out)
+    if json:
+        output.as_json({"path": str(out), **map_view.figures(merged)})
+    else:
+        typer.echo(map_view.line(out, merged))
+
+
+@verbs.verb(
+    app, "tsfusion map crop out/latest/map.tsf --box -2 -2 -0.5 2 2 2.5 --out desk.tsf",
+    "tsfusion map crop my-maps --map yard --box 0 0 -1 40 25 10 --out yard.tsf",
+)  # fmt: skip
+def crop(
+    path: Where,
+    *,
+    box: Annotated[
+        tuple[float, float, float, float, float, float],
+        typer.Option(metavar="X0 Y0 Z0 X1 Y1 Z1", help="Metres in the map's frame."),
+    ],
+    out: Out,
+    map_: Map = None,
+    json: options.Json = False,
+) -> None:
+    """Write the part of a map that lies in a box, as a map.
+
+    Kept are the voxels whose centres lie in the box; one on its upper side
+    does not, so that boxes side by side share none. `tsfusion map info` has
+    the box of a whole map. Keyframes that were cut can be neither corrected
+    nor removed; new ones are taken, anywhere (`tsfusion map resume`).
+    """
+    from tsfusion.cli import output
+    from tsfusion.core.output_folder import check_writable
+
+    check_writable(out, (".tsf",))
+    cropped = _load(path, map_, quiet=json).crop(box)
+    if not cropped.stats().blocks:
+        typer.echo(
+            "note: nothing of the map lies in this box; `tsfusion map info` has the map's own", err=True
+        )
+    cropped.save(out)
+    if json:
+        output.as_json({"path": str(out), **map_view.figures(cropped)})
+    else:
+        typer.echo(map_view.line(out, cropped))
+
+
+@verbs.verb(
+    app, "tsfusion map diff monday.tsf tuesday.tsf",
+    "tsfusion map diff monday.tsf tuesday.tsf --out changes.glb --tolerance 0.05",
+)  # fmt: skip
+def diff(
+    earlier: Annotated[Path, typer.Argument(metavar="EARLIER", help="A map: file or state folder.")],
+    later: Annotated[Path, typer.Argument(metavar="LATER", help="One of the same place and frame.")],
+    *,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A coloured mesh: .ply, .glb, .obj, or .png.")
+    ] = None,
+    tolerance: Annotated[
+        float | None, typer.Option(metavar="METRES", help="Between equal surfaces; default 2 voxels.")
+    ] = None,
+    json: options.Json = False,
+) -> None:
+    """Show what is different between two maps of one place.
+
+    In square metres of surface, and in FILE by colour:
+    unchanged       grey, in both
+    appeared        green, where the earlier scan saw free space
+    gone            red, where the later scan saw free space
+    new             blue, where the earlier scan saw nothing
+    not seen again  yellow, where the later scan saw nothing
+
+    Maps made with --space-carving know all the free space that was seen,
+    others that near surfaces alone. Equal maps: `tsfusion map hash`.
+    """
+    from tsfusion.cli import output
+    from tsfusion.core.output_folder import check_writable
+    from tsfusion.geometry.mesh import FORMATS
+    from tsfusion.pipelines import mesh_files
+
+    if out is not None:
+        check_writable(out, (*FORMATS, mesh_files.PICTURE))
+    found = _load(earlier, quiet=json).diff(_load(later, quiet=json), tolerance=tolerance)
+    if out is not None:
+        mesh_files.write(found.mesh, [out], keep_islands=True)
+    figures = {
+        "same": found.is_same,
+        "blocks": found.blocks,
+        "voxels": found.voxels,
+        "area_m2": found.area_m2,
+    }
+    if json:
+        output.as_json({**figures, "path": None if out is None else str(out)})
+    else:
+        typer.echo(map_view.difference(found))
+
+
+@verbs.verb(
+    app,
+    "tsfusion map convert out/latest/map.tsf voxels.npz",
+    "tsfusion map convert my-maps yard.tsf --map yard",
+)
+def convert(
+    path: Where,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="A .npz, .tsf, .ply, .glb or .obj file.")],
+    *,
+    dense: Annotated[
+        bool, typer.Option("--dense", help="One array around the map, not its blocks (.npz).")
+    ] = False,
+    map_: Map = None,
+    json: options.Json = False,
+) -> None:
+    """Write a map as voxels for NumPy, as a mesh, or as a file of its own.
+
+    .npz: tsdf (n, 8, 8, 8) float32 in metres, positive in front of the
+    surface, NaN where nothing was seen; weight likewise; color uint8 RGB;
+    blocks (n, 3) int32; voxel_size. Voxel (i, j, k) of block b has its
+    centre at (8 b + (i, j, k) + 0.5) voxel_size. --dense: tsdf (X, Y, Z)
+    and origin instead, centres at origin + ((i, j, k) + 0.5) voxel_size.
+
+    .tsf: of a state folder, with all that its journal holds.
+    Meshes: `tsfusion mesh` has more choices.
+    """
+    from tsfusion.cli import output, progress
+    from tsfusion.core.errors import InvalidConfig
+    from tsfusion.core.output_folder import check_writable
+    from tsfusion.geometry.mesh import FORMATS
+    from tsfusion.pipelines import mesh_files
+
+    suffix = out.suffix.lower()
+    check_writable(out, (".npz", ".tsf", *FORMATS))
+    if dense and suffix != ".npz":
+        raise InvalidConfig(f"--dense has no effect on {out}: only a .npz file has arrays")
+    volume = _load(path, map_, quiet=json)
+    if suffix == ".tsf":
+        volume.save(out)
+    elif suffix == ".npz":
+        with progress.reading(f"writing {out}", quiet=json) as watch:
+            volume.save_voxels(out, dense=dense, watch=watch)
+    else:
+        mesh_files.write(volume.extract_mesh(), [out])
+    if json:
+        output.as_json({"path": str(out), **map_view.figures(volume)})
+    else:
+        typer.echo(map_view.line(out, volume))
+
+
+@verbs.verb(
+    app, "tsfusion map resume out/latest/map.tsf --state my-maps",
+    "tsfusion map resume house.tsf --state my-maps --map house",
+)  # fmt: skip
+def resume(
+    path: Where,
+    *,
+    state: Annotated[Path, typer.Option(metavar="DIR", help="State folder; made where there is none.")],
+    map_: Annotated[
+        str, typer.Option("--map", metavar="NAME", help="Name of the map there; it must be free.")
+    ] = "default",
+    json: options.Json = False,
+) -> None:
+    """Let a saved map take keyframes again: put it into a server's state folder.
+
+    `tsfusion serve`, `scan` and `replay` go on with it with --state DIR and
+    --map NAME; new scans that find their poses themselves need --same-frame.
+    Its journal stays where it is: keyframes that are in the map already can
+    be neither corrected nor removed. End a server that runs there first.
+    """
+    from tsfusion.cli import output
+    from tsfusion.pipelines import saved_maps
+
+    with _opened(path, quiet=json) as file:
+        folder = saved_maps.resume(file, state, map_)
+        found = saved_maps.summarise(saved_maps.SavedMap(file))
+    flags = map_view.serve_flags(found.settings)
+    command = " ".join(["tsfusion", "serve", "--state", shlex.quote(str(state)), *flags])
+    if json:
+        output.as_json({"path": str(folder), "map_hash": found.map_hash, "keyframes": found.keyframes,
+                        "command": command})  # fmt: skip
+    else:
+        typer.echo(f"{folder}: {count_of(found.keyframes, 'keyframe')}, hash {found.map_hash}")
+        typer.echo(f"go on with: {command}")
+
+
+def _load(path: Path, map_name: str | None = None, *, quiet: bool) -> "Volume":
+    from tsfusion.tsdf.volume import Volume
+
+    with _opened(path, map_name, quiet=quiet) as file:
+        return Volume.load(file)
+
+
 @contextmanager
 def _opened(path: Path, map_name: str | None = None, *, quiet: bool) -> Iterator[Path]:
     """The file of a map; one of a state folder is brought up to date in a copy, with progress on stderr."""
@@ -84,65 +320,3 @@ def _opened(path: Path, map_name: str | None = None, *, quiet: bool) -> Iterator
             for reason, count in left_out.items():
                 typer.echo(f"left out {count_of(count, 'keyframe')}: {reason}", err=True)
             yield file
-
-
-def _describe(found: "MapSummary") -> str:
-    from msgspec import to_builtins
-
-    from tsfusion.cli.output import counted, grouped, size
-    from tsfusion.core.config import VolumeConfig
-
-    config = found.settings
-    lines = [
-        f"map        {found.path}, {size(found.nbytes)}",
-        f"hash       {found.map_hash}",
-        f"keyframes  {found.keyframes}",
-        f"voxels     {grouped(found.voxels)} of {config['voxel_size']:g} m in {grouped(found.blocks)} blocks",
-        f"memory     {size(found.voxel_bytes)} ({', '.join(found.layers)})",
-        f"box        {_box(found.box)}",
-        f"sessions   {len(found.sessions)}",
-        *(
-            f"  {one.session[:8]}  {one.client or 'no key':<12} up to number {one.last}, {_listed(one)}, "
-            + (f"world {one.world[:8]}" if one.world else "poses given")
-            for one in found.sessions[:_MOST_LINES]
-        ),
-    ]
-    if len(found.sessions) > _MOST_LINES:
-        lines.append(f"  … and {len(found.sessions) - _MOST_LINES} more: --json lists all")
-    if found.rejected:
-        lines.append(f"rejected   {counted(found.rejected)}")
-    if note := _behind(found):
-        lines.append(f"note       {note}")
-    defaults = to_builtins(VolumeConfig())
-    changed = [f"{name} {value}" for name, value in config.items() if value != defaults[name]]
-    return "\n".join([*lines, f"settings   {', '.join(changed) or 'defaults'}"])
-
-
-def _box(box: list[float] | None) -> str:
-    if box is None:
-        return "empty"
-    return " ".join(f"{metres:g}" for metres in box) + " m (x0 y0 z0 x1 y1 z1)"
-
-
-def _listed(one: "SessionSummary") -> str:
-    count = count_of(one.listed, "keyframe")
-    return f"{count} and those up to {one.unlisted_up_to}" if one.unlisted_up_to else count
-
-
-def _behind(found: "MapSummary") -> str:
-    """What the map does not have yet; empty = it has all."""
-    words = [
-        count_of(count, noun)
-        for count, noun in (
-            (found.keyframes_after, "keyframe of the journal"),
-            (found.corrections_after, "correction of the journal"),
-            (found.corrections_waiting, "corrected pose"),
-        )
-        if count
-    ]
-    if not words:
-        return ""
-    return (
-        f"this checkpoint is without {' and '.join(words)}; a server saves the map with all of it when it is "
-        "told to end, and the other verbs of `tsfusion map` fuse it first"
-    )

@@ -11,8 +11,10 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from tsfusion.core.durable_files import size_of
-from tsfusion.core.errors import CheckpointError
+from tsfusion.core.config import ClientConfig, override
+from tsfusion.core.durable_files import make_folder, size_of
+from tsfusion.core.errors import CheckpointError, OutputError
+from tsfusion.core.folder_lock import lock_folder
 from tsfusion.journal import state_folder
 from tsfusion.pipelines import settled_maps
 from tsfusion.tsdf import checkpoint, map_history
@@ -90,6 +92,36 @@ def find(path: Path, map_name: str | None = None) -> SavedMap:
         is_a_maps = (folder / state_folder.JOURNAL_FOLDER).is_dir()
         raise CheckpointError(unsaved if is_a_maps else expected, missing=True)
     return SavedMap(file, folder)
+
+
+def resume(path: Path, state: Path, map_name: str) -> Path:
+    """Put a saved map into a state folder as a checkpoint, for a server to go on with; the map's folder.
+
+    No journal comes with it: keyframes that are in it can be neither moved nor removed from then on.
+
+    Raises:
+        OutputError: when that folder holds a map already, or cannot be written.
+        JournalError: when a server runs in the state folder.
+        InvalidConfig: for a name that is none; CheckpointError: when the map cannot be read or written.
+    """
+    map_name = override(ClientConfig(), map=map_name).map
+    folder = state_folder.map_folder(state, map_name)
+    with lock_folder(state, "state", "server"):
+        if state_folder.holds_a_map(folder):
+            raise OutputError(
+                f"{folder} holds a map already: choose another name (--map), or merge the two (`tsfusion map "
+                "merge`)"
+            )
+        make_folder(folder)
+        checkpoint.copy(path, folder / state_folder.MAP_FILE, _leave_journal)
+    return folder
+
+
+def _leave_journal(header: checkpoint.CheckpointHeader) -> None:
+    # A map that no server saved counts as a session with given poses: others of that kind are let in.
+    known = header.meta.get("done") or {header.map_hash: (0, "", "")}
+    meta = {"rejected": {}, "blocks": {}, **header.meta, "done": known}
+    header.meta = map_history.without_journal(meta)
 
 
 @contextmanager

@@ -13,6 +13,7 @@ import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -28,6 +29,7 @@ from tsfusion.core.errors import CheckpointError, DamagedCheckpoint
 MAGIC = b"TSFMAP1\n"
 CHUNK = 1024  # blocks
 CUBE = 512  # voxels a block
+_PART = 1 << 20  # bytes that are copied at a time
 _ROWS = 128  # that are gathered at a time
 _MAX_WINDOW_BYTES = 1 << 24  # of zstd; level 1 uses less
 LAYER_DTYPES = {"sums": np.int64, "color_rgn": np.int64, "color_b": np.int32, "correction": np.float32}
@@ -84,6 +86,31 @@ def write(
     except OSError as error:
         raise CheckpointError(f"cannot write the map {path}: {error.strerror}") from error
     return path
+
+
+def copy(source: Path, target: Path, alter: Callable[[CheckpointHeader], None]) -> Path:
+    """Write a checkpoint whose header is another one; the blocks are copied as they are.
+
+    Raises:
+        DamagedCheckpoint, CheckpointError: as `reading` and `write`.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    try:
+        with source.open("rb") as old, durable_files.replacing(target) as file:
+            _check_magic(old, source)
+            _check_digest(old, source)
+            header = _read_header(old, source)
+            alter(header)
+            encoded = msgspec.msgpack.encode(header)
+            left = os.fstat(old.fileno()).st_size - old.tell() - digest.digest_size
+            parts = (old.read(min(_PART, left - at)) for at in range(0, left, _PART))
+            for part in chain((MAGIC, struct.pack("<I", len(encoded)), encoded), parts):
+                digest.update(part)
+                file.write(part)
+            file.write(digest.digest())
+    except OSError as error:
+        raise CheckpointError(f"cannot copy the map {source} to {target}: {error.strerror}") from error
+    return target
 
 
 @contextmanager
@@ -199,7 +226,7 @@ def _check_digest(file: BinaryIO, path: Path) -> None:
     file.seek(0)
     digest = hashlib.blake2b(digest_size=16)
     while remaining > 0:
-        part = file.read(min(1 << 20, remaining))
+        part = file.read(min(_PART, remaining))
         digest.update(part)
         remaining -= len(part)
     if file.read() != digest.digest():

@@ -46,13 +46,13 @@ class SessionHistory(Struct, frozen=True, eq=False):
 
 def sessions(meta: Mapping[str, Any]) -> list[SessionHistory]:
     """The sessions of a map; of one that no server saved none is known."""
-    poses = meta.get("poses") or {}
-    listed = poses.get("sessions", {})
-    waiting = [name for name, *_ in poses.get("waiting", ())]
+    saved = meta.get("poses") or {}
+    listed = saved.get("sessions", {})
+    waiting = [name for name, *_ in saved.get("waiting", ())]
     found = []
     for name, (last, client, *world) in meta.get("done", {}).items():
         # Of one that is not listed nothing is in the map, or an earlier version fused it
-        nothing = {"seqs": b"", "fused": b"", "unknown": 0 if poses else last}
+        nothing = {"seqs": b"", "fused": b"", "unknown": 0 if saved else last}
         one: Mapping[str, Any] = listed.get(name, nothing)
         fused = np.frombuffer(one["fused"]).reshape(-1, _POSE)
         there = ~np.isnan(fused[:, 0])
@@ -78,8 +78,9 @@ def check_addable(here: Mapping[str, Any], there: Mapping[str, Any], *, same_fra
         same_frame: they are in one, whatever their worlds.
     """
     ours, theirs = ({one.session: one for one in sessions(meta)} for meta in (here, there))
-    for name in ours.keys() & theirs.keys():
-        _check_distinct(ours[name], theirs[name])
+    for name in ours:
+        if name in theirs:
+            _check_distinct(ours[name], theirs[name])
     worlds = [{one.world for one in each.values()} or {""} for each in (ours, theirs)]
     if not same_frame and worlds[0].isdisjoint(worlds[1]):
         raise MapError(
@@ -103,11 +104,9 @@ def _check_distinct(ours: SessionHistory, theirs: SessionHistory) -> None:
         )
 
 
-def shared_poses(here: Mapping[str, Any], there: Mapping[str, Any]) -> int:
-    """Number of keyframes of `there` with exactly the pose of one in `here`: likely one recording, twice."""
-    ours, theirs = ([row.tobytes() for one in sessions(meta) for row in one.poses] for meta in (here, there))
-    known = set(ours)
-    return sum(row in known for row in theirs)
+def poses(meta: Mapping[str, Any]) -> set[bytes]:
+    """The poses of a map's keyframes, as far as they are listed: who has one of them is likely the same."""
+    return {row.tobytes() for one in sessions(meta) for row in one.poses}
 
 
 def without_journal(meta: Mapping[str, Any]) -> dict[str, Any]:
@@ -117,22 +116,22 @@ def without_journal(meta: Mapping[str, Any]) -> dict[str, Any]:
     """
     if "done" not in meta:
         return dict(meta)
-    poses = meta.get("poses") or {}
+    saved = meta.get("poses") or {}
     waiting: dict[str, set[int]] = {}
-    for name, seq, _ in poses.get("waiting", ()):
+    for name, seq, _ in saved.get("waiting", ()):
         waiting.setdefault(name, set()).add(seq)
     listed = {
         name: {
             **dict.fromkeys(("seqs", "segments", "offsets", "fused"), b""),
-            "T": poses.get("sessions", {}).get(name, {}).get("T", b""),
+            "T": saved.get("sessions", {}).get(name, {}).get("T", b""),
             "unknown": last,
             "missed": sorted(
-                waiting.get(name, set()).union(poses.get("sessions", {}).get(name, {}).get("missed", ()))
+                waiting.get(name, set()).union(saved.get("sessions", {}).get(name, {}).get("missed", ()))
             ),
         }
         for name, (last, *_) in meta["done"].items()
     }
-    return {**meta, "poses": {"sessions": listed, "waiting": [], "removed": poses.get("removed", 0)}}
+    return {**meta, "poses": {"sessions": listed, "waiting": [], "removed": saved.get("removed", 0)}}
 
 
 def added(here: Mapping[str, Any], there: Mapping[str, Any]) -> dict[str, Any]:

@@ -33,7 +33,15 @@ from tsfusion.kernels import integrate, runtime
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.kernels.voxel_traversal import COUNT
-from tsfusion.tsdf import checkpoint, field_regularizer, map_addition, map_crop, map_difference, map_history
+from tsfusion.tsdf import (
+    checkpoint,
+    field_regularizer,
+    map_addition,
+    map_crop,
+    map_difference,
+    map_history,
+    voxel_arrays,
+)
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.map_difference import MapDifference
@@ -214,6 +222,25 @@ class Volume:
             for one in (self, later)
         )
         return MapDifference(blocks, voxels, *map_difference.surfaces(earlier, other, metres))
+
+    def save_voxels(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        dense: bool = False,
+        watch: voxel_arrays.Watch = lambda _done, _all: None,
+    ) -> Path:
+        """Write an `.npz` file of voxels as `tsdf/voxel_arrays.py` describes; complete or not at all.
+
+        Args:
+            dense: one array around the whole map, instead of its blocks.
+            watch: told the bytes of the arrays that are written, and all of them.
+
+        Raises:
+            OutputError: for an empty map, a box that is too large, or a path that cannot be written.
+        """
+        voxel_arrays.write(self._store, Path(path), dense=dense, watch=watch)
+        return Path(path)
 
     def _check_voxels(self, other: "Volume") -> None:
         ours, theirs = self.config.voxel_size, other.config.voxel_size
