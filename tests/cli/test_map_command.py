@@ -199,6 +199,17 @@ def test_an_old_keyframe_of_a_resumed_map_stays_where_it_was(here: Here, state: 
     assert found["map_hash"] == volume_of(kept, voxel_size=0.04).map_hash()
 
 
+def test_the_mesh_of_a_resumed_map_has_all_of_it(here: Here, state: Path) -> None:
+    here("map", "resume", file_of(state, "yard"), "--state", "own")
+    assert here("mesh", "own", "before.ply").returncode == 0
+    make_map(Path("own/maps/default"), range(60, 62), session=BOB, behind=1)
+    assert here("mesh", "own", "after.ply").returncode == 0
+    whole = volume_of((decoded(wall(i)) for i in (*range(5), 60, 61)), voxel_size=0.04).extract_mesh()
+    assert len(trimesh.load("after.ply", process=False).faces) == len(whole.faces)
+    anew = here("mesh", "own", "anew.ply", "--voxel-size", 0.08)
+    assert (anew.returncode, "of its 6 keyframes the journal has 2" in anew.stderr) == (1, True)
+
+
 def test_a_map_of_no_server_is_resumed_for_given_poses(here: Here, tmp_path: Path) -> None:
     volume_of((wall(i) for i in range(3)), voxel_size=0.04).save(tmp_path / "map.tsf")
     assert here("map", "resume", "map.tsf", "--state", "own").returncode == 0

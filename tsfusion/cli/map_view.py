@@ -105,8 +105,9 @@ def _box(box: list[float] | None) -> str:
 
 
 def _listed(one: "SessionSummary") -> str:
-    count = count_of(one.listed, "keyframe")
-    return f"{count} and those up to {one.unlisted_up_to}" if one.unlisted_up_to else count
+    if not one.unlisted_up_to:
+        return count_of(one.listed, "keyframe")
+    return f"those up to {one.unlisted_up_to} not listed" + (f", {one.listed} more" if one.listed else "")
 
 
 def _behind(found: "MapSummary") -> str:

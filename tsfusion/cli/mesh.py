@@ -2,6 +2,7 @@
 """`tsfusion mesh`."""
 
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -91,7 +92,7 @@ def mesh(
 
 
 def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bool, quiet: bool) -> "Volume":
-    """The saved map where it is complete; otherwise a new map of every keyframe of the journal."""
+    """The saved map with all that its journal holds; with other settings a new map of the journal."""
     from tsfusion.core.config import VIEW_SETTINGS
     from tsfusion.core.errors import DatasetError
     from tsfusion.tsdf.volume import Volume
@@ -101,18 +102,19 @@ def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bo
         raise DatasetError(f"{source} does not exist; expected a map (.tsf), a state folder or a journal")
     from tsfusion.journal import state_folder
     from tsfusion.journal.recording import JournalRecording
+    from tsfusion.pipelines import saved_maps
 
     if source.suffix == ".tsf":
         return Volume.load(source, config.threads, **view)
     source = state_folder.resolve_map(source, name)
-    recording = JournalRecording(source)
     saved = source / state_folder.MAP_FILE
     if saved.is_file() and not given:
-        volume = Volume.load(saved, config.threads, **view)
-        if volume.keyframes + sum(volume.meta.get("rejected", {}).values()) == len(recording):
-            return volume
-        config = volume.config  # the server died before it saved the rest
-        del volume  # two maps may not fit
+        with saved_maps.opened(saved_maps.SavedMap(saved, source)) as (file, left_out):
+            _say(left_out)
+            return Volume.load(file, config.threads, **view)
+    recording = JournalRecording(source)
+    if saved.is_file():
+        saved_maps.check_journal(saved, len(recording))
     return _fuse(recording, Volume(config), quiet)
 
 
@@ -130,9 +132,13 @@ def _fuse(recording: "JournalRecording", volume: "Volume", quiet: bool) -> "Volu
             except MapError as error:
                 left_out[str(error)] += 1
             display.update(index, volume.keyframes, len(recording))
+    _say(left_out)
+    return volume
+
+
+def _say(left_out: Mapping[str, int]) -> None:
     for reason, count in left_out.items():
         typer.echo(f"left out {count_of(count, 'keyframe')}: {reason}", err=True)
-    return volume
 
 
 def _print_result(out: Path, figures: dict[str, Any], json: bool) -> None:

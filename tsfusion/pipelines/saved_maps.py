@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from tsfusion.core.config import ClientConfig, override
 from tsfusion.core.durable_files import make_folder, size_of
-from tsfusion.core.errors import CheckpointError, OutputError
+from tsfusion.core.errors import CheckpointError, JournalError, OutputError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.journal import state_folder
 from tsfusion.pipelines import settled_maps
@@ -92,6 +92,18 @@ def find(path: Path, map_name: str | None = None) -> SavedMap:
         is_a_maps = (folder / state_folder.JOURNAL_FOLDER).is_dir()
         raise CheckpointError(unsaved if is_a_maps else expected, missing=True)
     return SavedMap(file, folder)
+
+
+def check_journal(path: Path, keyframes: int) -> None:
+    """Raise JournalError where a checkpoint has keyframes that its journal, of so many, does not have."""
+    with checkpoint.reading(path) as (header, _):
+        removed = (header.meta.get("poses") or {}).get("removed", 0)
+        there = header.keyframes + sum(header.meta.get("rejected", {}).values()) + removed
+    if there > keyframes:
+        raise JournalError(
+            f"the map {path} cannot be fused anew: of its {there} keyframes the journal has {keyframes} "
+            "(others were deleted from it, or came with `tsfusion map resume`); leave the map flags out"
+        )
 
 
 def resume(path: Path, state: Path, map_name: str) -> Path:
