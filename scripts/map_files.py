@@ -29,11 +29,11 @@ from tsfusion.tsdf.checkpoint import CUBE
 Seconds = dict[str, float]  # of wall clock and of CPU
 
 
-def large_map(source: str, blocks: int, frames: int, voxel_size: float) -> Volume:
+def large_map(options: argparse.Namespace) -> Volume:
     """Copies of a recording's map, side by side along x."""
-    small = Volume(voxel_size, threads=len(os.sched_getaffinity(0)))
-    dataset = open_dataset(source)
-    for index in np.linspace(0, len(dataset) - 1, min(frames, len(dataset)), dtype=int):
+    small = Volume(options.voxel_size, regularizer=options.regularizer, threads=len(os.sched_getaffinity(0)))
+    dataset = open_dataset(options.source)
+    for index in np.linspace(0, len(dataset) - 1, min(options.frames, len(dataset)), dtype=int):
         small.integrate(dataset[int(index)])
     volume = Volume(small.config)
     volume.keyframes = small.keyframes
@@ -41,8 +41,8 @@ def large_map(source: str, blocks: int, frames: int, voxel_size: float) -> Volum
     places = unpack_keys(small._store.keys[used])
     step = np.array([int(np.ptp(places[:, 0])) + 2, 0, 0])
     copy = 0
-    while volume._store.count < blocks:
-        count = min(len(used), blocks - volume._store.count)
+    while volume._store.count < options.blocks:
+        count = min(len(used), options.blocks - volume._store.count)
         first = volume._store.count
         volume._store.insert(pack_keys(places[:count] + copy * step))
         for name, layer in volume._store.layers().items():
@@ -82,9 +82,10 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=40, help="keyframes of it, evenly")
     parser.add_argument("--voxel-size", type=float, default=0.01, help="metres")
     parser.add_argument("--blocks", type=int, default=200_000)
+    parser.add_argument("--regularizer", default="off", help="off, paper or ray: with smoothed values")
     parser.add_argument("--folder", type=Path, help="where the file is written; default: a temporary folder")
     options = parser.parse_args()
-    volume = large_map(options.source, options.blocks, options.frames, options.voxel_size)
+    volume = large_map(options)
     about, saved, read = measured(volume, options.folder)
     for verb, took in (("save", saved), ("load", read)):
         rates = {f"mb_per_{name}": about["voxel_mb"] / seconds for name, seconds in took.items()}

@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from command_processes import python
 from failures import memory_limited
 from formula_scenes import sphere_views, volume_of
 
@@ -167,6 +168,25 @@ def test_a_forged_file_is_refused_before_it_asks_for_memory(saved: Path, tmp_pat
         Volume.load(path)
 
 
+def test_blocks_that_are_empty_or_out_of_order_are_refused(tmp_path: Path) -> None:
+    volume = small()
+    store = volume._store
+    keys, layers = store.keys, {name: layer[: store.count] for name, layer in store.layers().items()}
+    header = checkpoint.CheckpointHeader(
+        config=volume.config, keyframes=3, map_hash="", layers=list(layers), meta={}
+    )
+    order = np.argsort(keys)
+    for slots in (order[::-1], np.append(order[:3], order[2])):
+        digest = volume._begin_hash()
+        path = checkpoint.write(tmp_path / "a.tsf", header, keys[slots], slots, layers, map_digest=digest)
+        with pytest.raises(DamagedCheckpoint, match="out of order"):
+            Volume.load(path)
+    layers["sums"] = np.zeros_like(layers["sums"])
+    path = checkpoint.write(tmp_path / "a.tsf", header, keys[order], order, layers)
+    with pytest.raises(DamagedCheckpoint, match="empty"):
+        Volume.load(path)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not limit memory")
 @pytest.mark.parametrize(
     ("part", "message"),
@@ -265,6 +285,66 @@ def test_a_failed_save_keeps_the_old_file(
     assert list(tmp_path.iterdir()) == [path]
     volume.save(path)
     assert Volume.load(path).map_hash() == volume.map_hash()
+
+
+SAVES = """
+import hashlib, os, signal, struct, sys
+from pathlib import Path
+import numpy as np
+from tsfusion import VolumeConfig
+from tsfusion.tsdf import checkpoint
+
+path, numbers = Path(sys.argv[1]), np.arange(3000, dtype=np.int64)
+
+def save(number):
+    known = {"config": VolumeConfig(), "map_hash": "", "layers": ["sums"], "meta": {}}
+    header = checkpoint.CheckpointHeader(keyframes=number, **known)
+    sums = np.full((3000, 512), number, np.int64)
+    checkpoint.write(path, header, numbers, numbers, {"sums": sums}, map_digest=hashlib.blake2b())
+
+def saved():
+    with checkpoint.reading(path) as (header, chunks):
+        sums = np.empty((checkpoint.CHUNK, 512), np.int64)
+        for chunk in chunks:
+            chunk.fill(np.empty(chunk.blocks, np.int64))
+            chunk.fill(sums[: chunk.blocks])
+            assert (sums[: chunk.blocks] == header.keyframes).all()
+        return header.keyframes
+
+def counting(real):
+    def called(*arguments, **options):
+        global left
+        left -= 1
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(*arguments, **options)
+    return called
+
+save(1)
+for left in range(1, 100):
+    pid = os.fork()
+    if not pid:
+        struct.pack = counting(struct.pack)  # before each part of the file
+        for name in ("open", "fsync", "replace", "unlink"):
+            setattr(os, name, counting(getattr(os, name)))
+        save(2)
+        os._exit(0)
+    if not os.WIFSIGNALED(os.waitpid(pid, 0)[1]):
+        break
+    print(saved())
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_a_save_that_is_killed_anywhere_leaves_the_file_before_or_the_new_one(tmp_path: Path) -> None:
+    path = tmp_path / "map.tsf"
+    done = python(SAVES, path)
+    assert done.returncode == 0, done.stderr
+    found = done.stdout.split()
+    assert found == sorted(found)
+    assert len(found) > 8
+    assert set(found) == {"1", "2"}
+    assert [path] == list(tmp_path.iterdir())  # no part is left by the save that went well
 
 
 def test_a_disk_that_really_fills_up_keeps_the_old_file(small_disk: Callable[[int], Path]) -> None:

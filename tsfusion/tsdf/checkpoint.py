@@ -13,7 +13,6 @@ import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -25,10 +24,12 @@ from numpy.typing import NDArray
 from tsfusion.core import durable_files
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint
+from tsfusion.core.side_thread import SideThread
 
 MAGIC = b"TSFMAP1\n"
 CHUNK = 1024  # blocks
 CUBE = 512  # voxels a block
+_DIGEST_BYTES = 16
 _PART = 1 << 20  # bytes that are copied at a time
 _ROWS = 128  # that are gathered at a time
 _MAX_WINDOW_BYTES = 1 << 24  # of zstd; level 1 uses less
@@ -64,28 +65,52 @@ def write(
     keys: NDArray[np.int64],
     slots: NDArray[np.int64],
     layers: dict[str, NDArray[Any]],
+    *,
+    map_digest: "hashlib.blake2b | None" = None,
 ) -> Path:
     """Write blocks `slots` of each layer (…, 512) under their keys.
 
     What was at `path` stays as it was until the new file is whole and on the disk. A part that a killed
     writer left is overwritten.
 
+    Args:
+        map_digest: takes the keys and sums, so that they are read once; what it comes to is the header's
+            `map_hash`.
+
     Raises:
         CheckpointError: when the file cannot be written.
     """
     header.blocks = len(keys)
-    digest = hashlib.blake2b(MAGIC, digest_size=16)
+    if map_digest is not None:
+        header.map_hash = "0" * 2 * map_digest.digest_size
     try:
         with durable_files.replacing(path) as file:
             file.write(MAGIC)
-            for payload in _payloads(header, keys, slots, layers):
+            _write_header(file, header)
+            for payload in _payloads(keys, slots, layers, map_digest):
                 for part in (struct.pack("<I", sum(map(len, payload))), *payload):
-                    digest.update(part)
                     file.write(part)
-            file.write(digest.digest())
+            if map_digest is not None:
+                header.map_hash = map_digest.hexdigest()
+                file.seek(len(MAGIC))
+                _write_header(file, header)
+                file.seek(0, os.SEEK_END)
+            _write_digest(file)
     except OSError as error:
         raise CheckpointError(f"cannot write the map {path}: {error.strerror}") from error
     return path
+
+
+def _write_header(file: BinaryIO, header: CheckpointHeader) -> None:
+    encoded = msgspec.msgpack.encode(header)
+    file.write(struct.pack("<I", len(encoded)) + encoded)
+
+
+def _write_digest(file: BinaryIO) -> None:
+    """Append the digest of a file that is written."""
+    file.flush()
+    with open(file.name, "rb") as written:
+        file.write(_digest(written, file.tell()))
 
 
 def copy(source: Path, target: Path, alter: Callable[[CheckpointHeader], None]) -> Path:
@@ -94,20 +119,18 @@ def copy(source: Path, target: Path, alter: Callable[[CheckpointHeader], None]) 
     Raises:
         DamagedCheckpoint, CheckpointError: as `reading` and `write`.
     """
-    digest = hashlib.blake2b(digest_size=16)
     try:
         with source.open("rb") as old, durable_files.replacing(target) as file:
             _check_magic(old, source)
             _check_digest(old, source)
             header = _read_header(old, source)
             alter(header)
-            encoded = msgspec.msgpack.encode(header)
-            left = os.fstat(old.fileno()).st_size - old.tell() - digest.digest_size
-            parts = (old.read(min(_PART, left - at)) for at in range(0, left, _PART))
-            for part in chain((MAGIC, struct.pack("<I", len(encoded)), encoded), parts):
-                digest.update(part)
-                file.write(part)
-            file.write(digest.digest())
+            file.write(MAGIC)
+            _write_header(file, header)
+            left = os.fstat(old.fileno()).st_size - old.tell() - _DIGEST_BYTES
+            for at in range(0, left, _PART):
+                file.write(old.read(min(_PART, left - at)))
+            _write_digest(file)
     except OSError as error:
         raise CheckpointError(f"cannot copy the map {source} to {target}: {error.strerror}") from error
     return target
@@ -143,19 +166,34 @@ def verify(path: Path, header: CheckpointHeader, map_hash: str) -> None:
 
 
 def _payloads(
-    header: CheckpointHeader,
     keys: NDArray[np.int64],
     slots: NDArray[np.int64],
     layers: dict[str, NDArray[Any]],
+    map_digest: "hashlib.blake2b | None",
 ) -> Iterator[list[bytes]]:
-    """The header, then each chunk, in parts: the map may have left little memory."""
-    yield [msgspec.msgpack.encode(header)]
-    for i in range(0, len(keys), CHUNK):
-        chunk = slots[i : i + CHUNK]
-        compressor = zstandard.ZstdCompressor(level=1).compressobj(size=len(chunk) * _block_bytes(layers))
-        rows = (layer[chunk[j : j + _ROWS]] for layer in layers.values() for j in range(0, len(chunk), _ROWS))
-        parts = [compressor.compress(part.data) for part in (keys[i : i + CHUNK], *rows)]
-        yield [*parts, compressor.flush()]
+    """Each chunk, in parts: the map may have left little memory. A second thread hashes meanwhile."""
+    with SideThread() as side:
+        for i in range(0, len(keys), CHUNK):
+            chunk = slots[i : i + CHUNK]
+            size = len(chunk) * _block_bytes(layers)
+            compressor = zstandard.ZstdCompressor(level=1).compressobj(size=size)
+            parts = []
+            for name, rows in _rows(keys[i : i + CHUNK], chunk, layers):
+                if map_digest is not None and name in ("keys", "sums"):
+                    side.do(partial(map_digest.update, rows.data))
+                parts.append(compressor.compress(rows.data))
+            yield [*parts, compressor.flush()]
+        side.wait()
+
+
+def _rows(
+    keys: NDArray[np.int64], slots: NDArray[np.int64], layers: dict[str, NDArray[Any]]
+) -> Iterator[tuple[str, NDArray[Any]]]:
+    """The keys of a chunk, and its rows, some at a time."""
+    yield "keys", keys
+    for name, layer in layers.items():
+        for j in range(0, len(slots), _ROWS):
+            yield name, layer[slots[j : j + _ROWS]]
 
 
 def _check_magic(file: BinaryIO, path: Path) -> None:
@@ -222,16 +260,19 @@ def _check_digest(file: BinaryIO, path: Path) -> None:
     This comes before any allocation: a header with one flipped bit may ask for all memory there is.
     """
     here = file.tell()
-    remaining = file.seek(0, os.SEEK_END) - 16
-    file.seek(0)
-    digest = hashlib.blake2b(digest_size=16)
-    while remaining > 0:
-        part = file.read(min(_PART, remaining))
-        digest.update(part)
-        remaining -= len(part)
-    if file.read() != digest.digest():
+    size = file.seek(0, os.SEEK_END) - _DIGEST_BYTES
+    if size < 0 or _digest(file, size) != file.read():
         raise DamagedCheckpoint(f"{path} is cut short or altered: its digest does not match")
     file.seek(here)
+
+
+def _digest(file: BinaryIO, size: int) -> bytes:
+    """The digest of the first bytes of a file, whose position is behind them then."""
+    file.seek(0)
+    digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
+    for at in range(0, size, _PART):
+        digest.update(file.read(min(_PART, size - at)))
+    return digest.digest()
 
 
 def _read_exactly(file: BinaryIO, size: int, path: Path) -> bytes:

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from tsfusion.core import other_names, process
 from tsfusion.core.config import LIMIT_SETTINGS, VIEW_SETTINGS, Surface, VolumeConfig, make_settings, override
-from tsfusion.core.errors import CheckpointError, InvalidConfig, MapError
+from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, MapError
+from tsfusion.core.side_thread import SideThread
 from tsfusion.geometry.keyframe import Keyframe, keyframe_of
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.sample_ranges import why_no_samples
@@ -308,12 +309,17 @@ class Volume:
 
         Colour and smoothed values are not part of it (colour may travel lossily; smoothing has an order).
         """
-        digest = hashlib.blake2b(digest_size=16)
-        digest.update(struct.pack("<di", self.config.voxel_size, integrate.QUANTA_PER_VOXEL))
+        digest = self._begin_hash()
         for keys, sums in self._store.in_order("sums"):
             digest.update(keys.data)
             digest.update(sums.data)
         return digest.hexdigest()
+
+    def _begin_hash(self) -> "hashlib.blake2b":
+        """A digest that is to take the keys and then the sums of the used blocks, 1024 at a time."""
+        digest = hashlib.blake2b(digest_size=16)
+        digest.update(struct.pack("<di", self.config.voxel_size, integrate.QUANTA_PER_VOXEL))
+        return digest
 
     def color_hash(self) -> str:
         """Hex digest of the exact colour sums."""
@@ -361,12 +367,14 @@ class Volume:
         header = checkpoint.CheckpointHeader(
             config=self.config,
             keyframes=self.keyframes,
-            map_hash=self.map_hash(),
+            map_hash="",
             meta={**(self.meta if meta is None else meta), _HELD: self.held.numbers},
             layers=list(layers),
         )
         used = self._store.used()
-        return checkpoint.write(Path(path), header, self._store.keys[used], used, layers)
+        return checkpoint.write(
+            Path(path), header, self._store.keys[used], used, layers, map_digest=self._begin_hash()
+        )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], threads: int | None = None, **changed: Any) -> "Volume":
@@ -387,17 +395,20 @@ class Volume:
             layers = store.layers()
             if set(header.layers) != set(layers):
                 raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
-            for chunk in chunks:
-                keys = np.empty(chunk.blocks, np.int64)
-                chunk.fill(keys)
-                store.insert(keys)
-                for name in header.layers:
-                    chunk.fill(layers[name][chunk.first : store.count])
-            store.measure_bounds()
+            digest = volume._begin_hash()
+            with SideThread() as side:
+                for chunk in chunks:
+                    keys = np.empty(chunk.blocks, np.int64)
+                    chunk.fill(keys)
+                    store.insert(keys)
+                    for name in header.layers:
+                        chunk.fill(layers[name][chunk.first : store.count])
+                    side.do(partial(_check_in, Path(path), store, slice(chunk.first, store.count), digest))
+                side.wait()
             volume.keyframes = header.keyframes
             volume.held = HeldSensor(header.meta.pop(_HELD, None))
             volume.meta = header.meta
-            checkpoint.verify(Path(path), header, volume.map_hash())
+            checkpoint.verify(Path(path), header, digest.hexdigest())
         return volume
 
     def limit_memory(self, nbytes: int) -> None:
@@ -453,6 +464,17 @@ class Volume:
         if surface == "normal":
             return partial(field_regularizer.along_normals, smoothness=self.model.smoothness)
         return values_of
+
+
+def _check_in(path: Path, store: BlockStore, blocks: slice, digest: "hashlib.blake2b") -> None:
+    """Hash blocks that were read, and measure their bounds."""
+    keys, sums = store.keys[blocks], store.sums[blocks]
+    store.bounds[blocks] = (sums & integrate.WEIGHT_MASK).max(axis=1)
+    before = store.keys[max(blocks.start - 1, 0) : blocks.stop]
+    if (np.diff(before) <= 0).any() or not store.bounds[blocks].all():
+        raise DamagedCheckpoint(f"{path} is malformed: its blocks are empty or out of order")
+    digest.update(keys.data)
+    digest.update(sums.data)
 
 
 def _loaded_config(
