@@ -115,6 +115,17 @@ def test_merge_refuses_what_would_count_twice_or_lie_elsewhere(
     assert f"hash {hash_of([*range(5), 0, 40, 30])}" in done.stdout
 
 
+def test_a_file_with_waiting_corrections_says_that_they_stay(here: Here, tmp_path: Path) -> None:
+    volume = Volume.load(make_map(tmp_path / "a", range(3)) / state_folder.MAP_FILE)
+    volume.meta["poses"]["waiting"] = [(ANNA.hex(), 2, pose(0.5)[:3].tobytes())]
+    volume.save("waiting.tsf")
+    assert "without 1 corrected pose; only the state folder" in here("map", "info", "waiting.tsf").stdout
+    done = here("map", "crop", "waiting.tsf", "--box", *[-FAR] * 3, *[FAR] * 3, "--out", "all.tsf")
+    assert "1 keyframe stays where fused, though corrected" in done.stderr
+    (one,) = Volume.load("all.tsf").meta["poses"]["sessions"].values()
+    assert one["missed"] == [2]
+
+
 def test_crop_and_merge_back(here: Here, state: Path) -> None:
     house = state_folder.map_folder(state, "house")
     for name, low, high in (("left.tsf", -FAR, 0.4), ("right.tsf", 0.4, FAR)):

@@ -20,6 +20,7 @@ ON_A_BAD_DISK = (
     "journal export left/default {disk}/a.mcap",
     "scan tum --connect {nobody} --spool {disk}/spool --out {disk}/out",
     "demo --count 1 --out {disk}/out",
+    "map resume small.tsf --state {disk}/state",
 )
 
 

@@ -230,6 +230,17 @@ download --check --to empty | no archives of these recordings in empty | --to
 map info missing | missing does not exist | expected a map (.tsf) or a state folder
 map hash empty | no map in empty | expected a map (.tsf) or a state folder
 map hash file | file is not a tsfusion map | expected the map.tsf
+map merge garbage.tsf --out a.tsf | got 1 | takes two maps or more
+map merge file file --out a.ply | cannot write a.ply | a name ending in .tsf
+map merge garbage.tsf file --out a.tsf | garbage.tsf is not a tsfusion map | expected the map.tsf
+map crop file --box 0 0 0 1 1 --out a.tsf | '--box' | a valid | 2
+map crop file --box 0 0 0 1 1 1 --out folder.ply | cannot write folder.ply | a name ending in .tsf
+map diff missing file | missing does not exist | expected a map (.tsf) or a state folder
+map diff file file --out a.txt | cannot write a.txt | a name ending in .ply, .glb, .obj, .png
+map convert file a.txt | cannot write a.txt | a name ending in .npz, .tsf, .ply
+map convert file a.ply --dense | --dense has no effect on a.ply | only a .npz file
+map resume garbage.tsf --state s | garbage.tsf is not a tsfusion map | expected the map.tsf
+map resume missing --state s | missing does not exist | expected a map (.tsf) or a state folder
 journal info missing | missing does not exist | expected a state folder
 journal info empty | no journal in empty | expected a state folder
 journal info file | file is no journal | expected a folder or an .mcap file
@@ -376,6 +387,7 @@ def make_files(root: Path) -> None:
     kitti(root / "kitti_no_calib")
     (root / "kitti_no_calib" / "sequences" / "06" / "calib.txt").unlink()
     key_folder.create_pair(root / "keys", "server")
+    tsfusion.Volume(0.1).save(root / "small.tsf")
 
 
 def _make_settings(root: Path) -> None:

@@ -15,6 +15,7 @@ from tsfusion.core.counts import count_of
 if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
 
+_STAYS = "give the state folder, whose journal can move what was corrected"
 _TWICE = "a recording that was sent twice counts twice"
 
 app = typer.Typer(
@@ -297,10 +298,16 @@ def resume(
 
 
 def _load(path: Path, map_name: str | None = None, *, quiet: bool) -> "Volume":
+    """Read a map, with all that a journal holds beyond it."""
+    from tsfusion.tsdf import map_history
     from tsfusion.tsdf.volume import Volume
 
     with _opened(path, map_name, quiet=quiet) as file:
-        return Volume.load(file)
+        volume = Volume.load(file)
+    if waiting := sum(one.waiting for one in map_history.sessions(volume.meta)):
+        stay = count_of(waiting, "keyframe stays", "keyframes stay")
+        typer.echo(f"note: {path}: {stay} where fused, though corrected: {_STAYS}", err=True)
+    return volume
 
 
 @contextmanager
