@@ -25,8 +25,9 @@ from tsfusion.evaluation.known_surfaces import (
     measure,
     rounded,
 )
-from tsfusion.evaluation.view_prediction import compare_views, points_world
+from tsfusion.evaluation.view_prediction import compare_views
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
+from tsfusion.geometry.measured_points import points_world
 from tsfusion.kernels import runtime
 
 # metres, for every system; else the sensor preset's. 2.8: the things in the middle, not the walls behind

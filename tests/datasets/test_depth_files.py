@@ -14,7 +14,7 @@ from written_recordings import check, matrix, millimetres, views, write
 from tsfusion.core.errors import DatasetError, MissingDependency
 from tsfusion.datasets import open_dataset
 from tsfusion.datasets.depth_files import check_metres, read_depth
-from tsfusion.evaluation.view_prediction import depth_metres
+from tsfusion.geometry.measured_points import depth_metres
 
 
 def save(path: Path, depth: np.ndarray) -> None:

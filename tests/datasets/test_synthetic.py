@@ -17,8 +17,8 @@ from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import Synthetic
 from tsfusion.datasets.synthetic import worlds
 from tsfusion.datasets.synthetic.dataset import DEPTH_SCALE, kinect, stereo
-from tsfusion.evaluation.view_prediction import depth_metres, points_world
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.measured_points import depth_metres, points_world
 from tsfusion.scanner.localization.rgbd.tracker import RGBDLocalizer
 
 

@@ -9,7 +9,7 @@ from tsfusion import Mesh
 from tsfusion.datasets import Synthetic
 from tsfusion.datasets.synthetic import benchmark_worlds, worlds
 from tsfusion.evaluation.known_surfaces import ReferenceSurface, WorldSurface, edges_of, measure
-from tsfusion.evaluation.view_prediction import points_world
+from tsfusion.geometry.measured_points import points_world
 
 VOXEL = 0.02
 

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from tsfusion import Intrinsics, Keyframe, Mesh
-from tsfusion.evaluation.view_prediction import compare_views, depth_metres, points_world, predicted_depth
+from tsfusion.evaluation.view_prediction import compare_views, predicted_depth
+from tsfusion.geometry.measured_points import depth_metres, points_world
 
 VOXEL = 0.02
 CAMERA = Intrinsics(200.0, 200.0, 79.5, 59.5)

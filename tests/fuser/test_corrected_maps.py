@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from corrected_maps import final_keyframes, fresh_map
 from formula_scenes import volume_of
@@ -19,11 +20,13 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_sta
 from keyframes_and_servers import VOLUME, pose, wall
 from test_fuser import Link, opened
 
-from tsfusion import Volume
+from tsfusion import Volume, journal
 from tsfusion.fuser import messages
 from tsfusion.fuser.fuser import Fuser
-from tsfusion.journal import Journal
+from tsfusion.journal import Journal, Position
 from tsfusion.wire import codec, corrections
+from tsfusion.wire.corrections import SERVER_SESSION
+from tsfusion.wire.selection import Selection
 
 SESSIONS = (b"a" * 16, b"b" * 16)
 
@@ -53,14 +56,50 @@ class Recorded:
         correction = corrections.checked(moves, removed=removed, T_map_odometry=T)
         self._append(session, partial(corrections.encode, correction))
 
+    def forget(self, session: bytes, seqs: Any) -> None:
+        """Write what the gateway writes for keyframes that are to be forgotten."""
+        content = corrections.forgetting(session, np.array(seqs, np.int64))
+        self._append(SERVER_SESSION, partial(corrections.encode, content))
+
     def _append(self, session: bytes, encode: Any) -> int:
-        self._seqs[session] = seq = self._seqs[session] + 1
+        self._seqs[session] = seq = self._seqs.get(session, 0) + 1
         position = self.journal.append(encode(session=session, seq=seq), session=session, seq=seq)
         self.orders.append(messages.Fuse(len(self.orders), position, session, seq, ""))
         return seq
 
     def fresh(self) -> Volume:
         return fresh_map(self.state / "journal", VOLUME.voxel_size)
+
+
+def find(fuser: Fuser, link: Link, **selection: Any) -> messages.Found:
+    """The keyframes of a selection."""
+    fuser.handle(messages.Find(7, Selection(**selection)))
+    while fuser.search_due(idle=True):
+        fuser.search()
+    found = link.last()
+    assert isinstance(found, messages.Found)
+    return found
+
+
+def found_numbers(found: messages.Found) -> dict[bytes, list[int]]:
+    """The numbers that were found and are not forgotten, by session."""
+    return {
+        one.session: np.frombuffer(one.seqs, np.int64)[~np.frombuffer(one.forgotten, np.bool_)].tolist()
+        for one in found.sessions
+    }
+
+
+def positions(found: messages.Found) -> list[Position]:
+    """Where the records are that were found."""
+    return [
+        Position(*place)
+        for one in found.sessions
+        for place in zip(
+            np.frombuffer(one.segments, np.int64).tolist(),
+            np.frombuffer(one.offsets, np.int64).tolist(),
+            strict=True,
+        )
+    ]
 
 
 def settle(fuser: Fuser) -> int:
@@ -264,8 +303,86 @@ def test_an_earlier_version_did_not_write_down_where_keyframes_were_fused(record
     assert opened(recorded.state)[0].ready().moves.unavailable == 2  # type: ignore[union-attr]
 
 
+def test_a_forgotten_keyframe_never_comes_back(recorded: Recorded) -> None:
+    recorded.forget(SESSIONS[0], [2, 3, 6, 7])
+    recorded.correct({1: pose(0.2), 2: pose(0.3)})
+    fuser, link = fused(recorded)
+    assert progress(link).waiting == 3
+    settle(fuser)
+    recorded.add()  # number 6: it comes late
+    recorded.correct({3: pose(0.4)})
+    recorded.add()
+    for order in recorded.orders[6:]:
+        fuser.handle(order)
+    assert settle(fuser) == 0
+    last = fuser.ready().moves
+    assert last is not None
+    assert (last.keyframes, last.removed, last.forgotten, last.waiting, last.unavailable) == (3, 3, 3, 0, 0)
+    assert fuser._volume.map_hash() == recorded.fresh().map_hash()
+    assert fuser._map.poses._sessions[SESSIONS[0]].seqs.tolist() == [1, 4, 8]
+
+
+def test_forgetting_takes_effect_before_its_keyframes_are_fused(recorded: Recorded) -> None:
+    recorded.forget(SESSIONS[0], [1, 2])
+    fuser, link = opened(recorded.state)
+    for order in (recorded.orders[-1], *recorded.orders[:-1]):
+        fuser.handle(order)
+    assert (fuser._volume.keyframes, progress(link).removed, progress(link).forgotten) == (2, 2, 2)
+    assert fuser._volume.map_hash() == recorded.fresh().map_hash()
+
+
+def test_a_box_selects_by_the_newest_poses_and_by_nearly_all_points(recorded: Recorded) -> None:
+    recorded.correct({2: pose(5.0)})
+    fuser, link = fused(recorded)
+    everything = (-9.0, -9.0, -9.0, 3.0, 9.0, 9.0)
+    assert found_numbers(find(fuser, link, box=everything)) == {SESSIONS[0]: [1, 3, 4]}
+    behind_the_wall = (3.0, 9.0, 1.0, -9.0, -9.0, -9.0)
+    assert find(fuser, link, box=behind_the_wall).sessions == ()
+    assert found_numbers(find(fuser, link, box=(-0.8, -9.0, -1.0, 9.0, 9.0, 9.0))) == {SESSIONS[0]: [3, 4]}
+
+
+def test_numbers_and_the_beginning_of_an_id_mean_one_session(recorded: Recorded) -> None:
+    recorded.add(SESSIONS[1])
+    fuser, link = fused(recorded)
+    assert "several sessions have keyframes of these numbers" in find(fuser, link, numbers=((1, 2),)).error
+    assert "several sessions begin with 6" in find(fuser, link, session="6").error
+    assert found_numbers(find(fuser, link, session="61", numbers=((2, 3),))) == {SESSIONS[0]: [2, 3]}
+
+
+def test_keyframes_that_the_journal_lost_cannot_be_forgotten_and_that_is_said(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path, segment_bytes=1)
+    for _ in range(4):
+        recorded.add()
+    fuser, link = fused(recorded)
+    recorded.journal.close()
+    for number in (1, 2):
+        (tmp_path / "journal" / f"{number:06d}.mcap").unlink()
+    fuser.handle(messages.Save())
+    found = find(fuser, link, session=SESSIONS[0].hex())
+    assert found_numbers(found) == {SESSIONS[0]: [3, 4]}
+    assert found.unavailable == ("61616161 up to number 2",)
+
+
+def test_a_checkpoint_that_is_to_be_alone_replaces_the_one_before(recorded: Recorded) -> None:
+    fuser, link = fused(recorded, keep_previous=True)
+    fuser.handle(messages.Save())
+    recorded.forget(SESSIONS[0], [1])
+    fuser.handle(recorded.orders[-1])
+    settle(fuser)
+    previous = recorded.state / "map.previous.tsf"
+    fuser.handle(messages.Save(alone=True))
+    assert link.last() == messages.Saved(written=True, alone=True)
+    assert previous.read_bytes() == (recorded.state / "map.tsf").read_bytes()
+    recorded.add()
+    fuser.handle(recorded.orders[-1])
+    fuser.handle(messages.Save())
+    assert opened(recorded.state)[0].ready().keyframes == 4
+    previous.replace(recorded.state / "map.tsf")
+    assert opened(recorded.state)[0].ready().keyframes == 3
+
+
 class Life(RuleBasedStateMachine):
-    """A map whose server is killed and started again while keyframes and corrections come."""
+    """A map whose server is killed and started again while keyframes come, are corrected and forgotten."""
 
     @initialize()
     def begin(self) -> None:
@@ -294,6 +411,49 @@ class Life(RuleBasedStateMachine):
         self.recorded.correct(moves, tuple(seq for seq in fates if seq not in moves), T, session)
         self._fuse()
 
+    @rule(draw=st.data())
+    def forget(self, draw: st.DataObject) -> None:
+        found = self._find(draw)
+        for session, seqs in found_numbers(found).items():
+            self.recorded.forget(session, seqs)
+            self._fuse()
+
+    @rule(draw=st.data())
+    def erase(self, draw: st.DataObject) -> None:
+        found = self._find(draw)
+        for session, seqs in found_numbers(found).items():
+            self.recorded.forget(session, seqs)
+            self._fuse()
+        settle(self.fuser)
+        self.fuser.handle(messages.Save(alone=True))
+        if found.sessions:
+            for _ in self.recorded.journal.erase(positions(found)):
+                pass
+
+    def _find(self, draw: st.DataObject) -> messages.Found:
+        """Keyframes by one of the ways to select them, or by two."""
+        logged = sorted(
+            record.logged_ns
+            for number in journal.segments(self.recorded.state / "journal")
+            for record in journal.records(journal.segment_path(self.recorded.state / "journal", number))
+        )
+        numbers = st.integers(1, 12)
+        times = st.sampled_from(logged or [0])
+        ways = {
+            "session": st.sampled_from(SESSIONS).map(bytes.hex),
+            "client": st.sampled_from(["", "nobody"]),
+            "since_ns": times,
+            "until_ns": times,
+            "numbers": st.lists(numbers, min_size=1, max_size=3).map(
+                lambda all_: tuple((n, n) for n in all_)
+            ),
+            "box": st.floats(-1.2, 0.2).map(lambda x: (x, -9.0, -9.0, 9.0, 9.0, 9.0)),
+        }
+        names = draw.draw(st.lists(st.sampled_from(sorted(ways)), min_size=1, max_size=2, unique=True))
+        if "numbers" in names and "session" not in names:
+            names.append("session")
+        return find(self.fuser, self.link, **{name: draw.draw(ways[name]) for name in names})
+
     @rule(count=st.integers(1, 3))
     def move(self, count: int) -> None:
         for _ in range(count):
@@ -310,7 +470,8 @@ class Life(RuleBasedStateMachine):
             self.fuser.handle(messages.Finish())
         self.fuser, self.link = opened(self.recorded.state)
         done = self.fuser.ready().done
-        for order in self.recorded.orders:
+        # Not in the journal's order: each session in its own.
+        for order in sorted(self.recorded.orders, key=lambda one: one.session, reverse=saved):
             if order.session not in done or order.seq > done[order.session].seq:
                 self.fuser.handle(order)
 

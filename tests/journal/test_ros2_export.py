@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from tsfusion import Keyframe
 from tsfusion.core.errors import JournalError, MissingDependency, OutputError
 from tsfusion.datasets import Dataset, open_dataset
-from tsfusion.evaluation.view_prediction import points_world
+from tsfusion.geometry.measured_points import points_world
 from tsfusion.journal import Journal, read, records, segment_path
 from tsfusion.journal.ros2_export import Export, export
 from tsfusion.journal.ros2_messages import depth_image

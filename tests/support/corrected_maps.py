@@ -11,10 +11,11 @@ from tsfusion.wire import codec
 
 
 def final_keyframes(folder: Path) -> list[Keyframe]:
-    """The keyframes of a journal that no correction removed, each at its newest pose."""
+    """The keyframes of a journal that nothing removed, each at its newest pose."""
     found: dict[tuple[bytes, int], Keyframe | None] = {}
     sent: dict[tuple[bytes, int], Keyframe] = {}
     T_map_odometry = {}
+    forgotten: set[tuple[bytes, int]] = set()
     for number in journal.segments(folder):
         for record in journal.records(journal.segment_path(folder, number)):
             content, session = codec.decode(record.frames), record.session
@@ -25,13 +26,17 @@ def final_keyframes(folder: Path) -> list[Keyframe]:
                 sent[session, record.seq] = content
                 found[session, record.seq] = replace(content, T_world_camera=T)
                 continue
+            if content.target is not None:
+                forgotten.update((content.target, seq) for seq in content.removed.tolist())
+                continue
             for seq, T in zip(content.seqs.tolist(), content.poses, strict=True):
-                found[session, seq] = replace(sent[session, seq], T_world_camera=T)
+                if (session, seq) in sent:  # it may have been erased
+                    found[session, seq] = replace(sent[session, seq], T_world_camera=T)
             for seq in content.removed.tolist():
                 found[session, seq] = None
             if content.T_map_odometry is not None:
                 T_map_odometry[session] = content.T_map_odometry
-    return [keyframe for keyframe in found.values() if keyframe is not None]
+    return [one for key, one in found.items() if one is not None and key not in forgotten]
 
 
 def fresh_map(folder: Path, voxel_size: float) -> Volume:

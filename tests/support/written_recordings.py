@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from tsfusion.datasets import Dataset, Synthetic
 from tsfusion.datasets.synthetic import worlds
-from tsfusion.evaluation.view_prediction import depth_metres
 from tsfusion.geometry.calibration import Camera
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
+from tsfusion.geometry.measured_points import depth_metres
 from tsfusion.geometry.se3 import inverse
 
 STEPS = 40  # keyframes of the whole circle

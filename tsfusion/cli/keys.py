@@ -87,6 +87,13 @@ def allow(
             "every map. Else as before; a new name may use every map.",
         ),
     ] = None,
+    forget: Annotated[
+        bool | None,
+        typer.Option(
+            "--forget/--no-forget",
+            help="It may make the server forget keyframes of others, too (`tsfusion map forget`).",
+        ),
+    ] = None,
     folder: Dir = _FOLDER,
 ) -> None:
     """Let a scanner connect; a running server lets it in at once.
@@ -98,10 +105,13 @@ def allow(
     from tsfusion.wire import key_folder
 
     patterns = None if maps is None else [one.strip() for one in maps.split(",")]
-    earlier = key_folder.allow(folder, name, key, maps=patterns)
-    limits = key_folder.read_allow_list(folder).maps.get(name)
+    earlier = key_folder.allow(folder, name, key, maps=patterns, forget=forget)
+    listed = key_folder.read_allow_list(folder)
+    limits = listed.maps.get(name)
     typer.echo(
-        f"{name} may connect" + ("" if limits is None else f", and use these maps: {', '.join(limits)}")
+        f"{name} may connect"
+        + ("" if limits is None else f", and use these maps: {', '.join(limits)}")
+        + ("; it may forget keyframes of others, too" if name in listed.forget else "")
     )
     if earlier is not None:
         typer.echo(f"its earlier key no longer may: {earlier}")
@@ -132,6 +142,7 @@ def list_(*, folder: Dir = _FOLDER, json: options.Json = False) -> None:
                 "allowed": listed.allowed if listed else {},
                 "revoked": listed.revoked if listed else {},
                 "maps": listed.maps if listed else {},
+                "forget": listed.forget if listed else (),
             }
         )
         return
@@ -146,4 +157,5 @@ def list_(*, folder: Dir = _FOLDER, json: options.Json = False) -> None:
     width = max((len(name) for _, name, _ in rows), default=0)
     for state, name, key in rows:
         maps = f"  maps: {', '.join(limits[name])}" if state == "allowed" and name in limits else ""
-        typer.echo(f"{state:<8} {name:<{width}}  {key}{maps}")
+        forgets = "  forgets others'" if listed and state == "allowed" and name in listed.forget else ""
+        typer.echo(f"{state:<8} {name:<{width}}  {key}{maps}{forgets}")

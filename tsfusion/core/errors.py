@@ -62,11 +62,13 @@ class JournalError(TsfusionError):
 
     Attributes:
         errno: why the operating system refused; None = it did not, the journal itself is wrong.
+        is_erased: whether the record that was to be read was erased on purpose.
     """
 
-    def __init__(self, message: str, errno: int | None = None) -> None:
+    def __init__(self, message: str, errno: int | None = None, *, is_erased: bool = False) -> None:
         super().__init__(message)
         self.errno = errno
+        self.is_erased = is_erased
 
     @property
     def temporary(self) -> bool:

@@ -56,6 +56,9 @@ def _serve(link: sockets.AnySocket) -> int:
         if fuser is not None and fuser.mesh_due(idle):
             fuser.mesh()
             continue
+        if fuser is not None and fuser.search_due(idle):
+            fuser.search()
+            continue
         if fuser is not None and fuser.move_due(idle):
             fuser.move()
             continue

@@ -25,6 +25,7 @@ from tsfusion.core import process
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
+from tsfusion.fuser.keyframe_search import KeyframeSearch
 from tsfusion.fuser.live_mesh import LiveMesh, mesh_frames
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.fuser.pose_mover import PoseMover
@@ -61,6 +62,7 @@ class Fuser:
         self._since_checkpoint = 0
         self._orders: deque[fuser_messages.Fuse] = deque()  # not answered; the first cannot be read for now
         self._held_since: float | None = None  # time.monotonic(); None = nothing is held
+        self._searches: deque[KeyframeSearch] = deque()
         self._answered = 0  # records of this process
         self._more_waits = False  # at the gateway
         self._hashes: tuple[int, str, str] | None = None  # changes, map hash, colour hash
@@ -114,8 +116,10 @@ class Fuser:
             self._answer(message)
         elif isinstance(message, fuser_messages.Publish):
             self._live_mesh.watch(message.wanted)
+        elif isinstance(message, fuser_messages.Find):
+            self._searches.append(KeyframeSearch(message, self._folder, self._map.poses, self._map.done))
         elif isinstance(message, fuser_messages.Save):
-            self._checkpoint()
+            self._checkpoint(alone=message.alone)
         elif isinstance(message, fuser_messages.Finish):
             self.exit_status = 0 if self._checkpoint() else 1
 
@@ -135,6 +139,8 @@ class Fuser:
         """Milliseconds to wait for a message at most; None = for ever."""
         if self.is_held:
             return _RETRY_MS
+        if self._searches:
+            return 0
         return round(1000 * self._mover.seconds_left) + 1 if self._mover.waiting else None
 
     @property
@@ -172,6 +178,16 @@ class Fuser:
             self._live_mesh.note_move()
             self._note_change()
 
+    def search_due(self, idle: bool) -> bool:
+        """Whether to go on looking for keyframes that are to be forgotten."""
+        return bool(self._searches) and self._searches[0].is_due(idle=idle)
+
+    def search(self) -> None:
+        """Look for keyframes that are to be forgotten, for a moment."""
+        if (found := self._searches[0].go_on()) is not None:
+            self._searches.popleft()
+            self._send(found)
+
     def _fuse(self, order: fuser_messages.Fuse) -> bool:
         """Take a record into the map, or reject it; False when it cannot be read for now."""
         start = time.monotonic_ns()
@@ -181,26 +197,18 @@ class Fuser:
             self._note_answer()
             self._send(fuser_messages.Done(order.index, start, start))
             return True
-        reason, message = order.skip, ""
+        reason, message, forgotten = order.skip, "", self._map.poses.forgotten
         if reason is None:
             self._current.set(order.index)
             try:
-                record = journal.read(self._folder / state_folder.JOURNAL_FOLDER, order.position)
-                found = codec.decode(record.frames)
-                if isinstance(found, Keyframe):
-                    found = self._map.poses.placed(order.session, found)
-                    stats = self._integrate(found, order.client)
-                    if stats.samples:
-                        self._map.poses.add(order.session, order.seq, order.position, found)
-                    else:
-                        reason, message = NO_SAMPLES, self._volume.why_no_samples(found)
-                else:
-                    self._map.poses.correct(order.session, found)
-                    self._mover.say()
+                reason, message = self._take(order)
             except TsfusionError as error:
                 if isinstance(error, JournalError) and self._hold(error):
                     return False
-                reason, message = _reason(error), str(error)
+                if not (isinstance(error, JournalError) and error.is_erased):
+                    reason, message = _reason(error), str(error)
+                else:
+                    self._map.poses.leave_out()
             except MemoryError as error:
                 reason, message = "memory", f"no memory to fuse it: {error}; raise fuser_memory_bytes"
             self._current.set(fuser_messages.NOT_WORKING)  # not reached if the keyframe ended the process
@@ -209,8 +217,34 @@ class Fuser:
         self._note_answer()
         self._map.done[order.session] = fuser_messages.SessionProgress(order.seq, order.client, order.world)
         self._send(fuser_messages.Done(order.index, start, time.monotonic_ns(), reason, message))
+        if self._map.poses.forgotten != forgotten:
+            self._mover.say()  # after the answer, which counts as a keyframe in the map
         self._note_change()
         return True
+
+    def _take(self, order: fuser_messages.Fuse) -> tuple[str | None, str]:
+        """Take a record of the journal into the map; why not, in a word and a message.
+
+        Raises:
+            TsfusionError: when it cannot be read or fused.
+        """
+        record = journal.read(self._folder / state_folder.JOURNAL_FOLDER, order.position)
+        found, poses = codec.decode(record.frames), self._map.poses
+        if isinstance(found, Keyframe):
+            if poses.is_forgotten(order.session, order.seq):
+                poses.leave_out()
+                return None, ""
+            found = poses.placed(order.session, found)
+            if not self._integrate(found, order.client).samples:
+                return NO_SAMPLES, self._volume.why_no_samples(found)
+            poses.add(order.session, order.seq, order.position, found)
+            return None, ""
+        if found.target is None:
+            poses.correct(order.session, found)
+        else:
+            poses.forget(found.target, found.removed)
+        self._mover.say()
+        return None, ""
 
     def _note_answer(self) -> None:
         self._answered += 1
@@ -272,18 +306,20 @@ class Fuser:
             taken[client] = taken.get(client, 0) + stats.new_blocks
         return stats
 
-    def _checkpoint(self) -> bool:
+    def _checkpoint(self, *, alone: bool = False) -> bool:
         written, problem = False, ""
         if self._since_checkpoint and not self._is_home:
             problem = f"the folder {self._folder} is not there, or is another one"
             log.error("no checkpoint: %s", problem)
         elif self._since_checkpoint:
-            self._mover.forget_deleted()
+            self._mover.drop_deleted()
             with self._memory_beyond(_FOR_A_CHECKPOINT):
                 written = self._map.save()
             self._since_checkpoint = 0 if written else 1
             problem = self._map.problem
-        self._send(fuser_messages.Saved(written, problem))
+        if alone and not problem:
+            problem = self._map.replace_previous()
+        self._send(fuser_messages.Saved(written, problem, alone))
         return not self._since_checkpoint
 
     @property

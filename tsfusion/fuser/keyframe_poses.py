@@ -4,11 +4,14 @@
 The map is settled when nothing is different: then it is the map that these keyframes make at their final
 poses, to the bit. A keyframe's pose is that of the newest correction that names it. Without one it is the
 pose that it came with, multiplied from the left by the newest `T_map_odometry` of its session before it.
+
+A keyframe that the server was told to forget is not in the settled map, whatever corrections say: then the
+order in which records of several sessions are taken makes no difference.
 """
 
 from array import array
 from bisect import bisect_left
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from heapq import heapify, heappop, heappush
 from typing import Any, NamedTuple
@@ -16,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core.number_ranges import NumberRanges
 from tsfusion.geometry.keyframe import Keyframe, check_pose
 from tsfusion.journal import Position
 from tsfusion.wire.corrections import Correction
@@ -53,6 +57,7 @@ class _SessionPoses:
         self.unknown = 0  # up to this number nothing is known of them: an earlier version fused them, or
         # the journal has them no more
         self.missed: set[int] = set()  # numbers of those that corrections name
+        self.forgotten = NumberRanges()
 
     def rows(self, at: int) -> Rows:
         return np.array(self.fused[_POSE * at : _POSE * (at + 1)])
@@ -61,13 +66,24 @@ class _SessionPoses:
         """The place of a keyframe that is known."""
         return bisect_left(self.seqs, seq)
 
-    def forget(self, before_segment: int) -> "array[int]":
-        """Forget the keyframes of segments below this number; these."""
+    def find(self, seq: int) -> int | None:
+        """The place of a keyframe; None = it is not known."""
+        at = self.place_of(seq)
+        return at if at < len(self.seqs) and self.seqs[at] == seq else None
+
+    def drop(self, start: int, stop: int) -> None:
+        """Know nothing any more of the keyframes at these places."""
+        for column in (self.seqs, self.segments, self.offsets):
+            del column[start:stop]
+        del self.fused[_POSE * start : _POSE * stop]
+
+    def drop_deleted(self, before_segment: int) -> "array[int]":
+        """Drop the keyframes of segments below this number; these."""
         count = bisect_left(self.segments, before_segment)
         gone = self.seqs[:count]
         if count:
             self.unknown = gone[-1]
-            del self.seqs[:count], self.segments[:count], self.offsets[:count], self.fused[: _POSE * count]
+            self.drop(0, count)
         return gone
 
     def saved(self) -> dict[str, Any]:
@@ -78,6 +94,7 @@ class _SessionPoses:
             "T": b"" if T is None else T.tobytes(),
             "unknown": self.unknown,
             "missed": sorted(self.missed),
+            "forgotten": list(self.forgotten),
         }
 
     @classmethod
@@ -88,6 +105,7 @@ class _SessionPoses:
         if saved["T"]:
             poses.T_map_odometry = np.frombuffer(saved["T"]).reshape(4, 4).copy()
         poses.unknown, poses.missed = saved["unknown"], set(saved["missed"])
+        poses.forgotten = NumberRanges(tuple(one) for one in saved.get("forgotten", ()))
         return poses
 
 
@@ -110,6 +128,7 @@ class KeyframePoses:
         for name, one in (saved or {}).get("sessions", {}).items():
             self._sessions[bytes.fromhex(name)] = _SessionPoses.of(one)
         self.removed = (saved or {}).get("removed", 0)  # keyframes that corrections took out of the map
+        self.forgotten = (saved or {}).get("forgotten", 0)  # of these, by the server, for good
         for name, seq, rows in (saved or {}).get("waiting", ()):
             self._want(bytes.fromhex(name), seq, np.frombuffer(rows))
 
@@ -117,7 +136,12 @@ class KeyframePoses:
         """All of it, for the file of a map: dicts, lists, numbers and bytes."""
         sessions = {key.hex(): poses.saved() for key, poses in self._sessions.items()}
         waiting = [(key.hex(), seq, rows.tobytes()) for (key, seq), (_, rows) in self._waiting.items()]
-        return {"sessions": sessions, "waiting": waiting, "removed": self.removed}
+        return {
+            "sessions": sessions,
+            "waiting": waiting,
+            "removed": self.removed,
+            "forgotten": self.forgotten,
+        }
 
     @property
     def waiting(self) -> int:
@@ -148,8 +172,50 @@ class KeyframePoses:
         poses.offsets.append(position.offset)
         poses.fused.extend(keyframe.T_world_camera[:3].ravel())
 
+    def pose_of(self, session: bytes, seq: int) -> NDArray[np.float64] | None:
+        """Where a keyframe is, or is to be: (4, 4) float64; None = it is not in the map, or not known."""
+        poses = self._sessions.get(session)
+        at = None if poses is None else poses.find(seq)
+        if poses is None or at is None:
+            return None
+        _, rows = self._waiting.get((session, seq), (0, poses.rows(at)))
+        return _pose(rows)
+
+    def is_forgotten(self, session: bytes, seq: int) -> bool:
+        """Whether the server was told to forget a keyframe."""
+        return session in self._sessions and seq in self._sessions[session].forgotten
+
+    def unknown(self) -> Iterator[tuple[bytes, int]]:
+        """The sessions with keyframes of which nothing is known, and the highest number of those."""
+        return ((key, poses.unknown) for key, poses in self._sessions.items() if poses.unknown)
+
+    def forget(self, session: bytes, seqs: NDArray[np.int64]) -> None:
+        """Note that keyframes are to leave the map for good, those too that come in later."""
+        poses = self._session(session)
+        poses.forgotten.add(seqs)
+        for seq in seqs.tolist():
+            at = poses.find(seq)
+            if at is None:
+                if seq <= poses.unknown:
+                    poses.missed.add(seq)
+                continue
+            is_in_map = not np.isnan(poses.fused[_POSE * at])
+            self._want(session, seq, _ABSENT)
+            if not is_in_map:
+                self._drop_forgotten(poses, at)
+        self._tidy_heap()
+
+    def leave_out(self) -> None:
+        """Note that a forgotten keyframe came in, and was not fused."""
+        self.removed += 1
+        self.forgotten += 1
+
+    def _drop_forgotten(self, poses: _SessionPoses, at: int) -> None:
+        poses.drop(at, at + 1)
+        self.forgotten += 1
+
     def correct(self, session: bytes, correction: Correction) -> None:
-        """Note where keyframes are to be. Those that the map did not take stay out of it."""
+        """Note where keyframes are to be. Those that the map did not take, or forgot, stay out of it."""
         poses = self._session(session)
         if correction.T_map_odometry is not None:
             poses.T_map_odometry = correction.T_map_odometry
@@ -161,10 +227,15 @@ class KeyframePoses:
             known = np.array(poses.seqs)
             places = np.searchsorted(known, seqs)
             for at, seq, one in zip(places.tolist(), seqs.tolist(), wanted, strict=True):
+                if seq in poses.forgotten:
+                    continue
                 if at < len(known) and known[at] == seq:
                     self._want(session, seq, one)
                 elif seq <= poses.unknown:
                     poses.missed.add(seq)
+        self._tidy_heap()
+
+    def _tidy_heap(self) -> None:
         if len(self._heap) > 2 * len(self._waiting) + _SPARE:
             self._heap = [one for one in self._heap if self._is_valid(one)]
             heapify(self._heap)
@@ -186,19 +257,22 @@ class KeyframePoses:
         """Note that the move that is `next` was done."""
         _, _, session, seq = heappop(self._heap)
         _, wanted = self._waiting.pop((session, seq))
-        at, fused = self._sessions[session].place_of(seq), self._sessions[session].fused
+        poses = self._sessions[session]
+        at, fused = poses.place_of(seq), poses.fused
         self.removed += int(np.isnan(wanted[0])) - int(np.isnan(fused[_POSE * at]))
         fused[_POSE * at : _POSE * (at + 1)] = array("d", wanted)
+        if seq in poses.forgotten:
+            self._drop_forgotten(poses, at)
 
     def give_up(self) -> None:
         """Note that the move that is `next` cannot be done: the keyframe stays where it is."""
         _, _, session, seq = heappop(self._heap)
         self._stuck.add((session, seq))
 
-    def forget(self, before_segment: int) -> None:
-        """Forget the keyframes that were deleted from the journal: they can be moved no more."""
+    def drop_deleted(self, before_segment: int) -> None:
+        """Drop the keyframes that were deleted from the journal: they can be moved no more."""
         for key, poses in self._sessions.items():
-            gone = poses.forget(before_segment)
+            gone = poses.drop_deleted(before_segment)
             for seq in gone:
                 if self._waiting.pop((key, seq), None) is not None:
                     self._stuck.discard((key, seq))

@@ -86,6 +86,24 @@ class MapCheckpoints:
             self.problem = ""
         return True
 
+    def replace_previous(self) -> str:
+        """Let the last checkpoint take the place of the one before it; why that failed, empty = it did not.
+
+        Where the disk has no hard links, the one before it is deleted.
+        """
+        try:
+            if self._previous.exists() and not self._previous.samefile(self._path):
+                self._new.unlink(missing_ok=True)
+                try:
+                    os.link(self._path, self._new)
+                    self._new.replace(self._previous)
+                except OSError:
+                    self._previous.unlink()
+                durable_files.sync_folder(self._path.parent)
+        except OSError as error:
+            return f"{self._previous} cannot be replaced: {error.strerror}"
+        return ""
+
 
 def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
     """The volume of a checkpoint; None when there is none, or when it is damaged.

@@ -15,9 +15,11 @@ from tsfusion.core.errors import CheckpointError, InvalidConfig, MapError, Tsfus
 from tsfusion.journal import Position
 from tsfusion.wire.health import MeshLayout
 from tsfusion.wire.messages import Command
+from tsfusion.wire.selection import Selection
 
 NOT_WORKING = -1  # instead of a keyframe's index
 MOVING = -2  # likewise: at a keyframe that a correction moves
+EXPIRED = -1  # instead of the number of a `Find`
 
 
 class Begin(Struct, frozen=True, tag="begin"):
@@ -81,6 +83,13 @@ class FuserQuery(Struct, frozen=True, tag="ask"):
     command: Command
 
 
+class Find(Struct, frozen=True, tag="find"):
+    """Find the keyframes of a selection in the journal; answered with `Found` of the same number."""
+
+    number: int
+    selection: Selection
+
+
 class Publish(Struct, frozen=True, tag="publish"):
     """Send the triangles with `Meshed` from now on, or do not: whether the map has viewers."""
 
@@ -88,7 +97,12 @@ class Publish(Struct, frozen=True, tag="publish"):
 
 
 class Save(Struct, frozen=True, tag="save"):
-    """Write a checkpoint, so that the journal can be cut."""
+    """Write a checkpoint, so that the journal can be cut.
+
+    `alone`: no older checkpoint may stay beside it: keyframes are to be erased that it still holds.
+    """
+
+    alone: bool = False
 
 
 class Finish(Struct, frozen=True, tag="finish"):
@@ -120,6 +134,7 @@ class CorrectionProgress(Struct, frozen=True, tag="corrected"):
         unavailable: keyframes that stay where they were fused, because the journal has them no more.
         moved: keyframes that were fused at another pose, or taken out, by this process.
         seconds: of work for that.
+        forgotten: of the removed, those that the server was told to forget.
     """
 
     keyframes: int
@@ -128,17 +143,48 @@ class CorrectionProgress(Struct, frozen=True, tag="corrected"):
     unavailable: int
     moved: int
     seconds: float
+    forgotten: int = 0
 
 
 class Saved(Struct, frozen=True, tag="saved"):
     """The checkpoint holds every keyframe that was answered with `Done` before this message.
 
     `written`: whether it is a new one; otherwise the one before held them all already, unless there is a
-    `problem`: why no checkpoint can be written.
+    `problem`: why no checkpoint can be written. `alone`: no older checkpoint is beside it, as `Save` wanted.
     """
 
     written: bool
     problem: str = ""
+    alone: bool = False
+
+
+class FoundKeyframes(Struct, frozen=True):
+    """The keyframes of one session that a `Find` selected, in journal order.
+
+    Attributes:
+        seqs: int64 numbers; one comes twice when its record stands in the journal twice.
+        segments, offsets: int64 positions of their records.
+        forgotten: bool, each: whether the map was told to forget it before.
+    """
+
+    session: bytes
+    client: str
+    seqs: bytes
+    segments: bytes
+    offsets: bytes
+    forgotten: bytes
+
+
+class Found(Struct, frozen=True, tag="found"):
+    """The answer to `Find`; `unavailable`: sessions with keyframes that the journal has no more.
+
+    Number `EXPIRED`: nobody asked, keyframes are too old or too far away by the settings of the map.
+    """
+
+    number: int
+    sessions: tuple[FoundKeyframes, ...] = ()
+    unavailable: tuple[str, ...] = ()
+    error: str = ""
 
 
 class Held(Struct, frozen=True, tag="held"):
@@ -220,8 +266,8 @@ class FuserReply(Struct, frozen=True, tag="answer"):
     layout: MeshLayout | None = None
 
 
-ToFuser = Begin | Fuse | FuserQuery | Publish | Save | Finish
-ToGateway = Started | Ready | Failed | Done | CorrectionProgress | Saved | Held | Meshed | FuserReply
+ToFuser = Begin | Fuse | FuserQuery | Find | Publish | Save | Finish
+ToGateway = Started | Ready | Failed | Done | CorrectionProgress | Saved | Found | Held | Meshed | FuserReply
 to_fuser: "msgspec.msgpack.Decoder[ToFuser]" = msgspec.msgpack.Decoder(ToFuser)
 to_gateway: "msgspec.msgpack.Decoder[ToGateway]" = msgspec.msgpack.Decoder(ToGateway)
 encode = msgspec.msgpack.encode

@@ -85,6 +85,7 @@ class PoseMover:
             self._poses.unavailable + self._poses.waiting - self.waiting,
             self.moved,
             self._seconds,
+            self._poses.forgotten,
         )
 
     def say(self) -> None:
@@ -116,12 +117,12 @@ class PoseMover:
             self.say()
         return True
 
-    def forget_deleted(self) -> None:
-        """Forget keyframes that were deleted to keep the journal to its limit: it holds them no more."""
+    def drop_deleted(self) -> None:
+        """Drop keyframes that were deleted to keep the journal to its limit: it holds them no more."""
         waiting = self.waiting
         with suppress(JournalError):
             if segments := journal.segments(self._folder):
-                self._poses.forget(min(segments))
+                self._poses.drop_deleted(min(segments))
         if self.waiting != waiting:
             self.say()
 

@@ -100,6 +100,10 @@ class AccessControl:
         """The maps that the client of a name may use: without keys every map."""
         return ALL_MAPS if self._allowed is None else self._allowed.maps_of(client)
 
+    def may_forget_all(self, client: str) -> bool:
+        """Whether a client may forget keyframes of others, too: without keys everybody may."""
+        return self._allowed is None or self._allowed.may_forget_all(client)
+
     def close(self) -> None:
         """Stop answering: nobody can connect any more."""
         if self._zap is not None:

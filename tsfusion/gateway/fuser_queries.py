@@ -180,4 +180,5 @@ def status(
         corrections_unavailable=own.corrections_unavailable,
         keyframes_moved=own.keyframes_moved,
         moving_s=own.moving_s,
+        keyframes_forgotten=own.keyframes_forgotten,
     )

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import msgspec
 import zmq
 
 from tsfusion.core import logs, process
@@ -24,6 +25,7 @@ from tsfusion.gateway.activity_log import ActivityLog
 from tsfusion.gateway.admission import Admission
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.connection_limits import ConnectionLimits
+from tsfusion.gateway.forgetting import Request
 from tsfusion.gateway.fuser_queries import FuserQueries
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.keyframe_intake import KeyframeIntake
@@ -34,7 +36,9 @@ from tsfusion.gateway.problems import Problem, ProblemTimes
 from tsfusion.gateway.sessions import Sessions
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
+from tsfusion.wire.corrections import SERVER_SESSION
 from tsfusion.wire.health import Health, MapHealth
+from tsfusion.wire.selection import Forgotten
 from tsfusion.wire.sockets import mesh_topic
 
 log = logging.getLogger(__name__)
@@ -229,6 +233,8 @@ class Gateway:
             return "map", f"map {hello.map} cannot be opened: {why}"
         if hosted is not None and not hosted.takes_records:
             return "opening", f"map {hello.map} is being opened"
+        if hello.session == SERVER_SESSION:
+            return "session", "the session of this spool is the server's own: use another spool folder"
         sessions = Sessions() if hosted is None else hosted.sessions
         if not self._admission.owns(sessions, hello.session, client):
             return "session", "the session of this spool is another client's: use another spool folder"
@@ -254,7 +260,7 @@ class Gateway:
             progress = self.maps.progress(route.map, ping.session)
             if (hosted := self.maps.get(route.map)) is not None:
                 hosted.outcomes.tell_untold(ping.session)
-                waiting = hosted.outcomes.moves.waiting
+                waiting = hosted.corrections_waiting
         pong = messages.Pong(self.epoch, ping.sent_ns, received_ns, time.monotonic_ns(), *progress, waiting)
         self.ports.reply(identity, pong)
 
@@ -273,8 +279,30 @@ class Gateway:
             self.ports.reply(identity, messages.Reply(name="new_map", map=name, error=error))
         elif forbidden := self._admission.denial_of_map(client, command.map):
             self.ports.reply(identity, messages.Reply(name=command.name, error=forbidden))
+        elif command.name == "forget":
+            self._on_forget(identity, command, client)
         else:
             self._queries.submit(identity, command, self.maps.get(command.map), client)
+
+    def _on_forget(self, identity: bytes, command: messages.Command, client: str) -> None:
+        def answer(found: Forgotten | str) -> None:
+            error, forgotten = (found, None) if isinstance(found, str) else (None, found)
+            self.ports.reply(identity, messages.Reply(name="forget", error=error, forgotten=forgotten))
+
+        selection, hosted = command.selection, self.maps.get(command.map)
+        if selection is None or selection.is_empty:
+            answer("name the keyframes that are to be forgotten: nothing was named")
+        elif hosted is None:
+            answer(f"no map {command.map} is open")
+        elif not hosted.warm:
+            answer(f"map {command.map} is being opened; ask again")
+        elif not self._access.may_forget_all(client) and selection.client not in (None, client):
+            self._refused["forbidden"] += 1
+            answer(f"this key may forget keyframes of client {client} only (`tsfusion keys allow --forget`)")
+        else:
+            if not self._access.may_forget_all(client):
+                selection = msgspec.structs.replace(selection, client=client)
+            hosted.forgetting.add(Request(selection, answer, erase=command.erase, dry_run=command.dry_run))
 
     def _on_subscription(self, frames: list[zmq.Frame]) -> None:
         """Let a viewer have the updates that it asks for, before the next message is read.

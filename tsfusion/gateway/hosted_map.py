@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import zmq
+from numpy.typing import NDArray
 
 from tsfusion.core import logs
 from tsfusion.core.config import ServerConfig, VolumeConfig
@@ -17,6 +19,7 @@ from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.disk_pause import DiskPause
+from tsfusion.gateway.forgetting import Forgetting
 from tsfusion.gateway.fuser_backlog import FuserBacklog
 from tsfusion.gateway.fuser_supervisor import FuserSupervisor
 from tsfusion.gateway.journal_retention import JournalRetention
@@ -26,9 +29,10 @@ from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.sessions import Sessions
 from tsfusion.journal import Journal, ReadingWatcher, state_folder
 from tsfusion.journal.quarantine import Quarantine
-from tsfusion.wire import keyframe_times
+from tsfusion.wire import corrections, keyframe_times
+from tsfusion.wire.corrections import SERVER_SESSION
 from tsfusion.wire.health import MapHealth, MapState
-from tsfusion.wire.record_header import CorrectionHeader, RecordHeader
+from tsfusion.wire.record_header import CorrectionHeader, RecordHeader, unpack
 
 log = logging.getLogger(__name__)
 
@@ -91,6 +95,15 @@ class HostedMap:
         self._retention = JournalRetention(self._journal, self._index, self.sessions, server.journal_bytes)
         _warn_of_old_corrections(self.folder)
         self.fuser = FuserSupervisor(context, self.folder, server, volume)
+        self._leaving: dict[int, int] = {}  # index of a record that forgets keyframes → how many
+        self.forgetting = Forgetting(
+            name,
+            self.folder,
+            self._journal,
+            self._quarantine,
+            append=self._append_forgotten,
+            send=self.fuser.send,
+        )
 
     @property
     def takes_records(self) -> bool:
@@ -101,6 +114,11 @@ class HostedMap:
     def drained(self) -> bool:
         """Whether the map has every keyframe of the journal, where the newest correction of it says."""
         return self.fuser.idle and self._backlog.is_empty and not self.outcomes.moves.waiting
+
+    @property
+    def corrections_waiting(self) -> int:
+        """Number of keyframes whose newest pose is not fused, or that are to be forgotten and are not yet."""
+        return self.outcomes.moves.waiting + sum(self._leaving.values())
 
     @property
     def settled(self) -> bool:
@@ -125,8 +143,20 @@ class HostedMap:
 
     # --- keyframes ---
 
-    def accept(self, header: RecordHeader, frames: Sequence[Any], client: str, received_ns: int) -> None:
-        """Write the session's next keyframe or correction to the journal, and acknowledge it.
+    def _append_forgotten(self, target: bytes, seqs: NDArray[np.int64]) -> None:
+        """Write the record to the journal that removes these keyframes of a session."""
+        durable, _ = self.sessions.progress(SERVER_SESSION)
+        frames = corrections.encode(
+            corrections.forgetting(target, seqs),
+            session=SERVER_SESSION,
+            seq=durable + 1,
+            map_name=self.name,
+        )
+        index = self.accept(unpack(frames[0]), frames, "", time.monotonic_ns())
+        self._leaving[index] = len(seqs)
+
+    def accept(self, header: RecordHeader, frames: Sequence[Any], client: str, received_ns: int) -> int:
+        """Write the session's next keyframe or correction to the journal, and acknowledge it; its index.
 
         Raises:
             JournalError: when the disk refuses.
@@ -141,7 +171,7 @@ class HostedMap:
         session.durable = header.seq
         durable_ns = time.monotonic_ns()
         is_correction = isinstance(header, CorrectionHeader)
-        self._index.add(
+        index = self._index.add(
             position,
             session,
             header.seq,
@@ -160,6 +190,7 @@ class HostedMap:
             self._metrics.observe(self.name, "journal", (durable_ns - received_ns) / 1e9)
         stamps = keyframe_times.Stamps(header.seq, received_ns, durable_ns)
         self.outcomes.acknowledge(header.session, [stamps])
+        return index
 
     # --- fuser ---
 
@@ -179,6 +210,7 @@ class HostedMap:
             if isinstance(message, fuser_messages.Done):
                 self._moved = time.monotonic()
                 self._backlog.on_done(message.index, (message.fused_ns - message.fuse_start_ns) / 1e9)
+                self._leaving.pop(message.index, None)
                 self.outcomes.on_done(message)
             elif isinstance(message, fuser_messages.CorrectionProgress):
                 self.outcomes.on_moves(message)
@@ -186,6 +218,8 @@ class HostedMap:
                 self._on_ready(message)
             elif isinstance(message, fuser_messages.Saved):
                 self._on_saved(message)
+            elif isinstance(message, fuser_messages.Found):
+                self.forgetting.on_found(message)
             elif isinstance(message, fuser_messages.Meshed):
                 self.outcomes.on_meshed(message)
                 for_people.append((message, frames))
@@ -202,7 +236,16 @@ class HostedMap:
         if not self.disk.is_away:
             self._retention.step(self.fuser, self.outcomes.unmeshed)
         self._save_again()
+        self._forget()
         return for_people
+
+    def _forget(self) -> None:
+        if self.fuser.failed and not self.fuser.ready:
+            self.forgetting.give_up(self.fuser.failed)
+        elif self.fuser.ready:
+            moves, own = self.outcomes.moves, self.sessions.get(SERVER_SESSION)
+            is_answered = own is None or own.in_map >= own.durable
+            self.forgetting.step(settled=is_answered and not moves.waiting, unavailable=moves.unavailable)
 
     def _on_saved(self, saved: fuser_messages.Saved) -> None:
         self._checkpoints += saved.written
@@ -211,6 +254,7 @@ class HostedMap:
         self._unsaved = saved.problem
         self._save_at = time.monotonic() + _SAVE_PAUSE
         self._retention.on_saved(saved)
+        self.forgetting.on_saved(saved)
 
     def _save_again(self) -> None:
         """Ask for a checkpoint where the last one failed, or segments of the journal have gone since."""
@@ -237,6 +281,7 @@ class HostedMap:
         self._backlog.restart(ready.done)
         self.outcomes.on_ready(ready)
         self._retention.on_ready()
+        self.forgetting.on_ready()
         if not self.warm:
             self.warm = True
             self._moved = time.monotonic()
@@ -330,7 +375,7 @@ class HostedMap:
             waiting=self._backlog.keyframes,
             rejected=dict(outcomes.rejected),
             quarantined=len(self._quarantine),
-            sessions=len(self.sessions),
+            sessions=self.sessions.of_clients,
             journal_bytes=self._journal.nbytes,
             journal_damaged=self._journal.damaged,
             fuser_restarts=self.fuser.restarts,
@@ -340,10 +385,11 @@ class HostedMap:
             delay_ms=outcomes.delays.summary(),
             delay_bound_ms=outcomes.delays.bound_ms,
             corrections=self._corrections,
-            corrections_waiting=outcomes.moves.waiting,
+            corrections_waiting=self.corrections_waiting,
             corrections_unavailable=outcomes.moves.unavailable,
             keyframes_moved=outcomes.moves.moved,
             moving_s=outcomes.moves.seconds,
+            keyframes_forgotten=outcomes.moves.forgotten,
             checkpoints=self._checkpoints,
             journal_missing=self._journal.absent + len(self._journal.missing),
             journal_put_back=self._journal.put_back,

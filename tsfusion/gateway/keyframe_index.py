@@ -45,11 +45,15 @@ class KeyframeIndex:
     def recover(self, found: Iterable[RecordEntry], sessions: Sessions) -> None:
         """Add the records that a scan of the journal found. One that was journaled twice counts once.
 
-        (The disk refused, the client sent it again, and the first copy had been written after all.)
+        (The disk refused, the client sent it again, and the first copy had been written after all.) Of one
+        that was erased the number alone counts: it is not taken again.
         """
         for record in found:
-            session = sessions.open(record.session, record.client, record.world)
-            if record.seq > session.durable:
+            world = None if record.is_erased else record.world
+            session = sessions.open(record.session, record.client, world)
+            if record.is_erased:
+                session.durable = max(session.durable, record.seq)
+            elif record.seq > session.durable:
                 session.durable = record.seq
                 self.add(record.position, session, record.seq, is_correction=record.is_correction)
 

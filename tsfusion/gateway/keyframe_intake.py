@@ -19,7 +19,7 @@ from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.quotas import Quotas
-from tsfusion.wire import codec, messages, sockets
+from tsfusion.wire import codec, corrections, messages, sockets
 from tsfusion.wire.record_header import Damaged, RecordHeader, Refused, unpack
 
 log = logging.getLogger(__name__)
@@ -54,6 +54,8 @@ class KeyframeIntake:
         nbytes = sum(buffer.nbytes for buffer in buffers)
         try:
             header = unpack(buffers[0])
+            if corrections.is_servers_own(header):
+                raise Refused("forgetting", "only the server itself writes such a record")
         except Refused as error:
             self._refuse(error, client)
             return

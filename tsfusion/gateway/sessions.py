@@ -7,6 +7,7 @@ from typing import Literal
 
 from msgspec import Struct, field
 
+from tsfusion.wire.corrections import SERVER_SESSION
 from tsfusion.wire.messages import Hello
 from tsfusion.wire.record_header import RecordHeader
 
@@ -60,6 +61,11 @@ class Sessions:
     def __len__(self) -> int:
         return len(self._all)
 
+    @property
+    def of_clients(self) -> int:
+        """How many sessions are clients': all but the server's own."""
+        return len(self) - (SERVER_SESSION in self._by_key)
+
     def get(self, key: bytes) -> Session | None:
         """The session of a key, or None when it has no keyframe in the journal."""
         return self._by_key.get(key)
@@ -83,7 +89,7 @@ class Sessions:
         if session is None:
             session = self._by_key[key] = Session(key, len(self._all), client)
             self._all.append(session)
-        if session.world is None and world is not None:
+        if session.world is None and world is not None and key != SERVER_SESSION:
             session.world = world
             self._worlds.add(world)
         return session

@@ -6,7 +6,7 @@ new segment. One chunk a keyframe, uncompressed: the arrays are compressed alrea
 """
 
 from tsfusion.journal.mcap_layout import Position, Record
-from tsfusion.journal.record_scan import Damage, scan_records, segment_number
+from tsfusion.journal.record_scan import Damage, Erased, scan_records, segment_number
 from tsfusion.journal.segments import (
     RecordEntry,
     describe,
@@ -24,6 +24,7 @@ from tsfusion.journal.writer import Journal, ReadingWatcher, write_file
 
 __all__ = [
     "Damage",
+    "Erased",
     "Journal",
     "Position",
     "ReadingWatcher",

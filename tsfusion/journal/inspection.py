@@ -15,11 +15,12 @@ from tsfusion import journal
 from tsfusion.core.errors import DecodeError, InvalidKeyframe
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import check_pose
+from tsfusion.journal.forgotten_numbers import ForgottenNumbers
 from tsfusion.journal.mcap_layout import Record
-from tsfusion.journal.record_scan import Damage
+from tsfusion.journal.record_scan import Damage, Erased
 from tsfusion.journal.state_folder import JournalPlace, Watcher
 from tsfusion.wire import codec
-from tsfusion.wire.corrections import Correction
+from tsfusion.wire.corrections import SERVER_SESSION, Correction
 from tsfusion.wire.record_header import unpack, unpack_keyframe
 
 
@@ -27,10 +28,10 @@ class Problem(Struct, frozen=True):
     """A place in a journal that is not as it should be.
 
     `torn`: the end of a write that was cut off before it was acknowledged. `note`: nothing is wrong with
-    what is there. Both are no damage.
+    what is there. `erased`: a keyframe was deleted on purpose. None of these is damage.
     """
 
-    kind: Literal["damage", "torn", "note"]
+    kind: Literal["damage", "torn", "note", "erased"]
     segment: str
     offset: int
     nbytes: int
@@ -45,6 +46,7 @@ class SegmentInfo(Struct, kw_only=True):
     nbytes: int
     keyframes: int = 0
     corrections: int = 0
+    erased: int = 0
     lost: int = 0
     state: Literal["closed", "open", "damaged"] = "open"
 
@@ -55,6 +57,7 @@ class SessionInfo(Struct, kw_only=True):
     Attributes:
         corrected: keyframes whose pose a correction names.
         removed: keyframes that a correction takes out of the map.
+        forgotten: keyframes that the server was told to forget.
         moved_m, turned_deg: the most that any corrected keyframe in the journal is away from where it was
             sent, in metres and degrees, by the newest pose of each.
     """
@@ -69,6 +72,7 @@ class SessionInfo(Struct, kw_only=True):
     corrections: int = 0
     corrected: int = 0
     removed: int = 0
+    forgotten: int = 0
     moved_m: float = 0.0
     turned_deg: float = 0.0
 
@@ -85,6 +89,7 @@ class JournalInfo(Struct, kw_only=True):
     sessions: list[SessionInfo]
     problems: list[Problem]
     quarantined: list[dict[str, Any]]  # name, bytes
+    erased: int = 0  # keyframes that were deleted on purpose
 
 
 class JournalVerdict(Struct, kw_only=True):
@@ -110,19 +115,25 @@ def summarize(place: JournalPlace, watch: Watcher) -> JournalInfo:
     sessions: dict[bytes, SessionInfo] = {}
     problems: list[Problem] = []
     moves: dict[bytes, _Moves] = {}
+    forgotten = ForgottenNumbers()
     for path, step in place.steps(watch):
         segment = segments.setdefault(path, _segment(path))
-        if isinstance(step, Damage):
+        if isinstance(step, Erased) and step.is_clear:
+            segment.erased += 1
+        elif isinstance(step, Damage):
             problems.append(problem(path, step))
             segment.lost += step.lost
             segment.state = segment.state if step.torn else "damaged"
         else:
             segment.keyframes += not step.is_correction
             segment.corrections += step.is_correction
-            _count(sessions, step)
-            moves.setdefault(step.session, _Moves()).note(step)
+            forgotten.note(step)
+            if step.session != SERVER_SESSION:
+                _count(sessions, step)
+                moves.setdefault(step.session, _Moves()).note(step)
     for key, session in sessions.items():
         moves[key].describe(session)
+        session.forgotten = len(forgotten.of(key))
     return JournalInfo(
         path=str(place.path),
         keyframes=sum(segment.keyframes for segment in segments.values()),
@@ -133,6 +144,7 @@ def summarize(place: JournalPlace, watch: Watcher) -> JournalInfo:
         sessions=list(sessions.values()),
         problems=problems,
         quarantined=[{"name": path.name, "bytes": _segment(path).nbytes} for path in place.quarantined()],
+        erased=sum(segment.erased for segment in segments.values()),
     )
 
 
@@ -206,8 +218,10 @@ def _count(sessions: dict[bytes, SessionInfo], record: Record) -> None:
 
 
 def problem(path: Path, damage: Damage) -> Problem:
-    """A damaged place as a report names it."""
-    kind: Literal["damage", "torn"] = "torn" if damage.torn else "damage"
+    """A damaged or erased place as a report names it."""
+    kind: Literal["damage", "torn", "erased"] = "torn" if damage.torn else "damage"
+    if isinstance(damage, Erased):
+        kind = "erased"
     return Problem(kind, path.name, damage.position.offset, damage.nbytes, damage.lost, damage.what)
 
 

@@ -6,6 +6,7 @@
 The first chunk holds the segment's identity, random bytes that every record repeats. A reader that lost its
 place takes only what carries them: a keyframe may contain whatever its sender likes, other records too.
 All lengths of a keyframe's chunk stand in it several times over, so a damaged one shows.
+Of a record that was erased a mark is left in its place (`journal.erasing`).
 """
 
 import struct
@@ -35,12 +36,17 @@ frame count: u8; length of each frame: u32; the frames of the wire message."""
 _SEGMENT_LAYOUT = b"tsfusion journal segment: TSFSEG1 and a zero, then the identity of the segment, 8 bytes"
 _SEGMENT_MAGIC = b"TSFSEG1\0"
 _KEYFRAMES, _SEGMENT = 1, 2  # channels
+KEYFRAMES_CHANNEL = _KEYFRAMES
+_ERASED_OPCODE = 0xE5  # of those that MCAP leaves to programs
+_ERASED_MAGIC = b"TSFGONE\0"
 
 _CHUNK = struct.Struct("<BQQQQIIQ")  # opcode, length, first and last time, size, CRC, compression, stored
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log and publish time
 _IDENTITY = struct.Struct(f"<8s{IDENTITY_BYTES}s")
 _RECORD = struct.Struct(f"<{IDENTITY_BYTES}s{_SESSION_BYTES}sQ{CLIENT_BYTES}sB")
 _HEAD = struct.Struct(_CHUNK.format + _MESSAGE.format[1:] + _RECORD.format[1:])
+_ERASED = struct.Struct(f"<BQ8s{IDENTITY_BYTES}s{_SESSION_BYTES}sQ{CLIENT_BYTES}s")  # then its CRC
+_CRC = struct.Struct("<I")
 _INDEX = struct.Struct("<BQHIQQ")  # opcode, length, channel, bytes that follow, time, offset in the chunk
 _LENGTH_BYTES = 9  # opcode and length, which no length counts
 _MAX_CHUNK_BYTES = 1 << 30
@@ -51,6 +57,7 @@ END_OF_DATA = struct.pack("<BQI", Opcode.DATA_END, 4, 0)
 MAGIC = MCAP0_MAGIC
 HEAD_BYTES = _HEAD.size
 INDEX_BYTES = _INDEX.size
+ERASED_BYTES = _ERASED.size + _CRC.size  # that are no zeros, of an erased record
 INDEX_START = struct.pack("<BQHI", Opcode.MESSAGE_INDEX, INDEX_BYTES - _LENGTH_BYTES, _KEYFRAMES, 16)
 
 
@@ -203,6 +210,35 @@ def parse_record(raw: bytes, position: Position) -> Record | None:
     except UnicodeDecodeError:
         return None
     return Record(position, parsed.session, parsed.seq, client, parsed.logged_ns, frames)
+
+
+class ErasedHead(NamedTuple):
+    """What stands in the place of an erased record."""
+
+    segment: bytes
+    session: bytes
+    seq: int
+    client: str
+    nbytes: int
+
+
+def erased_mark(head: ChunkHead, nbytes: int) -> bytes:
+    """The first bytes of what takes the place of a record, so many bytes long."""
+    fields = (head.segment, head.session, head.seq, head.client)
+    mark = _ERASED.pack(_ERASED_OPCODE, nbytes - _LENGTH_BYTES, _ERASED_MAGIC, *fields)
+    return mark + _CRC.pack(zlib.crc32(mark))
+
+
+def parse_erased(raw: bytes) -> ErasedHead | None:
+    """Read the first bytes of an erased record; None when they are none."""
+    if len(raw) < ERASED_BYTES or raw[0] != _ERASED_OPCODE:
+        return None
+    _, length, magic, segment, session, seq, client = _ERASED.unpack_from(raw)
+    (crc32,) = _CRC.unpack_from(raw, _ERASED.size)
+    if magic != _ERASED_MAGIC or zlib.crc32(raw[: _ERASED.size]) != crc32:
+        return None
+    name = client.rstrip(b"\0").decode(errors="replace")
+    return ErasedHead(segment, session, seq, name, _LENGTH_BYTES + length)
 
 
 class SegmentChunk(NamedTuple):

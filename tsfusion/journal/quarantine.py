@@ -14,6 +14,7 @@ from typing import Any
 from tsfusion import journal
 from tsfusion.core import durable_files, logs
 from tsfusion.core.errors import JournalError
+from tsfusion.core.number_ranges import NumberRanges
 
 log = logging.getLogger(__name__)
 
@@ -65,6 +66,21 @@ class Quarantine:
         self._files[path] = size
         self._prune()
         return path
+
+    def drop(self, session: bytes, numbers: NumberRanges) -> int:
+        """Delete the keyframes of these numbers of a session; how many files that were.
+
+        The first eight digits of the session stand in a file's name, so another one's may go with them.
+        """
+        count = 0
+        for path in list(self._files):
+            match = _FILE_NAME.fullmatch(path.name)
+            if match and match[1] == session[:4].hex() and int(match[2]) in numbers:
+                with suppress(OSError):
+                    path.unlink(missing_ok=True)
+                    self._nbytes -= self._files.pop(path)
+                    count += 1
+        return count
 
     def _prune(self) -> None:
         while len(self) > 1 and (self._nbytes > self._max_bytes or len(self) > _MAX_FILES):

@@ -37,6 +37,18 @@ class Damage(Struct, frozen=True):
     torn: bool = False  # the end of the last write, cut off before it was acknowledged: no keyframe is lost
 
 
+class Erased(Damage, frozen=True):
+    """A record whose bytes were deleted on purpose: no keyframe is lost.
+
+    `is_clear`: whether none of them is left; a crash may have come between.
+    """
+
+    session: bytes = b""
+    seq: int = 0
+    client: str = ""
+    is_clear: bool = True
+
+
 def scan_records(path: Path, on_read: Callable[[], None] = lambda: None) -> Iterator[Record | Damage]:
     """The records and damaged places of a segment file in their order; one record at a time is read.
 
@@ -83,6 +95,11 @@ class _Scan:
         at = yield from self._opening()
         while at < self._end and not self._is_end_of_data(at):
             found = self._record_at(at)
+            if found is None and (erased := self._erased_at(at)) is not None:
+                self._found += 1
+                yield erased
+                at += erased.nbytes
+                continue
             if found is None:
                 damage = self._damage(at)
                 self._lost += damage.lost
@@ -120,6 +137,19 @@ class _Scan:
             return None
         self._identity = head.segment  # of a segment whose own chunk is damaged: that of the first record
         return record, head
+
+    def _erased_at(self, at: int) -> Erased | None:
+        raw = self._source.read(at, mcap_layout.ERASED_BYTES, self._end)
+        head = mcap_layout.parse_erased(raw)
+        if head is None or at + head.nbytes > self._end or self._identity not in (None, head.segment):
+            return None
+        name = f"keyframe {head.seq} of session {head.session.hex()[:8]}"
+        is_clear = self._is_zero(at + len(raw), at + head.nbytes)
+        what = f"{name} was erased" if is_clear else f"{name} is being erased: forget it again with --erase"
+        return Erased(
+            Position(self._number, at), head.nbytes, 0, what,
+            session=head.session, seq=head.seq, client=head.client, is_clear=is_clear,
+        )  # fmt: skip
 
     # --- the start ---
 
@@ -184,10 +214,11 @@ class _Scan:
         is_there = self._source.read(end, len(start), self._end) == start
         return behind if is_there and behind <= self._end else end
 
-    def _is_zero(self, at: int) -> bool:
+    def _is_zero(self, at: int, end: int | None = None) -> bool:
         """Whether nothing was ever written there: a file may grow before its bytes reach the disk."""
-        starts = range(at, self._end, _WINDOW_BYTES)
-        rest = any(self._source.read(start, _WINDOW_BYTES, self._end).strip(b"\0") for start in starts)
+        end = self._end if end is None else end
+        starts = range(at, end, _WINDOW_BYTES)
+        rest = any(self._source.read(start, _WINDOW_BYTES, end).strip(b"\0") for start in starts)
         return not rest and not self._source.failed
 
     def _search(self, start: int) -> int | None:

@@ -14,6 +14,7 @@ from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal import state_folder
+from tsfusion.journal.forgotten_numbers import ForgottenNumbers
 from tsfusion.wire import codec
 
 log = logging.getLogger(__name__)
@@ -24,7 +25,8 @@ class JournalRecording:
     spool folder or one `.mcap` segment.
 
     Each once and in journal order, also when a crash left a second copy. Keyframes the map had to reject
-    are among them; corrections are left out, so poses are those that the keyframes came with.
+    are among them; corrections are left out, so poses are those that the keyframes came with. Keyframes that
+    the server was told to forget are left out, too, and counted in `skipped`.
 
     Raises:
         JournalError: when there is no keyframe.
@@ -33,7 +35,7 @@ class JournalRecording:
     def __init__(self, path: str | os.PathLike[str], map_name: str | None = None) -> None:
         place = state_folder.find_journal(Path(path), map_name)
         self.name = str(place.path)
-        self._places = _places(place)
+        self._places, forgotten = _places(place)
         if not self._places:
             raise JournalError(
                 f"no keyframes in {place.path}; expected a state folder, a spool folder or an .mcap file"
@@ -41,7 +43,7 @@ class JournalRecording:
         first = self[0]
         self.sensor = first.sensor or VolumeConfig().sensor
         self.timestamps_ns: NDArray[np.int64] | None = None
-        self.skipped: dict[str, int] = {}
+        self.skipped: dict[str, int] = {"forgotten": forgotten} if forgotten else {}
 
     def __len__(self) -> int:
         return len(self._places)
@@ -58,14 +60,20 @@ class JournalRecording:
         return (self[index] for index in range(len(self)))
 
 
-def _places(place: state_folder.JournalPlace) -> list[tuple[Path, int]]:
-    """Segment file and offset of each keyframe."""
-    found, last = [], dict[bytes, int]()
+def _places(place: state_folder.JournalPlace) -> tuple[list[tuple[Path, int]], int]:
+    """Segment file and offset of each keyframe, and how many were forgotten."""
+    found: list[tuple[bytes, int, Path, int]] = []
+    last, forgotten = dict[bytes, int](), ForgottenNumbers()
     for file, step in place.steps():
-        if isinstance(step, journal.Damage):
+        if isinstance(step, journal.Erased):
+            last[step.session] = max(step.seq, last.get(step.session, 0))
+        elif isinstance(step, journal.Damage):
             log.log(logging.WARNING if step.torn else logging.ERROR, "%s: %s", file, step.what)
         elif step.seq > last.get(step.session, 0):
             last[step.session] = step.seq
             if not step.is_correction:
-                found.append((file, step.position.offset))
-    return found
+                found.append((step.session, step.seq, file, step.position.offset))
+            else:
+                forgotten.note(step)
+    kept = [(file, at) for session, seq, file, at in found if (session, seq) not in forgotten]
+    return kept, len(found) - len(kept)

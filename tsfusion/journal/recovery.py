@@ -11,7 +11,7 @@ from tsfusion.core import durable_files
 from tsfusion.core.errors import JournalError, OutputError
 from tsfusion.core.output_folder import building
 from tsfusion.journal.inspection import Problem, problem
-from tsfusion.journal.record_scan import Damage
+from tsfusion.journal.record_scan import Damage, Erased
 from tsfusion.journal.state_folder import JournalPlace, Watcher
 from tsfusion.journal.writer import Journal
 
@@ -32,6 +32,8 @@ class Recovery(Struct, kw_only=True):
 def recover(place: JournalPlace, out: Path, segment_bytes: int, watch: Watcher) -> Recovery:
     """Write every whole record of a journal into the new folder `out`, in order, in closed segments.
 
+    Of a record that was erased nothing is written.
+
     The journal itself is only read. `out` appears when all of it is on the disk, and not at all otherwise.
 
     Raises:
@@ -44,6 +46,8 @@ def recover(place: JournalPlace, out: Path, segment_bytes: int, watch: Watcher) 
         out.rmdir()
     with building(out) as work, closing(Journal(work, segment_bytes, sync=False)) as new:
         for path, step in place.steps(watch):
+            if isinstance(step, Erased):
+                continue
             if isinstance(step, Damage):
                 problems.append(problem(path, step))
             elif (step.session, step.seq) in seen:

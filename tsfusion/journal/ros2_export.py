@@ -12,9 +12,10 @@ from msgspec import Struct
 from tsfusion.core import durable_files
 from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError, MissingDependency, OutputError
 from tsfusion.core.output_folder import check_writable
+from tsfusion.journal.forgotten_numbers import ForgottenNumbers
 from tsfusion.journal.inspection import Problem, problem
 from tsfusion.journal.mcap_layout import Record
-from tsfusion.journal.record_scan import Damage
+from tsfusion.journal.record_scan import Damage, Erased
 from tsfusion.journal.ros2_messages import Converter, Outgoing
 from tsfusion.journal.state_folder import JournalPlace, Watcher
 from tsfusion.wire import codec
@@ -113,10 +114,14 @@ class _Exporter:
         self._keyframes = 0
 
     def run(self, place: JournalPlace, watch: Watcher) -> None:
-        """Write everything that is whole, each keyframe once."""
+        """Write everything that is whole, each keyframe once, and none that was forgotten."""
+        forgotten = ForgottenNumbers.in_journal(place)
         for path, step in place.steps(watch):
             if isinstance(step, Damage):
-                self._problems.append(problem(path, step))
+                if not isinstance(step, Erased):
+                    self._problems.append(problem(path, step))
+            elif (step.session, step.seq) in forgotten:
+                continue
             elif not step.is_correction and (step.session, step.seq) not in self._seen:
                 self._seen.add((step.session, step.seq))
                 self._add(path, step)

@@ -14,7 +14,7 @@ from tsfusion.core.counts import count_of
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import mcap_layout, segment_file
 from tsfusion.journal.mcap_layout import Position, Record
-from tsfusion.journal.record_scan import Damage, journal_error, scan_records, segment_number
+from tsfusion.journal.record_scan import Damage, Erased, journal_error, scan_records, segment_number
 from tsfusion.journal.segment_file import SegmentFile
 
 log = logging.getLogger(__name__)
@@ -30,6 +30,7 @@ class RecordEntry(Struct, frozen=True):
     nbytes: int
     is_correction: bool = False
     world: str = ""  # as its header names it
+    is_erased: bool = False
 
 
 def segments(folder: Path) -> list[int]:
@@ -92,13 +93,16 @@ def read_at(path: Path, offset: int) -> Record:
 def record_at(source: SegmentFile, number: int, offset: int) -> Record:
     """One record of the open segment file of this number; raises JournalError as `read_at`."""
     try:
-        head = mcap_layout.parse_head(source.read(offset, mcap_layout.HEAD_BYTES))
+        start = source.read(offset, mcap_layout.HEAD_BYTES)
+        head = mcap_layout.parse_head(start)
         raw = b"" if head is None else source.read(offset, head.nbytes)
         record = mcap_layout.parse_record(raw, Position(number, offset))
         if record is None and source.failed:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
     except OSError as error:
         raise journal_error("read", source.path, error) from error
+    if record is None and mcap_layout.parse_erased(start) is not None:
+        raise JournalError(f"the keyframe at byte {offset} of {source.path} was erased", is_erased=True)
     if record is None:
         raise JournalError(f"{source.path} holds no whole keyframe at byte {offset}")
     return record
@@ -107,7 +111,7 @@ def record_at(source: SegmentFile, number: int, offset: int) -> Record:
 def list_records(
     path: Path, watch: Callable[[int, int], None] = lambda _at, _records: None
 ) -> tuple[list[RecordEntry], int]:
-    """Every whole record of a segment in order, and how many keyframes are lost to damage between them.
+    """Every whole or erased record of a segment, and how many keyframes are lost to damage between them.
 
     A torn tail was never acknowledged and does not count as damage. Each damaged place is logged.
 
@@ -125,7 +129,12 @@ def list_records(
 
     for step in scan_records(path, note):
         at = step.position.offset
-        if isinstance(step, Damage):
+        if isinstance(step, Erased):
+            place = (step.position, step.session, step.seq, step.client)
+            found.append(RecordEntry(*place, step.nbytes, is_erased=True))
+            if not step.is_clear:
+                log.warning("%s", describe(path, step))
+        elif isinstance(step, Damage):
             lost += step.lost
             level = logging.ERROR if step.lost else logging.WARNING
             log.log(level, "%s", describe(path, step))

@@ -8,13 +8,13 @@ import math
 import os
 import secrets
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from tsfusion.core import durable_files
 from tsfusion.core.errors import JournalError
-from tsfusion.journal import mcap_layout
+from tsfusion.journal import erasing, mcap_layout
 from tsfusion.journal.free_space import FreeSpace
 from tsfusion.journal.mcap_layout import Position, Record
 from tsfusion.journal.open_segment import OpenSegment
@@ -320,6 +320,30 @@ class Journal:
         self._closed.pop(number, None)
         if number in self._kept:
             self._kept.pop(number).close()
+
+    def erase(self, positions: Iterable[Position]) -> Iterator[int]:
+        """Delete the bytes of records, a piece at a time; all other records keep their positions.
+
+        Yields:
+            How many are erased so far. A record of a segment that is not there any more is gone.
+
+        Raises:
+            JournalError: when the disk refuses, or there is no record at such a place.
+        """
+        offsets: dict[int, set[int]] = {}
+        for position in positions:
+            offsets.setdefault(position.segment, set()).add(position.offset)
+        erased = 0
+        for number, places in sorted(offsets.items()):
+            if self._open is not None and number == self._number:
+                self._rotate_or_abandon()
+            path = segment_path(self.folder, number)
+            if path.exists():
+                for count in erasing.erase(path, places):
+                    yield erased + count
+                self._closed[number] = durable_files.size_of(path)
+            erased += len(places)
+        yield erased
 
     def retire(self, below: int, limit: int) -> int:
         """Delete the oldest closed segments until the journal is no larger than `limit`.

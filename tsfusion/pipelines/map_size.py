@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 
 from tsfusion.core.config import SensorModel, VolumeConfig
 from tsfusion.core.errors import InvalidConfig
-from tsfusion.evaluation.view_prediction import points_camera
 from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.measured_points import points_camera
 
 _BLOCK = 8  # voxels, edge of a block
 _VOXEL_BYTES = 20  # sums and colour

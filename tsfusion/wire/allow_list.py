@@ -28,6 +28,7 @@ class AllowList:
         self._names: dict[str, str] = {}  # public key → name
         self._revoked: dict[str, str] = {}
         self._maps: dict[str, AllowedMaps] = {}  # name → what it may use
+        self._forget: frozenset[str] = frozenset()  # names that may forget keyframes of others, too
         self.refresh()
 
     def refresh(self) -> bool:
@@ -46,6 +47,7 @@ class AllowList:
             self._names = {key: name for name, key in listed.allowed.items()}
             self._revoked = dict(listed.revoked)
             self._maps = {name: AllowedMaps(listed.maps.get(name)) for name in listed.allowed}
+            self._forget = frozenset(listed.forget)
             level = logging.INFO if self._names else logging.WARNING
             counts = len(self._names), len(self._revoked)
             log.log(level, "clients that may connect: %d, keys revoked: %d", *counts)
@@ -66,6 +68,10 @@ class AllowList:
     def maps_of(self, name: str) -> AllowedMaps:
         """The maps that the client of a name may use."""
         return self._maps.get(name, AllowedMaps(()))
+
+    def may_forget_all(self, name: str) -> bool:
+        """Whether the client of a name may forget keyframes of others, too, in the maps that it may use."""
+        return name in self._forget
 
     def rejection_reason(self, key: str) -> str:
         """One word for the reason why a key is not allowed."""
@@ -90,4 +96,4 @@ class AllowList:
             log.error("nobody is allowed to connect: %s", problem)
         self.problem = problem
         self._again = time.monotonic() + _RETRY
-        self._names, self._revoked, self._maps = {}, {}, {}
+        self._names, self._revoked, self._maps, self._forget = {}, {}, {}, frozenset()

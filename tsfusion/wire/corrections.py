@@ -4,6 +4,10 @@
 A loop that closes shows it. A correction is a record of the session like a keyframe, with the next number, so
 it can only name keyframes with lower numbers. The newest pose of a keyframe counts.
 
+A server that is told to forget keyframes writes such records, too: into a session of its own, each with the
+session that it is about as its `target`. A keyframe that one of them removes never comes back, whatever
+corrections come before or after. No client may send one.
+
 Message: `CorrectionHeader`, then one body frame, little-endian: `count` numbers (int64, rising), as many
 poses (12 float64 each: the upper three rows of `T_world_camera`), then `removed` numbers (int64, rising).
 """
@@ -19,9 +23,10 @@ from numpy.typing import NDArray
 from tsfusion.core.config import DEFAULT_MAP
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry.keyframe import MAX_TRANSLATION, check_pose
-from tsfusion.wire.record_header import CorrectionHeader, Damaged, Refused, pack
+from tsfusion.wire.record_header import CorrectionHeader, Damaged, RecordHeader, Refused, pack
 
 MAX_KEYFRAMES = 100_000  # named by one correction
+SERVER_SESSION = b"tsfusion forgets"  # session of the records in which a server forgets keyframes
 _NUMBER_BYTES, _POSE_BYTES = 8, 12 * 8
 _EXACT = 1e-9  # |RᵀR - I|, as `check_pose` leaves it
 _MAX_NUMBER = (1 << 63) - 1
@@ -40,12 +45,14 @@ class Correction:
         removed: (m,) int64, rising: the numbers of the keyframes that are to be taken out of the map.
         T_map_odometry: (4, 4) float64: p_map = T_map_odometry @ p_odometry, for the poses after the last
             keyframe; None = as before.
+        target: the session of the removed keyframes, which are removed for good; None = its own.
     """
 
     seqs: Numbers
     poses: Transforms
     removed: Numbers
     T_map_odometry: NDArray[np.float64] | None = None
+    target: bytes | None = None
 
 
 def checked(
@@ -107,6 +114,18 @@ def _are_rigid(rows: NDArray[np.float64]) -> NDArray[np.bool_]:
     return good
 
 
+def forgetting(target: bytes, seqs: Numbers) -> Correction:
+    """The correction by which a server forgets these keyframes of a session."""
+    none = checked({})
+    return Correction(seqs=none.seqs, poses=none.poses, removed=np.unique(seqs), target=target)
+
+
+def is_servers_own(header: RecordHeader) -> bool:
+    """Whether only a server may write such a record."""
+    has_target = isinstance(header, CorrectionHeader) and header.target is not None
+    return has_target or header.session == SERVER_SESSION
+
+
 def encode(
     correction: Correction,
     *,
@@ -132,6 +151,7 @@ def encode(
         removed=len(correction.removed),
         crc32=zlib.crc32(body),
         T_map_odometry=None if T is None else tuple(T[:3].ravel().tolist()),
+        target=correction.target,
     )
     return [pack(header), body]
 
@@ -160,6 +180,8 @@ def check(header: CorrectionHeader, frames: Sequence[Any]) -> None:
 def _check_values(
     header: CorrectionHeader, seqs: Numbers, rows: NDArray[np.float64], removed: Numbers
 ) -> None:
+    if header.target is not None and (header.count or header.T_map_odometry is not None):
+        raise Refused("values", "a record that forgets keyframes of another session moves none")
     for numbers in (seqs, removed):
         if len(numbers) and (numbers[0] < 1 or (np.diff(numbers) <= 0).any()):
             raise Refused("values", "the numbers of corrected and of removed keyframes must rise from 1")
@@ -197,4 +219,5 @@ def unpack(header: CorrectionHeader, body: Any) -> Correction:
         poses=np.concatenate([rows, last_rows], axis=1),
         removed=removed.astype(np.int64),
         T_map_odometry=None if T is None else np.array([*T, 0.0, 0.0, 0.0, 1.0]).reshape(4, 4),
+        target=header.target,
     )

@@ -55,6 +55,7 @@ class MapHealth(Struct, frozen=True, kw_only=True):
     )
     keyframes_moved: int = 0  # fused at a corrected pose, or taken out, since the fuser began
     moving_s: float = 0.0  # seconds of the fuser for that
+    keyframes_forgotten: int = 0  # taken out of the map for good, by `tsfusion map forget` or a setting
 
 
 ClientState = Literal["connected", "silent", "gone"]
@@ -135,3 +136,4 @@ class Status(Struct, frozen=True, kw_only=True):
     corrections_unavailable: int = 0
     keyframes_moved: int = 0
     moving_s: float = 0.0
+    keyframes_forgotten: int = 0

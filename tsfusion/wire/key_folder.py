@@ -8,6 +8,7 @@
 
 In `[allowed]` stands `"NAME" = "KEY"` for a client that may use every map, and `"NAME" = { key = "KEY",
 maps = ["house", "yard-*"] }` for one that may use these: a map's name, or with a `*` all that begin so.
+With `forget = true` in the braces it may make the server forget keyframes of other clients, too.
 
 The folder is its owner's alone (0700), every file 0600 from its first byte, and replaced whole.
 """
@@ -44,16 +45,18 @@ class Allowed(Struct, frozen=True):
     allowed: dict[str, str] = {}  # name → public key
     revoked: dict[str, str] = {}  # public key → the name it had
     maps: dict[str, tuple[str, ...]] = {}  # name → the maps it may use; a name without may use every map
+    forget: tuple[str, ...] = ()  # names that may make the server forget keyframes of other clients
 
 
 _Key = Annotated[str, Meta(max_length=64)]
 
 
 class _Entry(Struct, frozen=True, forbid_unknown_fields=True):
-    """A client in the file that may not use every map."""
+    """A client in the file that may not use every map, or may make the server forget."""
 
     key: _Key
-    maps: Annotated[tuple[MapPattern, ...], Meta(max_length=256)]
+    maps: Annotated[tuple[MapPattern, ...], Meta(max_length=256)] = ("*",)
+    forget: bool = False
 
 
 class _ListFile(Struct, frozen=True, forbid_unknown_fields=True):
@@ -99,7 +102,12 @@ def create_pair(folder: Folder, name: str, *, force: bool = False) -> Pair:
 
 
 def allow(
-    folder: Folder, name: str, key: str | None = None, *, maps: Iterable[str] | None = None
+    folder: Folder,
+    name: str,
+    key: str | None = None,
+    *,
+    maps: Iterable[str] | None = None,
+    forget: bool | None = None,
 ) -> str | None:
     """Allow a client with this public key under this name; the name's earlier key is revoked.
 
@@ -107,6 +115,8 @@ def allow(
         key: 40 characters, or a file; None = the one that the name has.
         maps: that it may use: names, or with a `*` at the end how names begin. None = those that the name
             may use already, of a new name every map.
+        forget: whether it may make the server forget keyframes of other clients; None = as before, and a
+            new name may not.
 
     Returns:
         The name's earlier key, if it has another one now.
@@ -133,7 +143,9 @@ def allow(
         rights = dict(listed.maps)
         if patterns is not None:
             rights[name] = patterns
-        changed = Allowed({**listed.allowed, name: public}, revoked, _limits(rights))
+        forgets = {one for one in listed.forget if one != name or forget is not False}
+        forgets |= {name} if forget else set()
+        changed = Allowed({**listed.allowed, name: public}, revoked, _limits(rights), tuple(sorted(forgets)))
         if changed != listed:
             _write(place / ALLOWED, _format_list(changed))
     return None if earlier == public else earlier
@@ -156,7 +168,8 @@ def revoke(folder: Folder, name: str) -> str:
         left = dict(listed.allowed)
         key = left.pop(name)
         rights = {other: maps for other, maps in listed.maps.items() if other != name}
-        _write(place / ALLOWED, _format_list(Allowed(left, {**listed.revoked, key: name}, rights)))
+        forgets = tuple(other for other in listed.forget if other != name)
+        _write(place / ALLOWED, _format_list(Allowed(left, {**listed.revoked, key: name}, rights, forgets)))
     return key
 
 
@@ -257,17 +270,21 @@ def _parse_list(content: bytes, path: Path) -> Allowed:
 def _listed(file: _ListFile) -> Allowed:
     entries = {name: one for name, one in file.allowed.items() if isinstance(one, _Entry)}
     keys = {name: one.key if isinstance(one, _Entry) else one for name, one in file.allowed.items()}
-    return Allowed(keys, file.revoked, _limits({name: one.maps for name, one in entries.items()}))
+    limits = _limits({name: one.maps for name, one in entries.items()})
+    return Allowed(
+        keys, file.revoked, limits, tuple(sorted(name for name, one in entries.items() if one.forget))
+    )
 
 
 def _format_list(listed: Allowed) -> str:
     lines = [_LIST_HEAD, "[allowed]"]  # a Z85 key has no quote and no backslash, nor has a map's name
     for name, key in sorted(listed.allowed.items()):
-        maps = listed.maps.get(name)
-        quoted = "" if maps is None else ", ".join(f'"{one}"' for one in maps)
-        lines.append(
-            f'"{name}" = "{key}"' if maps is None else f'"{name}" = {{ key = "{key}", maps = [{quoted}] }}'
-        )
+        rights = [f'key = "{key}"']
+        if (maps := listed.maps.get(name)) is not None:
+            rights.append(f"maps = [{', '.join(f'{chr(34)}{one}{chr(34)}' for one in maps)}]")
+        if name in listed.forget:
+            rights.append("forget = true")
+        lines.append(f'"{name}" = ' + (f'"{key}"' if len(rights) == 1 else f"{{ {', '.join(rights)} }}"))
     lines += ["", "[revoked]"]
     lines += [f'"{key}" = "{name}"' for key, name in listed.revoked.items()]
     return "\n".join(lines) + "\n"

@@ -15,6 +15,7 @@ from tsfusion.wire.health import Health, MeshLayout, Status
 from tsfusion.wire.keyframe_times import Seq, Stamps
 from tsfusion.wire.record_header import SessionId, WorldName
 from tsfusion.wire.seal import is_damaged, seal
+from tsfusion.wire.selection import Forgotten, Selection
 
 PROTOCOL_VERSION = 2  # of these messages and of which kinds of records a server takes
 # Why a client never sends a keyframe: the reasons in `Ping.skipped`, in words
@@ -153,9 +154,12 @@ class Pong(Struct, frozen=True, tag="pong"):
 class Command(Struct, frozen=True, tag="command", kw_only=True):
     """A request of a person or program; answered by one Reply."""
 
-    name: Literal["ping", "health", "status", "mesh", "new_map"]
+    name: Literal["ping", "health", "status", "mesh", "new_map", "forget"]
     map: MapName = "default"  # of `new_map`: the name to begin with, where that is free
     min_weight: float | None = None
+    selection: Selection | None = None  # of `forget`, with the two that follow
+    erase: bool = False  # also delete the records' bytes
+    dry_run: bool = False  # only say what would be forgotten
 
 
 class Reply(Struct, frozen=True, tag="reply", kw_only=True):
@@ -168,6 +172,7 @@ class Reply(Struct, frozen=True, tag="reply", kw_only=True):
     health: "Health | None" = None
     status: "Status | None" = None
     mesh: "MeshLayout | None" = None
+    forgotten: Forgotten | None = None
 
 
 ToServer = Hello | Ping | Command

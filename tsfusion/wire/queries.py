@@ -17,6 +17,7 @@ from tsfusion.wire.connection import Connection
 from tsfusion.wire.curve import ClientKeys
 from tsfusion.wire.health import Health, MeshLayout, Status
 from tsfusion.wire.messages import Command, Reply
+from tsfusion.wire.selection import Forgotten, Selection
 from tsfusion.wire.sockets import control_address
 
 _AGAIN_INTERVAL = 0.25  # seconds
@@ -123,6 +124,35 @@ def fetch_mesh(
     if reply.mesh is None:
         raise TransportError(f"the server at {address} answered without a mesh")
     return mesh_of(reply.mesh, frames)
+
+
+def forget(
+    address: str,
+    selection: Selection,
+    *,
+    erase: bool = False,
+    dry_run: bool = False,
+    control: str | None = None,
+    map_name: str = DEFAULT_MAP,
+    timeout: float = 600.0,
+    keys: ClientKeys | None = None,
+) -> Forgotten:
+    """Tell the server at a data address to forget keyframes of a map. See `fetch_health`.
+
+    Args:
+        erase: also delete them from its journal; it answers when that is done.
+        dry_run: only ask which that would be.
+        timeout: seconds; a server that does not answer in time may still forget them.
+
+    Raises:
+        ServerUnreachable: when nobody is there, or it takes longer.
+        TransportError: when the server cannot, or this client may not.
+    """
+    command = Command(name="forget", map=map_name, selection=selection, erase=erase, dry_run=dry_run)
+    reply, _ = _request_if_present(address, control, command, timeout, keys)
+    if reply.forgotten is None:
+        raise TransportError(f"the server at {address} answered without what it forgot")
+    return reply.forgotten
 
 
 def _request_if_present(

@@ -101,6 +101,7 @@ class CorrectionHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
         crc32: of the body.
         T_map_odometry: the upper three rows, row by row, of what poses after the last keyframe are to be
             multiplied by from the left; None = as before.
+        target: the session whose keyframes it removes, for good; only a server writes it. None = its own.
     """
 
     kind: ClassVar[str] = "correction"
@@ -116,6 +117,7 @@ class CorrectionHeader(Struct, frozen=True, kw_only=True, omit_defaults=True):
     sent_ns: Natural = 0
     removed: Natural = 0
     T_map_odometry: TransformRows | None = None
+    target: SessionId | None = None
 
 
 RecordHeader: TypeAlias = KeyframeHeader | CorrectionHeader

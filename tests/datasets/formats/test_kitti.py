@@ -12,7 +12,7 @@ from small_recordings import P0, P1, TR, kitti, one_line, put
 
 from tsfusion.core.errors import DatasetError
 from tsfusion.datasets import KITTI, open_dataset
-from tsfusion.evaluation.view_prediction import depth_metres, points_world
+from tsfusion.geometry.measured_points import depth_metres, points_world
 from tsfusion.geometry.stereo_matching import Matcher
 
 scipy_spatial = pytest.importorskip("scipy.spatial")

@@ -14,9 +14,9 @@ from small_recordings import one_line, put
 from written_recordings import check, fits_together, transforms, views
 
 from tsfusion.datasets import Nerfstudio, open_dataset
-from tsfusion.evaluation.view_prediction import depth_metres
 from tsfusion.geometry.calibration import Camera
 from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.measured_points import depth_metres
 
 
 def rewrite(root: Path, change: Callable[[dict], object]) -> None:

@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: MIT
+"""Sets of whole numbers that lie in few ranges, such as keyframes 3 to 17 and 20."""
+
+import re
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import InvalidConfig
+
+_WORD = re.compile(r"\s*([0-9]{1,18})\s*(?:-\s*([0-9]{1,18})\s*)?")
+
+
+class NumberRanges:
+    """A set of whole numbers, 16 bytes a range.
+
+    Args:
+        ranges: first and last number of each.
+    """
+
+    def __init__(self, ranges: Iterable[tuple[int, int]] = ()) -> None:
+        self._ranges: NDArray[np.int64] = _merged(np.array(list(ranges), dtype=np.int64).reshape(-1, 2))
+
+    def __contains__(self, number: int) -> bool:
+        at = bisect_right(self._ranges[:, 0], number) - 1
+        return at >= 0 and number <= int(self._ranges[at, 1])
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        """First and last number of each range, rising."""
+        return ((first, last) for first, last in self._ranges.tolist())
+
+    def __len__(self) -> int:
+        """How many numbers there are."""
+        return int((self._ranges[:, 1] - self._ranges[:, 0] + 1).sum())
+
+    def __str__(self) -> str:
+        return ", ".join(f"{first}-{last}" if last > first else f"{first}" for first, last in self)
+
+    def add(self, numbers: NDArray[np.int64]) -> None:
+        """Add numbers, in any order."""
+        self._ranges = _merged(np.concatenate([self._ranges, np.repeat(numbers[:, None], 2, axis=1)]))
+
+
+def _merged(ranges: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(n, 2) ranges in order, with those joined that overlap or touch."""
+    if not len(ranges):
+        return ranges
+    ranges = ranges[np.argsort(ranges[:, 0], kind="stable")]
+    reach = np.maximum.accumulate(ranges[:, 1])
+    begins = np.flatnonzero(np.concatenate([[True], ranges[1:, 0] > reach[:-1] + 1]))
+    return np.stack([ranges[begins, 0], reach[np.append(begins[1:], len(ranges)) - 1]], axis=1)
+
+
+def parse(text: str) -> tuple[tuple[int, int], ...]:
+    """The ranges in a text such as `3-17,20`.
+
+    Raises:
+        InvalidConfig: for anything else.
+    """
+    found = []
+    for word in text.split(","):
+        match = _WORD.fullmatch(word)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, 0)
+        if not 1 <= first <= last:
+            raise InvalidConfig(f"keyframes must be numbers and ranges such as 3-17,20, got {text!r}")
+        found.append((first, last))
+    return tuple(NumberRanges(found))

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: MIT
+"""Deleting records out of a segment: their bytes become zeros, and all other records stay where they are.
+
+In the place of an erased record, its chunk and its index, stands one MCAP record of a private opcode that is
+as long, which readers pass over. It says which record of which session was there: so it is not taken again
+when its client sends it once more.
+
+    opcode, length | mark | segment's identity | session | seq | client | CRC | zeros
+
+The index at the end of a segment goes first and is written anew at last. A crash in between leaves a segment
+without an index, as a server leaves one that was killed, and the next run goes on.
+"""
+
+import os
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from io import FileIO
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+
+from tsfusion.core.errors import JournalError
+from tsfusion.journal import mcap_layout, segment_file
+from tsfusion.journal.record_scan import journal_error
+from tsfusion.journal.segment_file import SegmentFile
+
+_PIECE_BYTES = 4 << 20
+_ZEROS = bytes(1 << 20)
+
+
+def erase(path: Path, offsets: Collection[int]) -> Iterator[int]:
+    """Erase the records that begin at these bytes of a segment that nobody writes, a piece at a time.
+
+    Yields:
+        How many records are erased so far; they are on the disk at the end.
+
+    Raises:
+        JournalError: when there is neither a record nor an erased one at such a place, or the disk refuses.
+    """
+    try:
+        with path.open("r+b", buffering=0) as file:
+            with SegmentFile(path) as source:
+                places = [_place(source, offset) for offset in sorted(offsets)]
+                end = segment_file.read_segment_end(source)
+                summary = _summary(source, end, {one.offset for one in places})
+            if summary is not None:
+                file.truncate(summary[0])
+                os.fdatasync(file.fileno())
+            for one in places:
+                _write(file, one.mark, one.offset)
+            os.fdatasync(file.fileno())  # from here on nobody takes what is left of them for damage
+            yield from _clear(file, places)
+            if summary is not None:
+                _write(file, summary[1], summary[0])
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise journal_error("erase records of", path, error) from error
+
+
+class _Place(NamedTuple):
+    offset: int
+    nbytes: int
+    mark: bytes  # the first of them, from then on
+
+
+def _place(source: SegmentFile, offset: int) -> _Place:
+    raw = source.read(offset, mcap_layout.HEAD_BYTES)
+    if (erased := mcap_layout.parse_erased(raw)) is not None:
+        return _Place(offset, erased.nbytes, raw[: mcap_layout.ERASED_BYTES])
+    head = mcap_layout.parse_head(raw)
+    if head is None or offset + head.nbytes > source.size:
+        raise JournalError(f"{source.path} holds no whole record at byte {offset}: it is not erased")
+    index = head.message_index
+    has_index = source.read(offset + head.nbytes, len(index)) == index
+    nbytes = head.nbytes + (len(index) if has_index else 0)
+    return _Place(offset, nbytes, mcap_layout.erased_mark(head, nbytes))
+
+
+def _write(file: FileIO, content: bytes, at: int) -> None:
+    view = memoryview(content)
+    while view:
+        written = os.pwrite(file.fileno(), view, at)
+        at, view = at + written, view[written:]
+
+
+def _clear(file: FileIO, places: list[_Place]) -> Iterator[int]:
+    """Overwrite all but the marks with zeros."""
+    unsynced = 0
+    for number, one in enumerate(places, 1):
+        at, end = one.offset + len(one.mark), one.offset + one.nbytes
+        while at < end:
+            piece = _ZEROS[: end - at]
+            _write(file, piece, at)
+            at += len(piece)
+            unsynced += len(piece)
+            if unsynced >= _PIECE_BYTES:
+                os.fdatasync(file.fileno())
+                unsynced = 0
+                yield number - 1
+    os.fdatasync(file.fileno())
+    yield len(places)
+
+
+# --- the index at the end ---
+
+_RECORD = struct.Struct("<BQ")  # opcode, length
+_CHUNK_INDEX_START = struct.Struct("<QQQ")  # first and last time, offset of the chunk
+_STATISTICS = struct.Struct("<QHIIIIQQI")  # messages, …, chunks, first and last time, bytes of the counts
+_CHANNEL_COUNT = struct.Struct("<HQ")
+_GROUP = struct.Struct("<BQQ")  # opcode, start, length
+_FOOTER = struct.Struct("<BQQQI")
+
+
+def _summary(source: SegmentFile, end: segment_file.SegmentEnd, erased: set[int]) -> tuple[int, bytes] | None:
+    """Where the index begins, its end-of-data mark included, and the new one; None = there is none."""
+    if end.data_end is None:
+        return None
+    start = end.data_end + len(mcap_layout.END_OF_DATA)
+    content = source.read(start, source.size - start)
+    groups: dict[int, list[bytes]] = {}
+    at = 0
+    while at + _RECORD.size <= len(content):
+        opcode, length = _RECORD.unpack_from(content, at)
+        record = content[at : at + _RECORD.size + length]
+        at += len(record)
+        if opcode == Opcode.FOOTER:
+            break
+        if opcode == Opcode.CHUNK_INDEX:
+            _, _, chunk = _CHUNK_INDEX_START.unpack_from(record, _RECORD.size)
+            if chunk in erased:
+                continue
+        if opcode != Opcode.SUMMARY_OFFSET:
+            groups.setdefault(opcode, []).append(record)
+    chunks = len(groups.get(Opcode.CHUNK_INDEX, ()))
+    groups[Opcode.STATISTICS] = [_recount(record, chunks) for record in groups.get(Opcode.STATISTICS, ())]
+    return end.data_end, mcap_layout.END_OF_DATA + _packed(groups, start) + mcap_layout.MAGIC
+
+
+def _recount(statistics: bytes, chunks: int) -> bytes:
+    """The statistics of a segment of so many chunks, one message each."""
+    fields = list(_STATISTICS.unpack_from(statistics, _RECORD.size))
+    gone, fields[0], fields[5] = fields[0] - chunks, chunks, chunks
+    counts = statistics[_RECORD.size + _STATISTICS.size :]
+    channels = [list(one) for one in _CHANNEL_COUNT.iter_unpack(counts)]
+    for one in channels:
+        one[1] -= gone if one[0] == mcap_layout.KEYFRAMES_CHANNEL else 0
+    packed = b"".join(_CHANNEL_COUNT.pack(*one) for one in channels)
+    return statistics[: _RECORD.size] + _STATISTICS.pack(*fields) + packed
+
+
+def _packed(groups: dict[int, list[bytes]], start: int) -> bytes:
+    """The records of an index that begins at this byte, with the offsets of its groups and its footer."""
+    records, offsets, at = b"", b"", start
+    for opcode, group in groups.items():
+        if group:
+            joined = b"".join(group)
+            fields = _GROUP.pack(opcode, at, len(joined))
+            offsets += _RECORD.pack(Opcode.SUMMARY_OFFSET, len(fields)) + fields
+            records += joined
+            at += len(joined)
+    footer = _FOOTER.pack(Opcode.FOOTER, _FOOTER.size - _RECORD.size, start, at, 0)[:-4]
+    crc32 = zlib.crc32(footer, zlib.crc32(records + offsets))
+    return records + offsets + footer + struct.pack("<I", crc32)

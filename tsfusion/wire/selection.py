@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: MIT
+"""Which keyframes of a map are to be forgotten, and which were."""
+
+from typing import Annotated
+
+from msgspec import Meta, Struct
+
+from tsfusion.core.number_ranges import NumberRanges
+from tsfusion.wire.record_header import Natural, RecordNumber
+
+_MAX_RANGES = 10_000
+_Session = Annotated[str, Meta(pattern=r"\A[0-9a-f]{0,32}\Z")]
+_Range = tuple[RecordNumber, RecordNumber]
+_Box = tuple[float, float, float, float, float, float]
+
+
+class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """The keyframes for which all of this is true.
+
+    Attributes:
+        session: how the session's id begins, hexadecimal; empty = any.
+        client: name that the sender's key is allowed under; None = any.
+        since_ns, until_ns: when the server journaled them, by its wall clock, both inclusive; None = any.
+        numbers: first and last of each range of numbers in their session; None = any.
+        box: x, y, z of two opposite corners, metres, in the map's frame: the sensor was in it, and so is
+            nearly all that it measured; None = anywhere.
+    """
+
+    session: _Session = ""
+    client: Annotated[str, Meta(max_length=32)] | None = None
+    since_ns: Natural | None = None
+    until_ns: Natural | None = None
+    numbers: Annotated[tuple[_Range, ...], Meta(max_length=_MAX_RANGES)] | None = None
+    box: _Box | None = None
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing is named: it would be every keyframe."""
+        return self == Selection()
+
+    def has(self, *, session: bytes, client: str, seq: int, logged_ns: int) -> bool:
+        """Whether a keyframe is selected, as far as that is known without its pose."""
+        return (
+            session.hex().startswith(self.session)
+            and self.client in (None, client)
+            and (self.since_ns is None or logged_ns >= self.since_ns)
+            and (self.until_ns is None or logged_ns <= self.until_ns)
+            and (self.numbers is None or any(first <= seq <= last for first, last in self.numbers))
+        )
+
+
+class ForgottenSession(Struct, frozen=True, kw_only=True):
+    """The keyframes of one session that were selected.
+
+    Attributes:
+        session: its id, hexadecimal.
+        client: name that its key is allowed under; empty = it came without keys.
+        keyframes: that were not forgotten before.
+        selected: all of them, first and last number of each range.
+    """
+
+    session: str
+    client: str
+    keyframes: int
+    selected: tuple[tuple[int, int], ...]
+
+    @property
+    def numbers(self) -> NumberRanges:
+        """All of the selected keyframes."""
+        return NumberRanges(self.selected)
+
+
+class Forgotten(Struct, frozen=True, kw_only=True):
+    """What became of a request to forget.
+
+    Attributes:
+        sessions: that have keyframes of the selection.
+        erased: records whose bytes were deleted from the journal, those of earlier requests included.
+        quarantined: files that were deleted from the quarantine.
+        remains: files of the server that may still hold something of these keyframes.
+        unavailable: sessions with keyframes in the map that its journal has no more: these stay in the map.
+    """
+
+    sessions: tuple[ForgottenSession, ...]
+    erased: int = 0
+    quarantined: int = 0
+    remains: tuple[str, ...] = ()
+    unavailable: tuple[str, ...] = ()
+
+    @property
+    def keyframes(self) -> int:
+        """How many keyframes were forgotten that were not before."""
+        return sum(one.keyframes for one in self.sessions)
+
+    @property
+    def selected(self) -> int:
+        """How many keyframes were selected, those that were forgotten before included."""
+        return sum(len(one.numbers) for one in self.sessions)
