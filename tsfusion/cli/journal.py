@@ -64,7 +64,8 @@ def verify(path: Where, map_: Map = None, json: options.Json = False) -> None:
     Each bad place is named by segment and byte. `damage`: the bytes are not
     those that were written. `torn`: a crash or a power cut took the end of a
     write; it was never acknowledged, and its scanner sends it again. `note`:
-    unusual, but nothing is wrong with the keyframes.
+    unusual, but nothing is wrong with the keyframes. `erased`: a keyframe was
+    deleted on purpose (`tsfusion map forget --erase`).
     """
     from tsfusion.journal.inspection import verify as check
 
@@ -211,6 +212,7 @@ def _describe_info(found: "JournalInfo") -> str:
         f"journal    {found.path}",
         f"keyframes  {found.keyframes}, {size(found.nbytes)}",
         *([f"corrections {found.corrections}"] if found.corrections else []),
+        *([f"erased     {_count(found.erased, 'keyframe')}"] if found.erased else []),
         f"damage     {_loss(found.lost)}",
     ]
     kept = sum(one["bytes"] for one in found.quarantined)
@@ -229,9 +231,10 @@ def _describe_info(found: "JournalInfo") -> str:
 
 def _session(one: "SessionInfo") -> str:
     first, last = _clock(one.first_logged_ns), _clock(one.last_logged_ns)
+    forgotten = f"  {one.forgotten} forgotten" if one.forgotten else ""
     return (
         f"  {one.session[:8]}  {one.client or 'no key':<12} {one.keyframes:>7} keyframes  "
-        f"{one.first_seq}…{one.last_seq}  {first} – {last}{_corrected(one)}"
+        f"{one.first_seq}…{one.last_seq}  {first} – {last}{_corrected(one)}{forgotten}"
     )
 
 

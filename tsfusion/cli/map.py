@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tsfusion.cli import map_view, options, verbs
+from tsfusion.cli import forget, map_view, options, verbs
 from tsfusion.core.counts import count_of
 
 if TYPE_CHECKING:
@@ -20,10 +20,11 @@ _TWICE = "a recording that was sent twice counts twice"
 
 app = typer.Typer(
     cls=verbs.Group,
-    help="Describe, compare, merge, crop, convert and resume saved maps.\n\n"
+    help="Describe, compare, merge, crop, convert and resume saved maps; forget keyframes.\n\n"
     "A saved map is a file (.tsf), or the last checkpoint of a server: its state folder, or the folder of "
-    "one map in it. All of this works while the server runs, and changes nothing of what it reads.",
+    "one map in it. All of this works while the server runs; only `forget` changes what it reads.",
 )
+forget.register(app)
 
 Where = Annotated[
     Path, typer.Argument(metavar="MAP", help="A .tsf file, a state folder, or a map's folder in it.")

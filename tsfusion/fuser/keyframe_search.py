@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion import journal
 from tsfusion.core.errors import DecodeError, InvalidConfig, InvalidKeyframe, JournalError
 from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.fuser.messages import Find, Found, FoundKeyframes, SessionProgress
 from tsfusion.geometry.measured_points import points_world
 from tsfusion.journal import Record, state_folder
 from tsfusion.wire import codec
-from tsfusion.wire.selection import Selection
+from tsfusion.wire.forgetting import Selection
 
 _SLICE_S = 0.05  # seconds at a time
 _REST_S = 0.15  # between two slices while keyframes come
@@ -39,6 +40,8 @@ class KeyframeSearch:
         self._selected: dict[bytes, _Columns] = {}
         self._steps = self._search(find.selection)
         self._next = 0.0  # time.monotonic()
+        self._since_ns: int | None = None
+        self._first_ns: int | None = None  # of the first record in the journal
 
     def is_due(self, *, idle: bool) -> bool:
         """Whether to go on now."""
@@ -57,12 +60,23 @@ class KeyframeSearch:
             return Found(self._find.number, error=str(error))
 
     def _search(self, selection: Selection) -> Iterator[None]:
+        if selection.counts_from_end:
+            selection = selection.at_end(self._last_logged_ns())
         for _, step in self._place.steps():
+            if isinstance(step, Record) and self._first_ns is None:
+                self._first_ns = step.logged_ns
+                self._since_ns = selection.since_ns
             if isinstance(step, Record) and not step.is_correction and self._is_selected(selection, step):
                 self._selected.setdefault(step.session, _Columns(step.client)).add(
                     step, self._poses.is_forgotten(step.session, step.seq)
                 )
             yield
+
+    def _last_logged_ns(self) -> int:
+        for path in reversed(self._place.files()):
+            if stamps := [record.logged_ns for record in journal.records(path)]:
+                return max(stamps)
+        return 0
 
     def _is_selected(self, selection: Selection, record: Record) -> bool:
         return selection.has(
@@ -101,6 +115,8 @@ class KeyframeSearch:
 
     def _unavailable(self) -> Iterator[str]:
         """The sessions that may have selected keyframes in the map which the journal has no more."""
+        if self._first_ns is not None and self._since_ns is not None and self._since_ns >= self._first_ns:
+            return  # those came before
         for key, seq in self._poses.unknown():
             client = self._done[key].client if key in self._done else ""
             own = self._find.selection

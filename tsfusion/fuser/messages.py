@@ -13,9 +13,9 @@ from msgspec import Struct
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.errors import CheckpointError, InvalidConfig, MapError, TsfusionError
 from tsfusion.journal import Position
+from tsfusion.wire.forgetting import Selection
 from tsfusion.wire.health import MeshLayout
 from tsfusion.wire.messages import Command
-from tsfusion.wire.selection import Selection
 
 NOT_WORKING = -1  # instead of a keyframe's index
 MOVING = -2  # likewise: at a keyframe that a correction moves

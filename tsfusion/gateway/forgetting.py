@@ -26,7 +26,7 @@ from tsfusion.fuser.messages import EXPIRED, Find, Found, FoundKeyframes, Saved
 from tsfusion.journal import Journal, Position
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire.corrections import MAX_KEYFRAMES
-from tsfusion.wire.selection import Forgotten, ForgottenSession, Selection
+from tsfusion.wire.forgetting import Forgotten, ForgottenSession, Selection
 
 log = logging.getLogger(__name__)
 

@@ -37,8 +37,8 @@ from tsfusion.gateway.sessions import Sessions
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
 from tsfusion.wire.corrections import SERVER_SESSION
+from tsfusion.wire.forgetting import Forgotten
 from tsfusion.wire.health import Health, MapHealth
-from tsfusion.wire.selection import Forgotten
 from tsfusion.wire.sockets import mesh_topic
 
 log = logging.getLogger(__name__)

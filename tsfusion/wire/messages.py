@@ -11,11 +11,11 @@ from msgspec import Meta, Struct
 
 from tsfusion.core.config import MapName
 from tsfusion.core.errors import DecodeError
+from tsfusion.wire.forgetting import Forgotten, Selection
 from tsfusion.wire.health import Health, MeshLayout, Status
 from tsfusion.wire.keyframe_times import Seq, Stamps
 from tsfusion.wire.record_header import SessionId, WorldName
 from tsfusion.wire.seal import is_damaged, seal
-from tsfusion.wire.selection import Forgotten, Selection
 
 PROTOCOL_VERSION = 2  # of these messages and of which kinds of records a server takes
 # Why a client never sends a keyframe: the reasons in `Ping.skipped`, in words

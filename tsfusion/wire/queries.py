@@ -15,9 +15,9 @@ from tsfusion.geometry.mesh import Mesh
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.connection import Connection
 from tsfusion.wire.curve import ClientKeys
+from tsfusion.wire.forgetting import Forgotten, Selection
 from tsfusion.wire.health import Health, MeshLayout, Status
 from tsfusion.wire.messages import Command, Reply
-from tsfusion.wire.selection import Forgotten, Selection
 from tsfusion.wire.sockets import control_address
 
 _AGAIN_INTERVAL = 0.25  # seconds

@@ -3,12 +3,14 @@
 
 from typing import Annotated
 
+import msgspec
 from msgspec import Meta, Struct
 
 from tsfusion.core.number_ranges import NumberRanges
-from tsfusion.wire.record_header import Natural, RecordNumber
+from tsfusion.wire.record_header import RecordNumber
 
 _MAX_RANGES = 10_000
+_WallClock = Annotated[int, Meta(ge=-(1 << 63), le=(1 << 63) - 1)]
 _Session = Annotated[str, Meta(pattern=r"\A[0-9a-f]{0,32}\Z")]
 _Range = tuple[RecordNumber, RecordNumber]
 _Box = tuple[float, float, float, float, float, float]
@@ -20,7 +22,8 @@ class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
     Attributes:
         session: how the session's id begins, hexadecimal; empty = any.
         client: name that the sender's key is allowed under; None = any.
-        since_ns, until_ns: when the server journaled them, by its wall clock, both inclusive; None = any.
+        since_ns, until_ns: when the server journaled them, by its wall clock, both inclusive; below zero, so
+            long before the last record of the journal. None = any.
         numbers: first and last of each range of numbers in their session; None = any.
         box: x, y, z of two opposite corners, metres, in the map's frame: the sensor was in it, and so is
             nearly all that it measured; None = anywhere.
@@ -28,8 +31,8 @@ class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     session: _Session = ""
     client: Annotated[str, Meta(max_length=32)] | None = None
-    since_ns: Natural | None = None
-    until_ns: Natural | None = None
+    since_ns: _WallClock | None = None
+    until_ns: _WallClock | None = None
     numbers: Annotated[tuple[_Range, ...], Meta(max_length=_MAX_RANGES)] | None = None
     box: _Box | None = None
 
@@ -37,6 +40,17 @@ class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
     def is_empty(self) -> bool:
         """Whether nothing is named: it would be every keyframe."""
         return self == Selection()
+
+    @property
+    def counts_from_end(self) -> bool:
+        """Whether a time is named as before the last record."""
+        return any(one is not None and one < 0 for one in (self.since_ns, self.until_ns))
+
+    def at_end(self, last_ns: int) -> "Selection":
+        """The selection in a journal whose last record has this time."""
+        times = {name: getattr(self, name) for name in ("since_ns", "until_ns")}
+        past = {name: last_ns + one for name, one in times.items() if one is not None and one < 0}
+        return msgspec.structs.replace(self, **past)
 
     def has(self, *, session: bytes, client: str, seq: int, logged_ns: int) -> bool:
         """Whether a keyframe is selected, as far as that is known without its pose."""

@@ -1,0 +1,232 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion map forget`."""
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tsfusion.cli import options, verbs
+from tsfusion.core.counts import count_of
+
+if TYPE_CHECKING:
+    from tsfusion.wire.forgetting import Forgotten, Selection
+
+_MOST_SESSIONS = 20  # printed; --json has all
+_EXAMPLES = (
+    "tsfusion map forget my-maps --session 3f2a91bc",
+    "tsfusion map forget tcp://server:5555 --client robot1 --since 90 --erase",
+)
+_KEPT = "their records are still in the journal: --erase deletes them, also later"
+_REMAINS = (
+    "of each erased keyframe the journal keeps session, number and client, so that it is not taken again, "
+    "and the corrected poses that its client sent",
+    "not touched: meshes, pictures and maps that were exported (OUT/map.tsf), copies and snapshots of the "
+    "disk, and what waits in a scanner's spool (`tsfusion spool list` there)",
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Make `forget` a verb of `tsfusion map`."""
+    verbs.verb(app, *_EXAMPLES)(forget)
+
+
+def forget(
+    where: Annotated[
+        str,
+        typer.Argument(
+            metavar="STATE|ADDRESS",
+            help="A state folder that no server uses, a map's folder in it, or a server: tcp://HOST:PORT.",
+        ),
+    ],
+    *,
+    session: Annotated[
+        str | None, typer.Option(metavar="ID", help="Of this session: how its id begins (`journal info`).")
+    ] = None,
+    client: Annotated[str | None, typer.Option(metavar="NAME", help="Of the client with this key.")] = None,
+    since: Annotated[
+        str | None,
+        typer.Option(metavar="TIME", help="That came then or later: ISO, or seconds before the last record."),
+    ] = None,
+    until: Annotated[str | None, typer.Option(metavar="TIME", help="That came then or earlier.")] = None,
+    keyframes: Annotated[
+        str | None, typer.Option(metavar="NUMBERS", help="With these numbers in their session: 3-17,20.")
+    ] = None,
+    box: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(
+            metavar="X Y Z X Y Z",
+            help="Taken in this box of the map, metres, and nine tenths of their points in it.",
+        ),
+    ] = None,
+    erase: Annotated[
+        bool, typer.Option("--erase", help="Also delete them from the journal and the quarantine.")
+    ] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say which that would be.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    map_: Annotated[str | None, typer.Option("--map", metavar="NAME", help="Which map.")] = None,
+    control: options.Control = None,
+    key: options.Key = None,
+    server_key: options.ServerKey = None,
+    json: options.Json = False,
+    help_all: verbs.HelpAll = None,
+) -> None:
+    """Take keyframes out of a map for good, exactly: as if they had never come.
+
+    Several flags select what fits all of them. The map of a running server
+    follows within seconds (`status`: corrections_waiting); that of a folder
+    is saved at the end. No later correction brings them back; a keyframe
+    that arrives later is a new one. Where the server has keys, a client may
+    forget its own keyframes, and others' with `keys allow NAME --forget`.
+
+    Exit status 1 also when nothing fits, or when some that fit stay in the
+    map because its journal has them no more.
+    """
+    from tsfusion.core.errors import JournalError
+
+    selection = _selection(
+        session=session, client=client, since=since, until=until, keyframes=keyframes, box=box
+    )
+    link = {"control": control, "key": key, "server_key": server_key}
+    with _target(where, map_, link, quiet=json) as ask:
+        found = ask(selection, erase=False, dry_run=True)
+        if not found.selected and not found.unavailable:
+            raise JournalError(f"{where}: no keyframe fits, so nothing is forgotten")
+        if not dry_run and (found.keyframes or (erase and found.selected)):
+            _confirm(found, erase=erase, yes=yes)
+            found = ask(selection, erase=erase, dry_run=False)
+    if json:
+        import msgspec
+
+        from tsfusion.cli import output
+
+        counts = {"dry_run": dry_run, "keyframes": found.keyframes, "selected": found.selected}
+        output.as_json({**counts, **msgspec.structs.asdict(found)})
+    else:
+        typer.echo("\n".join(_lines(found, erase=erase, dry_run=dry_run)))
+    if found.unavailable:
+        raise JournalError(
+            "keyframes that the journal has no more stay in the map, also where they would fit: of session "
+            + "; ".join(found.unavailable)
+        )
+
+
+def _selection(
+    *,
+    session: str | None,
+    client: str | None,
+    since: str | None,
+    until: str | None,
+    keyframes: str | None,
+    box: tuple[float, ...] | None,
+) -> "Selection":
+    """The keyframes that the flags name; raises InvalidConfig for nonsense, or when there is no flag."""
+    import math
+
+    from tsfusion.core import number_ranges
+    from tsfusion.core.config import make_settings
+    from tsfusion.core.errors import InvalidConfig
+    from tsfusion.wire.forgetting import Selection
+
+    if box is not None and not all(map(math.isfinite, box)):
+        raise InvalidConfig(f"--box must be six finite numbers, got {' '.join(map(str, box))}")
+    if session is not None and not session:
+        raise InvalidConfig("--session must be how a session's id begins, got nothing")
+    made = make_settings(
+        Selection,
+        {
+            "session": (session or "").lower(),
+            "client": client,
+            "since_ns": None if since is None else _moment_ns(since),
+            "until_ns": None if until is None else _moment_ns(until),
+            "numbers": None if keyframes is None else number_ranges.parse(keyframes),
+            "box": box,
+        },
+    )
+    if made.is_empty:
+        raise InvalidConfig(
+            "name what is to be forgotten: --session, --client, --since, --until, --keyframes or --box"
+        )
+    return made
+
+
+def _moment_ns(text: str) -> int:
+    """A time of the wall clock; below zero, so long before the last record."""
+    import time
+
+    from tsfusion.journal import selection
+
+    now = time.time_ns()
+    try:
+        float(text)
+    except ValueError:
+        return selection.moment_ns(text, now)
+    return min(selection.moment_ns(text, now) - now, -1)
+
+
+@contextmanager
+def _target(
+    where: str, map_: str | None, link: dict[str, str | None], *, quiet: bool
+) -> "Iterator[Callable[..., Forgotten]]":
+    """Forget keyframes of a server's map, or of one that no server uses."""
+    if "://" in where:
+        from tsfusion.core.config import DEFAULT_MAP
+        from tsfusion.wire import queries
+        from tsfusion.wire.curve import client_keys
+
+        keys = client_keys(link["key"], link["server_key"])
+        at = {"control": link["control"], "map_name": map_ or DEFAULT_MAP, "keys": keys}
+        yield partial(queries.forget, where, **at)  # type: ignore[arg-type]
+        return
+    from tsfusion.cli import progress
+    from tsfusion.core.errors import InvalidConfig
+    from tsfusion.pipelines.stored_map import open_map
+
+    if given := [name for name, value in link.items() if value is not None]:
+        flag = "--" + given[0].replace("_", "-")
+        raise InvalidConfig(f"{flag} has no effect on {where}: only a live server (tcp://…) has one")
+    with progress.shown(quiet=quiet) as display:
+        display.stage(f"opening the map of {where}")
+        with open_map(Path(where), map_) as opened:
+            display.stage(f"forgetting keyframes of {where}")
+            yield opened.forget
+
+
+def _confirm(found: "Forgotten", *, erase: bool, yes: bool) -> None:
+    """Ask whether to go on; raises InvalidConfig where nobody can be asked."""
+    from tsfusion.core.errors import InvalidConfig
+
+    what = f"{count_of(found.selected, 'keyframe')} of {count_of(len(found.sessions), 'session')}"
+    what += " would be forgotten" + (" and erased" if erase else "")
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise InvalidConfig(f"{what}, for good: say --yes")
+    typer.echo("\n".join(_rows(found)), err=True)
+    typer.confirm(f"{what}, for good. Go on?", abort=True, err=True)
+
+
+def _lines(found: "Forgotten", *, erase: bool, dry_run: bool) -> list[str]:
+    what = count_of(found.keyframes, "keyframe")
+    if dry_run:
+        known = found.selected - found.keyframes
+        more = f"; {count_of(known, 'more that fits is', 'more that fit are')} forgotten already"
+        return [f"{what} would be forgotten{more if known else ''}", *_rows(found)]
+    lines = [f"forgot {what}", *_rows(found)]
+    if not erase:
+        return [*lines, _KEPT]
+    aside = f", and {count_of(found.quarantined, 'file')} of the quarantine" if found.quarantined else ""
+    lines.append(f"erased {count_of(found.erased, 'record')} of the journal{aside}")
+    lines += [f"left: {note}" for note in _REMAINS]
+    return lines + [f"left: {path} (delete it, if it is not needed)" for path in found.remains]
+
+
+def _rows(found: "Forgotten") -> list[str]:
+    rows = [f"  {one.session[:8]}  {one.client or 'no key':<12} {one.numbers}" for one in found.sessions]
+    if len(rows) > _MOST_SESSIONS:
+        rows[_MOST_SESSIONS:] = [f"  … and {len(rows) - _MOST_SESSIONS} more sessions: --json lists all"]
+    return rows
