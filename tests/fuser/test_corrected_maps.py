@@ -381,6 +381,78 @@ def test_a_checkpoint_that_is_to_be_alone_replaces_the_one_before(recorded: Reco
     assert opened(recorded.state)[0].ready().keyframes == 3
 
 
+def expired(link: Link) -> messages.Found | None:
+    """The last message of keyframes that are too old or too far away."""
+    found = [one for one, _ in link.sent if isinstance(one, messages.Found)]
+    return next((one for one in reversed(found) if one.number == messages.EXPIRED), None)
+
+
+def journal_expired(recorded: Recorded, fuser: Fuser, link: Link) -> None:
+    """Do as the gateway does with keyframes that are to leave."""
+    while fuser.search_due(idle=True):
+        before = len(link.sent)
+        fuser.search()
+        for found in (one for one, _ in link.sent[before:] if isinstance(one, messages.Found)):
+            for session, seqs in found_numbers(found).items():
+                recorded.forget(session, seqs)
+                fuser.handle(recorded.orders[-1])
+    settle(fuser)
+
+
+@pytest.mark.parametrize(
+    ("bound", "stay"),
+    [
+        ({"keep_keyframes": 3}, [4, 5, 6]),
+        ({"keep_radius": 0.07}, [4, 5, 6]),
+        ({"keep_seconds": 25.0}, [4, 5, 6]),
+        ({"keep_keyframes": 5, "keep_radius": 0.04}, [5, 6]),
+    ],
+)
+def test_a_map_of_what_is_now_keeps_a_window(
+    tmp_path: Path, bound: dict[str, Any], stay: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded = Recorded(tmp_path)
+    for number in range(6):
+        clock_ns = 10**18 + number * 10**10
+        monkeypatch.setattr("tsfusion.journal.mcap_layout.wall_clock_ns", lambda ns=clock_ns: ns)
+        recorded.add()
+    fuser, link = fused(recorded, **bound)
+    assert progress(link).waiting == 1  # nobody takes it for settled
+    journal_expired(recorded, fuser, link)
+    assert fuser._map.poses._sessions[SESSIONS[0]].seqs.tolist() == stay
+    assert progress(link).waiting == 0
+    assert fuser._volume.map_hash() == recorded.fresh().map_hash()
+    fuser.handle(messages.Save())
+    again, link = opened(tmp_path, **bound)
+    journal_expired(recorded, again, link)
+    assert expired(link) is None
+
+
+def test_a_window_counts_all_sessions_and_goes_by_corrected_poses(recorded: Recorded) -> None:
+    recorded.add(SESSIONS[1])
+    fuser, link = fused(recorded, keep_radius=1.0)
+    journal_expired(recorded, fuser, link)
+    assert expired(link) is None
+    recorded.correct({1: pose(3.0)})
+    fuser.handle(recorded.orders[-1])
+    journal_expired(recorded, fuser, link)
+    assert found_numbers(expired(link) or messages.Found(0)) == {SESSIONS[0]: [1]}
+    assert fuser._volume.map_hash() == recorded.fresh().map_hash()
+
+
+def test_a_journal_at_its_limit_takes_the_oldest_from_the_window(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path, segment_bytes=1)
+    for _ in range(4):
+        recorded.add()
+    fuser, link = fused(recorded, keep_keyframes=100)
+    journal_expired(recorded, fuser, link)
+    assert (expired(link), progress(link).first_segment) == (None, 1)
+    fuser.handle(messages.Expire(3))
+    journal_expired(recorded, fuser, link)
+    assert (progress(link).keyframes, progress(link).first_segment) == (2, 3)
+    assert fuser._volume.map_hash() == recorded.fresh().map_hash()
+
+
 class Life(RuleBasedStateMachine):
     """A map whose server is killed and started again while keyframes come, are corrected and forgotten."""
 

@@ -53,6 +53,27 @@ def let_go(retention: JournalRetention, folder: Folder, fuser: Fuser) -> int:
     return folder.below
 
 
+def test_a_map_that_forgets_lets_keyframes_go_before_their_segment_goes() -> None:
+    retention, folder, session = ten_segments()
+    fuser = Fuser()
+    retention.on_ready()
+    session.in_map = 10
+
+    def step(window_from: int) -> int:
+        retention.step(cast(FuserSupervisor, fuser), (), window_from=window_from)
+        return folder.below
+
+    assert step(3) == 0
+    assert step(3) == 0
+    assert [one for one in fuser.asked if isinstance(one, fuser_messages.Expire)] == [
+        fuser_messages.Expire(4)
+    ]
+    for window_from, may_go in ((4, 0), (6, 4), (0, 6)):
+        step(window_from)
+        retention.on_saved(fuser_messages.Saved(True))
+        assert step(window_from) == may_go
+
+
 def test_what_two_checkpoints_hold_may_go() -> None:
     retention, folder, session = ten_segments()
     fuser = Fuser()

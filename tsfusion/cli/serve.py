@@ -33,6 +33,12 @@ SERVER_OPTIONS: dict[str, Any] = {
                      "Prometheus and health checks, such as at 127.0.0.1:9464."),
     "log_format": _flag("--log-format", "FORMAT", "Log on stderr as text or json."),
     "log_level": _flag("--log-level", "LEVEL", "Log from debug, info, warning or error on."),
+    "keep_seconds": Annotated[float | None, options.option(
+        "--keep-seconds", "SECONDS", "Forget what came so long before the newest keyframe.", rare=True)],
+    "keep_keyframes": Annotated[int | None, options.option(
+        "--keep-keyframes", "N", "Forget all but the newest N keyframes of a map.", rare=True)],
+    "keep_radius": Annotated[float | None, options.option(
+        "--keep-radius", "METRES", "Forget what was seen farther from the newest keyframe.", rare=True)],
     "keys": _flag("--keys", "DIR",
                   "Who may connect: `tsfusion keys`; needed beyond this machine."),
 }  # fmt: skip

@@ -216,6 +216,10 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     checkpoint_every: Annotated[int, Meta(ge=0)] = 500  # keyframes; 0 = only at shutdown
     mesh_interval: NonNegative = 0.2  # seconds between incremental meshes while busy
     journal_bytes: Bytes | None = None  # per map; the oldest keyframes are deleted first; None = keep all
+    # Of each map, against its newest keyframe, whoever sent it; what is beyond is forgotten. None = keep all
+    keep_seconds: Positive | None = None  # from a keyframe's coming to the newest one's
+    keep_keyframes: Annotated[int, Meta(ge=1)] | None = None  # the newest ones
+    keep_radius: Positive | None = None  # metres from the sensor of the newest one
     min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left free on the disk; keyframes wait for that
     quarantine_bytes: Bytes = 256 << 20  # per map; keyframes that could not be fused, the newest ones
     memory_bytes: Bytes = 512 << 20  # of the gateway; near it, connections are cut off, then all of them

@@ -38,6 +38,14 @@ class NumberRanges:
     def __str__(self) -> str:
         return ", ".join(f"{first}-{last}" if last > first else f"{first}" for first, last in self)
 
+    def mask(self, numbers: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(n,) which of these numbers are in the set."""
+        if not len(self._ranges):
+            return np.zeros(len(numbers), np.bool_)
+        at = np.searchsorted(self._ranges[:, 0], numbers, side="right") - 1
+        found: NDArray[np.bool_] = (at >= 0) & (numbers <= self._ranges[at, 1])
+        return found
+
     def add(self, numbers: NDArray[np.int64]) -> None:
         """Add numbers, in any order."""
         self._ranges = _merged(np.concatenate([self._ranges, np.repeat(numbers[:, None], 2, axis=1)]))

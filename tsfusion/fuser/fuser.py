@@ -25,10 +25,11 @@ from tsfusion.core import process
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
+from tsfusion.fuser.keep_window import KeepWindow
 from tsfusion.fuser.keyframe_search import KeyframeSearch
 from tsfusion.fuser.live_mesh import LiveMesh, mesh_frames
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
-from tsfusion.fuser.pose_mover import PoseMover
+from tsfusion.fuser.pose_mover import REST_FACTOR, PoseMover
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import state_folder
@@ -45,6 +46,8 @@ LOCK = "fuser.lock"  # in the map's folder
 _PATIENCE_S = 10.0  # for a record that the system refuses to read, or whose segment is not there
 _RETRY_MS = 500  # until it is tried again
 _CARVING = 10  # times `quota_cost` where rays also vote for the free space before them
+# Where keyframes leave as they come, each costs as much as another that comes: half of the time for moves
+_WINDOW_REST_FACTOR = 1.0
 _MORE_MS = 50  # milliseconds within which the next record comes, if the gateway said that one waits
 
 log = logging.getLogger(__name__)
@@ -85,6 +88,14 @@ class Fuser:
             sparing=lambda: self._memory_beyond(-_FOR_KEYFRAMES),
             send=self._send,
         )
+        self._window = KeepWindow(
+            self._map.poses,
+            self._folder / state_folder.JOURNAL_FOLDER,
+            seconds=begin.keep_seconds,
+            keyframes=begin.keep_keyframes,
+            radius=begin.keep_radius,
+            send=self._send,
+        )
         self._mover = PoseMover(
             self._volume,
             self._map.poses,
@@ -93,6 +104,8 @@ class Fuser:
             is_away=self._journal_is_away,
             say=self._send,
             moves=begin.moves,
+            expects=lambda: int(self._window.is_behind),
+            rest_factor=_WINDOW_REST_FACTOR if self._window.is_set else REST_FACTOR,
         )
 
     def ready(self) -> fuser_messages.Ready:
@@ -118,6 +131,8 @@ class Fuser:
             self._live_mesh.watch(message.wanted)
         elif isinstance(message, fuser_messages.Find):
             self._searches.append(KeyframeSearch(message, self._folder, self._map.poses, self._map.done))
+        elif isinstance(message, fuser_messages.Expire):
+            self._window.expire(message.before_segment)
         elif isinstance(message, fuser_messages.Save):
             self._checkpoint(alone=message.alone)
         elif isinstance(message, fuser_messages.Finish):
@@ -141,6 +156,8 @@ class Fuser:
             return _RETRY_MS
         if self._searches:
             return 0
+        if self._window.is_behind:
+            return _RETRY_MS
         return round(1000 * self._mover.seconds_left) + 1 if self._mover.waiting else None
 
     @property
@@ -180,11 +197,16 @@ class Fuser:
 
     def search_due(self, idle: bool) -> bool:
         """Whether to go on looking for keyframes that are to be forgotten."""
-        return bool(self._searches) and self._searches[0].is_due(idle=idle)
+        if self._searches:
+            return self._searches[0].is_due(idle=idle)
+        return self._window.is_due(idle=idle)
 
     def search(self) -> None:
         """Look for keyframes that are to be forgotten, for a moment."""
-        if (found := self._searches[0].go_on()) is not None:
+        if not self._searches:
+            self._window.look()
+            self._mover.say()
+        elif (found := self._searches[0].go_on()) is not None:
             self._searches.popleft()
             self._send(found)
 
@@ -238,11 +260,16 @@ class Fuser:
             if not self._integrate(found, order.client).samples:
                 return NO_SAMPLES, self._volume.why_no_samples(found)
             poses.add(order.session, order.seq, order.position, found)
+            self._window.note_keyframe()
+            if self._window.is_behind:
+                self._mover.say()
             return None, ""
         if found.target is None:
             poses.correct(order.session, found)
+            self._window.note_keyframe()
         else:
             poses.forget(found.target, found.removed)
+            self._window.note_record()
         self._mover.say()
         return None, ""
 

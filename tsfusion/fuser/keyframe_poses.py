@@ -45,6 +45,24 @@ class Move(NamedTuple):
     wanted: NDArray[np.float64] | None
 
 
+class KeptKeyframes(NamedTuple):
+    """The keyframes that are in a map, and are to stay.
+
+    Attributes:
+        sessions: their sessions.
+        session: (n,) int64, the place in `sessions` of each keyframe's.
+        seqs, segments, offsets: (n,) int64, number and position of each.
+        centers: (n, 3) float64 metres, where the sensor was.
+    """
+
+    sessions: list[bytes]
+    session: NDArray[np.int64]
+    seqs: NDArray[np.int64]
+    segments: NDArray[np.int64]
+    offsets: NDArray[np.int64]
+    centers: NDArray[np.float64]
+
+
 class _SessionPoses:
     """The keyframes of one session that the map took, in the order of their numbers."""
 
@@ -85,6 +103,12 @@ class _SessionPoses:
             self.unknown = gone[-1]
             self.drop(0, count)
         return gone
+
+    def kept(self) -> NDArray[np.bool_]:
+        """(n,) which of them are in the map and not forgotten."""
+        first = np.array(self.fused).reshape(-1, _POSE)[:, 0]
+        found: NDArray[np.bool_] = ~np.isnan(first) & ~self.forgotten.mask(np.array(self.seqs))
+        return found
 
     def saved(self) -> dict[str, Any]:
         T = self.T_map_odometry
@@ -180,6 +204,41 @@ class KeyframePoses:
             return None
         _, rows = self._waiting.get((session, seq), (0, poses.rows(at)))
         return _pose(rows)
+
+    def kept(self) -> KeptKeyframes:
+        """The keyframes that are in the map and not forgotten; where they are to be counts."""
+        keys, all_ = list(self._sessions), list(self._sessions.values())
+        masks = [one.kept() for one in all_]
+        numbers = [np.full(int(mask.sum()), number) for number, mask in enumerate(masks)]
+
+        def columns(name: str) -> NDArray[np.int64]:
+            found = [np.array(getattr(one, name))[mask] for one, mask in zip(all_, masks, strict=True)]
+            return np.concatenate([np.zeros(0, np.int64), *found])
+
+        return KeptKeyframes(
+            keys,
+            np.concatenate([np.zeros(0, np.int64), *numbers]),
+            columns("seqs"),
+            columns("segments"),
+            columns("offsets"),
+            self._centers(masks),
+        )
+
+    def _centers(self, masks: list[NDArray[np.bool_]]) -> NDArray[np.float64]:
+        centers = {
+            key: np.array(poses.fused).reshape(-1, 3, 4)[:, :, 3].copy()
+            for key, poses in self._sessions.items()
+        }
+        for (key, seq), (_, rows) in self._waiting.items():
+            if not np.isnan(rows[0]):
+                centers[key][self._sessions[key].place_of(seq)] = rows[3::4]
+        kept = [found[mask] for found, mask in zip(centers.values(), masks, strict=True)]
+        return np.concatenate([np.zeros((0, 3)), *kept])
+
+    @property
+    def first_segment(self) -> int:
+        """The lowest number of a segment with a keyframe of the map; 0 = there is none."""
+        return min((one.segments[0] for one in self._sessions.values() if one.segments), default=0)
 
     def is_forgotten(self, session: bytes, seq: int) -> bool:
         """Whether the server was told to forget a keyframe."""

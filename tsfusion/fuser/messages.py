@@ -34,6 +34,7 @@ class Begin(Struct, frozen=True, tag="begin"):
         memory_bytes: that the process may allocate.
         quota_cost, quota_map: as in the server's settings.
         moves: whether to fuse keyframes where corrections say; False = others died of that.
+        keep_seconds, keep_keyframes, keep_radius: as in the server's settings.
     """
 
     folder: str
@@ -46,6 +47,9 @@ class Begin(Struct, frozen=True, tag="begin"):
     quota_cost: int
     quota_map: float
     moves: bool = True
+    keep_seconds: float | None = None
+    keep_keyframes: int | None = None
+    keep_radius: float | None = None
 
 
 class SessionProgress(Struct, frozen=True, array_like=True):
@@ -88,6 +92,12 @@ class Find(Struct, frozen=True, tag="find"):
 
     number: int
     selection: Selection
+
+
+class Expire(Struct, frozen=True, tag="expire"):
+    """Let keyframes of segments below this number go, for the journal is at its limit."""
+
+    before_segment: int
 
 
 class Publish(Struct, frozen=True, tag="publish"):
@@ -135,6 +145,7 @@ class CorrectionProgress(Struct, frozen=True, tag="corrected"):
         moved: keyframes that were fused at another pose, or taken out, by this process.
         seconds: of work for that.
         forgotten: of the removed, those that the server was told to forget.
+        first_segment: the oldest segment of the journal with a keyframe of the map; 0 = there is none.
     """
 
     keyframes: int
@@ -144,6 +155,7 @@ class CorrectionProgress(Struct, frozen=True, tag="corrected"):
     moved: int
     seconds: float
     forgotten: int = 0
+    first_segment: int = 0
 
 
 class Saved(Struct, frozen=True, tag="saved"):
@@ -266,7 +278,7 @@ class FuserReply(Struct, frozen=True, tag="answer"):
     layout: MeshLayout | None = None
 
 
-ToFuser = Begin | Fuse | FuserQuery | Find | Publish | Save | Finish
+ToFuser = Begin | Fuse | FuserQuery | Find | Expire | Publish | Save | Finish
 ToGateway = Started | Ready | Failed | Done | CorrectionProgress | Saved | Found | Held | Meshed | FuserReply
 to_fuser: "msgspec.msgpack.Decoder[ToFuser]" = msgspec.msgpack.Decoder(ToFuser)
 to_gateway: "msgspec.msgpack.Decoder[ToGateway]" = msgspec.msgpack.Decoder(ToGateway)

@@ -21,7 +21,7 @@ from tsfusion.wire import codec
 if TYPE_CHECKING:
     from tsfusion.tsdf.volume import Volume
 
-_REST_FACTOR = 3  # no move for three times as long as the last took: a quarter of a busy fuser's time
+REST_FACTOR = 3.0  # a quarter of a busy fuser's time is for moves
 _RETRY_S = 0.5  # until a record that the system refuses to read, or whose folder is away, is tried again
 _PATIENCE_S = 10.0  # for it; then the keyframe stays where it is
 _SAY_INTERVAL = 0.2  # seconds between two messages of progress
@@ -37,6 +37,8 @@ class PoseMover:
         is_away: whether the journal's folder is not to be found.
         say: takes each message of progress.
         moves: False = none is moved; those that wait for it count as unavailable.
+        expects: how many more will wait in a moment; counted, that nobody takes the map for settled.
+        rest_factor: after a move, so many times as long as it took none is made while keyframes come.
     """
 
     def __init__(
@@ -49,11 +51,14 @@ class PoseMover:
         is_away: Callable[[], bool],
         say: Callable[[CorrectionProgress], None],
         moves: bool = True,
+        expects: Callable[[], int] = lambda: 0,
+        rest_factor: float = REST_FACTOR,
     ) -> None:
         self.moved = 0  # keyframes
         self._volume, self._poses, self._folder = volume, poses, folder
         self._integrate, self._is_away, self._say = integrate, is_away, say
         self._moves = moves
+        self._expects, self._rest_factor = expects, rest_factor
         self._seconds = 0.0
         self._next = 0.0  # time.monotonic()
         self._held_since: float | None = None
@@ -81,11 +86,12 @@ class PoseMover:
         return CorrectionProgress(
             self._volume.keyframes,
             self._poses.removed,
-            self.waiting,
+            self.waiting + self._expects(),
             self._poses.unavailable + self._poses.waiting - self.waiting,
             self.moved,
             self._seconds,
             self._poses.forgotten,
+            self._poses.first_segment,
         )
 
     def say(self) -> None:
@@ -112,7 +118,7 @@ class PoseMover:
         self._held_since = None
         now = time.monotonic()
         self._seconds += now - began
-        self._next = now + _REST_FACTOR * (now - began)
+        self._next = now + self._rest_factor * (now - began)
         if not self.waiting or now - self._said > _SAY_INTERVAL:
             self.say()
         return True

@@ -56,6 +56,9 @@ class FuserSupervisor:
             server.fuser_memory_bytes or process.physical_memory_bytes() * 3 // 4,
             server.quota_cost,
             server.quota_map,
+            keep_seconds=server.keep_seconds,
+            keep_keyframes=server.keep_keyframes,
+            keep_radius=server.keep_radius,
         )
         self._early_deaths = 0  # in a row, of processes that were not at work on a keyframe
         self._blame: dict[int, int] = {}  # index of a keyframe → weight of the deaths at it

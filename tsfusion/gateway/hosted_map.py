@@ -67,6 +67,7 @@ class HostedMap:
         self.sessions = Sessions()
         self.warm = False  # the fuser has been ready once: from then on it is known what the map has
         self._metrics = metrics
+        self._keeps_window = (server.keep_seconds, server.keep_keyframes, server.keep_radius) != (None,) * 3
         self._last_keyframe: float | None = None  # time.monotonic()
         self._moved = 0.0  # time.monotonic(): the fuser answered, or had nothing to answer
         self._loss = ""
@@ -234,7 +235,8 @@ class HostedMap:
         self._backlog.hand_out(self.fuser)
         self.disk.step()
         if not self.disk.is_away:
-            self._retention.step(self.fuser, self.outcomes.unmeshed)
+            needed = self.outcomes.moves.first_segment if self._keeps_window else None
+            self._retention.step(self.fuser, self.outcomes.unmeshed, window_from=needed)
         self._save_again()
         self._forget()
         return for_people

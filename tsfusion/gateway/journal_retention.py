@@ -35,9 +35,14 @@ class JournalRetention:
         self._in_last = self._in_previous = 0
         self._saving = False
         self._saved_at = float("-inf")  # time.monotonic()
+        self._expired = 0  # keyframes of lower segments were let go
+        self._window_from: int | None = None
+        # Segments below these have no keyframe that the last two checkpoints hold and that is to leave
+        self._window = (0, 0)
 
     def on_ready(self) -> None:
         """Note that a fuser began with the last checkpoint."""
+        self._expired = 0
         self._saving = False
         self._in_last = self._first_needed()
 
@@ -47,6 +52,7 @@ class JournalRetention:
         self._saved_at = time.monotonic()
         if saved.written:
             self._in_previous, self._in_last = self._in_last, self._first_needed()
+            self._window = (self._window[1], self._window_from or 0)
 
     def _first_needed(self) -> int:
         """The number of the oldest segment with a keyframe that the map does not have."""
@@ -57,19 +63,33 @@ class JournalRetention:
         )
         return min(unfused, default=self._journal.segment)
 
-    def step(self, fuser: FuserSupervisor, needed: Iterable[int]) -> None:
+    def step(self, fuser: FuserSupervisor, needed: Iterable[int], *, window_from: int | None = None) -> None:
         """Delete segments if the journal is too large, and ask for a checkpoint if that is not enough.
 
         Args:
             needed: indices of keyframes that must stay in the index.
+            window_from: the oldest segment with a keyframe of a map that is to forget old ones, which takes
+                their records: it lets them go before their segment does. None = none is forgotten.
         """
+        self._window_from = None if window_from is None else window_from or self._journal.segment
         if self._max_bytes is None or self._journal.nbytes <= self._max_bytes:
             return
         try:
-            self._journal.retire(self._in_previous, self._max_bytes)
+            below = self._in_previous
+            if self._window_from is not None:
+                below = min(below, *self._window)
+                self._expire(fuser, self._window_from)
+            self._journal.retire(below, self._max_bytes)
             self._index.forget(self._journal.first, self._sessions, [*needed, *fuser.in_flight])
         except JournalError as error:
             log.warning("%s", error)
         due = not self._saving and time.monotonic() - self._saved_at > _SAVE_INTERVAL
         if due and fuser.ready and self._journal.nbytes > self._max_bytes:
             self._saving = fuser.send(fuser_messages.Save())
+
+    def _expire(self, fuser: FuserSupervisor, window_from: int) -> None:
+        """Have the keyframes of the oldest segment forgotten, so that it can be deleted."""
+        before = window_from + 1
+        is_due = window_from < self._journal.segment and before > self._expired
+        if is_due and fuser.ready and fuser.send(fuser_messages.Expire(before)):
+            self._expired = before

@@ -76,6 +76,23 @@ def read(folder: Path, position: Position) -> Record:
     return read_at(segment_path(folder, position.segment), position.offset)
 
 
+def logged_ns(folder: Path, position: Position) -> int:
+    """Wall clock of a record by its position; only the first bytes of it are read, and none is checked.
+
+    Raises:
+        JournalError: when it is not there.
+    """
+    path = segment_path(folder, position.segment)
+    try:
+        with SegmentFile(path) as source:
+            head = mcap_layout.parse_head(source.read(position.offset, mcap_layout.HEAD_BYTES))
+    except OSError as error:
+        raise journal_error("read", path, error) from error
+    if head is None:
+        raise JournalError(f"{path} holds no whole keyframe at byte {position.offset}")
+    return head.logged_ns
+
+
 def read_at(path: Path, offset: int) -> Record:
     """One record of a segment file.
 
