@@ -4,9 +4,10 @@
     python scripts/chaos.py --seeds 20                20 runs of 300 keyframes and 12 kills, a JSON line each
     python scripts/chaos.py --first 7 --seeds 1       one of them again; --keep FOLDER leaves its files there
 
-A run is good when the journal has every keyframe exactly once and in order, and the map's hash is that of an
-undisturbed one. The exit status is 1 unless all are. The seed fixes the plan; what the machine makes of it
-differs from run to run.
+Meanwhile the server is told to forget keyframes, and to erase some of them. A run is good when the journal
+has every keyframe exactly once and in order, less those that were erased, and the map's hash is that of a
+fresh one of those that were not forgotten, at their final poses. The exit status is 1 unless all are.
+The seed fixes the plan; what the machine makes of it differs from run to run.
 """
 
 import argparse
@@ -28,6 +29,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=1, help="the first seed")
     parser.add_argument("--keyframes", type=int, default=300)
     parser.add_argument("--kills", type=int, default=12)
+    parser.add_argument("--forgets", type=int, default=5, help="requests to forget keyframes")
     parser.add_argument("--keep", type=Path, help="leave the files of each run here")
     options = parser.parse_args()
     good = 0
@@ -35,7 +37,8 @@ def main() -> int:
         with tempfile.TemporaryDirectory(prefix="tsfusion-chaos-") as scratch:
             folder = Path(scratch) if options.keep is None else options.keep / f"seed-{seed}"
             folder.mkdir(parents=True, exist_ok=True)
-            result = run(seed, folder, keyframes=options.keyframes, kills=options.kills)
+            counts = {"keyframes": options.keyframes, "kills": options.kills, "forgets": options.forgets}
+            result = run(seed, folder, **counts)
         good += not result.problems
         print(msgspec.json.encode(result).decode(), flush=True)
     print(f"{good} of {options.seeds} good", file=sys.stderr)

@@ -7,6 +7,7 @@ from typing import Literal
 from msgspec import Struct
 
 Kind = Literal["server", "fuser", "scanner"]
+Way = Literal["session", "numbers", "until", "box"]
 KINDS: tuple[Kind, ...] = ("server", "fuser", "scanner")
 
 
@@ -25,6 +26,23 @@ class Attack(Struct, frozen=True):
     ready: bool
     wait: float
     hold: float = 0.0
+
+
+class Forgetting(Struct, frozen=True):
+    """Keyframes that the server is told to forget, again and again until it says that it did.
+
+    Attributes:
+        keyframes: not before so many are in the journal.
+        way: `session` = the first ones of one; `numbers` = a part of them; `until` = all that came before
+            some time; `box` = those that were taken in a part of the map.
+        share: how much, 0 to 1.
+        erase: also delete them from the journal.
+    """
+
+    keyframes: int
+    way: Way
+    share: float
+    erase: bool
 
 
 class Fault(Struct, frozen=True):
@@ -55,6 +73,16 @@ def on_server(rng: random.Random, keyframes: int, kills: int) -> list[Attack]:
             hold = rng.choice([0.0, rng.uniform(0.1, 0.4)])
             planned.append(Attack(kind, at, True, rng.uniform(0.0, 1.5), hold))
     return planned
+
+
+def on_map(rng: random.Random, keyframes: int, count: int) -> list[Forgetting]:
+    """Requests to forget, most of them of few keyframes."""
+    ways: list[Way] = ["numbers", "until", "box", "numbers", "session"]
+    moments = sorted(rng.randrange(keyframes // 4, keyframes) for _ in range(count))
+    return [
+        Forgetting(at, ways[i % len(ways)], rng.uniform(0.05, 0.3), rng.random() < 0.5)
+        for i, at in enumerate(moments)
+    ]
 
 
 def fault(rng: random.Random) -> Fault:

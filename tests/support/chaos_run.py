@@ -13,9 +13,9 @@ from collections import Counter
 from pathlib import Path
 
 from bad_network import Proxy
-from chaos_plan import KINDS, Attack, Kind, fault, on_scanners, on_server
+from chaos_plan import KINDS, Attack, Forgetting, Kind, fault, on_map, on_scanners, on_server
 from delivery_verdict import client_problems, server_problems, verify
-from keyframes_and_servers import UNSECURED, Secured, secured, until, wall
+from keyframes_and_servers import NUMBERED_NS, UNSECURED, Secured, secured, until, wall
 from msgspec import Struct
 from scanner_process import Plan, journals, plan_in
 from supervisors import PATIENCE, Daemon, Scanner
@@ -23,9 +23,14 @@ from supervisors import PATIENCE, Daemon, Scanner
 from tsfusion import journal
 from tsfusion.core.config import ClientConfig, override
 from tsfusion.core.errors import TransportError, TsfusionError
+from tsfusion.core.number_ranges import NumberRanges
+from tsfusion.journal.forgotten_numbers import ForgottenNumbers
+from tsfusion.journal.state_folder import JournalPlace
 from tsfusion.wire import codec
+from tsfusion.wire.forgetting import Forgotten, Selection
 from tsfusion.wire.health import Status
-from tsfusion.wire.queries import fetch_health, fetch_status
+from tsfusion.wire.queries import fetch_health, fetch_status, forget
+from tsfusion.wire.record_header import unpack_keyframe
 
 _RECORD_OVERHEAD = 300  # bytes of MCAP a keyframe
 
@@ -47,6 +52,8 @@ class Result(Struct, kw_only=True):
     """Result of one seed. `problems` is empty when every promise was kept."""
 
     seed: int
+    forgotten: int  # keyframes
+    erasures: int  # of a part of a session each
     keys: bool
     scanners: int
     problems: list[str]
@@ -173,7 +180,120 @@ class Killer:
         return True
 
 
-def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Result:
+class Forgetter:
+    """Has the server forget keyframes, in a thread, and keeps what it said of it.
+
+    Args:
+        erased: a file for the numbers of walls, before they are erased.
+    """
+
+    def __init__(
+        self, acts: list[Forgetting], daemon: Daemon, scanners: list[Scanner], keys: Secured, erased: Path
+    ) -> None:
+        self.told: list[tuple[bytes, NumberRanges, bool]] = []  # session, numbers, whether erased
+        self.problems: list[str] = []
+        self._daemon, self._scanners, self._keys, self._erased = daemon, scanners, keys, erased
+        self._thread = threading.Thread(target=self._work, args=(acts,))
+        self._thread.start()
+
+    def end(self) -> None:
+        """Wait until the server has said it of all."""
+        self._thread.join()
+
+    def _work(self, acts: list[Forgetting]) -> None:
+        for act in acts:
+            with contextlib.suppress(AssertionError):
+                until(lambda act=act: self._is_time(act), PATIENCE)
+            selection, deadline = None, time.monotonic() + PATIENCE
+            while time.monotonic() < deadline:
+                with contextlib.suppress(TransportError):
+                    selection = selection or self._selection(act)
+                    if selection is None or self._ask(selection, act.erase):
+                        break
+                time.sleep(0.2)
+            else:
+                self.problems.append(f"the server does not say that it forgot {act}")
+
+    def _is_time(self, act: Forgetting) -> bool:
+        over = all(scanner.finished for scanner in self._scanners)
+        return journaled(self._daemon.state) >= act.keyframes or over
+
+    def _selection(self, act: Forgetting) -> Selection | None:
+        """The keyframes of an act, by what is in the journal now."""
+        found = self._walls()
+        if not found:
+            return None
+        session, seq = sorted(found)[int(act.share * len(found))]
+        if act.way == "session":
+            return Selection(session=session.hex(), numbers=((1, seq),))
+        if act.way == "numbers":
+            return Selection(session=session.hex(), numbers=((seq, seq + 9), (seq + 15, seq + 16)))
+        if act.way == "until":
+            return Selection(until_ns=sorted(ns for _, ns in found.values())[int(act.share * len(found))])
+        x = float(wall(found[session, seq][0]).T_world_camera[0, 3])
+        return Selection(box=(x - 1.0, -9.0, -9.0, x + 1.0, 9.0, 9.0))
+
+    def _ask(self, selection: Selection, erase: bool) -> bool:
+        if not erase:
+            return self._tell(selection)
+        listed = self._forget(selection, dry_run=True)
+        walls = self._walls()
+        with self._erased.open("a") as file:
+            for one in listed.sessions:
+                for key, (i, _) in walls.items():
+                    if key[0].hex() == one.session and key[1] in one.numbers:
+                        file.write(f"{i}\n")
+            file.flush()
+        for one in listed.sessions:  # no more than was listed: a scanner that comes back looks for the rest
+            known = [(n, n) for s, n in walls if s.hex() == one.session and n in one.numbers]
+            if known and not self._tell(Selection(session=one.session, numbers=tuple(known)), erase=True):
+                return False
+        return True
+
+    def _tell(self, selection: Selection, *, erase: bool = False) -> bool:
+        done = self._forget(selection, erase=erase)
+        self.told += [(bytes.fromhex(one.session), one.numbers, erase) for one in done.sessions]
+        return True
+
+    def _forget(self, selection: Selection, **how: bool) -> Forgotten:
+        server = self._daemon.server
+        if not server.address:
+            raise TransportError("it starts")
+        return forget(server.address, selection, timeout=20.0, keys=self._keys.keys, **how)
+
+    def _walls(self) -> dict[tuple[bytes, int], tuple[int, int]]:
+        """Session and number → number of the wall, and when it was journaled."""
+        found = {}
+        for folder in journals(self._daemon.state):
+            for number in journal.segments(folder):
+                for record in journal.records(journal.segment_path(folder, number)):
+                    if not record.is_correction:
+                        i = unpack_keyframe(record.frames[0]).timestamp_ns - NUMBERED_NS
+                        found[record.session, record.seq] = i, record.logged_ns
+        return found
+
+    def verdict(self) -> list[str]:
+        """What the server said that is not so in the journal that it left."""
+        (folder,) = journals(self._daemon.state)
+        forgotten = ForgottenNumbers.in_journal(JournalPlace(folder))
+        left = set(self._walls())
+        problems = list(self.problems)
+        for session, numbers, erased in self.told:
+            for seq in (seq for first, last in numbers for seq in range(first, last + 1)):
+                if (session, seq) not in forgotten:
+                    problems.append(f"keyframe {seq} of {session.hex()[:8]} was forgotten, and is not")
+                if erased and (session, seq) in left:
+                    problems.append(f"keyframe {seq} of {session.hex()[:8]} was erased, and is there")
+        return problems
+
+    def count(self) -> int:
+        """How many keyframes are forgotten."""
+        (folder,) = journals(self._daemon.state)
+        forgotten = ForgottenNumbers.in_journal(JournalPlace(folder))
+        return sum(len(forgotten.of(session)) for session in {one[0] for one in self.told})
+
+
+def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12, forgets: int = 5) -> Result:
     """One seed in an empty folder; every other one with keys, and every other two with two scanners."""
     keys = secured(folder / "keys") if seed % 2 == 0 else UNSECURED
     count = 1 + seed // 2 % 2
@@ -197,6 +317,9 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
         stack.callback(watch.end)
         weather = Weather(random.Random(-seed - 1), proxy)
         stack.callback(weather.end)
+        acts = on_map(random.Random(-seed - 1000), keyframes, forgets)
+        forgetter = Forgetter(acts, daemon, scanners, keys, folder / "erased")
+        stack.callback(forgetter.end)
         killer = Killer(daemon, scanners, proxy, started)
         other = threading.Thread(target=killer.work, args=(early,))
         other.start()
@@ -205,6 +328,7 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
         weather.end()
         for scanner in scanners:
             scanner.wait()
+        forgetter.end()
         problems = [scanner.problem for scanner in scanners if scanner.problem]
         watch.end()
         status = _status(daemon, keys)
@@ -215,11 +339,14 @@ def run(seed: int, folder: Path, *, keyframes: int = 300, kills: int = 12) -> Re
     if len(killer.kills) < kills - 2:  # a scanner that has finished cannot be killed
         problems.append(f"only {len(killer.kills)} of {kills} were killed")
     if status and not problems:
-        problems += server_problems(status, keyframes)
+        problems += server_problems(status, keyframes, forgetter.count())
+        problems += forgetter.verdict()
         problems += [problem for scanner in scanners for problem in client_problems(scanner.report())]
         problems += verify(state, keyframes, status.map_hash, CORRECT_EVERY)
     return Result(
         seed=seed,
+        forgotten=forgetter.count(),
+        erasures=sum(erased for *_, erased in forgetter.told),
         keys=keys is not UNSECURED,
         scanners=count,
         problems=problems,
@@ -262,6 +389,7 @@ def journaled(state: Path) -> int:
 def _plan(folder: Path, address: str, numbers: range, rate: float, keys: Secured) -> Plan:
     first, client = numbers.start, override(CLIENT, **keys.client)
     names = {"spool": f"spool-{first}", "log": f"taken-{first}", "report": f"report-{first}.json"}
+    names["erased"] = "erased"
     own = {name: str(folder / file) for name, file in names.items()}
     return plan_in(
         folder, address, count=numbers.stop, first=first, step=numbers.step, rate=rate,

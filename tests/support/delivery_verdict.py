@@ -8,17 +8,18 @@ from keyframes_and_servers import NUMBERED_NS, wall
 from scanner_process import Report, correction_number, journals
 
 from tsfusion import journal
+from tsfusion.wire.corrections import SERVER_SESSION
 from tsfusion.wire.health import Status
 from tsfusion.wire.record_header import unpack_keyframe
 
 VOXEL_SIZE = 0.04  # as `wire.Server`'s map
 
 
-def server_problems(status: Status, keyframes: int) -> list[str]:
+def server_problems(status: Status, keyframes: int, forgotten: int = 0) -> list[str]:
     problems = []
-    counted = (status.keyframes_durable, status.keyframes_fused)
-    if counted != (keyframes, keyframes):
-        problems.append(f"durable and fused are {counted}, not {keyframes}")
+    counted = (status.keyframes_durable, status.keyframes_fused, status.keyframes_forgotten)
+    if counted != (wanted := (keyframes, keyframes - forgotten, forgotten)):
+        problems.append(f"durable, fused and forgotten are {counted}, not {wanted}")
     if status.keyframes_rejected or set(status.messages_refused) - {"gap", "held"}:
         problems.append(f"rejected {status.keyframes_rejected}, refused {status.messages_refused}")
     if status.journal_damaged:
@@ -40,17 +41,21 @@ def verify(state: Path, keyframes: int, map_hash: str, correct_every: int = 0) -
     problems = []
     corrected: list[int] = []
     last: dict[bytes, tuple[int, int]] = {}
-    found = []
+    found, erased = [], 0
     for folder in journals(state):
         for number in journal.segments(folder):
             path = journal.segment_path(folder, number)
-            if damaged := journal.list_records(path)[1]:
+            entries, damaged = journal.list_records(path)
+            erased += sum(entry.is_erased for entry in entries)
+            if damaged:
                 problems.append(f"{damaged} damaged records in {path.name}")
             for record in journal.records(path):
+                if record.session == SERVER_SESSION:
+                    continue
                 if record.is_correction:
                     i = correction_number(record)
                     corrected.append(i)
-                    if i != last.get(record.session, (0, i))[1]:
+                    if not erased and i != last.get(record.session, (0, i))[1]:
                         problems.append(f"correction {i} does not follow its keyframe")
                     continue
                 i = unpack_keyframe(record.frames[0]).timestamp_ns - NUMBERED_NS
@@ -59,10 +64,11 @@ def verify(state: Path, keyframes: int, map_hash: str, correct_every: int = 0) -
                     problems.append(f"keyframe {i} (seq {record.seq}) comes after {before}")
                 last[record.session] = (record.seq, i)
                 found.append(i)
-    if sorted(found) != list(range(keyframes)):
+    if len(found) + erased != keyframes or len(set(found)) != len(found):
         missing = sorted(set(range(keyframes)) - set(found))
         twice = sorted({i for i in found if found.count(i) > 1})
-        problems.append(f"the journal has {len(found)} keyframes: missing {missing}, twice {twice}")
+        counts = f"{len(found)} keyframes and {erased} erased"
+        problems.append(f"the journal has {counts}: missing {missing}, twice {twice}")
     due = list(range(0, keyframes, correct_every)) if correct_every else []
     if sorted(corrected) != due:
         problems.append(f"the journal has the corrections {sorted(corrected)}, not {due}")

@@ -21,6 +21,7 @@ from msgspec import Struct
 
 from tsfusion import Client, Intrinsics, Keyframe, journal
 from tsfusion.core.config import ClientConfig
+from tsfusion.wire.corrections import SERVER_SESSION
 from tsfusion.wire.keyframe_times import KeyframeTimes
 from tsfusion.wire.record_header import CorrectionHeader, unpack, unpack_keyframe
 
@@ -42,6 +43,7 @@ class Plan(Struct, kw_only=True):
         log: a line is on the disk here for each `send` that returned.
         trimmed: the server deletes old parts of its journal: what is logged was taken, wherever it is now.
         report: where the `Report` goes when all is fused.
+        erased: a file of numbers, a line each, that were erased from the journal; None = none are.
         room: a file of `save_room`, seen again and again; None = `wire.wall`s, each elsewhere.
         until: sends no more once this file is there.
         patience: seconds to wait for the map in the end.
@@ -59,6 +61,7 @@ class Plan(Struct, kw_only=True):
     log: str | None = None
     trimmed: bool = False
     report: str | None = None
+    erased: str | None = None
     room: str | None = None
     until: str | None = None
     patience: float = 120.0
@@ -97,7 +100,8 @@ def numbers(folder: Path) -> list[int]:
 
 def corrections(folder: Path) -> list[int]:
     """The numbers that corrections in a spool or journal folder carry, in its order."""
-    return [correction_number(record) for record in _records(folder) if record.is_correction]
+    found = [record for record in _records(folder) if record.is_correction]
+    return [correction_number(record) for record in found if record.session != SERVER_SESSION]
 
 
 def correction_number(record: journal.Record) -> int:
@@ -161,6 +165,7 @@ def unsent(plan: Plan) -> range:
     taken = set(numbers(Path(plan.spool))) if Path(plan.spool).is_dir() else set()
     for folder in journals(Path(plan.state)):
         taken.update(numbers(folder))
+    taken.update(map(int, _lines(plan.erased)))
     logged = {int(line) for line in _lines(plan.log)}
     if plan.trimmed and plan.log is not None:  # what was not logged for a kill may be found no more, later
         with Path(plan.log).open("a") as log:
