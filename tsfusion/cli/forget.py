@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """`tsfusion map forget`."""
 
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -134,8 +135,8 @@ def _selection(
 
     if box is not None and not all(map(math.isfinite, box)):
         raise InvalidConfig(f"--box must be six finite numbers, got {' '.join(map(str, box))}")
-    if session is not None and not session:
-        raise InvalidConfig("--session must be how a session's id begins, got nothing")
+    if session is not None and not re.fullmatch("[0-9a-fA-F]{1,32}", session):
+        raise InvalidConfig(f"--session must be how a session's id begins, such as 3f2a91bc, got {session!r}")
     made = make_settings(
         Selection,
         {
@@ -192,7 +193,7 @@ def _target(
     with progress.shown(quiet=quiet) as display:
         display.stage(f"opening the map of {where}")
         with open_map(Path(where), map_) as opened:
-            display.stage(f"forgetting keyframes of {where}")
+            display.stage(f"looking for keyframes in {where}")
             yield opened.forget
 
 

@@ -39,6 +39,7 @@ _OF_MAPS: tuple[tuple[str, str, Callable[[MapHealth], float]], ...] = (
         "Keyframes that a correction cannot move any more.",
         lambda one: one.corrections_unavailable,
     ),
+    ("keyframes_forgotten", "Keyframes taken out of the map for good.", lambda one: one.keyframes_forgotten),
     ("keyframes_quarantined", "Keyframes kept aside for inspection.", lambda one: one.quarantined),
     ("sessions", "Sessions that sent keyframes.", lambda one: one.sessions),
     ("journal_bytes", "Bytes of the journal.", lambda one: one.journal_bytes),
