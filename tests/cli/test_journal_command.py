@@ -170,7 +170,7 @@ def test_info_counts_what_is_there(state: Path, run: Run) -> None:
         {
             "session": session.hex(), "client": client, "keyframes": 3, "first_seq": 1, "last_seq": 3,
             "first_logged_ns": 10**18 + first, "last_logged_ns": 10**18 + first + 4,
-            "corrections": 0, "corrected": 0, "removed": 0, "moved_m": 0.0, "turned_deg": 0.0,
+            "corrections": 0, "corrected": 0, "removed": 0, "forgotten": 0, "moved_m": 0.0, "turned_deg": 0.0,
         }
         for first, (session, client) in enumerate([(ANNA, "anna"), (BOB, "bob")])
     ]  # fmt: skip

@@ -41,32 +41,30 @@ def forget(
         str,
         typer.Argument(
             metavar="STATE|ADDRESS",
-            help="A state folder that no server uses, a map's folder in it, or a server: tcp://HOST:PORT.",
+            help="A state folder that no server uses, or a server: tcp://HOST:PORT.",
         ),
     ],
     *,
     session: Annotated[
-        str | None, typer.Option(metavar="ID", help="Of this session: how its id begins (`journal info`).")
+        str | None, typer.Option(metavar="ID", help="Of this session: how its id begins.")
     ] = None,
     client: Annotated[str | None, typer.Option(metavar="NAME", help="Of the client with this key.")] = None,
     since: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="That came then or later: ISO, or seconds before the last record."),
+        typer.Option(metavar="TIME", help="Came then or later: ISO, or seconds from the end."),
     ] = None,
-    until: Annotated[str | None, typer.Option(metavar="TIME", help="That came then or earlier.")] = None,
+    until: Annotated[str | None, typer.Option(metavar="TIME", help="Came then or earlier.")] = None,
     keyframes: Annotated[
-        str | None, typer.Option(metavar="NUMBERS", help="With these numbers in their session: 3-17,20.")
+        str | None, typer.Option(metavar="NUMBERS", help="By number in their session: 3-17,20.")
     ] = None,
     box: Annotated[
         tuple[float, float, float, float, float, float] | None,
         typer.Option(
             metavar="X Y Z X Y Z",
-            help="Taken in this box of the map, metres, and nine tenths of their points in it.",
+            help="Taken in this box, with 9 of 10 points in it.",
         ),
     ] = None,
-    erase: Annotated[
-        bool, typer.Option("--erase", help="Also delete them from the journal and the quarantine.")
-    ] = False,
+    erase: Annotated[bool, typer.Option("--erase", help="Also delete them from the journal.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say which that would be.")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
     map_: Annotated[str | None, typer.Option("--map", metavar="NAME", help="Which map.")] = None,
@@ -78,11 +76,11 @@ def forget(
 ) -> None:
     """Take keyframes out of a map for good, exactly: as if they had never come.
 
-    Several flags select what fits all of them. The map of a running server
-    follows within seconds (`status`: corrections_waiting); that of a folder
-    is saved at the end. No later correction brings them back; a keyframe
-    that arrives later is a new one. Where the server has keys, a client may
-    forget its own keyframes, and others' with `keys allow NAME --forget`.
+    Several flags select what fits all of them; `journal info` lists sessions.
+    A running server's map follows in a while (`status`: corrections_waiting).
+    No correction brings them back; a keyframe that arrives later is new.
+    With keys, a client may forget its own keyframes, and those of others
+    after `tsfusion keys allow NAME --forget`.
 
     Exit status 1 also when nothing fits, or when some that fit stay in the
     map because its journal has them no more.
