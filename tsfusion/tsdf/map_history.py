@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from tsfusion.core.counts import count_of
 from tsfusion.core.errors import MapError
 
+_COUNTS = ("removed", "forgotten")  # keyframes that were taken out of a map
 _POSE = 12  # numbers: the upper three rows
 
 
@@ -120,18 +121,19 @@ def without_journal(meta: Mapping[str, Any]) -> dict[str, Any]:
     waiting: dict[str, set[int]] = {}
     for name, seq, _ in saved.get("waiting", ()):
         waiting.setdefault(name, set()).add(seq)
+    sessions = saved.get("sessions", {})
     listed = {
         name: {
             **dict.fromkeys(("seqs", "segments", "offsets", "fused"), b""),
-            "T": saved.get("sessions", {}).get(name, {}).get("T", b""),
+            "T": sessions.get(name, {}).get("T", b""),
             "unknown": last,
-            "missed": sorted(
-                waiting.get(name, set()).union(saved.get("sessions", {}).get(name, {}).get("missed", ()))
-            ),
+            "missed": sorted(waiting.get(name, set()).union(sessions.get(name, {}).get("missed", ()))),
+            "forgotten": sessions.get(name, {}).get("forgotten", []),
         }
         for name, (last, *_) in meta["done"].items()
     }
-    return {**meta, "poses": {"sessions": listed, "waiting": [], "removed": saved.get("removed", 0)}}
+    counts = {name: saved.get(name, 0) for name in _COUNTS}
+    return {**meta, "poses": {"sessions": listed, "waiting": [], **counts}}
 
 
 def added(here: Mapping[str, Any], there: Mapping[str, Any]) -> dict[str, Any]:
@@ -149,7 +151,7 @@ def added(here: Mapping[str, Any], there: Mapping[str, Any]) -> dict[str, Any]:
             name: _later([part[name] for part in parts if name in part]) for name in together["done"]
         },
         "waiting": [],
-        "removed": sum(each.get("poses", {}).get("removed", 0) for each in (one, other)),
+        **{name: sum(each.get("poses", {}).get(name, 0) for each in (one, other)) for name in _COUNTS},
     }
     for counts in ("rejected", "blocks"):
         together[counts] = dict(sum((Counter(each.get(counts, {})) for each in (one, other)), Counter[str]()))
@@ -159,4 +161,5 @@ def added(here: Mapping[str, Any], there: Mapping[str, Any]) -> dict[str, Any]:
 def _later(parts: list[dict[str, Any]]) -> dict[str, Any]:
     """A session of two maps, as the one that is farther has it."""
     latest = max(parts, key=lambda part: part["unknown"])
-    return {**latest, "missed": sorted({seq for part in parts for seq in part["missed"]})}
+    together = {name: [one for part in parts for one in part[name]] for name in ("missed", "forgotten")}
+    return {**latest, **together, "missed": sorted(set(together["missed"]))}
