@@ -200,6 +200,14 @@ VIEW_SETTINGS = (
 LIMIT_SETTINGS = ("max_blocks", "max_blocks_per_keyframe")
 
 
+class CacheConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The files that hold a map's blocks where not all of them fit into memory."""
+
+    folder: str  # on a disk; the files have no names there
+    disk_bytes: Bytes = 1 << 50  # that the blocks may take
+    min_free_bytes: Annotated[int, Meta(ge=0)] = 64 << 20  # left free on the disk
+
+
 class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The server daemon."""
 

@@ -89,6 +89,17 @@ def require_room(folder: Path, nbytes: int) -> None:
         raise OSError(errno.ENOSPC, needed)
 
 
+def is_in_memory(folder: Path) -> bool:
+    """Whether a folder is a RAM disk (Linux; elsewhere nobody tells): what lies there takes memory."""
+    with suppress(OSError):
+        device = os.stat(folder).st_dev
+        number = f"{os.major(device)}:{os.minor(device)}"
+        for line in Path("/proc/self/mountinfo").read_text(encoding="utf-8").splitlines():
+            if line.split()[2] == number:
+                return line.partition(" - ")[2].split()[0] in ("tmpfs", "ramfs", "devtmpfs")
+    return False
+
+
 def make_private_folder(folder: Path) -> None:
     """Make a folder that only its owner can open (0700), unless it is there.
 

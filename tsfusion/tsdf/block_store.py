@@ -2,15 +2,19 @@
 """The map's memory: blocks of 8³ voxels in slots, found by their packed coordinates."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tsfusion.core.config import CacheConfig
+from tsfusion.core.errors import MapFull
 from tsfusion.kernels import block_hash
 from tsfusion.kernels.integrate import CUBE, WEIGHT_MASK
 from tsfusion.tsdf.checkpoint import LAYER_DTYPES
-from tsfusion.tsdf.growing_array import MAX_ITEMS, GrowingArray
+from tsfusion.tsdf.growing_array import MAX_ITEMS, FileArray, GrowingArray
+from tsfusion.tsdf.residency import Residency
 
 _FIRST_CAPACITY = 1024
 _CHUNK = 1024  # blocks read at a time where a whole layer would be copied
@@ -27,9 +31,14 @@ class BlockStore:
     block: `dirty` uint8, and int32 `stamps` (the last keyframe that touched it), `places` (where in that
     keyframe's list), `bounds` (no voxel has more weight than this).
     A layer the map does not have is one row of zeros, so that kernels can be handed it.
+
+    With a `cache` the layers lie in files, and blocks that no keyframe has changed for long leave memory:
+    whoever touches rows of many blocks calls `keep_within_memory` now and then.
     """
 
-    def __init__(self, *, voxel_size: float, color: bool, corrected: bool) -> None:
+    def __init__(
+        self, *, voxel_size: float, color: bool, corrected: bool, cache: CacheConfig | None = None
+    ) -> None:
         self.voxel_size = voxel_size
         self.color, self.corrected = color, corrected
         self.count = 0
@@ -42,11 +51,23 @@ class BlockStore:
             GrowingArray((), np.int32, _FIRST_CAPACITY) for _ in range(3)
         )
         present = {"sums": True, "color_rgn": color, "color_b": color, "correction": corrected}
-        self._layers = {
-            name: GrowingArray((CUBE,), LAYER_DTYPES[name], _FIRST_CAPACITY if there else 1)
-            for name, there in present.items()
-        }
         self._present = [name for name, there in present.items() if there]
+        self._layers = {name: self._layer(name, cache) for name in present}
+        self._residency: Residency | None = None
+        self._memory_bytes = 0
+        self._disk_bytes = cache.disk_bytes if cache else 0
+        if cache:
+            files = [self._layers[name] for name in self._present]
+            self._residency = Residency([layer for layer in files if isinstance(layer, FileArray)])
+            self.most_blocks = min(MAX_ITEMS, cache.disk_bytes // self._residency.row_bytes)
+
+    def _layer(self, name: str, cache: CacheConfig | None) -> GrowingArray:
+        kind = (CUBE,), LAYER_DTYPES[name]
+        if name not in self._present:
+            return GrowingArray(*kind, 1)
+        if cache is None:
+            return GrowingArray(*kind, _FIRST_CAPACITY)
+        return FileArray(*kind, _FIRST_CAPACITY, Path(cache.folder), cache.min_free_bytes)
 
     @property
     def keys(self) -> NDArray[np.int64]:
@@ -89,18 +110,35 @@ class BlockStore:
         return {name: self._layers[name].array for name in self._present}
 
     def limit(self, nbytes: int) -> None:
-        """Let the map take no more than so many bytes from now on; one that is larger stays as it is.
+        """Let the map take no more than so many bytes of memory from now on; a larger one stays as it is.
 
         The number of blocks that this allows depends on the layers alone, never on how the map has grown.
+        With a cache the map may grow on; its coldest blocks leave memory.
         """
-        self.most_blocks = nbytes // (self.bytes_per_block + _HASH_BYTES)
+        if self._residency is None:
+            self.most_blocks = nbytes // (self.bytes_per_block + _HASH_BYTES)
+        else:
+            self._memory_bytes = nbytes
+            self.keep_within_memory()
+
+    def keep_within_memory(self) -> None:
+        """Let the coldest blocks leave memory if there are too many: call it after rows were touched."""
+        if self._residency is not None:
+            index = self.nbytes - self.count * self._residency.row_bytes
+            self._residency.keep_within(self._memory_bytes - index, self.stamps[: self.count])
 
     def reserve(self, count: int) -> None:
         """Make room for `count` blocks in all.
 
         Raises:
             MemoryError: when there is not enough; the map is as it was.
+            MapFull: likewise on the disk of the cache.
         """
+        if count > max(self.most_blocks, self.count) and self._residency is not None:
+            raise MapFull(
+                f"the map may take disk_bytes = {self._disk_bytes} bytes on the disk, which are "
+                f"{self.most_blocks} blocks; it has {self.count}, and {count - self.count} more are needed"
+            )
         if count > max(self.most_blocks, self.count):
             raise MemoryError(
                 f"the map may have {self.most_blocks} blocks in the memory that is set; "
@@ -140,6 +178,7 @@ class BlockStore:
         for i in range(0, self.count, _CHUNK):
             chunk = slice(i, min(i + _CHUNK, self.count))
             self.bounds[chunk] = (self.sums[chunk] & WEIGHT_MASK).max(axis=1)
+            self.keep_within_memory()
 
     def take_dirty(self) -> NDArray[np.int64]:
         """Slots of the blocks changed since the last call."""
@@ -153,6 +192,7 @@ class BlockStore:
         for i in range(0, self.count, _CHUNK):
             chunk = slice(i, min(i + _CHUNK, self.count))
             self.sums[chunk].any(axis=1, out=has_votes[chunk])
+            self.keep_within_memory()
         order = np.argsort(self.keys)
         return order[has_votes[order]]
 
@@ -165,6 +205,7 @@ class BlockStore:
                 yield self.keys[chunk], rows[chunk[0] : chunk[-1] + 1]
             else:
                 yield self.keys[chunk], rows[chunk]
+            self.keep_within_memory()
 
     def _hash(self, first: int) -> None:
         """Put the blocks from `first` on into the hash."""
@@ -183,8 +224,15 @@ class BlockStore:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the blocks and their hash, bytes."""
+        """Size of the blocks and their hash, bytes."""
         return self.count * self.bytes_per_block + self.hash_keys.nbytes + self.hash_slots.nbytes
+
+    @property
+    def resident_bytes(self) -> int:
+        """Memory that the blocks and their hash take, bytes: less than `nbytes` where some are in files."""
+        if self._residency is None:
+            return self.nbytes
+        return self.nbytes - self.count * self._residency.row_bytes + self._residency.nbytes
 
 
 def pack_keys(coordinates: NDArray[np.int32]) -> NDArray[np.int64]:

@@ -67,6 +67,7 @@ def write(
     layers: dict[str, NDArray[Any]],
     *,
     map_digest: "hashlib.blake2b | None" = None,
+    between: Callable[[], None] = lambda: None,
 ) -> Path:
     """Write blocks `slots` of each layer (…, 512) under their keys.
 
@@ -76,6 +77,7 @@ def write(
     Args:
         map_digest: takes the keys and sums, so that they are read once; what it comes to is the header's
             `map_hash`.
+        between: called after each 1024 blocks are read.
 
     Raises:
         CheckpointError: when the file cannot be written.
@@ -87,7 +89,7 @@ def write(
         with durable_files.replacing(path) as file:
             file.write(MAGIC)
             _write_header(file, header)
-            for payload in _payloads(keys, slots, layers, map_digest):
+            for payload in _payloads(keys, slots, layers, map_digest, between):
                 for part in (struct.pack("<I", sum(map(len, payload))), *payload):
                     file.write(part)
             if map_digest is not None:
@@ -170,6 +172,7 @@ def _payloads(
     slots: NDArray[np.int64],
     layers: dict[str, NDArray[Any]],
     map_digest: "hashlib.blake2b | None",
+    between: Callable[[], None],
 ) -> Iterator[list[bytes]]:
     """Each chunk, in parts: the map may have left little memory. A second thread hashes meanwhile."""
     with SideThread() as side:
@@ -182,6 +185,7 @@ def _payloads(
                 if map_digest is not None and name in ("keys", "sums"):
                     side.do(partial(map_digest.update, rows.data))
                 parts.append(compressor.compress(rows.data))
+            between()
             yield [*parts, compressor.flush()]
         side.wait()
 

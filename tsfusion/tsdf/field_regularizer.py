@@ -175,6 +175,7 @@ class _Batch:
             self.values, store.slots_of(self.keys), store.sums, sides,
             fine.number, fine.starts, fine.links, fine.y, fine.weight, fine.x,
         )  # fmt: skip
+        store.keep_within_memory()
         levels = [fine]
         for _ in range(self.settings.coarser):
             number = np.empty((blocks, fine.number.shape[1] // 8), np.int32)

@@ -1,14 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""Arrays that grow without copying: anonymous memory whose pages the operating system adds on first touch."""
+"""Arrays that grow without copying: anonymous memory whose pages the operating system adds on first touch, or
+a file whose pages can leave memory."""
 
 import ctypes
 import mmap
+import os
 import sys
+import tempfile
+import weakref
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+
+from tsfusion.core import durable_files
+from tsfusion.core.errors import InvalidConfig, MapFull
 
 _MOVES_PAGES = sys.platform == "linux"
 _STEP = 4096  # items more than are needed, at most: what is reserved counts against a memory limit
@@ -49,7 +57,7 @@ class GrowingArray:
         ahead = min(2 * self.capacity, self.capacity + _STEP if _MOVES_PAGES else MAX_ITEMS, MAX_ITEMS)
         try:
             self._grow(max(capacity, ahead))
-        except MemoryError:
+        except (MemoryError, MapFull):
             self._grow(capacity)  # near the limit, no more than is needed
 
     def _grow(self, capacity: int) -> None:
@@ -76,3 +84,63 @@ class GrowingArray:
             "shape": (capacity, *self._item),
         }
         self.array = np.asarray(SimpleNamespace(__array_interface__=interface))
+
+
+class FileArray(GrowingArray):
+    """A growing array in a file that has no name, in a folder on a disk (Linux).
+
+    Address space for all items there can be is taken once: growing only asks the disk for room, and `array`
+    keeps its address. Its pages are the file's: the system counts them neither as this process's allocations
+    nor for ever as its resident memory (`let_go`).
+
+    Args:
+        min_free_bytes: that growing leaves free on the disk.
+
+    Raises:
+        InvalidConfig: when the folder cannot hold such a file.
+    """
+
+    def __init__(
+        self, item: tuple[int, ...], dtype: DTypeLike, capacity: int, folder: Path, min_free_bytes: int = 0
+    ) -> None:
+        self._folder, self._min_free_bytes = folder, min_free_bytes
+        size = (MAX_ITEMS + 1) * int(np.prod(item, dtype=np.int64)) * np.dtype(dtype).itemsize
+        try:
+            with tempfile.TemporaryFile(dir=folder) as file:
+                os.ftruncate(file.fileno(), size)
+                self._pages = mmap.mmap(file.fileno(), size)
+                self._file = os.dup(file.fileno())
+        except OSError as error:
+            raise InvalidConfig(
+                f"the folder {folder} cannot hold blocks that are not in memory: {error.strerror}; choose "
+                "another one for `cache`, on a disk of this machine"
+            ) from error
+        weakref.finalize(self, os.close, self._file)
+        super().__init__(item, dtype, capacity)
+
+    def _grow(self, capacity: int) -> None:
+        held, size = self.capacity * self.item_bytes, capacity * self.item_bytes
+        try:
+            durable_files.require_room(self._folder, size - held + self._min_free_bytes)
+            # A page that the disk has no room for would end the process when it is written.
+            os.posix_fallocate(self._file, held, size - held)
+        except OSError as error:
+            raise MapFull(
+                f"no room for {(size - held) >> 20} MB more of the map in {self._folder}: {error.strerror}; "
+                "make room on that disk, or begin another map"
+            ) from error
+        self.array = np.ndarray((capacity, *self._item), self._dtype, buffer=self._pages)
+
+    @property
+    def address(self) -> int:
+        """Of the first item, for ever."""
+        return int(self.array.ctypes.data)
+
+    def let_go(self, first: int, end: int) -> None:
+        """Take items first … end-1, whole pages, out of this process's memory; touched, they come back.
+
+        The system begins to write them to the disk, so that it can use their memory for something else.
+        """
+        start, size = first * self.item_bytes, (end - first) * self.item_bytes
+        self._pages.madvise(mmap.MADV_DONTNEED, start, size)
+        os.posix_fadvise(self._file, start, size, os.POSIX_FADV_DONTNEED)

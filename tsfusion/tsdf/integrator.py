@@ -93,6 +93,8 @@ class Integrator:
         except BaseException:
             self._take_back(added, sign, before)
             raise
+        finally:
+            self._store.keep_within_memory()
         return updates
 
     def _take_back(self, added: list[Part], sign: int, before: int) -> None:

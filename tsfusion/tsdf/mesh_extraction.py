@@ -119,6 +119,7 @@ def _extract(
         store.color_rgn, store.color_b, int(store.color),
         positions, normals, colors,
     )  # fmt: skip
+    store.keep_within_memory()
     faces = np.empty((triangles, 3), np.int32)
     marching_cubes.emit_faces(
         count, around, inside, active, edges, starts, first,

@@ -11,6 +11,8 @@ from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf.block_store import BlockStore
 
+_PART = 1 << 14  # blocks read at a time: they may have to come from a file
+
 
 class SurfaceView(Protocol):
     """Function that reads signed distances from the map: `values_of`, or one of `field_regularizer`."""
@@ -36,8 +38,12 @@ def values_of(
     """Signed distances as they were fused: the `SurfaceView` of the surface `raw`."""
     if out is None:
         out = np.empty((len(keys), CUBE), np.float32)
-    voxel_values.read_values(
-        len(keys), keys, store.hash_keys, store.hash_slots, store.sums, store.correction,
-        int(store.corrected), max(1, int(np.ceil(min_weight * WEIGHT_ONE))), out,
-    )  # fmt: skip
+    least = max(1, int(np.ceil(min_weight * WEIGHT_ONE)))
+    for first in range(0, len(keys), _PART):
+        part = keys[first : first + _PART]
+        voxel_values.read_values(
+            len(part), part, store.hash_keys, store.hash_slots, store.sums, store.correction,
+            int(store.corrected), least, out[first : first + len(part)],
+        )  # fmt: skip
+        store.keep_within_memory()
     return out[: len(keys)]

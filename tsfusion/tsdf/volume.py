@@ -12,6 +12,7 @@ import logging
 import math
 import os
 import struct
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -22,8 +23,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core import other_names, process
-from tsfusion.core.config import LIMIT_SETTINGS, VIEW_SETTINGS, Surface, VolumeConfig, make_settings, override
+from tsfusion.core import durable_files, other_names, process
+from tsfusion.core.config import (
+    LIMIT_SETTINGS,
+    VIEW_SETTINGS,
+    CacheConfig,
+    Surface,
+    VolumeConfig,
+    make_settings,
+    override,
+)
 from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig, MapError
 from tsfusion.core.side_thread import SideThread
 from tsfusion.geometry.keyframe import Keyframe, keyframe_of
@@ -44,6 +53,7 @@ from tsfusion.tsdf import (
     voxel_arrays,
 )
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.growing_array import MAX_ITEMS
 from tsfusion.tsdf.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.map_difference import MapDifference
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
@@ -67,7 +77,7 @@ class IntegrateStats(msgspec.Struct, frozen=True):
 
 
 class VolumeStats(msgspec.Struct, frozen=True):
-    """Size of the map. `bytes` is the memory of the blocks and their hash, without `scratch_bytes`."""
+    """Size of the map. `bytes` is that of the blocks and their hash, without `scratch_bytes`."""
 
     keyframes: int
     blocks: int
@@ -75,6 +85,7 @@ class VolumeStats(msgspec.Struct, frozen=True):
     bytes: int
     bytes_per_block: int
     scratch_bytes: int  # working memory of rays and meshes
+    resident_bytes: int  # of `bytes`, those in memory: all, unless the map has `memory_bytes`
 
 
 class Volume:
@@ -84,11 +95,23 @@ class Volume:
     `Volume(0.02, sensor="kinect", regularizer="ray")`.
     Use it from one thread (Taichi's). `threads` counts for the first volume of a process: Taichi starts once.
 
+    Args:
+        memory_bytes: that the blocks may take of memory; those that no keyframe has changed for longest wait
+            in files without names, and come back when they are touched (Linux). None = all stay in memory.
+        cache: folder of these files, on a disk, or all about it; default: `TMPDIR`, or /var/tmp.
+
     Raises:
         InvalidConfig: for an unknown setting or a value out of range.
     """
 
-    def __init__(self, config: VolumeConfig | float | None = None, *others: object, **settings: Any) -> None:
+    def __init__(
+        self,
+        config: VolumeConfig | float | None = None,
+        *others: object,
+        memory_bytes: int | None = None,
+        cache: str | os.PathLike[str] | CacheConfig | None = None,
+        **settings: Any,
+    ) -> None:
         if others:  # VDBFusion's: sdf_trunc, space_carving
             hint = other_names.instead("sdf_trunc", other_names.SETTINGS, ())
             raise InvalidConfig(
@@ -108,7 +131,14 @@ class Volume:
         self._has_warned = False  # of a keyframe without
         runtime.start(config.threads)
         smooths = model.regularizer != "off"
-        self._store = BlockStore(voxel_size=config.voxel_size, color=config.color, corrected=smooths)
+        self._store = BlockStore(
+            voxel_size=config.voxel_size,
+            color=config.color,
+            corrected=smooths,
+            cache=None if memory_bytes is None else _checked_cache(memory_bytes, cache),
+        )
+        if memory_bytes is not None:
+            self.limit_memory(memory_bytes)
         self._ray_buffers = RayBuffers(color=config.color, regularised=smooths)
         self._mesh_buffers = MeshBuffers()
         self._integrator = Integrator(self._store, self._ray_buffers, config)
@@ -341,6 +371,7 @@ class Volume:
             bytes=store.nbytes,
             bytes_per_block=store.bytes_per_block,
             scratch_bytes=self._ray_buffers.nbytes + self._mesh_buffers.nbytes,
+            resident_bytes=store.resident_bytes,
         )
 
     def warm_up(self) -> None:
@@ -372,15 +403,24 @@ class Volume:
             layers=list(layers),
         )
         used = self._store.used()
-        return checkpoint.write(
-            Path(path), header, self._store.keys[used], used, layers, map_digest=self._begin_hash()
-        )
+        keys, rest = self._store.keys[used], self._store.keep_within_memory
+        digest = self._begin_hash()
+        return checkpoint.write(Path(path), header, keys, used, layers, map_digest=digest, between=rest)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], threads: int | None = None, **changed: Any) -> "Volume":
+    def load(
+        cls,
+        path: str | os.PathLike[str],
+        threads: int | None = None,
+        *,
+        memory_bytes: int | None = None,
+        cache: str | os.PathLike[str] | CacheConfig | None = None,
+        **changed: Any,
+    ) -> "Volume":
         """Read a checkpoint back, verified against its own hash.
 
         Args:
+            memory_bytes, cache: as of a new map; one that is larger than the cache may be opens, too.
             changed: settings instead of the saved ones, of how the surface is read (`config.VIEW_SETTINGS`)
                 or of how the map may grow (`config.LIMIT_SETTINGS`); None = as saved.
 
@@ -389,8 +429,9 @@ class Volume:
             CheckpointError: when the file is missing, torn, altered or of another version.
         """
         with checkpoint.reading(Path(path)) as (header, chunks):
-            volume = cls(_loaded_config(header, threads, changed))
+            volume = cls(_loaded_config(header, threads, changed), memory_bytes=memory_bytes, cache=cache)
             store = volume._store
+            most, store.most_blocks = store.most_blocks, MAX_ITEMS
             store.reserve(header.blocks)
             layers = store.layers()
             if set(header.layers) != set(layers):
@@ -403,8 +444,10 @@ class Volume:
                     store.insert(keys)
                     for name in header.layers:
                         chunk.fill(layers[name][chunk.first : store.count])
+                    store.keep_within_memory()
                     side.do(partial(_check_in, Path(path), store, slice(chunk.first, store.count), digest))
                 side.wait()
+            store.most_blocks = most
             volume.keyframes = header.keyframes
             volume.held = HeldSensor(header.meta.pop(_HELD, None))
             volume.meta = header.meta
@@ -414,7 +457,8 @@ class Volume:
     def limit_memory(self, nbytes: int) -> None:
         """Let a keyframe fail with MemoryError from now on if the map, with it, would take more bytes.
 
-        The map stays as it is, also where it takes more already. Working memory is not counted.
+        The map stays as it is, also where it takes more already. Working memory is not counted. In a map with
+        `memory_bytes` no keyframe fails: its coldest blocks leave memory instead.
         """
         self._store.limit(nbytes)
 
@@ -489,6 +533,22 @@ def _loaded_config(
         raise InvalidConfig(f"a saved map cannot change {', '.join(sorted(fixed))}; fuse it anew")
     config = override(msgspec.structs.replace(saved, threads=threads), **changed)
     return override(config, max_blocks=max(config.max_blocks, header.blocks))
+
+
+def _checked_cache(memory_bytes: int, cache: str | os.PathLike[str] | CacheConfig | None) -> CacheConfig:
+    """Where blocks may wait that are not in memory."""
+    if memory_bytes < 1:
+        raise InvalidConfig(f"memory_bytes must be > 0, got {memory_bytes}")
+    if sys.platform != "linux":
+        raise InvalidConfig("memory_bytes needs Linux: elsewhere all blocks stay in memory")
+    if not isinstance(cache, CacheConfig):
+        cache = CacheConfig(folder=os.fspath(cache or os.environ.get("TMPDIR") or "/var/tmp"))
+    if durable_files.is_in_memory(Path(cache.folder)):
+        raise InvalidConfig(
+            f"the folder {cache.folder} is a RAM disk: what lies there takes memory; choose one on a disk "
+            "for `cache`"
+        )
+    return cache
 
 
 def _keyframe(keyframe: Any, others: tuple[object, ...], fields: dict[str, Any]) -> Keyframe:

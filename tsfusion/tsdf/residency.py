@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: MIT
+"""Which blocks of a map in files are in memory, and which of them leave it when they take too much."""
+
+import mmap
+import os
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core import process
+from tsfusion.tsdf.growing_array import FileArray
+
+GROUP = 32  # blocks that leave memory together: whole pages of every layer, also where a page has 64 kB
+_LOW = 7 / 8  # of the budget, down to which blocks leave once it is passed
+_PART = 1 << 17  # entries of the page table read at a time
+_PRESENT = np.uint64(63)  # bit of an entry: the page is in memory
+
+
+class Residency:
+    """Keeps the pages of some layers that are in this process's memory within a budget."""
+
+    def __init__(self, layers: Collection[FileArray]) -> None:
+        self._layers = layers
+        self._measured = 0  # bytes of the layers that were in memory when it was last looked at,
+        self._shared = process.shared_rss_bytes()  # and of all files then
+
+    @property
+    def row_bytes(self) -> int:
+        """Size of a block, bytes."""
+        return sum(layer.item_bytes for layer in self._layers)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the blocks that are here, bytes; a library that was loaded meanwhile counts, too."""
+        return max(0, self._measured + process.shared_rss_bytes() - self._shared)
+
+    def keep_within(self, budget: int, stamps: NDArray[np.int32]) -> None:
+        """Let blocks go if they take more bytes than `budget`, those changed longest ago first.
+
+        Args:
+            stamps: (count,) the last keyframe that changed each block.
+        """
+        if self.nbytes <= budget or not len(stamps):
+            return
+        held = self._held(-(-len(stamps) // GROUP))
+        total = int(held.sum())
+        if total > budget:
+            newest = np.maximum.reduceat(stamps, np.arange(0, len(stamps), GROUP))
+            here = np.flatnonzero(held)
+            here = here[np.argsort(newest[here], kind="stable")]
+            freed = np.cumsum(held[here])
+            leaving = here[: int(np.searchsorted(freed, total - _LOW * budget)) + 1]
+            self._let_go(np.sort(leaving))
+            total -= int(held[leaving].sum())
+        self._measured, self._shared = total, process.shared_rss_bytes()
+
+    def _held(self, groups: int) -> NDArray[np.int64]:
+        """Bytes of each of the first groups in memory; of whole groups where the system does not tell."""
+        held = np.zeros(groups, np.int64)
+        for layer in self._layers:
+            pages = GROUP * layer.item_bytes // mmap.PAGESIZE  # of a group
+            is_here = _pages_in_memory(layer.address // mmap.PAGESIZE, groups * pages)
+            held += is_here.reshape(groups, pages).sum(axis=1) * mmap.PAGESIZE
+        return held
+
+    def _let_go(self, groups: NDArray[np.int64]) -> None:
+        for first, end in _runs(groups):
+            for layer in self._layers:
+                layer.let_go(first * GROUP, end * GROUP)
+
+
+def _pages_in_memory(first: int, count: int) -> NDArray[np.bool_]:
+    """Which of `count` pages from number `first` on are in this process's memory (Linux)."""
+    found = np.ones(count, bool)
+    with suppress(OSError), open("/proc/self/pagemap", "rb", buffering=0) as table:
+        for i in range(0, count, _PART):
+            part = os.pread(table.fileno(), 8 * min(_PART, count - i), 8 * (first + i))
+            entries = np.frombuffer(part, np.uint64)
+            found[i : i + len(entries)] = entries >> _PRESENT != 0
+    return found
+
+
+def _runs(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
+    """First and end of each run of consecutive numbers, which are sorted."""
+    cuts = np.flatnonzero(np.diff(numbers) != 1) + 1
+    for part in np.split(numbers, cuts):
+        yield int(part[0]), int(part[-1]) + 1
