@@ -57,7 +57,8 @@ class Open3D:
         reach = (scale, self._range, self._truncation)
         blocks = self.grid.compute_unique_block_coordinates(depth, K, extrinsic, *reach)
         if self._color:
-            color = image(Tensor(np.ascontiguousarray(keyframe.color[..., ::-1])))
+            of_depth = np.float32 if raw.dtype == np.float32 else np.uint8  # it takes no other pairs
+            color = image(Tensor(np.ascontiguousarray(keyframe.color[..., ::-1], of_depth)))
             self.grid.integrate(blocks, depth, color, K, K, extrinsic, *reach)
         else:
             self.grid.integrate(blocks, depth, K, extrinsic, *reach)

@@ -11,7 +11,7 @@ import cv2
 import pytest
 import trimesh
 from clients_and_spools import deliver
-from command_processes import Here, end, read_until, server, started, tsfusion
+from command_processes import Here, descendants, end, read_until, server, started, tsfusion
 from small_recordings import first_views
 
 from tsfusion import Client, FlushTimeout, Volume
@@ -21,7 +21,11 @@ VOXEL = 0.08
 
 
 def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
-    with server(tmp_path / "state", "--voxel-size", VOXEL) as (address, process):
+    (tmp_path / "cache").mkdir()
+    flags = ("--voxel-size", VOXEL, "--memory", "0.3GB", "--cache", tmp_path / "cache")
+    with server(tmp_path / "state", *flags) as (address, process):
+        maps = [Path(f"/proc/{pid}/maps").read_text() for pid in descendants(process.pid)]
+        assert any(f"{tmp_path}/cache/" in mappings for mappings in maps)
         first, second = first_views(2)
         with Client("tcp://127.0.0.1:1", spool=tmp_path / "spool") as client:
             client.send(first)
@@ -53,6 +57,19 @@ def test_serve_answers_and_ends_well(tmp_path: Path) -> None:
         assert json.loads(done.stdout)["keyframes_fused"] == 1, done.stderr
         assert end(process) == 0
     assert Volume.load(tmp_path / "state/maps/default/map.tsf").keyframes == 3
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--memory", "much"), "expected a number of bytes such as 2GB, 512MiB or 2000000000, got 'much'"),
+        (("--memory", "1MB"), "fuser_memory_bytes must be >= 268435456, got 1000000"),
+        (("--cache", "."), "--cache has no effect without --memory: all blocks stay in memory"),
+    ],
+)
+def test_what_bounds_no_memory_is_named(tmp_path: Path, flags: tuple[str, ...], message: str) -> None:
+    done = tsfusion("serve", "--state", tmp_path / "state", *flags)
+    assert (done.returncode, message in done.stderr) == (1, True), done.stderr
 
 
 def test_a_server_that_fell_silent_is_not_called_slow(tmp_path: Path) -> None:

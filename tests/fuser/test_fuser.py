@@ -22,10 +22,12 @@ import pytest
 from command_processes import alive, python
 from failures import raising, refuse
 from keyframes_and_servers import VOLUME, pose, serving, until, wall
+from resident_memory import unnamed_files_rss
 
 import tsfusion
 from tsfusion import VolumeConfig
-from tsfusion.core import errors, folder_lock, process
+from tsfusion.core import durable_files, errors, folder_lock, process
+from tsfusion.core.config import CacheConfig, override
 from tsfusion.fuser import __main__ as fuser_main
 from tsfusion.fuser import fuser as fuser_module
 from tsfusion.fuser import messages
@@ -121,6 +123,37 @@ def test_keyframes_are_fused_meshed_and_checkpointed(tmp_path: Path) -> None:
     again, link_again = opened(tmp_path)
     assert again.ready().done == {SESSION: messages.SessionProgress(3, "robot")}
     assert status(again, link_again) == status(fuser, link)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a cache needs Linux")
+def test_a_map_whose_blocks_wait_on_the_disk_is_the_same_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(process, "limit_memory", lambda _: None)
+    if durable_files.is_in_memory(tmp_path):
+        pytest.skip("the folder for temporary files is a RAM disk")
+    fine, positions = override(VOLUME, voxel_size=0.01), fill(tmp_path, 4)
+    limits = {"memory_bytes": 1 << 20, "cache": CacheConfig(folder=str(tmp_path))}
+    usual, link = opened(tmp_path, fine)
+    for index, position in enumerate(positions):
+        usual.handle(order(index, position))
+    expected = status(usual, link)
+    assert expected.map_bytes > 4 << 20
+    fuser, link = opened(tmp_path, fine, **limits)
+    for index, position in enumerate(positions[:2]):
+        fuser.handle(order(index, position))
+    fuser.mesh()
+    fuser.handle(messages.Finish())
+    again, link = opened(tmp_path, fine, **limits)
+    for index, position in enumerate(positions):
+        again.handle(order(index, position))
+    assert status(again, link) == expected
+    assert unnamed_files_rss(tmp_path) < 3 << 20
+    little = CacheConfig(folder=str(tmp_path), disk_bytes=1 << 20)
+    full, link = opened(tmp_path, fine, memory_bytes=1 << 20, cache=little)
+    full.handle(msgspec.structs.replace(order(2, positions[2]), client=""))  # whose share is all of it
+    done = link.last()
+    assert (done.reason, "1048576 bytes on the disk" in done.message) == ("MapFull", True)
 
 
 def test_a_sensor_that_no_map_knows_is_rejected_where_an_older_server_journaled_it(tmp_path: Path) -> None:

@@ -180,6 +180,26 @@ def configuration(file: Path | None, *, preset: dict[str, Any] | None = None, **
     return config.Config(client=loaded.client, **changed)
 
 
+def byte_count(text: str | None) -> int | None:
+    """What `2GB`, `512MiB` or a number of bytes says; None = not given.
+
+    Raises:
+        InvalidConfig: for anything else.
+    """
+    import re
+
+    from tsfusion.core.errors import InvalidConfig
+
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d+(?:\.\d+)?) ?(?:([kMGT])(i?)B?|B)?", text.strip(), re.IGNORECASE)
+    if found is None:
+        raise InvalidConfig(f"expected a number of bytes such as 2GB, 512MiB or 2000000000, got {text!r}")
+    number, prefix, binary = found.groups()
+    power = " kmgt".index(prefix.lower()) if prefix else 0
+    return int(float(number) * (1024 if binary else 1000) ** power)
+
+
 def up_direction(text: str | None) -> "Up | None":
     """What --up says; raises InvalidConfig for nonsense."""
     from tsfusion.geometry import up_direction

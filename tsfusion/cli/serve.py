@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -15,6 +16,7 @@ import typer
 from tsfusion.cli import options
 
 if TYPE_CHECKING:
+    from tsfusion.core.config import Config
     from tsfusion.wire.sockets import Addresses
 
 log = logging.getLogger(__name__)
@@ -41,6 +43,11 @@ SERVER_OPTIONS: dict[str, Any] = {
         "--keep-radius", "METRES", "Forget what was seen farther from the newest keyframe.", rare=True)],
     "keys": _flag("--keys", "DIR",
                   "Who may connect: `tsfusion keys`; needed beyond this machine."),
+    "fuser_memory_bytes": _flag("--memory", "BYTES",
+                                "Memory of each map's blocks, such as 2GB; more wait on the disk."),
+    "fuser_disk_bytes": _flag("--disk", "BYTES",
+                              "Most that they may take there; default: what the disk has."),
+    "cache": _flag("--cache", "DIR", "Folder where they wait; default: the map's own."),
 }  # fmt: skip
 
 
@@ -61,7 +68,7 @@ def serve(
     from tsfusion.core import logs
     from tsfusion.core.errors import TsfusionError
 
-    chosen = options.configuration(config, **settings)
+    chosen = _configuration(config, settings)
     logs.configure(chosen.server.log_format, chosen.server.log_level)
     if until_eof:
         threading.Thread(target=_stop_at_eof, daemon=True).start()
@@ -76,6 +83,24 @@ def serve(
             raise
         log.critical("%s", error)  # the last line is a JSON object too
         return 1
+
+
+def _configuration(file: Path | None, settings: dict[str, Any]) -> "Config":
+    """All settings; where a flag bounds the memory, the disk takes the rest of a map."""
+    from msgspec.structs import replace
+
+    from tsfusion.core.config import CacheConfig, override
+    from tsfusion.core.errors import InvalidConfig
+
+    sizes = {name: options.byte_count(settings[name]) for name in ("fuser_memory_bytes", "fuser_disk_bytes")}
+    chosen = options.configuration(file, **{**settings, **sizes})
+    server = chosen.server
+    if server.fuser_disk_bytes is None:
+        if sizes["fuser_memory_bytes"] is not None:
+            server = override(server, fuser_disk_bytes=CacheConfig(folder="").disk_bytes)
+        elif settings["cache"] is not None:
+            raise InvalidConfig("--cache has no effect without --memory: all blocks stay in memory")
+    return replace(chosen, server=server)
 
 
 def _announce(addresses: "Addresses", state: str, seconds: float, json: bool) -> None:

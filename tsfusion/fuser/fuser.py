@@ -78,7 +78,12 @@ class Fuser:
         with suppress(OSError):
             self._journal_home = os.stat(self._folder / state_folder.JOURNAL_FOLDER)
         # A map of any size opens, as long as there is memory; from then on it may not outgrow its own.
-        self._map = MapCheckpoints(self._folder, begin.volume, keep_previous=begin.keep_previous)
+        self._map = MapCheckpoints(
+            self._folder,
+            begin.volume,
+            keep_previous=begin.keep_previous,
+            kept={"memory_bytes": begin.memory_bytes, "cache": begin.cache} if begin.cache else {},
+        )
         self._volume = self._map.volume
         self._volume.warm_up()
         self._volume.limit_memory(begin.memory_bytes)

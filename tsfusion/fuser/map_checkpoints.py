@@ -5,7 +5,7 @@ import logging
 import os
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -33,6 +33,7 @@ class MapCheckpoints:
 
     Args:
         keep_previous: whether to keep the checkpoint before the last, too: the journal may be cut.
+        kept: where the map's blocks are kept: arguments of `Volume`.
 
     Raises:
         InvalidConfig: when the map was made with other settings.
@@ -40,7 +41,9 @@ class MapCheckpoints:
             one is set aside.
     """
 
-    def __init__(self, folder: Path, config: VolumeConfig, *, keep_previous: bool) -> None:
+    def __init__(
+        self, folder: Path, config: VolumeConfig, *, keep_previous: bool, kept: dict[str, Any] | None = None
+    ) -> None:
         from tsfusion.tsdf.volume import Volume
 
         self._path, self._previous = folder / state_folder.MAP_FILE, folder / state_folder.PREVIOUS_FILE
@@ -52,7 +55,9 @@ class MapCheckpoints:
         self.rejected: dict[str, int] = {}  # reason → number of keyframes that the map could not take
         self.blocks: dict[str, int] = {}  # client with a key → number of blocks that its keyframes added
         # The map, at first as it was in the last checkpoint
-        self.volume = _resume(self._path, config) or _resume(self._previous, config) or Volume(config)
+        kept = kept or {}
+        found = _resume(self._path, config, kept) or _resume(self._previous, config, kept)
+        self.volume = found or Volume(config, **kept)
         if meta := self.volume.meta:
             self.done = {
                 bytes.fromhex(key): SessionProgress(*progress) for key, progress in meta["done"].items()
@@ -105,7 +110,7 @@ class MapCheckpoints:
         return ""
 
 
-def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
+def _resume(path: Path, wanted: VolumeConfig, kept: dict[str, Any]) -> "Volume | None":
     """The volume of a checkpoint; None when there is none, or when it is damaged.
 
     All else raises: a checkpoint that cannot be read now may be good, and the map must not begin anew.
@@ -114,7 +119,7 @@ def _resume(path: Path, wanted: VolumeConfig) -> "Volume | None":
 
     try:
         changed = {name: getattr(wanted, name) for name in (*VIEW_SETTINGS, *LIMIT_SETTINGS)}
-        volume = Volume.load(path, wanted.threads, **changed)
+        volume = Volume.load(path, wanted.threads, **kept, **changed)
     except DamagedCheckpoint as error:
         _set_aside(path, error)
         return None

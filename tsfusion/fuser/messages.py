@@ -10,7 +10,7 @@ from typing import Any, Literal
 import msgspec
 from msgspec import Struct
 
-from tsfusion.core.config import VolumeConfig
+from tsfusion.core.config import CacheConfig, VolumeConfig
 from tsfusion.core.errors import CheckpointError, InvalidConfig, MapError, TsfusionError
 from tsfusion.journal import Position
 from tsfusion.wire.forgetting import Selection
@@ -31,10 +31,11 @@ class Begin(Struct, frozen=True, tag="begin"):
         working: a file of 8 bytes: the index of the keyframe that is being fused, little-endian, or
             `NOT_WORKING` or `MOVING`. Read when the process has died, so that the right keyframe is blamed.
         keep_previous: whether to keep the checkpoint before the last, too: the journal may be cut.
-        memory_bytes: that the process may allocate.
+        memory_bytes: that the map's blocks may take.
         quota_cost, quota_map: as in the server's settings.
         moves: whether to fuse keyframes where corrections say; False = others died of that.
         keep_seconds, keep_keyframes, keep_radius: as in the server's settings.
+        cache: where blocks beyond `memory_bytes` wait; None = nowhere, the map is full then.
     """
 
     folder: str
@@ -50,6 +51,7 @@ class Begin(Struct, frozen=True, tag="begin"):
     keep_seconds: float | None = None
     keep_keyframes: int | None = None
     keep_radius: float | None = None
+    cache: CacheConfig | None = None
 
 
 class SessionProgress(Struct, frozen=True, array_like=True):

@@ -14,7 +14,7 @@ import msgspec
 import zmq
 
 from tsfusion.core import logs, process
-from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.core.config import CacheConfig, ServerConfig, VolumeConfig
 from tsfusion.core.errors import MapError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.fuser_process import FuserProcess
@@ -59,6 +59,7 @@ class FuserSupervisor:
             keep_seconds=server.keep_seconds,
             keep_keyframes=server.keep_keyframes,
             keep_radius=server.keep_radius,
+            cache=_cache(server, folder),
         )
         self._early_deaths = 0  # in a row, of processes that were not at work on a keyframe
         self._blame: dict[int, int] = {}  # index of a keyframe → weight of the deaths at it
@@ -298,3 +299,14 @@ class FuserSupervisor:
             wait: some seconds until it has ended; else the next one waits for the lock of the map's folder.
         """
         self._process.close(_END_DEADLINE if self.ready and wait else 0.0, wait=wait)
+
+
+def _cache(server: ServerConfig, folder: Path) -> CacheConfig | None:
+    """Where a map's blocks wait that are not in memory."""
+    if server.fuser_disk_bytes is None:
+        return None
+    return CacheConfig(
+        folder=str(server.cache or folder),
+        disk_bytes=server.fuser_disk_bytes,
+        min_free_bytes=server.min_free_bytes,
+    )
