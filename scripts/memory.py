@@ -15,9 +15,11 @@ start, or when it takes keyframes at less than half the rate.
 """
 
 import argparse
+import hashlib
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -47,7 +49,9 @@ class Curve(msgspec.Struct):
     map_bytes: int = 0
     map_hash: str = ""
     budget: int = 0
-    cached: int = 0  # bytes that the files of the map took on the disk
+    mesh_rss: int = 0  # bytes, the most while the mesh was written
+    mesh_seconds: float = 0.0
+    mesh_digest: str = ""
 
     @property
     def beyond(self) -> int:
@@ -88,7 +92,22 @@ def grow(name: str, options: argparse.Namespace) -> Curve:
     if name != "Open3D":
         curve.map_bytes, curve.map_hash = fused.stats().bytes, fused.map_hash()
         curve.rss[-1] = max(curve.rss[-1], process.rss_bytes())
+    if options.mesh and name != "Open3D":
+        with tempfile.TemporaryDirectory(dir=options.cache) as folder:
+            _mesh(fused, curve, Path(folder) / "mesh.ply")
     return curve
+
+
+def _mesh(volume: Any, curve: Curve, path: Path) -> None:
+    """Write the mesh, tile by tile where the memory is bounded."""
+    Path("/proc/self/clear_refs").write_text("5")  # the peak of the resident memory begins anew
+    began = time.monotonic()
+    if curve.budget:
+        volume.mesh_parts(path.parent).save(path)
+    else:
+        volume.extract_mesh().save(path)
+    curve.mesh_seconds, curve.mesh_rss = time.monotonic() - began, process.peak_rss_bytes()
+    curve.mesh_digest = hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 
 
 def _volume(options: argparse.Namespace, budget: int) -> Any:
@@ -115,6 +134,7 @@ def measured(name: str, options: argparse.Namespace, budget: int = 0) -> Curve |
     command = [sys.executable, __file__, "--only", name, "--budget", str(budget)]
     for flag in ("keyframes", "voxel_size", "width", "cache"):
         command += [f"--{flag.replace('_', '-')}", str(getattr(options, flag))]
+    command += ["--mesh"] * options.mesh
     done = subprocess.run(command, stdout=subprocess.PIPE, check=False)
     if done.returncode:
         if name == "Open3D":
@@ -165,6 +185,7 @@ def main() -> int:
     parser.add_argument("--share", type=float, default=0.25, help="of the map that may be in memory")
     parser.add_argument("--cache", default=os.environ.get("TMPDIR", "/var/tmp"), help="folder on a disk")
     parser.add_argument("--plot", type=Path, help="draw the memory over the keyframes into this file")
+    parser.add_argument("--mesh", action="store_true", help="write the mesh, too, and compare the files")
     parser.add_argument("--only", help=argparse.SUPPRESS)
     parser.add_argument("--budget", type=int, default=0, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -186,6 +207,7 @@ def main() -> int:
         for is_wrong, problem in (
             (bounded.map_hash != unbounded.map_hash, "the maps differ"),
             (bounded.beyond > budget + SPARE, "the bounded map takes more than its budget and 200 MB"),
+            (bounded.mesh_digest != unbounded.mesh_digest, "the meshes differ"),
             (rate < 0.5, "the bounded map takes keyframes at less than half the rate"),
         )
         if is_wrong
@@ -194,7 +216,10 @@ def main() -> int:
         "keyframes": options.keyframes, "voxel_size": options.voxel_size, "map_bytes": unbounded.map_bytes,
         "memory_bytes": budget, "rss_beyond_bytes": bounded.beyond, "rate_ratio": round(rate, 3),
         "cpu_ratio": round(unbounded.cpu_seconds / bounded.cpu_seconds, 3),
-        "hash": bounded.map_hash, "problems": problems,
+        "hash": bounded.map_hash, "mesh": bounded.mesh_digest,
+        "mesh_rss_bytes": [unbounded.mesh_rss, bounded.mesh_rss],
+        "mesh_seconds": [round(unbounded.mesh_seconds, 1), round(bounded.mesh_seconds, 1)],
+        "problems": problems,
     }  # fmt: skip
     print(msgspec.json.encode(result).decode())
     return 1 if problems else 0

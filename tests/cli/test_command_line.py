@@ -167,6 +167,8 @@ def test_doctor_says_what_to_do(here: Here, tmp_path: Path) -> None:
         (["replay", "synthetic:room", "--control", NOBODY], "--control has no effect without --connect"),
         (["mesh", "garbage.tsf", "a.ply", "--voxel-size", "1"], "--voxel-size has no effect on a saved map"),
         (["mesh", "garbage.tsf", "a.ply", "--control", NOBODY], "only a live server"),
+        (["mesh", "garbage.tsf", "a.ply", "--memory", "all"], "expected a number of bytes such as 2GB"),
+        (["mesh", NOBODY, "a.ply", "--memory", "1GB"], "--memory has no effect on a live server's map"),
         (["mesh", NOBODY, "a.ply", "--threads", "1"], "--threads has no effect on a live server's map"),
         (["mesh", NOBODY, "a.ply"], "no server answered at tcp://127.0.0.1:10 within 0.2 s"),
     ],

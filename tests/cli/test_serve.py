@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import signal
+import sys
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,9 @@ from command_processes import Here, descendants, end, read_until, server, starte
 from small_recordings import first_views
 
 from tsfusion import Client, FlushTimeout, Volume
+from tsfusion.core import durable_files
 from tsfusion.geometry.up_direction import HeldSensor
+from tsfusion.tsdf import field_regularizer
 
 VOXEL = 0.08
 
@@ -143,6 +146,35 @@ def test_mesh_of_a_map_alone_says_that_up_is_not_known(state: Path, here: Here, 
     assert "up -x (given: -1.0000 0.0000 0.0000)" in done.stdout
     assert "up is not known" not in done.stdout
     assert trimesh.load("a.glb", force="mesh").extents == pytest.approx(lying[[1, 0, 2]], abs=0.1)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="--memory needs Linux")
+def test_the_mesh_of_a_map_larger_than_its_memory_is_written_in_tiles(
+    here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if durable_files.is_in_memory(tmp_path):
+        pytest.skip("the folder for temporary files is a RAM disk")
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(field_regularizer, "BATCH", 40)
+    volume = Volume(VOXEL, threads=2)
+    for keyframe in first_views(2):
+        volume.integrate(keyframe)
+    volume.save("map.tsf")
+    assert here("mesh", "map.tsf", "whole.ply").returncode == 0
+    done = here("mesh", "map.tsf", "tiles.ply", "--memory", "100kB")
+    assert "tiles.ply: " in done.stdout
+    assert "islands not looked for" in done.stdout
+    assert Path("tiles.ply").read_bytes() == Path("whole.ply").read_bytes()
+    found = json.loads(here("mesh", "map.tsf", "map.glb", "--memory", "100kB", "--json").stdout)
+    assert found["files"][:2] == ["map-0001.glb", "map-0002.glb"]
+    assert not Path("map.glb").exists()
+    for flags, message in (
+        (("c.obj",), "is saved as .ply or .glb, got 'c.obj'"),
+        (("c.ply", "--preview", "c.png"), "--preview needs all of the mesh, which is too large for memory"),
+        (("c.ply", "--drop-islands"), "--drop-islands needs all of the mesh, which is too large for memory"),
+    ):
+        done = here("mesh", "map.tsf", *flags, "--memory", "100kB")
+        assert (done.returncode, message in done.stderr) == (1, True), done.stderr
 
 
 @pytest.mark.slow

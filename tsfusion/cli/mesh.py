@@ -13,8 +13,11 @@ from tsfusion.core.counts import count_of
 
 if TYPE_CHECKING:
     from tsfusion.core.config import VolumeConfig
+    from tsfusion.geometry.up_direction import Up
     from tsfusion.journal.recording import JournalRecording
     from tsfusion.tsdf.volume import Volume
+
+_EXPANDS = 8  # a map in memory against its file: more than any
 
 
 @options.takes_map_settings
@@ -32,6 +35,10 @@ def mesh(
     up: options.UpDirection = None,
     keep_islands: options.KeepIslands = None,
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw a picture, too.")] = None,
+    memory: Annotated[
+        str | None,
+        typer.Option(metavar="BYTES", help="Memory of the map, such as 2GB; default: half of the machine's."),
+    ] = None,
     control: options.Control = None,
     map_: options.Map = None,
     key: options.Key = None,
@@ -42,10 +49,13 @@ def mesh(
 ) -> None:
     """Write the mesh of a saved map, of a live server, or of a journal.
 
-    A journal is fused again, with the map flags given here.
+    A journal is fused again, with the map flags given here. The mesh of a map that is larger than --memory is
+    written in tiles: to one .ply, or to a .glb each (OUT-0001.glb and on).
     """
     from dataclasses import replace
 
+    from tsfusion.core import process
+    from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
     from tsfusion.geometry.mesh import FORMATS
     from tsfusion.pipelines import mesh_files
@@ -56,7 +66,7 @@ def mesh(
         check_writable(preview, (".png",))
     if "://" in source:
         options.refuse(
-            context, {*options.MAP_OPTIONS, "config"} - {"min_weight"},
+            context, {*options.MAP_OPTIONS, "config", "memory"} - {"min_weight"},
             "has no effect on a live server's map: give it to `tsfusion serve`",
         )  # fmt: skip
         from tsfusion.core.config import DEFAULT_MAP
@@ -81,7 +91,14 @@ def mesh(
         given = config is not None or any(
             value is not None for name, value in settings.items() if name not in options.VIEW_OPTIONS
         )
-        volume = _volume(Path(source), chosen.volume, name=map_, given=given, quiet=json)
+        most = options.byte_count(memory)
+        volume = _volume(Path(source), chosen.volume, most, name=map_, given=given, quiet=json)
+        if volume.stats().bytes > (most or process.physical_memory_bytes() // 2):
+            options.refuse(context, ("preview",), "needs all of the mesh, which is too large for memory")
+            if keep_islands is False:
+                raise InvalidConfig("--drop-islands needs all of the mesh, which is too large for memory")
+            _write_tiles(volume, out, given_up, json)
+            return
         made = volume.extract_mesh()
     if given_up is not None:
         made = replace(made, known_up=given_up)
@@ -91,7 +108,39 @@ def mesh(
     _print_result(out, {**written.figures, "left_out": left_out}, json)
 
 
-def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bool, quiet: bool) -> "Volume":
+def _write_tiles(volume: "Volume", out: Path, up: "Up | None", json: bool) -> None:
+    """Write the mesh in bounded memory."""
+    from tsfusion.cli import progress
+    from tsfusion.geometry import mesh_parts
+
+    mesh_parts.check(out)
+    with progress.shown(quiet=json) as display:
+        display.stage("meshing in tiles")
+        parts = volume.mesh_parts(out.parent, up=up)
+        files = parts.save(out)
+    figures = {**parts.figures, "left_out": {"islands": 0, "triangles": 0, "files": []}}
+    _print_result(files[0] if len(files) == 1 else out, {**figures, "files": list(map(str, files))}, json)
+
+
+def _kept(memory_bytes: int | None, saved: Path | None = None) -> dict[str, Any]:
+    """Where a map's blocks are kept, as arguments of `Volume`: in memory, where a saved one surely fits."""
+    from tsfusion.core import durable_files, process
+
+    half = process.physical_memory_bytes() // 2
+    if memory_bytes is None and saved is not None and _EXPANDS * durable_files.size_of(saved) > half:
+        memory_bytes = half
+    return {"memory_bytes": memory_bytes}
+
+
+def _volume(
+    source: Path,
+    config: "VolumeConfig",
+    memory_bytes: int | None,
+    *,
+    name: str | None,
+    given: bool,
+    quiet: bool,
+) -> "Volume":
     """The saved map with all that its journal holds; with other settings a new map of the journal."""
     from tsfusion.core.config import VIEW_SETTINGS
     from tsfusion.core.errors import DatasetError
@@ -105,17 +154,17 @@ def _volume(source: Path, config: "VolumeConfig", *, name: str | None, given: bo
     from tsfusion.pipelines import saved_maps
 
     if source.suffix == ".tsf":
-        return Volume.load(source, config.threads, **view)
+        return Volume.load(source, config.threads, **_kept(memory_bytes, source), **view)
     source = state_folder.resolve_map(source, name)
     saved = source / state_folder.MAP_FILE
     if saved.is_file() and not given:
         with saved_maps.opened(saved_maps.SavedMap(saved, source)) as (file, left_out):
             _say(left_out)
-            return Volume.load(file, config.threads, **view)
+            return Volume.load(file, config.threads, **_kept(memory_bytes, file), **view)
     recording = JournalRecording(source)
     if saved.is_file():
         saved_maps.check_journal(saved, len(recording))
-    return _fuse(recording, Volume(config), quiet)
+    return _fuse(recording, Volume(config, **_kept(memory_bytes)), quiet)
 
 
 def _fuse(recording: "JournalRecording", volume: "Volume", quiet: bool) -> "Volume":

@@ -161,16 +161,19 @@ class Mesh:
 
 def summarise(figures: dict[str, Any]) -> str:
     """A mesh's `figures` as one line."""
-    vertices, triangles, islands = (
-        f"{figures[name]:,}".replace(",", "\u202f") for name in ("vertices", "triangles", "islands")
-    )
     extent = " × ".join(f"{length:.2f}" for length in figures["extent_m"])
-    share = 100 * figures["island_triangles"] / max(figures["triangles"], 1)
-    word = "island" if figures["islands"] == 1 else "islands"
-    return (
-        f"{vertices} vertices, {triangles} triangles, {extent} m, {islands} {word} ({share:.1f} %), "
-        f"up {_described(figures['up'])}"
-    )
+    if figures["islands"] is None:
+        pieces = "islands not looked for"
+    else:
+        share = 100 * figures["island_triangles"] / max(figures["triangles"], 1)
+        word = "island" if figures["islands"] == 1 else "islands"
+        pieces = f"{_grouped(figures['islands'])} {word} ({share:.1f} %)"
+    vertices, triangles = _grouped(figures["vertices"]), _grouped(figures["triangles"])
+    return f"{vertices} vertices, {triangles} triangles, {extent} m, {pieces}, up {_described(figures['up'])}"
+
+
+def _grouped(number: int) -> str:
+    return f"{number:,}".replace(",", "\u202f")
 
 
 def _described(up: Up | None) -> str:

@@ -20,7 +20,7 @@ GRAVITY = 9.81  # m/s²
 # beyond half of that it would be taken for one.
 _CONE = math.cos(math.radians(45))
 _LEVEL = math.cos(math.radians(8))  # of a direction, in which a normal is one of a plane across it
-_SAMPLE = 50_000  # triangles looked at
+SAMPLE = 50_000  # triangles looked at
 _UPRIGHT = 0.5  # least length of the mean of the cameras' unit up vectors: less, and they were turned about
 _LEAST = 0.02  # share of the surface that a floor has at least
 _APART = math.cos(math.radians(30))  # of two directions that are not the same
@@ -171,7 +171,7 @@ class _Surface:
     """A sample of a mesh's triangles: centres (n, 3), unit normals (n, 3), areas (n,) of sum 1."""
 
     def __init__(self, mesh: "Mesh") -> None:
-        faces = mesh.faces[:: max(1, len(mesh.faces) // _SAMPLE)]
+        faces = mesh.faces[:: max(1, len(mesh.faces) // SAMPLE)]
         corners, normals = mesh.vertices[faces].astype(np.float64), mesh.normals[faces].astype(np.float64)
         edges = np.diff(corners, axis=1)
         area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)

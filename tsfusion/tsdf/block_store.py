@@ -20,7 +20,7 @@ _FIRST_CAPACITY = 1024
 _CHUNK = 1024  # blocks read at a time where a whole layer would be copied
 _HASH_BYTES = 4 * 12  # most that a block takes in the hash, which is a quarter full or fuller
 # What the keys of a block and of its neighbours towards −x, −y, −z are smaller by
-_CELL_STEPS = np.array([x << 42 | y << 21 | z for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+CELL_STEPS = np.array([x << 42 | y << 21 | z for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 
 
 class BlockStore:
@@ -120,6 +120,11 @@ class BlockStore:
         else:
             self._memory_bytes = nbytes
             self.keep_within_memory()
+
+    @property
+    def is_in_files(self) -> bool:
+        """Whether blocks may leave memory."""
+        return self._residency is not None
 
     def keep_within_memory(self) -> None:
         """Let the coldest blocks leave memory if there are too many: call it after rows were touched."""
@@ -249,4 +254,4 @@ def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int32]:
 
 def cells_of(coordinates: NDArray[np.int32]) -> NDArray[np.int32]:
     """The blocks whose cells read these blocks: themselves and their neighbours towards −x, −y, −z."""
-    return unpack_keys(np.unique((pack_keys(coordinates)[:, None] - _CELL_STEPS).ravel()))
+    return unpack_keys(np.unique((pack_keys(coordinates)[:, None] - CELL_STEPS).ravel()))

@@ -90,14 +90,15 @@ def extract(
     """Mesh of the cells of the map's blocks `wanted` (sorted distinct keys)."""
     buffers = buffers or MeshBuffers()
     try:
-        return _extract(wanted, store, min_weight, buffers, view)
+        return extract_rows(wanted, store, min_weight, buffers, view)[0]
     finally:
         buffers.release()  # also of a mesh that there was no memory for
 
 
-def _extract(
+def extract_rows(
     wanted: NDArray[np.int64], store: BlockStore, min_weight: float, buffers: MeshBuffers, view: SurfaceView
-) -> Mesh:
+) -> tuple[Mesh, NDArray[np.int64]]:
+    """The mesh as of `extract`, and the (n,) keys of the blocks that rows of `buffers` are about."""
     keys = buffers.keys_around(wanted, store)
     count = len(keys)
     buffers.reserve(count)
@@ -125,4 +126,4 @@ def _extract(
         count, around, inside, active, edges, starts, first,
         marching_tables.TRIANGLE_COUNT, marching_tables.TRIANGLE_STARTS, faces,
     )  # fmt: skip
-    return Mesh(positions, faces, normals, colors if store.color else None)
+    return Mesh(positions, faces, normals, colors if store.color else None), keys

@@ -37,8 +37,9 @@ from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConf
 from tsfusion.core.side_thread import SideThread
 from tsfusion.geometry.keyframe import Keyframe, keyframe_of
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.mesh_parts import MeshParts, joined
 from tsfusion.geometry.sample_ranges import why_no_samples
-from tsfusion.geometry.up_direction import HeldSensor
+from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.kernels import integrate, runtime
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
@@ -57,6 +58,7 @@ from tsfusion.tsdf.growing_array import MAX_ITEMS
 from tsfusion.tsdf.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.map_difference import MapDifference
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
+from tsfusion.tsdf.mesh_tiles import tiles
 from tsfusion.tsdf.ray_buffers import RayBuffers, keyframes_of_every_kind
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
 
@@ -318,12 +320,11 @@ class Volume:
                 changed.
             surface: what to mesh instead of what the settings say; for `raw`, `cells_of(take_dirty())` do.
         """
-        if min_weight is None:
-            min_weight = self.model.min_weight
-        most = integrate.WEIGHT_LIMIT / WEIGHT_ONE
-        if not 0 <= min_weight <= most:
-            raise InvalidConfig(f"min_weight must be from 0 to {most:.0f}, got {min_weight}")
+        min_weight = self._checked_min_weight(min_weight)
         store = self._store
+        if blocks is None and store.is_in_files and store.count:
+            whole = joined(list(tiles(store, min_weight, self._view(surface))))
+            return replace(whole, held=self.held)
         chosen = store.keys
         if blocks is not None:
             if np.shape(blocks)[1:] != (3,) or np.asarray(blocks).dtype.kind != "i":
@@ -333,6 +334,31 @@ class Volume:
             chosen = chosen[store.slots_of(chosen) >= 0]
         mesh = extract(np.sort(chosen), self._store, min_weight, self._mesh_buffers, self._view(surface))
         return mesh if blocks is not None else replace(mesh, held=self.held)
+
+    def mesh_parts(
+        self, folder: str | os.PathLike[str], min_weight: float | None = None, *, up: Up | None = None
+    ) -> MeshParts:
+        """The mesh of the whole map, made tile by tile in bounded memory, to be saved: `extract_mesh`'s.
+
+        Args:
+            folder: where it waits in files without names.
+            up: away from the ground; None = it is found.
+
+        Raises:
+            OutputError: when the folder's disk has no room.
+        """
+        least = self._checked_min_weight(min_weight)
+        parts = tiles(self._store, least, self._view(None))
+        return MeshParts(parts, Path(folder), held=self.held, known_up=up)
+
+    def _checked_min_weight(self, min_weight: float | None) -> float:
+        """As given, or the sensor's."""
+        if min_weight is None:
+            min_weight = self.model.min_weight
+        most = integrate.WEIGHT_LIMIT / WEIGHT_ONE
+        if not 0 <= min_weight <= most:
+            raise InvalidConfig(f"min_weight must be from 0 to {most:.0f}, got {min_weight}")
+        return min_weight
 
     def map_hash(self) -> str:
         """Hex digest of the exact sums: equal for the same keyframes in any order, on any number of threads.

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: MIT
+"""A mesh that was written in parts is the mesh that was written as a whole."""
+
+import errno
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from failures import refuse
+from formula_scenes import sphere_views, tilted_plane, volume_of
+
+from tsfusion import Volume
+from tsfusion.core.errors import OutputError
+from tsfusion.geometry import up_direction
+from tsfusion.tsdf import field_regularizer
+
+
+@pytest.fixture
+def volume(monkeypatch: pytest.MonkeyPatch) -> Volume:
+    """A map of several tiles."""
+    monkeypatch.setattr(field_regularizer, "BATCH", 25)
+    volume = volume_of(sphere_views(0.4, 6))
+    assert volume.stats().blocks > 5 * 25
+    return volume
+
+
+@pytest.mark.parametrize("surface", ["raw", "normal", "field"])
+def test_one_ply_of_tiles_is_byte_for_byte_that_of_the_whole_map(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, surface: str
+) -> None:
+    monkeypatch.setattr(field_regularizer, "BATCH", 32)
+    monkeypatch.setattr(up_direction, "SAMPLE", 700)
+    volume = volume_of(sphere_views(0.4, 6), surface=surface, color=surface != "raw")
+    whole = volume.extract_mesh()
+    whole.save(tmp_path / "whole.ply")
+    parts = volume.mesh_parts(tmp_path)
+    assert parts.up == whole.up is not None
+    (file,) = parts.save(tmp_path / "parts.ply")
+    assert file.read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    figures = {**whole.figures, "islands": None, "island_triangles": None}
+    assert parts.figures == figures
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["parts.ply", "whole.ply"]
+
+
+def test_glb_tiles_are_the_triangles_of_the_whole_mesh(tmp_path: Path, volume: Volume) -> None:
+    whole = volume.extract_mesh()
+    (tmp_path / "map-0001.glb").write_bytes(b"of a mesh before")
+    (tmp_path / "map-0099.glb").write_bytes(b"somebody's own")
+    parts = volume.mesh_parts(tmp_path)
+    count = len(parts.save(tmp_path / "map.glb"))
+    stale = [tmp_path / f"map-{count + more:04}.glb" for more in (1, 2)]
+    for path in stale:
+        path.write_bytes(b"of a larger mesh before")
+    files = parts.save(tmp_path / "map.glb")
+    assert not any(path.exists() for path in stale)
+    assert (tmp_path / "map-0099.glb").exists()
+    assert len(files) > 4
+    assert files[0].name == "map-0001.glb"
+    expected = trimesh.load(whole.save(tmp_path / "whole.glb"), process=False).to_geometry()
+    found = [trimesh.load(file, process=False).to_geometry() for file in files]
+    assert np.array_equal(np.concatenate([one.triangles for one in found]), expected.triangles)
+    colors = np.concatenate([one.visual.vertex_colors[one.faces] for one in found])
+    assert np.array_equal(colors, expected.visual.vertex_colors[expected.faces])
+
+
+def test_what_cannot_be_written_is_named(
+    tmp_path: Path, volume: Volume, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts = volume.mesh_parts(tmp_path, up=up_direction.parse("z"))
+    with pytest.raises(OutputError, match=r"is saved as .ply or .glb, got 'mesh.obj'"):
+        parts.save(tmp_path / "mesh.obj")
+    with pytest.raises(OutputError, match=r"cannot write .*mesh.ply: No such file"):
+        parts.save(tmp_path / "none" / "mesh.ply")
+    with pytest.raises(OutputError, match="no triangles"):
+        Volume(0.02, threads=2).mesh_parts(tmp_path).save(tmp_path / "mesh.ply")
+    with pytest.raises(OutputError, match="no triangles"):
+        volume_of(tilted_plane()[1]).mesh_parts(tmp_path, min_weight=1000).save(tmp_path / "mesh.ply")
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse(errno.ENOSPC))
+    with pytest.raises(OutputError, match=r"cannot write the mesh to .*: No space left"):
+        volume.mesh_parts(tmp_path)
+    assert list(tmp_path.iterdir()) == []

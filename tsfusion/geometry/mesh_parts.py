@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: MIT
+"""A mesh that is too large for memory: it comes in parts, waits on a disk, and is written from there."""
+
+import tempfile
+import weakref
+from collections.abc import Iterable, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core import durable_files
+from tsfusion.core.errors import OutputError
+from tsfusion.geometry import up_direction
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.up_direction import HeldSensor, Up
+
+FORMATS = (".ply", ".glb")
+_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
+
+
+class MeshPart(NamedTuple):
+    """A part of a mesh: as of a `Mesh`, but `faces` (m, 3) int32 count vertices from the end of the whole: 1
+    is the last one. They may name vertices of the parts that come behind this one in the mesh."""
+
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    normals: NDArray[np.float32]
+    colors: NDArray[np.uint8] | None
+
+
+def joined(parts: list[MeshPart]) -> Mesh:
+    """The whole mesh of its parts, the last of the mesh first."""
+    nothing = np.zeros((0, 3), np.float32)
+    vertices, faces, normals = (
+        np.concatenate([part[which] for part in reversed(parts)]) if parts else nothing for which in range(3)
+    )
+    colors = [part.colors for part in reversed(parts) if part.colors is not None]
+    return Mesh(
+        vertices,
+        np.asarray(len(vertices) - faces, np.int32),
+        normals,
+        np.concatenate(colors) if colors else None,
+    )
+
+
+class MeshParts:
+    """A mesh on the disk.
+
+    Args:
+        parts: the last of the mesh first.
+        folder: for files without names.
+        held: how the sensors that saw the map were held.
+        known_up: away from the ground; None = it is found.
+
+    Raises:
+        OutputError: when the folder's disk has no room.
+    """
+
+    def __init__(
+        self, parts: Iterable[MeshPart], folder: Path, *, held: HeldSensor, known_up: Up | None = None
+    ) -> None:
+        self._held, self._known_up = held, known_up
+        self._counts: list[tuple[int, int]] = []  # vertices and faces of each part, as they came
+        self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
+        self._vertex = np.dtype([])
+        try:
+            self._vertices, self._faces = (self._file(folder) for _ in range(2))
+            for part in parts:
+                self._take(part)
+            self._vertices.flush()
+            self._faces.flush()
+        except OSError as error:
+            raise OutputError(f"cannot write the mesh to {folder}: {error.strerror}") from error
+        self.vertices, self.faces = (sum(part[which] for part in self._counts) for which in (0, 1))
+
+    def _file(self, folder: Path) -> BinaryIO:
+        file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115  it is closed with this object
+        weakref.finalize(self, file.close)
+        return file
+
+    def _take(self, part: MeshPart) -> None:
+        self._vertex = _vertex_type(part.colors is not None)
+        rows = np.empty(len(part.vertices), self._vertex)
+        rows["position"], rows["normal"] = part.vertices, part.normals
+        if part.colors is not None:
+            rows["color"][:, :3], rows["color"][:, 3] = part.colors, 255
+        self._vertices.write(rows.data)
+        self._faces.write(np.ascontiguousarray(part.faces, "<i4").data)
+        self._counts.append((len(part.vertices), len(part.faces)))
+        if len(part.vertices):
+            self._low = np.minimum(self._low, part.vertices.min(axis=0))
+            self._high = np.maximum(self._high, part.vertices.max(axis=0))
+
+    @cached_property
+    def up(self) -> Up | None:
+        """Direction away from the ground, as given or found; None = not known."""
+        if self._known_up is not None:
+            return self._known_up
+        step, skipped = max(1, self.faces // up_direction.SAMPLE), 0
+        found = [np.empty(0, self._vertex)]
+        for part in self._in_order():
+            found.append(self._rows(part[skipped::step].ravel()))
+            skipped = (skipped - len(part)) % step
+        rows = np.concatenate(found)
+        faces = np.arange(len(rows), dtype=np.int32).reshape(-1, 3)
+        return up_direction.find(Mesh(rows["position"], faces, rows["normal"]), self._held)
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """As a `Mesh` has them; nobody has looked for islands."""
+        extent = self._high - self._low if self.vertices else np.zeros(3)
+        return {
+            "vertices": self.vertices,
+            "triangles": self.faces,
+            "extent_m": [round(float(length), 3) for length in extent],
+            "islands": None,
+            "island_triangles": None,
+            "up": self.up,
+        }
+
+    def save(self, path: Path) -> list[Path]:
+        """Write one PLY, the same as `Mesh.save` does, or GLB files of a part each: `NAME-0001.glb` and on.
+
+        Returns:
+            The files.
+
+        Raises:
+            OutputError: for another suffix, an empty mesh, or a path that cannot be written.
+        """
+        check(path)
+        if not self.faces:
+            raise OutputError(f"nothing to write to {path}: the mesh has no triangles (yet)")
+        if path.suffix.lower() == ".ply":
+            return [self._save_ply(path)]
+        return self._save_tiles(path)
+
+    def _save_tiles(self, path: Path) -> list[Path]:
+        meshes = (self._mesh(faces) for faces in self._in_order() if len(faces))
+        files = [mesh.save(_tile(path, number)) for number, mesh in enumerate(meshes, 1)]
+        number = len(files) + 1
+        while (left := _tile(path, number)).is_file():  # of a larger mesh that was written here before
+            left.unlink()
+            number += 1
+        return files
+
+    def _save_ply(self, path: Path) -> Path:
+        try:
+            with durable_files.replacing(path) as file:
+                file.write(self._header())
+                for count, offset in self._pieces(0, self._vertex.itemsize):
+                    file.write(_read(self._vertices, offset, count * self._vertex.itemsize))
+                for faces in self._in_order():
+                    rows = np.empty(len(faces), _FACE)
+                    rows["count"], rows["corners"] = 3, faces
+                    file.write(rows.data)
+        except OSError as error:
+            raise OutputError(f"cannot write {path}: {error.strerror}") from error
+        return path
+
+    def _header(self) -> bytes:
+        """That of a PLY of one triangle, with the numbers of this mesh."""
+        corners, grey = np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8)
+        faces = np.arange(3, dtype=np.int32)[None]
+        one = Mesh(corners, faces, corners, grey if self._has_color else None, known_up=self.up)
+        head, end, _ = one.encode(".ply").partition(b"end_header\n")
+        head = head.replace(b"element vertex 3\n", b"element vertex %d\n" % self.vertices)
+        return head.replace(b"element face 1\n", b"element face %d\n" % self.faces) + end
+
+    def _pieces(self, which: int, item_bytes: int) -> Iterator[tuple[int, int]]:
+        """Number of items and offset in the file of each part, in the order of the mesh."""
+        offset = sum(counts[which] for counts in self._counts) * item_bytes
+        for counts in reversed(self._counts):
+            offset -= counts[which] * item_bytes
+            yield counts[which], offset
+
+    def _in_order(self) -> Iterator[NDArray[np.int32]]:
+        """Faces of each part, in the order of the mesh: numbers of the whole mesh's vertices."""
+        for count, offset in self._pieces(1, 12):
+            from_end = np.frombuffer(_read(self._faces, offset, 12 * count), "<i4").reshape(-1, 3)
+            yield np.asarray(self.vertices - from_end, np.int32)
+
+    def _mesh(self, faces: NDArray[np.int32]) -> Mesh:
+        """Some faces with their vertices alone."""
+        used, corners = np.unique(faces, return_inverse=True)
+        rows = self._rows(used)
+        colors = rows["color"][:, :3].copy() if self._has_color else None
+        triangles: NDArray[np.int32] = corners.reshape(-1, 3).astype(np.int32)
+        return Mesh(rows["position"].copy(), triangles, rows["normal"].copy(), colors, known_up=self.up)
+
+    def _rows(self, numbers: NDArray[np.int32]) -> NDArray[Any]:
+        """Vertices, as they stand in the file: parts lie there last first."""
+        if not len(numbers):
+            return np.empty(0, self._vertex)
+        counts = np.array([count for count, _ in reversed(self._counts)])
+        first = np.cumsum(counts) - counts
+        part = np.searchsorted(first, numbers, side="right") - 1
+        lies = numbers - first[part] + self.vertices - first[part] - counts[part]
+        return np.asarray(np.memmap(self._vertices, self._vertex, "r")[lies])
+
+    @property
+    def _has_color(self) -> bool:
+        return "color" in (self._vertex.names or ())
+
+
+def _tile(path: Path, number: int) -> Path:
+    return path.with_stem(f"{path.stem}-{number:04}")
+
+
+def check(path: Path) -> None:
+    """Raise OutputError for a file that is not written in parts."""
+    if path.suffix.lower() not in FORMATS:
+        raise OutputError(
+            f"a mesh that is too large for memory is saved as {' or '.join(FORMATS)}, got {path.name!r}"
+        )
+
+
+def _vertex_type(has_color: bool) -> np.dtype[Any]:
+    """A vertex as it stands in a PLY file."""
+    fields: list[Any] = [("position", "<f4", 3), ("normal", "<f4", 3)]
+    return np.dtype(fields + [("color", "u1", 4)] * has_color)
+
+
+def _read(file: BinaryIO, offset: int, size: int) -> bytes:
+    file.seek(offset)
+    return file.read(size)
