@@ -548,3 +548,34 @@ def test_habits_of_other_libraries_are_answered() -> None:
     with pytest.raises(AttributeError, match=r"no extract_triangle_mesh: write extract_mesh\(\)"):
         volume.extract_triangle_mesh()
     assert volume.keyframes == 0
+
+
+def test_blocks_that_retractions_empty_make_room_and_nothing_else_changes(tmp_path: Path) -> None:
+    views = sphere_views(0.4, 6)
+    volume = volume_of(views[:4])
+    volume.take_dirty()
+    assert volume.release_empty() == 0
+    before = volume.stats().blocks
+    for gone in views[:2]:
+        volume.retract(gone)
+    dirty = {tuple(block) for block in volume.take_dirty().tolist()}
+    volume.retract(views[2])
+    dirty_again = {tuple(block) for block in volume.take_dirty().tolist()}
+    volume.integrate(views[2])
+    volume.retract(views[2])
+    released = volume.release_empty()
+    assert 0 < released == before - volume.stats().blocks
+    assert {tuple(block) for block in volume.take_dirty().tolist()} == dirty_again  # also those released
+    assert len(volume.take_dirty()) == 0 < len(dirty)
+    fresh = volume_of(views[3:4])
+    assert volume.map_hash() == fresh.map_hash()
+    assert volume.color_hash() == fresh.color_hash()
+    loaded = Volume.load(volume.save(tmp_path / "map.tsf"), threads=2)
+    assert loaded.stats().blocks == volume.stats().blocks
+    for one in (volume, fresh):
+        for view in views[4:]:
+            one.integrate(view)
+    assert volume.map_hash() == fresh.map_hash()
+    assert volume.color_hash() == fresh.color_hash()
+    assert volume.extract_mesh().encode(".ply") == fresh.extract_mesh().encode(".ply")
+    assert volume.release_empty() == 0

@@ -75,6 +75,7 @@ class MapCheckpoints:
         done = {key.hex(): msgspec.structs.astuple(progress) for key, progress in self.done.items()}
         meta = {"done": done, "rejected": self.rejected, "blocks": self.blocks, "poses": self.poses.saved()}
         try:
+            self.volume.release_empty()
             self.volume.save(self._new, meta=meta)
             if self._keep_previous:
                 with suppress(FileNotFoundError):

@@ -172,6 +172,19 @@ class BlockStore:
         self.hash_keys[:] = self.hash_slots[:] = 0
         self._hash(0)
 
+    def release(self, slots: NDArray[np.int64]) -> None:
+        """Give up blocks without votes: the last ones take their slots, and new ones the room."""
+        left = self.count - len(slots)
+        is_free = np.zeros(self.count, bool)
+        is_free[slots] = True
+        to, moved = np.flatnonzero(is_free[:left]), left + np.flatnonzero(~is_free[left:])
+        for rows in (array.array for array in self._arrays()):
+            for i in range(0, len(to), _CHUNK):
+                rows[to[i : i + _CHUNK]] = rows[moved[i : i + _CHUNK]]
+            rows[left : self.count] = 0
+            self.keep_within_memory()
+        self.drop(left)
+
     def slots_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
         """(n,) slots of (n,) keys, −1 where there is no such block."""
         slots = np.empty(len(keys), np.int32)

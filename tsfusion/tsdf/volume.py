@@ -131,6 +131,8 @@ class Volume:
         self.held = HeldSensor()  # their sensors
         self.quota: KeyframeQuota | None = None  # of the keyframes that are integrated from here on
         self._has_warned = False  # of a keyframe without
+        self._has_retracted = False  # since `release_empty`
+        self._released: list[NDArray[np.int64]] = []  # keys of released blocks whose mesh has to go
         runtime.start(config.threads)
         smooths = model.regularizer != "off"
         self._store = BlockStore(
@@ -292,7 +294,23 @@ class Volume:
 
     def take_dirty(self) -> NDArray[np.int32]:
         """Coordinates of the blocks changed since the last call: (n, 3) int32, in units of 8 voxels."""
-        return unpack_keys(self._store.keys[self._store.take_dirty()])
+        keys = np.concatenate([self._store.keys[self._store.take_dirty()], *self._released])
+        self._released.clear()
+        return unpack_keys(keys)
+
+    def release_empty(self) -> int:
+        """Give up the blocks that `retract` has left without votes; returns how many.
+
+        The map stays the same, as if it were saved and loaded. Blocks that come later take their room.
+        """
+        if not self._has_retracted:
+            return 0
+        store = self._store
+        empty = np.setdiff1d(np.arange(store.count), store.used(), assume_unique=True)
+        self._released.append(store.keys[empty[store.dirty[empty] != 0]])
+        store.release(empty)
+        self._has_retracted = False
+        return len(empty)
 
     def cells_to_mesh(self, dirty: NDArray[np.int32]) -> NDArray[np.int32]:
         """The blocks whose mesh the changes to these blocks reach: (m, 3) int32.
@@ -498,6 +516,7 @@ class Volume:
             raise MapError("cannot retract a keyframe from a map that holds none")
         blocks_before = self._store.count
         samples = self._ray_buffers.make_rays(keyframe, self.config)  # paper eq. 1
+        self._has_retracted |= sign < 0
         with process.uninterrupted():
             updates = self._integrator.apply(sign, self.quota)  # paper eq. 2 and 3
             if samples:
