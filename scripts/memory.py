@@ -16,6 +16,7 @@ start, or when it takes keyframes at less than half the rate.
 
 import argparse
 import hashlib
+import importlib.util
 import os
 import subprocess
 import sys
@@ -129,16 +130,14 @@ def _open3d(options: argparse.Namespace) -> Any:
     return Open3D(options.voxel_size, max_range=30.0, truncation=10.0, color=True)
 
 
-def measured(name: str, options: argparse.Namespace, budget: int = 0) -> Curve | None:
-    """`grow` in a process of its own; None where Open3D is not installed."""
+def measured(name: str, options: argparse.Namespace, budget: int = 0) -> Curve:
+    """`grow` in a process of its own."""
     command = [sys.executable, __file__, "--only", name, "--budget", str(budget)]
     for flag in ("keyframes", "voxel_size", "width", "cache"):
         command += [f"--{flag.replace('_', '-')}", str(getattr(options, flag))]
     command += ["--mesh"] * options.mesh
     done = subprocess.run(command, stdout=subprocess.PIPE, check=False)
     if done.returncode:
-        if name == "Open3D":
-            return None
         raise SystemExit(f"{name} failed with status {done.returncode}")
     return msgspec.json.decode(done.stdout, type=Curve)
 
@@ -193,11 +192,11 @@ def main() -> int:
         print(msgspec.json.encode(grow(options.only, options)).decode())
         return 0
     unbounded = measured("tsfusion", options)
-    assert unbounded is not None
     budget = int(options.share * unbounded.map_bytes)
     bounded = measured(f"tsfusion, memory_bytes={budget / 1e6:.0f} MB", options, budget)
-    assert bounded is not None
-    curves = [unbounded, bounded] + ([peer] if (peer := measured("Open3D", options)) else [])
+    curves = [unbounded, bounded]
+    if importlib.util.find_spec("open3d"):
+        curves.append(measured("Open3D", options))
     print(table(curves), file=sys.stderr)
     if options.plot:
         plot(curves, options.plot)

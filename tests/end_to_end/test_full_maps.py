@@ -29,15 +29,15 @@ def far_points(first: int, count: int) -> Keyframe:
     return Keyframe(points=points, origins=origins, T_world_camera=np.eye(4), timestamp_ns=first + 1)
 
 
-def fill(server: Server, most: int) -> list[Keyframe]:
+def fill(server: Server, most: int, reason: str) -> list[Keyframe]:
     """Send keyframes until not even the smallest fits any more; those that the map has."""
     fused, first, count = [], 0, most
     with Client(server.address, policy="spool_all") as client:
         while count > most // 256:
             keyframe = far_points(first, count)
-            rejected = client.stats.rejected.get("memory", 0)
+            rejected = client.stats.rejected.get(reason, 0)
             deliver(client, [keyframe])
-            if client.stats.rejected.get("memory", 0) == rejected:
+            if client.stats.rejected.get(reason, 0) == rejected:
                 fused.append(keyframe)
                 first += count
             else:
@@ -69,14 +69,15 @@ def stop(server: Server) -> int:
     return server.process.wait(PATIENCE)
 
 
-def check_reopening(folder: Path, memory: int, most: int) -> None:
-    """Fill a map of so many bytes, then stop, kill and open it again and again."""
-    settings = {"fuser_memory_bytes": memory, "checkpoint_every": 7}
+def check_reopening(folder: Path, memory: int, most: int, disk: int | None = None) -> None:
+    """Fill a map of so many bytes, in memory or on the disk, then stop, kill and open it again and again."""
+    settings = {"fuser_memory_bytes": memory, "fuser_disk_bytes": disk, "checkpoint_every": 7}
+    reason = "memory" if disk is None else "MapFull"
     with serving(folder, **settings) as server:
-        fused = fill(server, most)
+        fused = fill(server, most, reason)
         full = state(server)
-        assert full[3] >= 0.99 * memory
-        assert full[2]["memory"] >= 8
+        assert full[3] >= 0.99 * (disk or memory)
+        assert full[2][reason] >= 8
         kill_fuser(server)
         assert state(server) == full
         assert stop(server) == 0
@@ -85,10 +86,10 @@ def check_reopening(folder: Path, memory: int, most: int) -> None:
         again, too_much = fused[0], far_points(1_000_000, most)
         with Client(server.address, policy="spool_all") as client:
             deliver(client, [again, too_much, again])
-            assert client.stats.rejected == {"memory": 1}
+            assert client.stats.rejected == {reason: 1}
         more = state(server)
         assert more[0] == map_hash([*fused, again, again], VOLUME)
-        assert (more[1], more[2]["memory"]) == (full[1] + 2, full[2]["memory"] + 1)
+        assert (more[1], more[2][reason]) == (full[1] + 2, full[2][reason] + 1)
         server.kill()
     with serving(folder, **settings) as server:
         assert state(server) == more
@@ -101,6 +102,11 @@ def check_reopening(folder: Path, memory: int, most: int) -> None:
 
 def test_a_full_map_is_opened_again(tmp_path: Path) -> None:
     check_reopening(tmp_path, LEAST, 2048)
+
+
+@pytest.mark.nightly
+def test_a_map_that_has_filled_its_disk_is_opened_again(tmp_path: Path) -> None:
+    check_reopening(tmp_path, LEAST, 2048, disk=3 * LEAST)
 
 
 @pytest.mark.nightly

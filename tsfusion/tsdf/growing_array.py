@@ -139,8 +139,9 @@ class FileArray(GrowingArray):
     def let_go(self, first: int, end: int) -> None:
         """Take items first … end-1, whole pages, out of this process's memory; touched, they come back.
 
-        The system begins to write them to the disk, so that it can use their memory for something else.
+        They are the system's then: it writes them to the disk, and keeps a copy for as long as nothing else
+        needs the memory. (Told to drop them by posix_fadvise, it reads again what comes back: 1.6 times the
+        CPU in a room four times as large as its memory.)
         """
-        start, size = first * self.item_bytes, (end - first) * self.item_bytes
-        self._pages.madvise(mmap.MADV_DONTNEED, start, size)
-        os.posix_fadvise(self._file, start, size, os.POSIX_FADV_DONTNEED)
+        size = self.item_bytes
+        self._pages.madvise(mmap.MADV_DONTNEED, first * size, (end - first) * size)
