@@ -98,7 +98,7 @@ def test_a_full_disk_budget_rejects_the_keyframe_and_keeps_the_map(
         volume.integrate(views[2])
     assert volume.map_hash() == first.map_hash()
     saved = volume.save(folder / "map.tsf")
-    smaller = CacheConfig(folder=str(folder), disk_bytes=1 << 20)
+    smaller = CacheConfig(folder=str(folder), disk_bytes=1 << 20, min_free_bytes=1 << 60)
     opened = Volume.load(saved, memory_bytes=MEMORY, cache=smaller)  # one that is larger opens, and is full
     assert opened.map_hash() == first.map_hash()
     with pytest.raises(MapFull):
@@ -125,6 +125,9 @@ def test_a_folder_that_cannot_hold_blocks_is_named(tmp_path: Path, monkeypatch: 
         Volume(VOXEL, memory_bytes=MEMORY, cache=tmp_path / "none")
     monkeypatch.setattr(durable_files, "is_in_memory", lambda _: True)
     with pytest.raises(InvalidConfig, match="is a RAM disk"):
+        Volume(VOXEL, memory_bytes=MEMORY, cache=tmp_path)
+    monkeypatch.setattr(process, "shared_rss_bytes", lambda: 0)
+    with pytest.raises(InvalidConfig, match="memory_bytes needs Linux and its /proc"):
         Volume(VOXEL, memory_bytes=MEMORY, cache=tmp_path)
     with pytest.raises(InvalidConfig, match="memory_bytes must be"):
         Volume(VOXEL, memory_bytes=0)

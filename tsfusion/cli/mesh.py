@@ -49,8 +49,9 @@ def mesh(
 ) -> None:
     """Write the mesh of a saved map, of a live server, or of a journal.
 
-    A journal is fused again, with the map flags given here. The mesh of a map that is larger than --memory is
-    written in tiles: to one .ply, or to a .glb each (OUT-0001.glb and on).
+    A journal is fused again, with the map flags given here.
+
+    The mesh of a map larger than --memory is made in tiles: one .ply, or a .glb each (OUT-0001.glb and on).
     """
     from dataclasses import replace
 

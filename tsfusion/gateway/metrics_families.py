@@ -46,7 +46,7 @@ _OF_MAPS: tuple[tuple[str, str, Callable[[MapHealth], float]], ...] = (
     ("journal_damaged", "Records of the journal that could not be read.", lambda one: one.journal_damaged),
     ("journal_missing", "Segments of the journal that are gone.", lambda one: one.journal_missing),
     ("map_blocks", "Blocks of 8³ voxels.", lambda one: one.blocks),
-    ("map_bytes", "Bytes of the map in memory.", lambda one: one.map_bytes),
+    ("map_bytes", "Bytes of the map's blocks.", lambda one: one.map_bytes),
     ("map_problem", "Whether something keeps it from taking or fusing.", lambda one: bool(one.problem)),
     ("delay_bound_seconds", "The total delays are right to within ±.", lambda one: one.delay_bound_ms / 1e3),
 )

@@ -2,6 +2,7 @@
 """The map's memory: blocks of 8³ voxels in slots, found by their packed coordinates."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -57,8 +58,7 @@ class BlockStore:
         self._memory_bytes = 0
         self._disk_bytes = cache.disk_bytes if cache else 0
         if cache:
-            files = [self._layers[name] for name in self._present]
-            self._residency = Residency([layer for layer in files if isinstance(layer, FileArray)])
+            self._residency = Residency(self._files)
             self.most_blocks = min(MAX_ITEMS, cache.disk_bytes // self._residency.row_bytes)
 
     def _layer(self, name: str, cache: CacheConfig | None) -> GrowingArray:
@@ -68,6 +68,25 @@ class BlockStore:
         if cache is None:
             return GrowingArray(*kind, _FIRST_CAPACITY)
         return FileArray(*kind, _FIRST_CAPACITY, Path(cache.folder), cache.min_free_bytes)
+
+    @property
+    def _files(self) -> list[FileArray]:
+        return [layer for layer in self._layers.values() if isinstance(layer, FileArray)]
+
+    @contextmanager
+    def opening(self, blocks: int) -> Iterator[None]:
+        """Take so many blocks of a saved map in the block, whatever limits one that grows has."""
+        limits = self.most_blocks, [file.min_free_bytes for file in self._files]
+        self.most_blocks = MAX_ITEMS
+        for file in self._files:
+            file.min_free_bytes = None
+        try:
+            self.reserve(blocks)
+            yield
+        finally:
+            self.most_blocks = limits[0]
+            for file, least in zip(self._files, limits[1], strict=True):
+                file.min_free_bytes = least
 
     @property
     def keys(self) -> NDArray[np.int64]:
@@ -130,7 +149,7 @@ class BlockStore:
         """Let the coldest blocks leave memory if there are too many: call it after rows were touched."""
         if self._residency is not None:
             index = self.nbytes - self.count * self._residency.row_bytes
-            self._residency.keep_within(self._memory_bytes - index, self.stamps[: self.count])
+            self._residency.keep_within(max(self._memory_bytes - index, 0), self.stamps[: self.count])
 
     def reserve(self, count: int) -> None:
         """Make room for `count` blocks in all.

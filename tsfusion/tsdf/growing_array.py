@@ -94,16 +94,22 @@ class FileArray(GrowingArray):
     nor for ever as its resident memory (`let_go`).
 
     Args:
-        min_free_bytes: that growing leaves free on the disk.
+        min_free_bytes: that growing beyond `capacity` leaves free on the disk; None = nothing.
 
     Raises:
         InvalidConfig: when the folder cannot hold such a file.
     """
 
     def __init__(
-        self, item: tuple[int, ...], dtype: DTypeLike, capacity: int, folder: Path, min_free_bytes: int = 0
+        self,
+        item: tuple[int, ...],
+        dtype: DTypeLike,
+        capacity: int,
+        folder: Path,
+        min_free_bytes: int | None = None,
     ) -> None:
-        self._folder, self._min_free_bytes = folder, min_free_bytes
+        self._folder = folder
+        self.min_free_bytes: int | None = None
         size = (MAX_ITEMS + 1) * int(np.prod(item, dtype=np.int64)) * np.dtype(dtype).itemsize
         try:
             with tempfile.TemporaryFile(dir=folder) as file:
@@ -117,11 +123,13 @@ class FileArray(GrowingArray):
             ) from error
         weakref.finalize(self, os.close, self._file)
         super().__init__(item, dtype, capacity)
+        self.min_free_bytes = min_free_bytes
 
     def _grow(self, capacity: int) -> None:
         held, size = self.capacity * self.item_bytes, capacity * self.item_bytes
         try:
-            durable_files.require_room(self._folder, size - held + self._min_free_bytes)
+            if self.min_free_bytes is not None:
+                durable_files.require_room(self._folder, size - held + self.min_free_bytes)
             # A page that the disk has no room for would end the process when it is written.
             os.posix_fallocate(self._file, held, size - held)
         except OSError as error:

@@ -14,6 +14,7 @@ import os
 import struct
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -54,7 +55,6 @@ from tsfusion.tsdf import (
     voxel_arrays,
 )
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
-from tsfusion.tsdf.growing_array import MAX_ITEMS
 from tsfusion.tsdf.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.map_difference import MapDifference
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
@@ -472,11 +472,10 @@ class Volume:
             InvalidConfig: for a setting that the stored sums depend on.
             CheckpointError: when the file is missing, torn, altered or of another version.
         """
-        with checkpoint.reading(Path(path)) as (header, chunks):
+        with ExitStack() as opening, checkpoint.reading(Path(path)) as (header, chunks):
             volume = cls(_loaded_config(header, threads, changed), memory_bytes=memory_bytes, cache=cache)
             store = volume._store
-            most, store.most_blocks = store.most_blocks, MAX_ITEMS
-            store.reserve(header.blocks)
+            opening.enter_context(store.opening(header.blocks))
             layers = store.layers()
             if set(header.layers) != set(layers):
                 raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
@@ -491,7 +490,6 @@ class Volume:
                     store.keep_within_memory()
                     side.do(partial(_check_in, Path(path), store, slice(chunk.first, store.count), digest))
                 side.wait()
-            store.most_blocks = most
             volume.keyframes = header.keyframes
             volume.held = HeldSensor(header.meta.pop(_HELD, None))
             volume.meta = header.meta
@@ -584,8 +582,8 @@ def _checked_cache(memory_bytes: int, cache: str | os.PathLike[str] | CacheConfi
     """Where blocks may wait that are not in memory."""
     if memory_bytes < 1:
         raise InvalidConfig(f"memory_bytes must be > 0, got {memory_bytes}")
-    if sys.platform != "linux":
-        raise InvalidConfig("memory_bytes needs Linux: elsewhere all blocks stay in memory")
+    if sys.platform != "linux" or not process.shared_rss_bytes():
+        raise InvalidConfig("memory_bytes needs Linux and its /proc: elsewhere all blocks stay in memory")
     if not isinstance(cache, CacheConfig):
         cache = CacheConfig(folder=os.fspath(cache or os.environ.get("TMPDIR") or "/var/tmp"))
     if durable_files.is_in_memory(Path(cache.folder)):
