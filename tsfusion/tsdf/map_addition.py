@@ -50,6 +50,8 @@ def add(store: BlockStore, other: BlockStore, max_blocks: int) -> None:
         for i in range(0, len(keys), _CHUNK):
             chunk = slice(i, i + _CHUNK)
             _add_rows(store, other, slots[chunk], theirs[chunk], missing[chunk])
+            store.keep_within_memory()
+            other.keep_within_memory()
 
 
 def _check_weights(
