@@ -3,8 +3,10 @@
 
     python scripts/memory.py                              400 keyframes: a table, then one JSON line
     python scripts/memory.py --keyframes 2000 --plot docs/images/memory.png
+    python scripts/memory.py --world room --keyframes 120 --voxel-size 0.01
 
 Forty stereo keyframes of the synthetic street are rendered once and repeated, 40 m further along each time.
+The room is the worst case: a Kinect goes round it again and again, and every block comes back each time.
 They are fused by one process each: without a bound; with `memory_bytes` at --share of what the map took; and
 by Open3D's VoxelBlockGrid, where it is installed. One core is enough; each holds one map at a time.
 
@@ -32,6 +34,7 @@ import msgspec
 from tsfusion.core import process
 from tsfusion.geometry.keyframe import Keyframe
 
+SENSORS = {"street": "stereo", "room": "kinect"}
 LAP = 40  # keyframes that are rendered
 STEP = 1.0  # metres from one to the next
 SPARE = 200 << 20  # bytes beside the budget
@@ -60,21 +63,23 @@ class Curve(msgspec.Struct):
         return max(self.rss) - self.start_rss
 
 
-def street(count: int, width: int) -> Iterator[Keyframe]:
-    """Keyframes of a street of any length."""
+def recording(world: str, count: int, width: int) -> Iterator[Keyframe]:
+    """Keyframes of a street of any length, or of laps in a room."""
     from tsfusion.datasets.synthetic.dataset import Synthetic
 
-    rendered = list(Synthetic("street", "stereo", count=LAP, width=width))
+    path = "tour" if world == "room" else None
+    rendered = list(Synthetic(world, SENSORS[world], count=LAP, width=width, path=path))
     for index in range(count):
         keyframe = rendered[index % LAP]
         T = keyframe.T_world_camera.copy()
-        T[0, 3] += STEP * LAP * (index // LAP)
+        if world == "street":
+            T[0, 3] += STEP * LAP * (index // LAP)
         yield replace(keyframe, T_world_camera=T)
 
 
 def grow(name: str, options: argparse.Namespace) -> Curve:
-    """Fuse the street in this process."""
-    keyframes = street(options.keyframes, options.width)
+    """Fuse the keyframes in this process."""
+    keyframes = recording(options.world, options.keyframes, options.width)
     first = next(keyframes)
     fused = _open3d(options) if name == "Open3D" else _volume(options, options.budget)
     fused.integrate(first)
@@ -116,7 +121,7 @@ def _volume(options: argparse.Namespace, budget: int) -> Any:
 
     volume = Volume(
         options.voxel_size,
-        sensor="stereo",
+        sensor=SENSORS[options.world],
         memory_bytes=budget or None,
         cache=options.cache if budget else None,
     )
@@ -133,7 +138,7 @@ def _open3d(options: argparse.Namespace) -> Any:
 def measured(name: str, options: argparse.Namespace, budget: int = 0) -> Curve:
     """`grow` in a process of its own."""
     command = [sys.executable, __file__, "--only", name, "--budget", str(budget)]
-    for flag in ("keyframes", "voxel_size", "width", "cache"):
+    for flag in ("world", "keyframes", "voxel_size", "width", "cache"):
         command += [f"--{flag.replace('_', '-')}", str(getattr(options, flag))]
     command += ["--mesh"] * options.mesh
     done = subprocess.run(command, stdout=subprocess.PIPE, check=False)
@@ -178,6 +183,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--world", choices=SENSORS, default="street")
     parser.add_argument("--keyframes", type=int, default=400)
     parser.add_argument("--voxel-size", type=float, default=0.15, help="metres")
     parser.add_argument("--width", type=int, default=310, help="of the image, pixels")
@@ -195,7 +201,7 @@ def main() -> int:
     budget = int(options.share * unbounded.map_bytes)
     bounded = measured(f"tsfusion, memory_bytes={budget / 1e6:.0f} MB", options, budget)
     curves = [unbounded, bounded]
-    if importlib.util.find_spec("open3d"):
+    if options.world == "street" and importlib.util.find_spec("open3d"):
         curves.append(measured("Open3D", options))
     print(table(curves), file=sys.stderr)
     if options.plot:

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-def _flag(flag: str, metavar: str, help_: str) -> Any:
-    return Annotated[str | None, options.option(flag, metavar, help_)]
+def _flag(flag: str, metavar: str, help_: str, *, rare: bool = False) -> Any:
+    return Annotated[str | None, options.option(flag, metavar, help_, rare=rare)]
 
 
 # By name: settings of the `server` table.
@@ -46,8 +46,8 @@ SERVER_OPTIONS: dict[str, Any] = {
     "fuser_memory_bytes": _flag("--memory", "BYTES",
                                 "Memory of each map's blocks, such as 2GB; more wait on the disk."),
     "fuser_disk_bytes": _flag("--disk", "BYTES",
-                              "Most that they may take there; default: what the disk has."),
-    "cache": _flag("--cache", "DIR", "Folder where they wait; default: the map's own."),
+                              "Most that they may take there; default: what the disk has.", rare=True),
+    "cache": _flag("--cache", "DIR", "Folder where they wait; default: the map's own.", rare=True),
 }  # fmt: skip
 
 

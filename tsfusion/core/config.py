@@ -232,7 +232,7 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     quarantine_bytes: Bytes = 256 << 20  # per map; keyframes that could not be fused, the newest ones
     memory_bytes: Bytes = 512 << 20  # of the gateway; near it, connections are cut off, then all of them
     fuser_memory_bytes: Annotated[int, Meta(ge=1 << 28)] | None = (
-        None  # of each map's blocks; None = three quarters of the machine's
+        None  # of each fuser; None = three quarters of the machine's
     )
     fuser_disk_bytes: Bytes | None = (
         None  # of each map's blocks that may wait on the disk beyond that; None = none, the map is full then
