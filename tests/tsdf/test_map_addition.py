@@ -9,10 +9,12 @@ from formula_scenes import sphere_views, volume_of
 from hypothesis import given
 from hypothesis import settings as given_settings
 from hypothesis import strategies as st
-from saved_maps import ANNA, BOB, make_map
+from keyframes_and_servers import wall
+from saved_maps import ANNA, BOB, decoded, make_map
 
 from tsfusion import Volume
 from tsfusion.core.errors import MapError, MapFull, WeightOverflow
+from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.journal import state_folder
 from tsfusion.kernels.integrate import COLOR_LIMIT, WEIGHT_LIMIT
 
@@ -142,6 +144,32 @@ def test_keyframes_that_both_maps_hold_are_not_counted_twice(tmp_path: Path) -> 
     assert sorted(volume.meta["done"]) == [ANNA.hex(), BOB.hex()]
     with pytest.raises(MapError, match="it is not known of all of them which"):
         volume.merge(same)
+
+
+def test_parts_of_one_session_add_up_where_it_is_known_which(tmp_path: Path) -> None:
+    """As where one map was told to forget what the other has kept."""
+    folder = make_map(tmp_path / "a", range(6))
+    parts = [Volume.load(folder / state_folder.MAP_FILE) for _ in range(2)]
+    for part, removed in zip(parts, (range(3), range(3, 6)), strict=True):
+        listed = part.meta["poses"]["sessions"][ANNA.hex()]
+        fused = np.frombuffer(listed["fused"]).reshape(-1, 12).copy()
+        for number in removed:
+            part.retract(decoded(wall(number)))
+            fused[number] = np.nan
+        listed["fused"] = fused.tobytes()
+        part.meta["poses"]["removed"] = 3
+    one, other = parts
+    one.meta["poses"]["waiting"] = [(ANNA.hex(), 5, b"")]
+    one.meta["rejected"], other.meta["rejected"] = {"quota": 2}, {"quota": 1, "memory": 4}
+    one.merge(other)
+    assert one.map_hash() == Volume.load(folder / state_folder.MAP_FILE).map_hash()
+    assert one.meta["rejected"] == {"quota": 3, "memory": 4}
+    (listed,) = one.meta["poses"]["sessions"].values()
+    assert (listed["unknown"], listed["missed"], one.meta["poses"]["removed"]) == (6, [5], 6)
+    KeyframePoses(one.meta["poses"], {})
+    later = loaded(tmp_path / "b", range(6, 9), session=BOB)
+    later.merge(one)
+    assert later.keyframes == 9
 
 
 def test_maps_of_other_worlds_are_merged_only_on_request(tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from tsfusion.core.counts import count_of
 from tsfusion.core.errors import MapError
 
-_COUNTS = ("removed", "forgotten")  # keyframes that were taken out of a map
 _POSE = 12  # numbers: the upper three rows
+_PLACES = ("seqs", "segments", "offsets", "fused")  # columns of a session's keyframes
 
 
 class SessionHistory(Struct, frozen=True, eq=False):
@@ -117,23 +117,18 @@ def without_journal(meta: Mapping[str, Any]) -> dict[str, Any]:
     """
     if "done" not in meta:
         return dict(meta)
-    saved = meta.get("poses") or {}
-    waiting: dict[str, set[int]] = {}
-    for name, seq, _ in saved.get("waiting", ()):
-        waiting.setdefault(name, set()).add(seq)
-    sessions = saved.get("sessions", {})
-    listed = {
-        name: {
-            **dict.fromkeys(("seqs", "segments", "offsets", "fused"), b""),
-            "T": sessions.get(name, {}).get("T", b""),
+    saved = meta.get("poses") or {"removed": 0}
+    listed = {}
+    for name, (last, *_) in meta["done"].items():
+        one = {"T": b"", "missed": (), **saved.get("sessions", {}).get(name, {})}
+        waiting = {seq for session, seq, _ in saved.get("waiting", ()) if session == name}
+        listed[name] = {
+            **one,
+            **dict.fromkeys(_PLACES, b""),
             "unknown": last,
-            "missed": sorted(waiting.get(name, set()).union(sessions.get(name, {}).get("missed", ()))),
-            "forgotten": sessions.get(name, {}).get("forgotten", []),
+            "missed": sorted(waiting.union(one["missed"])),
         }
-        for name, (last, *_) in meta["done"].items()
-    }
-    counts = {name: saved.get(name, 0) for name in _COUNTS}
-    return {**meta, "poses": {"sessions": listed, "waiting": [], **counts}}
+    return {**meta, "poses": {**saved, "sessions": listed, "waiting": []}}
 
 
 def added(here: Mapping[str, Any], there: Mapping[str, Any]) -> dict[str, Any]:
@@ -145,21 +140,33 @@ def added(here: Mapping[str, Any], there: Mapping[str, Any]) -> dict[str, Any]:
     for name, progress in other.get("done", {}).items():
         if progress[0] > together["done"].get(name, [0])[0]:
             together["done"] = {**together["done"], name: progress}
-    parts = [each.get("poses", {}).get("sessions", {}) for each in (one, other)]
+    poses = [each.get("poses", {}) for each in (one, other)]
     together["poses"] = {
+        **_sums(*poses),
         "sessions": {
-            name: _later([part[name] for part in parts if name in part]) for name in together["done"]
+            name: _later([each["sessions"][name] for each in poses if name in each.get("sessions", ())])
+            for name in together["done"]
         },
         "waiting": [],
-        **{name: sum(each.get("poses", {}).get(name, 0) for each in (one, other)) for name in _COUNTS},
     }
     for counts in ("rejected", "blocks"):
-        together[counts] = dict(sum((Counter(each.get(counts, {})) for each in (one, other)), Counter[str]()))
+        together[counts] = _sums(*(each.get(counts, {}) for each in (one, other)))
     return together
 
 
+def _sums(*parts: Mapping[str, Any]) -> dict[str, int]:
+    """The counts of all parts, added by name."""
+    counts = Counter[str]()
+    for part in parts:
+        counts.update({name: value for name, value in part.items() if isinstance(value, int)})
+    return dict(counts)
+
+
 def _later(parts: list[dict[str, Any]]) -> dict[str, Any]:
-    """A session of two maps, as the one that is farther has it."""
+    """A session of one map, or of two as the one that is farther has it."""
+    if len(parts) == 1:
+        return parts[0]
     latest = max(parts, key=lambda part: part["unknown"])
-    together = {name: [one for part in parts for one in part[name]] for name in ("missed", "forgotten")}
-    return {**latest, **together, "missed": sorted(set(together["missed"]))}
+    missed = sorted({seq for part in parts for seq in part["missed"]})
+    forgotten = [numbers for part in parts for numbers in part.get("forgotten", ())]
+    return {**latest, "missed": missed, "forgotten": forgotten}
