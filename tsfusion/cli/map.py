@@ -2,14 +2,12 @@
 """`tsfusion map`: saved maps, described, compared, put together and taken apart without a server."""
 
 import shlex
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tsfusion.cli import forget, map_view, options, verbs
+from tsfusion.cli import forget, map_view, opened_maps, options, verbs
 from tsfusion.core.counts import count_of
 
 if TYPE_CHECKING:
@@ -21,8 +19,8 @@ _TWICE = "a recording that was sent twice counts twice"
 app = typer.Typer(
     cls=verbs.Group,
     help="Describe, compare, merge, crop, convert and resume saved maps; forget keyframes.\n\n"
-    "A saved map is a file (.tsf), or the last checkpoint of a server: its state folder, or the folder of "
-    "one map in it. All of this works while the server runs; only `forget` changes what it reads.",
+    "A saved map is a file (.tsf), or that of a server: its state folder, or the folder of one map in it. "
+    "All of this works while the server runs; only `forget` changes what it reads.",
 )
 forget.register(app)
 
@@ -42,10 +40,11 @@ def info(path: Where, map_: Map = None, json: options.Json = False) -> None:
     Each byte of the file is checked. Of a state folder this is the last
     checkpoint; what the journal has beyond it is counted.
     """
-    from tsfusion.cli import output
+    from tsfusion.cli import output, progress
     from tsfusion.pipelines import saved_maps
 
-    found = saved_maps.summarise(saved_maps.find(path, map_))
+    with progress.reading(opened_maps.JOURNAL, quiet=json) as watch:
+        found = saved_maps.summarise(saved_maps.find(path, map_), watch)
     if json:
         output.as_json(found)
     else:
@@ -63,7 +62,7 @@ def hash_(path: Where, map_: Map = None, json: options.Json = False) -> None:
     from tsfusion.cli import output
     from tsfusion.pipelines import saved_maps
 
-    with _opened(path, map_, quiet=json) as file:
+    with opened_maps.opened(path, map_, quiet=json) as file:
         found = saved_maps.summarise(saved_maps.SavedMap(file))
     if json:
         output.as_json({"path": str(path), "map_hash": found.map_hash, "keyframes": found.keyframes})
@@ -285,7 +284,7 @@ def resume(
     from tsfusion.cli import output
     from tsfusion.pipelines import saved_maps
 
-    with _opened(path, quiet=json) as file:
+    with opened_maps.opened(path, quiet=json) as file:
         folder = saved_maps.resume(file, state, map_)
         found = saved_maps.summarise(saved_maps.SavedMap(file))
     flags = map_view.serve_flags(found.settings)
@@ -303,28 +302,9 @@ def _load(path: Path, map_name: str | None = None, *, quiet: bool) -> "Volume":
     from tsfusion.tsdf import map_history
     from tsfusion.tsdf.volume import Volume
 
-    with _opened(path, map_name, quiet=quiet) as file:
+    with opened_maps.opened(path, map_name, quiet=quiet) as file:
         volume = Volume.load(file)
     if waiting := sum(one.waiting for one in map_history.sessions(volume.meta)):
         stay = count_of(waiting, "keyframe stays", "keyframes stay")
         typer.echo(f"note: {path}: {stay} where fused, though corrected: {_STAYS}", err=True)
     return volume
-
-
-@contextmanager
-def _opened(path: Path, map_name: str | None = None, *, quiet: bool) -> Iterator[Path]:
-    """The file of a map; one of a state folder is brought up to date in a copy, with progress on stderr."""
-    from tsfusion.cli import progress
-    from tsfusion.pipelines import saved_maps
-
-    with progress.shown(quiet=quiet) as display:
-
-        def watch(done: int, total: int) -> None:
-            if done == 1:
-                display.stage(f"fusing what the checkpoint of {path} lacks")
-            display.update(done, done, total)
-
-        with saved_maps.opened(saved_maps.find(path, map_name), watch) as (file, left_out):
-            for reason, count in left_out.items():
-                typer.echo(f"left out {count_of(count, 'keyframe')}: {reason}", err=True)
-            yield file

@@ -2,7 +2,6 @@
 """`tsfusion mesh`."""
 
 from collections import Counter
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -143,6 +142,7 @@ def _volume(
     quiet: bool,
 ) -> "Volume":
     """The saved map with all that its journal holds; with other settings a new map of the journal."""
+    from tsfusion.cli import opened_maps
     from tsfusion.core.config import VIEW_SETTINGS
     from tsfusion.core.errors import DatasetError
     from tsfusion.tsdf.volume import Volume
@@ -159,8 +159,7 @@ def _volume(
     source = state_folder.resolve_map(source, name)
     saved = source / state_folder.MAP_FILE
     if saved.is_file() and not given:
-        with saved_maps.opened(saved_maps.SavedMap(saved, source)) as (file, left_out):
-            _say(left_out)
+        with opened_maps.opened(source, quiet=quiet) as file:
             return Volume.load(file, config.threads, **_kept(memory_bytes, file), **view)
     recording = JournalRecording(source)
     if saved.is_file():
@@ -182,13 +181,9 @@ def _fuse(recording: "JournalRecording", volume: "Volume", quiet: bool) -> "Volu
             except MapError as error:
                 left_out[str(error)] += 1
             display.update(index, volume.keyframes, len(recording))
-    _say(left_out)
-    return volume
-
-
-def _say(left_out: Mapping[str, int]) -> None:
     for reason, count in left_out.items():
         typer.echo(f"left out {count_of(count, 'keyframe')}: {reason}", err=True)
+    return volume
 
 
 def _print_result(out: Path, figures: dict[str, Any], json: bool) -> None:

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import typer
@@ -36,7 +37,7 @@ def shown(*, quiet: bool) -> "Quiet":
 def reading(text: str, *, quiet: bool) -> Iterator[Callable[[int, int], None]]:
     """A function that takes the bytes read and all bytes, and shows them after `text`."""
     with shown(quiet=quiet) as display:
-        yield lambda done, total: display.show([_byte_row(text, done, total, display.rates)])
+        yield partial(display.show_bytes, text)
 
 
 class Quiet:
@@ -60,6 +61,10 @@ class Quiet:
             self.show(_keyframe_rows(taken, fused, total, self.rates))
         else:
             self.show(_scan_rows(scan, total, self.rates))
+
+    def show_bytes(self, text: str, done: int, total: int) -> None:
+        """Show how much is read, after `text`."""
+        self.show([_byte_row(text, done, total, self.rates)])
 
     def show(self, rows: "list[_Row]") -> None:
         """Show these rows in place of the last ones."""

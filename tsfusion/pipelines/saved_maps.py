@@ -138,12 +138,17 @@ def _leave_journal(header: checkpoint.CheckpointHeader) -> None:
 
 @contextmanager
 def opened(
-    saved: SavedMap, watch: settled_maps.Watch = lambda _done, _all: None
+    saved: SavedMap,
+    watch: settled_maps.Watch = lambda _done, _all: None,
+    reading: state_folder.Watcher = lambda _done, _all: None,
 ) -> Iterator[tuple[Path, dict[str, int]]]:
     """The file of a map with all that its journal holds, which is there during the block.
 
     Where the checkpoint in a state folder is behind the journal, as after a crash or while the server runs,
     what it lacks is fused into a copy.
+
+    Args:
+        watch: told the records that are fused, and all of them; `reading` the bytes of the journal.
 
     Yields:
         The file; reason → number of the journal's keyframes that the map could not take.
@@ -154,7 +159,7 @@ def opened(
     if saved.folder is not None:
         with checkpoint.reading(saved.path) as (header, _):
             histories, config = map_history.sessions(header.meta), header.config
-        records = settled_maps.records_after(saved.folder, histories)
+        records = settled_maps.records_after(saved.folder, histories, reading)
         if records or any(one.waiting for one in histories):
             with settled_maps.settled(saved.folder, records, config, watch) as found:
                 yield found
@@ -162,8 +167,11 @@ def opened(
     yield saved.path, {}
 
 
-def summarise(saved: SavedMap) -> MapSummary:
+def summarise(saved: SavedMap, reading: state_folder.Watcher = lambda _done, _all: None) -> MapSummary:
     """Describe a saved map; every byte of the file is checked, no voxel is read.
+
+    Args:
+        reading: told the bytes of the journal that are read, and all of them.
 
     Raises:
         CheckpointError: when the file is missing, damaged or of another version.
@@ -176,7 +184,8 @@ def summarise(saved: SavedMap) -> MapSummary:
     histories = map_history.sessions(header.meta)
     after = None
     if saved.folder is not None:
-        after = Counter(one.is_correction for one in settled_maps.records_after(saved.folder, histories))
+        records = settled_maps.records_after(saved.folder, histories, reading)
+        after = Counter(one.is_correction for one in records)
     return MapSummary(
         path=str(saved.path),
         nbytes=size_of(saved.path),

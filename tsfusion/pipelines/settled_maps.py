@@ -10,11 +10,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tsfusion import journal
 from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.core.durable_files import size_of
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages
 from tsfusion.fuser.fuser import Fuser
@@ -37,8 +39,15 @@ class _Answers:
             self.left_out[message.message or message.reason] += 1
 
 
-def records_after(folder: Path, histories: list[map_history.SessionHistory]) -> list[journal.RecordEntry]:
+def records_after(
+    folder: Path,
+    histories: list[map_history.SessionHistory],
+    reading: state_folder.Watcher = lambda _done, _all: None,
+) -> list[journal.RecordEntry]:
     """The records of a map's journal that a checkpoint with these sessions does not have, in order.
+
+    Args:
+        reading: told the bytes that are read, and all of them: each record's CRC is checked.
 
     Raises:
         JournalError: when the journal cannot be read.
@@ -46,12 +55,22 @@ def records_after(folder: Path, histories: list[map_history.SessionHistory]) -> 
     last = {bytes.fromhex(one.session): one.last for one in histories}
     found = []
     path = folder / state_folder.JOURNAL_FOLDER
-    for number in journal.segments(path) if path.is_dir() else ():
-        for record in journal.list_records(journal.segment_path(path, number))[0]:
+    files = [
+        journal.segment_path(path, number) for number in (journal.segments(path) if path.is_dir() else ())
+    ]
+    before, total = 0, sum(map(size_of, files))
+    for file in files:
+        records, _ = journal.list_records(file, partial(_add_to, reading, before, total))
+        before += size_of(file)
+        for record in records:
             if record.seq > last.get(record.session, 0):
                 last[record.session] = record.seq
                 found.append(record)
     return found
+
+
+def _add_to(reading: state_folder.Watcher, before: int, total: int, at: int, _records: int) -> None:
+    reading(before + at, total)
 
 
 @contextmanager

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: MIT
+"""Maps that a verb reads, with what it shows on stderr meanwhile."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import typer
+
+from tsfusion.core.counts import count_of
+
+JOURNAL = "reading the journal"
+_LARGE_BYTES = 64 << 20  # of a file: reading it takes seconds
+
+
+@contextmanager
+def opened(path: Path, map_name: str | None = None, *, quiet: bool) -> Iterator[Path]:
+    """The file of a map; one of a state folder is brought up to date in a copy, with progress on stderr."""
+    from tsfusion.cli import progress
+    from tsfusion.core.durable_files import size_of
+    from tsfusion.pipelines import saved_maps
+
+    with progress.shown(quiet=quiet) as display:
+
+        def watch(done: int, total: int) -> None:
+            if done == 1:
+                display.stage(f"fusing what the checkpoint of {path} lacks")
+            display.update(done, done, total)
+
+        read = partial(display.show_bytes, JOURNAL)
+        with saved_maps.opened(saved_maps.find(path, map_name), watch, read) as (file, left_out):
+            for reason, count in left_out.items():
+                typer.echo(f"left out {count_of(count, 'keyframe')}: {reason}", err=True)
+            if size_of(file) > _LARGE_BYTES:
+                display.stage(f"reading {path}")
+            yield file
