@@ -43,6 +43,16 @@ def test_recovery_counts_a_keyframe_once() -> None:
     assert index.segment(2) == 1
 
 
+def test_an_erased_keyframe_is_known_and_not_taken_again() -> None:
+    index, sessions = KeyframeIndex(), Sessions()
+    index.recover([RecordEntry(Position(1, 8), bytes(16), 5, "robot", 100, is_erased=True)], sessions)
+    assert (len(index), sessions.progress(bytes(16))[0]) == (0, 5)
+    assert sessions.admit(bytes(16), 5, 4) == "duplicate"
+    session = sessions.get(bytes(16))
+    assert session is not None
+    assert (session.client, session.world, session.keyframes) == ("robot", None, 0)
+
+
 def test_keyframes_are_counted_and_corrections_are_not() -> None:
     """A scanner that was restarted goes on with numbers far above: they are no counts."""
     index, sessions = index_of((1, 1, SESSION, 1), (1, 2, SESSION, 5_641_760))

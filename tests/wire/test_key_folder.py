@@ -197,6 +197,25 @@ def test_a_key_for_some_maps(run: Run) -> None:
     assert f'"robot1" = "{one}"' in listed_text()
 
 
+def test_a_key_that_may_forget_what_others_sent(run: Run) -> None:
+    run("new", "server")
+    one, two = key(), key()
+    assert run("allow", "desk", one, "--forget") == (
+        "desk may connect; it may forget keyframes of others, too\n"
+    )
+    run("allow", "robot1", two, "--maps", "house", "--forget")
+    assert f'"desk" = {{ key = "{one}", forget = true }}' in listed_text()
+    assert f'"robot1" = {{ key = "{two}", maps = ["house"], forget = true }}' in listed_text()
+    assert f"allowed  desk    {one}  forgets others'\n" in run("list")
+    run("allow", "robot1", "--maps", "*")
+    assert json.loads(run("list", "--json"))["forget"] == ["desk", "robot1"]
+    run("allow", "robot1", "--no-forget")
+    assert f'"robot1" = "{two}"' in listed_text()
+    run("revoke", "desk")
+    run("allow", "desk", one)
+    assert f'"desk" = "{one}"' in listed_text()
+
+
 def listed_text() -> str:
     return Path("tsfusion-keys/allowed.toml").read_text()
 

@@ -51,9 +51,9 @@ def forget(
     client: Annotated[str | None, typer.Option(metavar="NAME", help="Of the client with this key.")] = None,
     since: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="Came then or later: ISO, or seconds from the end."),
+        typer.Option(metavar="TIME", help="From then on: ISO, or seconds from end."),
     ] = None,
-    until: Annotated[str | None, typer.Option(metavar="TIME", help="Came then or earlier.")] = None,
+    until: Annotated[str | None, typer.Option(metavar="TIME", help="Up to then.")] = None,
     keyframes: Annotated[
         str | None, typer.Option(metavar="NUMBERS", help="By number in their session: 3-17,20.")
     ] = None,
@@ -61,7 +61,7 @@ def forget(
         tuple[float, float, float, float, float, float] | None,
         typer.Option(
             metavar="X Y Z X Y Z",
-            help="Taken in this box, with 9 of 10 points in it.",
+            help="Sensor and 9 of 10 points in this box.",
         ),
     ] = None,
     erase: Annotated[bool, typer.Option("--erase", help="Also delete them from the journal.")] = False,

@@ -25,8 +25,7 @@ from tsfusion.core import process
 from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
-from tsfusion.fuser.keep_window import KeepWindow
-from tsfusion.fuser.keyframe_search import KeyframeSearch
+from tsfusion.fuser.departures import Departures
 from tsfusion.fuser.live_mesh import LiveMesh, mesh_frames
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.fuser.pose_mover import REST_FACTOR, PoseMover
@@ -65,7 +64,6 @@ class Fuser:
         self._since_checkpoint = 0
         self._orders: deque[fuser_messages.Fuse] = deque()  # not answered; the first cannot be read for now
         self._held_since: float | None = None  # time.monotonic(); None = nothing is held
-        self._searches: deque[KeyframeSearch] = deque()
         self._answered = 0  # records of this process
         self._more_waits = False  # at the gateway
         self._hashes: tuple[int, str, str] | None = None  # changes, map hash, colour hash
@@ -93,14 +91,8 @@ class Fuser:
             sparing=lambda: self._memory_beyond(-_FOR_KEYFRAMES),
             send=self._send,
         )
-        self._window = KeepWindow(
-            self._map.poses,
-            self._folder / state_folder.JOURNAL_FOLDER,
-            seconds=begin.keep_seconds,
-            keyframes=begin.keep_keyframes,
-            radius=begin.keep_radius,
-            send=self._send,
-        )
+        self._departures = Departures(begin, self._map.poses, self._map.done, send=self._send)
+        window = self._departures.window
         self._mover = PoseMover(
             self._volume,
             self._map.poses,
@@ -109,8 +101,8 @@ class Fuser:
             is_away=self._journal_is_away,
             say=self._send,
             moves=begin.moves,
-            expects=lambda: int(self._window.is_behind),
-            rest_factor=_WINDOW_REST_FACTOR if self._window.is_set else REST_FACTOR,
+            expects=lambda: int(window.is_behind),
+            rest_factor=_WINDOW_REST_FACTOR if window.is_set else REST_FACTOR,
         )
 
     def ready(self) -> fuser_messages.Ready:
@@ -134,10 +126,8 @@ class Fuser:
             self._answer(message)
         elif isinstance(message, fuser_messages.Publish):
             self._live_mesh.watch(message.wanted)
-        elif isinstance(message, fuser_messages.Find):
-            self._searches.append(KeyframeSearch(message, self._folder, self._map.poses, self._map.done))
-        elif isinstance(message, fuser_messages.Expire):
-            self._window.expire(message.before_segment)
+        elif isinstance(message, fuser_messages.Find | fuser_messages.Expire):
+            self._departures.ask(message)
         elif isinstance(message, fuser_messages.Save):
             self._checkpoint(alone=message.alone)
         elif isinstance(message, fuser_messages.Finish):
@@ -159,11 +149,10 @@ class Fuser:
         """Milliseconds to wait for a message at most; None = for ever."""
         if self.is_held:
             return _RETRY_MS
-        if self._searches:
-            return 0
-        if self._window.is_behind:
-            return _RETRY_MS
-        return round(1000 * self._mover.seconds_left) + 1 if self._mover.waiting else None
+        waits = [self._departures.wait_ms]
+        if self._mover.waiting:
+            waits.append(round(1000 * self._mover.seconds_left) + 1)
+        return min((wait for wait in waits if wait is not None), default=None)
 
     @property
     def idle_after_ms(self) -> int:
@@ -201,19 +190,13 @@ class Fuser:
             self._note_change()
 
     def search_due(self, idle: bool) -> bool:
-        """Whether to go on looking for keyframes that are to be forgotten."""
-        if self._searches:
-            return self._searches[0].is_due(idle=idle)
-        return self._window.is_due(idle=idle)
+        """Whether to look now for keyframes that are to leave the map."""
+        return self._departures.is_due(idle=idle)
 
     def search(self) -> None:
-        """Look for keyframes that are to be forgotten, for a moment."""
-        if not self._searches:
-            self._window.look()
+        """Look for keyframes that are to leave the map, for a moment."""
+        if self._departures.look():
             self._mover.say()
-        elif (found := self._searches[0].go_on()) is not None:
-            self._searches.popleft()
-            self._send(found)
 
     def _fuse(self, order: fuser_messages.Fuse) -> bool:
         """Take a record into the map, or reject it; False when it cannot be read for now."""
@@ -265,16 +248,16 @@ class Fuser:
             if not self._integrate(found, order.client).samples:
                 return NO_SAMPLES, self._volume.why_no_samples(found)
             poses.add(order.session, order.seq, order.position, found)
-            self._window.note_keyframe()
-            if self._window.is_behind:
+            self._departures.window.note_keyframe()
+            if self._departures.window.is_behind:
                 self._mover.say()
             return None, ""
         if found.target is None:
             poses.correct(order.session, found)
-            self._window.note_keyframe()
+            self._departures.window.note_keyframe()
         else:
             poses.forget(found.target, found.removed)
-            self._window.note_record()
+            self._departures.window.note_record()
         self._mover.say()
         return None, ""
 

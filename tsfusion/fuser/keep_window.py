@@ -71,6 +71,11 @@ class KeepWindow:
         self._before_segment = max(before_segment, self._before_segment)
         self._is_behind = self.is_set
 
+    @property
+    def wait_ms(self) -> int | None:
+        """Milliseconds until `is_due` has to be asked again although nothing comes; None = for ever."""
+        return round(1000 * _INTERVAL_S) if self._is_behind else None
+
     def is_due(self, *, idle: bool) -> bool:
         """Whether to look now."""
         now = time.monotonic()

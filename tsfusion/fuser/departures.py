@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: MIT
+"""Which keyframes are to leave a map: those that somebody names, and those beyond its window."""
+
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tsfusion.fuser import messages as fuser_messages
+from tsfusion.fuser.keep_window import KeepWindow
+from tsfusion.fuser.keyframe_poses import KeyframePoses
+from tsfusion.fuser.keyframe_search import KeyframeSearch
+from tsfusion.fuser.messages import Begin, Expire, Find, SessionProgress
+from tsfusion.journal import state_folder
+
+
+class Departures:
+    """The searches of one map. Call `look` when it `is_due`. What is found the gateway writes to the journal.
+
+    Args:
+        done: how far the map is with each session.
+        send: takes a message.
+    """
+
+    def __init__(
+        self,
+        begin: Begin,
+        poses: KeyframePoses,
+        done: dict[bytes, SessionProgress],
+        *,
+        send: Callable[[Any], None],
+    ) -> None:
+        self._folder, self._poses, self._done, self._send = Path(begin.folder), poses, done, send
+        self._searches: deque[KeyframeSearch] = deque()
+        self.window = KeepWindow(
+            poses,
+            self._folder / state_folder.JOURNAL_FOLDER,
+            seconds=begin.keep_seconds,
+            keyframes=begin.keep_keyframes,
+            radius=begin.keep_radius,
+            send=send,
+        )
+
+    def ask(self, message: Find | Expire) -> None:
+        """Take what the gateway wants to know, or to let go."""
+        if isinstance(message, fuser_messages.Find):
+            self._searches.append(KeyframeSearch(message, self._folder, self._poses, self._done))
+        else:
+            self.window.expire(message.before_segment)
+
+    @property
+    def wait_ms(self) -> int | None:
+        """Milliseconds to wait for a message at most; None = for ever."""
+        if self._searches:
+            return 0
+        return self.window.wait_ms
+
+    def is_due(self, *, idle: bool) -> bool:
+        """Whether to go on looking now."""
+        if self._searches:
+            return self._searches[0].is_due(idle=idle)
+        return self.window.is_due(idle=idle)
+
+    def look(self) -> bool:
+        """Look for a moment, and send what was found; whether the window is known to be kept, or asked for."""
+        if not self._searches:
+            self.window.look()
+            return True
+        if (found := self._searches[0].go_on()) is not None:
+            self._searches.popleft()
+            self._send(found)
+        return False
