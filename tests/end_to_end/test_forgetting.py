@@ -195,6 +195,27 @@ def test_what_cannot_be_meant(shared: Server, here: Here) -> None:
         assert problem in refused.stderr
 
 
+@pytest.mark.nightly
+@pytest.mark.parametrize("most", [50, 2000])
+def test_a_window_in_a_journal_with_a_limit(tmp_path: Path, most: int) -> None:
+    limits = {
+        "keep_keyframes": most,
+        "journal_bytes": 1 << 20,
+        "segment_bytes": 1 << 16,
+        "checkpoint_every": 20,
+    }
+    with serving(tmp_path, **limits) as server:  # type: ignore[arg-type]
+        with Client(server.address) as client:
+            for i in range(1500):
+                client.send(wall(i))
+            client.wait_settled(DEADLINE)
+        told = fetch_status(server.address)
+        assert told.keyframes_fused <= most
+        assert told.journal_bytes < 1.2 * (1 << 20)
+        assert told.corrections_unavailable == 0
+        assert told.map_hash == map_hash(wall(i) for i in range(1500 - told.keyframes_fused, 1500))
+
+
 def test_a_server_that_keeps_a_window(tmp_path: Path) -> None:
     with serving(tmp_path, keep_keyframes=5) as server:
         scan(server, 0)

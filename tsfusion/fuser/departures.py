@@ -62,7 +62,7 @@ class Departures:
         return self.window.is_due(idle=idle)
 
     def look(self) -> bool:
-        """Look for a moment, and send what was found; whether the window is known to be kept, or asked for."""
+        """Look for a moment, and send what was found; whether it was the window that was looked at."""
         if not self._searches:
             self.window.look()
             return True
