@@ -23,12 +23,12 @@ from keyframes_and_servers import (
 )
 
 from tsfusion import Client, journal
+from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import JournalError
 from tsfusion.journal import state_folder
 from tsfusion.journal.inspection import verify
 from tsfusion.pipelines.stored_map import open_map
 from tsfusion.wire import corrections, key_folder, sockets
-from tsfusion.wire.corrections import SERVER_SESSION
 from tsfusion.wire.forgetting import Selection
 from tsfusion.wire.health import MapHealth
 from tsfusion.wire.messages import PROTOCOL_VERSION, Denied, Hello
@@ -204,7 +204,7 @@ def test_a_window_in_a_journal_with_a_limit(tmp_path: Path, most: int) -> None:
         "segment_bytes": 1 << 16,
         "checkpoint_every": 20,
     }
-    with serving(tmp_path, **limits) as server:  # type: ignore[arg-type]
+    with serving(tmp_path, keep_keyframes=most, **limits) as server:  # type: ignore[arg-type]
         with Client(server.address) as client:
             for i in range(1500):
                 client.send(wall(i))

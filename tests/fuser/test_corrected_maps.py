@@ -21,11 +21,11 @@ from keyframes_and_servers import VOLUME, pose, wall
 from test_fuser import Link, opened
 
 from tsfusion import Volume, journal
+from tsfusion.core.config import SERVER_SESSION
 from tsfusion.fuser import messages
 from tsfusion.fuser.fuser import Fuser
 from tsfusion.journal import Journal, Position
 from tsfusion.wire import codec, corrections
-from tsfusion.wire.corrections import SERVER_SESSION
 from tsfusion.wire.forgetting import Selection
 
 SESSIONS = (b"a" * 16, b"b" * 16)

@@ -8,7 +8,7 @@ from keyframes_and_servers import NUMBERED_NS, wall
 from scanner_process import Report, correction_number, journals
 
 from tsfusion import journal
-from tsfusion.wire.corrections import SERVER_SESSION
+from tsfusion.core.config import SERVER_SESSION
 from tsfusion.wire.health import Status
 from tsfusion.wire.record_header import unpack_keyframe
 

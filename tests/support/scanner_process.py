@@ -20,8 +20,7 @@ from keyframes_and_servers import NUMBERED_NS, pose, wall
 from msgspec import Struct
 
 from tsfusion import Client, Intrinsics, Keyframe, journal
-from tsfusion.core.config import ClientConfig
-from tsfusion.wire.corrections import SERVER_SESSION
+from tsfusion.core.config import SERVER_SESSION, ClientConfig
 from tsfusion.wire.keyframe_times import KeyframeTimes
 from tsfusion.wire.record_header import CorrectionHeader, unpack, unpack_keyframe
 

@@ -13,10 +13,12 @@ from keyframes_and_servers import wall
 from saved_maps import ANNA, BOB, decoded, make_map
 
 from tsfusion import Volume
+from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import MapError, MapFull, WeightOverflow
 from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.journal import state_folder
 from tsfusion.kernels.integrate import COLOR_LIMIT, WEIGHT_LIMIT
+from tsfusion.tsdf.map_history import of_clients, sessions
 
 VIEWS = sphere_views(0.4, 6)
 
@@ -186,3 +188,20 @@ def test_maps_of_other_worlds_are_merged_only_on_request(tmp_path: Path) -> None
     empty = Volume(given.config)
     empty.merge(given)
     assert empty.map_hash() == given.map_hash()
+
+
+def test_what_servers_forgot_neither_joins_worlds_nor_keeps_maps_apart(tmp_path: Path) -> None:
+    given, found = (
+        loaded(tmp_path / "a", range(3)),
+        loaded(tmp_path / "b", range(3, 5), session=BOB, world="w"),
+    )
+    for number, volume in enumerate((given, found), 1):
+        volume.meta["done"][SERVER_SESSION.hex()] = [number, "", ""]
+    with pytest.raises(MapError, match="coordinate frame of its own"):
+        given.merge(found)
+    given.merge(found, same_frame=True)
+    assert given.meta["done"][SERVER_SESSION.hex()][0] == 2
+    third = loaded(tmp_path / "c", range(5, 7), session=b"c" * 16, world="w")
+    third.meta["done"][SERVER_SESSION.hex()] = [1, "", ""]
+    given.merge(third)
+    assert sum(one.session == SERVER_SESSION.hex() for one in of_clients(sessions(given.meta))) == 0

@@ -36,6 +36,7 @@ Policy = Literal["thin", "block", "drop_oldest", "spool_all"]
 LogFormat = Literal["text", "json"]
 LogLevel = Literal["debug", "info", "warning", "error"]
 DEFAULT_MAP = "default"
+SERVER_SESSION = b"tsfusion forgets"  # of the records in which a server forgets keyframes
 MAP_NAME_LENGTH = 32
 MAP_NAME = rf"[a-z0-9][a-z0-9_-]{{0,{MAP_NAME_LENGTH - 1}}}"
 # Becomes a folder's name, so it is no path: \A and \Z, because `$` would let a newline through.

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion import journal
+from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import DecodeError, InvalidConfig, InvalidKeyframe, JournalError
 from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.fuser.messages import Find, Found, FoundKeyframes, SessionProgress
@@ -118,6 +119,8 @@ class KeyframeSearch:
         if self._first_ns is not None and self._since_ns is not None and self._since_ns >= self._first_ns:
             return  # those came before
         for key, seq in self._poses.unknown():
+            if key == SERVER_SESSION:
+                continue
             client = self._done[key].client if key in self._done else ""
             own = self._find.selection
             first = min((one for one, _ in own.numbers), default=1) if own.numbers is not None else 1

@@ -15,7 +15,7 @@ import msgspec
 import zmq
 
 from tsfusion.core import logs, process
-from tsfusion.core.config import ServerConfig
+from tsfusion.core.config import SERVER_SESSION, ServerConfig
 from tsfusion.core.counts import count_of
 from tsfusion.core.errors import DecodeError, JournalError
 from tsfusion.fuser import messages as fuser_messages
@@ -36,7 +36,6 @@ from tsfusion.gateway.problems import Problem, ProblemTimes
 from tsfusion.gateway.sessions import Sessions
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
-from tsfusion.wire.corrections import SERVER_SESSION
 from tsfusion.wire.forgetting import Forgotten
 from tsfusion.wire.health import Health, MapHealth
 from tsfusion.wire.sockets import mesh_topic

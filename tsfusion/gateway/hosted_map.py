@@ -13,7 +13,7 @@ import zmq
 from numpy.typing import NDArray
 
 from tsfusion.core import logs
-from tsfusion.core.config import ServerConfig, VolumeConfig
+from tsfusion.core.config import SERVER_SESSION, ServerConfig, VolumeConfig
 from tsfusion.core.counts import count_of
 from tsfusion.core.errors import JournalError
 from tsfusion.fuser import messages as fuser_messages
@@ -30,7 +30,6 @@ from tsfusion.gateway.sessions import Sessions
 from tsfusion.journal import Journal, ReadingWatcher, state_folder
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import corrections, keyframe_times
-from tsfusion.wire.corrections import SERVER_SESSION
 from tsfusion.wire.health import MapHealth, MapState
 from tsfusion.wire.record_header import CorrectionHeader, RecordHeader, unpack
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 from msgspec import Struct, field
 
-from tsfusion.wire.corrections import SERVER_SESSION
+from tsfusion.core.config import SERVER_SESSION
 from tsfusion.wire.messages import Hello
 from tsfusion.wire.record_header import RecordHeader
 

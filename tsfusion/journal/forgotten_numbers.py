@@ -3,12 +3,13 @@
 
 from contextlib import suppress
 
+from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import DecodeError
 from tsfusion.core.number_ranges import NumberRanges
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.state_folder import JournalPlace
 from tsfusion.wire import codec
-from tsfusion.wire.corrections import SERVER_SESSION, Correction
+from tsfusion.wire.corrections import Correction
 
 
 class ForgottenNumbers:

@@ -12,6 +12,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from tsfusion import journal
+from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import DecodeError, InvalidKeyframe
 from tsfusion.geometry import se3
 from tsfusion.geometry.keyframe import check_pose
@@ -20,7 +21,7 @@ from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.record_scan import Damage, Erased
 from tsfusion.journal.state_folder import JournalPlace, Watcher
 from tsfusion.wire import codec
-from tsfusion.wire.corrections import SERVER_SESSION, Correction
+from tsfusion.wire.corrections import Correction
 from tsfusion.wire.record_header import unpack, unpack_keyframe
 
 

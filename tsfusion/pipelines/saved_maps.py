@@ -198,7 +198,7 @@ def summarise(saved: SavedMap, reading: state_folder.Watcher = lambda _done, _al
         box=_box(keys, 8 * header.config.voxel_size),
         sessions=[
             SessionSummary(one.session, one.client, one.world, one.last, len(one.seqs), one.unlisted)
-            for one in histories
+            for one in map_history.of_clients(histories)
         ],
         rejected=header.meta.get("rejected", {}),
         corrections_waiting=sum(one.waiting for one in histories),

@@ -63,7 +63,7 @@ def records_after(
         records, _ = journal.list_records(file, partial(_add_to, reading, before, total))
         before += size_of(file)
         for record in records:
-            if record.seq > last.get(record.session, 0):
+            if record.seq > last.get(record.session, 0) and not record.is_erased:
                 last[record.session] = record.seq
                 found.append(record)
     return found

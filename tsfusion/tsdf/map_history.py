@@ -7,13 +7,14 @@ are not added either, unless somebody knows better.
 """
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.counts import count_of
 from tsfusion.core.errors import MapError
 
@@ -71,6 +72,11 @@ def sessions(meta: Mapping[str, Any]) -> list[SessionHistory]:
     return found
 
 
+def of_clients(histories: Iterable[SessionHistory]) -> list[SessionHistory]:
+    """The sessions of scanners: all but the server's own, in which it forgets keyframes."""
+    return [one for one in histories if one.session != SERVER_SESSION.hex()]
+
+
 def check_addable(here: Mapping[str, Any], there: Mapping[str, Any], *, same_frame: bool) -> None:
     """Raise MapError where two maps hold the same keyframes, or are not known to be in one coordinate frame.
 
@@ -78,7 +84,7 @@ def check_addable(here: Mapping[str, Any], there: Mapping[str, Any], *, same_fra
         here, there: `meta` of each map.
         same_frame: they are in one, whatever their worlds.
     """
-    ours, theirs = ({one.session: one for one in sessions(meta)} for meta in (here, there))
+    ours, theirs = ({one.session: one for one in of_clients(sessions(meta))} for meta in (here, there))
     for name in ours:
         if name in theirs:
             _check_distinct(ours[name], theirs[name])

@@ -20,13 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.config import DEFAULT_MAP
+from tsfusion.core.config import DEFAULT_MAP, SERVER_SESSION
 from tsfusion.core.errors import InvalidKeyframe
 from tsfusion.geometry.keyframe import MAX_TRANSLATION, check_pose
 from tsfusion.wire.record_header import CorrectionHeader, Damaged, RecordHeader, Refused, pack
 
 MAX_KEYFRAMES = 100_000  # named by one correction
-SERVER_SESSION = b"tsfusion forgets"  # session of the records in which a server forgets keyframes
 _NUMBER_BYTES, _POSE_BYTES = 8, 12 * 8
 _EXACT = 1e-9  # |RᵀR - I|, as `check_pose` leaves it
 _MAX_NUMBER = (1 << 63) - 1
