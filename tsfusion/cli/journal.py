@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """`tsfusion journal`: describe a journal, check it, save its whole keyframes, export it to other tools."""
 
-import datetime
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -230,7 +229,9 @@ def _describe_info(found: "JournalInfo") -> str:
 
 
 def _session(one: "SessionInfo") -> str:
-    first, last = _clock(one.first_logged_ns), _clock(one.last_logged_ns)
+    from tsfusion.journal.selection import clock
+
+    first, last = clock(one.first_logged_ns), clock(one.last_logged_ns)
     forgotten = f"  {one.forgotten} forgotten" if one.forgotten else ""
     return (
         f"  {one.session[:8]}  {one.client or 'no key':<12} {one.keyframes:>7} keyframes  "
@@ -244,14 +245,6 @@ def _corrected(one: "SessionInfo") -> str:
     most = f"{one.moved_m:.3g} m, {one.turned_deg:.2g}°"
     removed = f", {one.removed} removed" if one.removed else ""
     return f"  {one.corrected} corrected by up to {most}{removed} ({_count(one.corrections, 'correction')})"
-
-
-def _clock(stamp_ns: int) -> str:
-    try:
-        moment = datetime.datetime.fromtimestamp(stamp_ns / 1e9, tz=datetime.timezone.utc)
-    except (OverflowError, OSError, ValueError):
-        return f"{stamp_ns} ns"
-    return moment.strftime("%Y-%m-%d %H:%M:%SZ")
 
 
 def _describe_verdict(verdict: "JournalVerdict") -> str:

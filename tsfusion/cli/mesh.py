@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: MIT
 """`tsfusion mesh`."""
 
-from collections import Counter
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from tsfusion.cli import options
-from tsfusion.core.counts import count_of
 
 if TYPE_CHECKING:
     from tsfusion.core.config import VolumeConfig
     from tsfusion.geometry.up_direction import Up
-    from tsfusion.journal.recording import JournalRecording
-    from tsfusion.tsdf.volume import Volume
+    from tsfusion.pipelines.journal_fusion import JournalMap
+
+ColorBy = Literal["client", "session"]
+
+_OF_A_JOURNAL = ("until", "only", "color_by")
 
 _EXPANDS = 8  # a map in memory against its file: more than any
 
@@ -33,6 +35,17 @@ def mesh(
     *,
     up: options.UpDirection = None,
     keep_islands: options.KeepIslands = None,
+    until: Annotated[
+        str | None,
+        typer.Option(metavar="TIME", help="As it was at TIME: ISO, or seconds from the end."),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="SESSION", help="As this session or client saw it (repeatable)."),
+    ] = None,
+    color_by: Annotated[
+        ColorBy | None, typer.Option(metavar="WHAT", help="client or session: a colour for each.")
+    ] = None,
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw a picture, too.")] = None,
     memory: Annotated[
         str | None,
@@ -48,7 +61,8 @@ def mesh(
 ) -> None:
     """Write the mesh of a saved map, of a live server, or of a journal.
 
-    A journal is fused again, with the map flags given here.
+    A journal is fused again, with the map flags given here. With --until, --only
+    or --color-by it is fused again as its map was, with corrected poses.
 
     The mesh of a map larger than --memory is made in tiles: one .ply, or a .glb each (OUT-0001.glb and on).
     """
@@ -61,10 +75,14 @@ def mesh(
     from tsfusion.pipelines import mesh_files
 
     given_up = options.up_direction(up)
+    legend: list[dict[str, Any]] = []
     check_writable(out, FORMATS)
     if preview is not None:
         check_writable(preview, (".png",))
     if "://" in source:
+        options.refuse(
+            context, _OF_A_JOURNAL, "needs a journal: give the state folder of the server",
+        )  # fmt: skip
         options.refuse(
             context, {*options.MAP_OPTIONS, "config", "memory"} - {"min_weight"},
             "has no effect on a live server's map: give it to `tsfusion serve`",
@@ -84,6 +102,10 @@ def mesh(
         )  # fmt: skip
         if source.endswith(".tsf"):
             options.refuse(
+                context, _OF_A_JOURNAL,
+                "has no effect on a saved map: give the state folder or the journal that has its keyframes",
+            )  # fmt: skip
+            options.refuse(
                 context, options.MAP_OPTIONS.keys() - options.VIEW_OPTIONS,
                 "has no effect on a saved map: give the state folder or the journal to fuse it anew",
             )  # fmt: skip
@@ -92,23 +114,24 @@ def mesh(
             value is not None for name, value in settings.items() if name not in options.VIEW_OPTIONS
         )
         most = options.byte_count(memory)
-        volume = _volume(Path(source), chosen.volume, most, name=map_, given=given, quiet=json)
-        if volume.stats().bytes > (most or process.physical_memory_bytes() // 2):
+        view = {"until": until, "only": only or (), "color_by": color_by}
+        found = _map(Path(source), chosen.volume, most, name=map_, given=given, quiet=json, view=view)
+        if found.volume.stats().bytes > (most or process.physical_memory_bytes() // 2):
             options.refuse(context, ("preview",), "needs all of the mesh, which is too large for memory")
             if keep_islands is False:
                 raise InvalidConfig("--drop-islands needs all of the mesh, which is too large for memory")
-            _write_tiles(volume, out, given_up, json)
+            _write_tiles(found, out, given_up, json)
             return
-        made = volume.extract_mesh()
+        made, legend = found.volume.extract_mesh(), found.legend
     if given_up is not None:
         made = replace(made, known_up=given_up)
     files = [out] if preview is None else [out, preview]
     left_out = mesh_files.write(made, files, keep_islands=keep_islands)
     written = made.without_islands() if out.name in left_out["files"] else made
-    _print_result(out, {**written.figures, "left_out": left_out}, json)
+    _print_result(out, {**written.figures, "left_out": left_out}, legend, json)
 
 
-def _write_tiles(volume: "Volume", out: Path, up: "Up | None", json: bool) -> None:
+def _write_tiles(found: "JournalMap", out: Path, up: "Up | None", json: bool) -> None:
     """Write the mesh in bounded memory."""
     from tsfusion.cli import progress
     from tsfusion.geometry import mesh_parts
@@ -116,10 +139,11 @@ def _write_tiles(volume: "Volume", out: Path, up: "Up | None", json: bool) -> No
     mesh_parts.check(out)
     with progress.shown(quiet=json) as display:
         display.stage("meshing in tiles")
-        parts = volume.mesh_parts(out.parent, up=up)
+        parts = found.volume.mesh_parts(out.parent, up=up)
         files = parts.save(out)
     figures = {**parts.figures, "left_out": {"islands": 0, "triangles": 0, "files": []}}
-    _print_result(files[0] if len(files) == 1 else out, {**figures, "files": list(map(str, files))}, json)
+    figures["files"] = list(map(str, files))
+    _print_result(files[0] if len(files) == 1 else out, figures, found.legend, json)
 
 
 def _kept(memory_bytes: int | None, saved: Path | None = None) -> dict[str, Any]:
@@ -132,7 +156,7 @@ def _kept(memory_bytes: int | None, saved: Path | None = None) -> dict[str, Any]
     return {"memory_bytes": memory_bytes}
 
 
-def _volume(
+def _map(
     source: Path,
     config: "VolumeConfig",
     memory_bytes: int | None,
@@ -140,57 +164,55 @@ def _volume(
     name: str | None,
     given: bool,
     quiet: bool,
-) -> "Volume":
-    """The saved map with all that its journal holds; with other settings a new map of the journal."""
-    from tsfusion.cli import opened_maps
+    view: dict[str, Any],
+) -> "JournalMap":
+    """The saved map where it is complete; otherwise a new map of every keyframe of the journal."""
+    from tsfusion.cli import opened_maps, progress
     from tsfusion.core.config import VIEW_SETTINGS
+    from tsfusion.core.counts import count_of
     from tsfusion.core.errors import DatasetError
+    from tsfusion.journal import state_folder
+    from tsfusion.pipelines import journal_fusion
     from tsfusion.tsdf.volume import Volume
 
-    view = {name: getattr(config, name) for name in VIEW_SETTINGS}
     if not source.exists():
         raise DatasetError(f"{source} does not exist; expected a map (.tsf), a state folder or a journal")
-    from tsfusion.journal import state_folder
-    from tsfusion.journal.recording import JournalRecording
-    from tsfusion.pipelines import saved_maps
-
     if source.suffix == ".tsf":
-        return Volume.load(source, config.threads, **_kept(memory_bytes, source), **view)
+        changed = {name: getattr(config, name) for name in VIEW_SETTINGS}
+        kept = _kept(memory_bytes, source)
+        return journal_fusion.JournalMap(Volume.load(source, config.threads, **kept, **changed), {})
     source = state_folder.resolve_map(source, name)
-    saved = source / state_folder.MAP_FILE
-    if saved.is_file() and not given:
-        with opened_maps.opened(source, quiet=quiet) as file:
-            return Volume.load(file, config.threads, **_kept(memory_bytes, file), **view)
-    recording = JournalRecording(source)
-    if saved.is_file():
-        saved_maps.check_journal(saved, len(recording))
-    return _fuse(recording, Volume(config, **_kept(memory_bytes)), quiet)
-
-
-def _fuse(recording: "JournalRecording", volume: "Volume", quiet: bool) -> "Volume":
-    """Add every keyframe; one that the map cannot take is counted and left out, as in the server."""
-    from tsfusion.cli import progress
-    from tsfusion.core.errors import MapError
-
-    left_out = Counter[str]()
     with progress.shown(quiet=quiet) as display:
-        display.stage(f"fusing {recording.name}")
-        for index, keyframe in enumerate(recording, 1):
-            try:
-                volume.integrate(keyframe)
-            except MapError as error:
-                left_out[str(error)] += 1
-            display.update(index, volume.keyframes, len(recording))
-    for reason, count in left_out.items():
+
+        def watch(read: int, fused: int, total: int) -> None:
+            if read == 1:
+                display.stage(f"fusing {source}")
+            display.update(read, fused, total)
+
+        reading = partial(display.show_bytes, opened_maps.JOURNAL)
+        found = journal_fusion.map_of(
+            source,
+            config,
+            given=given,
+            kept=partial(_kept, memory_bytes),
+            reading=reading,
+            watch=watch,
+            **view,
+        )
+    for reason, count in found.left_out.items():
         typer.echo(f"left out {count_of(count, 'keyframe')}: {reason}", err=True)
-    return volume
+    if found.missing:
+        have = count_of(found.missing, "keyframe", "keyframes")
+        typer.echo(f"warning: the journal lacks {have} of the saved map: not in this mesh", err=True)
+    return found
 
 
-def _print_result(out: Path, figures: dict[str, Any], json: bool) -> None:
+def _print_result(out: Path, figures: dict[str, Any], legend: list[dict[str, Any]], json: bool) -> None:
     from tsfusion.cli import output, run_summary
     from tsfusion.geometry.mesh import summarise
 
     if json:
-        output.as_json({"path": str(out), **figures})
+        output.as_json({"path": str(out), **figures, **({"legend": legend} if legend else {})})
     else:
-        typer.echo("\n".join((f"{out}: {summarise(figures)}", *run_summary.mesh_notes(figures))))
+        colors = [f"  {one['color']}  {one['name']}, {one['keyframes']} keyframes" for one in legend]
+        typer.echo("\n".join((f"{out}: {summarise(figures)}", *run_summary.mesh_notes(figures), *colors)))

@@ -94,15 +94,22 @@ def find(path: Path, map_name: str | None = None) -> SavedMap:
     return SavedMap(file, folder)
 
 
+def missing(header: checkpoint.CheckpointHeader, keyframes: int) -> int:
+    """How many keyframes of a checkpoint are not in its journal, which has, or once had, so many."""
+    removed = (header.meta.get("poses") or {}).get("removed", 0)
+    there: int = header.keyframes + sum(header.meta.get("rejected", {}).values()) + removed
+    return max(0, there - keyframes)
+
+
 def check_journal(path: Path, keyframes: int) -> None:
     """Raise JournalError where a checkpoint has keyframes that its journal, of so many, does not have."""
     with checkpoint.reading(path) as (header, _):
-        removed = (header.meta.get("poses") or {}).get("removed", 0)
-        there = header.keyframes + sum(header.meta.get("rejected", {}).values()) + removed
-    if there > keyframes:
+        absent = missing(header, keyframes)
+    if absent:
         raise JournalError(
-            f"the map {path} cannot be fused anew: of its {there} keyframes the journal has {keyframes} "
-            "(others were deleted from it, or came with `tsfusion map resume`); leave the map flags out"
+            f"the map {path} cannot be fused anew: of its {keyframes + absent} keyframes the journal has "
+            f"{keyframes} (others were deleted from it, or came with `tsfusion map resume`); leave the map "
+            "flags out"
         )
 
 

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: MIT
+"""The keyframes of a map's journal at their final poses, as the map has them when it is settled."""
+
+import logging
+from collections import Counter
+from collections.abc import Collection
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion import journal
+from tsfusion.core.errors import DecodeError, InvalidKeyframe
+from tsfusion.fuser.keyframe_poses import KeyframePoses
+from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.journal.mcap_layout import Record
+from tsfusion.journal.state_folder import JournalPlace, Watcher
+from tsfusion.wire import codec
+from tsfusion.wire.corrections import SERVER_SESSION, Correction
+from tsfusion.wire.record_header import KeyframeHeader, unpack_keyframe
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class JournaledSession:
+    """The records of one session, as far as they were read.
+
+    Attributes:
+        client: name of the key that they came under; empty = no keys.
+        last_seq: of its last record, a keyframe or a correction.
+        first_ns, last_ns: when its first and last records were journaled, by the server's wall clock.
+    """
+
+    key: bytes
+    client: str
+    first_ns: int
+    keyframes: int = 0
+    last_seq: int = 0
+    last_ns: int = 0
+
+    @property
+    def name(self) -> str:
+        """The client's name, or the session's first digits where the server has no keys."""
+        return self.client or self.key.hex()[:8]
+
+
+class FinalKeyframe(NamedTuple):
+    """A keyframe at its final pose, and whose it is."""
+
+    keyframe: Keyframe
+    session: JournaledSession
+
+
+class _Place(NamedTuple):
+    session: bytes
+    seq: int
+    file: Path
+    offset: int
+
+
+class JournaledKeyframes:
+    """The keyframes of a journal that no correction removed, each at its newest pose, in journal order.
+
+    Each once, also when a crash left a second copy. Those that a map could not take are among them, those
+    that the server was told to forget are not. Arrays are read one keyframe at a time; a keyframe takes some
+    300 bytes otherwise.
+
+    Args:
+        until_ns: leave out all that was journaled later, also corrections; by the server's wall clock. What
+            was forgotten later does not come back.
+        watch: called with the bytes read and all bytes, while the headers are read.
+
+    Attributes:
+        sessions: of the whole journal up to `until_ns`.
+        unreadable: number of records without a readable header by reason.
+        recorded: number of keyframes that are, or were until they were erased, in the journal.
+    """
+
+    def __init__(
+        self,
+        place: JournalPlace,
+        *,
+        until_ns: int | None = None,
+        watch: Watcher = lambda _done, _all: None,
+    ) -> None:
+        self.name = str(place.path)
+        self.sessions: dict[bytes, JournaledSession] = {}
+        self.unreadable = Counter[str]()
+        self.recorded = 0
+        self._poses = KeyframePoses(None, {})
+        self._places: list[_Place] = []
+        for file, step in place.steps(watch):
+            if isinstance(step, journal.Erased):
+                self.recorded += 1
+            elif isinstance(step, journal.Damage):
+                log.log(logging.WARNING if step.torn else logging.ERROR, "%s: %s", file, step.what)
+            elif step.session == SERVER_SESSION:
+                self._forget(step)
+            elif until_ns is None or step.logged_ns <= until_ns:
+                self._note(file, step)
+        self._places = [place for place in self._places if self._pose(place) is not None]
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, index: int) -> FinalKeyframe:
+        """Read a keyframe.
+
+        Raises:
+            JournalError: when it cannot be read any more.
+            DecodeError, InvalidKeyframe: when it is of no use, to a server neither.
+        """
+        place = self._places[index]
+        found = codec.decode_keyframe(journal.read_at(place.file, place.offset).frames)
+        T = self._pose(place)
+        assert T is not None  # others are left out
+        return FinalKeyframe(replace(found, T_world_camera=T), self.sessions[place.session])
+
+    def keep_only(self, sessions: Collection[bytes]) -> None:
+        """Leave out the keyframes of other sessions. Corrections count whoever sent them."""
+        self._places = [place for place in self._places if place.session in sessions]
+
+    def _pose(self, place: _Place) -> NDArray[np.float64] | None:
+        return self._poses.pose_of(place.session, place.seq)
+
+    def _note(self, file: Path, record: Record) -> None:
+        key, seq = record.session, record.seq
+        session = self.sessions.setdefault(key, JournaledSession(key, record.client, record.logged_ns))
+        if seq <= session.last_seq:
+            return
+        session.last_seq, session.last_ns = seq, record.logged_ns
+        self.recorded += not record.is_correction
+        if self._poses.is_forgotten(key, seq):
+            return
+        try:
+            if record.is_correction:
+                found = codec.decode(record.frames)
+                assert isinstance(found, Correction)
+                self._poses.correct(key, found)
+                return
+            sent = _without_measurement(unpack_keyframe(record.frames[0]))
+            self._poses.add(key, seq, record.position, self._poses.placed(key, sent))
+        except (DecodeError, InvalidKeyframe, IndexError) as error:
+            self.unreadable[str(error)] += 1
+            return
+        session.keyframes += 1
+        self._places.append(_Place(key, seq, file, record.position.offset))
+
+    def _forget(self, record: Record) -> None:
+        with suppress(DecodeError):  # `tsfusion journal verify` tells of it
+            found = codec.decode(record.frames)
+            if isinstance(found, Correction) and found.target is not None:
+                self._poses.forget(found.target, found.removed)
+
+
+def _without_measurement(header: KeyframeHeader) -> Keyframe:
+    """A keyframe of no points, at its place."""
+    rows = np.array(header.pose).reshape(3, 4)
+    T = np.vstack([rows, (0.0, 0.0, 0.0, 1.0)])
+    return Keyframe(points=np.empty((0, 3), np.float32), T_world_camera=T)
