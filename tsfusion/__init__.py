@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from tsfusion.client import Client as Client
     from tsfusion.core.config import Config as Config
     from tsfusion.core.config import VolumeConfig as VolumeConfig
+    from tsfusion.core.errors import AlignmentRefused as AlignmentRefused
     from tsfusion.core.errors import CheckpointError as CheckpointError
     from tsfusion.core.errors import DamagedCheckpoint as DamagedCheckpoint
     from tsfusion.core.errors import DatasetError as DatasetError
@@ -47,8 +48,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _ERRORS = (
-    "CheckpointError", "DamagedCheckpoint", "DatasetError", "DecodeError", "FlushTimeout", "IncompleteRun",
-    "InvalidConfig",
+    "AlignmentRefused", "CheckpointError", "DamagedCheckpoint", "DatasetError", "DecodeError", "FlushTimeout",
+    "IncompleteRun", "InvalidConfig",
     "InvalidKeyframe", "JournalError", "KeyframeRefused", "KeyframeTooLarge", "MapError", "MapFull",
     "MapQuota", "MissingDependency",
     "NotAllowed", "OutputError", "ServerUnreachable", "SourceError",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tsfusion.cli import forget, map_view, opened_maps, options, verbs
+from tsfusion.cli import forget, map_align, map_view, opened_maps, options, verbs
 from tsfusion.core.counts import count_of
 
 if TYPE_CHECKING:
@@ -18,11 +18,12 @@ _TWICE = "a recording that was sent twice counts twice"
 
 app = typer.Typer(
     cls=verbs.Group,
-    help="Describe, compare, merge, crop, convert and resume saved maps; forget keyframes.\n\n"
+    help="Describe, compare, align, merge, crop, convert and resume saved maps; forget keyframes.\n\n"
     "A saved map is a file (.tsf), or that of a server: its state folder, or the folder of one map in it. "
     "All of this works while the server runs; only `forget` changes what it reads.",
 )
 forget.register(app)
+map_align.register(app)
 
 Where = Annotated[
     Path, typer.Argument(metavar="MAP", help="A .tsf file, a state folder, or a map's folder in it.")

@@ -15,6 +15,7 @@
     │   ├── WeightOverflow                 a voxel has taken as many votes as its integers hold
     │   └── CheckpointError                a saved map is missing, unreadable or of another version
     │       └── DamagedCheckpoint          its bytes are not those that were written
+    ├── AlignmentRefused                   nobody can tell where one map lies in another
     ├── TransportError
     │   ├── ServerUnreachable              nobody answered on the control socket in time
     │   ├── NotAllowed                     the server turned this client's keys away, or its lack of them
@@ -110,6 +111,10 @@ class CheckpointError(MapError):
 
 class DamagedCheckpoint(CheckpointError):
     """A saved map is cut short, altered or malformed: its bytes are not those that were written."""
+
+
+class AlignmentRefused(TsfusionError):
+    """Two maps share too little, or too much looks alike, to say where one lies in the other."""
 
 
 class TransportError(TsfusionError):

@@ -378,6 +378,28 @@ class Volume:
             raise InvalidConfig(f"min_weight must be from 0 to {most:.0f}, got {min_weight}")
         return min_weight
 
+    def signed_distance(
+        self, points: NDArray[np.floating], min_weight: float | None = None
+    ) -> NDArray[np.float32]:
+        """Signed distances that the map holds at points of the world: positive in the free space it saw.
+
+        Args:
+            points: (n, 3) metres; each takes the value of the voxel that it lies in.
+            min_weight: as for `extract_mesh`.
+
+        Returns:
+            (n,) metres; NaN where the map saw nothing, which is all but a band around its surfaces.
+        """
+        voxels = np.floor(np.asarray(points, np.float64) / self.config.voxel_size)
+        near = np.asarray((np.abs(voxels) < 1 << 20).all(axis=1))  # others have no key; nor has NaN
+        x, y, z = np.where(near[:, np.newaxis], voxels, 0).astype(np.int64).T
+        keys, rows = np.unique(pack_keys(np.stack([x, y, z], axis=1) >> 3), return_inverse=True)
+        weight = self._checked_min_weight(min_weight)
+        values = values_of(keys, self._store, weight)[rows.ravel(), (x & 7) << 6 | (y & 7) << 3 | z & 7]
+        metres = values * np.float32(self.config.voxel_size / integrate.QUANTA_PER_VOXEL)
+        metres[~near] = np.nan
+        return np.asarray(metres, np.float32)
+
     def map_hash(self) -> str:
         """Hex digest of the exact sums: equal for the same keyframes in any order, on any number of threads.
 

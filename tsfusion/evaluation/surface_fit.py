@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: MIT
+"""How well two surfaces of one place lie on each other, and what speaks against it."""
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.evaluation.surface_error import nearest
+from tsfusion.geometry import se3
+from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.se3 import Transform
+
+_AGREE = 0.8  # least cosine between normals of one surface
+_REACH = 2.0  # cells within which the other surface is looked for
+_DEPTH_MARGIN = 0.02  # of the depth, by which a point lies before a measurement at least to be seen through
+
+
+class SurfaceFit(msgspec.Struct, frozen=True):
+    """The fit of a surface to another.
+
+    Attributes:
+        overlap: share of the smaller surface that lies on the other, 0 to 1.
+        rmse_m: of the distances between the two where they overlap, metres; NaN where they do not.
+        constraint: 0 to 1; how firmly the overlap holds the direction (or turn) in which it could most
+            easily slide. A plane, a ball or a straight corridor has about 0; of three planes, each across
+            the others, it is about 0.1.
+        matches: number of cells that overlap.
+    """
+
+    overlap: float
+    rmse_m: float
+    constraint: float
+    matches: int
+
+
+class SampledSurface:
+    """One point with a normal for each cell of a mesh: (n, 3) each."""
+
+    def __init__(self, mesh: Mesh, cell: float) -> None:
+        self.cell = cell
+        at = np.floor(mesh.vertices.astype(np.float64) / cell).astype(np.int64) + (1 << 20)
+        _, cells = np.unique(at[:, 0] << 42 | at[:, 1] << 21 | at[:, 2], return_inverse=True)
+        count = np.bincount(cells)
+        points, normals = (
+            np.stack([np.bincount(cells, axis.astype(np.float64)) for axis in values.T], 1) / count[:, None]
+            for values in (mesh.vertices, mesh.normals)
+        )
+        length = np.linalg.norm(normals, axis=1)
+        is_flat = length > _AGREE  # in others there are two sides of something thin
+        self.points, self.normals = points[is_flat], normals[is_flat] / length[is_flat, None]
+
+    def moved(self, T: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Points and normals after a (4, 4) transform."""
+        return se3.apply(T, self.points), self.normals @ T[:3, :3].T
+
+
+def fit(a: SampledSurface, b: SampledSurface, T_a_b: Transform, tolerance: float) -> SurfaceFit:
+    """The fit of surface `b`, moved by `T_a_b`, to surface `a`.
+
+    Args:
+        tolerance: metres along the normal within which both are one surface.
+
+    Raises:
+        MissingDependency: without scipy.
+    """
+    points, normals = b.moved(T_a_b)
+    distance, index = nearest(points, a.points)
+    offset = ((points - a.points[index]) * a.normals[index]).sum(axis=1)
+    agree = (normals * a.normals[index]).sum(axis=1) > _AGREE
+    lies = agree & (distance < _REACH * a.cell) & (np.abs(offset) < tolerance)
+    matches = int(lies.sum())
+    overlap = min(1.0, matches / max(1, min(len(a.points), len(b.points))))
+    if matches < 6:
+        return SurfaceFit(overlap, np.nan, 0.0, matches)
+    rmse = float(np.sqrt((offset[lies] ** 2).mean()))
+    return SurfaceFit(overlap, rmse, _constraint(points[lies], a.normals[index[lies]]), matches)
+
+
+def _constraint(points: NDArray[np.float64], normals: NDArray[np.float64]) -> float:
+    """The least eigenvalue of the information of point-to-plane distances, for a surface of unit size."""
+    arms = points - points.mean(axis=0)
+    arms /= max(float(np.sqrt((arms**2).sum(axis=1).mean())), 1e-9)
+    J = np.hstack([normals, np.cross(arms, normals)])
+    return max(0.0, float(np.linalg.eigvalsh(J.T @ J / len(J))[0]))
+
+
+class SeenDepth:
+    """The depth image of a keyframe, to ask whether its camera looked through a point.
+
+    Args:
+        keyframe: of depth or disparity.
+        voxel_size: metres; what is nearer than two to a measurement counts as seen.
+    """
+
+    def __init__(self, keyframe: Keyframe, voxel_size: float) -> None:
+        assert keyframe.intrinsics is not None
+        self._K, self._T_camera_world = keyframe.intrinsics, se3.inverse(keyframe.T_world_camera)
+        self._near, self._far = _depth_range(keyframe)
+        self._margin = 2 * voxel_size
+
+    def looks(self, points: NDArray[np.float64]) -> tuple[int, int]:
+        """How many of (n, 3) points of the world the camera looked through, and how many it saw.
+
+        Points out of view, hidden ones and those where it measured nothing are neither.
+        """
+        x, y, z = se3.apply(self._T_camera_world, points).T
+        K, (height, width) = self._K, self._near.shape
+        with np.errstate(all="ignore"):
+            u, v = np.round(K.fx * x / z + K.cx), np.round(K.fy * y / z + K.cy)
+            inside = (z > 0.1) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        z, u, v = z[inside], u[inside].astype(int), v[inside].astype(int)
+        margin = self._margin + _DEPTH_MARGIN * z
+        near, far = self._near[v, u], self._far[v, u]
+        through = z < near - margin
+        return int(through.sum()), int(((z <= far + margin) & ~through & (near > 0)).sum())
+
+
+def _depth_range(keyframe: Keyframe) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The least and the greatest depth around each pixel, metres; NaN where one is not measured."""
+    measured = keyframe.measurement.astype(np.float32)
+    with np.errstate(all="ignore"):
+        if keyframe.kind == "disparity":
+            depth = np.float32(keyframe.baseline_fx or np.nan) / (measured * keyframe.disparity_scale)
+        elif keyframe.measurement.dtype == np.uint16:
+            depth = measured * np.float32(keyframe.depth_scale)
+        else:
+            depth = measured
+    depth[~(np.isfinite(depth) & (measured > 0))] = 0
+    window = np.ones((5, 5), np.uint8)
+    near, far = cv2.erode(depth, window), cv2.dilate(depth, window)
+    near[near == 0] = np.nan
+    return np.asarray(near, np.float32), np.asarray(far, np.float32)
