@@ -65,6 +65,10 @@ def scan(
     connect: options.Connect = None,
     map_: options.NewMap = None,
     same_frame: options.SameFrame = False,
+    align: Annotated[
+        bool,
+        options.option("--align", None, "First find the scan's place in that map."),
+    ] = False,
     control: options.Control = None,
     key: options.Key = None,
     server_key: options.ServerKey = None,
@@ -94,13 +98,18 @@ def scan(
     **settings: Any,
 ) -> None:
     """Localise a sensor and fuse its keyframes until the end or Ctrl-C."""
-    remote = {"spool", *options.only_for_kept_maps(state)}
+    remote = {"spool", "align", *options.only_for_kept_maps(state)}
     options.check_target_flags(context, connect, own={*options.MAP_OPTIONS, "state"}, remote=remote)
     if connect is not None:
         options.refuse(
             context, ("up", "keep_islands"), "has no effect with --connect: give it to `tsfusion mesh`"
         )
     given_up = options.up_direction(up)
+    if align:
+        from tsfusion.evaluation.surface_registration import check_installed
+
+        options.refuse(context, ("same_frame",), "and --align exclude each other: one says that it is known")
+        check_installed()
     from tsfusion.cli import output, progress, run_summary
     from tsfusion.pipelines.scan import scan as run
 
@@ -121,7 +130,7 @@ def scan(
         result = run(
             opened, out, overwrite=overwrite, config=chosen.scan, volume=chosen.volume,
             server=options.own_server(chosen, state), client=client, connect=connect, spool=spool,
-            same_frame=same_frame, min_weight=settings["min_weight"], up=given_up,
+            same_frame=same_frame, align=align, min_weight=settings["min_weight"], up=given_up,
             keep_islands=keep_islands, progress=display,
         )  # fmt: skip
     if json:

@@ -2,12 +2,14 @@
 """A whole scan: a source's frames localised, chosen, sent and fused, and its results left in a folder."""
 
 import dataclasses
+import logging
 import os
 import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,25 +17,44 @@ import numpy as np
 
 from tsfusion.client import Client, ClientStats
 from tsfusion.core import process
-from tsfusion.core.config import ClientConfig, ScanConfig, ServerConfig, VolumeConfig
+from tsfusion.core.config import ClientConfig, ScanConfig, ServerConfig, VolumeConfig, override
 from tsfusion.core.counts import count_of
-from tsfusion.core.errors import DatasetError, OutputError, SourceError, TsfusionError, WorldRefused
+from tsfusion.core.errors import (
+    AlignmentRefused,
+    DatasetError,
+    OutputError,
+    SourceError,
+    TsfusionError,
+    WorldRefused,
+)
 from tsfusion.core.output_folder import results
 from tsfusion.datasets.cameras import described
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.sample_ranges import wrong_unit
 from tsfusion.geometry.up_direction import HeldSensor, Up
-from tsfusion.pipelines import engine, map_size, run_files, scan_results, shortfall, target_server
+from tsfusion.pipelines import (
+    engine,
+    map_size,
+    run_files,
+    scan_alignment,
+    scan_results,
+    shortfall,
+    target_server,
+)
 from tsfusion.pipelines.engine import Engine, Progress
 from tsfusion.pipelines.leftovers import ANSWER_SECONDS, Leftovers
+from tsfusion.pipelines.scan_alignment import ExistingMap
 from tsfusion.pipelines.scan_results import MapResult, ScanSummary
 from tsfusion.pipelines.target_server import Target
+from tsfusion.scanner.keyframe_selection import KeyframeSelector
 from tsfusion.scanner.localization import registry
 from tsfusion.scanner.localization.localizer import Localizer
 from tsfusion.scanner.scanner import Scanner, Submap
 from tsfusion.scanner.sources.source import Source
 
 OUTDOOR_SENSORS = ("stereo", "lidar")
+
+log = logging.getLogger(__name__)
 
 
 def scan(
@@ -49,6 +70,7 @@ def scan(
     connect: str | None = None,
     spool: str | os.PathLike[str] = "tsfusion-spool",
     same_frame: bool = False,
+    align: bool = False,
     min_weight: float | None = None,
     up: Up | None = None,
     keep_islands: bool | None = None,
@@ -68,6 +90,8 @@ def scan(
         spool: with `connect`, the folder where keyframes wait until they are acknowledged; what earlier
             scans left there goes to its own maps, or waits on.
         same_frame: the scan's coordinate frame is declared to be that of the map, whatever worlds it has.
+        align: with `connect`: find the scan's place in the map, if that has a surface, before anything is
+            sent. Where that fails the scan goes into a free map.
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
         up: away from the ground, in the map's frame; None = it is found.
         keep_islands: see `mesh_files.write`.
@@ -79,6 +103,7 @@ def scan(
         OutputError: `out` cannot be written, or no frame could be localised; or the own map has no surface,
             when all else is in `out`.
         TransportError: the server cannot be reached or stopped fusing.
+        AlignmentRefused: the place was not found; the scan is in a map of its own.
         WorldRefused: the map has keyframes of another session; those of this scan are in the spool.
     """
     failure: list[Exception] = []
@@ -100,7 +125,17 @@ def scan(
             leftovers = Leftovers(target, given=localizer.absolute)
             leftovers.begin()
 
-            scanner = _open_scanner(source, localizer, config, target, leftovers, same_frame=same_frame)
+            frames, map_name = _timely(source, first, frames, config.patience), target.link.map
+            unplaced = ""  # why
+            if align and (existing := _existing_map(target)) is not None:
+                localizer, frames, unplaced = _placed(
+                    source, localizer, frames, existing, config=config, volume=volume, tell=progress.stage
+                )
+                same_frame = not unplaced
+                map_name = _other_map(target, unplaced) if unplaced else map_name
+            scanner = _open_scanner(
+                source, localizer, config, target, leftovers, map_name=map_name, same_frame=same_frame
+            )
 
             def observe() -> ClientStats:
                 state = scanner.state()
@@ -109,9 +144,9 @@ def scan(
 
             running = Engine(target, observe, lambda: scanner.state().link)
             pace = running.wait_turn if own and not source.live else running.check
-            progress.stage(f"scanning {source.name}" + ("" if own else f" into the map {target.link.map}"))
+            progress.stage(f"scanning {source.name}" + ("" if own else f" into the map {map_name}"))
             started = time.monotonic()
-            _run_scanner(scanner, _timely(source, first, frames, config.patience), pace, failure)
+            _run_scanner(scanner, frames, pace, failure)
             peak = process.peak_rss_bytes()
             if not any(submap.located for submap in scanner.submaps):
                 raise (failure[0] if failure else _not_localised(scanner, first, config))
@@ -136,9 +171,56 @@ def scan(
                 seconds=seconds, peak_rss_bytes=peak, config=config, volume=volume if own else None,
             )  # fmt: skip
         run_files.write_record(work, result)
+    if unplaced and not failure:
+        raise AlignmentRefused(f"the scan is in the map {map_name}, as its place was not found: {unplaced}")
     if failure:
         raise failure[0]
     return result
+
+
+def _existing_map(target: Target) -> ExistingMap | None:
+    """The map to scan into as the server has it now; None = it has no surface yet, and may begin here."""
+    name = target.link.map
+    if name not in target.health().maps:
+        return None
+    mesh = target.mesh(name, min_weight=None)
+    if not len(mesh.faces):
+        return None
+    return ExistingMap(name, mesh, target.status(name).config["volume"]["voxel_size"])
+
+
+def _placed(
+    source: Source,
+    localizer: Localizer,
+    frames: Iterator[Frame],
+    existing: ExistingMap,
+    *,
+    config: ScanConfig,
+    volume: VolumeConfig,
+    tell: Callable[[str], None],
+) -> tuple[Localizer, Iterator[Frame], str]:
+    """A localizer in the frame of an existing map, and its frames from the first; or why there is none.
+
+    Where there is none the localizer is in a frame of its own.
+    """
+    found = scan_alignment.find_place(
+        existing, override(volume, voxel_size=existing.voxel_size), localizer, frames,
+        KeyframeSelector(config, outdoors=source.sensor in OUTDOOR_SENSORS), live=source.live, tell=tell,
+    )  # fmt: skip
+    T = np.eye(4) if found.T_map_world is None else found.T_map_world
+    if found.T_map_world is not None:
+        log.info("the place in the map %s is found by %d keyframes", existing.name, len(found.keyframes))
+    placed = scan_alignment.PlacedLocalizer(localizer, T, found.answers)
+    return placed, chain(found.frames, frames), found.why if found.T_map_world is None else ""
+
+
+def _other_map(target: Target, why: str) -> str:
+    """The name of a free map, for a scan whose place was not found."""
+    name = target.free_map_name()
+    if name is None:
+        raise AlignmentRefused(f"{why}; nothing was sent, as the server names no free map")
+    log.warning("the scan goes into the map %s, as its place was not found: %s", name, why)
+    return name
 
 
 def _open_scanner(
@@ -148,21 +230,22 @@ def _open_scanner(
     target: Target,
     leftovers: Leftovers,
     *,
+    map_name: str,
     same_frame: bool,
 ) -> Scanner:
     """A scanner that sends to a target; raises WorldRefused at once when the map is of another world."""
 
-    def open_client(map_name: str) -> Client:
+    def open_client(name: str) -> Client:
         return target.client(
-            map_name,
+            name,
             # A recording waits, so nothing of it is left out; what a live source gives is thinned.
             policy=None if source.live else "spool_all",
             world="" if localizer.absolute else uuid.uuid4().hex,
-            same_frame=same_frame and map_name == target.link.map,
+            same_frame=same_frame and name == target.link.map,
         )
 
     scanner = Scanner(
-        localizer, config, open_client, map_name=target.link.map,
+        localizer, config, open_client, map_name=map_name,
         taken=leftovers.maps, free_name=target.free_map_name,
         outdoors=source.sensor in OUTDOOR_SENSORS,
         most=None if target.child is None else target_server.MAPS - 1,

@@ -34,7 +34,7 @@ from tsfusion.delivery import left_spools
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.journal import state_folder
 from tsfusion.wire.curve import ClientKeys, client_keys
-from tsfusion.wire.health import Status
+from tsfusion.wire.health import Health, Status
 from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_new_map, fetch_status
 
 START_DEADLINE = 180.0  # seconds; a cold kernel compilation on a slow machine
@@ -203,6 +203,10 @@ class Target:
         """The status of a map; see `fetch_status`."""
         address, control, keys = self.link.address, self.link.control, self.keys
         return fetch_status(address, control=control, map_name=map_name, timeout=timeout, keys=keys)
+
+    def health(self) -> Health:
+        """The server's health; see `fetch_health`."""
+        return fetch_health(self.link.address, control=self.link.control, keys=self.keys)
 
     def mesh(self, map_name: str, *, min_weight: float | None) -> Mesh:
         """The mesh of a map, as of now; see `fetch_mesh`."""
