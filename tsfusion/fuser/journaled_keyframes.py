@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion import journal
+from tsfusion.core.config import SERVER_SESSION
 from tsfusion.core.errors import DecodeError, InvalidKeyframe
 from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.journal.state_folder import JournalPlace, Watcher
 from tsfusion.wire import codec
-from tsfusion.wire.corrections import SERVER_SESSION, Correction
+from tsfusion.wire.corrections import Correction
 from tsfusion.wire.record_header import KeyframeHeader, unpack_keyframe
 
 log = logging.getLogger(__name__)
