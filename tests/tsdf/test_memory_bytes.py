@@ -172,3 +172,28 @@ def test_without_the_systems_page_table_the_newest_blocks_stay(
     monkeypatch.setattr(process, "shared_rss_bytes", lambda: 1 << 40)
     residency.keep_within(2 * GROUP * 4096, np.repeat(np.arange(6, dtype=np.int32), GROUP))
     assert unnamed_files_rss(folder) == GROUP * 4096
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_whatever_comes_and_goes_the_map_is_that_of_what_remains(folder: Path, seed: int) -> None:
+    views, random = sphere_views(0.5, 8), np.random.default_rng(seed)
+    volume, held = Volume(0.01, threads=2, memory_bytes=2 << 20, cache=folder), [views[0]]
+    volume.integrate(views[0])
+    for act in random.choice(["add", "add", "move", "release", "load", "mesh"], 14):
+        if act == "move":
+            volume.retract(held.pop(int(random.integers(len(held)))))
+        if act in ("add", "move"):
+            held.append(views[int(random.integers(len(views)))])
+            volume.integrate(held[-1])
+        elif act == "release":
+            volume.release_empty()
+        elif act == "load":
+            saved = volume.save(folder / "map.tsf")
+            volume = Volume.load(saved, memory_bytes=2 << 20, cache=folder)
+        else:
+            volume.extract_mesh(blocks=volume.cells_to_mesh(volume.take_dirty()))
+    fresh = volume_of(held, voxel_size=0.01)
+    assert (volume.map_hash(), volume.color_hash()) == (fresh.map_hash(), fresh.color_hash())
+    mesh, expected = volume.extract_mesh(), fresh.extract_mesh()
+    assert mesh.vertices.tobytes() == expected.vertices.tobytes()
+    assert mesh.faces.tobytes() == expected.faces.tobytes()
