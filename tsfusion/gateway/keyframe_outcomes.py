@@ -195,8 +195,8 @@ class KeyframeOutcomes:
     def _note_want_of_room(self, reason: str, client: str) -> None:
         if reason in _FULL:
             self.notices["full"] = (
-                "it is full, keyframes that need more room are rejected: raise fuser_memory_bytes, "
-                "fuser_disk_bytes or max_blocks, make room on the disk, or begin another map"
+                "it is full, keyframes that need more room are rejected: raise max_blocks, "
+                "fuser_memory_bytes or fuser_disk_bytes, make room on the disk, or begin another map"
             )
         elif reason == _OVER_QUOTA:
             self.notices[f"client {client}"] = (
