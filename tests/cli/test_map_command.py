@@ -13,7 +13,7 @@ from command_processes import Here
 from corrected_maps import fresh_map
 from formula_scenes import volume_of
 from keyframes_and_servers import DEADLINE, pose, serving, wall
-from saved_maps import ANNA, BOB, correct, decoded, make_map
+from saved_maps import ANNA, BOB, correct, decoded, forget, make_map
 
 from tsfusion import Client, Volume
 from tsfusion.journal import state_folder
@@ -75,6 +75,18 @@ def test_hash_moves_what_was_corrected(here: Here, tmp_path: Path) -> None:
     assert found.stdout == fresh_map(folder / "journal", 0.04).map_hash() + "\n"
 
 
+def test_hash_is_without_what_was_forgotten(here: Here, tmp_path: Path) -> None:
+    folder = make_map(tmp_path / "state" / "maps" / "default", range(5), behind=2)
+    forget(folder, ANNA, (2, 4), 1)
+    found = json.loads(here("map", "hash", tmp_path / "state", "--json").stdout)
+    assert (found["map_hash"], found["keyframes"]) == (hash_of([0, 2, 4]), 3)
+    here("map", "convert", tmp_path / "state", "all.tsf")
+    assert here("map", "resume", "all.tsf", "--state", "own").returncode == 0
+    assert here("map", "hash", "own").stdout.strip() == hash_of([0, 2, 4])
+    listed, *_ = Volume.load("own/maps/default/map.tsf").meta["poses"]["sessions"].values()
+    assert listed["forgotten"]
+
+
 FAR = 50
 
 
@@ -93,6 +105,22 @@ def test_merge_is_the_map_of_all(here: Here, state: Path, tmp_path: Path) -> Non
     assert [(one["last"], one["listed"], one["unlisted_up_to"]) for one in sessions] == [
         (3, 0, 3), (2, 0, 2), (2, 0, 2),
     ]  # fmt: skip
+
+
+def test_maps_whose_servers_forgot_something_are_merged_by_the_same_rules(here: Here, tmp_path: Path) -> None:
+    folders = [
+        make_map(tmp_path / world, range(start, start + 3), session=session, world=world)
+        for world, start, session in (("one", 0, ANNA), ("two", 3, BOB))
+    ]
+    for folder, session in zip(folders, (ANNA, BOB), strict=True):
+        forget(folder, session, [2], 1)
+    refused = here("map", "merge", *folders, "--out", "all.tsf")
+    assert "in a coordinate frame of its own" in refused.stderr
+    for path, name in ((folders[0], "one.tsf"), (folders[1], "two.tsf")):
+        assert here("map", "crop", path, "--box", *[-FAR] * 3, *[FAR] * 3, "--out", name).returncode == 0
+        assert len(json.loads(here("map", "info", name, "--json").stdout)["sessions"]) == 1
+    done = here("map", "merge", "one.tsf", "two.tsf", "--same-frame", "--out", "all.tsf")
+    assert f"hash {hash_of([0, 2, 3, 5])}" in done.stdout, done.stderr
 
 
 def test_merge_refuses_what_would_count_twice_or_lie_elsewhere(

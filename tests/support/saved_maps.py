@@ -5,9 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from keyframes_and_servers import VOLUME, wall
 
 from tsfusion import Keyframe, VolumeConfig
+from tsfusion.core.config import SERVER_SESSION
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.fuser.messages import SessionProgress
 from tsfusion.journal import Journal, state_folder
@@ -53,9 +55,17 @@ def correct(
     folder: Path, session: bytes, seq: int, moves: dict[int, Any], removed: Sequence[int] = ()
 ) -> None:
     """Write a correction to a map's journal, of which no checkpoint has anything."""
+    _append(folder, session, seq, corrections.checked(moves, removed=removed))
+
+
+def forget(folder: Path, session: bytes, seqs: Sequence[int], number: int) -> None:
+    """Write to a map's journal, as its `number`-th record of that kind, that keyframes are forgotten."""
+    _append(folder, SERVER_SESSION, number, corrections.forgetting(session, np.array(seqs, np.int64)))
+
+
+def _append(folder: Path, session: bytes, seq: int, correction: corrections.Correction) -> None:
     journal = Journal(folder / state_folder.JOURNAL_FOLDER, 1 << 20, sync=False)
-    frames = corrections.encode(corrections.checked(moves, removed=removed), session=session, seq=seq)
-    journal.append(frames, session=session, seq=seq)
+    journal.append(corrections.encode(correction, session=session, seq=seq), session=session, seq=seq)
     journal.close()
 
 
