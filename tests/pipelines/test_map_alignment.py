@@ -105,6 +105,14 @@ def test_what_is_merged_is_the_map_of_both(halves: tuple[Path, Path], here: Here
     assert (said["merged"]["exact"], said["merged"]["keyframes"]) == (True, 25)
 
 
+def test_a_map_is_not_merged_with_itself(
+    given: type[Given], halves: tuple[Path, Path], here: Here, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(given, "found", [np.eye(4)])
+    done = here("map", "align", halves[0], halves[0], "--out", "c.tsf")
+    assert (done.returncode, "both maps hold 13 keyframes of session" in done.stderr) == (1, True)
+
+
 @pytest.mark.usefixtures("given")
 def test_without_a_journal_the_surface_is_resampled(
     maps: tuple[AlignedMap, AlignedMap], here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -71,7 +71,6 @@ verbs.verb(
     app, "tsfusion ate out/latest/trajectory.txt groundtruth.txt",
     "tsfusion ate estimate.txt my-recording --plot error.png", panel=OWN,
 )(ate.ate)  # fmt: skip
-app.add_typer(map.app, name="map", rich_help_panel=OWN)
 app.add_typer(datasets.app, name="datasets", rich_help_panel=OWN)
 verbs.verb(app, "tsfusion download", "tsfusion download tum-fr1-xyz --to datasets", panel=OWN)(
     download.download

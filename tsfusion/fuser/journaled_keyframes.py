@@ -101,8 +101,10 @@ class JournaledKeyframes:
                 log.log(logging.WARNING if step.torn else logging.ERROR, "%s: %s", file, step.what)
             elif step.session == SERVER_SESSION:
                 self._forget(step)
-            elif until_ns is None or step.logged_ns <= until_ns:
-                self._note(file, step)
+            else:
+                self.recorded += not step.is_correction
+                if until_ns is None or step.logged_ns <= until_ns:
+                    self._note(file, step)
         self._places = [place for place in self._places if self._pose(place) is not None]
 
     def __len__(self) -> int:
@@ -134,7 +136,6 @@ class JournaledKeyframes:
         if seq <= session.last_seq:
             return
         session.last_seq, session.last_ns = seq, record.logged_ns
-        self.recorded += not record.is_correction
         if self._poses.is_forgotten(key, seq):
             return
         try:

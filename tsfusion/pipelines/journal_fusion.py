@@ -174,10 +174,9 @@ def map_of(
     view = {name: getattr(config, name) for name in VIEW_SETTINGS}
     saved = source / state_folder.MAP_FILE
     is_view = bool(only) or until is not None or color_by is not None
-    if saved.is_file() and not given and not is_view:
-        settled = saved_maps.opened(
-            saved_maps.SavedMap(saved, source), lambda done, all_: watch(done, done, all_), reading
-        )
+    if saved.is_file() and not given and not is_view and _is_of_server(saved):
+        there = saved_maps.SavedMap(saved, source)
+        settled = saved_maps.opened(there, lambda done, total: watch(done, done, total), reading)
         with settled as (file, left_out):
             return JournalMap(Volume.load(file, config.threads, **kept(file), **view), dict(left_out))
     keyframes, missing = choose(source, until=until, only=only, watch=reading), 0
@@ -194,6 +193,12 @@ def map_of(
     made = fuse(keyframes, volume, paint=None if color_by is None else Painter(color_by), watch=watch)
     made.missing = missing
     return made
+
+
+def _is_of_server(saved: Path) -> bool:
+    """Whether a map says how far it is with the journal beside it; one that was put there does not."""
+    with checkpoint.reading(saved) as (header, _):
+        return "done" in header.meta
 
 
 def _color(index: int) -> tuple[int, int, int]:
