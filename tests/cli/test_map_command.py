@@ -2,6 +2,7 @@
 """`tsfusion map`: what it says of saved maps, what it makes of them, and what it refuses."""
 
 import json
+import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -170,6 +171,17 @@ def test_crop_and_merge_back(here: Here, state: Path) -> None:
     assert (empty.returncode, Volume.load("none.tsf").stats().blocks) == (0, 0)
     assert "nothing of the map lies in this box" in empty.stderr
     assert "x0 y0 z0" in here("map", "crop", house, "--box", 1, 0, 0, 0, 1, 1, "--out", "no.tsf").stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="blocks wait in files there alone")
+def test_maps_that_are_large_for_the_machine_wait_in_files(
+    here: Here, state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    third = make_map(tmp_path / "third", range(20, 22), session=b"c" * 16)
+    monkeypatch.setattr("tsfusion.core.process.physical_memory_bytes", lambda: 1 << 20)
+    monkeypatch.setenv("TMPDIR", "/var/tmp")
+    done = here("map", "merge", file_of(state, "yard"), third, "--out", "all.tsf")
+    assert f"hash {hash_of([*range(5), 20, 21])}" in done.stdout, done.stderr
 
 
 def test_diff_counts_and_paints(here: Here, state: Path) -> None:

@@ -304,7 +304,7 @@ def _load(path: Path, map_name: str | None = None, *, quiet: bool) -> "Volume":
     from tsfusion.tsdf.volume import Volume
 
     with opened_maps.opened(path, map_name, quiet=quiet) as file:
-        volume = Volume.load(file)
+        volume = Volume.load(file, memory_bytes=opened_maps.memory_for(file, maps=2))
     if waiting := sum(one.waiting for one in map_history.sessions(volume.meta)):
         stay = count_of(waiting, "keyframe stays", "keyframes stay")
         typer.echo(f"note: {path}: {stay} where fused, though corrected: {_STAYS}", err=True)

@@ -18,8 +18,6 @@ ColorBy = Literal["client", "session"]
 
 _OF_A_JOURNAL = ("until", "only", "color_by")
 
-_EXPANDS = 8  # a map in memory against its file: more than any
-
 
 @options.takes_map_settings
 def mesh(
@@ -146,16 +144,6 @@ def _write_tiles(found: "JournalMap", out: Path, up: "Up | None", json: bool) ->
     _print_result(files[0] if len(files) == 1 else out, figures, found.legend, json)
 
 
-def _kept(memory_bytes: int | None, saved: Path | None = None) -> dict[str, Any]:
-    """Where a map's blocks are kept, as arguments of `Volume`: in memory, where a saved one surely fits."""
-    from tsfusion.core import durable_files, process
-
-    half = process.physical_memory_bytes() // 2
-    if memory_bytes is None and saved is not None and _EXPANDS * durable_files.size_of(saved) > half:
-        memory_bytes = half
-    return {"memory_bytes": memory_bytes}
-
-
 def _map(
     source: Path,
     config: "VolumeConfig",
@@ -179,8 +167,9 @@ def _map(
         raise DatasetError(f"{source} does not exist; expected a map (.tsf), a state folder or a journal")
     if source.suffix == ".tsf":
         changed = {name: getattr(config, name) for name in VIEW_SETTINGS}
-        kept = _kept(memory_bytes, source)
-        return journal_fusion.JournalMap(Volume.load(source, config.threads, **kept, **changed), {})
+        memory = opened_maps.memory_for(source, memory_bytes)
+        loaded = Volume.load(source, config.threads, memory_bytes=memory, **changed)
+        return journal_fusion.JournalMap(loaded, {})
     source = state_folder.resolve_map(source, name)
     with progress.shown(quiet=quiet) as display:
 
@@ -189,13 +178,15 @@ def _map(
                 display.stage(f"fusing {source}")
             display.update(read, fused, total)
 
-        reading = partial(display.show_bytes, opened_maps.JOURNAL)
+        def memory_for(saved: Path | None) -> int | None:
+            return memory_bytes if saved is None else opened_maps.memory_for(saved, memory_bytes)
+
         found = journal_fusion.map_of(
             source,
             config,
             given=given,
-            kept=partial(_kept, memory_bytes),
-            reading=reading,
+            memory_for=memory_for,
+            reading=partial(display.show_bytes, opened_maps.JOURNAL),
             watch=watch,
             **view,
         )

@@ -9,16 +9,32 @@ from pathlib import Path
 import typer
 
 from tsfusion.core.counts import count_of
+from tsfusion.core.durable_files import size_of
 
 JOURNAL = "reading the journal"
+_EXPANDS = 8  # a map in memory against its file: more than any
 _LARGE_BYTES = 64 << 20  # of a file: reading it takes seconds
+
+
+def memory_for(file: Path, memory_bytes: int | None = None, *, maps: int = 1) -> int | None:
+    """Memory that a saved map may take, the rest waits in files; None = all of it, where it surely fits.
+
+    Args:
+        memory_bytes: that a person gave for it.
+        maps: that are open at the same time.
+    """
+    from tsfusion.core import process
+
+    share = process.physical_memory_bytes() // (2 * maps)
+    if memory_bytes is None and _EXPANDS * size_of(file) > share:
+        return share
+    return memory_bytes
 
 
 @contextmanager
 def opened(path: Path, map_name: str | None = None, *, quiet: bool) -> Iterator[Path]:
     """The file of a map; one of a state folder is brought up to date in a copy, with progress on stderr."""
     from tsfusion.cli import progress
-    from tsfusion.core.durable_files import size_of
     from tsfusion.pipelines import saved_maps
 
     with progress.shown(quiet=quiet) as display:

@@ -153,7 +153,7 @@ def map_of(
     until: str | None = None,
     only: Collection[str] = (),
     color_by: ColorBy | None = None,
-    kept: Callable[[Path | None], dict[str, Any]] = lambda _saved: {},
+    memory_for: Callable[[Path | None], int | None] = lambda _saved: None,
     reading: Watcher = lambda _done, _all: None,
     watch: Watch = lambda _read, _fused, _all: None,
 ) -> JournalMap:
@@ -165,7 +165,7 @@ def map_of(
     Args:
         given: fuse anew with the settings of `config`. Otherwise only those of how the surface is read and
             its threads count, and all where there is no saved map.
-        kept: arguments of `Volume` that say where blocks are kept, of a saved map's file or of a new map.
+        memory_for: gives `memory_bytes` of `Volume` for a saved map's file, or for a new map (None).
 
     Raises:
         InvalidConfig, JournalError, CheckpointError: as `choose`, `saved_maps.check_journal` and
@@ -178,7 +178,8 @@ def map_of(
         there = saved_maps.SavedMap(saved, source)
         settled = saved_maps.opened(there, lambda done, total: watch(done, done, total), reading)
         with settled as (file, left_out):
-            return JournalMap(Volume.load(file, config.threads, **kept(file), **view), dict(left_out))
+            volume = Volume.load(file, config.threads, memory_bytes=memory_for(file), **view)
+            return JournalMap(volume, dict(left_out))
     keyframes, missing = choose(source, until=until, only=only, watch=reading), 0
     if saved.is_file():
         if given and not is_view:
@@ -189,7 +190,7 @@ def map_of(
                 config = override(msgspec.structs.replace(header.config, threads=config.threads), **view)
     if color_by is not None:
         config = override(config, color=True)
-    volume = Volume(config, **kept(None))
+    volume = Volume(config, memory_bytes=memory_for(None))
     made = fuse(keyframes, volume, paint=None if color_by is None else Painter(color_by), watch=watch)
     made.missing = missing
     return made
