@@ -15,10 +15,13 @@ from clients_and_spools import deliver
 from command_processes import Here, descendants, end, read_until, server, started, tsfusion
 from small_recordings import first_views
 
-from tsfusion import Client, FlushTimeout, Volume
+from tsfusion import Client, FlushTimeout, Volume, VolumeConfig, journal
 from tsfusion.core import durable_files
+from tsfusion.fuser.map_checkpoints import MapCheckpoints
+from tsfusion.fuser.messages import SessionProgress
 from tsfusion.geometry.up_direction import HeldSensor
 from tsfusion.tsdf import field_regularizer
+from tsfusion.wire.codec import decode_keyframe
 
 VOXEL = 0.08
 
@@ -182,15 +185,21 @@ def test_the_mesh_of_a_map_larger_than_its_memory_is_written_in_tiles(
 @pytest.mark.slow
 def test_mesh_fuses_what_the_checkpoint_missed(state: Path, tmp_path: Path) -> None:
     """A state folder whose map is older than its journal, as a killed server leaves it."""
-    shutil.copytree(state / "maps/default/journal", tmp_path / "state/maps/default/journal")
-    volume = Volume(voxel_size=VOXEL)
-    volume.integrate(first_views(1)[0])
-    volume.save(tmp_path / "state/maps/default/map.tsf")
+    folder = tmp_path / "state/maps/default"
+    shutil.copytree(state / "maps/default/journal", folder / "journal")
+    saved = MapCheckpoints(folder, VolumeConfig(voxel_size=VOXEL), keep_previous=False)
+    first = next(journal.records(folder / "journal/000001.mcap"))
+    keyframe = decode_keyframe(first.frames)
+    saved.volume.integrate(keyframe)
+    saved.poses.add(first.session, first.seq, first.position, keyframe)
+    saved.done[first.session] = SessionProgress(first.seq, "")
+    assert saved.save()
     done = tsfusion(
         "mesh", tmp_path / "state", tmp_path / "a.glb", "--preview", tmp_path / "a.png", "--keep-islands"
     )
     assert done.returncode == 0, done.stderr
-    for keyframe in first_views(6)[1:]:
+    volume = Volume(voxel_size=VOXEL)
+    for keyframe in first_views(6):
         volume.integrate(keyframe)
     assert f"{len(volume.extract_mesh().vertices):,}".replace(",", "\u202f") in done.stdout
     assert cv2.imread(str(tmp_path / "a.png")).std() > 5
