@@ -349,6 +349,22 @@ def test_numbers_and_the_beginning_of_an_id_mean_one_session(recorded: Recorded)
     assert found_numbers(find(fuser, link, session="61", numbers=((2, 3),))) == {SESSIONS[0]: [2, 3]}
 
 
+def test_seconds_count_from_the_last_record_of_a_scanner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded = Recorded(tmp_path, segment_bytes=1)
+    for second in range(5):
+        clock_ns = 10**18 + second * 10**9 if second < 4 else 2 * 10**18
+        monkeypatch.setattr("tsfusion.journal.mcap_layout.wall_clock_ns", lambda ns=clock_ns: ns)
+        if second < 4:
+            recorded.add()
+        else:
+            recorded.forget(SESSIONS[0], [1])
+    fuser, link = fused(recorded)
+    assert found_numbers(find(fuser, link, since_ns=-(10**9))) == {SESSIONS[0]: [3, 4]}
+    assert found_numbers(find(fuser, link, until_ns=-2 * 10**9)) == {SESSIONS[0]: [2]}
+
+
 def test_keyframes_that_the_journal_lost_cannot_be_forgotten_and_that_is_said(tmp_path: Path) -> None:
     recorded = Recorded(tmp_path, segment_bytes=1)
     for _ in range(4):

@@ -75,8 +75,9 @@ class KeyframeSearch:
 
     def _last_logged_ns(self) -> int:
         for path in reversed(self._place.files()):
-            if stamps := [record.logged_ns for record in journal.records(path)]:
-                return max(stamps)
+            found = [record for record in journal.records(path) if record.session != SERVER_SESSION]
+            if found:
+                return max(record.logged_ns for record in found)
         return 0
 
     def _is_selected(self, selection: Selection, record: Record) -> bool:

@@ -23,7 +23,7 @@ class Selection(Struct, frozen=True, kw_only=True, omit_defaults=True):
         session: how the session's id begins, hexadecimal; empty = any.
         client: name that the sender's key is allowed under; None = any.
         since_ns, until_ns: when the server journaled them, by its wall clock, both inclusive; below zero, so
-            long before the last record of the journal. None = any.
+            long before the last record of a scanner. None = any.
         numbers: first and last of each range of numbers in their session; None = any.
         box: x, y, z of two opposite corners, metres, in the map's frame: the sensor was in it, and so is
             nearly all that it measured; None = anywhere.
