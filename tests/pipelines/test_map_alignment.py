@@ -103,6 +103,8 @@ def test_what_is_merged_is_the_map_of_both(halves: tuple[Path, Path], here: Here
         both.integrate(replace(keyframe, T_world_camera=T))
     assert Volume.load(tmp_path / "c.tsf").map_hash() == both.map_hash() == said["merged"]["map_hash"]
     assert (said["merged"]["exact"], said["merged"]["keyframes"]) == (True, 25)
+    done = here("map", "align", "c.tsf", b, "--out", "d.tsf")
+    assert (done.returncode, "was merged into that map before" in done.stderr) == (1, True)
 
 
 def test_a_map_is_not_merged_with_itself(

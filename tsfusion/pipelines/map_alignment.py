@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.config import VolumeConfig
 from tsfusion.core.counts import count_of
-from tsfusion.core.errors import AlignmentRefused, JournalError
+from tsfusion.core.errors import AlignmentRefused, JournalError, MapError
 from tsfusion.evaluation.surface_fit import SampledSurface, SeenDepth, SurfaceFit, fit
 from tsfusion.evaluation.surface_registration import Registration
 from tsfusion.fuser.journaled_keyframes import JournaledKeyframes
@@ -329,6 +329,11 @@ def merge(volume: Volume, b: AlignedMap, T_a_b: Transform, *, watch: Watch = lam
     """
     theirs = {} if b.volume is None else b.volume.meta
     map_history.check_addable(volume.meta, theirs, same_frame=True)
+    aligned, sessions = volume.meta.get("aligned", ()), set(theirs.get("done", ()))
+    if twice := sessions & {name for one in aligned for name in one["sessions"]}:
+        raise MapError(
+            f"{b.name} was merged into that map before (session {min(twice)[:8]}): it would count twice"
+        )
     not_exact, left_out = "", dict[str, int]()
     if b.keyframes is None:
         not_exact = f"{b.name} has no journal: its surface was resampled"
@@ -341,8 +346,8 @@ def merge(volume: Volume, b: AlignedMap, T_a_b: Transform, *, watch: Watch = lam
         ).left_out
         if b.missing:
             not_exact = f"{count_of(b.missing, 'keyframe')} of {b.name} are not in its journal, and left out"
-    aligned = [*volume.meta.get("aligned", ()), {"name": b.name, "T_map_other": np.array(T_a_b).tolist()}]
-    volume.meta = {**map_history.without_journal(volume.meta), "aligned": aligned}
+    entry = {"name": b.name, "T_map_other": np.array(T_a_b).tolist(), "sessions": sorted(sessions)}
+    volume.meta = {**map_history.without_journal(volume.meta), "aligned": [*aligned, entry]}
     return Merge(not_exact, left_out)
 
 
