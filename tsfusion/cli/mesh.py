@@ -47,7 +47,7 @@ def mesh(
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw a picture, too.")] = None,
     memory: Annotated[
         str | None,
-        typer.Option(metavar="BYTES", help="Memory of the map, such as 2GB; default: half of the machine's."),
+        options.option("--memory", "BYTES", "Of the map, as 2GB; else half of the machine's.", rare=True),
     ] = None,
     control: options.Control = None,
     map_: options.Map = None,
@@ -62,7 +62,7 @@ def mesh(
     A journal is fused again, with the map flags given here. With --until, --only
     or --color-by it is fused again as its map was, with corrected poses.
 
-    The mesh of a map larger than --memory is made in tiles: one .ply, or a .glb each (OUT-0001.glb and on).
+    A mesh larger than memory is made in tiles: one .ply, or a .glb each.
     """
     from dataclasses import replace
 
