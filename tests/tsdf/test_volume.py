@@ -579,3 +579,12 @@ def test_blocks_that_retractions_empty_make_room_and_nothing_else_changes(tmp_pa
     assert volume.color_hash() == fresh.color_hash()
     assert volume.extract_mesh().encode(".ply") == fresh.extract_mesh().encode(".ply")
     assert volume.release_empty() == 0
+
+
+def test_denormal_numbers_in_a_pose_are_zeros() -> None:
+    """Taichi has the processor flush them to zero, and then LAPACK finds no rotation."""
+    volume, T = Volume(voxel_size=0.05, threads=2), np.eye(4)
+    T[0, 1:3], T[1, 1] = (5e-322, 1e-310), 1 + 5e-7
+    keyframe = Keyframe(points=np.ones((1, 3), np.float32), T_world_camera=T)
+    assert (keyframe.T_world_camera == np.eye(4)).all()
+    assert volume.integrate(keyframe).samples == 1

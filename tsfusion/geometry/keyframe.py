@@ -21,6 +21,7 @@ MAX_IMAGE_SIDE = 8192
 MAX_POINTS = 2_000_000
 MAX_TRANSLATION = 1e6
 MAX_SENSOR_NAME = 32
+_LEAST = np.finfo(np.float64).tiny  # smaller numbers stop LAPACK where a library has the processor flush them
 _ROTATION_TOLERANCE = 1e-3
 _ROTATION_EXACT = 1e-9
 
@@ -275,6 +276,7 @@ def check_pose(pose: Any) -> NDArray[np.float64]:
         raise InvalidKeyframe(f"T_world_camera must have shape (4, 4), got {T.shape}")
     if not np.isfinite(T).all():
         raise InvalidKeyframe(f"T_world_camera must be finite, got {T.tolist()}")
+    T[np.abs(T) < _LEAST] = 0
     R, t = T[:3, :3], T[:3, 3]
     if np.abs(R).max() > 2:  # so far off that RᵀR could overflow
         raise InvalidKeyframe(f"T_world_camera must hold a rotation, got entries up to {np.abs(R).max():.3g}")
@@ -293,10 +295,19 @@ def check_pose(pose: Any) -> NDArray[np.float64]:
             f"T_world_camera must translate by at most {MAX_TRANSLATION:.0e} m, got {t.tolist()}"
         )
     if deviation > _ROTATION_EXACT:
-        U, _, Vt = np.linalg.svd(R)
-        T[:3, :3] = U @ Vt
+        T[:3, :3] = _nearest_rotation(R)
     T[3] = (0, 0, 0, 1)
     return T
+
+
+def _nearest_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    try:
+        U, _, Vt = np.linalg.svd(R)
+    except np.linalg.LinAlgError as error:
+        raise InvalidKeyframe(f"T_world_camera must hold a rotation, got {R.tolist()}") from error
+    exact: NDArray[np.float64] = U @ Vt
+    exact[np.abs(exact) < _LEAST] = 0
+    return exact
 
 
 def _array(name: str, value: Any, dtypes: tuple[type, ...], shape: tuple[int | None, ...]) -> NDArray[Any]:
