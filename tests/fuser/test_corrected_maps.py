@@ -20,7 +20,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_sta
 from keyframes_and_servers import VOLUME, pose, wall
 from test_fuser import Link, opened
 
-from tsfusion import Volume, journal
+from tsfusion import Keyframe, Volume, journal
 from tsfusion.core.config import SERVER_SESSION
 from tsfusion.fuser import messages
 from tsfusion.fuser.fuser import Fuser
@@ -469,8 +469,18 @@ def test_a_journal_at_its_limit_takes_the_oldest_from_the_window(tmp_path: Path)
     assert fuser._volume.map_hash() == recorded.fresh().map_hash()
 
 
+OTHERS = [wall(40), wall(41)]  # of a map from elsewhere
+
+
+def _hash(keyframes: list[Keyframe]) -> str:
+    return volume_of(keyframes, voxel_size=VOLUME.voxel_size, threads=1).map_hash()
+
+
 class Life(RuleBasedStateMachine):
-    """A map whose server is killed and started again while keyframes come, are corrected and forgotten."""
+    """A map whose server is killed and started again while keyframes come, are corrected and forgotten.
+
+    In the end it is merged with another.
+    """
 
     @initialize()
     def begin(self) -> None:
@@ -569,7 +579,13 @@ class Life(RuleBasedStateMachine):
         settle(self.fuser)
         assert self.fuser._volume.map_hash() == self.recorded.fresh().map_hash()
         assert self.fuser._volume.color_hash() == self.recorded.fresh().color_hash()
-        assert self.fuser._volume.keyframes == len(final_keyframes(self.recorded.state / "journal"))
+        final = final_keyframes(self.recorded.state / "journal")
+        assert self.fuser._volume.keyframes == len(final)
+        self.fuser.handle(messages.Finish())
+        if (self.recorded.state / "map.tsf").exists():
+            merged = Volume.load(self.recorded.state / "map.tsf")
+            merged.merge(volume_of(OTHERS, voxel_size=VOLUME.voxel_size, threads=1))
+            assert merged.map_hash() == _hash([*final, *OTHERS])
         self.stack.close()
 
 
