@@ -276,7 +276,6 @@ def check_pose(pose: Any) -> NDArray[np.float64]:
         raise InvalidKeyframe(f"T_world_camera must have shape (4, 4), got {T.shape}")
     if not np.isfinite(T).all():
         raise InvalidKeyframe(f"T_world_camera must be finite, got {T.tolist()}")
-    T[np.abs(T) < _LEAST] = 0
     R, t = T[:3, :3], T[:3, 3]
     if np.abs(R).max() > 2:  # so far off that RᵀR could overflow
         raise InvalidKeyframe(f"T_world_camera must hold a rotation, got entries up to {np.abs(R).max():.3g}")
@@ -302,12 +301,10 @@ def check_pose(pose: Any) -> NDArray[np.float64]:
 
 def _nearest_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
     try:
-        U, _, Vt = np.linalg.svd(R)
+        U, _, Vt = np.linalg.svd(np.where(np.abs(R) < _LEAST, 0, R))
     except np.linalg.LinAlgError as error:
         raise InvalidKeyframe(f"T_world_camera must hold a rotation, got {R.tolist()}") from error
-    exact: NDArray[np.float64] = U @ Vt
-    exact[np.abs(exact) < _LEAST] = 0
-    return exact
+    return np.asarray(U @ Vt, np.float64)
 
 
 def _array(name: str, value: Any, dtypes: tuple[type, ...], shape: tuple[int | None, ...]) -> NDArray[Any]:
