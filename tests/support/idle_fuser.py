@@ -9,12 +9,14 @@ from pathlib import Path
 from keyframes_and_servers import Server
 
 _FUSER = """
-import signal, sys, zmq
+import select, signal, sys, zmq
 from tsfusion.core import process
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.wire import sockets
 
 process.on_parent_end(signal.SIGKILL)
+if select.select([sys.stdin], [], [], 0)[0]:
+    sys.exit()  # the gateway ended before that
 link = sockets.pair(zmq.Context())
 link.connect(sys.argv[1])
 link.send(fuser_messages.encode(fuser_messages.Started()))
