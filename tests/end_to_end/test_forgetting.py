@@ -68,7 +68,7 @@ def pieces(state: Path, session: str) -> list[bytes]:
 
 
 def on_disk(state: Path, parts: list[bytes]) -> list[bytes]:
-    """Those that any file of the state folder has."""
+    """The payloads that any file of the state folder has."""
     content = b"".join(path.read_bytes() for path in state.rglob("*") if path.is_file())
     return [part for part in parts if part in content]
 

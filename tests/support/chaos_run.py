@@ -273,7 +273,7 @@ class Forgetter:
         return found
 
     def verdict(self) -> list[str]:
-        """What the server said that is not so in the journal that it left."""
+        """Lies of the server: what it said of forgetting that is not so in its journal."""
         (folder,) = journals(self._daemon.state)
         forgotten = ForgottenNumbers.in_journal(JournalPlace(folder))
         left = set(self._walls())

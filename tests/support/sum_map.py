@@ -68,7 +68,7 @@ class SumMap:
         """It takes none."""
 
     def release_empty(self) -> int:
-        """It has no blocks."""
+        """Release nothing: this map has no blocks."""
         return 0
 
     def integrate(self, keyframe: Keyframe) -> Any:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is different between two maps of one place, by voxels and by surface."""
+"""The difference between two maps of one place, by voxels and by surface."""
 
 import numpy as np
 import pytest

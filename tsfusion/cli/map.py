@@ -147,14 +147,13 @@ def crop(
     nor removed; new ones are taken, anywhere (`tsfusion map resume`).
     """
     from tsfusion.cli import output
+    from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
 
     check_writable(out, (".tsf",))
     cropped = _load(path, map_, quiet=json).crop(box)
     if not cropped.stats().blocks:
-        typer.echo(
-            "note: nothing of the map lies in this box; `tsfusion map info` has the map's own", err=True
-        )
+        raise InvalidConfig("nothing of the map lies in this box; `tsfusion map info` has the map's own")
     cropped.save(out)
     if json:
         output.as_json({"path": str(out), **map_view.figures(cropped)})

@@ -16,13 +16,13 @@ _MOST_LINES = 20  # printed of one kind; --json has all
 
 
 def figures(volume: "Volume") -> dict[str, Any]:
-    """What a program wants to know of a map that was written."""
+    """Figures of a map that was written, for a program."""
     stats = volume.stats()
     return {"map_hash": volume.map_hash(), "keyframes": stats.keyframes, "blocks": stats.blocks}
 
 
 def line(out: Path, volume: "Volume") -> str:
-    """What a person wants to know of it."""
+    """A line on a map that was written, for a person."""
     from tsfusion.cli.output import size
 
     stats = volume.stats()
@@ -111,7 +111,7 @@ def _listed(one: "SessionSummary") -> str:
 
 
 def _behind(found: "MapSummary") -> str:
-    """What the map does not have yet; empty = it has all."""
+    """Records of the journal that the map lacks, counted; empty = it has all."""
     words = [
         count_of(count, noun)
         for count, noun in (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is different between two maps of one frame: their numbers, and the surface that came or went."""
+"""The difference between two maps of one frame: counts, and the surface that came or went."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -202,8 +202,8 @@ class Volume:
             same_frame: the maps are in one frame, although their scans found their poses each for itself.
 
         Raises:
-            MapError: when the voxels or layers differ, when both hold the same keyframes, as far as a server
-                wrote down which, or are of different worlds; MapFull, WeightOverflow, MemoryError: when the
+            MapError: when the voxels or layers differ, when both are the same map or hold the same keyframes, as
+                far as a server wrote down which, or are of different worlds; MapFull, WeightOverflow, MemoryError: when the
                 sum has no room. After each of them the map is as it was.
         """
         if other is self:
@@ -211,6 +211,8 @@ class Volume:
         self._check_like(other)
         if self.keyframes and other.keyframes:
             map_history.check_addable(self.meta, other.meta, same_frame=same_frame)
+        if self._store.count and self._has_content_of(other):
+            raise MapError("the two maps are the same one: each keyframe would count twice")
         map_addition.add(self._store, other._store, self.config.max_blocks)
         self.keyframes += other.keyframes
         self.held.merge(other.held)
@@ -281,6 +283,13 @@ class Volume:
         ours, theirs = self.config.voxel_size, other.config.voxel_size
         if ours != theirs:
             raise MapError(f"the maps have voxels of {ours:g} m and {theirs:g} m: fuse one anew")
+
+    def _has_content_of(self, other: "Volume") -> bool:
+        """Whether the other map has the same sums; hashed only where the counts do not tell."""
+        counts = [(one.keyframes, one._store.count) for one in (self, other)]
+        return counts[0] == counts[1] and all(
+            hash_of(self) == hash_of(other) for hash_of in (Volume.map_hash, Volume.color_hash)
+        )
 
     def _check_like(self, other: "Volume") -> None:
         """Raise MapError unless voxels and layers are those of another map."""
