@@ -202,9 +202,9 @@ class Volume:
             same_frame: the maps are in one frame, although their scans found their poses each for itself.
 
         Raises:
-            MapError: when the voxels or layers differ, when both are the same map or hold the same keyframes, as
-                far as a server wrote down which, or are of different worlds; MapFull, WeightOverflow, MemoryError: when the
-                sum has no room. After each of them the map is as it was.
+            MapError: when the voxels or layers differ, when both are the same map or hold the same keyframes,
+                as far as a server wrote down which, or are of different worlds; MapFull, WeightOverflow,
+                MemoryError: when the sum has no room. After each of them the map is as it was.
         """
         if other is self:
             raise MapError("a map cannot be merged with itself: each keyframe would count twice")
