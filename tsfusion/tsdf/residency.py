@@ -3,13 +3,17 @@
 
 import mmap
 import os
+import sys
 from collections.abc import Collection, Iterator
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core import process
+from tsfusion.core import durable_files, process
+from tsfusion.core.config import CacheConfig
+from tsfusion.core.errors import InvalidConfig
 from tsfusion.tsdf.growing_array import FileArray
 
 GROUP = 32  # blocks that leave memory together: whole pages of every layer, also where a page has 64 kB
@@ -87,3 +91,19 @@ def _runs(numbers: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
     cuts = np.flatnonzero(np.diff(numbers) != 1) + 1
     for part in np.split(numbers, cuts):
         yield int(part[0]), int(part[-1]) + 1
+
+
+def checked_cache(memory_bytes: int, cache: str | os.PathLike[str] | CacheConfig | None) -> CacheConfig:
+    """Where blocks may wait that are not in memory."""
+    if memory_bytes < 1:
+        raise InvalidConfig(f"memory_bytes must be > 0, got {memory_bytes}")
+    if sys.platform != "linux" or not process.shared_rss_bytes():
+        raise InvalidConfig("memory_bytes needs Linux and its /proc: elsewhere all blocks stay in memory")
+    if not isinstance(cache, CacheConfig):
+        cache = CacheConfig(folder=os.fspath(cache or os.environ.get("TMPDIR") or "/var/tmp"))
+    if durable_files.is_in_memory(Path(cache.folder)):
+        raise InvalidConfig(
+            f"the folder {cache.folder} is a RAM disk: what lies there takes memory; choose one on a disk "
+            "for `cache`"
+        )
+    return cache

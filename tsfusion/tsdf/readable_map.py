@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: MIT
+"""What is read from a map: surfaces, distances, hashes, files of voxels. Nothing here changes it."""
+
+import hashlib
+import math
+import os
+import struct
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.config import Surface, VolumeConfig
+from tsfusion.core.errors import InvalidConfig, MapError
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.mesh_parts import MeshParts, joined
+from tsfusion.geometry.up_direction import HeldSensor, Up
+from tsfusion.kernels import integrate
+from tsfusion.kernels.sensor_noise import WEIGHT_ONE
+from tsfusion.tsdf import field_regularizer, map_difference, voxel_arrays
+from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.map_difference import MapDifference
+from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
+from tsfusion.tsdf.mesh_tiles import tiles
+from tsfusion.tsdf.surface_values import SurfaceView, values_of
+
+
+class ReadableMap:
+    """A map as one reads it: `Volume` without the ways to change it.
+
+    Attributes:
+        config: its settings; `model`: those of its sensor.
+        keyframes: number of those in it with a usable sample.
+        held: their sensors.
+        meta: anything JSON-like that is saved with it.
+    """
+
+    def __init__(self, config: VolumeConfig, store: BlockStore) -> None:
+        self.config = config
+        self.model = config.checked_model()
+        self.meta: dict[str, Any] = {}
+        self.keyframes = 0
+        self.held = HeldSensor()
+        self._store = store
+        self._mesh_buffers = MeshBuffers()
+
+    def extract_mesh(
+        self,
+        min_weight: float | None = None,
+        blocks: NDArray[np.int32] | None = None,
+        surface: Surface | None = None,
+    ) -> Mesh:
+        """The surface, by marching cubes over the whole map or over the cells of some blocks.
+
+        Args:
+            min_weight: full-confidence samples a voxel needs to count as seen; default the sensor's.
+            blocks: (n, 3) int32 block coordinates. A mesh of `cells_to_mesh(take_dirty())` replaces what
+                changed.
+            surface: what to mesh instead of what the settings say; for `raw`, `cells_of(take_dirty())` do.
+        """
+        min_weight = self._checked_min_weight(min_weight)
+        store = self._store
+        if blocks is None and store.is_in_files and store.count:
+            whole = joined(list(tiles(store, min_weight, self._view(surface))))
+            return replace(whole, held=self.held)
+        chosen = store.keys
+        if blocks is not None:
+            if np.shape(blocks)[1:] != (3,) or np.asarray(blocks).dtype.kind != "i":
+                raise InvalidConfig(f"blocks must be (n, 3) integers, got {np.asarray(blocks)!r}")
+            reachable = (np.abs(np.asarray(blocks, np.int64)) < 1 << 18).all(axis=1)  # others have no key
+            chosen = np.unique(pack_keys(blocks[reachable]))
+            chosen = chosen[store.slots_of(chosen) >= 0]
+        mesh = extract(np.sort(chosen), self._store, min_weight, self._mesh_buffers, self._view(surface))
+        return mesh if blocks is not None else replace(mesh, held=self.held)
+
+    def mesh_parts(
+        self, folder: str | os.PathLike[str], min_weight: float | None = None, *, up: Up | None = None
+    ) -> MeshParts:
+        """The mesh of the whole map, made tile by tile in bounded memory, to be saved: `extract_mesh`'s.
+
+        Args:
+            folder: where it waits in files without names.
+            up: away from the ground; None = it is found.
+
+        Raises:
+            OutputError: when the folder's disk has no room.
+        """
+        least = self._checked_min_weight(min_weight)
+        parts = tiles(self._store, least, self._view(None))
+        return MeshParts(parts, Path(folder), held=self.held, known_up=up)
+
+    def cells_to_mesh(self, dirty: NDArray[np.int32]) -> NDArray[np.int32]:
+        """The blocks whose mesh the changes to these blocks reach: (m, 3) int32.
+
+        They and their neighbours towards −x, −y, −z; the field carries a change into the blocks around first.
+        Of what is meshed raw, normals at the rim may be a keyframe behind.
+        """
+        if self.model.surface == "normal":
+            dirty = unpack_keys(field_regularizer.around(pack_keys(dirty), self._store, 1))
+        if self.model.surface == "field":
+            dirty = unpack_keys(field_regularizer.spread(pack_keys(dirty), self._store, self._field))
+        return cells_of(dirty)
+
+    def signed_distance(
+        self, points: NDArray[np.floating], min_weight: float | None = None
+    ) -> NDArray[np.float32]:
+        """Signed distances that the map holds at points of the world: positive in the free space it saw.
+
+        Args:
+            points: (n, 3) metres; each takes the value of the voxel that it lies in.
+            min_weight: as for `extract_mesh`.
+
+        Returns:
+            (n,) metres; NaN where the map saw nothing, which is all but a band around its surfaces.
+        """
+        voxels = np.floor(np.asarray(points, np.float64) / self.config.voxel_size)
+        near = np.asarray((np.abs(voxels) < 1 << 20).all(axis=1))  # others have no key; nor has NaN
+        x, y, z = np.where(near[:, np.newaxis], voxels, 0).astype(np.int64).T
+        keys, rows = np.unique(pack_keys(np.stack([x, y, z], axis=1) >> 3), return_inverse=True)
+        weight = self._checked_min_weight(min_weight)
+        values = values_of(keys, self._store, weight)[rows.ravel(), (x & 7) << 6 | (y & 7) << 3 | z & 7]
+        metres = values * np.float32(self.config.voxel_size / integrate.QUANTA_PER_VOXEL)
+        metres[~near] = np.nan
+        return np.asarray(metres, np.float32)
+
+    def diff(self, later: "ReadableMap", *, tolerance: float | None = None) -> MapDifference:
+        """What is different in a later map of the same frame, in numbers and as a coloured mesh.
+
+        Args:
+            tolerance: metres between two surfaces that count as the same; default two voxels.
+
+        Raises:
+            MapError: when the maps have voxels of different sizes.
+            InvalidConfig: for a tolerance that is none.
+        """
+        self._check_voxels(later)
+        metres = 2 * self.config.voxel_size if tolerance is None else tolerance
+        if not 0 <= metres < math.inf:
+            raise InvalidConfig(f"tolerance must be 0 metres or more, got {tolerance}")
+        blocks, voxels = map_difference.count(self._store, later._store)
+        earlier, other = (
+            map_difference.Side(one.extract_mesh().without_islands(), one._store, one.model.min_weight)
+            for one in (self, later)
+        )
+        return MapDifference(blocks, voxels, *map_difference.surfaces(earlier, other, metres))
+
+    def save_voxels(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        dense: bool = False,
+        watch: voxel_arrays.Watch = lambda _done, _all: None,
+    ) -> Path:
+        """Write an `.npz` file of voxels as `tsdf/voxel_arrays.py` describes; complete or not at all.
+
+        Args:
+            dense: one array around the whole map, instead of its blocks.
+            watch: told the bytes of the arrays that are written, and all of them.
+
+        Raises:
+            OutputError: for an empty map, a box that is too large, or a path that cannot be written.
+        """
+        voxel_arrays.write(self._store, Path(path), dense=dense, watch=watch)
+        return Path(path)
+
+    def map_hash(self) -> str:
+        """Hex digest of the exact sums: equal for the same keyframes in any order, on any number of threads.
+
+        Colour and smoothed values are not part of it (colour may travel lossily; smoothing has an order).
+        """
+        digest = self._begin_hash()
+        for keys, sums in self._store.in_order("sums"):
+            digest.update(keys.data)
+            digest.update(sums.data)
+        return digest.hexdigest()
+
+    def color_hash(self) -> str:
+        """Hex digest of the exact colour sums."""
+        digest = hashlib.blake2b(digest_size=16)
+        if self.config.color:
+            for layer in ("color_rgn", "color_b"):
+                for keys, sums in self._store.in_order(layer):
+                    digest.update(keys.data)
+                    digest.update(sums.data)
+        return digest.hexdigest()
+
+    def _begin_hash(self) -> "hashlib.blake2b":
+        """A digest that is to take the keys and then the sums of the used blocks, 1024 at a time."""
+        digest = hashlib.blake2b(digest_size=16)
+        digest.update(struct.pack("<di", self.config.voxel_size, integrate.QUANTA_PER_VOXEL))
+        return digest
+
+    def _check_voxels(self, other: "ReadableMap") -> None:
+        ours, theirs = self.config.voxel_size, other.config.voxel_size
+        if ours != theirs:
+            raise MapError(f"the maps have voxels of {ours:g} m and {theirs:g} m: fuse one anew")
+
+    def _checked_min_weight(self, min_weight: float | None) -> float:
+        """As given, or the sensor's."""
+        if min_weight is None:
+            min_weight = self.model.min_weight
+        most = integrate.WEIGHT_LIMIT / WEIGHT_ONE
+        if not 0 <= min_weight <= most:
+            raise InvalidConfig(f"min_weight must be from 0 to {most:.0f}, got {min_weight}")
+        return min_weight
+
+    @property
+    def _field(self) -> field_regularizer.FieldSettings:
+        model = self.model
+        return field_regularizer.FieldSettings(
+            model.field_smoothness, model.field_edge, model.field_reweightings
+        )
+
+    def _view(self, surface: Surface | None) -> SurfaceView:
+        """The function that reads a surface's signed distances from the map."""
+        surface = surface or self.model.surface
+        if surface not in get_args(Surface):
+            raise InvalidConfig(f"surface must be one of {', '.join(get_args(Surface))}, got {surface!r}")
+        if surface == "field":
+            return partial(field_regularizer.solve, settings=self._field)
+        if surface == "normal":
+            return partial(field_regularizer.along_normals, smoothness=self.model.smoothness)
+        return values_of

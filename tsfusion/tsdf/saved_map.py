@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: MIT
+"""The blocks and settings of a checkpoint, checked on the way into a map."""
+
+import hashlib
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from tsfusion.core.config import LIMIT_SETTINGS, VIEW_SETTINGS, VolumeConfig, override
+from tsfusion.core.errors import CheckpointError, DamagedCheckpoint, InvalidConfig
+from tsfusion.core.side_thread import SideThread
+from tsfusion.kernels import integrate
+from tsfusion.tsdf import checkpoint
+from tsfusion.tsdf.block_store import BlockStore
+
+
+def fill(
+    store: BlockStore,
+    path: Path,
+    header: checkpoint.CheckpointHeader,
+    chunks: Iterable[checkpoint.Chunk],
+    digest: "hashlib.blake2b",
+) -> None:
+    """Put the blocks of a checkpoint into an empty store, and their keys and sums into a digest.
+
+    Raises:
+        CheckpointError: for other layers than the store has, or blocks that no map has.
+    """
+    layers = store.layers()
+    if set(header.layers) != set(layers):
+        raise CheckpointError(f"{path} is of another version: it has layers {header.layers}")
+    with SideThread() as side:
+        for chunk in chunks:
+            keys = np.empty(chunk.blocks, np.int64)
+            chunk.fill(keys)
+            store.insert(keys)
+            for name in header.layers:
+                chunk.fill(layers[name][chunk.first : store.count])
+            store.keep_within_memory()
+            side.do(partial(_check_in, path, store, slice(chunk.first, store.count), digest))
+        side.wait()
+
+
+def _check_in(path: Path, store: BlockStore, blocks: slice, digest: "hashlib.blake2b") -> None:
+    """Hash blocks that were read, and measure their bounds."""
+    keys, sums = store.keys[blocks], store.sums[blocks]
+    store.bounds[blocks] = (sums & integrate.WEIGHT_MASK).max(axis=1)
+    before = store.keys[max(blocks.start - 1, 0) : blocks.stop]
+    if (np.diff(before) <= 0).any() or not store.bounds[blocks].all():
+        raise DamagedCheckpoint(f"{path} is malformed: its blocks are empty or out of order")
+    digest.update(keys.data)
+    digest.update(sums.data)
+
+
+def loaded_config(
+    header: checkpoint.CheckpointHeader, threads: int | None, changed: dict[str, Any]
+) -> VolumeConfig:
+    """The settings of a saved map, with those that may be others."""
+    saved = header.config
+    fixed = {name for name in changed if name not in (*VIEW_SETTINGS, *LIMIT_SETTINGS)}
+    if saved.model().regularizer != "off" and changed.get("smoothness") not in (None, saved.smoothness):
+        fixed.add("smoothness")  # it has smoothed along rays already
+    if fixed:
+        raise InvalidConfig(f"a saved map cannot change {', '.join(sorted(fixed))}; fuse it anew")
+    config = override(msgspec.structs.replace(saved, threads=threads), **changed)
+    return override(config, max_blocks=max(config.max_blocks, header.blocks))
