@@ -24,7 +24,7 @@ from small_recordings import claim_size
 from tsfusion.core.errors import InvalidConfig, SourceError
 from tsfusion.geometry.frame import Frame
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.scanner.sources import folder_layouts
+from tsfusion.scanner.sources import folder_layouts, watched_folder
 from tsfusion.scanner.sources.registry import is_live, open_source
 from tsfusion.scanner.sources.source import Source
 from tsfusion.scanner.sources.watched_folder import WatchedFolder
@@ -275,19 +275,31 @@ def assert_same(frame: Frame, points: NDArray[np.float32]) -> None:
     np.testing.assert_array_equal(np.asarray(frame.points), points[:, :3])
 
 
-def test_scans(tmp_path: Path) -> None:
+def settle(path: Path) -> None:
+    """Let a file look as if it had been written some time ago."""
+    os.utime(path, (time.time() - 100, time.time() - 100))
+
+
+def test_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(watched_folder, "_SETTLED_S", 60.0)  # a loaded machine is not to reach it
     points = np.random.default_rng(0).normal(size=(100, 4)).astype(np.float32)
     write(tmp_path, "velodyne/000000.bin", points.tobytes())
-    with WatchedFolder(tmp_path, poll=0.01) as source:
+    settle(tmp_path / "velodyne" / "000000.bin")
+    with WatchedFolder(tmp_path, poll=0.01, deadline=60.0) as source:
         frames = iter(source)
         assert_same(next(frames), points)
         path = tmp_path / "velodyne" / "000001.bin"
-        with path.open("wb", buffering=0) as file:  # half of it would be whole points
-            file.write(points[:50].tobytes())
-            writing = threading.Timer(0.2, file.write, [points[50:].tobytes()])
-            writing.start()
-            assert_same(next(frames), points)
-            writing.join()
+        path.write_bytes(points[:50].tobytes())  # whole points, by chance
+
+        def go_on() -> None:
+            with path.open("ab") as file:
+                file.write(points[50:].tobytes())
+            settle(path)
+
+        writing = threading.Timer(0.2, go_on)
+        writing.start()
+        assert_same(next(frames), points)
+        writing.join()
         write(tmp_path, "velodyne/000002.bin", points.tobytes()[:-3])
         (tmp_path / "DONE").touch()
         assert list(frames) == []
