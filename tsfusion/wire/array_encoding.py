@@ -130,12 +130,19 @@ def _unzigzag(zigzag: NDArray[Any]) -> NDArray[Any]:
 
 
 def _planes(values: NDArray[Any]) -> NDArray[np.uint8]:
-    return np.ascontiguousarray(values.view(np.uint8).reshape(-1, values.dtype.itemsize).T)
+    """The bytes of n unsigned integers, (size, n) uint8. Shifts are several times faster than a transpose."""
+    planes = np.empty((values.dtype.itemsize, len(values)), np.uint8)
+    for byte, plane in enumerate(planes):
+        np.right_shift(values, 8 * byte, out=plane, casting="unsafe")
+    return planes
 
 
 def _unplanes(planes: bytes, itemsize: int) -> NDArray[Any]:
     rows = np.frombuffer(planes, np.uint8).reshape(itemsize, -1)
-    return np.ascontiguousarray(rows.T).reshape(-1).view(f"u{itemsize}")
+    values: NDArray[Any] = rows[0].astype(f"u{itemsize}")
+    for byte in range(1, itemsize):
+        values |= rows[byte].astype(values.dtype) << (8 * byte)
+    return values
 
 
 def _to_mm(points: NDArray[np.float32]) -> NDArray[np.int32]:
