@@ -41,6 +41,7 @@ from tsfusion.wire.record_header import unpack_keyframe
 RATE = 8.0  # keyframes a second of the well-behaved one
 MEMORY_BYTES = ServerConfig().memory_bytes  # the bound on the gateway
 FUSER_MEMORY_BYTES = 2 << 30
+_LOGS = 'from tsfusion.core import logs\nlogs.configure("text", "warning")\n'  # cut short, as `serve` does
 _ATTACKS = Path(__file__).with_name("attacks.py")
 _FILES = 8192
 _MORE_FILES = 30  # of maps that were opened meanwhile
@@ -108,7 +109,7 @@ def run(
     _raise_file_limit()
     limits = {"memory_bytes": MEMORY_BYTES, "fuser_memory_bytes": FUSER_MEMORY_BYTES}
     with contextlib.ExitStack() as stack:
-        server = stack.enter_context(serving(folder / "state", **limits, **given.server))
+        server = stack.enter_context(serving(folder / "state", code=_LOGS, **limits, **given.server))
         target = msgspec.structs.replace(
             target, data=server.address, control=server.control, publish=server.publish
         )
