@@ -114,6 +114,7 @@ def main() -> int:
     logging.getLogger("tsfusion.tsdf.volume").disabled = True  # the gateway warns, and names the client
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # a terminal or supervisor signals all; the gateway decides
+    signal.signal(signal.SIGTTOU, signal.SIG_IGN)  # a line of the log does not stop it (`stty tostop`)
     return run(endpoint)
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import zmq
 
+from tsfusion.core import process
 from tsfusion.core.config import LogFormat, LogLevel
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.wire import sockets
@@ -47,7 +48,7 @@ class FuserProcess:
                 stdin=subprocess.PIPE,  # closes when the gateway dies, however it dies
                 stdout=subprocess.DEVNULL,
                 pass_fds=[self._working.fileno()],
-                start_new_session=True,  # a Ctrl-C is for the gateway
+                **process.OWN_GROUP,  # a Ctrl-C is for the gateway
             )
         except BaseException:
             self._clear_up()

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from tsfusion.client import Client
-from tsfusion.core import config
+from tsfusion.core import config, process
 from tsfusion.core.config import (
     DEFAULT_MAP,
     ClientConfig,
@@ -132,7 +132,7 @@ def _start(settings: Path, stderr: IO[str]) -> subprocess.Popen[str]:
         stderr=stderr,
         text=True,
         env=environment,
-        start_new_session=True,  # Ctrl-C is ours to handle
+        **process.OWN_GROUP,  # Ctrl-C is ours to handle
     )
 
 
