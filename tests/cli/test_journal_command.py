@@ -365,7 +365,8 @@ append = Journal.append
 def first_only(*arguments, **fields):
     append(*arguments, **fields)
     print("halfway", flush=True)
-    threading.Event().wait(60)
+    while True:  # not for long at once: Python handles a signal that comes just before a wait after it
+        threading.Event().wait(0.1)
 
 Journal.append = first_only
 main(sys.argv[1:])
