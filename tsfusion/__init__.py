@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from tsfusion.datasets import open_dataset as open_dataset
     from tsfusion.geometry.keyframe import Intrinsics as Intrinsics
     from tsfusion.geometry.keyframe import Keyframe as Keyframe
+    from tsfusion.geometry.map_answers import Samples as Samples
+    from tsfusion.geometry.map_answers import View as View
     from tsfusion.geometry.mesh import Mesh as Mesh
     from tsfusion.scanner.sources.registry import open_source as open_source
     from tsfusion.scanner.sources.source import Source as Source
@@ -62,7 +64,9 @@ _HOME = {
     "Keyframe": "geometry.keyframe",
     "Layout": "datasets",
     "Mesh": "geometry.mesh",
+    "Samples": "geometry.map_answers",
     "Source": "scanner.sources.source",
+    "View": "geometry.map_answers",
     "Volume": "tsdf.volume",
     "VolumeConfig": "core.config",
     "open_dataset": "datasets",

@@ -10,32 +10,17 @@ from tsfusion.geometry.keyframe import Intrinsics, Keyframe
 from tsfusion.geometry.measured_points import depth_metres
 from tsfusion.geometry.mesh import Mesh
 
-NEAR = 0.05  # metres in front of the eye where the view starts
-
 
 def predicted_depth(
     mesh: Mesh, T_world_camera: NDArray[np.float64], intrinsics: Intrinsics, shape: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """(H, W) float32 metres along the optical axis to the first front side; 0 = none.
-
-    The rasteriser knows one focal length and a centred image. A shear of space that keeps z makes any
-    pinhole camera such a one.
-    """
+    """(H, W) float32 metres along the optical axis to the first front side; 0 = none."""
     from tsfusion.kernels import runtime
 
     runtime.start()
-    from tsfusion.kernels import rasterizer
+    from tsfusion.tsdf import camera_views
 
-    height, width = shape
-    K, focal = intrinsics, intrinsics.fx
-    p = (mesh.vertices.astype(np.float64) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
-    p[:, 0] += (K.cx - 0.5 * (width - 1)) / focal * p[:, 2]
-    p[:, 1] = K.fy / focal * p[:, 1] + (K.cy - 0.5 * (height - 1)) / focal * p[:, 2]
-    faces = np.ascontiguousarray(mesh.faces if K.fy > 0 else mesh.faces[:, ::-1], np.int32)
-    seen = np.full(shape, rasterizer.EMPTY, np.int64)
-    rasterizer.rasterise(seen, np.ascontiguousarray(p, np.float32), faces, focal, NEAR)
-    depth = (seen >> 32).astype(np.int32).view(np.float32)
-    return np.where(seen == rasterizer.EMPTY, np.float32(0), depth)
+    return camera_views.look_at(mesh, intrinsics, T_world_camera, shape).depth
 
 
 def compare_views(

@@ -207,7 +207,7 @@ class Keyframe:
             raise InvalidKeyframe(
                 f"{self.kind} must be at most {MAX_IMAGE_SIDE} pixels a side, got {self.shape}"
             )
-        intrinsics = _intrinsics(self.intrinsics)
+        intrinsics = intrinsics_of(self.intrinsics)
         if intrinsics is None:
             raise InvalidKeyframe(
                 f"intrinsics must be given with {self.kind} as Intrinsics(fx, fy, cx, cy), or as the matrix "
@@ -237,7 +237,7 @@ def keyframe_of(value: Any) -> Keyframe:
     return Keyframe(**{name: getattr(value, name) for name in names})
 
 
-def _intrinsics(value: Any) -> Intrinsics | None:
+def intrinsics_of(value: Any) -> Intrinsics | None:
     """Intrinsics as they are, of a camera matrix, or of four numbers; None = neither."""
     if isinstance(value, Intrinsics) or value is None:
         return value

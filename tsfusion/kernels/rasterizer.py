@@ -92,6 +92,47 @@ def rasterise(
                 fill(seen, a, cut(a, b, near), cut(a, c, near), f, focal, width, height)
 
 
+@ti.func
+def barycentric(a, b, c, ray):
+    """Weights of the corners where a ray meets the plane of their triangle (Möller and Trumbore 1997)."""
+    w = tm.vec3(tm.dot(ray, tm.cross(b, c)), tm.dot(ray, tm.cross(c, a)), tm.dot(ray, tm.cross(a, b)))
+    total = w.sum()
+    w = ti.select(total != 0.0, w / total, tm.vec3(1.0, 0.0, 0.0))
+    return tm.clamp(w, 0.0, 1.0)
+
+
+@ti.kernel
+def look_up(
+    seen: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    vertices: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    faces: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    normals: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    colors: ti.types.ndarray(dtype=ti.u8, ndim=2),  # of no rows: none wanted
+    focal: ti.f32,
+    empty: ti.i64,
+    depth: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    normal: ti.types.ndarray(dtype=ti.f32, ndim=3),
+    color: ti.types.ndarray(dtype=ti.u8, ndim=3),
+):
+    """Depth, unit normal and colour of every pixel that is not EMPTY, as the corners of its triangle say."""
+    height, width = seen.shape[0], seen.shape[1]
+    for v, u in ti.ndrange(height, width):
+        if seen[v, u] != empty:
+            f = ti.cast(seen[v, u], ti.i32)  # the low half
+            ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
+            ray = tm.vec3((u - 0.5 * (width - 1)) / focal, (v - 0.5 * (height - 1)) / focal, 1.0)
+            w = barycentric(corner(vertices, ia), corner(vertices, ib), corner(vertices, ic), ray)
+            depth[v, u] = ti.bit_cast(ti.cast(seen[v, u] >> 32, ti.i32), ti.f32)
+            n = w[0] * corner(normals, ia) + w[1] * corner(normals, ib) + w[2] * corner(normals, ic)
+            n /= ti.max(n.norm(), 1e-9)
+            for k in ti.static(range(3)):
+                normal[v, u, k] = n[k]
+            if colors.shape[0] > 0:
+                for k in ti.static(range(3)):
+                    shade_ = w[0] * colors[ia, k] + w[1] * colors[ib, k] + w[2] * colors[ic, k]
+                    color[v, u, k] = ti.cast(shade_ + 0.5, ti.u8)
+
+
 @ti.kernel
 def shade(
     image: ti.types.ndarray(dtype=ti.f32, ndim=3),
@@ -118,16 +159,7 @@ def shade(
             ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
             a, b, c = corner(vertices, ia), corner(vertices, ib), corner(vertices, ic)
             ray = tm.vec3((u - 0.5 * (width - 1)) / focal, (v - 0.5 * (height - 1)) / focal, 1.0)
-            # Barycentric weights of the ray through the triangle's plane (Möller and Trumbore 1997).
-            wa = tm.dot(ray, tm.cross(b, c))
-            wb = tm.dot(ray, tm.cross(c, a))
-            wc = tm.dot(ray, tm.cross(a, b))
-            total = wa + wb + wc
-            if total != 0.0:
-                wa, wb, wc = wa / total, wb / total, wc / total
-            else:
-                wa, wb, wc = 1.0, 0.0, 0.0
-            wa, wb, wc = tm.clamp(wa, 0.0, 1.0), tm.clamp(wb, 0.0, 1.0), tm.clamp(wc, 0.0, 1.0)
+            wa, wb, wc = barycentric(a, b, c, ray)
             normal = wa * corner(normals, ia) + wb * corner(normals, ib) + wc * corner(normals, ic)
             normal /= ti.max(normal.norm(), 1e-9)
             facing = ti.max(-tm.dot(normal, ray) / ray.norm(), 0.0)

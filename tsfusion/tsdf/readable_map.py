@@ -11,16 +11,18 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tsfusion.core.config import Surface, VolumeConfig
 from tsfusion.core.errors import InvalidConfig, MapError
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.map_answers import Samples, View, checked_camera, checked_points
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_parts import MeshParts, joined
 from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.kernels import integrate
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
-from tsfusion.tsdf import field_regularizer, map_difference, voxel_arrays
+from tsfusion.tsdf import camera_views, field_regularizer, map_difference, point_samples, voxel_arrays
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.map_difference import MapDifference
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
@@ -116,15 +118,42 @@ class ReadableMap:
         Returns:
             (n,) metres; NaN where the map saw nothing, which is all but a band around its surfaces.
         """
-        voxels = np.floor(np.asarray(points, np.float64) / self.config.voxel_size)
-        near = np.asarray((np.abs(voxels) < 1 << 20).all(axis=1))  # others have no key; nor has NaN
-        x, y, z = np.where(near[:, np.newaxis], voxels, 0).astype(np.int64).T
-        keys, rows = np.unique(pack_keys(np.stack([x, y, z], axis=1) >> 3), return_inverse=True)
-        weight = self._checked_min_weight(min_weight)
-        values = values_of(keys, self._store, weight)[rows.ravel(), (x & 7) << 6 | (y & 7) << 3 | z & 7]
-        metres = values * np.float32(self.config.voxel_size / integrate.QUANTA_PER_VOXEL)
-        metres[~near] = np.nan
-        return np.asarray(metres, np.float32)
+        centres = np.floor(checked_points(points) / self.config.voxel_size) + 0.5
+        return self.sample(centres * self.config.voxel_size, min_weight=min_weight, surface="raw").distance
+
+    def sample(
+        self, points: ArrayLike, *, min_weight: float | None = None, surface: Surface | None = None
+    ) -> Samples:
+        """The signed distance, its weight and its gradient at points, between voxel centres interpolated.
+
+        Args:
+            points: (n, 3) float32 or float64 metres.
+            min_weight, surface: as for `extract_mesh`.
+        """
+        least = self._checked_min_weight(min_weight)
+        return point_samples.sample(checked_points(points), self._store, least, self._view(surface))
+
+    def raycast(
+        self,
+        intrinsics: Intrinsics | ArrayLike,
+        T_world_camera: ArrayLike,
+        shape: tuple[int, int],
+        *,
+        min_weight: float | None = None,
+        surface: Surface | None = None,
+    ) -> View:
+        """What a pinhole camera sees of the surface: depth, normals, and colours if the map has them.
+
+        A surface is seen from its front alone, which is where the sensors were.
+
+        Args:
+            intrinsics: `Intrinsics`, a (3, 3) camera matrix, or fx, fy, cx, cy; pixels.
+            T_world_camera: (4, 4) pose, camera axes x right, y down, z forward.
+            shape: (height, width), pixels.
+            min_weight, surface: as for `extract_mesh`.
+        """
+        camera = checked_camera(intrinsics, T_world_camera, shape)
+        return camera_views.look_at(self.extract_mesh(min_weight, surface=surface), *camera)
 
     def diff(self, later: "ReadableMap", *, tolerance: float | None = None) -> MapDifference:
         """What is different in a later map of the same frame, in numbers and as a coloured mesh.

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: MIT
+"""What a map answers: samples of its distance field, and what a camera would see of it."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import InvalidConfig, InvalidKeyframe
+from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics, check_pose, intrinsics_of
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """The map's signed distance at points of the world.
+
+    Attributes:
+        distance: (n,) float32 metres, positive in the free space in front of a surface; NaN where unseen.
+        weight: (n,) float32 votes in full-confidence samples; 0 where there are none.
+        gradient: (n, 3) float32, how the distance grows along x, y, z; NaN where unseen.
+    """
+
+    distance: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    gradient: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a pinhole camera sees of the map's surface.
+
+    Attributes:
+        depth: (H, W) float32 metres along the optical axis; 0 = nothing hit, as in a keyframe's depth.
+        normals: (H, W, 3) float32 unit normals in the world's frame, towards the camera; 0 = nothing hit.
+        colors: (H, W, 3) uint8 RGB (sRGB), 0 = nothing hit; None if the map holds none.
+    """
+
+    depth: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    colors: NDArray[np.uint8] | None = None
+
+
+def checked_points(points: Any) -> NDArray[np.floating]:
+    """Points as a contiguous (n, 3) array of float32 or float64.
+
+    Raises:
+        InvalidConfig: for another shape, or something that is no number.
+    """
+    array = np.asarray(points)
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "fiu":
+        raise InvalidConfig(
+            f"points must be numbers of shape (n, 3), in metres; got {array.dtype} of shape {array.shape}"
+        )
+    return np.ascontiguousarray(array, np.float32 if array.dtype == np.float32 else np.float64)
+
+
+def checked_camera(
+    intrinsics: Any, T_world_camera: Any, shape: Any
+) -> tuple[Intrinsics, NDArray[np.float64], tuple[int, int]]:
+    """Intrinsics, pose and (height, width) of a view that is asked for.
+
+    Raises:
+        InvalidConfig: naming what is wrong.
+    """
+    found = intrinsics_of(intrinsics)
+    if found is None:
+        raise InvalidConfig(
+            "intrinsics must be Intrinsics(fx, fy, cx, cy), these four numbers, or the matrix "
+            f"[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; got {' '.join(repr(intrinsics).split())}"
+        )
+    try:
+        found, T = check_intrinsics(found), check_pose(T_world_camera)
+    except InvalidKeyframe as error:
+        raise InvalidConfig(str(error)) from error
+    try:
+        height, width = (int(side) for side in shape if side == int(side))
+    except (TypeError, ValueError):
+        height = width = 0
+    if not 1 <= min(height, width) <= max(height, width) <= MAX_IMAGE_SIDE:
+        raise InvalidConfig(
+            f"shape must be (height, width), 1 to {MAX_IMAGE_SIDE} pixels each; got {shape!r}"
+        )
+    return found, T, (height, width)

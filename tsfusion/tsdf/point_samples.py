@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: MIT
+"""The map's signed distance at points: which blocks are read; the work is in `kernels/point_sampling.py`."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.geometry.map_answers import Samples
+from tsfusion.kernels import point_sampling
+from tsfusion.kernels.sensor_noise import WEIGHT_ONE
+from tsfusion.tsdf.block_store import BlockStore
+from tsfusion.tsdf.surface_values import SurfaceView, values_of
+
+_PART = 1 << 20  # points at a time: their blocks may have to come from a file
+
+
+def sample(
+    points: NDArray[np.floating], store: BlockStore, min_weight: float, view: SurfaceView = values_of
+) -> Samples:
+    """Samples of a surface's distances at points (n, 3), metres."""
+    count = len(points)
+    whole = Samples(
+        np.empty(count, np.float32), np.empty(count, np.float32), np.empty((count, 3), np.float32)
+    )
+    for first in range(0, count, _PART):
+        part = slice(first, first + _PART)
+        found = Samples(whole.distance[part], whole.weight[part], whole.gradient[part])
+        _fill(found, points[part], store, min_weight, view)
+        store.keep_within_memory()
+    return whole
+
+
+def _fill(
+    found: Samples, points: NDArray[np.floating], store: BlockStore, min_weight: float, view: SurfaceView
+) -> None:
+    per_metre = 1 / store.voxel_size
+    row_of, solved = np.empty(0, np.int32), np.empty((1, 512), np.float32)
+    if view is not values_of:
+        is_needed = np.zeros(max(store.count, 1), np.uint8)
+        point_sampling.list_blocks(points, per_metre, store.hash_keys, store.hash_slots, is_needed)
+        slots = np.flatnonzero(is_needed)
+        slots = slots[np.argsort(store.keys[slots])]
+        row_of = np.zeros(len(is_needed), np.int32)
+        row_of[slots] = np.arange(len(slots))
+        solved = view(store.keys[slots], store, min_weight) if len(slots) else solved
+    point_sampling.interpolate(
+        points, per_metre, store.hash_keys, store.hash_slots, store.sums, store.correction,
+        int(store.corrected), solved, row_of, max(1, int(np.ceil(min_weight * WEIGHT_ONE))),
+        found.distance, found.weight, found.gradient,
+    )  # fmt: skip
