@@ -59,6 +59,10 @@ def expected(volume: Volume, points: NDArray[np.floating], min_weight: float = 0
         for axis in range(3):
             lines = [np.array([-1.0, 1.0]) / VOXEL if a == axis else ends[:, a] for a in range(3)]
             found[2][n, axis] = (np.einsum("i,j,k->ijk", *lines) * values).sum()
+        steep = np.linalg.norm(found[2][n])
+        if steep > 1:
+            found[0][n] /= steep
+            found[2][n] /= steep
     return Samples(*(array.astype(np.float32) for array in found))
 
 
@@ -115,8 +119,10 @@ def test_each_surface_at_voxel_centres_is_what_is_meshed(surface: str) -> None:
     voxels = np.floor(centres / VOXEL).astype(int)
     x, y, z = voxels.T & 7
     at = values[np.searchsorted(keys, pack_keys(voxels >> 3)), x << 6 | y << 3 | z]
-    np.testing.assert_allclose(found.distance, at * VOXEL / 60, atol=1e-6)
-    assert np.isfinite(at).any()
+    assert np.array_equal(np.isnan(found.distance), np.isnan(at))
+    flat = np.linalg.norm(found.gradient, axis=1) < 0.999
+    np.testing.assert_allclose(found.distance[flat], at[flat] * VOXEL / 60, atol=1e-6)
+    assert np.isfinite(at[flat]).sum() > 20
 
 
 def test_a_wall_is_as_far_as_it_is(volume: Volume) -> None:

@@ -3,23 +3,30 @@
 
 A point is rounded to 2⁻¹⁶ voxel. It lies between eight voxel centres, of which those count that have a share
 in it: at a voxel's centre that voxel alone.
+
+The map holds distances along rays. Where these were oblique, the gradient is steeper than 1: divided by it,
+the distance is, to first order, that to the surface.
 """
 
 import taichi as ti
 
 from tsfusion.kernels.block_hash import map_find
-from tsfusion.kernels.integrate import QUANTA_PER_VOXEL, lane_weight
+from tsfusion.kernels.integrate import QUANTA_PER_VOXEL, lane_distance, lane_weight
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
-from tsfusion.kernels.voxel_traversal import RUN, VOXEL_LIMIT, pack, vec3i
-from tsfusion.kernels.voxel_values import distance_as_float
+from tsfusion.kernels.voxel_traversal import RUN, VOXEL_LIMIT, offset_in_block, pack, vec3i
 
 ONE = 65536.0  # of a voxel
 UNKNOWN = -2  # slot of a block that was not looked up
 BAND = 512  # points that one thread takes at a time
 
+# What values are: Σ w·m / Σ w; that, with what `values` adds to Σ w·m; or `values`
+FUSED, CORRECTED, SOLVED = 0, 1, 2
+
 vec3f = ti.types.vector(3, ti.f32)
+vec4f = ti.types.vector(4, ti.f32)
 vec3l = ti.types.vector(3, ti.i64)
 corners_i = ti.types.vector(8, ti.i32)
+corners_l = ti.types.vector(8, ti.i64)
 corners_f = ti.types.vector(8, ti.f32)
 
 
@@ -64,6 +71,52 @@ def corner_offset(voxel, c: ti.template()):
     )
 
 
+@ti.func
+def read_voxel(slot, o, sums: ti.template(), kind, values: ti.template(), row_of: ti.template()):
+    """The sums of a voxel, and what `values` holds of it."""
+    held = ti.f32(0.0)
+    if kind == CORRECTED:
+        held = values[slot, o]
+    elif kind == SOLVED:
+        held = values[row_of[slot], o]
+    return sums[slot, o], held
+
+
+@ti.func
+def value_of(packed, held, kind, min_weight):
+    """Value of a voxel in quanta, NaN where it is unseen, and its weight."""
+    w = lane_weight(packed)
+    weight = ti.cast(w, ti.f32)
+    value = (ti.cast(lane_distance(packed), ti.f32) + held) / weight
+    value = ti.select(kind == SOLVED, held, value)
+    return ti.select(w >= min_weight, value, ti.math.nan), weight
+
+
+@ti.func
+def blend(v, f):
+    """Trilinear mean of eight corners at the place f in their cell, and its gradient."""
+    x = vec4f(v[1] - v[0], v[3] - v[2], v[5] - v[4], v[7] - v[6])
+    along_x = vec4f(v[0], v[2], v[4], v[6]) + f[0] * x
+    y0, y1 = along_x[1] - along_x[0], along_x[3] - along_x[2]
+    low, high = along_x[0] + f[1] * y0, along_x[2] + f[1] * y1
+    x0, x1 = x[0] + f[1] * (x[1] - x[0]), x[2] + f[1] * (x[3] - x[2])
+    z = high - low
+    return low + f[2] * z, vec3f(x0 + f[2] * (x1 - x0), y0 + f[2] * (y1 - y0), z)
+
+
+@ti.func
+def blend_shares(v, f):
+    """Trilinear mean of those of eight corners that have a share in it."""
+    total = ti.f32(0.0)
+    for c in ti.static(range(8)):
+        share = ti.f32(1.0)
+        for a in ti.static(range(3)):
+            share *= f[a] if ti.static(c >> a & 1) else 1.0 - f[a]
+        if share > 0.0:
+            total += share * v[c]
+    return total
+
+
 @ti.kernel
 def list_blocks(
     points: ti.types.ndarray(ndim=2),
@@ -102,11 +155,10 @@ def interpolate(
     map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
     map_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
     sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
-    correction: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    corrected: ti.i32,
-    solved: ti.types.ndarray(dtype=ti.f32, ndim=2),
-    row_of: ti.types.ndarray(dtype=ti.i32, ndim=1),  # of a slot; of length 0: values are those of the sums
     min_weight: ti.i32,
+    kind: ti.i32,  # FUSED, or what is in `values`
+    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    row_of: ti.types.ndarray(dtype=ti.i32, ndim=1),  # SOLVED: row of a slot
     distance: ti.types.ndarray(dtype=ti.f32, ndim=1),
     weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
     gradient: ti.types.ndarray(dtype=ti.f32, ndim=2),
@@ -127,42 +179,34 @@ def interpolate(
                     last = block
                     near = corners_i(UNKNOWN)
                 across = crossing(voxel)
-                values = corners_f(ti.math.nan)
-                weights = corners_f(0.0)
-                for c in ti.static(range(8)):
-                    slot = -1
-                    if inside:
-                        slot = find_near(near, voxel, c & across, map_keys, map_slots)
+                packed = corners_l(0)
+                held = corners_f(0.0)
+                if inside and across == 0:  # two of three: eight corners in one block
+                    slot = find_near(near, voxel, 0, map_keys, map_slots)
                     if slot >= 0:
-                        o = corner_offset(voxel, c)
-                        packed = sums[slot, o]
-                        w = lane_weight(packed)
-                        weights[c] = ti.cast(w, ti.f32)
-                        if w >= min_weight:
-                            if row_of.shape[0] > 0:
-                                values[c] = solved[row_of[slot], o]
-                            else:
-                                total = distance_as_float(packed)
-                                if corrected == 1:
-                                    total += correction[slot, o]
-                                values[c] = total / weights[c]
-                f = vec3f(0.0)
-                for a in ti.static(range(3)):
-                    f[a] = ti.cast(place[a] & 65535, ti.f32) * (1.0 / ONE)
-                total = ti.f32(0.0)
-                votes = ti.f32(0.0)
-                slope = vec3f(0.0)
+                        o = offset_in_block(voxel)
+                        for c in ti.static(range(8)):
+                            step = ti.static(64 * (c & 1) + 8 * (c >> 1 & 1) + (c >> 2))
+                            packed[c], held[c] = read_voxel(slot, o + step, sums, kind, values, row_of)
+                elif inside:
+                    for c in ti.static(range(8)):
+                        slot = find_near(near, voxel, c & across, map_keys, map_slots)
+                        if slot >= 0:
+                            o = corner_offset(voxel, c)
+                            packed[c], held[c] = read_voxel(slot, o, sums, kind, values, row_of)
+                v = corners_f(0.0)
+                w = corners_f(0.0)
                 for c in ti.static(range(8)):
-                    x = f[0] if ti.static(c & 1) else 1.0 - f[0]
-                    y = f[1] if ti.static(c >> 1 & 1) else 1.0 - f[1]
-                    z = f[2] if ti.static(c >> 2) else 1.0 - f[2]
-                    share = x * y * z
-                    total += ti.select(share > 0.0, share * values[c], 0.0)
-                    votes += share * weights[c]
-                    slope[0] += ti.static(2 * (c & 1) - 1) * (y * z) * values[c]
-                    slope[1] += ti.static(2 * (c >> 1 & 1) - 1) * (x * z) * values[c]
-                    slope[2] += ti.static(2 * (c >> 2) - 1) * (x * y) * values[c]
-                distance[n] = total * metres
-                weight[n] = votes * ti.static(1.0 / WEIGHT_ONE)
+                    v[c], w[c] = value_of(packed[c], held[c], kind, min_weight)
+                f = ti.cast(place & 65535, ti.f32) * ti.static(1.0 / ONE)
+                total, slope = blend(v, f)
+                if not (total == total):  # Taichi's != is false of NaN
+                    total = blend_shares(v, f)
+                slope *= ti.static(1.0 / QUANTA_PER_VOXEL)
+                # along oblique rays the distance grows faster than that to the surface
+                steep = slope.norm()
+                shorter = 1.0 / ti.select(steep > 1.0, steep, 1.0)
+                distance[n] = total * metres * shorter
+                weight[n] = blend(w, f)[0] * ti.static(1.0 / WEIGHT_ONE)
                 for a in ti.static(range(3)):
-                    gradient[n, a] = slope[a] * ti.static(1.0 / QUANTA_PER_VOXEL)
+                    gradient[n, a] = slope[a] * shorter

@@ -33,17 +33,26 @@ def _fill(
     found: Samples, points: NDArray[np.floating], store: BlockStore, min_weight: float, view: SurfaceView
 ) -> None:
     per_metre = 1 / store.voxel_size
-    row_of, solved = np.empty(0, np.int32), np.empty((1, 512), np.float32)
+    kind, values, row_of = point_sampling.FUSED, store.correction, np.empty(0, np.int32)
     if view is not values_of:
-        is_needed = np.zeros(max(store.count, 1), np.uint8)
-        point_sampling.list_blocks(points, per_metre, store.hash_keys, store.hash_slots, is_needed)
-        slots = np.flatnonzero(is_needed)
-        slots = slots[np.argsort(store.keys[slots])]
-        row_of = np.zeros(len(is_needed), np.int32)
-        row_of[slots] = np.arange(len(slots))
-        solved = view(store.keys[slots], store, min_weight) if len(slots) else solved
+        kind, values, row_of = point_sampling.SOLVED, *_solved(points, store, min_weight, view)
+    elif store.corrected:
+        kind = point_sampling.CORRECTED
     point_sampling.interpolate(
-        points, per_metre, store.hash_keys, store.hash_slots, store.sums, store.correction,
-        int(store.corrected), solved, row_of, max(1, int(np.ceil(min_weight * WEIGHT_ONE))),
+        points, per_metre, store.hash_keys, store.hash_slots, store.sums,
+        max(1, int(np.ceil(min_weight * WEIGHT_ONE))), kind, values, row_of,
         found.distance, found.weight, found.gradient,
     )  # fmt: skip
+
+
+def _solved(
+    points: NDArray[np.floating], store: BlockStore, min_weight: float, view: SurfaceView
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Values of the blocks that the points need, and the row of each slot."""
+    is_needed = np.zeros(store.count, np.uint8)
+    point_sampling.list_blocks(points, 1 / store.voxel_size, store.hash_keys, store.hash_slots, is_needed)
+    slots = np.flatnonzero(is_needed)
+    slots = slots[np.argsort(store.keys[slots])]
+    row_of = np.zeros(store.count, np.int32)
+    row_of[slots] = np.arange(len(slots))
+    return view(store.keys[slots], store, min_weight), row_of
