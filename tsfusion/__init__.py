@@ -40,11 +40,13 @@ if TYPE_CHECKING:
     from tsfusion.datasets import open_dataset as open_dataset
     from tsfusion.geometry.keyframe import Intrinsics as Intrinsics
     from tsfusion.geometry.keyframe import Keyframe as Keyframe
+    from tsfusion.geometry.map_answers import PointCloud as PointCloud
     from tsfusion.geometry.map_answers import Samples as Samples
     from tsfusion.geometry.map_answers import View as View
     from tsfusion.geometry.mesh import Mesh as Mesh
     from tsfusion.scanner.sources.registry import open_source as open_source
     from tsfusion.scanner.sources.source import Source as Source
+    from tsfusion.tsdf.map_blocks import Blocks as Blocks
     from tsfusion.tsdf.volume import Volume as Volume
 
 __version__ = "0.1.0"
@@ -58,12 +60,14 @@ _ERRORS = (
     "TransportError", "TsfusionError", "WeightOverflow", "WorldRefused",
 )  # fmt: skip
 _HOME = {
+    "Blocks": "tsdf.map_blocks",
     "Client": "client",
     "Config": "core.config",
     "Intrinsics": "geometry.keyframe",
     "Keyframe": "geometry.keyframe",
     "Layout": "datasets",
     "Mesh": "geometry.mesh",
+    "PointCloud": "geometry.map_answers",
     "Samples": "geometry.map_answers",
     "Source": "scanner.sources.source",
     "View": "geometry.map_answers",

@@ -67,6 +67,27 @@ def test_the_map_is_the_same_and_takes_no_more_memory(
     assert volume.map_hash() == volume_of(views[1::2], voxel_size=VOXEL).map_hash()
 
 
+def test_questions_are_answered_in_no_more_memory(
+    folder: Path, views: list[Keyframe], unbounded: Volume
+) -> None:
+    volume = bounded(folder, views)
+    points = unbounded.extract_mesh().vertices[::5]
+    points = points + np.random.default_rng(0).normal(0, VOXEL, points.shape)
+    for surface in ("raw", "field"):
+        found, wanted = (one.sample(points, surface=surface) for one in (volume, unbounded))
+        assert np.array_equal(found.distance, wanted.distance, equal_nan=True)
+        assert np.array_equal(found.weight, wanted.weight)
+        assert np.isfinite(found.distance).sum() > 100
+        assert unnamed_files_rss(folder) <= MEMORY + BESIDE
+    blocks, distance = volume.blocks(), unbounded.blocks().distance()
+    assert np.array_equal(blocks.distance(), distance, equal_nan=True)
+    assert np.array_equal(blocks.sums, unbounded.blocks().sums)
+    camera = views[0].intrinsics, views[0].T_world_camera, (60, 80)
+    found, wanted = (one.raycast(*camera).depth for one in (volume, unbounded))
+    assert np.array_equal(found, wanted)
+    assert (found > 0).mean() > 0.05
+
+
 def test_meshes_and_checkpoints_are_the_same_in_no_more_memory(
     folder: Path, views: list[Keyframe], unbounded: Volume, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,12 +2,13 @@
 """What a map answers: samples of its distance field, and what a camera would see of it."""
 
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import InvalidConfig, InvalidKeyframe
+from tsfusion.core.errors import InvalidConfig, InvalidKeyframe, MissingDependency
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics, check_pose, intrinsics_of
 
 
@@ -39,6 +40,49 @@ class View:
     depth: NDArray[np.float32]
     normals: NDArray[np.float32]
     colors: NDArray[np.uint8] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points of the map's surface.
+
+    Attributes:
+        points: (n, 3) float32 metres.
+        normals: (n, 3) float32, unit length, away from the surface.
+        weights: (n,) float32 votes in full-confidence samples.
+        colors: (n, 3) uint8 RGB (sRGB); None if the map holds none.
+    """
+
+    points: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    weights: NDArray[np.float32]
+    colors: NDArray[np.uint8] | None = None
+
+    def to_open3d(self) -> Any:
+        """Make an `open3d.t.geometry.PointCloud` with `normals`, `weights` and `colors` (float32, 0 to 1).
+
+        Raises:
+            MissingDependency: without Open3D.
+        """
+        o3d = import_open3d()
+        cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(self.points))
+        cloud.point.normals = o3d.core.Tensor(self.normals)
+        cloud.point.weights = o3d.core.Tensor(self.weights[:, None])
+        if self.colors is not None:
+            cloud.point.colors = o3d.core.Tensor(self.colors / np.float32(255))
+        return cloud
+
+
+def import_open3d() -> Any:
+    """The module `open3d`.
+
+    Raises:
+        MissingDependency: without it.
+    """
+    try:
+        return import_module("open3d")
+    except ImportError as error:
+        raise MissingDependency("Open3D is not installed (pip install open3d)") from error
 
 
 def checked_points(points: Any) -> NDArray[np.floating]:

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core import durable_files, process
-from tsfusion.core.errors import MissingDependency, OutputError
+from tsfusion.core.errors import OutputError
 from tsfusion.geometry import mesh_islands, up_direction
+from tsfusion.geometry.map_answers import import_open3d
 from tsfusion.geometry.up_direction import HeldSensor, Up
 
 FORMATS = (".ply", ".glb", ".obj")
@@ -96,10 +97,7 @@ class Mesh:
         Raises:
             MissingDependency: without Open3D.
         """
-        try:
-            import open3d
-        except ImportError as error:
-            raise MissingDependency("Open3D is not installed (pip install open3d)") from error
+        open3d = import_open3d()
         vectors = open3d.utility
         mesh = open3d.geometry.TriangleMesh(
             vectors.Vector3dVector(self.vertices), vectors.Vector3iVector(self.faces)

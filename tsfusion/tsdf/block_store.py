@@ -88,6 +88,10 @@ class BlockStore:
             for file, least in zip(self._files, limits[1], strict=True):
                 file.min_free_bytes = least
 
+    def shown(self, layer: str) -> NDArray[Any] | None:
+        """(count, 512) rows of a layer, not copied (`GrowingArray.shown`); None if there is none."""
+        return self._layers[layer].shown(self.count) if layer in self._present else None
+
     @property
     def keys(self) -> NDArray[np.int64]:
         return self._keys.array[: self.count]

@@ -46,6 +46,18 @@ class GrowingArray:
     def item_bytes(self) -> int:
         return int(np.prod(self._item, dtype=np.int64)) * self._dtype.itemsize
 
+    def shown(self, count: int) -> NDArray[Any]:
+        """The first items, read-only, without copying: memory that stays, however the array grows.
+
+        Once it has grown, what was shown before may be a copy of how it was.
+        """
+        items = self.array[:count]
+        if self._map is not None:  # as a buffer of the map, which then is not resized
+            of_map = np.asarray(memoryview(self._map)[: count * self.item_bytes])
+            items = of_map.view(self._dtype).reshape(count, *self._item)
+        items.flags.writeable = False
+        return items
+
     def reserve(self, capacity: int) -> None:
         """Make room for `capacity` items; new items are zero.
 
@@ -68,10 +80,7 @@ class GrowingArray:
             return
         size = capacity * self.item_bytes
         try:
-            if self._map is None:
-                self._map = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-            else:
-                self._map.resize(size)
+            self._map = self._resized(size)
         except OSError as error:
             raise MemoryError(f"no memory for {size >> 20} MB: {error.strerror}") from error
         # By address, not as a buffer of the map: Taichi's launches leave reference cycles around their
@@ -84,6 +93,18 @@ class GrowingArray:
             "shape": (capacity, *self._item),
         }
         self.array = np.asarray(SimpleNamespace(__array_interface__=interface))
+
+    def _resized(self, size: int) -> mmap.mmap:
+        if self._map is not None:
+            try:
+                self._map.resize(size)
+                return self._map
+            except BufferError:  # somebody is shown items of it, and keeps that map
+                pass
+        grown = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        if self._map is not None:
+            grown[: len(self._map)] = memoryview(self._map)
+        return grown
 
 
 class FileArray(GrowingArray):

@@ -10,7 +10,7 @@ from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf.block_store import BlockStore
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
 
-_PART = 1 << 20  # points at a time: their blocks may have to come from a file
+_PART = 1 << 14  # points at a time where their blocks may have to come from a file
 
 
 def sample(
@@ -21,8 +21,9 @@ def sample(
     whole = Samples(
         np.empty(count, np.float32), np.empty(count, np.float32), np.empty((count, 3), np.float32)
     )
-    for first in range(0, count, _PART):
-        part = slice(first, first + _PART)
+    length = _PART if store.is_in_files else max(count, 1)
+    for first in range(0, count, length):
+        part = slice(first, first + length)
         found = Samples(whole.distance[part], whole.weight[part], whole.gradient[part])
         _fill(found, points[part], store, min_weight, view)
         store.keep_within_memory()

@@ -16,14 +16,22 @@ from numpy.typing import ArrayLike, NDArray
 from tsfusion.core.config import Surface, VolumeConfig
 from tsfusion.core.errors import InvalidConfig, MapError
 from tsfusion.geometry.keyframe import Intrinsics
-from tsfusion.geometry.map_answers import Samples, View, checked_camera, checked_points
+from tsfusion.geometry.map_answers import PointCloud, Samples, View, checked_camera, checked_points
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_parts import MeshParts, joined
 from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.kernels import integrate
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
-from tsfusion.tsdf import camera_views, field_regularizer, map_difference, point_samples, voxel_arrays
+from tsfusion.tsdf import (
+    camera_views,
+    field_regularizer,
+    map_blocks,
+    map_difference,
+    point_samples,
+    voxel_arrays,
+)
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.map_blocks import Blocks
 from tsfusion.tsdf.map_difference import MapDifference
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
 from tsfusion.tsdf.mesh_tiles import tiles
@@ -154,6 +162,33 @@ class ReadableMap:
         """
         camera = checked_camera(intrinsics, T_world_camera, shape)
         return camera_views.look_at(self.extract_mesh(min_weight, surface=surface), *camera)
+
+    def point_cloud(self, *, min_weight: float | None = None, surface: Surface | None = None) -> PointCloud:
+        """Points of the surface, a vertex of its mesh each: at most three a voxel.
+
+        Args:
+            min_weight, surface: as for `extract_mesh`.
+        """
+        mesh = self.extract_mesh(min_weight, surface=surface)
+        weights = self.sample(mesh.vertices, min_weight=min_weight, surface="raw").weight
+        return PointCloud(mesh.vertices, mesh.normals, weights, mesh.colors)
+
+    def blocks(self) -> Blocks:
+        """The blocks of voxels as NumPy arrays: the stored sums without copying, and decoded on request."""
+        return Blocks(self._store)
+
+    def to_open3d(self) -> Any:
+        """Make an `open3d.t.geometry.VoxelBlockGrid` of the map as it was fused.
+
+        Open3D's meshes and points of it lie half a voxel too low along x, y and z, since Open3D takes a
+        voxel's value for that of its lowest corner: `translate` them. A distance of 8 voxels is 1 there
+        (`trunc_voxel_multiplier=8`, the default). `extract_mesh().to_open3d()` and
+        `point_cloud().to_open3d()` need no such care.
+
+        Raises:
+            MissingDependency: without Open3D.
+        """
+        return map_blocks.to_voxel_block_grid(self._store)
 
     def diff(self, later: "ReadableMap", *, tolerance: float | None = None) -> MapDifference:
         """What is different in a later map of the same frame, in numbers and as a coloured mesh.

@@ -117,7 +117,7 @@ def _write_array(
 def _blocks(store: BlockStore, used: NDArray[np.int64], name: str) -> Iterator[NDArray[Any]]:
     """Parts (m, 8, 8, 8, …) of a field."""
     for i in range(0, len(used), _CHUNK):
-        yield _values(store, used[i : i + _CHUNK], name)
+        yield decoded(store, used[i : i + _CHUNK], name)
 
 
 def _slabs(
@@ -132,12 +132,12 @@ def _slabs(
         slab = np.full((8, wide, 8, high, 8, *field.shape), field.unseen, field.dtype)
         for i in range(first, end, _CHUNK):
             part = slice(i, min(i + _CHUNK, end))
-            slab[:, y[part], :, z[part]] = _values(store, used[part], name)
+            slab[:, y[part], :, z[part]] = decoded(store, used[part], name)
         yield slab
 
 
-def _values(store: BlockStore, slots: NDArray[np.int64], name: str) -> NDArray[Any]:
-    """(m, 8, 8, 8, …) of a field in blocks."""
+def decoded(store: BlockStore, slots: NDArray[np.int64], name: str) -> NDArray[Any]:
+    """(m, 8, 8, 8, …) of a field in blocks: `tsdf`, `weight` or `color`."""
     shape = (len(slots), 8, 8, 8, *_FIELDS[name].shape)
     if name == "tsdf":
         quanta = values_of(store.keys[slots], store, 0.0)
