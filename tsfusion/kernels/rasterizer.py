@@ -9,7 +9,11 @@ Triangles whose back is turned are not drawn, so a room opens like a doll's hous
 import taichi as ti
 import taichi.math as tm
 
+from tsfusion.kernels.voxel_traversal import RUN
+
 EMPTY = (1 << 63) - 1
+OVERLAP = 5e-4  # pixels that a triangle is wider by: where neighbours are rounded otherwise there is no gap
+BANDS = 64  # of rows of the image: units of parallel work
 
 
 @ti.func
@@ -39,19 +43,32 @@ def fill(seen: ti.types.ndarray(), a, b, c, triangle, focal, width, height):
     pb = centre + focal * b.xy / b.z
     pc = centre + focal * c.xy / c.z
     area = edge(pa, pb, pc)
-    if area != 0.0:
-        low = ti.ceil(tm.max(ti.min(ti.min(pa, pb), pc), 0.0))
-        high = ti.floor(ti.min(ti.max(ti.max(pa, pb), pc), tm.vec2(width - 1, height - 1)))
+    low = ti.ceil(tm.max(ti.min(ti.min(pa, pb), pc), 0.0))
+    high = ti.floor(ti.min(ti.max(ti.max(pa, pb), pc), tm.vec2(width - 1, height - 1)))
+    if area != 0.0 and low.x <= high.x and low.y <= high.y:
+        # Shares of the corners, and 1 / depth, are linear in the image: a value at `low`, and steps.
+        share = 1.0 / area
+        wa, wb, wc = edge(pb, pc, low) * share, edge(pc, pa, low) * share, edge(pa, pb, low) * share
+        wa_u, wa_v = (pb.y - pc.y) * share, (pc.x - pb.x) * share
+        wb_u, wb_v = (pc.y - pa.y) * share, (pa.x - pc.x) * share
+        wc_u, wc_v = (pa.y - pb.y) * share, (pb.x - pa.x) * share
+        least_a = -OVERLAP * (ti.abs(wa_u) + ti.abs(wa_v))
+        least_b = -OVERLAP * (ti.abs(wb_u) + ti.abs(wb_v))
+        least_c = -OVERLAP * (ti.abs(wc_u) + ti.abs(wc_v))
+        za, zb, zc = 1.0 / a.z, 1.0 / b.z, 1.0 / c.z
         for v in range(ti.cast(low.y, ti.i32), ti.cast(high.y, ti.i32) + 1):
+            down = ti.cast(v, ti.f32) - low.y
             for u in range(ti.cast(low.x, ti.i32), ti.cast(high.x, ti.i32) + 1):
-                p = tm.vec2(u, v)
-                wa = edge(pb, pc, p) / area
-                wb = edge(pc, pa, p) / area
-                wc = edge(pa, pb, p) / area
-                if wa >= 0.0 and wb >= 0.0 and wc >= 0.0:
-                    depth = 1.0 / (wa / a.z + wb / b.z + wc / c.z)
+                right = ti.cast(u, ti.f32) - low.x
+                w = wa + wa_v * down + wa_u * right
+                x = wb + wb_v * down + wb_u * right
+                y = wc + wc_v * down + wc_u * right
+                if w >= least_a and x >= least_b and y >= least_c:
+                    depth = 1.0 / (w * za + x * zb + y * zc)
                     bits = ti.cast(ti.bit_cast(ti.cast(depth, ti.f32), ti.i32), ti.i64)
-                    ti.atomic_min(seen[v, u], (bits << 32) | ti.cast(triangle, ti.i64))
+                    key = (bits << 32) | ti.cast(triangle, ti.i64)
+                    if key < seen[v, u]:
+                        ti.atomic_min(seen[v, u], key)
 
 
 @ti.kernel
@@ -93,11 +110,20 @@ def rasterise(
 
 
 @ti.func
-def barycentric(a, b, c, ray):
-    """Weights of the corners where a ray meets the plane of their triangle (Möller and Trumbore 1997)."""
-    w = tm.vec3(tm.dot(ray, tm.cross(b, c)), tm.dot(ray, tm.cross(c, a)), tm.dot(ray, tm.cross(a, b)))
+def opposite(a, b, c):
+    """Rows: normals of the planes through the eye and the side opposite to each corner of a triangle."""
+    return ti.Matrix.rows([tm.cross(b, c), tm.cross(c, a), tm.cross(a, b)])
+
+
+@ti.func
+def shares(edges, ray):
+    """Shares of the corners where a ray meets the plane of their triangle (Möller and Trumbore 1997)."""
+    w = edges @ ray
     total = w.sum()
-    w = ti.select(total != 0.0, w / total, tm.vec3(1.0, 0.0, 0.0))
+    if total != 0.0:
+        w *= 1.0 / total
+    else:
+        w = tm.vec3(1.0, 0.0, 0.0)
     return tm.clamp(w, 0.0, 1.0)
 
 
@@ -116,21 +142,36 @@ def look_up(
 ):
     """Depth, unit normal and colour of every pixel that is not EMPTY, as the corners of its triangle say."""
     height, width = seen.shape[0], seen.shape[1]
-    for v, u in ti.ndrange(height, width):
-        if seen[v, u] != empty:
-            f = ti.cast(seen[v, u], ti.i32)  # the low half
-            ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
-            ray = tm.vec3((u - 0.5 * (width - 1)) / focal, (v - 0.5 * (height - 1)) / focal, 1.0)
-            w = barycentric(corner(vertices, ia), corner(vertices, ib), corner(vertices, ic), ray)
-            depth[v, u] = ti.bit_cast(ti.cast(seen[v, u] >> 32, ti.i32), ti.f32)
-            n = w[0] * corner(normals, ia) + w[1] * corner(normals, ib) + w[2] * corner(normals, ic)
-            n /= ti.max(n.norm(), 1e-9)
-            for k in ti.static(range(3)):
-                normal[v, u, k] = n[k]
-            if colors.shape[0] > 0:
-                for k in ti.static(range(3)):
-                    shade_ = w[0] * colors[ia, k] + w[1] * colors[ib, k] + w[2] * colors[ic, k]
-                    color[v, u, k] = ti.cast(shade_ + 0.5, ti.u8)
+    per_pixel = 1.0 / focal
+    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
+        if run % RUN == 0:
+            band = run // RUN
+            last = -1  # triangle
+            edges, towards, tints = tm.mat3(0.0), tm.mat3(0.0), tm.mat3(0.0)
+            for v in range(height * band // BANDS, height * (band + 1) // BANDS):
+                y = (v - 0.5 * (height - 1)) * per_pixel
+                for u in range(width):
+                    key = seen[v, u]
+                    if key != empty:
+                        f = ti.cast(key, ti.i32)  # the low half
+                        if f != last:
+                            last = f
+                            ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
+                            edges = opposite(corner(vertices, ia), corner(vertices, ib), corner(vertices, ic))
+                            for k in ti.static(range(3)):
+                                towards[k, :] = tm.vec3(normals[ia, k], normals[ib, k], normals[ic, k])
+                                if colors.shape[0] > 0:
+                                    tints[k, :] = tm.vec3(colors[ia, k], colors[ib, k], colors[ic, k])
+                        w = shares(edges, tm.vec3((u - 0.5 * (width - 1)) * per_pixel, y, 1.0))
+                        n = towards @ w
+                        n *= 1.0 / ti.max(n.norm(), 1e-9)
+                        depth[v, u] = ti.bit_cast(ti.cast(key >> 32, ti.i32), ti.f32)
+                        for k in ti.static(range(3)):
+                            normal[v, u, k] = n[k]
+                        if colors.shape[0] > 0:
+                            tint = tints @ w
+                            for k in ti.static(range(3)):
+                                color[v, u, k] = ti.cast(tint[k] + 0.5, ti.u8)
 
 
 @ti.kernel
@@ -159,7 +200,7 @@ def shade(
             ia, ib, ic = faces[f, 0], faces[f, 1], faces[f, 2]
             a, b, c = corner(vertices, ia), corner(vertices, ib), corner(vertices, ic)
             ray = tm.vec3((u - 0.5 * (width - 1)) / focal, (v - 0.5 * (height - 1)) / focal, 1.0)
-            wa, wb, wc = barycentric(a, b, c, ray)
+            wa, wb, wc = shares(opposite(a, b, c), ray)
             normal = wa * corner(normals, ia) + wb * corner(normals, ib) + wc * corner(normals, ic)
             normal /= ti.max(normal.norm(), 1e-9)
             facing = ti.max(-tm.dot(normal, ray) / ray.norm(), 0.0)
