@@ -144,7 +144,7 @@ def test_doctor_says_what_to_do(here: Here, tmp_path: Path) -> None:
         (["mesh", "missing", "a.ply"], "missing does not exist"),
         (["mesh", "empty", "a.ply"], "no keyframes"),
         (["mesh", "garbage.tsf", "a.ply"], "not a tsfusion map"),
-        (["mesh", "garbage.tsf", "a.stl"], "ending in .ply, .glb, .obj"),
+        (["mesh", "garbage.tsf", "a.fbx"], "ending in .ply, .glb, .obj, .stl, .pcd, .las, .laz"),
         (["mesh", "garbage.tsf", "missing/a.ply"], "cannot write"),
         (["mesh", "nonsense://x", "a.ply"], "an address looks like"),
         (["mesh", "garbage.tsf", "a.ply", "--up", "w"], "up must be x, y, z, -x, -y, -z or three numbers"),

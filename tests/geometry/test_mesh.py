@@ -30,8 +30,8 @@ def test_a_mesh_that_cannot_be_saved_says_why_and_leaves_nothing(tmp_path: Path)
     with pytest.raises(OutputError, match="no triangles"):
         volume_of([]).extract_mesh().save(tmp_path / "m.ply")
     mesh = volume_of(sphere_views(0.4, 2)[:1]).extract_mesh()
-    with pytest.raises(OutputError, match=r"\.ply, \.glb, \.obj"):
-        mesh.save(tmp_path / "m.stl")
+    with pytest.raises(OutputError, match=r"\.ply, \.glb, \.obj, \.stl"):
+        mesh.save(tmp_path / "m.fbx")
     with pytest.raises(OutputError, match="cannot write"):
         mesh.save(tmp_path / "missing" / "m.ply")
     assert not list(tmp_path.iterdir())

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """`tsfusion mesh`."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,12 +13,17 @@ from tsfusion.cli import options
 
 if TYPE_CHECKING:
     from tsfusion.core.config import VolumeConfig
+    from tsfusion.geometry.mesh import Mesh
     from tsfusion.geometry.up_direction import Up
     from tsfusion.pipelines.journal_fusion import JournalMap
+    from tsfusion.tsdf.volume import Volume
+    from tsfusion.wire.curve import ClientKeys
 
 ColorBy = Literal["client", "session"]
+Box = tuple[float, float, float, float, float, float]
 
 _OF_A_JOURNAL = ("until", "only", "color_by")
+_OF_A_WHOLE_MESH = ("preview", "min_component", "fill_holes", "mark_guesses", "simplify")
 
 
 @options.takes_map_settings
@@ -26,23 +33,45 @@ def mesh(
         str,
         typer.Argument(
             metavar="SOURCE",
-            help="A map (.tsf), a state folder, a journal (folder or .mcap), or tcp://HOST:PORT.",
+            help="Map, state folder, journal, or tcp://HOST:PORT.",
         ),
     ],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="A .ply, .glb or .obj file.")],
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", help=".ply, .glb, .obj, .stl; points: .pcd, .las, .laz.")
+    ],
     *,
     up: options.UpDirection = None,
     keep_islands: options.KeepIslands = None,
     until: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="As it was at TIME: ISO, or seconds from the end."),
+        typer.Option(metavar="TIME", help="As it was: ISO, or seconds from the end."),
     ] = None,
     only: Annotated[
         list[str] | None,
-        typer.Option(metavar="SESSION", help="As this session or client saw it (repeatable)."),
+        typer.Option(metavar="SESSION", help="As this session or client saw it (or more)."),
     ] = None,
     color_by: Annotated[
-        ColorBy | None, typer.Option(metavar="WHAT", help="client or session: a colour for each.")
+        ColorBy | None,
+        options.option("--color-by", "WHAT", "client or session: a colour for each.", rare=True),
+    ] = None,
+    crop: Annotated[
+        Box | None,
+        typer.Option(metavar="BOX", help="Cut to x0 y0 z0 x1 y1 z1, in metres."),
+    ] = None,
+    min_component: Annotated[
+        float | None,
+        options.option("--min-component", "METRES", "Leave out pieces smaller than this."),
+    ] = None,
+    fill_holes: Annotated[
+        int | None,
+        options.option("--fill-holes", "VOXELS", "Close holes up to so wide: a guess."),
+    ] = None,
+    mark_guesses: Annotated[
+        bool, options.option("--mark-guesses", None, "Paint what --fill-holes guessed.", rare=True)
+    ] = False,
+    simplify: Annotated[
+        str | None,
+        options.option("--simplify", "TARGET", "25%, 50000 triangles, or off by 5mm."),
     ] = None,
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw a picture, too.")] = None,
     memory: Annotated[
@@ -53,60 +82,44 @@ def mesh(
     map_: options.Map = None,
     key: options.Key = None,
     server_key: options.ServerKey = None,
-    config: options.ConfigFile = None,
+    config: Annotated[
+        Path | None, options.option("--config", "FILE", "TOML; as `tsfusion config dump`.", rare=True)
+    ] = None,
     json: options.Json = False,
     **settings: Any,
 ) -> None:
     """Write the mesh of a saved map, of a live server, or of a journal.
 
-    A journal is fused again, with the map flags given here. With --until, --only
-    or --color-by it is fused again as its map was, with corrected poses.
-
-    A mesh larger than memory is made in tiles: one .ply, or a .glb each.
+    A journal is fused again, with the map flags below; --help-all has more.
     """
     from dataclasses import replace
 
     from tsfusion.core import process
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
-    from tsfusion.geometry.mesh import FORMATS
-    from tsfusion.pipelines import mesh_files
+    from tsfusion.pipelines import mesh_files, mesh_finishing
 
     given_up = options.up_direction(up)
-    legend: list[dict[str, Any]] = []
-    check_writable(out, FORMATS)
+    check_writable(out, mesh_files.SURFACES)
     if preview is not None:
         check_writable(preview, (".png",))
+    finishing = mesh_finishing.checked(
+        crop=crop, min_component=min_component, fill_holes=fill_holes, simplify=simplify,
+        mark_guesses=mark_guesses,
+    )  # fmt: skip
+    if min_component is not None and keep_islands is not None:
+        raise InvalidConfig(
+            "--min-component says which pieces go: leave out --keep-islands or --drop-islands"
+        )
+    legend: list[dict[str, Any]] = []
     if "://" in source:
-        options.refuse(
-            context, _OF_A_JOURNAL, "needs a journal: give the state folder of the server",
-        )  # fmt: skip
-        options.refuse(
-            context, {*options.MAP_OPTIONS, "config", "memory"} - {"min_weight"},
-            "has no effect on a live server's map: give it to `tsfusion serve`",
-        )  # fmt: skip
-        from tsfusion.core.config import DEFAULT_MAP
         from tsfusion.wire.curve import client_keys
-        from tsfusion.wire.queries import fetch_mesh
 
-        made = fetch_mesh(
-            source, control=control, map_name=map_ or DEFAULT_MAP, min_weight=settings["min_weight"],
-            keys=client_keys(key, server_key),
-        )  # fmt: skip
+        _refuse_for_server(context)
+        keys = client_keys(key, server_key)
+        made = _of_server(source, map_, keys, control=control, min_weight=settings["min_weight"])
     else:
-        options.refuse(
-            context, ("control", "key", "server_key"),
-            f"has no effect on {source}: only a live server (tcp://…) has one",
-        )  # fmt: skip
-        if source.endswith(".tsf"):
-            options.refuse(
-                context, _OF_A_JOURNAL,
-                "has no effect on a saved map: give the state folder or the journal that has its keyframes",
-            )  # fmt: skip
-            options.refuse(
-                context, options.MAP_OPTIONS.keys() - options.VIEW_OPTIONS,
-                "has no effect on a saved map: give the state folder or the journal to fuse it anew",
-            )  # fmt: skip
+        _refuse_for_files(context, source)
         chosen = options.configuration(config, **settings)
         given = config is not None or any(
             value is not None for name, value in settings.items() if name not in options.VIEW_OPTIONS
@@ -114,19 +127,97 @@ def mesh(
         most = options.byte_count(memory)
         view = {"until": until, "only": only or (), "color_by": color_by}
         found = _map(Path(source), chosen.volume, most, name=map_, given=given, quiet=json, view=view)
-        if found.volume.stats().bytes > (most or process.physical_memory_bytes() // 2):
-            options.refuse(context, ("preview",), "needs all of the mesh, which is too large for memory")
+        most = most or process.physical_memory_bytes() // 2
+        if found.volume.stats().bytes > most and crop is not None:
+            found.volume = mesh_finishing.part_around(found.volume, crop, most)
+        if found.volume.stats().bytes > most:
+            options.refuse(
+                context,
+                _OF_A_WHOLE_MESH,
+                "needs all of the mesh, which is too large for memory: give a --crop",
+            )
             if keep_islands is False:
                 raise InvalidConfig("--drop-islands needs all of the mesh, which is too large for memory")
             _write_tiles(found, out, given_up, json)
             return
-        made, legend = found.volume.extract_mesh(), found.legend
+        made, legend = _extracted(found.volume, source, fill_holes, json), found.legend
     if given_up is not None:
         made = replace(made, known_up=given_up)
+    with _stage(f"finishing the mesh of {source}", json or finishing.is_nothing):
+        made, dropped = finishing.apply(made)
     files = [out] if preview is None else [out, preview]
-    left_out = mesh_files.write(made, files, keep_islands=keep_islands)
+    left_out = mesh_files.write(made, files, keep_islands=keep_islands if min_component is None else True)
     written = made.without_islands() if out.name in left_out["files"] else made
-    _print_result(out, {**written.figures, "left_out": left_out}, legend, json)
+    left_out = (
+        left_out
+        if min_component is None
+        else {**dropped, "min_extent_m": min_component, "files": [file.name for file in files]}
+    )
+    _print_result(out, {**written.figures, "left_out": left_out}, [*legend, *finishing.legend(made)], json)
+
+
+def _refuse_for_server(context: typer.Context) -> None:
+    """Raise InvalidConfig for flags that a live server's map does not take."""
+    options.refuse(context, _OF_A_JOURNAL, "needs a journal: give the state folder of the server")
+    options.refuse(
+        context, {*options.MAP_OPTIONS, "config", "memory"} - {"min_weight"},
+        "has no effect on a live server's map: give it to `tsfusion serve`",
+    )  # fmt: skip
+    options.refuse(context, ("fill_holes",), "needs the map: give the state folder of the server")
+
+
+def _refuse_for_files(context: typer.Context, source: str) -> None:
+    """Raise InvalidConfig for flags that a map of files does not take."""
+    options.refuse(
+        context, ("control", "key", "server_key"),
+        f"has no effect on {source}: only a live server (tcp://…) has one",
+    )  # fmt: skip
+    if source.endswith(".tsf"):
+        options.refuse(
+            context, _OF_A_JOURNAL,
+            "has no effect on a saved map: give the state folder or the journal that has its keyframes",
+        )  # fmt: skip
+        options.refuse(
+            context, options.MAP_OPTIONS.keys() - options.VIEW_OPTIONS,
+            "has no effect on a saved map: give the state folder or the journal to fuse it anew",
+        )  # fmt: skip
+
+
+def _of_server(
+    address: str,
+    map_name: str | None,
+    keys: "ClientKeys | None",
+    *,
+    control: str | None,
+    min_weight: float | None,
+) -> "Mesh":
+    from dataclasses import replace
+
+    from tsfusion.core.config import DEFAULT_MAP
+    from tsfusion.geometry.provenance import Provenance
+    from tsfusion.wire.queries import fetch_mesh
+
+    name = map_name or DEFAULT_MAP
+    made = fetch_mesh(address, control=control, map_name=name, min_weight=min_weight, keys=keys)
+    return replace(made, provenance=Provenance(source=f"{address}, map {name}"))
+
+
+def _extracted(volume: "Volume", source: str, fill_holes: int | None, json: bool) -> "Mesh":
+    """The mesh of a map in memory, which knows where it comes from."""
+    from dataclasses import replace
+
+    with _stage(f"closing holes of {source}", json or fill_holes is None):
+        made = volume.extract_mesh(fill_holes=fill_holes)
+    return replace(made, provenance=volume.provenance(source))
+
+
+@contextmanager
+def _stage(text: str, quiet: bool) -> Iterator[None]:
+    from tsfusion.cli import progress
+
+    with progress.shown(quiet=quiet) as display:
+        display.stage(text)
+        yield
 
 
 def _write_tiles(found: "JournalMap", out: Path, up: "Up | None", json: bool) -> None:
@@ -205,5 +296,9 @@ def _print_result(out: Path, figures: dict[str, Any], legend: list[dict[str, Any
     if json:
         output.as_json({"path": str(out), **figures, **({"legend": legend} if legend else {})})
     else:
-        colors = [f"  {one['color']}  {one['name']}, {one['keyframes']} keyframes" for one in legend]
+        colors = [
+            f"  {one['color']}  {one['name']}"
+            + (f", {one['keyframes']} keyframes" if "keyframes" in one else "")
+            for one in legend
+        ]
         typer.echo("\n".join((f"{out}: {summarise(figures)}", *run_summary.mesh_notes(figures), *colors)))

@@ -104,7 +104,12 @@ def mesh_notes(figures: dict[str, Any]) -> list[str]:
     notes = []
     if left_out := figures["left_out"].get("islands"):
         files = " and ".join(figures["left_out"]["files"])
-        notes.append(f"{grouped(left_out)} islands left out of {files} (--keep-islands keeps them)")
+        why = (
+            "smaller than --min-component"
+            if "min_extent_m" in figures["left_out"]
+            else "--keep-islands keeps them"
+        )
+        notes.append(f"{grouped(left_out)} islands left out of {files} ({why})")
     if figures["up"] is None:
         notes.append("up is not known: GLB and pictures keep the map's axes (--up z, for instance, gives it)")
     return notes

@@ -3,6 +3,7 @@
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,12 +14,20 @@ from numpy.typing import NDArray
 
 from tsfusion.core import durable_files, process
 from tsfusion.core.errors import OutputError
-from tsfusion.geometry import mesh_islands, up_direction
+from tsfusion.geometry import (
+    mesh_cropping,
+    mesh_encoding,
+    mesh_islands,
+    mesh_simplification,
+    point_files,
+    up_direction,
+)
 from tsfusion.geometry.map_answers import import_open3d
+from tsfusion.geometry.provenance import Provenance
 from tsfusion.geometry.up_direction import HeldSensor, Up
 
-FORMATS = (".ply", ".glb", ".obj")
-_COMMENTS = {".ply": (b"comment ", b"format binary_little_endian 1.0\n"), ".obj": (b"# ", b"")}
+FORMATS = tuple(mesh_encoding.FORMATS)
+GUESS_COLOR = (230, 40, 190)  # RGB, seldom seen indoors or out
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +41,8 @@ class Mesh:
         colors: (n, 3) uint8 RGB (sRGB); grey where no colour was seen, None if the map holds none.
         known_up: away from the ground; None = `up` finds it.
         held: how the sensors that saw a whole map were held; None = nobody knows.
+        guessed: (m,) bool, the faces that close holes where nothing was seen; None = there are none.
+        provenance: where it comes from, for whoever gets a file of it; None = not known.
     """
 
     vertices: NDArray[np.float32]
@@ -40,6 +51,8 @@ class Mesh:
     colors: NDArray[np.uint8] | None = None
     known_up: Up | None = field(default=None, kw_only=True)
     held: HeldSensor | None = field(default=None, kw_only=True, repr=False)
+    guessed: NDArray[np.bool_] | None = field(default=None, kw_only=True)
+    provenance: Provenance | None = field(default=None, kw_only=True)
 
     @cached_property
     def up(self) -> Up | None:
@@ -49,10 +62,11 @@ class Mesh:
         return up_direction.find(self, self.held)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write PLY (binary), GLB or OBJ by the file's suffix; complete or not at all.
+        """Write PLY (binary), GLB, OBJ or STL by the file's suffix; complete or not at all.
 
-        PLY and OBJ keep the map's frame and name its up direction in a comment. GLB is turned so that up is
-        +Y, as glTF 2.0 asks for; where up is not known it keeps the map's frame.
+        PLY, OBJ and STL keep the map's frame. GLB is turned so that up is +Y, as glTF 2.0 asks for; where up
+        is not known it keeps the map's frame, too. Each file says its unit, its up direction, where it comes
+        from, and which triangles are guessed (`mesh_encoding`); STL holds no colours.
 
         Raises:
             OutputError: for another suffix, an empty mesh, or a path that cannot be written.
@@ -70,17 +84,19 @@ class Mesh:
             raise OutputError(f"cannot write {path}: {error.strerror}") from error
         return path
 
+    def save_points(self, path: str | os.PathLike[str]) -> Path:
+        """Write the vertices with their normals and colours as PLY, PCD, LAS or LAZ, in the map's frame.
+
+        Raises:
+            OutputError: for another suffix, an empty mesh, or a path that cannot be written.
+            MissingDependency: for LAS and LAZ without laspy.
+        """
+        facts = mesh_encoding.facts_of(self)
+        return point_files.save(path, self.vertices, normals=self.normals, colors=self.colors, facts=facts)
+
     def encode(self, suffix: str) -> bytes:
-        """Encode the mesh as the content of a `.ply`, `.glb` or `.obj` file."""
-        if suffix == ".glb":
-            return bytes(self._as_gltf().export(file_type="glb", include_normals=True))
-        normals = {".ply": "vertex_normal", ".obj": "include_normals"}[suffix]
-        content = self.to_trimesh().export(file_type=suffix[1:], **{normals: True})
-        content = content.encode() if isinstance(content, str) else bytes(content)
-        comment, before = _COMMENTS[suffix]
-        head, before, rest = content.partition(before) if before else (b"", b"", content)
-        lines = (b"frame of the map, right-handed; unit metre", f"up {_described(self.up)}".encode())
-        return head + before + b"".join(comment + line + b"\n" for line in lines) + rest
+        """Encode the mesh as the content of a `.ply`, `.glb`, `.obj` or `.stl` file."""
+        return mesh_encoding.encode(self, suffix)
 
     def to_trimesh(self) -> Any:
         """Make a `trimesh.Trimesh` in the map's frame, with normals and colours; nothing is merged."""
@@ -107,32 +123,105 @@ class Mesh:
             mesh.vertex_colors = vectors.Vector3dVector(self.colors / 255)
         return mesh
 
-    def without_islands(self) -> "Mesh":
-        """The mesh without its islands (`mesh_islands.find`); itself where it has none."""
-        kept = ~self._islands
-        if kept.all():
+    def without_islands(self, min_extent: float | None = None) -> "Mesh":
+        """The mesh without its islands; itself where it has none.
+
+        Args:
+            min_extent: metres from corner to corner of the box around a piece, below which it is an island;
+                None = pieces of few vertices (`mesh_islands.find`).
+        """
+        islands = self.islands(min_extent)
+        if not islands.any():
             return self
-        number = np.cumsum(kept, dtype=np.int32) - 1
+        return dataclasses.replace(self.of_faces(~islands[self.faces[:, 0]]), known_up=self.up)
+
+    def islands(self, min_extent: float | None = None) -> NDArray[np.bool_]:
+        """(n,) bool: vertices of islands, as `without_islands` leaves them out."""
+        if min_extent is None:
+            return self._islands
+        return mesh_islands.find_smaller(self.faces, self.vertices, min_extent)
+
+    def count_islands(self, islands: NDArray[np.bool_]) -> dict[str, int]:
+        """Number of `islands` and their `triangles`, of what `islands` found."""
+        triangles = int(islands[self.faces[:, 0]].sum())
+        return {"islands": mesh_islands.count(self.faces, islands), "triangles": triangles}
+
+    def cropped(self, box: Sequence[float]) -> "Mesh":
+        """The part of the mesh inside a box; triangles across a side are cut there.
+
+        Args:
+            box: x0, y0, z0, x1, y1, z1 in metres, in the mesh's frame.
+
+        Raises:
+            InvalidConfig: for another box.
+        """
+        return dataclasses.replace(mesh_cropping.cropped(self, box), known_up=self.up)
+
+    def simplified(
+        self, *, ratio: float | None = None, triangles: int | None = None, max_error: float | None = None
+    ) -> "Mesh":
+        """The mesh with fewer triangles, the same borders, and the mean colours of what became one.
+
+        Args:
+            ratio: share of the triangles that is wanted, above 0 and up to 1.
+            triangles: number that is wanted. Borders need two triangles an edge: fewer are not made.
+            max_error: metres that a new vertex may be off the planes of the triangles that it stands for.
+
+        Raises:
+            InvalidConfig: unless one of them is given, in its range.
+            MissingDependency: without fast-simplification.
+        """
+        less = mesh_simplification.simplified(self, ratio=ratio, triangles=triangles, max_error=max_error)
+        return dataclasses.replace(less, known_up=self.up)
+
+    def with_guesses_marked(self) -> "Mesh":
+        """The mesh with its guessed triangles in `GUESS_COLOR`, on vertices of their own."""
+        if self.guessed is None or not self.guessed.any():
+            return self
+        seen, guess = self.of_faces(~self.guessed), self.of_faces(self.guessed)
+        colors = [
+            np.full(part.vertices.shape, shade, np.uint8) if part.colors is None else part.colors
+            for part, shade in ((seen, 160), (guess, 160))
+        ]
+        colors[1] = np.full(guess.vertices.shape, GUESS_COLOR, np.uint8)
         return dataclasses.replace(
             self,
-            vertices=self.vertices[kept],
-            faces=number[self.faces[kept[self.faces[:, 0]]]],
-            normals=self.normals[kept],
-            colors=None if self.colors is None else self.colors[kept],
+            vertices=np.concatenate((seen.vertices, guess.vertices)),
+            faces=np.concatenate((seen.faces, guess.faces + np.int32(len(seen.vertices)))),
+            normals=np.concatenate((seen.normals, guess.normals)),
+            colors=np.concatenate(colors),
+            guessed=np.repeat((False, True), (len(seen.faces), len(guess.faces))),
             known_up=self.up,
+        )
+
+    def of_faces(self, kept: NDArray[np.bool_]) -> "Mesh":
+        """The faces of a (m,) bool, and the vertices that they use, in the same order."""
+        faces = self.faces[kept]
+        used = np.zeros(len(self.vertices), bool)
+        used[faces] = True
+        number = np.cumsum(used, dtype=np.int32) - 1
+        return dataclasses.replace(
+            self,
+            vertices=self.vertices[used],
+            faces=number[faces],
+            normals=self.normals[used],
+            colors=None if self.colors is None else self.colors[used],
+            guessed=None if self.guessed is None else self.guessed[kept],
         )
 
     @property
     def figures(self) -> dict[str, Any]:
         """Counts of vertices, triangles, and islands with their triangles; extent along the axes; up."""
         extent = np.ptp(self.vertices, axis=0) if len(self.vertices) else np.zeros(3)
+        islands = self.count_islands(self._islands)
         return {
             "vertices": len(self.vertices),
             "triangles": len(self.faces),
             "extent_m": [round(float(length), 3) for length in extent],
-            "islands": mesh_islands.count(self.faces, self._islands),
-            "island_triangles": int(self._islands[self.faces[:, 0]].sum()),
+            "islands": islands["islands"],
+            "island_triangles": islands["triangles"],
             "up": self.up,
+            **({} if self.guessed is None else {"guessed_triangles": int(self.guessed.sum())}),
         }
 
     @property
@@ -143,18 +232,6 @@ class Mesh:
     @cached_property
     def _islands(self) -> NDArray[np.bool_]:
         return mesh_islands.find(self.faces, len(self.vertices))
-
-    def _as_gltf(self) -> Any:
-        """Make the `trimesh.Trimesh` that goes into a GLB file: +Y up, vertex colours as linear light."""
-        turn = np.eye(3) if self.up is None else self.up.to_y()
-        turned = dataclasses.replace(
-            self,
-            vertices=(self.vertices @ turn.T).astype(np.float32),
-            normals=(self.normals @ turn.T).astype(np.float32),
-            colors=None if self.colors is None else _SRGB_TO_LINEAR[self.colors],
-        ).to_trimesh()
-        turned.metadata["up"] = f"map's {_described(self.up)}" + (", here +y" if self.up else "")
-        return turned
 
 
 def summarise(figures: dict[str, Any]) -> str:
@@ -167,21 +244,13 @@ def summarise(figures: dict[str, Any]) -> str:
         word = "island" if figures["islands"] == 1 else "islands"
         pieces = f"{_grouped(figures['islands'])} {word} ({share:.1f} %)"
     vertices, triangles = _grouped(figures["vertices"]), _grouped(figures["triangles"])
-    return f"{vertices} vertices, {triangles} triangles, {extent} m, {pieces}, up {_described(figures['up'])}"
+    if figures.get("guessed_triangles"):
+        triangles += f" triangles ({_grouped(figures['guessed_triangles'])} guessed)"
+    else:
+        triangles += " triangles"
+    up = mesh_encoding.described(figures["up"])
+    return f"{vertices} vertices, {triangles}, {extent} m, {pieces}, up {up}"
 
 
 def _grouped(number: int) -> str:
     return f"{number:,}".replace(",", "\u202f")
-
-
-def _described(up: Up | None) -> str:
-    return "unknown" if up is None else str(up)
-
-
-def _srgb_to_linear() -> NDArray[np.uint8]:
-    s = np.arange(256) / 255
-    linear = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
-    return np.round(linear * 255).astype(np.uint8)
-
-
-_SRGB_TO_LINEAR = _srgb_to_linear()

@@ -5,18 +5,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry import point_files
+from tsfusion.geometry.mesh import FORMATS, Mesh
 from tsfusion.pipelines import mesh_preview
 
 PICTURE = ".png"
-_EXACT = (".ply", ".obj")  # the whole map
+SURFACES = (*FORMATS, *point_files.ONLY_POINTS)
+_EXACT = (".ply", ".obj", *point_files.ONLY_POINTS)  # the whole map
 
 
 def write(mesh: Mesh, files: Sequence[Path], *, keep_islands: bool | None = None) -> dict[str, Any]:
-    """Write PLY, GLB, OBJ or PNG by each file's suffix.
+    """Write a surface, its points (PCD, LAS, LAZ) or a picture (PNG) by each file's suffix.
 
     Args:
-        keep_islands: None = PLY and OBJ keep them, GLB and pictures do not.
+        keep_islands: None = PLY, OBJ and points keep them; GLB, STL and pictures do not.
 
     Returns:
         Number of `islands` left out, their `triangles`, and the names of the `files` without them.
@@ -33,6 +35,8 @@ def write(mesh: Mesh, files: Sequence[Path], *, keep_islands: bool | None = None
             without.append(file.name)
         if suffix == PICTURE:
             mesh_preview.render(chosen, file)
+        elif suffix in point_files.ONLY_POINTS:
+            chosen.save_points(file)
         else:
             chosen.save(file)
     if not without:

@@ -25,8 +25,8 @@ COARSE_FROM = 64.0  # λ that smooths over more voxels than so few iterations re
 NORMAL_SAMPLES = 3  # voxels to each side of the surface: less would be no ray
 
 _KEY_STEP = np.array([1 << 42, 1 << 21, 1], np.int64)  # one block along x, y, z in a packed key
-_AROUND = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]) @ _KEY_STEP
-_SIDES = np.array([sign * step for step in _KEY_STEP for sign in (-1, 1)], np.int64)
+AROUND = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]) @ _KEY_STEP
+SIDES = np.array([sign * step for step in _KEY_STEP for sign in (-1, 1)], np.int64)
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def along_normals(
         part = keys[first : first + BATCH]
         read = around(part, store, 1)
         normal_smoothing.smooth_along_normals(
-            _index(read, part), _index(read, part[:, None] + _AROUND), values_of(read, store, min_weight),
+            index_of(read, part), index_of(read, part[:, None] + AROUND), values_of(read, store, min_weight),
             LEAST_REACH * QUANTA_PER_VOXEL, centre, out[first : first + len(part)],
         )  # fmt: skip
     return out[: len(keys)]
@@ -100,7 +100,7 @@ def spread(keys: NDArray[np.int64], store: BlockStore, settings: FieldSettings) 
 
 
 @dataclass
-class _Level:
+class Level:
     """Listed cells of one resolution: `bits` = log2 of the cells a side of a block."""
 
     bits: int
@@ -112,7 +112,7 @@ class _Level:
     x: NDArray[np.float32]
 
     @classmethod
-    def make(cls, bits: int, number: NDArray[np.int32], counts: NDArray[np.int32]) -> "_Level":
+    def make(cls, bits: int, number: NDArray[np.int32], counts: NDArray[np.int32]) -> "Level":
         total = int(counts.sum())
         y, weight, x = (np.zeros(total + 1, np.float32) for _ in range(3))  # the last stands for "none"
         starts = (np.cumsum(counts) - counts).astype(np.int32)
@@ -126,7 +126,7 @@ class _Level:
         for flat in ([1] if first else []) + [0] * reweightings:
             kernels.reweigh(self.links, self.x, flat, edge, omega)
             kernels.precondition(self.links, self.weight, omega, smoothness, inverse)
-            for keep, gain in _chebyshev():
+            for keep, gain in chebyshev(LOWEST, ITERATIONS):
                 kernels.bend(self.links, self.x, omega, bent)
                 kernels.relax(
                     self.links, self.y, self.weight, inverse, bent, smoothness, keep, gain, step, self.x
@@ -161,16 +161,16 @@ class _Batch:
                 first=depth == coarsest,
             )  # fmt: skip
         finest = self.levels[0]
-        rows = _index(self.keys, self.wanted)
+        rows = index_of(self.keys, self.wanted)
         kernels.write_values(rows, self.values, finest.number, finest.starts, finest.x, solved)
 
-    def _list(self, store: BlockStore) -> list[_Level]:
+    def _list(self, store: BlockStore) -> list[Level]:
         """The voxels near the surface, and their coarser cells."""
         blocks = len(self.keys)
-        sides = _index(self.keys, self.keys[:, None] + _SIDES)
+        sides = index_of(self.keys, self.keys[:, None] + SIDES)
         number, counts = np.empty((blocks, CUBE), np.int32), np.empty(blocks, np.int32)
         kernels.number_voxels(self.values, self.settings.reach * QUANTA_PER_VOXEL, number, counts)
-        fine = _Level.make(3, number, counts)
+        fine = Level.make(3, number, counts)
         kernels.list_voxels(
             self.values, store.slots_of(self.keys), store.sums, sides,
             fine.number, fine.starts, fine.links, fine.y, fine.weight, fine.x,
@@ -180,7 +180,7 @@ class _Batch:
         for _ in range(self.settings.coarser):
             number = np.empty((blocks, fine.number.shape[1] // 8), np.int32)
             kernels.number_parents(fine.bits, fine.number, number, counts)
-            coarse = _Level.make(fine.bits - 1, number, counts)
+            coarse = Level.make(fine.bits - 1, number, counts)
             kernels.list_parents(
                 fine.bits, sides, fine.number, fine.starts, fine.links, fine.y, fine.weight,
                 coarse.number, coarse.starts, coarse.links, coarse.y, coarse.weight, coarse.x,
@@ -190,12 +190,12 @@ class _Batch:
         return levels
 
 
-def _chebyshev() -> Iterator[tuple[float, float]]:
-    """(share of the last step, gain of the residual) of each step, for eigenvalues in [LOWEST, 1]."""
-    middle, half = (1 + LOWEST) / 2, (1 - LOWEST) / 2
+def chebyshev(lowest: float, steps: int) -> Iterator[tuple[float, float]]:
+    """(share of the last step, gain of the residual) of each step, for eigenvalues in [lowest, 1]."""
+    middle, half = (1 + lowest) / 2, (1 - lowest) / 2
     rho = half / middle
     yield 0.0, 1 / middle
-    for _ in range(ITERATIONS - 1):
+    for _ in range(steps - 1):
         last, rho = rho, 1 / (2 * middle / half - rho)
         yield rho * last, 2 * rho / half
 
@@ -203,12 +203,12 @@ def _chebyshev() -> Iterator[tuple[float, float]]:
 def around(keys: NDArray[np.int64], store: BlockStore, rings: int = 1) -> NDArray[np.int64]:
     """The blocks of the map up to so many blocks away, these among them; sorted."""
     for _ in range(rings):
-        keys = np.unique((keys[:, None] + _AROUND).ravel())
+        keys = np.unique((keys[:, None] + AROUND).ravel())
         keys = keys[store.slots_of(keys) >= 0]
     return keys
 
 
-def _index(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int32]:
+def index_of(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int32]:
     """Position of each query in the sorted `keys`, −1 where absent."""
     if not len(keys):
         return np.full(queries.shape, -1, np.int32)

@@ -96,10 +96,20 @@ def extract(
 
 
 def extract_rows(
-    wanted: NDArray[np.int64], store: BlockStore, min_weight: float, buffers: MeshBuffers, view: SurfaceView
+    wanted: NDArray[np.int64],
+    store: BlockStore,
+    min_weight: float,
+    buffers: MeshBuffers,
+    view: SurfaceView,
+    *,
+    keys: NDArray[np.int64] | None = None,
 ) -> tuple[Mesh, NDArray[np.int64]]:
-    """The mesh as of `extract`, and the (n,) keys of the blocks that rows of `buffers` are about."""
-    keys = buffers.keys_around(wanted, store)
+    """The mesh as of `extract`, and the (n,) keys of the blocks that rows of `buffers` are about.
+
+    Args:
+        keys: the wanted blocks and those around them, of which `view` knows more than the map has.
+    """
+    keys = buffers.keys_around(wanted, store) if keys is None else keys
     count = len(keys)
     buffers.reserve(count)
     values = view(keys, store, min_weight, buffers.values.array)

@@ -19,14 +19,17 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.map_answers import PointCloud, Samples, View, checked_camera, checked_points
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_parts import MeshParts, joined
+from tsfusion.geometry.provenance import Provenance
 from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.kernels import integrate
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf import (
     camera_views,
     field_regularizer,
+    hole_filling,
     map_blocks,
     map_difference,
+    map_history,
     point_samples,
     voxel_arrays,
 )
@@ -62,6 +65,8 @@ class ReadableMap:
         min_weight: float | None = None,
         blocks: NDArray[np.int32] | None = None,
         surface: Surface | None = None,
+        *,
+        fill_holes: int | None = None,
     ) -> Mesh:
         """The surface, by marching cubes over the whole map or over the cells of some blocks.
 
@@ -70,9 +75,22 @@ class ReadableMap:
             blocks: (n, 3) int32 block coordinates. A mesh of `cells_to_mesh(take_dirty())` replaces what
                 changed.
             surface: what to mesh instead of what the settings say; for `raw`, `cells_of(take_dirty())` do.
+            fill_holes: close holes and gaps up to so many voxels wide with a guess that continues the field
+                (`tsdf/hole_filling.py`); the mesh's `guessed` says which triangles these are. Of a whole map
+                only, and all of its field has to fit into memory.
+
+        Raises:
+            InvalidConfig: for a value out of range, or `fill_holes` with `blocks`.
         """
         min_weight = self._checked_min_weight(min_weight)
         store = self._store
+        if fill_holes is not None:
+            if blocks is not None:
+                raise InvalidConfig("holes are filled in the mesh of a whole map, not of some blocks")
+            voxels = hole_filling.checked(fill_holes)
+            view = self._view(surface)
+            filled = hole_filling.extract_filled(store, min_weight, view, voxels, self._mesh_buffers)
+            return replace(filled, held=self.held)
         if blocks is None and store.is_in_files and store.count:
             whole = joined(list(tiles(store, min_weight, self._view(surface))))
             return replace(whole, held=self.held)
@@ -101,6 +119,21 @@ class ReadableMap:
         least = self._checked_min_weight(min_weight)
         parts = tiles(self._store, least, self._view(None))
         return MeshParts(parts, Path(folder), held=self.held, known_up=up)
+
+    def provenance(self, source: str | None = None) -> Provenance:
+        """What a file of its surface says about the map; its hash is taken anew.
+
+        Args:
+            source: file or folder that the map came from.
+        """
+        worlds = {one.world for one in map_history.of_clients(map_history.sessions(self.meta)) if one.world}
+        return Provenance(
+            source=source,
+            keyframes=self.keyframes,
+            map_hash=self.map_hash(),
+            world=" ".join(sorted(worlds)),
+            voxel_size=self.config.voxel_size,
+        )
 
     def cells_to_mesh(self, dirty: NDArray[np.int32]) -> NDArray[np.int32]:
         """The blocks whose mesh the changes to these blocks reach: (m, 3) int32.

@@ -185,7 +185,7 @@ class Volume(ReadableMap):
         self.held.merge(other.held)
         self.meta = map_history.added(self.meta, other.meta)
 
-    def crop(self, box: Sequence[float]) -> "Volume":
+    def crop(self, box: Sequence[float], *, most_bytes: int | None = None) -> "Volume":
         """A new map of the voxels whose centres lie in a box, with their sums, colours and smoothed values.
 
         It can be merged, meshed and saved, and takes keyframes, anywhere. A keyframe that was cut can no
@@ -194,12 +194,15 @@ class Volume(ReadableMap):
         Args:
             box: x0, y0, z0, x1, y1, z1 in metres; a centre on the upper side is outside, so that maps of
                 boxes side by side add up to that of both.
+            most_bytes: that the part may take.
 
         Raises:
             InvalidConfig: for another box; MemoryError: when there is no room for both maps.
         """
         first, end = map_crop.voxel_range(box, self.config.voxel_size)
         cropped = Volume(self.config)
+        if most_bytes is not None:
+            cropped.limit_memory(most_bytes)
         map_crop.copy(self._store, cropped._store, first, end)
         cropped.keyframes = self.keyframes if cropped._store.count else 0
         cropped.held = HeldSensor(self.held.numbers)

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: MIT
+"""Cut a mesh along the sides of a box: triangles across a side are cut there, exactly."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import InvalidConfig
+
+if TYPE_CHECKING:
+    from tsfusion.geometry.mesh import Mesh
+
+
+def checked_box(box: Sequence[float]) -> NDArray[np.float64]:
+    """x0, y0, z0, x1, y1, z1 in metres as (2, 3); raises InvalidConfig for anything else."""
+    corners = np.asarray(box, np.float64)
+    if corners.shape != (6,) or not np.isfinite(corners).all() or (corners[3:] <= corners[:3]).any():
+        raise InvalidConfig(f"a box is x0 y0 z0 x1 y1 z1 in metres, the lower corner first, got {list(box)}")
+    return corners.reshape(2, 3)
+
+
+def cropped(mesh: "Mesh", box: Sequence[float]) -> "Mesh":
+    """See `Mesh.cropped`."""
+    low, high = checked_box(box)
+    for axis in range(3):
+        for side, sign in ((low[axis], 1), (high[axis], -1)):
+            mesh = _cut(mesh, axis, np.float32(side), sign)
+    return mesh
+
+
+def _cut(mesh: "Mesh", axis: int, side: np.float32, sign: int) -> "Mesh":
+    """What lies on one side of a plane across an axis."""
+    height = sign * (mesh.vertices[:, axis] - side)
+    kept = height >= 0
+    count = kept[mesh.faces].sum(axis=1)
+    if (count == 3).all():
+        return mesh
+    crossed = np.flatnonzero((count == 1) | (count == 2))
+    # Turned so that corner 0 is the one that is alone on its side
+    faces = mesh.faces[crossed]
+    alone = kept[faces] == (count[crossed] == 1)[:, None]
+    turn = (np.argmax(alone, axis=1)[:, None] + np.arange(3)) % 3
+    a, b, c = np.take_along_axis(faces, turn, axis=1).T
+    edges = np.concatenate((np.stack((a, b), axis=1), np.stack((a, c), axis=1)))
+    mesh, on = _with_cuts(mesh, edges, height, axis, side)
+    ab, ac = on[: len(a)], on[len(a) :]
+    one = count[crossed] == 1
+    tip = np.stack((a, ab, ac), axis=1)[one]
+    base = np.concatenate((np.stack((ab, b, c), axis=1)[~one], np.stack((ab, c, ac), axis=1)[~one]))
+    whole = np.flatnonzero(count == 3)
+    origin = np.concatenate((whole, crossed[one], crossed[~one], crossed[~one]))
+    pieces = np.concatenate((mesh.faces[whole], tip, base)).astype(np.int32)
+    result = dataclasses.replace(
+        mesh, faces=pieces, guessed=None if mesh.guessed is None else mesh.guessed[origin]
+    )
+    return result.of_faces((pieces != pieces[:, [1, 2, 0]]).all(axis=1))  # a corner on the plane leaves none
+
+
+def _with_cuts(
+    mesh: "Mesh",
+    edges: NDArray[np.int32],
+    height: NDArray[np.float32],
+    axis: int,
+    side: np.float32,
+) -> tuple["Mesh", NDArray[np.int64]]:
+    """The mesh with a vertex where each edge meets the plane, and their numbers; an edge has one.
+
+    Where an edge ends on the plane this is its end.
+    """
+    edges, which = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
+    p, q = edges.T
+    share = (height[p] / (height[p] - height[q]))[:, None]
+    vertices = mesh.vertices[p] + share * (mesh.vertices[q] - mesh.vertices[p])
+    vertices[:, axis] = side
+    normals = (1 - share) * mesh.normals[p] + share * mesh.normals[q]
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), mesh.normals[p])
+    colors = mesh.colors
+    if colors is not None:
+        mixed = np.round((1 - share) * colors[p] + share * colors[q]).astype(np.uint8)
+        colors = np.concatenate((colors, mixed))
+    grown = dataclasses.replace(
+        mesh,
+        vertices=np.concatenate((mesh.vertices, vertices.astype(np.float32))),
+        normals=np.concatenate((mesh.normals, normals.astype(np.float32))),
+        colors=colors,
+    )
+    on = np.where(height[p] == 0, p, np.where(height[q] == 0, q, len(mesh.vertices) + np.arange(len(edges))))
+    return grown, on[which.reshape(-1)]

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: MIT
+"""Fewer triangles by collapsing edges in the order of their quadric error (Garland and Heckbert, 1997), by
+the library `fast-simplification`. Borders stay as they are; each vertex gets the mean colour and normal of
+those that became one with it."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import InvalidConfig, MissingDependency
+
+if TYPE_CHECKING:
+    from tsfusion.geometry.mesh import Mesh
+
+_INSTALL = "to simplify a mesh: pip install fast-simplification (or tsfusion[mesh])"
+_RISE = 5.0  # how fast the allowed error rises when a number of triangles is wanted
+_ALLOWED = 1e-9  # the library's first allowed error, squared units: lengths are scaled to it
+_CHUNK = 1 << 18  # vertices whose deviation is measured at once
+
+
+def simplified(
+    mesh: "Mesh", *, ratio: float | None, triangles: int | None, max_error: float | None
+) -> "Mesh":
+    """See `Mesh.simplified`."""
+    if [ratio, triangles, max_error].count(None) != 2:
+        raise InvalidConfig("a mesh is simplified to a ratio, a number of triangles or a max_error: give one")
+    if ratio is not None and not 0 < ratio <= 1:
+        raise InvalidConfig(f"ratio must be > 0 and ≤ 1, got {ratio}")
+    if triangles is not None and triangles < 1:
+        raise InvalidConfig(f"triangles must be ≥ 1, got {triangles}")
+    if max_error is not None and not 0 < max_error < np.inf:
+        raise InvalidConfig(f"max_error must be > 0 m, got {max_error}")
+    total = len(mesh.faces)
+    if triangles is not None:
+        ratio = min(triangles / max(total, 1), 1.0)
+    if not total or ratio == 1:
+        return mesh
+    guessed = np.zeros(total, bool) if mesh.guessed is None else mesh.guessed
+    parts = [mesh.of_faces(which) for which in (~guessed, guessed) if which.any()]
+    return _joined([_reduced(part, ratio, max_error) for part in parts], mesh)
+
+
+def library() -> Any:
+    """The module `fast_simplification`; raises MissingDependency where it is not installed."""
+    try:
+        import fast_simplification
+    except ImportError as error:
+        raise MissingDependency(_INSTALL) from error
+    return fast_simplification
+
+
+def _reduced(mesh: "Mesh", ratio: float | None, max_error: float | None) -> "Mesh":
+    """One part with its border locked."""
+    fast_simplification = library()
+    points = mesh.vertices.astype(np.float64)
+    wanted: dict[str, Any] = {"target_count": 0, "agg": 0.0}
+    if max_error is not None:
+        points *= _ALLOWED**0.5 / max_error
+    elif ratio is not None:
+        # With its border kept a mesh has at least so many; close to it triangles would be torn long
+        least = 2 * len(border_edges(mesh.faces))
+        wanted = {"target_count": max(int(ratio * len(mesh.faces)), least), "agg": _RISE}
+        if wanted["target_count"] >= len(mesh.faces):
+            return mesh
+    *_, collapses = fast_simplification.simplify(
+        points, mesh.faces, preserve_border=True, return_collapses=True, **wanted
+    )
+    vertices, faces, became = fast_simplification.replay_simplification(points, mesh.faces, collapses)
+    if max_error is not None:
+        vertices = vertices * (max_error / _ALLOWED**0.5)
+    return _with_means(mesh, vertices.astype(np.float32), faces.astype(np.int32), became)
+
+
+def _with_means(
+    full: "Mesh", vertices: NDArray[np.float32], faces: NDArray[np.int32], became: NDArray[np.int64]
+) -> "Mesh":
+    """The simplified mesh; each vertex with the mean of the vertices that became it."""
+    used = became >= 0
+    count = np.bincount(became[used], minlength=len(vertices))
+
+    def mean(of: NDArray[Any]) -> NDArray[np.float64]:
+        sums = [np.bincount(became[used], column[used], len(vertices)) for column in of.T.astype(np.float64)]
+        return np.stack(sums, axis=1) / np.maximum(count, 1)[:, None]
+
+    normals = mean(full.normals)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), (0.0, 0.0, 1.0))
+    colors = None if full.colors is None else np.round(mean(full.colors)).astype(np.uint8)
+    guessed = None if full.guessed is None else np.full(len(faces), full.guessed[0])
+    result = dataclasses.replace(
+        full, vertices=vertices, faces=faces, normals=normals.astype(np.float32), colors=colors,
+        guessed=guessed, known_up=full.known_up,
+    )  # fmt: skip
+    return result.of_faces(np.ones(len(faces), bool))
+
+
+def _joined(parts: list["Mesh"], like: "Mesh") -> "Mesh":
+    """Seen and guessed triangles as one mesh; vertices at the same place are one again."""
+    if len(parts) == 1:
+        return parts[0]
+    vertices = np.concatenate([part.vertices for part in parts])
+    _, first, same = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    number = np.empty(len(first), np.int64)
+    order = np.argsort(first)
+    number[order] = np.arange(len(first))
+    kept, same = first[order], number[same.reshape(-1)]
+    offset = len(parts[0].vertices)
+    faces = np.concatenate([parts[0].faces, parts[1].faces + offset])
+    colors = [part.colors for part in parts if part.colors is not None]
+    return dataclasses.replace(
+        like,
+        vertices=vertices[kept],
+        faces=same[faces].astype(np.int32),
+        normals=np.concatenate([part.normals for part in parts])[kept],
+        colors=np.concatenate(colors)[kept] if colors else None,
+        guessed=np.concatenate([part.guessed for part in parts if part.guessed is not None]),
+        known_up=like.known_up,
+    )
+
+
+def border_edges(faces: NDArray[np.int32]) -> NDArray[np.int32]:
+    """(n, 2) edges that one triangle has alone."""
+    edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
+    key = edges.min(axis=1).astype(np.int64) << 32 | edges.max(axis=1)
+    _, first, count = np.unique(key, return_index=True, return_counts=True)
+    alone: NDArray[np.int32] = edges[first[count == 1]]
+    return alone

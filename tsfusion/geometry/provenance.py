@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: MIT
+"""What a file of a surface says about itself, for whoever gets it without its map."""
+
+from dataclasses import dataclass
+
+GENERATOR = "tsfusion"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """Where a surface comes from; None = it is not known.
+
+    Attributes:
+        source: file, folder or address of the map.
+        keyframes: number that the map was made from.
+        map_hash: `map_hash()` of the map.
+        world: coordinate frames of its scans; empty = poses were given from elsewhere.
+        voxel_size: metres.
+    """
+
+    source: str | None = None
+    keyframes: int | None = None
+    map_hash: str | None = None
+    world: str | None = None
+    voxel_size: float | None = None
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """What is known, by name, as text of one line each."""
+        facts = {
+            "source": self.source,
+            "keyframes": self.keyframes,
+            "map_hash": self.map_hash,
+            "world": self.world or None,
+            "voxel_size_m": self.voxel_size,
+        }
+        return {name: " ".join(str(value).split()) for name, value in facts.items() if value is not None}
+
+
+def generator() -> str:
+    """Name and version of this program."""
+    from tsfusion import __version__
+
+    return f"{GENERATOR} {__version__}"

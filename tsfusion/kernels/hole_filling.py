@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: MIT
+"""The field carried into voxels that nobody saw, near where a surface breaks off (`tsdf/hole_filling.py`).
+
+Unseen voxels near a rim and the seen ones beside them are numbered into one list, as for the field
+regulariser, whose `bend` and `relax` then solve it: paper eq. 3 with no weight where nothing was seen.
+"""
+
+import taichi as ti
+
+from tsfusion.kernels.field_smoothing import neighbour
+from tsfusion.kernels.integrate import CUBE
+from tsfusion.kernels.normal_smoothing import value_at
+from tsfusion.kernels.surface_cells import case_of, corner_planes, lowest
+from tsfusion.kernels.voxel_traversal import RUN, vec3i
+from tsfusion.kernels.voxel_values import BANDS
+
+UNSEEN = 1  # voxels to solve
+FIXED = 2  # seen voxels beside them
+HELD = 1e6  # weight of a value that stays as it is, in units of the smoothness
+EARLY = 1 << 20  # layer of a voxel that has no value yet
+
+
+@ti.func
+def voxel_of(o):
+    return vec3i(o >> 6, (o >> 3) & 7, o & 7)
+
+
+@ti.kernel
+def find_rims(
+    around: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (blocks, 27): rows of the blocks around, −1 = none
+    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    rims: ti.types.ndarray(dtype=ti.u8, ndim=2),
+):
+    """1 for each seen voxel that the surface passes and that has an unseen one among the 26 around."""
+    for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
+        if run % RUN == 0:
+            b = run // RUN
+            for o in range(CUBE):
+                here = values[b, o]
+                is_rim = 0
+                if here == here:
+                    p = voxel_of(o)
+                    crossed = 0
+                    for side in ti.static(range(6)):
+                        q = p
+                        q[side // 2] += 2 * (side % 2) - 1
+                        there = value_at(values, around, b, q)
+                        crossed |= ti.cast(
+                            (there < 0.0 and here >= 0.0) or (there >= 0.0 and here < 0.0), ti.i32
+                        )
+                    if crossed == 1:
+                        for n in range(27):
+                            q = p + vec3i(n // 9 - 1, n // 3 % 3 - 1, n % 3 - 1)
+                            there = value_at(values, around, b, q)
+                            if not (there == there):
+                                is_rim = 1
+                rims[b, o] = ti.cast(is_rim, ti.u8)
+
+
+@ti.func
+def row_of(keys: ti.template(), count, key):
+    """Position of a key in the sorted keys, −1 where absent."""
+    low = 0
+    high = count
+    while low < high:
+        middle = (low + high) // 2
+        if keys[middle] < key:
+            low = middle + 1
+        else:
+            high = middle
+    found = -1
+    if low < count and keys[ti.min(low, count - 1)] == key:
+        found = low
+    return found
+
+
+@ti.kernel
+def mark_unseen(
+    keys: ti.types.ndarray(dtype=ti.i64, ndim=1),  # sorted
+    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    rims: ti.types.ndarray(dtype=ti.u8, ndim=2),
+    columns: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (n, 3) of a ball: x, y, and how far it reaches in z
+    marks: ti.types.ndarray(dtype=ti.u8, ndim=2),
+):
+    """Mark the unseen voxels in a ball around each rim voxel. Threads that meet write the same."""
+    count = values.shape[0]
+    for run in range(count * RUN):  # run loop: kernels/__init__.py
+        if run % RUN == 0:
+            b = run // RUN
+            for o in range(CUBE):
+                if rims[b, o] == 1:
+                    p = voxel_of(o)
+                    for c in range(columns.shape[0]):
+                        x = p[0] + columns[c, 0]
+                        y = p[1] + columns[c, 1]
+                        column = keys[b] + (ti.cast(x >> 3, ti.i64) << 42) + (ti.cast(y >> 3, ti.i64) << 21)
+                        block = -1
+                        last = 1 << 20
+                        for z in range(p[2] - columns[c, 2], p[2] + columns[c, 2] + 1):
+                            if z >> 3 != last:
+                                last = z >> 3
+                                block = row_of(keys, count, column + last)
+                            if block >= 0:
+                                i = ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)
+                                there = values[block, i]
+                                if not (there == there):
+                                    marks[block, i] = ti.u8(UNSEEN)
+
+
+@ti.kernel
+def number_marked(
+    around: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    marks: ti.types.ndarray(dtype=ti.u8, ndim=2),
+    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """Number the voxels to solve and the seen ones up to two before or behind them along an axis."""
+    for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
+        if run % RUN == 0:
+            b = run // RUN
+            n = 0
+            for o in range(CUBE):
+                taken = ti.cast(marks[b, o], ti.i32)
+                if taken == 0 and values[b, o] == values[b, o]:
+                    for k in range(12):
+                        q = voxel_of(o)
+                        q[k // 4] += (k % 4 - 2) + ti.cast(k % 4 >= 2, ti.i32)
+                        row = around[b, ((q[0] >> 3) + 1) * 9 + ((q[1] >> 3) + 1) * 3 + (q[2] >> 3) + 1]
+                        if row >= 0:
+                            i = ((q[0] & 7) << 6) | ((q[1] & 7) << 3) | (q[2] & 7)
+                            if marks[row, i] == UNSEEN:
+                                taken = FIXED
+                number[b, o] = ti.select(taken > 0, n, -1)
+                n += ti.cast(taken > 0, ti.i32)
+            counts[b] = n
+
+
+@ti.kernel
+def list_marked(
+    sides: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (blocks, 6): −x, +x, −y, +y, −z, +z; −1 = none
+    values: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    marks: ti.types.ndarray(dtype=ti.u8, ndim=2),
+    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    y: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    weight: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    layer: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """Fill the list: the value and weight of each seen voxel, none of the others, and the neighbours."""
+    for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
+        if run % RUN == 0:
+            b = run // RUN
+            for o in range(CUBE):
+                k = number[b, o]
+                if k >= 0:
+                    i = starts[b] + k
+                    seen = marks[b, o] != UNSEEN
+                    value = ti.select(seen, values[b, o], 0.0)
+                    y[i] = value
+                    x[i] = value
+                    weight[i] = ti.select(seen, ti.f32(HELD), 0.0)
+                    layer[i] = ti.select(seen, 0, EARLY)
+                    for side in ti.static(range(6)):
+                        links[i, side] = neighbour(
+                            number, starts, sides, 3, b, o, side // 2, side % 2, links.shape[0]
+                        )
+
+
+@ti.kernel
+def extend(
+    sweep: ti.i32,
+    links: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    layer: ti.types.ndarray(dtype=ti.i32, ndim=1),  # the last of it, as of `x`, stands for none
+    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+) -> ti.i32:
+    """Give a first value to voxels beside those that have one: the mean of what ramps and neighbours say.
+
+    Returns how many got one.
+    """
+    given = 0
+    for i in range(links.shape[0]):
+        if layer[i] == EARLY:
+            total = ti.f32(0.0)
+            count = ti.f32(0.0)
+            for side in ti.static(range(6)):
+                m = links[i, side]
+                if layer[m] < sweep:
+                    value = x[m]
+                    far = links[ti.min(m, links.shape[0] - 1), side]
+                    if layer[far] < sweep:
+                        value += x[m] - x[far]
+                    total += value
+                    count += 1.0
+            if count > 0.0:
+                x[i] = total / count
+                layer[i] = sweep
+                given += 1
+    return given
+
+
+@ti.kernel
+def write_marked(
+    rows: ti.types.ndarray(dtype=ti.i32, ndim=1),  # of the listed blocks, which of them to write
+    marks: ti.types.ndarray(dtype=ti.u8, ndim=2),
+    number: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    layer: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    x: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    filled: ti.types.ndarray(dtype=ti.f32, ndim=2),
+):
+    """Values of the voxels that were solved; NaN elsewhere."""
+    for run in range(rows.shape[0] * RUN):  # run loop: kernels/__init__.py
+        if run % RUN == 0:
+            r = run // RUN
+            b = rows[r]
+            for o in range(CUBE):
+                value = ti.math.nan
+                if marks[b, o] == UNSEEN:
+                    i = starts[b] + number[b, o]
+                    if layer[i] != EARLY:
+                        value = x[i]
+                filled[r, o] = value
+
+
+@ti.kernel
+def mark_guessed_faces(
+    count: ti.i32,
+    around: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    unseen: ti.types.ndarray(dtype=ti.u64, ndim=2),  # (row, 8): planes, as in `surface_cells`
+    inside: ti.types.ndarray(dtype=ti.u64, ndim=2),
+    active: ti.types.ndarray(dtype=ti.u64, ndim=2),
+    first: ti.types.ndarray(dtype=ti.i32, ndim=2),
+    triangle_count: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    guessed: ti.types.ndarray(dtype=ti.u8, ndim=1),
+):
+    """1 for each triangle, in the order of `emit_faces`, of a cell with a corner that nobody saw."""
+    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
+        if run % RUN == 0:
+            band = run // RUN
+            for r in range(count * band // BANDS, count * (band + 1) // BANDS):
+                face = first[r, 1]
+                if face < first[r + 1, 1]:
+                    low = corner_planes(inside, around, r, 0)
+                    guess_low = corner_planes(unseen, around, r, 0)
+                    for x in range(8):
+                        high = corner_planes(inside, around, r, x + 1)
+                        guess_high = corner_planes(unseen, around, r, x + 1)
+                        any_guess = ti.u64(0)
+                        for c in ti.static(range(4)):
+                            any_guess |= guess_low[c] | guess_high[c]
+                        left = active[r, x]
+                        while left != 0:
+                            j = lowest(left)
+                            left &= left - ti.u64(1)
+                            is_guess = (any_guess >> ti.cast(j, ti.u64)) & ti.u64(1)
+                            for _ in range(triangle_count[case_of(low, high, j)]):
+                                guessed[face] = ti.cast(is_guess, ti.u8)
+                                face += 1
+                        low = high
+                        guess_low = guess_high

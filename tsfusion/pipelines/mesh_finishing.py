@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: MIT
+"""What is done to a mesh before it is shared: cut to a box, without crumbs, with fewer triangles."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+from tsfusion.core.errors import InvalidConfig, OutputError
+from tsfusion.geometry import mesh_cropping, mesh_islands, mesh_simplification
+from tsfusion.geometry.mesh import GUESS_COLOR, Mesh
+
+if TYPE_CHECKING:
+    from tsfusion.tsdf.volume import Volume
+
+_MARGIN = 128  # voxels around a box that its surface depends on
+Box = tuple[float, float, float, float, float, float]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Finishing:
+    """Steps, in this order; None = left out.
+
+    Attributes:
+        crop: x0, y0, z0, x1, y1, z1 in metres.
+        min_component: metres from corner to corner of the box around a piece: smaller ones go.
+        simplify: arguments of `Mesh.simplified`.
+        mark_guesses: guessed triangles get a colour of their own.
+    """
+
+    crop: Box | None = None
+    min_component: float | None = None
+    simplify: dict[str, float] | None = None
+    mark_guesses: bool = False
+
+    @property
+    def is_nothing(self) -> bool:
+        """Whether a mesh stays as it is."""
+        return self == Finishing()
+
+    def apply(self, mesh: Mesh) -> tuple[Mesh, dict[str, Any]]:
+        """The finished mesh, and how many `islands` with how many `triangles` were left out.
+
+        Raises:
+            OutputError: when nothing is left.
+        """
+        left_out = {"islands": 0, "triangles": 0}
+        if self.crop is not None and len(mesh.faces):
+            mesh = _not_empty(mesh.cropped(self.crop), "nothing of the mesh lies in this box")
+        if self.min_component is not None and len(mesh.faces):
+            whole, islands = mesh, mesh.islands(self.min_component)
+            mesh = mesh.without_islands(self.min_component)
+            _not_empty(mesh, f"no piece of the mesh is {self.min_component:g} m across")
+            left_out = whole.count_islands(islands)
+        if self.simplify is not None:
+            mesh = mesh.simplified(**self.simplify)  # type: ignore[arg-type]
+        return mesh.with_guesses_marked() if self.mark_guesses else mesh, left_out
+
+    def legend(self, mesh: Mesh) -> list[dict[str, str]]:
+        """What the colour of guesses means, where there are any."""
+        if not self.mark_guesses or mesh.guessed is None:
+            return []
+        return [{"color": "#{:02x}{:02x}{:02x}".format(*GUESS_COLOR), "name": "guessed: nobody saw this"}]
+
+
+def checked(
+    *,
+    crop: Box | None,
+    min_component: float | None,
+    fill_holes: int | None,
+    simplify: str | None,
+    mark_guesses: bool,
+) -> Finishing:
+    """What a person asked for.
+
+    Raises:
+        InvalidConfig: for a value that is none, before anything takes time.
+        MissingDependency: without the library that simplifies.
+    """
+    if crop is not None:
+        mesh_cropping.checked_box(crop)
+    if min_component is not None:
+        mesh_islands.checked_extent(min_component)
+    if fill_holes is not None:
+        from tsfusion.tsdf import hole_filling  # Taichi: a mesh of a server needs none
+
+        hole_filling.checked(fill_holes)
+    if mark_guesses and fill_holes is None:
+        raise InvalidConfig("--mark-guesses paints what --fill-holes guesses: give that, too")
+    target = simplification(simplify)
+    if target is not None:
+        mesh_simplification.library()
+    return Finishing(crop=crop, min_component=min_component, simplify=target, mark_guesses=mark_guesses)
+
+
+def part_around(volume: "Volume", box: Box, most_bytes: int) -> "Volume":
+    """The part of a large map that the mesh in a box is made from.
+
+    Raises:
+        OutputError: when even this is too large.
+    """
+    margin = _MARGIN * volume.config.voxel_size
+    around = [*(low - margin for low in box[:3]), *(high + margin for high in box[3:])]
+    try:
+        return volume.crop(around, most_bytes=most_bytes)
+    except MemoryError as error:
+        raise OutputError(f"the map in this box is too large for memory, too: {error}") from error
+
+
+def simplification(text: str | None) -> dict[str, float] | None:
+    """Arguments of `Mesh.simplified` for `0.25` or `25%` (ratio), `50000` (triangles), `5mm` (largest error).
+
+    Raises:
+        InvalidConfig: for anything else.
+    """
+    if text is None:
+        return None
+    units = {
+        "mm": ("max_error", 1e-3),
+        "cm": ("max_error", 1e-2),
+        "%": ("ratio", 1e-2),
+        "m": ("max_error", 1.0),
+    }
+    unit = next((unit for unit in units if text.endswith(unit)), "")
+    try:
+        number = float(text.removesuffix(unit))
+    except ValueError:
+        number = -1.0
+    if unit and number > 0:
+        name, scale = units[unit]
+        return {name: number * scale}
+    if 0 < number < 1:
+        return {"ratio": number}
+    if number >= 1 and number == int(number):
+        return {"triangles": int(number)}
+    raise InvalidConfig(
+        "a mesh is simplified to a share (0.25 or 25%), a number of triangles (50000) or an error (5mm), "
+        f"got {text!r}"
+    )
+
+
+def _not_empty(mesh: Mesh, why: str) -> Mesh:
+    if not len(mesh.faces):
+        raise OutputError(f"nothing to write: {why}")
+    return mesh

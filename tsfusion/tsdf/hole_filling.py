@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: MIT
+"""Holes closed by the field: a guess of the surface where nothing was seen, and which triangles are guessed.
+
+1. A rim is where a surface breaks off: a seen voxel that it passes, beside an unseen one.
+2. The unseen voxels within half a hole of a rim get values: paper eq. 3 with seen voxels held and no weight
+   elsewhere, so that second differences are least; a plane or a ramp goes on as it is.
+3. Marching cubes meshes seen and guessed voxels together. A triangle is guessed if its cell has a voxel that
+   nobody saw; all others are those of the mesh without guesses.
+4. A guessed patch stays if it closes: none of its edges may be free. At the border of a scan and in a
+   hole that is too wide the patches end in free edges, and go.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import InvalidConfig
+from tsfusion.geometry import mesh_islands
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.kernels import field_smoothing, marching_tables
+from tsfusion.kernels import hole_filling as kernels
+from tsfusion.kernels.integrate import CUBE
+from tsfusion.tsdf import field_regularizer
+from tsfusion.tsdf.block_store import BlockStore
+from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract_rows
+from tsfusion.tsdf.surface_values import SurfaceView
+
+MOST_VOXELS = 64
+BATCH = 4096  # blocks solved at once, beside their halo
+_STIFFEST = 48.0  # most that the operator of the preconditioner's units has: 4 · 4 an axis
+_SOFTEST = 500.0  # least eigenvalue of D2ᵀD2 between two held ends, times the distance⁴: (4.73)⁴
+_TOLERANCE = 1e-3  # of the first guess's error
+
+
+def checked(voxels: int) -> int:
+    """The width of holes to close; raises InvalidConfig for one that is none."""
+    if not 1 <= voxels <= MOST_VOXELS:
+        raise InvalidConfig(f"holes are filled up to 1 to {MOST_VOXELS} voxels, got {voxels}")
+    return voxels
+
+
+def extract_filled(
+    store: BlockStore, min_weight: float, view: SurfaceView, voxels: int, buffers: MeshBuffers
+) -> Mesh:
+    """The mesh of the whole map with its holes up to so many voxels closed; `guessed` says where."""
+    own = np.sort(store.keys)
+    seen = view(own, store, min_weight)
+    more, filled = _fill(own, seen, voxels)
+    union = np.union1d(own, more)
+
+    def both(
+        keys: NDArray[np.int64],
+        store: BlockStore,
+        min_weight: float,
+        out: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        assert out is not None  # `mesh_extraction` has rows for them
+        out[: len(keys)] = np.nan
+        out[np.searchsorted(keys, own)] = seen
+        if keys is union:
+            at = np.searchsorted(keys, more)
+            out[at] = np.where(np.isnan(filled), out[at], filled)
+        return out[: len(keys)]
+
+    try:
+        plain, _ = extract_rows(own, store, min_weight, buffers, both, keys=own)
+        mesh, _ = extract_rows(union, store, min_weight, buffers, both, keys=union)
+        unseen = np.zeros((len(union) + 1, 8), np.uint64)
+        bits = np.packbits(~np.isnan(filled), axis=1, bitorder="little")
+        unseen[np.searchsorted(union, more)] = bits.view("<u8")
+        guessed = np.zeros(len(mesh.faces), np.uint8)
+        kernels.mark_guessed_faces(
+            len(union), buffers.around.array, unseen, buffers.inside.array, buffers.active.array,
+            buffers.first.array, marching_tables.TRIANGLE_COUNT, guessed,
+        )  # fmt: skip
+    finally:
+        buffers.release()
+    seen_vertices = np.unique(mesh.faces[guessed == 0])
+    mesh.normals[seen_vertices] = plain.normals  # not bent by what was guessed beside them
+    return _with_colors(_closing(replace(mesh, guessed=guessed.astype(bool))))
+
+
+def _fill(
+    keys: NDArray[np.int64], seen: NDArray[np.float32], voxels: int
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Sorted keys of blocks with guessed values, and their (n, 512) values; NaN where nothing is guessed."""
+    rims = np.zeros((len(keys), CUBE), np.uint8)
+    kernels.find_rims(_rows(keys, keys[:, None] + field_regularizer.AROUND), seen, rims)
+    rings = math.ceil(_reach(voxels) / 8)
+    wanted = _spread(keys[rims.any(axis=1)], rings)
+    found_keys, found = [keys[:0]], [np.zeros((0, CUBE), np.float32)]
+    for first in range(0, len(wanted), BATCH):
+        part = wanted[first : first + BATCH]
+        local = _spread(part, rings + 1)
+        local = local[np.isin(local, wanted) | np.isin(local, keys)]
+        filled = _solve(part, local, *_taken(local, keys, seen, rims), voxels)
+        used = ~np.isnan(filled).all(axis=1)
+        found_keys.append(part[used])
+        found.append(filled[used])
+    return np.concatenate(found_keys), np.concatenate(found)
+
+
+def _taken(
+    local: NDArray[np.int64], keys: NDArray[np.int64], seen: NDArray[np.float32], rims: NDArray[np.uint8]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Values and rims of some blocks; nothing was seen in those that the map does not have."""
+    at = _rows(keys, local)
+    values, marks = np.full((len(local), CUBE), np.nan, np.float32), np.zeros((len(local), CUBE), np.uint8)
+    values[at >= 0], marks[at >= 0] = seen[at[at >= 0]], rims[at[at >= 0]]
+    return values, marks
+
+
+def _solve(
+    part: NDArray[np.int64],
+    local: NDArray[np.int64],
+    values: NDArray[np.float32],
+    rims: NDArray[np.uint8],
+    voxels: int,
+) -> NDArray[np.float32]:
+    """Guessed values of the blocks `part`, from those of the blocks `local` around them."""
+    marks = np.zeros((len(local), CUBE), np.uint8)
+    kernels.mark_unseen(local, values, rims, _ball(voxels), marks)
+    number, counts = np.empty((len(local), CUBE), np.int32), np.empty(len(local), np.int32)
+    around = _rows(local, local[:, None] + field_regularizer.AROUND)
+    kernels.number_marked(around, values, marks, number, counts)
+    level = field_regularizer.Level.make(3, number, counts)
+    layer = np.full(len(level.x), kernels.EARLY, np.int32)
+    sides = _rows(local, local[:, None] + field_regularizer.SIDES)
+    kernels.list_marked(
+        sides, values, marks, level.number, level.starts, level.links, level.y, level.weight, level.x, layer
+    )
+    layer[-1] = kernels.EARLY
+    sweep = 1
+    while len(level.links) and kernels.extend(sweep, level.links, layer, level.x):
+        sweep += 1
+    if len(level.links):
+        _relax(level, voxels)
+    filled = np.empty((len(part), CUBE), np.float32)
+    kernels.write_marked(_rows(local, part), marks, level.number, level.starts, layer, level.x, filled)
+    return filled
+
+
+def _relax(level: "field_regularizer.Level", voxels: int) -> None:
+    """Least second differences between the held values: as many steps as a hole of this width needs."""
+    total = len(level.x)
+    omega, bent = np.zeros((total, 3), np.float32), np.zeros((total, 3), np.float32)
+    inverse, step = np.zeros(total, np.float32), np.zeros(total, np.float32)
+    field_smoothing.reweigh(level.links, level.x, 1, 1.0, omega)
+    field_smoothing.precondition(level.links, level.weight, omega, 1.0, inverse)
+    inverse[~np.isfinite(inverse)] = 0.0  # a voxel without any second difference stays as it is
+    lowest = _SOFTEST / _STIFFEST / (voxels + 2) ** 4
+    steps = math.ceil(0.5 * math.log(2 / _TOLERANCE) / math.sqrt(lowest))
+    for keep, gain in field_regularizer.chebyshev(lowest, steps):
+        field_smoothing.bend(level.links, level.x, omega, bent)
+        field_smoothing.relax(
+            level.links, level.y, level.weight, inverse, bent, 1.0, keep, gain, step, level.x
+        )
+
+
+def _closing(mesh: Mesh) -> Mesh:
+    """The mesh without the guessed patches that have a free edge, or that touch nothing that was seen."""
+    assert mesh.guessed is not None
+    guess = np.flatnonzero(mesh.guessed)
+    faces = mesh.faces[guess]
+    edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
+    owner = np.tile(np.arange(len(guess), dtype=np.int32), 3)
+    key = _edge_keys(edges)
+    order = np.argsort(key, kind="stable")
+    same = key[order][1:] == key[order][:-1]
+    patch = mesh_islands.linked(owner[order][1:][same], owner[order][:-1][same], len(guess))
+    alone = np.ones(len(key), bool)
+    alone[1:] &= ~same
+    alone[:-1] &= ~same
+    rim = order[alone]  # edges that one guessed triangle has
+    is_attached = np.isin(key[rim], _edge_keys(_edges_at(mesh, np.unique(edges[rim]))))
+    keeps = np.zeros(len(guess), bool)
+    keeps[patch[owner[rim[is_attached]]]] = True
+    keeps[patch[owner[rim[~is_attached]]]] = False
+    kept = ~mesh.guessed
+    kept[guess] = keeps[patch]
+    closed = mesh.of_faces(kept)
+    return closed if keeps[patch].any() else replace(closed, guessed=None)
+
+
+def _edges_at(mesh: Mesh, vertices: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Edges of the seen triangles that touch any of these vertices."""
+    assert mesh.guessed is not None
+    touched = np.zeros(len(mesh.vertices), bool)
+    touched[vertices] = True
+    faces = mesh.faces[~mesh.guessed & touched[mesh.faces].any(axis=1)]
+    return np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
+
+
+def _edge_keys(edges: NDArray[np.int32]) -> NDArray[np.int64]:
+    keys: NDArray[np.int64] = edges.min(axis=1).astype(np.int64) << 32 | edges.max(axis=1)
+    return keys
+
+
+def _with_colors(mesh: Mesh) -> Mesh:
+    """Colours of the guessed surface: those of its rim, diffused inward."""
+    if mesh.guessed is None or mesh.colors is None:
+        return mesh
+    known = np.zeros(len(mesh.vertices), bool)
+    known[mesh.faces[~mesh.guessed]] = True
+    faces = mesh.faces[mesh.guessed]
+    edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
+    a, b = np.unique(np.concatenate((edges, edges[:, ::-1])), axis=0).T
+    a, b = a[~known[a]], b[~known[a]]
+    colors = mesh.colors.astype(np.float64)
+    has = known.copy()
+    for _ in range(4 * MOST_VOXELS):
+        use = has[b]
+        count = np.bincount(a[use], minlength=len(known))
+        sums = [np.bincount(a[use], colors[b[use], channel], len(known)) for channel in range(3)]
+        reached = count > 0
+        change = np.stack(sums, axis=1)[reached] / count[reached, None] - colors[reached]
+        colors[reached] += change
+        if (reached <= has).all() and (not len(change) or np.abs(change).max() < 0.5):
+            break
+        has |= reached
+    return replace(mesh, colors=np.round(colors).astype(np.uint8))
+
+
+def _reach(voxels: int) -> float:
+    """Voxels from a rim to the middle of the widest hole, and half a voxel along the normal."""
+    return (voxels + 1) / 2 + 0.5
+
+
+def _ball(voxels: int) -> NDArray[np.int32]:
+    """(n, 3) columns of the ball that is marked around a rim: x, y, and how far it reaches up and down."""
+    radius = _reach(voxels)
+    n = int(radius)
+    x, y = np.mgrid[-n : n + 1, -n : n + 1].reshape(2, -1)
+    left = radius**2 - x**2 - y**2
+    inside = left >= 0
+    return np.stack((x[inside], y[inside], np.sqrt(left[inside])), axis=1).astype(np.int32)
+
+
+def _spread(keys: NDArray[np.int64], rings: int) -> NDArray[np.int64]:
+    """Keys of the blocks up to so many blocks away, whether the map has them or not; sorted."""
+    for _ in range(rings):
+        keys = np.unique((keys[:, None] + field_regularizer.AROUND).ravel())
+    return keys
+
+
+def _rows(keys: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int32]:
+    return field_regularizer.index_of(keys, queries)
