@@ -33,9 +33,9 @@ def _ply(mesh: "Mesh") -> bytes:
     shape = mesh.to_trimesh()
     if mesh.guessed is not None:
         shape.face_attributes["guessed"] = mesh.guessed.astype(np.uint8)
-    content: bytes = shape.export(file_type="ply", vertex_normal=True)
+    content = bytes(shape.export(file_type="ply", vertex_normal=True))
     head, before, rest = content.partition(_PLY_FORMAT)
-    return head + before + _lines(mesh, b"comment ") + rest
+    return b"".join((head, before, _lines(mesh, b"comment "), rest))
 
 
 def _obj(mesh: "Mesh") -> bytes:
@@ -52,7 +52,7 @@ def _stl(mesh: "Mesh") -> bytes:
         return content
     facets = np.frombuffer(content, _STL_FACET, offset=_STL_HEADER + 4).copy()
     facets["attribute"] = mesh.guessed
-    return content[: _STL_HEADER + 4] + facets.tobytes()
+    return content[: _STL_HEADER + 4] + bytes(facets.tobytes())
 
 
 def _glb(mesh: "Mesh") -> bytes:
