@@ -14,7 +14,7 @@ from tsfusion.core.errors import InvalidConfig, MissingDependency
 if TYPE_CHECKING:
     from tsfusion.geometry.mesh import Mesh
 
-_INSTALL = "to simplify a mesh: pip install fast-simplification (or tsfusion[mesh])"
+_INSTALL = "to simplify a mesh: pip install fast-simplification (or '.[mesh]')"
 _RISE = 5.0  # how fast the allowed error rises when a number of triangles is wanted
 _ALLOWED = 1e-9  # the library's first allowed error, squared units: lengths are scaled to it
 _CHUNK = 1 << 18  # vertices whose deviation is measured at once

@@ -17,7 +17,7 @@ from tsfusion.core.errors import MissingDependency, OutputError
 
 FORMATS = (".ply", ".pcd", ".las", ".laz")
 ONLY_POINTS = (".pcd", ".las", ".laz")  # formats that hold no triangles
-_INSTALL = "to write LAS or LAZ: pip install 'laspy[lazrs]' (or tsfusion[mesh])"
+_INSTALL = "to write LAS or LAZ: pip install 'laspy[lazrs]' (or '.[mesh]')"
 _LAS_STEP = 1e-5  # metres; int32 then reaches 21 km
 _LAS_FARTHEST = 2**31 * _LAS_STEP
 _RECORD = 4711  # of our own user id

@@ -19,6 +19,8 @@ FIXED = 2  # seen voxels beside them
 HELD = 1e6  # weight of a value that stays as it is, in units of the smoothness
 EARLY = 1 << 20  # layer of a voxel that has no value yet
 
+vec3f = ti.types.vector(3, ti.f32)
+
 
 @ti.func
 def voxel_of(o):
@@ -74,15 +76,41 @@ def row_of(keys: ti.template(), count, key):
     return found
 
 
+@ti.func
+def normal_at(values: ti.template(), around: ti.template(), b, p):
+    """Unit gradient at a seen voxel, from the seen ones beside it; 0 where there are none."""
+    here = value_at(values, around, b, p)
+    normal = vec3f(0.0)
+    for a in ti.static(range(3)):
+        step = vec3i(0)
+        step[a] = 1
+        before = value_at(values, around, b, p - step)
+        after = value_at(values, around, b, p + step)
+        if before == before and after == after:
+            normal[a] = 0.5 * (after - before)
+        elif after == after:
+            normal[a] = after - here
+        elif before == before:
+            normal[a] = here - before
+    length = normal.norm()
+    return normal * ti.select(length > 0.0, 1.0 / ti.max(length, 1e-6), 0.0)
+
+
 @ti.kernel
 def mark_unseen(
     keys: ti.types.ndarray(dtype=ti.i64, ndim=1),  # sorted
+    around: ti.types.ndarray(dtype=ti.i32, ndim=2),
     values: ti.types.ndarray(dtype=ti.f32, ndim=2),
     rims: ti.types.ndarray(dtype=ti.u8, ndim=2),
     columns: ti.types.ndarray(dtype=ti.i32, ndim=2),  # (n, 3) of a ball: x, y, and how far it reaches in z
+    slab: ti.f32,  # voxels from the plane of the rim, and how that grows with the distance from it
+    slope: ti.f32,
     marks: ti.types.ndarray(dtype=ti.u8, ndim=2),
 ):
-    """Mark the unseen voxels in a ball around each rim voxel. Threads that meet write the same."""
+    """Mark the unseen voxels in a ball around each rim voxel that are near the surface as it would go on.
+
+    Threads that meet write the same.
+    """
     count = values.shape[0]
     for run in range(count * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
@@ -90,6 +118,7 @@ def mark_unseen(
             for o in range(CUBE):
                 if rims[b, o] == 1:
                     p = voxel_of(o)
+                    normal = normal_at(values, around, b, p)
                     for c in range(columns.shape[0]):
                         x = p[0] + columns[c, 0]
                         y = p[1] + columns[c, 1]
@@ -97,14 +126,16 @@ def mark_unseen(
                         block = -1
                         last = 1 << 20
                         for z in range(p[2] - columns[c, 2], p[2] + columns[c, 2] + 1):
-                            if z >> 3 != last:
-                                last = z >> 3
-                                block = row_of(keys, count, column + last)
-                            if block >= 0:
-                                i = ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)
-                                there = values[block, i]
-                                if not (there == there):
-                                    marks[block, i] = ti.u8(UNSEEN)
+                            d = ti.cast(vec3i(x, y, z) - p, ti.f32)
+                            if abs(normal.dot(d)) <= slab + slope * d.norm():
+                                if z >> 3 != last:
+                                    last = z >> 3
+                                    block = row_of(keys, count, column + last)
+                                if block >= 0:
+                                    i = ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)
+                                    there = values[block, i]
+                                    if not (there == there):
+                                        marks[block, i] = ti.u8(UNSEEN)
 
 
 @ti.kernel

@@ -31,7 +31,8 @@ MOST_VOXELS = 64
 BATCH = 4096  # blocks solved at once, beside their halo
 _STIFFEST = 48.0  # most that the operator of the preconditioner's units has: 4 · 4 an axis
 _SOFTEST = 500.0  # least eigenvalue of D2ᵀD2 between two held ends, times the distance⁴: (4.73)⁴
-_TOLERANCE = 1e-3  # of the first guess's error
+_SLAB, _SLOPE = 2.5, 0.5  # voxels from the plane of a rim that are solved, and how that grows with distance
+_TOLERANCE = 1e-2  # of the first guess's error
 
 
 def checked(voxels: int) -> int:
@@ -121,20 +122,9 @@ def _solve(
 ) -> NDArray[np.float32]:
     """Guessed values of the blocks `part`, from those of the blocks `local` around them."""
     marks = np.zeros((len(local), CUBE), np.uint8)
-    kernels.mark_unseen(local, values, rims, _ball(voxels), marks)
-    number, counts = np.empty((len(local), CUBE), np.int32), np.empty(len(local), np.int32)
     around = _rows(local, local[:, None] + field_regularizer.AROUND)
-    kernels.number_marked(around, values, marks, number, counts)
-    level = field_regularizer.Level.make(3, number, counts)
-    layer = np.full(len(level.x), kernels.EARLY, np.int32)
-    sides = _rows(local, local[:, None] + field_regularizer.SIDES)
-    kernels.list_marked(
-        sides, values, marks, level.number, level.starts, level.links, level.y, level.weight, level.x, layer
-    )
-    layer[-1] = kernels.EARLY
-    sweep = 1
-    while len(level.links) and kernels.extend(sweep, level.links, layer, level.x):
-        sweep += 1
+    kernels.mark_unseen(local, around, values, rims, _ball(voxels), _SLAB, _SLOPE, marks)
+    level, layer = _list(local, around, values, marks)
     if len(level.links):
         _relax(level, voxels)
     filled = np.empty((len(part), CUBE), np.float32)
@@ -142,7 +132,28 @@ def _solve(
     return filled
 
 
-def _relax(level: "field_regularizer.Level", voxels: int) -> None:
+def _list(
+    local: NDArray[np.int64],
+    around: NDArray[np.int32],
+    values: NDArray[np.float32],
+    marks: NDArray[np.uint8],
+) -> tuple[field_regularizer.Level, NDArray[np.int32]]:
+    """The marked voxels with first values and the seen ones beside them; the layer of each, 0 where seen."""
+    number, counts = np.empty((len(local), CUBE), np.int32), np.empty(len(local), np.int32)
+    kernels.number_marked(around, values, marks, number, counts)
+    level = field_regularizer.Level.make(3, number, counts)
+    layer = np.full(len(level.x), kernels.EARLY, np.int32)
+    sides = _rows(local, local[:, None] + field_regularizer.SIDES)
+    kernels.list_marked(
+        sides, values, marks, level.number, level.starts, level.links, level.y, level.weight, level.x, layer
+    )
+    sweep = 1
+    while len(level.links) and kernels.extend(sweep, level.links, layer, level.x):
+        sweep += 1
+    return level, layer
+
+
+def _relax(level: field_regularizer.Level, voxels: int) -> None:
     """Least second differences between the held values: as many steps as a hole of this width needs."""
     total = len(level.x)
     omega, bent = np.zeros((total, 3), np.float32), np.zeros((total, 3), np.float32)
