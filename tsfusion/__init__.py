@@ -43,6 +43,10 @@ if TYPE_CHECKING:
     from tsfusion.geometry.map_answers import PointCloud as PointCloud
     from tsfusion.geometry.map_answers import Samples as Samples
     from tsfusion.geometry.map_answers import View as View
+    from tsfusion.geometry.map_grids import DistanceField as DistanceField
+    from tsfusion.geometry.map_grids import DistanceSlice as DistanceSlice
+    from tsfusion.geometry.map_grids import OccupancySlice as OccupancySlice
+    from tsfusion.geometry.map_grids import SliceGrid as SliceGrid
     from tsfusion.geometry.mesh import Mesh as Mesh
     from tsfusion.scanner.sources.registry import open_source as open_source
     from tsfusion.scanner.sources.source import Source as Source
@@ -63,12 +67,16 @@ _HOME = {
     "Blocks": "tsdf.map_blocks",
     "Client": "client",
     "Config": "core.config",
+    "DistanceField": "geometry.map_grids",
+    "DistanceSlice": "geometry.map_grids",
     "Intrinsics": "geometry.keyframe",
     "Keyframe": "geometry.keyframe",
     "Layout": "datasets",
     "Mesh": "geometry.mesh",
     "PointCloud": "geometry.map_answers",
     "Samples": "geometry.map_answers",
+    "OccupancySlice": "geometry.map_grids",
+    "SliceGrid": "geometry.map_grids",
     "Source": "scanner.sources.source",
     "View": "geometry.map_answers",
     "Volume": "tsdf.volume",

@@ -5,6 +5,7 @@ import hashlib
 import math
 import os
 import struct
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,8 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from tsfusion.core.config import Surface, VolumeConfig
 from tsfusion.core.errors import InvalidConfig, MapError
+from tsfusion.geometry import up_direction
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.map_answers import PointCloud, Samples, View, checked_camera, checked_points
+from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.mesh_parts import MeshParts, joined
 from tsfusion.geometry.provenance import Provenance
@@ -25,17 +28,21 @@ from tsfusion.kernels import integrate
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf import (
     camera_views,
+    distance_fields,
     field_regularizer,
     hole_filling,
     map_blocks,
     map_difference,
     map_history,
+    map_slices,
     point_samples,
     voxel_arrays,
 )
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.distance_fields import FieldBlocks
 from tsfusion.tsdf.map_blocks import Blocks
 from tsfusion.tsdf.map_difference import MapDifference
+from tsfusion.tsdf.map_slices import CurrentSlice
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
 from tsfusion.tsdf.mesh_tiles import tiles
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
@@ -222,6 +229,123 @@ class ReadableMap:
             MissingDependency: without Open3D.
         """
         return map_blocks.to_voxel_block_grid(self._store)
+
+    def distance_field(
+        self,
+        box: Sequence[float] | None = None,
+        *,
+        max_distance: float = 2.0,
+        subvoxel: bool = True,
+        min_weight: float | None = None,
+    ) -> DistanceField:
+        """Euclidean distance to the nearest surface, of every voxel in a box.
+
+        Surfaces around the box count, too: a voxel has the same distance in whatever box.
+
+        Args:
+            box: x0, y0, z0, x1, y1, z1 in metres, one voxel thick for a plane; None = around the whole map.
+            max_distance: metres; what is farther has this distance.
+            subvoxel: distances to the surface where it lies in the voxels; else between voxels' centres, as
+                SciPy's `distance_transform_edt`.
+            min_weight: as for `extract_mesh`.
+
+        Raises:
+            InvalidConfig: for another box, or one of too many voxels; MapError: no box, and an empty map.
+        """
+        weight = self._checked_min_weight(min_weight)
+        return distance_fields.in_box(self._store, box, max_distance, weight, subvoxel=subvoxel)
+
+    def distance_blocks(
+        self, *, max_distance: float = 0.5, min_weight: float | None = None
+    ) -> Iterator[FieldBlocks]:
+        """The distance field of the whole map, blocks of 8³ voxels nearer than `max_distance` to a surface.
+
+        Memory holds one tile of 16³ blocks and what lies around it, however large the map is. The values are
+        those of `distance_field`.
+
+        Raises:
+            InvalidConfig: for a `max_distance` of too many voxels.
+        """
+        weight = self._checked_min_weight(min_weight)
+        return distance_fields.in_blocks(self._store, max_distance, weight)
+
+    def current_slice(
+        self,
+        low: float,
+        high: float,
+        *,
+        box: Sequence[float] | None = None,
+        up: Up | str | None = None,
+        resolution: float | None = None,
+        max_distance: float = 2.0,
+        min_weight: float | None = None,
+    ) -> CurrentSlice:
+        """Occupancy and horizontal distances between two heights, which can follow the map.
+
+        Args:
+            low, high: metres along `up` in the map's frame.
+            box: u0, v0, u1, v1 in metres along the slice's own axes (`SliceGrid`; they are x and y where z is
+                up); None = around the whole map.
+            up: away from the ground, such as `"z"`, `"-y"` or `"0,-0.9,0.1"`; None = it is found, for which
+                the map is meshed.
+            resolution: metres, edge of a cell; None = the voxel size. A cell holds the least of its voxels.
+            max_distance, min_weight: as for `distance_field`.
+
+        Raises:
+            InvalidConfig: for another box, or too many cells; MapError: for an empty map and no box, or when
+                nobody can tell which way is up.
+        """
+        return CurrentSlice(
+            self._store,
+            (low, high),
+            box,
+            map_slices.axes_of(np.array(self._up(up).direction)),
+            resolution=resolution,
+            max_distance=max_distance,
+            min_weight=self._checked_min_weight(min_weight),
+            knows_free_space=self.config.space_carving,
+        )
+
+    def occupancy_slice(
+        self, low: float, high: float, *, need_free: bool = False, **options: Any
+    ) -> OccupancySlice:
+        """A costmap: free, occupied or unseen between two heights; `save` writes it for ROS's map_server.
+
+        A cell is occupied where a surface, or what lies behind one, was seen between the heights; free where
+        half of its samples or more were seen, and no surface. Made without `space_carving`, a map knows free
+        space in a band before surfaces alone.
+
+        Args:
+            low, high, options: as for `current_slice`.
+            need_free: refuse a map that was made without `space_carving`.
+
+        Raises:
+            MapError: for such a map, or as `current_slice` does.
+        """
+        if need_free and not self.config.space_carving:
+            raise MapError(
+                "the map was made without space_carving: it knows free space near surfaces alone; fuse it "
+                "anew with space_carving=True (--space-carving)"
+            )
+        options = {"max_distance": self.config.voxel_size, **options}  # nobody asks for distances
+        return self.current_slice(low, high, **options).occupancy()
+
+    def distance_slice(self, low: float, high: float, **options: Any) -> DistanceSlice:
+        """Horizontal distance of each cell to what stands between two heights.
+
+        Args:
+            low, high, options: as for `current_slice`.
+        """
+        return self.current_slice(low, high, **options).distances()
+
+    def _up(self, given: Up | str | None) -> Up:
+        """Up as given, or found."""
+        if isinstance(given, str):
+            given = up_direction.parse(given)
+        up = given or up_direction.find(self.extract_mesh(surface="raw"), self.held)
+        if up is None:
+            raise MapError('nobody can tell which way is up in this map: give it, such as up="z" or up="-y"')
+        return up
 
     def diff(self, later: "ReadableMap", *, tolerance: float | None = None) -> MapDifference:
         """What is different in a later map of the same frame, in numbers and as a coloured mesh.

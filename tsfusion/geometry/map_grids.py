@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: MIT
+"""What a robot is told of a map: distances and occupancy on a grid, and the files that planners read."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core import durable_files
+from tsfusion.core.errors import InvalidConfig, OutputError
+
+FREE, OCCUPIED, UNSEEN = 0, 100, -1  # as in ROS's nav_msgs/OccupancyGrid
+SLICE_FORMATS = (".pgm", ".yaml", ".png", ".npz")
+# What map_server and nav2 make of a pixel p: occupied if (255 − p) / 255 > OCCUPIED_THRESH, free if it is
+# < FREE_THRESH, else unknown. 205 is 0.19608: at 0.25, which some tools write, all that is unknown is free.
+OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
+_PIXELS = {FREE: 254, OCCUPIED: 0, UNSEEN: 205}
+
+
+@dataclass(frozen=True)
+class SliceGrid:
+    """The cells of a slice: rows along `axes[1]`, columns along `axes[0]`, between two heights along
+    `axes[2]`, which is up.
+
+    The centre of cell (row, column) is at origin + (column + 0.5, row + 0.5) · resolution in the slice's
+    frame. Its axes are the rows of `axes`: p_slice = axes @ p_map, without a shift.
+    """
+
+    origin: tuple[float, float]  # metres: the corner of cell (0, 0)
+    resolution: float  # metres: edge of a cell
+    shape: tuple[int, int]  # rows, columns
+    low: float  # metres
+    high: float
+    axes: NDArray[np.float64]  # (3, 3)
+
+    def cells_of(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
+        """(n, 3) points of the map, metres → (n, 2) row and column, which may lie outside."""
+        flat = np.asarray(points, np.float64) @ self.axes[:2].T
+        cells: NDArray[np.int64] = np.floor((flat - self.origin) / self.resolution).astype(np.int64)
+        return cells[:, ::-1]
+
+    def centres(self, height: float | None = None) -> NDArray[np.float64]:
+        """(rows, columns, 3) centres in the map's frame, metres; at mid-height unless another is given."""
+        rows, columns = (np.arange(count) + 0.5 for count in self.shape)
+        u, v = np.meshgrid(columns * self.resolution, rows * self.resolution)
+        h = np.full_like(u, (self.low + self.high) / 2 if height is None else height)
+        places: NDArray[np.float64] = np.stack([u + self.origin[0], v + self.origin[1], h], axis=-1)
+        return places @ self.axes
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """What stands beside the cells in a file."""
+        return {
+            "origin": np.array(self.origin), "resolution": np.float64(self.resolution),
+            "heights": np.array([self.low, self.high]), "axes": self.axes,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class OccupancySlice:
+    """A costmap: what stands between two heights.
+
+    `cells` (rows, columns) int8: 0 free, 100 occupied, −1 unseen, as in a `nav_msgs/OccupancyGrid`.
+    """
+
+    grid: SliceGrid
+    cells: NDArray[np.int8]
+    knows_free_space: bool  # whether the map was made with space_carving; else it knows it near surfaces
+
+    def save(self, path: str | Path) -> list[Path]:
+        """Write the pair of files that ROS's map_server reads (.yaml or .pgm: both), a picture (.png), or
+        arrays (.npz). Returns the files.
+
+        Raises:
+            OutputError: when a file cannot be written; InvalidConfig: for another suffix.
+        """
+        path = Path(path)
+        suffix = _checked_suffix(path)
+        if suffix == ".npz":
+            return _save_arrays(path, {"cells": self.cells, **self.grid.figures})
+        if suffix == ".png":
+            return _save_picture(path, cv2.cvtColor(self.pixels(), cv2.COLOR_GRAY2BGR))
+        picture, text = path.with_suffix(".pgm"), path.with_suffix(".yaml")
+        rows, columns = self.cells.shape
+        _write(picture, f"P5\n{columns} {rows}\n255\n".encode() + self.pixels().tobytes())
+        _write(text, self._map_server_text(picture.name).encode())
+        return [text, picture]
+
+    def pixels(self) -> NDArray[np.uint8]:
+        """(rows, columns) uint8 for map_server, last row on top: 0 occupied, 254 free, 205 unseen."""
+        pixels = np.full(self.cells.shape, _PIXELS[UNSEEN], np.uint8)
+        pixels[self.cells == FREE], pixels[self.cells == OCCUPIED] = _PIXELS[FREE], _PIXELS[OCCUPIED]
+        return np.ascontiguousarray(pixels[::-1])
+
+    def _map_server_text(self, picture: str) -> str:
+        grid = self.grid
+        axes = "; ".join(" ".join(f"{one:.6f}" for one in row) for row in grid.axes.tolist())
+        return (
+            f"# What stands between {grid.low:g} and {grid.high:g} m; p_slice = [{axes}] p_map\n"
+            f"image: {json.dumps(picture)}\nmode: trinary\nresolution: {grid.resolution!r}\n"
+            f"origin: [{grid.origin[0]!r}, {grid.origin[1]!r}, 0.0]\nnegate: 0\n"
+            f"occupied_thresh: {OCCUPIED_THRESH}\nfree_thresh: {FREE_THRESH}\n"
+        )
+
+
+@dataclass(frozen=True)
+class DistanceSlice:
+    """Horizontal distances to what stands between two heights.
+
+    `distance` (rows, columns) float32 metres, at most `max_distance`: to the nearest surface, negative where
+    the map knows that a cell lies behind one. Where nothing was seen it is the distance to the nearest
+    surface that was; `cells` tells which these are, as in an `OccupancySlice`.
+    """
+
+    grid: SliceGrid
+    distance: NDArray[np.float32]
+    cells: NDArray[np.int8]
+    max_distance: float
+
+    def save(self, path: str | Path) -> list[Path]:
+        """Write a picture (.png) or arrays (.npz). Returns the files.
+
+        Raises:
+            OutputError: when a file cannot be written; InvalidConfig: for another suffix.
+        """
+        path = Path(path)
+        if _checked_suffix(path, (".png", ".npz")) == ".png":
+            return _save_picture(path, self.picture())
+        arrays = {"distance": self.distance, "cells": self.cells, "max_distance": self.max_distance}
+        return _save_arrays(path, {**arrays, **self.grid.figures})
+
+    def picture(self) -> NDArray[np.uint8]:
+        """(rows, columns, 3) BGR, the last row on top: near red, far blue; occupied black, unseen paler."""
+        near = np.clip(1 - np.maximum(self.distance, 0) / self.max_distance, 0, 1)
+        colors = cv2.applyColorMap((255 * near).astype(np.uint8), cv2.COLORMAP_TURBO)
+        unseen = self.cells == UNSEEN
+        colors[unseen] = (0.35 * colors[unseen] + 0.65 * 205).astype(np.uint8)
+        colors[self.cells == OCCUPIED] = 0
+        return np.ascontiguousarray(colors[::-1])
+
+
+@dataclass(frozen=True)
+class DistanceField:
+    """Distances to the nearest surface in a box of voxels.
+
+    `distance` (X, Y, Z) float32 metres, at most `max_distance`, negative where the map knows that a voxel
+    lies behind the surface. Where nothing was seen it is the distance to the nearest surface that was;
+    `occupancy` (X, Y, Z) int8 tells which these are: 0 free, 100 occupied, −1 unseen. The centre of voxel
+    (i, j, k) is at origin + ((i, j, k) + 0.5) · voxel_size.
+    """
+
+    origin: NDArray[np.float64]  # (3,) metres: the box's lower corner
+    voxel_size: float
+    distance: NDArray[np.float32]
+    occupancy: NDArray[np.int8]
+    max_distance: float
+
+    def save(self, path: str | Path) -> list[Path]:
+        """Write the arrays (.npz). Returns the files.
+
+        Raises:
+            OutputError: when it cannot be written; InvalidConfig: for another suffix.
+        """
+        _checked_suffix(path := Path(path), (".npz",))
+        return _save_arrays(path, {
+            "distance": self.distance, "occupancy": self.occupancy, "origin": self.origin,
+            "voxel_size": np.float64(self.voxel_size), "max_distance": np.float64(self.max_distance),
+        })  # fmt: skip
+
+
+def _checked_suffix(path: Path, known: tuple[str, ...] = SLICE_FORMATS) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in known:
+        raise InvalidConfig(f"{path} must end in {', '.join(known)}")
+    return suffix
+
+
+def _save_arrays(path: Path, arrays: dict[str, Any]) -> list[Path]:
+    try:
+        with durable_files.replacing(path) as file:
+            np.savez_compressed(file, **arrays)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+    return [path]
+
+
+def _save_picture(path: Path, picture: NDArray[np.uint8]) -> list[Path]:
+    _write(path, cv2.imencode(".png", picture)[1].tobytes())
+    return [path]
+
+
+def _write(path: Path, content: bytes) -> None:
+    try:
+        with durable_files.replacing(path) as file:
+            file.write(content)
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: MIT
+"""A slice of the map: a plane of cells, each a column of samples between two heights."""
+
+import taichi as ti
+
+from tsfusion.kernels.block_hash import map_find
+from tsfusion.kernels.integrate import QUANTA_PER_VOXEL, lane_weight
+from tsfusion.kernels.voxel_traversal import RUN, VOXEL_LIMIT, block_key, offset_in_block, vec3i
+from tsfusion.kernels.voxel_values import BANDS, distance_as_float
+
+vec3d = ti.types.vector(3, ti.f64)
+
+
+@ti.kernel
+def read_columns(
+    cells: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    width: ti.i32,
+    row: ti.i32,
+    column: ti.i32,
+    across: ti.i32,
+    heights: ti.i32,
+    corner: vec3d,
+    along_row: vec3d,
+    along_column: vec3d,
+    along_height: vec3d,
+    map_keys: ti.types.ndarray(dtype=ti.i64, ndim=1),
+    map_slots: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    sums: ti.types.ndarray(dtype=ti.i64, ndim=2),
+    correction: ti.types.ndarray(dtype=ti.f32, ndim=2),
+    corrected: ti.i32,
+    min_weight: ti.i32,
+    values: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    seen: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """`values`: the smallest signed distance in voxels among the samples of each of the `cells` that were
+    seen, NaN where none was; `seen`: how many were.
+
+    Cell n is (`row` + n // `width`, `column` + n % `width`). It has `across`² columns of `heights` samples;
+    these are `along_row`, `along_column`, `along_height` apart, in voxels, from `corner` on.
+    """
+    mask = map_keys.shape[0] - 1
+    for run in range(BANDS * RUN):  # run loop: kernels/__init__.py
+        if run % RUN == 0:
+            band, count = run // RUN, cells.shape[0]
+            last, slot = vec3i(2147483647), -1
+            for n in range(count * band // BANDS, count * (band + 1) // BANDS):
+                cell = cells[n]
+                first_row = (row + cell // width) * across
+                first_column = (column + cell % width) * across
+                least, number = ti.math.nan, 0
+                for line in range(across * across):
+                    r, c = first_row + line // across, first_column + line % across
+                    foot = corner + along_row * ti.cast(r, ti.f64) + along_column * ti.cast(c, ti.f64)
+                    for h in range(heights):
+                        place = foot + along_height * ti.cast(h, ti.f64)
+                        if ti.max(ti.abs(place[0]), ti.abs(place[1]), ti.abs(place[2])) < VOXEL_LIMIT - 1:
+                            voxel = ti.floor(place, ti.i32)
+                            block = voxel >> 3
+                            if block[0] != last[0] or block[1] != last[1] or block[2] != last[2]:
+                                last = block
+                                slot = map_find(map_keys, map_slots, mask, block_key(voxel))
+                            if slot >= 0:
+                                o = offset_in_block(voxel)
+                                packed = sums[slot, o]
+                                w = lane_weight(packed)
+                                if w >= min_weight:
+                                    distance = distance_as_float(packed)
+                                    if corrected == 1:
+                                        distance += correction[slot, o]
+                                    value = distance / ti.cast(w, ti.f32) / QUANTA_PER_VOXEL
+                                    number += 1
+                                    if not value >= least:  # also where none was seen before
+                                        least = value
+                values[cell], seen[cell] = least, number
