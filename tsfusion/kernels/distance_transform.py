@@ -17,6 +17,7 @@ BANDS = 64  # units of parallel work; fixed, so that nothing depends on the thre
 FAR = 1 << 30  # squared distance where no site is near
 NONE = -1  # number of no site
 
+vec2i = ti.types.vector(2, ti.i32)
 vec3f = ti.types.vector(3, ti.f32)
 
 
@@ -181,20 +182,22 @@ def measure(
     extent: vec3i,
     squared: ti.types.ndarray(dtype=ti.i32, ndim=1),
     nearest: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    first: ti.i32,
-    end: ti.i32,
+    rows: vec2i,
+    columns: vec2i,
     subvoxel: ti.i32,
     edge: ti.f32,
     most: ti.f32,
     distances: ti.types.ndarray(dtype=ti.f32, ndim=1),
 ):
-    """Distances in metres, at most `most`, of the rows `first` ≤ x < `end` of the box `begin`, `extent`:
+    """Distances in metres, at most `most`, of the voxels in some `rows`, x, and `columns`, y (first,
+    end), of the box `begin`, `extent`:
     to the surface at the nearest site, or to the site's centre. Negative where a voxel lies behind it.
 
     `edge` is a voxel's, metres.
     """
-    for row in range((end - first) * extent[1]):
-        x, y = first + row // extent[1], row % extent[1]
+    width = columns[1] - columns[0]
+    for n in range((rows[1] - rows[0]) * width):
+        x, y = rows[0] + n // width, columns[0] + n % width
         for z in range(extent[2]):
             i = (x * extent[1] + y) * extent[2] + z
             place = begin + vec3i(x, y, z)

@@ -69,19 +69,9 @@ def in_box(
     squared, nearest = _nearest_sites(values, shape, low, extent, reach)
     distance = np.empty(math.prod(extent), np.float32)
     kernels.measure(
-        values,
-        shape,
-        low,
-        extent,
-        squared,
-        nearest,
-        0,
-        extent[0],
-        int(subvoxel),
-        size,
-        reach.metres,
-        distance,
-    )
+        values, shape, low, extent, squared, nearest, (0, extent[0]), (0, extent[1]), int(subvoxel), size,
+        reach.metres, distance,
+    )  # fmt: skip
     inside = tuple(slice(a, a + n) for a, n in zip(low, extent, strict=True))
     return DistanceField(
         origin=first.astype(np.float64) * size,

@@ -149,8 +149,9 @@ class CurrentSlice:
         centres = (blocks + 0.5) * block @ grid.axes.T
         half = block / 2 * np.abs(grid.axes).sum(axis=1) + 1e-6 * block  # as samples are rounded
         near = centres[(centres[:, 2] + half[2] >= grid.low) & (centres[:, 2] - half[2] <= grid.high)]
-        corners = np.floor((near[:, :2] - half[:2]) / grid.resolution)[:, ::-1]
-        side = np.ceil(2 * half[:2] / grid.resolution).astype(np.int64)[::-1] + 1
+        inset = 0.5 / self._across  # of the outermost samples in a cell
+        corners = np.ceil((near[:, :2] - half[:2]) / grid.resolution - 1 + inset)[:, ::-1]
+        side = np.floor(2 * half[1::-1] / grid.resolution + 1 - 2 * inset).astype(np.int64) + 1
         corners = np.unique(corners.astype(np.int64) - self._first, axis=0)
         corners = corners[((corners + side > 0) & (corners < self._shape)).all(axis=1)]
         reached = np.zeros(self._shape, bool)
@@ -180,8 +181,8 @@ class CurrentSlice:
         )  # fmt: skip
         transform.measure(
             self._values, (rows, columns, 1), (0, 0, 0), (rows, columns, 1), *self._nearest,
-            max(top - reach, 0), min(bottom + reach, rows), 1, self.grid.resolution, self._reach.metres,
-            self._distance,
+            (max(top - reach, 0), min(bottom + reach, rows)), (left, right), 1,
+            self.grid.resolution, self._reach.metres, self._distance,
         )  # fmt: skip
 
 
