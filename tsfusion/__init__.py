@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from tsfusion.core.config import Config as Config
     from tsfusion.core.config import VolumeConfig as VolumeConfig
     from tsfusion.core.errors import AlignmentRefused as AlignmentRefused
+    from tsfusion.core.errors import AnswerLate as AnswerLate
     from tsfusion.core.errors import CheckpointError as CheckpointError
     from tsfusion.core.errors import DamagedCheckpoint as DamagedCheckpoint
     from tsfusion.core.errors import DatasetError as DatasetError
@@ -52,12 +53,13 @@ if TYPE_CHECKING:
     from tsfusion.scanner.sources.source import Source as Source
     from tsfusion.tsdf.map_blocks import Blocks as Blocks
     from tsfusion.tsdf.volume import Volume as Volume
+    from tsfusion.wire.map_client import MapClient as MapClient
 
 __version__ = "0.1.0"
 
 _ERRORS = (
-    "AlignmentRefused", "CheckpointError", "DamagedCheckpoint", "DatasetError", "DecodeError", "FlushTimeout",
-    "IncompleteRun", "InvalidConfig",
+    "AlignmentRefused", "AnswerLate", "CheckpointError", "DamagedCheckpoint", "DatasetError", "DecodeError",
+    "FlushTimeout", "IncompleteRun", "InvalidConfig",
     "InvalidKeyframe", "JournalError", "KeyframeRefused", "KeyframeTooLarge", "MapError", "MapFull",
     "MapQuota", "MissingDependency",
     "NotAllowed", "OutputError", "ServerUnreachable", "SourceError",
@@ -72,6 +74,7 @@ _HOME = {
     "Intrinsics": "geometry.keyframe",
     "Keyframe": "geometry.keyframe",
     "Layout": "datasets",
+    "MapClient": "wire.map_client",
     "Mesh": "geometry.mesh",
     "PointCloud": "geometry.map_answers",
     "Samples": "geometry.map_answers",

@@ -19,6 +19,7 @@ from tsfusion.core import config
 from tsfusion.core.errors import InvalidConfig, ServerUnreachable, TransportError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.gateway.fuser_queries import FuserQueries
+from tsfusion.gateway.memory_guard import PendingReplies
 from tsfusion.gateway.ports import Ports
 from tsfusion.wire import codec, health, messages, queries, sockets
 from tsfusion.wire.messages import Command
@@ -122,7 +123,7 @@ class Asking:
         self.map: Any = Map()
         self.errors: list[str | None] = []
         self.frames: list[Any] = []
-        self.queries = FuserQueries(cast(Ports, self), most_bytes)
+        self.queries = FuserQueries(cast(Ports, self), PendingReplies(), most_bytes)
 
     def reply(self, identity: bytes, message: messages.ToClient, frames: Any = ()) -> None:
         assert isinstance(message, messages.Reply)

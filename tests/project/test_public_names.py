@@ -23,8 +23,8 @@ def test_the_public_surface() -> None:
     tree = {name for name, value in vars(errors).items() if inspect.isclass(value)}
     assert set(tsfusion.__all__) - tree == {
         "Blocks", "Client", "Config", "DistanceField", "DistanceSlice", "Intrinsics", "Keyframe",
-        "Layout", "Mesh", "OccupancySlice", "PointCloud", "Samples", "SliceGrid", "Source", "View",
-        "Volume", "VolumeConfig", "__version__", "open_dataset", "open_source",
+        "Layout", "MapClient", "Mesh", "OccupancySlice", "PointCloud", "Samples", "SliceGrid",
+        "Source", "View", "Volume", "VolumeConfig", "__version__", "open_dataset", "open_source",
     }  # fmt: skip
     assert tree <= set(tsfusion.__all__)
     assert all(issubclass(getattr(errors, name), tsfusion.TsfusionError) for name in tree)

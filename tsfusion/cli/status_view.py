@@ -115,7 +115,16 @@ def _notes(name: str, one: MapHealth) -> list[Text]:
     notes = [f"{count} {what}" for what, count in counts.items() if count]
     if one.rejected:
         notes.append(f"rejected: {_reasons(one.rejected)}")
-    return [Text(f"map {printable(name)}: {', '.join(notes)}", style="yellow")] if notes else []
+    lines = [Text(f"map {printable(name)}: {', '.join(notes)}", style="yellow")] if notes else []
+    if one.questions:
+        took = one.question_ms
+        lines.append(
+            Text(
+                f"map {printable(name)}: questions {_reasons(one.questions)}, "
+                f"answered in {took.p50:.1f} ms (p95 {took.p95:.1f}, at most {took.max:.1f})"
+            )
+        )
+    return lines
 
 
 def _reasons(counts: dict[str, int]) -> str:

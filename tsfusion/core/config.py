@@ -243,6 +243,7 @@ class ServerConfig(Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     quota_bytes: Bytes = 256 << 20  # a second, of each client
     quota_keyframes: Positive = 1000.0  # a second, of each client
     quota_points: Annotated[int, Meta(ge=1)] = 8 << 20  # points or pixels a keyframe
+    quota_questions: Positive = 200.0  # to the map, a second, of each client
     # What the rays of a keyframe may cost, in voxels that they cross; five times those of a ray away from the
     # one before it. Six times what the densest recordings need, a second and a half of one core
     quota_cost: Annotated[int, Meta(ge=1)] = 50_000_000

@@ -18,6 +18,7 @@
     ├── AlignmentRefused                   nobody can tell where one map lies in another
     ├── TransportError
     │   ├── ServerUnreachable              nobody answered on the control socket in time
+    │   ├── AnswerLate                     the map on a server did not answer a question in time
     │   ├── NotAllowed                     the server turned this client's keys away, or its lack of them
     │   ├── WorldRefused                   the map has keyframes of another coordinate frame
     │   ├── FlushTimeout                   keyframes were still unacknowledged at the deadline
@@ -123,6 +124,10 @@ class TransportError(TsfusionError):
 
 class ServerUnreachable(TransportError):
     """Nobody answered on the control socket in time."""
+
+
+class AnswerLate(TransportError):
+    """The map on a server did not answer a question before the deadline: the server is there, and busy."""
 
 
 class NotAllowed(TransportError):

@@ -17,6 +17,7 @@ from tsfusion.core.errors import MapError, TsfusionError
 from tsfusion.core.folder_lock import lock_folder
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.fuser import LOCK, Fuser
+from tsfusion.fuser.inbox import Inbox
 from tsfusion.wire import sockets
 
 _LOCK_WAIT_S = 60.0  # for another fuser to end: it may be reading a large map
@@ -46,36 +47,36 @@ def _remove_scratch_folder(endpoint: str) -> None:
 
 
 def _serve(link: sockets.AnySocket) -> int:
-    """Handle messages, mesh when it is time, and refine the mesh when there is nothing else to do."""
+    """Handle messages, mesh when it is time, and refine the mesh when there is nothing else to do.
+
+    Questions come before all that.
+    """
     poller = zmq.Poller()
     poller.register(link, zmq.POLLIN)
     poller.register(sys.stdin.fileno(), zmq.POLLIN)
     fuser: Fuser | None = None
+    inbox = Inbox(link)
     while fuser is None or fuser.exit_status is None:
-        idle = not poller.poll(fuser.idle_after_ms if fuser is not None else 0)
-        if fuser is not None and fuser.mesh_due(idle):
-            fuser.mesh()
+        if fuser is not None:
+            fuser.answer()
+        idle = not inbox.orders and not poller.poll(fuser.idle_after_ms if fuser is not None else 0)
+        if fuser is not None and _do_some(fuser, idle=idle):
             continue
-        if fuser is not None and fuser.search_due(idle):
-            fuser.search()
+        if not inbox.orders:
+            process.on_parent_end(signal.SIGCONT)  # a stopped process would not notice the gateway's end
+            events = dict(poller.poll(fuser.wait_ms if fuser is not None else None))
+            if sys.stdin.fileno() in events:  # nothing is ever written there: the gateway has ended
+                return 1
+            if fuser is not None:
+                process.on_parent_end(signal.SIGKILL)
+                if not events:
+                    fuser.go_on()
+            inbox.read()
+        if not inbox.orders:
             continue
-        if fuser is not None and fuser.move_due(idle):
-            fuser.move()
-            continue
-        if idle and fuser is not None and fuser.refine_due:
-            fuser.refine()
-            continue
-        process.on_parent_end(signal.SIGCONT)  # a stopped process would not notice the gateway's end
-        events = dict(poller.poll(fuser.wait_ms if fuser is not None else None))
-        if sys.stdin.fileno() in events:  # nothing is ever written there: the gateway has ended
-            return 1
-        if not events and fuser is not None:
-            process.on_parent_end(signal.SIGKILL)
-            fuser.go_on()
-            continue
-        message = fuser_messages.to_fuser.decode(link.recv())
+        message = inbox.orders.popleft()
         if isinstance(message, fuser_messages.Begin):
-            fuser = _open_map(link, message)
+            fuser = _open_map(link, message, inbox)
             if fuser is None:
                 return 1
         elif fuser is not None:
@@ -84,7 +85,24 @@ def _serve(link: sockets.AnySocket) -> int:
     return fuser.exit_status
 
 
-def _open_map(link: sockets.AnySocket, message: fuser_messages.Begin) -> Fuser | None:
+def _do_some(fuser: Fuser, *, idle: bool) -> bool:
+    """Do a piece of the work that nobody waits for, if one is due; whether there was one."""
+    if fuser.mesh_due(idle):
+        fuser.mesh()
+    elif fuser.search_due(idle):
+        fuser.search()
+    elif fuser.move_due(idle):
+        fuser.move()
+    elif idle and fuser.refine_due:
+        fuser.refine()
+    else:
+        return False
+    return True
+
+
+def _open_map(
+    link: sockets.AnySocket, message: fuser_messages.Begin, inbox: Inbox | None = None
+) -> Fuser | None:
     """Open the map and report that, or why it cannot be opened; None = it cannot."""
     try:
         process.end_first()
@@ -93,7 +111,7 @@ def _open_map(link: sockets.AnySocket, message: fuser_messages.Begin) -> Fuser |
             Path(message.folder), "map", "fuser", name=LOCK, wait=_LOCK_WAIT_S, error_type=MapError,
             make=False,  # one that is away must not be made in its place
         )  # fmt: skip
-        fuser = Fuser(link, message)
+        fuser = Fuser(link, message, inbox)
     except (TsfusionError, OSError, MemoryError) as error:
         if isinstance(error, MemoryError):
             known: TsfusionError = MapError(f"no memory to open the map: {error}; raise fuser_memory_bytes")

@@ -26,13 +26,16 @@ from tsfusion.core.errors import JournalError, TsfusionError
 from tsfusion.fuser import messages as fuser_messages
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.departures import Departures
+from tsfusion.fuser.inbox import Inbox
 from tsfusion.fuser.live_mesh import LiveMesh, mesh_frames
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.fuser.pose_mover import REST_FACTOR, PoseMover
+from tsfusion.fuser.question_answers import QuestionAnswers
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
-from tsfusion.journal import state_folder
+from tsfusion.journal import Position, state_folder
 from tsfusion.wire import codec, sockets
+from tsfusion.wire.questions import MapState
 from tsfusion.wire.record_header import Refused
 
 if TYPE_CHECKING:
@@ -53,9 +56,15 @@ log = logging.getLogger(__name__)
 
 
 class Fuser:
-    """One map, and the work for each message of the gateway."""
+    """One map, and the work for each message of the gateway.
 
-    def __init__(self, link: sockets.AnySocket, begin: fuser_messages.Begin) -> None:
+    Args:
+        inbox: where questions to the map come in; None = nobody asks any.
+    """
+
+    def __init__(
+        self, link: sockets.AnySocket, begin: fuser_messages.Begin, inbox: Inbox | None = None
+    ) -> None:
         from tsfusion.kernels import runtime
 
         self._link = link
@@ -66,6 +75,8 @@ class Fuser:
         self._held_since: float | None = None  # time.monotonic(); None = nothing is held
         self._answered = 0  # records of this process
         self._more_waits = False  # at the gateway
+        self._epoch = f"{time.monotonic_ns():x}"  # of the answers of this process
+        self._newest = Position(0, 0)  # of the records that were answered
         self._hashes: tuple[int, str, str] | None = None  # changes, map hash, colour hash
         self._current = CurrentKeyframe(begin.working)
         runtime.start(begin.volume.threads)  # it reserves a GB, and more for each thread, and hardly uses it
@@ -91,6 +102,10 @@ class Fuser:
             sparing=lambda: self._memory_beyond(-_FOR_KEYFRAMES),
             send=self._send,
         )
+        self._answers: QuestionAnswers | None = None
+        if inbox is not None:
+            self._answers = QuestionAnswers(self._volume, inbox, state=self._state, send=self._send)
+            self._volume.set_pause(self._answers.give_between)
         self._departures = Departures(begin, self._map.poses, self._map.done, send=self._send)
         window = self._departures.window
         self._mover = PoseMover(
@@ -116,6 +131,11 @@ class Fuser:
             stats.bytes,
             self._mover.progress(),
         )
+
+    def answer(self) -> None:
+        """Answer the questions that wait, before anything else is done."""
+        if self._answers is not None:
+            self._answers.give()
 
     def handle(self, message: fuser_messages.ToFuser) -> None:
         """Do the work for a message of the gateway."""
@@ -207,6 +227,7 @@ class Fuser:
             self._note_answer()
             self._send(fuser_messages.Done(order.index, start, start))
             return True
+        self._newest = max(self._newest, order.position)
         reason, message, forgotten = order.skip, "", self._map.poses.forgotten
         if reason is None:
             self._current.set(order.index)
@@ -380,6 +401,17 @@ class Fuser:
                 **{name: version(name) for name in ("tsfusion", "taichi", "numpy", "pyzmq")},
             },
             config=msgspec.to_builtins(self._volume.config),
+        )
+
+    def _state(self) -> MapState:
+        """The state of the map for whoever asked it something."""
+        return MapState(
+            keyframes=self._volume.keyframes,
+            changes=self._answered + self._mover.moved,
+            epoch=self._epoch,
+            segment=self._newest.segment,
+            offset=self._newest.offset,
+            waiting=self._mover.waiting,
         )
 
     def _send(self, message: Any, frames: list[Any] | None = None) -> None:

@@ -16,6 +16,7 @@ from tsfusion.journal import Position
 from tsfusion.wire.forgetting import Selection
 from tsfusion.wire.health import MeshLayout
 from tsfusion.wire.messages import Command
+from tsfusion.wire.questions import Answer, Question
 
 NOT_WORKING = -1  # instead of a keyframe's index
 MOVING = -2  # likewise: at a keyframe that a correction moves
@@ -87,6 +88,19 @@ class FuserQuery(Struct, frozen=True, tag="ask"):
 
     number: int
     command: Command
+
+
+class FuserQuestion(Struct, frozen=True, tag="question"):
+    """Answer a question to the map, before everything else; its points follow as frames.
+
+    `asked_ns`, `deadline_ns`: monotonic, of the machine: when it came, and until when it is worth an answer.
+    """
+
+    number: int
+    question: Question
+    asked_ns: int
+    deadline_ns: int
+    compress: bool = False
 
 
 class Find(Struct, frozen=True, tag="find"):
@@ -280,8 +294,23 @@ class FuserReply(Struct, frozen=True, tag="answer"):
     layout: MeshLayout | None = None
 
 
-ToFuser = Begin | Fuse | FuserQuery | Find | Expire | Publish | Save | Finish
-ToGateway = Started | Ready | Failed | Done | CorrectionProgress | Saved | Found | Held | Meshed | FuserReply
+class FuserAnswer(Struct, frozen=True, tag="answered"):
+    """The answer to a FuserQuestion, with its arrays as frames; or why there is none.
+
+    `late`: its time was over.
+    """
+
+    number: int
+    answer: Answer | None = None
+    error: str = ""
+    late: bool = False
+
+
+ToFuser = Begin | Fuse | FuserQuery | FuserQuestion | Find | Expire | Publish | Save | Finish
+ToGateway = (
+    Started | Ready | Failed | Done | CorrectionProgress | Saved | Found | Held | Meshed | FuserReply
+    | FuserAnswer
+)  # fmt: skip
 to_fuser: "msgspec.msgpack.Decoder[ToFuser]" = msgspec.msgpack.Decoder(ToFuser)
 to_gateway: "msgspec.msgpack.Decoder[ToGateway]" = msgspec.msgpack.Decoder(ToGateway)
 encode = msgspec.msgpack.encode

@@ -47,20 +47,20 @@ class FuserQueries:
     """The commands that wait for a fuser's answer.
 
     Args:
-        max_bytes: of meshes that wait to be read; a single one may be larger.
+        unread: meshes and other large replies that wait to be read.
+        max_bytes: of replies that wait to be read; a single one may be larger.
     """
 
-    def __init__(self, ports: Ports, max_bytes: int) -> None:
-        self._ports = ports
+    def __init__(self, ports: Ports, unread: PendingReplies, max_bytes: int) -> None:
+        self._ports, self._unread = ports, unread
         self._max_bytes = max_bytes
         self._pending: dict[int, PendingQuery] = {}
         self._count = 0
-        self._unread = PendingReplies()
         self._last_meshes: dict[str, LastMesh] = {}
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the meshes that wait to be read, up to what may wait."""
+        """Bytes of the replies that wait to be read, up to what may wait."""
         return min(self._unread.nbytes, max(self._max_bytes, self._unread.largest))
 
     def submit(

@@ -134,10 +134,10 @@ class FuserSupervisor:
         """Whether another keyframe may be handed out."""
         return self.ready and not self.finishing and len(self.in_flight) < _MAX_IN_FLIGHT
 
-    def send(self, message: fuser_messages.ToFuser) -> bool:
+    def send(self, message: fuser_messages.ToFuser, frames: Sequence[zmq.Frame] = ()) -> bool:
         """Send a message; False when its queue is full now. What a dead fuser has not read is lost."""
         try:
-            self.socket.send(fuser_messages.encode(message), zmq.NOBLOCK)
+            self.socket.send_multipart([fuser_messages.encode(message), *frames], zmq.NOBLOCK)
         except zmq.Again:
             return False
         return True

@@ -29,7 +29,9 @@ from tsfusion.gateway.forgetting import Request
 from tsfusion.gateway.fuser_queries import FuserQueries
 from tsfusion.gateway.hosted_map import ForPeople, HostedMap
 from tsfusion.gateway.keyframe_intake import KeyframeIntake
+from tsfusion.gateway.map_questions import MapQuestions
 from tsfusion.gateway.map_registry import MapRegistry
+from tsfusion.gateway.memory_guard import PendingReplies
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Flood, Ports, Subscriptions, receive_some
 from tsfusion.gateway.problems import Problem, ProblemTimes
@@ -46,7 +48,7 @@ _TICK_MS = 100  # within which a signal or a fuser's death is noticed
 _RENEW_TICK_MS = 10  # while the sockets are made anew
 _SNAPSHOT_INTERVAL = 1.0  # seconds
 _CLIENT_PROBLEMS = 10  # lines about single clients
-_MESHES_SHARE = 4  # one fourth of the memory is for meshes that wait to be read
+_REPLIES_SHARE = 4  # one fourth of the memory is for meshes and answers that wait to be read
 Handlers = dict[sockets.AnySocket, Callable[[list[zmq.Frame]], None]]
 
 
@@ -70,7 +72,11 @@ class Gateway:
         self._refused = self._admission.refused
         self.maps = MapRegistry(context, server, self._routes, metrics)
         self._intake = KeyframeIntake(server, self.maps, self._admission, self._routes)
-        self._queries = FuserQueries(ports, server.memory_bytes // _MESHES_SHARE)
+        unread, most_unread = PendingReplies(), server.memory_bytes // _REPLIES_SHARE
+        self._queries = FuserQueries(ports, unread, most_unread)
+        self._questions = MapQuestions(
+            ports, metrics, self._refused, unread=unread, max_bytes=most_unread, rate=server.quota_questions
+        )
         self._subscriptions = Subscriptions()
         self._publishing: dict[str, bool] = {}  # map → whether its fuser was told to send triangles
         self._limits = ConnectionLimits(ports, access, self._refused, server.memory_bytes)
@@ -114,6 +120,7 @@ class Gateway:
         self._limits.step()
         for hosted, message in self.maps.step():
             self._pass_to_people(hosted, message)
+        self._questions.step()
         self._update_fusers()
         self._snapshot()
 
@@ -163,6 +170,7 @@ class Gateway:
             if not hosted.fuser.ready:
                 self._publishing.pop(hosted.name, None)
                 self._queries.give_up(hosted.name)
+                self._questions.give_up(hosted.name)
                 continue
             watched = self._subscriptions.watched(hosted.name)
             changed = watched != self._publishing.get(hosted.name)
@@ -176,6 +184,8 @@ class Gateway:
             own = message.status
             status = fuser_queries.status(hosted, own, self.health(), self._server) if own else None
             self._queries.on_reply(message, status, frames)
+        elif isinstance(message, fuser_messages.FuserAnswer):
+            self._questions.on_answer(message, frames)
         elif frames:
             self.ports.publish(mesh_topic(hosted.name), fuser_messages.encode(message), frames)
 
@@ -186,14 +196,16 @@ class Gateway:
         if client is None:
             return
         try:
-            identity, content = frames
+            identity, content, *points = frames
             message = messages.decode_to_server(content.buffer)
+            if points and not (isinstance(message, messages.Command) and message.name == "ask"):
+                raise DecodeError(f"{len(points)} frames more than there may be")
         except (DecodeError, ValueError) as error:
             self._refused["control"] += 1
             log.debug("%s", error)
             return
         if isinstance(message, messages.Command):
-            self._on_command(identity.bytes, message, client)
+            self._on_command(identity.bytes, message, points, client)
         elif isinstance(message, messages.Hello):
             self._on_hello(identity, message, client)
         else:
@@ -263,10 +275,12 @@ class Gateway:
         pong = messages.Pong(self.epoch, ping.sent_ns, received_ns, time.monotonic_ns(), *progress, waiting)
         self.ports.reply(identity, pong)
 
-    def _on_command(self, identity: bytes, command: messages.Command, client: str) -> None:
+    def _on_command(
+        self, identity: bytes, command: messages.Command, points: list[zmq.Frame], client: str
+    ) -> None:
         maps = self._admission.maps_of(client)
         if command.name == "ping":
-            self.ports.reply(identity, messages.Reply(name="ping"))
+            self.ports.reply(identity, messages.Reply(name="ping", asks=True))
         elif command.name == "health":
             self.ports.reply(identity, messages.Reply(name="health", health=self.health(maps)))
         elif command.name == "new_map":
@@ -277,9 +291,12 @@ class Gateway:
                 name, error = None, str(refusal)
             self.ports.reply(identity, messages.Reply(name="new_map", map=name, error=error))
         elif forbidden := self._admission.denial_of_map(client, command.map):
-            self.ports.reply(identity, messages.Reply(name=command.name, error=forbidden))
+            number = command.number
+            self.ports.reply(identity, messages.Reply(name=command.name, number=number, error=forbidden))
         elif command.name == "forget":
             self._on_forget(identity, command, client)
+        elif command.name == "ask":
+            self._questions.ask(identity, command, points, self.maps.get(command.map), client)
         else:
             self._queries.submit(identity, command, self.maps.get(command.map), client)
 

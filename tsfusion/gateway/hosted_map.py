@@ -26,6 +26,7 @@ from tsfusion.gateway.journal_retention import JournalRetention
 from tsfusion.gateway.keyframe_index import KeyframeIndex
 from tsfusion.gateway.keyframe_outcomes import KeyframeOutcomes
 from tsfusion.gateway.metrics import Metrics
+from tsfusion.gateway.question_counts import QuestionCounts
 from tsfusion.gateway.sessions import Sessions
 from tsfusion.journal import Journal, ReadingWatcher, state_folder
 from tsfusion.journal.quarantine import Quarantine
@@ -40,7 +41,9 @@ _FOR_GONE = "what no checkpoint holds of them is lost, unless they are put back"
 _SAVE_PAUSE = 10.0  # seconds until a checkpoint is tried again that could not be written
 _LONGEST_WAIT = 0.2  # seconds of a step, for a segment of the journal that is put back
 _STALLED_AFTER = 10.0  # seconds in which keyframes wait and none is fused
-ForPeople = tuple[fuser_messages.Meshed | fuser_messages.FuserReply, Sequence[zmq.Frame]]
+ForPeople = tuple[
+    fuser_messages.Meshed | fuser_messages.FuserReply | fuser_messages.FuserAnswer, Sequence[zmq.Frame]
+]
 
 
 class HostedMap:
@@ -64,6 +67,7 @@ class HostedMap:
         self.name = name
         self.folder = state_folder.map_folder(server.state, name)
         self.sessions = Sessions()
+        self.questions = QuestionCounts()
         self.warm = False  # the fuser has been ready once: from then on it is known what the map has
         self._metrics = metrics
         self._keeps_window = (server.keep_seconds, server.keep_keyframes, server.keep_radius) != (None,) * 3
@@ -222,6 +226,8 @@ class HostedMap:
                 self.forgetting.on_found(message)
             elif isinstance(message, fuser_messages.Meshed):
                 self.outcomes.on_meshed(message)
+                for_people.append((message, frames))
+            elif isinstance(message, fuser_messages.FuserAnswer):
                 for_people.append((message, frames))
             elif isinstance(message, fuser_messages.FuserReply):
                 for_people.append((message, frames))
@@ -395,6 +401,8 @@ class HostedMap:
             journal_missing=self._journal.absent + len(self._journal.missing),
             journal_put_back=self._journal.put_back,
             fusing_s=self.fuser.seconds_at_work,
+            questions=dict(self.questions.by_outcome),
+            question_ms=self.questions.delay_ms,
         )
 
 

@@ -55,6 +55,11 @@ class PendingReplies:
         self._forget()
         return reader in self._trackers
 
+    def count(self, owner: bytes) -> int:
+        """Number of replies that wait for readers whose keys begin so."""
+        self._forget()
+        return sum(key.startswith(owner) for key in self._trackers)
+
     @property
     def nbytes(self) -> int:
         """Bytes of all replies that wait."""

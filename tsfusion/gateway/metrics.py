@@ -54,16 +54,29 @@ class Metrics(Collector):
             buckets=BUCKETS,
             registry=self._registry,
         )
+        self._question_delay = Histogram(
+            "tsfusion_question_delay_seconds",
+            "How long an answer to a question about the map took, in the server.",
+            ("map",),
+            buckets=BUCKETS,
+            registry=self._registry,
+        )
         self._registry.register(self)
 
     def observe(self, map_name: str, stage: str, seconds: float) -> None:
         """Count the seconds that a keyframe took for a stage of `STAGES`."""
+        self._delay.labels(self._label(map_name), stage).observe(max(seconds, 0.0))
+
+    def observe_question(self, map_name: str, seconds: float) -> None:
+        """Count the seconds that the answer to a question took."""
+        self._question_delay.labels(self._label(map_name)).observe(max(seconds, 0.0))
+
+    def _label(self, map_name: str) -> str:
         if map_name not in self._maps:
             if len(self._maps) >= _MAX_MAPS:
-                map_name = metrics_families.OTHERS
-            else:
-                self._maps.add(map_name)
-        self._delay.labels(map_name, stage).observe(max(seconds, 0.0))
+                return metrics_families.OTHERS
+            self._maps.add(map_name)
+        return map_name
 
     @property
     def health(self) -> Health | None:

@@ -98,6 +98,9 @@ def _of_maps(maps: dict[str, MapHealth], age: float) -> Iterator[Metric]:
     rejected = [(name, reason, n) for name, one in maps.items() for reason, n in one.rejected.items()]
     rows = (((name, reason), n) for name, reason, n in rejected)
     yield _gauge("keyframes_rejected", "Keyframes journaled, but not fusable.", ("map", "reason"), rows)
+    asked = [(name, outcome, n) for name, one in maps.items() for outcome, n in one.questions.items()]
+    rows = (((name, outcome), n) for name, outcome, n in asked)
+    yield _counter("questions", "Questions to the map, by what became of them.", ("map", "outcome"), rows)
     restarts = (((name,), one.fuser_restarts) for name, one in maps.items())
     yield _counter("fuser_restarts", "Fusers that took over from a dead one.", ("map",), restarts)
     corrections = (((name,), one.corrections) for name, one in maps.items())

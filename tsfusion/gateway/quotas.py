@@ -10,36 +10,17 @@ import numpy as np
 
 from tsfusion.core.config import ServerConfig, VolumeConfig
 from tsfusion.core.errors import InvalidConfig
+from tsfusion.core.token_bucket import Bucket
 from tsfusion.wire import corrections
 from tsfusion.wire.codec import measurement
 from tsfusion.wire.record_header import CorrectionHeader, KeyframeHeader, RecordHeader, Refused
 
-_BURST = 2.0  # seconds' worth that may come at once
 _MAX_CLIENTS = 4096
 # Without keys all share one quota, and each of so many connections has at least one part in so many of it,
 # whatever others send. A connection that is silent for so long loses it.
 _SHARES = 16
 _SHARE_KEPT_S = 10.0
 _ANY_MAP = VolumeConfig()
-
-
-class Bucket:
-    """A token bucket: `rate` a second on average, `_BURST` seconds of it at once."""
-
-    def __init__(self, rate: float, now: float) -> None:
-        self._rate = rate
-        self._level = self._most = _BURST * rate
-        self._then = now
-
-    def wait(self, amount: float, now: float) -> float:
-        """Seconds until an amount may pass; one that is larger than the bucket passes when that is full."""
-        self._level = min(self._level + (now - self._then) * self._rate, self._most)
-        self._then = now
-        return max(min(amount, self._most) - self._level, 0.0) / self._rate
-
-    def spend(self, amount: float) -> None:
-        """Count an amount that passes now."""
-        self._level -= amount
 
 
 class Allowance:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """The map's memory: blocks of 8³ voxels in slots, found by their packed coordinates."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,7 @@ class BlockStore:
         self.color, self.corrected = color, corrected
         self.count = 0
         self.most_blocks = MAX_ITEMS
+        self.pause: Callable[[], None] = lambda: None  # between two steps of a long pass that only reads
         self.hash_keys = np.zeros(4 * _FIRST_CAPACITY, np.int64)
         self.hash_slots = np.zeros(4 * _FIRST_CAPACITY, np.int32)
         self._keys = GrowingArray((), np.int64, _FIRST_CAPACITY)
@@ -155,6 +156,14 @@ class BlockStore:
             index = self.nbytes - self.count * self._residency.row_bytes
             self._residency.keep_within(max(self._memory_bytes - index, 0), self.stamps[: self.count])
 
+    def rest(self) -> None:
+        """Let blocks leave memory, and others have their turn: call it between the steps of a long pass.
+
+        Only of one that reads, and can bear that others read meanwhile.
+        """
+        self.keep_within_memory()
+        self.pause()
+
     def reserve(self, count: int) -> None:
         """Make room for `count` blocks in all.
 
@@ -233,7 +242,7 @@ class BlockStore:
         for i in range(0, self.count, _CHUNK):
             chunk = slice(i, min(i + _CHUNK, self.count))
             self.sums[chunk].any(axis=1, out=has_votes[chunk])
-            self.keep_within_memory()
+            self.rest()
         order = np.argsort(self.keys)
         return order[has_votes[order]]
 
@@ -246,7 +255,7 @@ class BlockStore:
                 yield self.keys[chunk], rows[chunk[0] : chunk[-1] + 1]
             else:
                 yield self.keys[chunk], rows[chunk]
-            self.keep_within_memory()
+            self.rest()
 
     def _hash(self, first: int) -> None:
         """Put the blocks from `first` on into the hash."""

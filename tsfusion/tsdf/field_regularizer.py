@@ -5,7 +5,7 @@ A view of the map's sums: no order of keyframes or threads can show. Blocks are 
 neighbours, so that some blocks' values are nearly those of the whole map (docs/method.md says how nearly).
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -118,8 +118,20 @@ class Level:
         starts = (np.cumsum(counts) - counts).astype(np.int32)
         return cls(bits, number, starts, np.empty((total, 6), np.int32), y, weight, x)
 
-    def relax(self, smoothness: float, edge: float, reweightings: int, *, first: bool) -> None:
-        """Solve with ω = 1 if `first`, then with ω from the last solution, again and again."""
+    def relax(
+        self,
+        smoothness: float,
+        edge: float,
+        reweightings: int,
+        *,
+        first: bool,
+        pause: Callable[[], None],
+    ) -> None:
+        """Solve with ω = 1 if `first`, then with ω from the last solution, again and again.
+
+        Args:
+            pause: called after each step.
+        """
         total = len(self.x)
         omega, bent = np.zeros((total, 3), np.float32), np.zeros((total, 3), np.float32)
         inverse, step = np.empty(total, np.float32), np.zeros(total, np.float32)
@@ -131,6 +143,7 @@ class Level:
                 kernels.relax(
                     self.links, self.y, self.weight, inverse, bent, smoothness, keep, gain, step, self.x
                 )
+                pause()
 
 
 class _Batch:
@@ -139,7 +152,7 @@ class _Batch:
     def __init__(
         self, wanted: NDArray[np.int64], store: BlockStore, min_weight: float, settings: FieldSettings
     ) -> None:
-        self.wanted, self.settings = wanted, settings
+        self.wanted, self.settings, self.pause = wanted, settings, store.pause
         self.keys = keys = around(wanted, store, 2 + settings.coarser)
         self.values = values_of(keys, store, min_weight)
         self.levels = self._list(store)
@@ -158,7 +171,7 @@ class _Batch:
             # between cells of twice the size a bend is 4 times as large, and there are 8 times fewer
             level.relax(
                 s.smoothness / 2**depth, s.edge * QUANTA_PER_VOXEL * 4**depth, s.reweightings,
-                first=depth == coarsest,
+                first=depth == coarsest, pause=self.pause,
             )  # fmt: skip
         finest = self.levels[0]
         rows = index_of(self.keys, self.wanted)

@@ -108,7 +108,11 @@ class ReadableMap:
             reachable = (np.abs(np.asarray(blocks, np.int64)) < 1 << 18).all(axis=1)  # others have no key
             chosen = np.unique(pack_keys(blocks[reachable]))
             chosen = chosen[store.slots_of(chosen) >= 0]
-        mesh = extract(np.sort(chosen), self._store, min_weight, self._mesh_buffers, self._view(surface))
+        buffers, self._mesh_buffers = self._mesh_buffers, MeshBuffers()  # who asks in a pause has others
+        try:
+            mesh = extract(np.sort(chosen), self._store, min_weight, buffers, self._view(surface))
+        finally:
+            self._mesh_buffers = buffers
         return mesh if blocks is not None else replace(mesh, held=self.held)
 
     def mesh_parts(

@@ -45,5 +45,5 @@ def values_of(
             len(part), part, store.hash_keys, store.hash_slots, store.sums, store.correction,
             int(store.corrected), least, out[first : first + len(part)],
         )  # fmt: skip
-        store.keep_within_memory()
+        store.rest()
     return out[: len(keys)]

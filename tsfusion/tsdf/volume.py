@@ -9,7 +9,7 @@ the sums and never change them.
 
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -268,6 +268,9 @@ class Volume(ReadableMap):
             throwaway.integrate(keyframe)
         throwaway.extract_mesh(min_weight=0)
         throwaway.extract_mesh(min_weight=0, blocks=throwaway.take_dirty()[:1])
+        for surface in {"raw", self.model.surface}:
+            throwaway.sample(np.zeros((1, 3), np.float32), surface=surface, min_weight=0)
+        throwaway.raycast((1, 1, 0, 0), np.eye(4), (1, 1), surface="raw")
 
     def save(self, path: str | os.PathLike[str], meta: dict[str, Any] | None = None) -> Path:
         """Write a checkpoint: complete and on disk, or not at all.
@@ -288,7 +291,7 @@ class Volume(ReadableMap):
             layers=list(layers),
         )
         used = self._store.used()
-        keys, rest = self._store.keys[used], self._store.keep_within_memory
+        keys, rest = self._store.keys[used], self._store.rest
         digest = self._begin_hash()
         return checkpoint.write(Path(path), header, keys, used, layers, map_digest=digest, between=rest)
 
@@ -334,6 +337,13 @@ class Volume(ReadableMap):
         `memory_bytes` no keyframe fails: its coldest blocks leave memory instead.
         """
         self._store.limit(nbytes)
+
+    def set_pause(self, pause: Callable[[], None]) -> None:
+        """Let a function be called between the steps of long passes that only read: meshes, hashes, saving.
+
+        It may ask the map anything, and must not change it.
+        """
+        self._store.pause = pause
 
     @property
     def most_blocks(self) -> int:

@@ -56,6 +56,8 @@ class MapHealth(Struct, frozen=True, kw_only=True):
     keyframes_moved: int = 0  # fused at a corrected pose, or taken out, since the fuser began
     moving_s: float = 0.0  # seconds of the fuser for that
     keyframes_forgotten: int = 0  # taken out of the map for good, by `tsfusion map forget` or a setting
+    questions: dict[str, int] = {}  # by outcome: answered, refused, late, failed; since the map was opened
+    question_ms: Spread = Spread()  # from question to answer, in the server, of the newest 1024
 
 
 ClientState = Literal["connected", "silent", "gone"]

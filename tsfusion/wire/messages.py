@@ -14,6 +14,7 @@ from tsfusion.core.errors import DecodeError
 from tsfusion.wire.forgetting import Forgotten, Selection
 from tsfusion.wire.health import Health, MeshLayout, Status
 from tsfusion.wire.keyframe_times import Seq, Stamps
+from tsfusion.wire.questions import Answer, Question
 from tsfusion.wire.record_header import SessionId, WorldName
 from tsfusion.wire.seal import is_damaged, seal
 
@@ -152,14 +153,18 @@ class Pong(Struct, frozen=True, tag="pong"):
 
 
 class Command(Struct, frozen=True, tag="command", kw_only=True):
-    """A request of a person or program; answered by one Reply."""
+    """A request of a person or program; answered by one Reply. The points of an `ask` follow as frames."""
 
-    name: Literal["ping", "health", "status", "mesh", "new_map", "forget"]
+    name: Literal["ping", "health", "status", "mesh", "new_map", "forget", "ask"]
     map: MapName = "default"  # of `new_map`: the name to begin with, where that is free
     min_weight: float | None = None
     selection: Selection | None = None  # of `forget`, with the two that follow
     erase: bool = False  # also delete the records' bytes
     dry_run: bool = False  # only say what would be forgotten
+    question: Question | None = None  # of `ask`, with what follows
+    number: Annotated[int, Meta(ge=0)] = 0  # comes back with the answer
+    timeout_s: float = 1.0  # then nobody waits for the answer any more
+    compress: bool = False  # large arrays of the answer
 
 
 class Reply(Struct, frozen=True, tag="reply", kw_only=True):
@@ -173,6 +178,10 @@ class Reply(Struct, frozen=True, tag="reply", kw_only=True):
     status: "Status | None" = None
     mesh: "MeshLayout | None" = None
     forgotten: Forgotten | None = None
+    asks: bool = False  # of a ping: whether this server's maps can be asked; an older one's cannot
+    number: int = 0  # of the question
+    late: bool = False  # whether its time was over
+    answer: Answer | None = None  # arrays follow as frames
 
 
 ToServer = Hello | Ping | Command

@@ -2,6 +2,7 @@
 """Queries to a running server: its health, the status of a map, the mesh of a map."""
 
 import time
+from collections.abc import Sequence
 from contextlib import closing, suppress
 from typing import Any
 
@@ -204,50 +205,74 @@ def request(
         CommandRefused: when the server answered that it cannot.
         TransportError: when what answers is no tsfusion server, or too few files can be opened.
     """
-    address, timeout = sockets.connect_address(address), min(timeout, _MAX_TIMEOUT_S)
-    with sockets.open_context() as context, closing(_connection(context, address, keys)) as connection:
-        try:
-            head, *frames = _send_until_answered(connection, command, timeout)
-            reply = messages.decode_to_client(head.buffer)
-        except DecodeError as error:
-            raise TransportError(f"what answers at {address} is no tsfusion server: {error}") from error
-    if not isinstance(reply, messages.Reply):
-        raise TransportError(f"the server at {address} answered a command with a {type(reply).__name__}")
+    address = sockets.connect_address(address)
+    with sockets.open_context() as context, closing(open_connection(context, address, keys)) as connection:
+        exchange = Exchange(connection, [[messages.encode_sealed(command)]])
+        reply, frames = exchange.reply(timeout)
     if reply.error is not None:
         raise CommandRefused(address, reply.error, retry=reply.retry)
-    return reply, [frame.buffer for frame in frames]
+    return reply, frames
 
 
-def _connection(context: "zmq.Context[Any]", address: str, keys: ClientKeys | None) -> Connection:
+def open_connection(context: "zmq.Context[Any]", address: str, keys: ClientKeys | None) -> Connection:
+    """A connection to a server's control address. Raises TransportError."""
     try:
         return Connection(context, sockets.dealer, address, keys)
     except zmq.ZMQError as error:
         raise TransportError(f"cannot open a socket: {error.strerror}") from error
 
 
-def _send_until_answered(
-    connection: Connection, command: messages.Command, timeout: float
-) -> list[zmq.Frame]:
-    """Send a command on each connection that is made, until there is an answer; returns its frames."""
-    deadline = time.monotonic() + timeout
-    why, asked = "", 0  # on which connection
-    while (left := deadline - time.monotonic()) > 0:
-        link = connection.socket
-        wanted = zmq.POLLIN | (zmq.POLLOUT if connection.made > asked else 0)
-        polled = [(link, wanted), (connection.events, zmq.POLLIN)]
-        events = dict(zmq.zmq_poll(polled, int(min(left, _POLL_S) * 1000) + 1)).get(link, 0)
-        if events & zmq.POLLIN:
-            return link.recv_multipart(copy=False)
-        if events & zmq.POLLOUT:
-            asked = connection.made
-            with suppress(zmq.Again):  # the connection has ended: the command is sent on the next one
-                link.send(messages.encode_sealed(command), zmq.NOBLOCK)
-        news, _ = connection.check(time.monotonic())
-        why = why if news is None else news
-        if connection.gave_up:
-            raise (NotAllowed if connection.refused else TransportError)(why)
-    reason = f": {why}" if why else ""
-    raise ServerUnreachable(
-        f"no server answered at {connection.address} within {timeout:g} s{reason}; is `tsfusion serve` "
-        "running there, and is the port right?"
-    )
+class Exchange:
+    """Messages sent on each connection that is made, until the replies to them have come."""
+
+    def __init__(self, connection: Connection, sent: Sequence[list[Any]]) -> None:
+        self._connection, self._sent = connection, sent
+        self._asked = 0  # on which connection
+        self._why = ""  # there is none
+
+    @property
+    def was_sent(self) -> bool:
+        """Whether the messages left over the connection that stands."""
+        return self._connection.is_made and self._asked == self._connection.made
+
+    def reply(self, timeout: float) -> tuple[Reply, list[memoryview]]:
+        """The next reply, and the raw frames that came with it.
+
+        Raises:
+            NotAllowed: as soon as the server turns the connection away.
+            ServerUnreachable: when nobody answered within `timeout` seconds.
+            TransportError: when what answers is no tsfusion server.
+        """
+        address = self._connection.address
+        try:
+            head, *frames = self._receive(min(timeout, _MAX_TIMEOUT_S))
+            reply = messages.decode_to_client(head.buffer)
+        except DecodeError as error:
+            raise TransportError(f"what answers at {address} is no tsfusion server: {error}") from error
+        if not isinstance(reply, Reply):
+            raise TransportError(f"the server at {address} answered a command with a {type(reply).__name__}")
+        return reply, [frame.buffer for frame in frames]
+
+    def _receive(self, timeout: float) -> list[zmq.Frame]:
+        connection, deadline = self._connection, time.monotonic() + timeout
+        while (left := deadline - time.monotonic()) > 0:
+            link = connection.socket
+            wanted = zmq.POLLIN | (zmq.POLLOUT if connection.made > self._asked else 0)
+            polled = [(link, wanted), (connection.events, zmq.POLLIN)]
+            events = dict(zmq.zmq_poll(polled, int(min(left, _POLL_S) * 1000) + 1)).get(link, 0)
+            if events & zmq.POLLIN:
+                return link.recv_multipart(copy=False)
+            if events & zmq.POLLOUT:
+                self._asked = connection.made
+                with suppress(zmq.Again):  # the connection has ended: all is sent on the next one
+                    for message in self._sent:
+                        link.send_multipart(message, zmq.NOBLOCK)
+            news, _ = connection.check(time.monotonic())
+            self._why = self._why if news is None else news
+            if connection.gave_up:
+                raise (NotAllowed if connection.refused else TransportError)(self._why)
+        reason = f": {self._why}" if self._why else ""
+        raise ServerUnreachable(
+            f"no server answered at {connection.address} within {timeout:g} s{reason}; is `tsfusion serve` "
+            "running there, and is the port right?"
+        )

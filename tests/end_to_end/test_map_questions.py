@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: MIT
+"""Questions to the map of a running server: real processes, real sockets."""
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import zmq
+from command_processes import python
+from keyframes_and_servers import CAMERA, DEADLINE, SHAPE, VOLUME, Server, secured, serving, until, wall
+from numpy.typing import NDArray
+
+from tsfusion import AnswerLate, Client, InvalidConfig, MapClient, ServerUnreachable, Volume
+from tsfusion.core.errors import TransportError
+from tsfusion.geometry.keyframe import Keyframe
+from tsfusion.wire import key_folder, messages, questions, sockets
+from tsfusion.wire.curve import client_keys
+from tsfusion.wire.messages import Command, Reply
+from tsfusion.wire.queries import CommandRefused, fetch_health
+from tsfusion.wire.questions import MOST_POINTS, Raycast, Sample
+
+COUNT = 4
+EASY = 30.0  # seconds for an answer that is there in milliseconds
+
+
+def gray(i: int) -> Keyframe:
+    """A wall whose colours no JPEG changes: without any."""
+    return replace(wall(i), color=None)
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A server whose map has some walls."""
+    with serving(tmp_path_factory.mktemp("state")) as running:
+        scan(running)
+        yield running
+
+
+def scan(server: Server, **keys: Any) -> None:
+    with Client(server.address, **keys) as client:
+        for i in range(COUNT):
+            client.send(gray(i))
+        client.wait_settled(DEADLINE)
+
+
+def points(n: int = 500) -> NDArray[np.float32]:
+    low, high = (-0.8, -0.6, 1.0), (0.8, 0.6, 1.5)
+    return np.random.default_rng(3).uniform(low, high, (n, 3)).astype(np.float32)
+
+
+def counts(server: Server) -> dict[str, int]:
+    return fetch_health(server.address).maps["default"].questions
+
+
+def test_answers_are_those_of_the_map_itself(server: Server) -> None:
+    """Also compressed, and up to the most points of a question: the same arrays, of a state that is named."""
+    volume = Volume(VOLUME)
+    for i in range(COUNT):
+        volume.integrate(gray(i))
+    for compress in (False, True):
+        with MapClient(server.address, compress=compress, timeout=EASY) as asked:
+            many = asked.sample(points(MOST_POINTS))
+            one = asked.sample(points(1), surface=None, min_weight=2.0)
+            view = asked.raycast(CAMERA, np.eye(4), SHAPE)
+        equal(many.result, volume.sample(points(MOST_POINTS), surface="raw"))
+        equal(one.result, volume.sample(points(1), min_weight=2.0))
+        equal(view.result, volume.raycast(CAMERA, np.eye(4), SHAPE, surface="raw"))
+        assert np.isfinite(many.result.distance).any()
+        assert (view.result.depth > 0).any()
+        assert many.state == view.state
+        assert (many.state.keyframes, many.state.segment) == (COUNT, 1)
+        assert many.delay_s > many.took_s > 0
+
+
+def equal(one: Any, other: Any) -> None:
+    """Two results of the same kind, array by array."""
+    assert type(one) is type(other)
+    for name, array in vars(other).items():
+        if array is None:
+            assert getattr(one, name) is None
+        else:
+            np.testing.assert_array_equal(getattr(one, name), array, strict=True)
+
+
+def test_the_client_needs_no_taichi() -> None:
+    python("import sys, tsfusion; tsfusion.MapClient; assert 'taichi' not in sys.modules")
+
+
+class Raw:
+    """A connection that sends whatever it likes."""
+
+    def __init__(self, server: Server) -> None:
+        self._context: zmq.Context[Any] = zmq.Context()
+        self._link = sockets.dealer(self._context)
+        self._link.connect(server.control)
+
+    def send(self, *frames: bytes) -> None:
+        assert self._link.poll(EASY * 1000, zmq.POLLOUT)
+        self._link.send_multipart(frames)
+
+    def ask(self, question: Any, *frames: bytes, **fields: Any) -> Reply:
+        """The reply to a question."""
+        command = Command(name="ask", question=question, **{"timeout_s": EASY, **fields})
+        self.send(messages.encode(command), *frames)
+        return self.reply()
+
+    def reply(self) -> Reply:
+        assert self._link.poll(EASY * 1000), "no reply"
+        reply = messages.decode_to_client(self._link.recv_multipart()[0])
+        assert isinstance(reply, Reply)
+        return reply
+
+    def close(self) -> None:
+        self._link.close()
+        self._context.term()
+
+
+GOOD = points(3).tobytes()
+SAMPLE = Sample(points=3, crc=questions.crc_of([GOOD]))
+LOOK = Raycast(intrinsics=(40, 40, 31.5, 23.5), pose=tuple(np.eye(4).ravel().tolist()), shape=(4, 4))
+NAN = np.array([[0, np.nan, 1]], "<f4").tobytes()
+
+
+def changed(question: Any, **fields: Any) -> Any:
+    return msgspec.structs.replace(question, **fields)
+
+
+@pytest.mark.parametrize(
+    ("question", "frames", "why"),
+    [
+        (changed(SAMPLE, points=10**9), [GOOD], "1 to 20000 points, got 1000000000"),
+        (changed(SAMPLE, points=-1), [], "1 to 20000 points"),
+        (SAMPLE, [], "36 bytes"),
+        (SAMPLE, [GOOD[:-4]], "36 bytes"),
+        (SAMPLE, [GOOD, b"x"], "36 bytes"),
+        (changed(SAMPLE, crc=7), [GOOD], "CRC-32"),
+        (Sample(points=1, crc=questions.crc_of([NAN])), [NAN], "finite"),
+        (changed(SAMPLE, min_weight=float("nan")), [GOOD], "min_weight"),
+        (LOOK, [GOOD], "no points"),
+        (changed(LOOK, shape=(1 << 40, 1)), [], "shape"),
+        (changed(LOOK, shape=(4096, 4096)), [], "1048576 pixels"),
+        (changed(LOOK, pose=(float("nan"),) * 16), [], ""),
+        (changed(LOOK, intrinsics=(0.0, 1.0, float("inf"), 1.0)), [], "intrinsics"),
+        (None, [], "nothing was asked"),
+    ],
+)
+def test_a_bad_question_is_refused_and_counted(
+    server: Server, question: Any, frames: list[bytes], why: str
+) -> None:
+    """By the server: the client would not have sent it."""
+    before, asked_before = fetch_health(server.address), counts(server)
+    with closing(Raw(server)) as link:
+        reply = link.ask(question, *frames, number=5)
+        assert why in (reply.error or "")
+        assert (reply.answer, reply.number) == (None, 5)
+        assert link.ask(SAMPLE, GOOD).answer is not None  # it lives
+    after = fetch_health(server.address)
+    assert after.refused.get("question", 0) == before.refused.get("question", 0) + 1
+    assert counts(server)["refused"] == asked_before.get("refused", 0) + 1
+
+
+def test_bad_times_and_bad_messages(server: Server) -> None:
+    with closing(Raw(server)) as link:
+        for seconds in (0.0, -1.0, float("nan"), float("inf"), 1e9):
+            assert "may wait" in (link.ask(SAMPLE, GOOD, timeout_s=seconds).error or "")
+        refused = fetch_health(server.address).refused.get("control", 0)
+        short = msgspec.msgpack.encode(
+            {"type": "command", "name": "ask", "question": {"type": "raycast", "pose": [1.0]}}
+        )
+        link.send(short)  # no pose
+        link.send(messages.encode(Command(name="ping")), b"more")
+        assert link.ask(SAMPLE, GOOD).answer is not None
+    assert fetch_health(server.address).refused["control"] == refused + 2
+
+
+def test_what_the_client_does_not_ask(server: Server) -> None:
+    with MapClient(server.address) as asked:
+        for bad in (np.zeros((0, 3)), [[0, 0, np.nan]], np.zeros((MOST_POINTS + 1, 3)), np.zeros(3)):
+            with pytest.raises(InvalidConfig):
+                asked.sample(bad)
+        with pytest.raises(InvalidConfig, match="timeout"):
+            asked.sample(points(1), timeout=0)
+        with pytest.raises(InvalidConfig, match="pixels"):
+            asked.raycast(CAMERA, np.eye(4), (4000, 4000))
+
+
+def test_an_answer_that_is_late_is_an_error_in_time(tmp_path: Path) -> None:
+    """The fuser stands still: the question ends after its own time, and the next one is answered."""
+    with serving(tmp_path) as running, MapClient(running.address) as asked:
+        asked.sample(points(1), timeout=EASY)
+        pid = running.fuser_pid()
+        os.kill(pid, signal.SIGSTOP)
+        began = time.monotonic()
+        try:
+            with pytest.raises(AnswerLate):
+                asked.sample(points(1), timeout=0.2)
+            assert time.monotonic() - began < 10
+            until(lambda: counts(running).get("late", 0) == 1)
+        finally:
+            os.kill(pid, signal.SIGCONT)
+        assert asked.sample(points(1), timeout=EASY).state.keyframes == 0
+    with MapClient(running.address) as asked, pytest.raises(ServerUnreachable):
+        asked.sample(points(1), timeout=0.2)
+
+
+def test_a_client_that_comes_back_is_answered(tmp_path: Path) -> None:
+    """The fuser dies, then the server: the same client asks on."""
+    with serving(tmp_path) as running, MapClient(running.address, timeout=EASY) as asked:
+        scan(running)
+        before = asked.sample(points())
+        os.kill(running.fuser_pid(), signal.SIGKILL)
+        until(lambda: again(asked))
+        after = asked.sample(points())
+        equal(after.result, before.result)
+        assert after.state.epoch != before.state.epoch
+
+
+def again(asked: MapClient) -> bool:
+    """Whether the map has all its keyframes again."""
+    try:
+        return asked.sample(points(1)).state.keyframes == COUNT
+    except CommandRefused as error:
+        if not error.retry:
+            raise
+        return False
+
+
+def test_each_client_has_so_many_questions_a_second(tmp_path: Path) -> None:
+    """The rate is each connection's own where there are no keys."""
+    with (
+        serving(tmp_path, quota_questions=1e-3) as running,
+        MapClient(running.address, timeout=EASY) as asked,
+        MapClient(running.address, timeout=EASY) as other,
+    ):
+        asked.sample(points(1))
+        with pytest.raises(CommandRefused, match="questions a second") as caught:
+            asked.sample(points(1))
+        assert caught.value.retry
+        other.sample(points(1))
+        assert counts(running) == {"answered": 2, "refused": 1}
+
+
+def test_keys_say_whose_map_may_be_asked(tmp_path: Path) -> None:
+    keys = secured(tmp_path)
+    with serving(tmp_path / "state", **keys.server) as running:
+        scan(running, **keys.client)
+        with MapClient(running.address, keys=keys.keys, timeout=EASY) as asked:
+            assert asked.sample(points()).state.keyframes == COUNT
+        guest = key_folder.create_pair(tmp_path / "guest", "guest").public
+        key_folder.allow(tmp_path / "server", "guest", guest, maps=("theirs",))
+        own = client_keys(str(tmp_path / "guest" / "guest.key_secret"), keys.client["server_key"])
+        for name, why in (("default", "may not use map default"), ("theirs", "no map theirs is open")):
+            with (
+                MapClient(running.address, name, keys=own, timeout=EASY) as asked,
+                pytest.raises(CommandRefused, match=why),
+            ):
+                asked.sample(points())
+
+
+def test_an_older_server_is_named() -> None:
+    """It answers a ping, and drops a command that it does not know."""
+    context: zmq.Context[Any] = zmq.Context()
+    link = sockets.router(context)
+    port = link.bind_to_random_port("tcp://127.0.0.1")
+
+    def answer() -> None:
+        while link.poll(EASY * 1000):
+            identity, *frames = link.recv_multipart()
+            if msgspec.msgpack.decode(frames[0])["name"] == "ping":
+                link.send_multipart([identity, msgspec.msgpack.encode({"type": "reply", "name": "ping"})])
+                return
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    try:
+        with (
+            MapClient(f"tcp://127.0.0.1:{port - 1}", timeout=EASY) as asked,
+            pytest.raises(TransportError, match="older and cannot answer questions: update it"),
+        ):
+            asked.sample(points(1))
+    finally:
+        thread.join()
+        link.close()
+        context.term()
+
+
+def test_questions_go_before_keyframes_that_wait(tmp_path: Path) -> None:
+    """While a scan comes in, each answer is of one state, and the states move on."""
+    with serving(tmp_path) as running, MapClient(running.address, timeout=EASY) as asked:
+        with Client(running.address) as client:
+            for i in range(40):
+                client.send(gray(i % 8))
+            seen = [asked.sample(points(50)).state for _ in range(20)]
+            client.wait_settled(DEADLINE)
+        assert [one.changes for one in seen] == sorted(one.changes for one in seen)
+        assert all(one.keyframes == one.changes for one in seen)
+        assert asked.sample(points(1)).state.keyframes == 40

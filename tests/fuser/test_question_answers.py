@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: MIT
+"""When a fuser answers questions: before all else, for a share of its time, and inside of long passes."""
+
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+import pytest
+import zmq
+from keyframes_and_servers import CAMERA, SHAPE, VOLUME, wall
+
+from tsfusion import Volume
+from tsfusion.fuser import question_answers
+from tsfusion.fuser.inbox import Inbox
+from tsfusion.fuser.messages import Finish, FuserAnswer, FuserQuestion, Publish, encode
+from tsfusion.fuser.question_answers import QuestionAnswers
+from tsfusion.wire import questions
+from tsfusion.wire.questions import MapState, Sample
+
+POINTS = np.array([[0, 0, 1.2], [0.1, 0.1, 1.25]], np.float32)
+FRAMES = questions.point_frames(POINTS)
+QUESTION = Sample(points=2, crc=questions.crc_of(FRAMES), surface="raw")
+
+
+def asked(number: int, left_s: float = 60.0) -> FuserQuestion:
+    now = time.monotonic_ns()
+    return FuserQuestion(number, QUESTION, now, now + int(1e9 * left_s))
+
+
+@pytest.fixture(scope="module")
+def volume() -> Volume:
+    found = Volume(VOLUME)
+    for i in range(3):
+        found.integrate(wall(i))
+    found.sample(POINTS, surface="raw")  # its kernels are compiled
+    return found
+
+
+class Desk:
+    """The answers to what is put into an inbox."""
+
+    def __init__(self, volume: Volume) -> None:
+        self.context: zmq.Context[Any] = zmq.Context()
+        self.gateway, link = (self.context.socket(zmq.PAIR) for _ in range(2))
+        self.gateway.bind("inproc://desk")
+        link.connect("inproc://desk")
+        self.links = self.gateway, link
+        self.inbox = Inbox(link)
+        self.sent: list[FuserAnswer] = []
+        self.answers = QuestionAnswers(
+            volume,
+            self.inbox,
+            state=lambda: MapState(keyframes=volume.keyframes),
+            send=lambda message, _frames: self.sent.append(message),
+        )
+
+    def put(self, *messages: Any) -> None:
+        for message in messages:
+            frames = FRAMES if isinstance(message, FuserQuestion) else []
+            self.gateway.send_multipart([encode(message), *frames])
+
+    @property
+    def numbers(self) -> list[int]:
+        return [one.number for one in self.sent if one.answer is not None]
+
+
+@pytest.fixture
+def desk(volume: Volume) -> Any:
+    made = Desk(volume)
+    yield made
+    for link in made.links:
+        link.close()
+    made.context.term()
+
+
+def test_questions_overtake_orders(desk: Desk) -> None:
+    desk.put(Publish(True), asked(1), Finish(), asked(2))
+    desk.answers.give()
+    assert desk.numbers == [1, 2]
+    assert desk.inbox.orders == deque([Publish(True), Finish()])
+    assert all(one.answer and one.answer.state.keyframes == 3 for one in desk.sent)
+
+
+def test_a_question_whose_time_is_over_costs_nothing(desk: Desk) -> None:
+    desk.put(asked(1, -1.0), asked(2))
+    desk.answers.give()
+    assert [(one.number, one.late) for one in desk.sent] == [(1, True), (2, False)]
+
+
+def test_orders_that_wait_have_the_larger_share(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Questions stop when their share is used up, and go on when nothing else waits."""
+    monkeypatch.setattr(question_answers, "answer_of", lambda *_: time.sleep(0.06) or {})
+    desk.put(Publish(True), *map(asked, range(1, 9)))
+    desk.answers.give()
+    assert 1 <= len(desk.numbers) <= 2
+    desk.inbox.orders.clear()
+    desk.answers.give()
+    assert desk.numbers == list(range(1, 9))
+
+
+def test_a_question_that_fails_is_answered_with_the_reason(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> Any:
+        raise MemoryError("much")
+
+    monkeypatch.setattr(question_answers, "answer_of", fail)
+    desk.put(asked(1))
+    desk.answers.give()
+    assert "fuser_memory_bytes" in desk.sent[0].error
+
+
+def test_long_passes_stop_for_questions_and_give_the_same(desk: Desk, volume: Volume) -> None:
+    """A mesh, hashes and a checkpoint, with views and samples asked for in the middle of each."""
+    mesh, hashes = volume.extract_mesh(), (volume.map_hash(), volume.color_hash())
+    asked_for = 0
+
+    def ask() -> None:
+        nonlocal asked_for
+        volume.set_pause(lambda: None)
+        volume.raycast(CAMERA, np.eye(4), SHAPE)
+        volume.sample(POINTS)
+        volume.set_pause(ask)
+        asked_for += 1
+
+    volume.set_pause(ask)
+    try:
+        paused = volume.extract_mesh()
+        assert asked_for > 10
+        assert (volume.map_hash(), volume.color_hash()) == hashes
+    finally:
+        volume.set_pause(lambda: None)
+    for name in ("vertices", "faces", "normals", "colors"):
+        np.testing.assert_array_equal(getattr(paused, name), getattr(mesh, name))
+
+
+def test_an_answer_is_not_interrupted_by_another(desk: Desk, volume: Volume) -> None:
+    """A question that itself is a long pass comes to the pause of long passes."""
+    volume.set_pause(desk.answers.give_between)
+    try:
+        field = FuserQuestion(1, Sample(points=2, crc=QUESTION.crc, surface="field"), 0, 1 << 62)
+        desk.put(field, asked(2))
+        desk.answers.give()
+    finally:
+        volume.set_pause(lambda: None)
+    assert desk.numbers == [1, 2]

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: MIT
+"""The map of a running server, asked from a machine without Taichi: how far is it to the wall?"""
+
+import time
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import ArrayLike, NDArray
+
+from tsfusion.core.config import DEFAULT_MAP, Surface
+from tsfusion.core.errors import AnswerLate, DecodeError, InvalidConfig, ServerUnreachable, TransportError
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.map_answers import Samples, View, checked_camera, checked_points
+from tsfusion.wire import messages, questions, sockets
+from tsfusion.wire.curve import ClientKeys
+from tsfusion.wire.messages import Command, Reply
+from tsfusion.wire.queries import CommandRefused, Exchange, open_connection
+from tsfusion.wire.questions import Answer, MapState, Question, Raycast, Sample
+
+Result = TypeVar("Result")
+
+
+class Answered(Struct, Generic[Result], frozen=True, kw_only=True, eq=False):
+    """What a map answered, of which state of it, and how long that took.
+
+    Attributes:
+        result: as of the method of `Volume` with the same name.
+        state: the one state of the map that all of the result is of.
+        delay_s: from the question to the answer, here.
+        waited_s, took_s: of it, seconds in the server: until the map was free, and to answer.
+    """
+
+    result: Result
+    state: MapState
+    delay_s: float
+    waited_s: float = 0.0
+    took_s: float = 0.0
+
+
+class MapClient:
+    """A map on a server, asked by the methods of `Volume`: each returns an `Answered` of what that returns.
+
+    The map answers between two keyframes, within milliseconds; a question that is not answered in its time
+    raises, and never hangs. By custom the surface is the raw one here, as it was fused: smoothing it takes
+    the server longer. Use it from one thread.
+
+    Args:
+        address: of the server: tcp://HOST:PORT.
+        map_: which of its maps.
+        control: its control address; None = the port after the other.
+        timeout: seconds that a question may take, unless it says otherwise.
+        keys: of `wire.curve.client_keys`, for a server with keys.
+        compress: large answers, for a slow link; None = unless the server is on this machine.
+
+    Raises:
+        InvalidConfig: for an address that is none.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        map_: str = DEFAULT_MAP,
+        *,
+        control: str | None = None,
+        timeout: float = 1.0,
+        keys: ClientKeys | None = None,
+        compress: bool | None = None,
+    ) -> None:
+        self.address, self.map = sockets.connect_address(address), map_
+        self.timeout = timeout
+        host, _ = sockets.parse_address(address)
+        self._compress = not sockets.is_loopback(host) if compress is None else compress
+        self._context = sockets.open_context()
+        place = sockets.control_address(self.address, control)
+        self._connection = open_connection(self._context, sockets.connect_address(place), keys)
+        self._number = 0
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._connection.close()
+        self._context.term()
+
+    def __enter__(self) -> "MapClient":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def sample(
+        self,
+        points: ArrayLike,
+        *,
+        min_weight: float | None = None,
+        surface: Surface | None = "raw",
+        timeout: float | None = None,
+    ) -> Answered[Samples]:
+        """The signed distance, its weight and its gradient at points; see `Volume.sample`.
+
+        Args:
+            points: (n, 3) metres, at most `wire.questions.MOST_POINTS`: an answer is of one state of the map.
+            surface: None = the one that the map's settings say.
+            timeout: seconds; None = the client's.
+
+        Raises:
+            InvalidConfig: for points that are none, or too many.
+            AnswerLate: when the map did not answer in time.
+            ServerUnreachable: when nobody is there.
+            TransportError: when the server cannot answer, with the reason.
+        """
+        rows = checked_points(points).astype(np.float32)
+        if not len(rows):
+            raise InvalidConfig("there is no point to ask about")
+        frames = questions.point_frames(rows)
+        crc = questions.crc_of(frames)
+        question = Sample(points=len(rows), crc=crc, min_weight=min_weight, surface=surface)
+        answer, arrays, delay = self._ask(question, frames, timeout)
+        return _answered(Samples(**_all(arrays, "distance", "weight", "gradient")), answer, delay)
+
+    def raycast(
+        self,
+        intrinsics: Intrinsics | ArrayLike,
+        T_world_camera: ArrayLike,
+        shape: tuple[int, int],
+        *,
+        min_weight: float | None = None,
+        surface: Surface | None = "raw",
+        timeout: float | None = None,
+    ) -> Answered[View]:
+        """What a pinhole camera sees of the surface; see `Volume.raycast`. Raises as `sample`."""
+        camera, T, (height, width) = checked_camera(intrinsics, T_world_camera, shape)
+        question = Raycast(
+            intrinsics=(camera.fx, camera.fy, camera.cx, camera.cy),
+            pose=tuple(T.ravel().tolist()),
+            shape=(height, width),
+            min_weight=min_weight,
+            surface=surface,
+        )
+        answer, arrays, delay = self._ask(question, [], timeout)
+        colors = arrays.pop("colors", None)
+        return _answered(View(**_all(arrays, "depth", "normals"), colors=colors), answer, delay)
+
+    def _ask(
+        self, question: Question, frames: Sequence[Any], timeout: float | None
+    ) -> tuple[Answer, dict[str, NDArray[Any]], float]:
+        """The answer, its arrays, and the seconds that it took."""
+        seconds = self.timeout if timeout is None else timeout
+        if not 0 < seconds <= questions.LONGEST_S:
+            raise InvalidConfig(f"timeout must be > 0 and up to {questions.LONGEST_S:g} s, got {timeout}")
+        if problem := question.problem([memoryview(frame) for frame in frames]):
+            raise InvalidConfig(problem)
+        began, self._number = time.monotonic(), self._number + 1
+        command = Command(
+            name="ask",
+            map=self.map,
+            question=question,
+            number=self._number,
+            timeout_s=seconds,
+            compress=self._compress,
+        )
+        sent = [messages.encode_sealed(Command(name="ping"))], [messages.encode_sealed(command), *frames]
+        reply, arrays = self._exchange(sent, began + seconds, seconds)
+        delay = time.monotonic() - began
+        if reply.late:
+            raise AnswerLate(f"the map {self.map} at {self.address}: {reply.error}")
+        if reply.error is not None:
+            raise CommandRefused(self.address, reply.error, retry=reply.retry)
+        if reply.answer is None:
+            raise TransportError(f"the server at {self.address} answered without an answer")
+        try:
+            return reply.answer, questions.unpack(reply.answer, arrays), delay
+        except DecodeError as error:
+            raise TransportError(f"the server at {self.address}: {error}") from error
+
+    def _exchange(
+        self, sent: Sequence[list[Any]], deadline: float, seconds: float
+    ) -> tuple[Reply, list[memoryview]]:
+        """Send the messages; the reply to the last one.
+
+        A ping goes before each question: an older server answers that one, and never the other.
+        """
+        exchange, is_there = Exchange(self._connection, sent), False
+        while True:
+            try:
+                reply, frames = exchange.reply(max(deadline - time.monotonic(), 0.0))
+            except ServerUnreachable as error:
+                if is_there:
+                    raise AnswerLate(
+                        f"the map {self.map} at {self.address} did not answer within {seconds:g} s: ask "
+                        "again, or give it longer (timeout)"
+                    ) from error
+                self._connection.reopen()  # what stands may lead nowhere, and nobody would notice
+                raise
+            if reply.name == "ping" and not reply.asks:
+                raise TransportError(
+                    f"the server at {self.address} is older and cannot answer questions: update it"
+                )
+            is_there = True
+            if reply.name == "ask" and reply.number == self._number:
+                return reply, frames
+
+
+def _all(arrays: dict[str, NDArray[Any]], *names: str) -> dict[str, NDArray[Any]]:
+    """The arrays of these names, and no others."""
+    if sorted(arrays) != sorted(names):
+        raise TransportError(f"an answer has {', '.join(arrays) or 'nothing'} instead of {', '.join(names)}")
+    return arrays
+
+
+def _answered(result: Result, answer: Answer, delay_s: float) -> Answered[Result]:
+    return Answered(
+        result=result,
+        state=answer.state,
+        delay_s=delay_s,
+        waited_s=answer.waited_s,
+        took_s=answer.took_s,
+    )

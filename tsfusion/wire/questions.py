@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: MIT
+"""Questions to the map of a running server, and their answers: small structs, then arrays as raw frames.
+
+A question has bounds that the server checks before it spends anything: points, pixels, cells. An answer
+belongs to one state of the map, and says which.
+"""
+
+import math
+import zlib
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from msgspec import Meta, Struct
+from numpy.typing import DTypeLike, NDArray
+
+from tsfusion.core.config import Surface
+from tsfusion.core.errors import DecodeError, InvalidConfig
+from tsfusion.geometry.map_answers import checked_camera
+from tsfusion.wire import array_encoding
+from tsfusion.wire.record_header import Refused
+from tsfusion.wire.sockets import CONTROL_MAX_BYTES
+
+MOST_POINTS = 20_000  # of a question
+MOST_PIXELS = 1 << 20  # of a view
+MOST_FRAMES = 4  # that its points come in
+LONGEST_S = 60.0  # that a question may wait
+LATE = "its time was over before the map came to it"
+_POINTS_A_FRAME = CONTROL_MAX_BYTES // 12
+_PACKED_FROM = 4096  # bytes: smaller arrays travel as they are
+Pose = Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)]
+
+
+class Sample(Struct, frozen=True, tag="sample", omit_defaults=True):
+    """How far is the surface from these points? They follow as (n, 3) float32 metres, little-endian.
+
+    Attributes:
+        points: n.
+        crc: CRC-32 of their bytes.
+        min_weight, surface: as of `Volume.sample`.
+    """
+
+    points: int
+    crc: int
+    min_weight: float | None = None
+    surface: Surface | None = None
+
+    def problem(self, frames: Sequence[Any]) -> str:
+        """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        if not 1 <= self.points <= MOST_POINTS:
+            return f"a question may have 1 to {MOST_POINTS} points, got {self.points}: ask in parts"
+        if sum(map(len, frames)) != 12 * self.points:
+            return f"{self.points} points are {12 * self.points} bytes, others came"
+        if crc_of(frames) != self.crc:
+            return "its points were damaged on their way (CRC-32 differs)"
+        if not np.isfinite(points_of(frames)).all():
+            return "points must be finite"
+        return _problem_of_weight(self.min_weight)
+
+
+class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
+    """What does a pinhole camera see of the surface? Arguments as of `Volume.raycast`.
+
+    Attributes:
+        intrinsics: fx, fy, cx, cy, pixels.
+        pose: the 16 numbers of T_world_camera, row by row.
+        shape: height, width, pixels.
+    """
+
+    intrinsics: tuple[float, float, float, float]
+    pose: Pose
+    shape: tuple[int, int]
+    min_weight: float | None = None
+    surface: Surface | None = None
+
+    def problem(self, frames: Sequence[Any]) -> str:
+        """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        if frames:
+            return "a view has no points"
+        try:
+            checked_camera(self.intrinsics, self.matrix, self.shape)
+        except InvalidConfig as error:
+            return str(error)
+        if math.prod(self.shape) > MOST_PIXELS:
+            return f"a view may have {MOST_PIXELS} pixels, got {self.shape[0]} × {self.shape[1]}"
+        return _problem_of_weight(self.min_weight)
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The pose T_world_camera, (4, 4)."""
+        return np.array(self.pose, np.float64).reshape(4, 4)
+
+
+Question = Sample | Raycast
+
+
+class ArrayLayout(Struct, frozen=True, array_like=True):
+    """One array of an answer, in the order of the frames. `packed`: as `array_encoding.pack` makes it."""
+
+    name: str
+    dtype: Literal["float32", "float64", "int8", "uint8", "int32", "bool"]
+    shape: tuple[int, ...]
+    packed: bool = False
+
+
+class MapState(Struct, frozen=True, kw_only=True):
+    """The one state of a map that an answer belongs to.
+
+    Attributes:
+        keyframes: in the map.
+        changes: records and moves that the process `epoch` of the server has taken: where both are equal,
+            the map is the same. An empty epoch is a file's.
+        segment, offset: the newest record of the journal in the map; 0 = none since it was opened.
+        waiting: keyframes whose corrected pose is not in the map yet.
+    """
+
+    keyframes: int
+    changes: int = 0
+    epoch: str = ""
+    segment: int = 0
+    offset: int = 0
+    waiting: int = 0
+
+
+class Answer(Struct, frozen=True, kw_only=True):
+    """What a map answered; its arrays follow as frames.
+
+    Attributes:
+        crc: CRC-32 of all frames.
+        waited_s: from when the server got the question until it was looked at.
+        took_s: to answer it.
+        values: that are no arrays, by name.
+    """
+
+    arrays: tuple[ArrayLayout, ...]
+    state: MapState
+    crc: int
+    waited_s: float = 0.0
+    took_s: float = 0.0
+    values: dict[str, Any] = {}
+
+
+def crc_of(frames: Sequence[Any]) -> int:
+    """CRC-32 of the bytes of all frames, one after the other."""
+    crc = 0
+    for frame in frames:
+        crc = zlib.crc32(frame, crc)
+    return crc
+
+
+def point_frames(points: NDArray[np.float32]) -> list[memoryview]:
+    """(n, 3) float32 points as frames that a server's control socket takes."""
+    rows = np.ascontiguousarray(points, "<f4")
+    return [rows[i : i + _POINTS_A_FRAME].data.cast("B") for i in range(0, len(rows), _POINTS_A_FRAME)]
+
+
+def points_of(frames: Sequence[Any]) -> NDArray[np.float32]:
+    """The (n, 3) points of frames whose sizes were checked."""
+    joined = np.concatenate([np.frombuffer(frame, np.uint8) for frame in frames])
+    return joined.view("<f4").reshape(-1, 3).astype(np.float32, copy=False)
+
+
+def pack(arrays: dict[str, NDArray[Any]], *, compress: bool) -> tuple[tuple[ArrayLayout, ...], list[Any]]:
+    """Arrays for the way: their layouts, and a frame each."""
+    layouts, frames = [], []
+    for name, array in arrays.items():
+        packed = compress and array.nbytes >= _PACKED_FROM and array.dtype != np.bool_
+        layouts.append(ArrayLayout(name, array.dtype.name, array.shape, packed))
+        frames.append(array_encoding.pack(array) if packed else np.ascontiguousarray(array).data.cast("B"))
+    return tuple(layouts), frames
+
+
+def unpack(answer: Answer, frames: Sequence[Any]) -> dict[str, NDArray[Any]]:
+    """The arrays of an answer, by name.
+
+    Raises:
+        DecodeError: when the frames are not what the answer says.
+    """
+    if len(frames) != len(answer.arrays) or crc_of(frames) != answer.crc:
+        raise DecodeError("an answer was damaged on its way (CRC-32 differs)")
+    return {one.name: _array(one, frame) for one, frame in zip(answer.arrays, frames, strict=True)}
+
+
+def _array(layout: ArrayLayout, frame: Any) -> NDArray[Any]:
+    dtype: DTypeLike = np.dtype(layout.dtype)
+    size = math.prod(layout.shape) * np.dtype(dtype).itemsize
+    if min(layout.shape, default=1) < 0 or (not layout.packed and memoryview(frame).nbytes != size):
+        raise DecodeError(f"an array {layout.shape} of {layout.dtype} was announced, got {len(frame)} bytes")
+    try:
+        if layout.packed:
+            return array_encoding.unpack(frame, np.dtype(dtype), layout.shape)
+    except Refused as error:
+        raise DecodeError(f"an answer is malformed: {error}") from error
+    return np.frombuffer(frame, dtype).reshape(layout.shape)
+
+
+def _problem_of_weight(min_weight: float | None) -> str:
+    """Why a weight makes no sense; empty = it does."""
+    good = min_weight is None or (math.isfinite(min_weight) and min_weight >= 0)
+    return "" if good else f"min_weight must be 0 or more, got {min_weight}"
