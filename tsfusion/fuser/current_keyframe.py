@@ -3,9 +3,12 @@
 
 import mmap
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from tsfusion.core.errors import MapError
+from tsfusion.fuser.messages import NOT_WORKING
 
 
 class CurrentKeyframe:
@@ -17,6 +20,14 @@ class CurrentKeyframe:
                 self._word = mmap.mmap(file.fileno(), 8)
         except (OSError, ValueError) as error:  # ValueError: the file is too short
             raise MapError(f"cannot share memory with the gateway: {error}") from error
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Be at no keyframe for the block: what happens in it is not the keyframe's fault."""
+        (index,) = struct.unpack_from("<q", self._word, 0)
+        self.set(NOT_WORKING)
+        yield
+        self.set(index)
 
     def set(self, index: int) -> None:
         """Write the index of the keyframe; `messages.NOT_WORKING` = none."""

@@ -104,7 +104,9 @@ class Fuser:
         )
         self._answers: QuestionAnswers | None = None
         if inbox is not None:
-            self._answers = QuestionAnswers(self._volume, inbox, state=self._state, send=self._send)
+            self._answers = QuestionAnswers(
+                self._volume, inbox, state=self._state, aside=self._current.aside, send=self._send
+            )
             self._volume.set_pause(self._answers.give_between)
         self._departures = Departures(begin, self._map.poses, self._map.done, send=self._send)
         window = self._departures.window
@@ -261,6 +263,7 @@ class Fuser:
         """
         record = journal.read(self._folder / state_folder.JOURNAL_FOLDER, order.position)
         found, poses = codec.decode(record.frames), self._map.poses
+        self.answer()
         if isinstance(found, Keyframe):
             if poses.is_forgotten(order.session, order.seq):
                 poses.leave_out()

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: MIT
 """Answers to questions about the map, between two pieces of the fuser's work.
 
-A question waits for the piece that is under way: a keyframe, or a step of a long pass that only reads the
-map (`BlockStore.pause`). It reads the map as it is then, between two keyframes. While keyframes wait,
-questions get a share of the time and no more.
+A question waits for the piece that is under way: a step of a keyframe before it touches the map, its sums,
+or a step of a long pass that only reads the map (`BlockStore.pause`). It reads the map as it is then, between
+two keyframes. While keyframes wait, questions get a share of the time and no more.
 """
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
@@ -33,6 +34,7 @@ class QuestionAnswers:
 
     Args:
         state: of the map, now.
+        aside: entered while a question is answered in the middle of other work.
         send: takes a message and its frames.
     """
 
@@ -42,9 +44,11 @@ class QuestionAnswers:
         inbox: Inbox,
         *,
         state: Callable[[], MapState],
+        aside: Callable[[], AbstractContextManager[None]] = nullcontext,
         send: Callable[[Any, list[Any]], None],
     ) -> None:
         self._volume, self._inbox, self._state, self._send = volume, inbox, state, send
+        self._aside = aside
         self._share = Bucket(_SHARE, time.monotonic(), burst=_BURST_S)
         self._is_answering = False
         self._next_look = 0.0  # time.monotonic()
@@ -59,7 +63,8 @@ class QuestionAnswers:
             while self._inbox.questions and self._may():
                 began = time.monotonic()
                 question, frames = self._inbox.questions.popleft()
-                self._answer(question, [frame.buffer for frame in frames])
+                with self._aside():
+                    self._answer(question, [frame.buffer for frame in frames])
                 if self._inbox.orders:
                     self._share.spend(time.monotonic() - began)
                 self._inbox.read()

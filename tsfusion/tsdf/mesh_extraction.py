@@ -121,6 +121,7 @@ def extract_rows(
         count, keys, len(wanted), wanted, table, table_rows, values, marching_tables.TRIANGLE_COUNT,
         around, buffers.seen.array, inside, active, edges, starts, buffers.state.array, first,
     )  # fmt: skip
+    store.pause()
     vertices, triangles = first[count]
     positions, normals = np.empty((vertices, 3), np.float32), np.empty((vertices, 3), np.float32)
     colors = np.empty((vertices if store.color else 0, 3), np.uint8)
@@ -130,7 +131,7 @@ def extract_rows(
         store.color_rgn, store.color_b, int(store.color),
         positions, normals, colors,
     )  # fmt: skip
-    store.keep_within_memory()
+    store.rest()
     faces = np.empty((triangles, 3), np.int32)
     marching_cubes.emit_faces(
         count, around, inside, active, edges, starts, first,

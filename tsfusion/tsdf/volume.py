@@ -339,7 +339,8 @@ class Volume(ReadableMap):
         self._store.limit(nbytes)
 
     def set_pause(self, pause: Callable[[], None]) -> None:
-        """Let a function be called between the steps of long passes that only read: meshes, hashes, saving.
+        """Let a function be called between steps that leave the map alone: of meshes, hashes, saving, and
+        before a keyframe's rays are added.
 
         It may ask the map anything, and must not change it.
         """
@@ -355,6 +356,8 @@ class Volume(ReadableMap):
             raise MapError("cannot retract a keyframe from a map that holds none")
         blocks_before = self._store.count
         samples = self._ray_buffers.make_rays(keyframe, self.config)  # paper eq. 1
+        if sign > 0:  # one that is moved is there twice until it is retracted: no time to ask
+            self._store.pause()
         self._has_retracted |= sign < 0
         with process.uninterrupted():
             updates = self._integrator.apply(sign, self.quota)  # paper eq. 2 and 3
