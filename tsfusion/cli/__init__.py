@@ -14,6 +14,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from tsfusion.cli import (
+    ask,
     ate,
     check,
     config,
@@ -66,6 +67,10 @@ verbs.verb(
     app, "tsfusion mesh out/latest/map.tsf room.glb", "tsfusion mesh tcp://server:5555 yard.ply --map yard",
     panel=OWN,
 )(mesh.mesh)  # fmt: skip
+verbs.verb(
+    app, "tsfusion ask tcp://server:5555 --at 1.2 0 0.5",
+    "tsfusion ask out/latest/map.tsf view.png --view 0 0 0 0 0 0 1", panel=OWN,
+)(ask.ask)  # fmt: skip
 app.add_typer(map.app, name="map", rich_help_panel=OWN)
 verbs.verb(
     app, "tsfusion ate out/latest/trajectory.txt groundtruth.txt",

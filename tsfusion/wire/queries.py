@@ -273,6 +273,6 @@ class Exchange:
                 raise (NotAllowed if connection.refused else TransportError)(self._why)
         reason = f": {self._why}" if self._why else ""
         raise ServerUnreachable(
-            f"no server answered at {connection.address} within {timeout:g} s{reason}; is `tsfusion serve` "
+            f"no server answered at {connection.address} within {timeout:.3g} s{reason}; is `tsfusion serve` "
             "running there, and is the port right?"
         )

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion ask`: the same of a file and of a live server."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from command_processes import Here, python
+from keyframes_and_servers import DEADLINE, VOLUME, Server, serving, wall
+
+from tsfusion import Client, Volume
+from tsfusion.core.errors import DatasetError
+from tsfusion.geometry.map_answers import View
+from tsfusion.pipelines import point_files
+from tsfusion.wire.questions import MOST_POINTS
+
+POINTS = np.array([[0.0, 0.0, 1.2], [0.1, 0.05, 1.27], [9.0, 9.0, 9.0]])
+VIEW = ("--view", *["0", "0", "0", "0", "0", "0", "1"], "--size", "64x48")
+
+
+@pytest.fixture(scope="module")
+def volume() -> Volume:
+    found = Volume(VOLUME)
+    for i in range(3):
+        found.integrate(replace(wall(i), color=None))
+    return found
+
+
+@pytest.fixture(scope="module")
+def saved(volume: Volume, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return volume.save(tmp_path_factory.mktemp("saved") / "map.tsf")
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with serving(tmp_path_factory.mktemp("state")) as running:
+        with Client(running.address) as client:
+            for i in range(3):
+                client.send(replace(wall(i), color=None))
+            client.wait_settled(DEADLINE)
+        yield running
+
+
+def test_a_file_and_a_server_answer_alike(
+    here: Here, volume: Volume, saved: Path, live: Server, tmp_path: Path
+) -> None:
+    """Points as a table, as an array, as JSON; a view."""
+    np.save(tmp_path / "points.npy", POINTS)
+    expected = volume.sample(POINTS, surface="raw")
+    for name, source in (("file", str(saved)), ("live", live.address)):
+        table = here("ask", source, "--points", tmp_path / "points.npy")
+        assert table.returncode == 0, table.stderr
+        rows = np.loadtxt(table.stdout.splitlines(), delimiter=",", skiprows=1)
+        assert table.stdout.splitlines()[0] == ",".join(point_files.COLUMNS)
+        np.testing.assert_array_equal(rows[:, :3], POINTS)
+        np.testing.assert_allclose(rows[:, 3], expected.distance, atol=1e-6)
+        assert "3 points, of which the map has seen 2" in table.stderr
+        done = here("ask", source, tmp_path / f"{name}.npz", "--points", tmp_path / "points.npy", "--json")
+        assert json.loads(done.stdout)["states"][0]["keyframes"] == 3
+        view = here("ask", source, tmp_path / f"{name}-view.npz", *VIEW)
+        assert view.returncode == 0, view.stderr
+        assert "64×48 pixels, the surface in" in view.stdout
+    for suffix in (".npz", "-view.npz"):
+        one, other = (np.load(tmp_path / f"{name}{suffix}") for name in ("file", "live"))
+        assert set(one) == set(other)
+        for key in one:
+            np.testing.assert_allclose(one[key], other[key], atol=1e-6)
+
+
+def test_one_point_in_words_and_for_a_program(here: Here, live: Server) -> None:
+    words = here("ask", live.address, "--at", "0", "0", "1.2").stdout
+    assert " m in front of the surface" in words or " m behind the surface" in words
+    assert "a map of 3 keyframes, answered in" in words
+    assert "-9 9 9: unseen" in here("ask", live.address, "--at", "-9", "9", "9").stdout
+    answer = json.loads(here("ask", live.address, "--at", "-9", "9", "9", "--json").stdout)
+    assert answer["samples"] == [{"point": [-9, 9, 9], "distance": None, "weight": 0, "gradient": None}]
+    assert answer["delay_ms"] > 0
+
+
+def test_many_points_are_asked_in_parts(here: Here, live: Server, tmp_path: Path) -> None:
+    many = np.repeat(POINTS, MOST_POINTS // 2, axis=0)
+    np.save(tmp_path / "many.npy", many)
+    done = here("ask", live.address, tmp_path / "out.npy", "--points", tmp_path / "many.npy")
+    assert done.returncode == 0, done.stderr
+    distances = np.load(tmp_path / "out.npy")
+    assert distances.shape == (len(many),)
+    assert len(np.unique(distances[np.isfinite(distances)])) == 2
+
+
+def test_a_ply_and_a_table(saved: Path, here: Here, tmp_path: Path) -> None:
+    trimesh.PointCloud(POINTS).export(tmp_path / "points.ply")
+    text = "x y z\n" + "\n".join(" ".join(map(str, point)) for point in POINTS.tolist()) + "\n"
+    (tmp_path / "points.txt").write_text(text)
+    one, other = (
+        here("ask", saved, "--points", tmp_path / name).stdout for name in ("points.ply", "points.txt")
+    )
+    assert one.count("\n") == other.count("\n") == 4
+    distances = [[line.split(",")[3] for line in text.splitlines()] for text in (one, other)]
+    assert distances[0] == distances[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        ((), "ask one thing"),
+        (("--at", "0", "0", "1", *VIEW), "ask one thing"),
+        (("--at", "0", "nan", "1"), "finite"),
+        (("--at", "0", "0", "1", "--size", "9x9"), "without --view"),
+        (VIEW, "needs a file"),
+        (("view.gif", *VIEW), "ending in .png, .npz"),
+        (("view.png", "--view", *["0", "0", "0", "0", "0", "0", "2"]), "length 1"),
+        (("view.png", *VIEW[:-1], "big"), "WIDTHxHEIGHT"),
+        (("out.doc", "--at", "0", "0", "1"), "ending in .csv"),
+        (("--at", "0", "0", "1", "--timeout", "3"), "only a live server"),
+        (("--points", "missing.csv"), "No such file"),
+    ],
+)
+def test_wrong_usage_is_one_line(here: Here, saved: Path, arguments: tuple[str, ...], why: str) -> None:
+    done = here("ask", saved, *arguments)
+    assert done.returncode == 1
+    assert why in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_nobody_there_is_known_in_time(here: Here) -> None:
+    done = here("ask", "tcp://127.0.0.1:1", "--at", "0", "0", "1", "--timeout", "0.2")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "no server answered" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("1 2 3\n1 2 x\n", ":2: expected x, y, z"),
+        ("1,2,x\n", ":1: expected x, y, z"),
+        ("1 2\n", ":1: expected x, y, z"),
+        ("x,y,z\n", "shape"),
+        ("", "shape"),
+        ("1 2 inf", "not finite"),
+    ],
+)
+def test_wrong_points_are_named(tmp_path: Path, text: str, why: str) -> None:
+    (tmp_path / "points.csv").write_text(text)
+    with pytest.raises(DatasetError, match=why):
+        point_files.read(str(tmp_path / "points.csv"))
+
+
+@pytest.mark.parametrize("content", [b"", b"\x93NUMPY", np.zeros((2, 2))])
+def test_wrong_arrays_are_named(tmp_path: Path, content: Any) -> None:
+    path = tmp_path / "points.npy"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        np.save(path, content)
+    with pytest.raises(DatasetError, match=r"points\.npy"):
+        point_files.read(str(path))
+
+
+def test_a_picture_shows_colours_or_the_shape(tmp_path: Path) -> None:
+    depth = np.array([[0, 1.0]], np.float32)
+    normals = np.array([[[0, 0, 0], [0, 0, -1]]], np.float32)
+    red = np.array([[[0, 0, 0], [200, 10, 20]]], np.uint8)
+    point_files.write_view(tmp_path / "view.png", View(depth, normals, red))
+    assert cv2.imread(str(tmp_path / "view.png")).tolist() == [[[255, 255, 255], [20, 10, 200]]]
+    (background, wall_) = point_files.picture(View(depth, normals))[0].tolist()
+    assert background == [255, 255, 255]
+    assert len(set(wall_)) == 1
+    assert 60 < wall_[0] < 255
+
+
+def test_the_command_needs_no_taichi_for_a_live_map(live: Server) -> None:
+    """A robot without it asks by the same verb."""
+    done = python(
+        "import sys; sys.modules['taichi'] = None; from tsfusion import cli; cli.main(sys.argv[1:])",
+        *("ask", live.address, "--at", "0", "0", "1.2"),
+    )
+    assert done.returncode == 0, done.stderr
+    assert "of the surface" in done.stdout

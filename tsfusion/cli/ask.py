@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion ask`."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from tsfusion.cli import options, verbs
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from tsfusion.geometry.map_answers import Samples
+    from tsfusion.wire.map_client import Answered
+
+SurfaceName = Literal["raw", "normal", "field"]
+
+Point = tuple[float, float, float]
+Pose = tuple[float, float, float, float, float, float, float]
+
+
+def ask(
+    context: typer.Context,
+    where: Annotated[
+        str, typer.Argument(metavar="WHERE", help="A map (.tsf), a state folder, or tcp://HOST:PORT.")
+    ],
+    out: Annotated[Path | None, typer.Argument(metavar="[OUT]", help="File for the answer.")] = None,
+    *,
+    at: Annotated[
+        Point | None, typer.Option(metavar="X Y Z", help="How far is the surface from there?")
+    ] = None,
+    points: Annotated[
+        str | None, typer.Option(metavar="FILE", help="From these? .csv, .npy, .ply; - = stdin.")
+    ] = None,
+    view: Annotated[
+        Pose | None,
+        typer.Option(metavar="X Y Z QX QY QZ QW", help="What does a camera see from there?"),
+    ] = None,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Its pixels.")] = "640x480",
+    intrinsics: options.Intrinsics = None,
+    surface: Annotated[
+        SurfaceName, typer.Option(metavar="MODE", help="raw: as fused; normal, field: smoothed, slower.")
+    ] = "raw",
+    min_weight: Annotated[
+        float | None, typer.Option(metavar="COUNT", min=0, help="Samples that a voxel needs to count.")
+    ] = None,
+    timeout: Annotated[
+        float, typer.Option(metavar="SECONDS", min=1e-3, max=60, help="For a live answer.")
+    ] = 5.0,
+    map_: options.Map = None,
+    control: options.Control = None,
+    key: options.Key = None,
+    server_key: options.ServerKey = None,
+    json: options.Json = False,
+    help_all: verbs.HelpAll = None,
+) -> None:
+    """Ask a map how far its surface is, or what a camera would see of it.
+
+    The same for a file and for a live server, which answers between two
+    keyframes. Metres in the map's frame; a distance is positive in the free
+    space before a surface, and nan where nothing was seen.
+
+    Points are written as a table: to stdout, or to OUT (.csv, .npz, or .npy:
+    distances alone). A view is written to OUT: .png, or .npz with its depth.
+
+    Exit status 1 also when a server does not answer in --timeout seconds.
+    """
+    from tsfusion.core.errors import InvalidConfig
+
+    if sum(one is not None for one in (at, points, view)) != 1:
+        raise InvalidConfig("ask one thing: --at X Y Z, --points FILE or --view X Y Z QX QY QZ QW")
+    if "://" not in where:
+        options.refuse(
+            context, ("control", "key", "server_key", "timeout"),
+            f"has no effect on {where}: only a live server (tcp://…) has one",
+        )  # fmt: skip
+    link = {"control": control, "key": key, "server_key": server_key, "timeout": timeout}
+    how = {"surface": surface, "min_weight": min_weight}
+    if view is not None:
+        camera = _camera(view, size, intrinsics)
+        with _map(where, map_, link, quiet=json) as asked:
+            _write_view(asked.raycast(*camera, **how), _checked(out, "a view"), json=json)
+        return
+    options.refuse(context, ("size", "intrinsics"), "has no effect without --view")
+    _ask_points(where, map_, link, how, at=at, points=points, out=out, json=json)
+
+
+def _ask_points(
+    where: str,
+    map_: str | None,
+    link: dict[str, Any],
+    how: dict[str, Any],
+    *,
+    at: Point | None,
+    points: str | None,
+    out: Path | None,
+    json: bool,
+) -> None:
+    """Sample the map at points, and write or print that."""
+    import numpy as np
+
+    from tsfusion.core.output_folder import check_writable
+    from tsfusion.pipelines import point_files
+
+    if out is not None:
+        check_writable(out, point_files.SAMPLES)
+    chosen = np.array([at], np.float64) if points is None else point_files.read(points)
+    with _map(where, map_, link, quiet=json) as asked:
+        answers = _in_parts(asked, chosen, how)
+    found = _joined(answers)
+    if out is not None:
+        point_files.write_samples(out, chosen, found)
+    if json:
+        _print_json(answers, chosen, found, out)
+    elif out is not None:
+        typer.echo(f"{out}: {_counts(found)}; {_state(answers)}")
+    elif points is not None:
+        typer.echo(point_files.csv_text(chosen, found), nl=False)
+        typer.echo(f"{_counts(found)}; {_state(answers)}", err=True)
+    else:
+        typer.echo("\n".join([*_sentences(chosen, found), _state(answers)]))
+
+
+def _in_parts(asked: Any, chosen: "NDArray[np.float64]", how: dict[str, Any]) -> "list[Answered[Samples]]":
+    """The answers to as many questions as so many points take."""
+    from tsfusion.wire.questions import MOST_POINTS
+
+    return [asked.sample(chosen[i : i + MOST_POINTS], **how) for i in range(0, len(chosen), MOST_POINTS)]
+
+
+def _joined(answers: "list[Answered[Samples]]") -> "Samples":
+    import numpy as np
+
+    from tsfusion.geometry.map_answers import Samples
+
+    names = ("distance", "weight", "gradient")
+    parts = [[getattr(one.result, name) for one in answers] for name in names]
+    return Samples(*map(np.concatenate, parts))
+
+
+@contextmanager
+def _map(where: str, map_: str | None, link: dict[str, Any], *, quiet: bool) -> Iterator[Any]:
+    """A live map, or a saved one, to be asked by the same methods."""
+    if "://" in where:
+        from tsfusion.core.config import DEFAULT_MAP
+        from tsfusion.wire.curve import client_keys
+        from tsfusion.wire.map_client import MapClient
+
+        keys = client_keys(link["key"], link["server_key"])
+        with MapClient(
+            where, map_ or DEFAULT_MAP, control=link["control"], timeout=link["timeout"], keys=keys
+        ) as client:
+            yield client
+        return
+    from tsfusion.cli import opened_maps
+    from tsfusion.pipelines.saved_map_answers import SavedMapAnswers
+    from tsfusion.tsdf.volume import Volume
+
+    with opened_maps.opened(Path(where), map_, quiet=quiet) as file:
+        yield SavedMapAnswers(Volume.load(file, memory_bytes=opened_maps.memory_for(file)))
+
+
+# --- views ---
+
+
+def _checked(out: Path | None, what: str) -> Path:
+    """The file for an answer that no terminal shows."""
+    from tsfusion.core.errors import InvalidConfig
+    from tsfusion.core.output_folder import check_writable
+    from tsfusion.pipelines import point_files
+
+    if out is None:
+        raise InvalidConfig(f"{what} needs a file: give OUT, such as view.png")
+    check_writable(out, point_files.VIEWS)
+    return out
+
+
+def _camera(view: Pose, size: str, intrinsics: str | None) -> tuple[Any, Any, tuple[int, int]]:
+    """Intrinsics, pose and (height, width)."""
+    import re
+
+    import numpy as np
+
+    from tsfusion.core.errors import InvalidConfig
+    from tsfusion.geometry.keyframe import Intrinsics
+    from tsfusion.geometry.map_answers import checked_camera
+    from tsfusion.geometry.trajectory import rigid
+
+    sides = re.fullmatch(r"([0-9]{1,5})[x×]([0-9]{1,5})", size)
+    if sides is None:
+        raise InvalidConfig(f"--size must be WIDTHxHEIGHT in pixels, such as 640x480, got {size!r}")
+    width, height = map(int, sides.groups())
+    quaternion = np.array(view[3:])
+    if not abs(np.linalg.norm(quaternion) - 1) < 0.01:
+        raise InvalidConfig(
+            "--view must be a line of trajectory.txt without its time: x y z, and a quaternion qx qy qz qw "
+            f"of length 1; got length {np.linalg.norm(quaternion):.3g}"
+        )
+    given = options.camera(intrinsics, None)["intrinsics"]
+    usual = Intrinsics(0.9 * width, 0.9 * width, (width - 1) / 2, (height - 1) / 2)
+    pose = rigid(quaternion / np.linalg.norm(quaternion), np.array(view[:3]))
+    return checked_camera(given or usual, pose, (height, width))
+
+
+def _write_view(answer: "Answered[Any]", out: Path, *, json: bool) -> None:
+    from tsfusion.cli import output
+    from tsfusion.pipelines import point_files
+
+    found = answer.result
+    point_files.write_view(out, found)
+    height, width = found.depth.shape
+    hit = found.depth[found.depth > 0]
+    share = float(len(hit) / found.depth.size)
+    nearest = float(hit.min()) if len(hit) else None
+    if json:
+        figures = {"width": width, "height": height, "hit": share, "nearest_m": nearest}
+        output.as_json({"path": str(out), **figures, **_figures([answer])})
+        return
+    seen = f"the surface in {100 * share:.0f} % of it" if len(hit) else "no surface"
+    near = "" if nearest is None else f", at {nearest:.2f} m and more"
+    typer.echo(f"{out}: {width}×{height} pixels, {seen}{near}; {_state([answer])}")
+
+
+# --- words ---
+
+
+def _sentences(points: "NDArray[np.float64]", found: "Samples") -> list[str]:
+    import numpy as np
+
+    lines = []
+    for point, distance, weight in zip(points.tolist(), found.distance, found.weight, strict=True):
+        place = " ".join(f"{one:g}" for one in point)
+        if np.isnan(distance):
+            lines.append(f"{place}: unseen")
+        else:
+            side = "in front of" if distance >= 0 else "behind"
+            lines.append(f"{place}: {abs(distance):.4f} m {side} the surface, weight {weight:.1f}")
+    return lines
+
+
+def _counts(found: "Samples") -> str:
+    import numpy as np
+
+    seen = int(np.isfinite(found.distance).sum())
+    return f"{len(found.distance)} points, of which the map has seen {seen}"
+
+
+def _state(answers: "list[Answered[Any]]") -> str:
+    """Which map that was, and how long it took."""
+    last = answers[-1]
+    took = sum(one.delay_s for one in answers)
+    words = f"a map of {last.state.keyframes} keyframes, answered in {1e3 * took:.1f} ms"
+    if len({one.state for one in answers}) > 1:
+        words += "; keyframes came between the parts of the answer, which are of different states of the map"
+    return words
+
+
+def _figures(answers: "list[Answered[Any]]") -> dict[str, Any]:
+    from msgspec.structs import asdict
+
+    states = list(dict.fromkeys(one.state for one in answers))
+    return {
+        "states": [asdict(one) for one in states],
+        "delay_ms": round(1e3 * sum(one.delay_s for one in answers), 3),
+        "waited_ms": round(1e3 * sum(one.waited_s for one in answers), 3),
+        "took_ms": round(1e3 * sum(one.took_s for one in answers), 3),
+    }
+
+
+def _print_json(
+    answers: "list[Answered[Samples]]", points: "NDArray[np.float64]", found: "Samples", out: Path | None
+) -> None:
+    """Print what was found; unseen is null."""
+    import numpy as np
+
+    from tsfusion.cli import output
+
+    figures: dict[str, Any] = {"points": len(points), "seen": int(np.isfinite(found.distance).sum())}
+    if out is None:
+        figures["samples"] = [
+            {
+                "point": point,
+                "distance": None if np.isnan(distance) else float(distance),
+                "weight": float(weight),
+                "gradient": None if np.isnan(gradient).any() else gradient.tolist(),
+            }
+            for point, distance, weight, gradient in zip(
+                points.tolist(), found.distance, found.weight, found.gradient, strict=True
+            )
+        ]
+    else:
+        figures["path"] = str(out)
+    output.as_json({**figures, **_figures(answers)})

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: MIT
+"""Points to ask a map about, from files; and its answers, to files."""
+
+import csv
+import io
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core import durable_files
+from tsfusion.core.errors import DatasetError, OutputError
+from tsfusion.geometry.map_answers import Samples, View
+
+POINTS = (".csv", ".txt", ".xyz", ".npy", ".ply")
+SAMPLES = (".csv", ".npy", ".npz")
+VIEWS = (".png", ".npz")
+COLUMNS = ("x", "y", "z", "distance", "weight", "gradient_x", "gradient_y", "gradient_z")
+
+
+def read(source: str) -> NDArray[np.float64]:
+    """The (n, 3) points of a file: three columns of numbers, an array, or the vertices of a PLY.
+
+    Args:
+        source: `-` = columns on the standard input.
+
+    Raises:
+        DatasetError: when it cannot be read, has no points, or one of them is not finite.
+    """
+    name = "standard input" if source == "-" else source
+    try:
+        points = _parsed(source, name)
+    except OSError as error:
+        raise DatasetError(f"cannot read {name}: {error.strerror}") from error
+    except (ValueError, KeyError, IndexError, EOFError) as error:
+        raise DatasetError(f"{name} has no points: {' '.join(str(error).split())}") from error
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points) or points.dtype.kind not in "fiu":
+        raise DatasetError(f"{name} must hold points (n, 3), got {points.dtype} of shape {points.shape}")
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise DatasetError(f"{name}: point {bad[0] + 1} is not finite: {points[bad[0]].tolist()}")
+    return points.astype(np.float64)
+
+
+def _parsed(source: str, name: str) -> NDArray[Any]:
+    suffix = Path(source).suffix.lower()
+    if source == "-":
+        return _columns(sys.stdin.read(), name)
+    if suffix == ".npy":
+        return np.asarray(np.load(source, allow_pickle=False))
+    if suffix == ".ply":
+        import trimesh
+
+        with open(source, "rb") as file:
+            return np.asarray(getattr(trimesh.load(file, file_type="ply"), "vertices", np.zeros((0, 3))))
+    if suffix not in POINTS:
+        raise DatasetError(f"{source} must end in {', '.join(POINTS)}")
+    return _columns(Path(source).read_text(encoding="utf-8"), source)
+
+
+def _columns(text: str, source: str) -> NDArray[np.float64]:
+    """Three columns, with commas or spaces between them; a first line without a number is a title."""
+    rows: list[list[float]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.partition("#")[0].replace(",", " ").replace(";", " ").split()
+        if not words:
+            continue
+        try:
+            rows.append([float(word) for word in words[:3]])
+        except ValueError as error:
+            if number > 1 or any(map(_is_number, words)):
+                raise DatasetError(f"{source}:{number}: expected x, y, z, got {line.strip()!r}") from error
+            continue
+        if len(rows[-1]) < 3:
+            raise DatasetError(f"{source}:{number}: expected x, y, z, got {line.strip()!r}")
+    return np.array(rows, np.float64).reshape(-1, 3)
+
+
+def _is_number(word: str) -> bool:
+    return word.lstrip("+-.")[:1].isdigit()
+
+
+def csv_text(points: NDArray[np.float64], found: Samples) -> str:
+    """A title and a line for each point, with the shortest numbers that stay the same; unseen is `nan`."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    columns = (*points.T, found.distance, found.weight, *found.gradient.T)
+    writer.writerows(zip(*columns, strict=True))
+    return text.getvalue()
+
+
+def write_samples(path: Path, points: NDArray[np.float64], found: Samples) -> None:
+    """Write a table (.csv), the distances alone (.npy), or all arrays by name (.npz); whole or not at all.
+
+    Raises:
+        OutputError: when it cannot be written.
+    """
+    suffix = path.suffix.lower()
+    with _replacing(path) as file:
+        if suffix == ".csv":
+            file.write(csv_text(points, found).encode())
+        elif suffix == ".npy":
+            np.save(file, found.distance)
+        else:
+            np.savez_compressed(file, points=points, **vars(found))
+
+
+def write_view(path: Path, found: View) -> None:
+    """Write a picture (.png), or the arrays by name (.npz); whole or not at all.
+
+    Raises:
+        OutputError: when it cannot be written.
+    """
+    if path.suffix.lower() == ".png":
+        content = cv2.imencode(".png", cv2.cvtColor(picture(found), cv2.COLOR_RGB2BGR))[1].tobytes()
+        with _replacing(path) as file:
+            file.write(content)
+        return
+    arrays = {name: array for name, array in vars(found).items() if array is not None}
+    with _replacing(path) as file:
+        np.savez_compressed(file, **arrays)
+
+
+def picture(view: View) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB: the map's colours, or without any its shape in grey; white where nothing was hit."""
+    hit = (view.depth > 0)[..., np.newaxis]
+    if view.colors is not None:
+        shown = view.colors
+    else:
+        light = np.abs(view.normals @ np.array([0.4, -0.5, 0.77]))  # along no axis: no wall is black
+        shown = np.repeat((60 + 190 * light.clip(0, 1)).astype(np.uint8)[..., np.newaxis], 3, axis=2)
+    return np.where(hit, shown, np.uint8(255))
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[BinaryIO]:
+    try:
+        with durable_files.replacing(path) as file:
+            yield file
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
