@@ -26,31 +26,31 @@ Pose = tuple[float, float, float, float, float, float, float]
 def ask(
     context: typer.Context,
     where: Annotated[
-        str, typer.Argument(metavar="WHERE", help="A map (.tsf), a state folder, or tcp://HOST:PORT.")
+        str, typer.Argument(metavar="WHERE", help="A .tsf file, a state folder, or tcp://HOST:PORT.")
     ],
     out: Annotated[Path | None, typer.Argument(metavar="[OUT]", help="File for the answer.")] = None,
     *,
     at: Annotated[
-        Point | None, typer.Option(metavar="X Y Z", help="How far is the surface from there?")
+        Point | None, typer.Option(metavar="X Y Z", help="Distance of the surface from there.")
     ] = None,
     points: Annotated[
-        str | None, typer.Option(metavar="FILE", help="From these? .csv, .npy, .ply; - = stdin.")
+        str | None, typer.Option(metavar="FILE", help="From .csv, .npy, .ply; - = stdin.")
     ] = None,
     view: Annotated[
         Pose | None,
-        typer.Option(metavar="X Y Z QX QY QZ QW", help="What does a camera see from there?"),
+        typer.Option(metavar="X…QW", help="View from the pose X Y Z QX QY QZ QW."),
     ] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Its pixels.")] = "640x480",
     intrinsics: options.Intrinsics = None,
     surface: Annotated[
-        SurfaceName, typer.Option(metavar="MODE", help="raw: as fused; normal, field: smoothed, slower.")
+        SurfaceName,
+        options.option("--surface", "MODE", "raw: as fused; normal, field: smoothed, slower.", rare=True),
     ] = "raw",
     min_weight: Annotated[
-        float | None, typer.Option(metavar="COUNT", min=0, help="Samples that a voxel needs to count.")
+        float | None,
+        options.option("--min-weight", "COUNT", "Samples that a voxel needs to count.", rare=True),
     ] = None,
-    timeout: Annotated[
-        float, typer.Option(metavar="SECONDS", min=1e-3, max=60, help="For a live answer.")
-    ] = 5.0,
+    timeout: Annotated[float, typer.Option(metavar="SECONDS", help="For a live answer.")] = 5.0,
     map_: options.Map = None,
     control: options.Control = None,
     key: options.Key = None,
@@ -58,14 +58,13 @@ def ask(
     json: options.Json = False,
     help_all: verbs.HelpAll = None,
 ) -> None:
-    """Ask a map how far its surface is, or what a camera would see of it.
+    """Ask a map how far its surface is, or what a camera sees of it.
 
-    The same for a file and for a live server, which answers between two
-    keyframes. Metres in the map's frame; a distance is positive in the free
-    space before a surface, and nan where nothing was seen.
+    A live server answers between two keyframes. Metres in the map's frame; a
+    distance is positive before a surface, and nan where nothing was seen.
 
-    Points are written as a table: to stdout, or to OUT (.csv, .npz, or .npy:
-    distances alone). A view is written to OUT: .png, or .npz with its depth.
+    Points come out as a table, on stdout or in OUT (.csv, .npz; .npy: distances
+    alone), a view in OUT: .png, or .npz with its depth.
 
     Exit status 1 also when a server does not answer in --timeout seconds.
     """
@@ -103,12 +102,15 @@ def _ask_points(
     """Sample the map at points, and write or print that."""
     import numpy as np
 
+    from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
     from tsfusion.pipelines import point_files
 
     if out is not None:
         check_writable(out, point_files.SAMPLES)
     chosen = np.array([at], np.float64) if points is None else point_files.read(points)
+    if not np.isfinite(chosen).all():
+        raise InvalidConfig("--at must be three finite numbers")
     with _map(where, map_, link, quiet=json) as asked:
         answers = _in_parts(asked, chosen, how)
     found = _joined(answers)

@@ -18,7 +18,7 @@ _TWICE = "a recording that was sent twice counts twice"
 
 app = typer.Typer(
     cls=verbs.Group,
-    help="Describe, compare, align, merge, crop, convert and resume saved maps; forget keyframes.\n\n"
+    help="Describe, align, merge, crop, convert maps; forget keyframes.\n\n"
     "A saved map is a file (.tsf), or that of a server: its state folder, or the folder of one map in it. "
     "All of this works while the server runs; only `forget` changes what it reads.",
 )
