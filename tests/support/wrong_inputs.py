@@ -138,7 +138,7 @@ replay synthetic:room --out file | it is not a folder | choose another name
 replay synthetic:room --out file/out | cannot write to | choose another folder
 replay synthetic:room --out /proc/out | cannot write to /proc/out | choose another folder
 demo --out file | it is not a folder | choose another name
-mesh garbage.tsf a.stl | cannot write a.stl | a name ending in .ply, .glb, .obj
+mesh garbage.tsf a.xyz | cannot write a.xyz | a name ending in .ply, .glb, .obj, .stl
 mesh garbage.tsf a | cannot write a | a name ending in .ply
 mesh garbage.tsf missing/a.ply | missing/a.ply: No such file | choose another place
 mesh garbage.tsf /proc/a.ply | cannot write /proc/a.ply | choose another place
@@ -236,7 +236,7 @@ map merge garbage.tsf file --out a.tsf | garbage.tsf is not a tsfusion map | exp
 map crop file --box 0 0 0 1 1 --out a.tsf | '--box' | a valid | 2
 map crop file --box 0 0 0 1 1 1 --out folder.ply | cannot write folder.ply | a name ending in .tsf
 map diff missing file | missing does not exist | expected a map (.tsf) or a state folder
-map diff file file --out a.txt | cannot write a.txt | a name ending in .ply, .glb, .obj, .png
+map diff file file --out a.txt | cannot write a.txt | a name ending in .ply, .glb, .obj, .stl, .png
 map convert file a.txt | cannot write a.txt | a name ending in .npz, .tsf, .ply
 map convert file a.ply --dense | --dense has no effect on a.ply | only a .npz file
 map resume garbage.tsf --state s | garbage.tsf is not a tsfusion map | expected the map.tsf
