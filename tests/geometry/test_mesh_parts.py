@@ -3,6 +3,7 @@
 
 import errno
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,28 @@ def test_glb_tiles_are_the_triangles_of_the_whole_mesh(tmp_path: Path, volume: V
     assert np.array_equal(np.concatenate([one.triangles for one in found]), expected.triangles)
     colors = np.concatenate([one.visual.vertex_colors[one.faces] for one in found])
     assert np.array_equal(colors, expected.visual.vertex_colors[expected.faces])
+
+
+@pytest.mark.parametrize("min_extent", [0.0, 0.2, 0.3, 0.6, 9.0])
+def test_parts_have_the_islands_of_the_whole_mesh(tmp_path: Path, volume: Volume, min_extent: float) -> None:
+    """Pieces of 0.28 m and less beside the ball, across tiles' borders."""
+    for x, radius in ((0.9, 0.1), (-0.8, 0.05)):
+        for view in sphere_views(radius, 6):
+            T = view.T_world_camera.copy()
+            T[:3, 3] += (x, 0.05, 0.02)
+            volume.integrate(replace(view, T_world_camera=T))
+    whole = replace(volume.extract_mesh(), provenance=volume.provenance("map.tsf"))
+    tidy = whole.without_islands(min_extent)
+    parts = volume.mesh_parts(tmp_path)
+    parts.provenance = whole.provenance
+    found = parts.without_islands(min_extent)
+    assert found.left_out == whole.count_islands(whole.islands(min_extent))
+    assert (found.vertices, found.faces) == (len(tidy.vertices), len(tidy.faces))
+    if found.faces:
+        (file,) = found.save(tmp_path / "parts.ply")
+        assert file.read_bytes() == tidy.save(tmp_path / "whole.ply").read_bytes()
+    else:
+        assert min_extent == 9.0
 
 
 def test_what_cannot_be_written_is_named(

@@ -123,3 +123,18 @@ def test_a_box_of_a_map_larger_than_memory_has_the_same_mesh(
         )
     with pytest.raises(OutputError, match="too large for memory, too"):
         mesh_finishing.part_around(whole, (-1, -1, -1, 1, 1, 1), 1000)
+
+
+def test_a_mesh_larger_than_memory_loses_its_small_pieces(
+    here: Here, saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tsfusion.tsdf.field_regularizer.BATCH", 40)
+    whole = Volume.load(saved, threads=2)
+    memory = ("--memory", whole.stats().bytes - 1)
+    mesh = whole.extract_mesh()
+    found = figures(here, saved, tmp_path / "m.ply", "--min-component", 0.2, *memory)
+    assert found["triangles"] == len(mesh.without_islands(0.2).faces)
+    left_out = {**mesh.count_islands(mesh.islands(0.2)), "files": ["m.ply"], "min_extent_m": 0.2}
+    assert found["left_out"] == left_out
+    head = (tmp_path / "m.ply").read_bytes().partition(b"end_header")[0].decode()
+    assert f"comment map_hash {whole.map_hash()}\n" in head

@@ -218,7 +218,7 @@ def diff(
 )
 def convert(
     path: Where,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="A .npz, .tsf, .ply, .glb or .obj file.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="A .npz, .tsf, .ply, .glb, .obj or .stl file.")],
     *,
     dense: Annotated[
         bool, typer.Option("--dense", help="One array around the map, not its blocks (.npz).")

@@ -23,7 +23,7 @@ ColorBy = Literal["client", "session"]
 Box = tuple[float, float, float, float, float, float]
 
 _OF_A_JOURNAL = ("until", "only", "color_by")
-_OF_A_WHOLE_MESH = ("preview", "min_component", "fill_holes", "mark_guesses", "simplify")
+_OF_A_WHOLE_MESH = ("preview", "fill_holes", "mark_guesses", "simplify")
 
 
 @options.takes_map_settings
@@ -138,7 +138,7 @@ def mesh(
             )
             if keep_islands is False:
                 raise InvalidConfig("--drop-islands needs all of the mesh, which is too large for memory")
-            _write_tiles(found, out, given_up, json)
+            _write_tiles(found, source, out, given_up, min_component=min_component, json=json)
             return
         made, legend = _extracted(found.volume, source, fill_holes, json), found.legend
     if given_up is not None:
@@ -220,7 +220,9 @@ def _stage(text: str, quiet: bool) -> Iterator[None]:
         yield
 
 
-def _write_tiles(found: "JournalMap", out: Path, up: "Up | None", json: bool) -> None:
+def _write_tiles(
+    found: "JournalMap", source: str, out: Path, up: "Up | None", *, min_component: float | None, json: bool
+) -> None:
     """Write the mesh in bounded memory."""
     from tsfusion.cli import progress
     from tsfusion.geometry import mesh_parts
@@ -229,9 +231,20 @@ def _write_tiles(found: "JournalMap", out: Path, up: "Up | None", json: bool) ->
     with progress.shown(quiet=json) as display:
         display.stage("meshing in tiles")
         parts = found.volume.mesh_parts(out.parent, up=up)
+        parts.provenance = found.volume.provenance(source)
+        if min_component is not None:
+            display.stage("leaving out small pieces")
+            parts = parts.without_islands(min_component)
+        display.stage("writing")
         files = parts.save(out)
-    figures = {**parts.figures, "left_out": {"islands": 0, "triangles": 0, "files": []}}
-    figures["files"] = list(map(str, files))
+    names = [] if min_component is None else [file.name for file in files]
+    figures = {
+        **parts.figures,
+        "left_out": {**parts.left_out, "files": names},
+        "files": list(map(str, files)),
+    }
+    if min_component is not None:
+        figures["left_out"]["min_extent_m"] = min_component
     _print_result(files[0] if len(files) == 1 else out, figures, found.legend, json)
 
 

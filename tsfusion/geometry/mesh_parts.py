@@ -4,6 +4,7 @@
 import tempfile
 import weakref
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -13,8 +14,9 @@ from numpy.typing import NDArray
 
 from tsfusion.core import durable_files
 from tsfusion.core.errors import OutputError
-from tsfusion.geometry import up_direction
+from tsfusion.geometry import mesh_part_islands, up_direction
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.provenance import Provenance
 from tsfusion.geometry.up_direction import HeldSensor, Up
 
 FORMATS = (".ply", ".glb")
@@ -55,6 +57,10 @@ class MeshParts:
         held: how the sensors that saw the map were held.
         known_up: away from the ground; None = it is found.
 
+    Attributes:
+        provenance: what its files say of where it comes from.
+        left_out: number of `islands` and their `triangles`, in a mesh without them.
+
     Raises:
         OutputError: when the folder's disk has no room.
     """
@@ -62,7 +68,9 @@ class MeshParts:
     def __init__(
         self, parts: Iterable[MeshPart], folder: Path, *, held: HeldSensor, known_up: Up | None = None
     ) -> None:
-        self._held, self._known_up = held, known_up
+        self._held, self._known_up, self._folder = held, known_up, folder
+        self.provenance: Provenance | None = None
+        self.left_out = {"islands": 0, "triangles": 0}
         self._counts: list[tuple[int, int]] = []  # vertices and faces of each part, as they came
         self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
         self._vertex = np.dtype([])
@@ -107,6 +115,36 @@ class MeshParts:
         rows = np.concatenate(found)
         faces = np.arange(len(rows), dtype=np.int32).reshape(-1, 3)
         return up_direction.find(Mesh(rows["position"], faces, rows["normal"]), self._held)
+
+    def without_islands(self, min_extent: float) -> "MeshParts":
+        """The mesh without pieces smaller than `min_extent` metres, as of a `Mesh`; on the disk, too.
+
+        Raises:
+            OutputError: when the folder's disk has no room.
+        """
+        file = self._file(self._folder)
+        try:
+            file.truncate(4 * (self.vertices + 1))
+            number = np.memmap(file, np.int32, "r+")
+            islands = mesh_part_islands.find(self._arrived(), number, min_extent)
+            kept = mesh_part_islands.without(self._arrived(), number, islands)
+            parts = MeshParts(kept, self._folder, held=self._held, known_up=self.up)
+        except OSError as error:
+            raise OutputError(f"cannot write the mesh to {self._folder}: {error.strerror}") from error
+        parts.provenance = self.provenance
+        parts.left_out = {"islands": islands.count, "triangles": self.faces - parts.faces}
+        return parts
+
+    def _arrived(self) -> Iterator[MeshPart]:
+        """The parts as they came."""
+        vertex_at = face_at = 0
+        for vertices, faces in self._counts:
+            size = vertices * self._vertex.itemsize
+            rows = np.frombuffer(_read(self._vertices, vertex_at, size), self._vertex)
+            corners = np.frombuffer(_read(self._faces, face_at, 12 * faces), "<i4").reshape(-1, 3)
+            colors = rows["color"][:, :3] if self._has_color else None
+            yield MeshPart(rows["position"], corners, rows["normal"], colors)
+            vertex_at, face_at = vertex_at + size, face_at + 12 * faces
 
     @property
     def figures(self) -> dict[str, Any]:
@@ -165,6 +203,7 @@ class MeshParts:
         corners, grey = np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8)
         faces = np.arange(3, dtype=np.int32)[None]
         one = Mesh(corners, faces, corners, grey if self._has_color else None, known_up=self.up)
+        one = replace(one, provenance=self.provenance)
         head, end, _ = one.encode(".ply").partition(b"end_header\n")
         head = head.replace(b"element vertex 3\n", b"element vertex %d\n" % self.vertices)
         return head.replace(b"element face 1\n", b"element face %d\n" % self.faces) + end
@@ -188,7 +227,8 @@ class MeshParts:
         rows = self._rows(used)
         colors = rows["color"][:, :3].copy() if self._has_color else None
         triangles: NDArray[np.int32] = corners.reshape(-1, 3).astype(np.int32)
-        return Mesh(rows["position"].copy(), triangles, rows["normal"].copy(), colors, known_up=self.up)
+        mesh = Mesh(rows["position"].copy(), triangles, rows["normal"].copy(), colors, known_up=self.up)
+        return replace(mesh, provenance=self.provenance)
 
     def _rows(self, numbers: NDArray[np.int32]) -> NDArray[Any]:
         """Vertices, as they stand in the file: parts lie there last first."""
