@@ -77,7 +77,7 @@ def _boxes(vertices: NDArray[np.float32], piece: NDArray[np.int32], pieces: int)
 
 
 def without(parts: Iterable[Any], number: NDArray[np.int32], islands: Islands) -> Iterator[Any]:
-    """The parts without the islands; `number` becomes the vertices' new numbers, 0 where they are left out."""
+    """The parts without the islands; `number` becomes the new numbers of the vertices, 0 where left out."""
     done = kept_before = 0
     for part in parts:
         count = len(part.vertices)
