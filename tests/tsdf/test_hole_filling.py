@@ -5,12 +5,14 @@ from itertools import product
 
 import numpy as np
 import pytest
+import trimesh
 from block_stores import store_of
 from formula_scenes import tilted_plane, volume_of
 from numpy.typing import NDArray
 
 from tsfusion import Mesh, Volume
 from tsfusion.core.errors import InvalidConfig
+from tsfusion.geometry import guessed_patches
 from tsfusion.geometry.mesh_simplification import border_edges
 from tsfusion.tsdf import hole_filling
 from tsfusion.tsdf.block_store import pack_keys
@@ -174,3 +176,27 @@ def test_what_cannot_be_filled_is_refused() -> None:
     with pytest.raises(InvalidConfig, match="whole map"):
         volume.extract_mesh(blocks=np.zeros((1, 3), np.int32), fill_holes=5)
     assert Volume(0.02).extract_mesh(fill_holes=5).faces.shape == (0, 3)
+
+
+def test_a_crumb_grows_no_bubble() -> None:
+    """A small piece of a plane, and a large one with a hole that is closed."""
+    p = points()
+    crumb = np.hypot(p[..., 0] - 24, p[..., 1] - 24) < 3
+    plate = (np.abs(p[..., :2]) < 16).all(axis=-1) & (np.hypot(p[..., 0], p[..., 1]) > 4)
+    plain, filled = meshes(p[..., 2] - 0.2, (crumb | plate) & (np.abs(p[..., 2]) < 1.6), 14)
+    check_marked(plain, filled)
+    ends = from_middle(filled.of_faces(filled.guessed))
+    assert np.abs(ends[:, :2]).max() < 6
+    assert np.abs(ends[:, 2] - 0.2).max() < 0.05
+
+
+def test_a_patch_is_not_larger_than_what_it_hangs_on() -> None:
+    """A ball, closed from a larger and from a smaller part of it."""
+    ball = trimesh.creation.icosphere(2)
+    for share, stays in ((0.3, True), (0.7, False)):
+        guessed = ball.triangles_center[:, 2] > 1 - 2 * share
+        vertices = ball.vertices.astype(np.float32)
+        mesh = Mesh(vertices, ball.faces.astype(np.int32), vertices, guessed=guessed)
+        found = guessed_patches.closing(mesh)
+        assert (found.guessed is not None) == stays
+        assert len(found.faces) == (len(guessed) if stays else (~guessed).sum())

@@ -6,8 +6,7 @@
    elsewhere, so that second differences are least; a plane or a ramp goes on as it is.
 3. Marching cubes meshes seen and guessed voxels together. A triangle is guessed if its cell has a voxel that
    nobody saw; all others are those of the mesh without guesses.
-4. A guessed patch stays if it closes: none of its edges may be free. At the border of a scan and in a
-   hole that is too wide the patches end in free edges, and go.
+4. A guessed patch stays if it closes (`geometry/guessed_patches.py`).
 """
 
 import math
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig
-from tsfusion.geometry import mesh_islands
+from tsfusion.geometry import guessed_patches
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.kernels import field_smoothing, marching_tables
 from tsfusion.kernels import hole_filling as kernels
@@ -80,7 +79,8 @@ def extract_filled(
         buffers.release()
     seen_vertices = np.unique(mesh.faces[guessed == 0])
     mesh.normals[seen_vertices] = plain.normals  # not bent by what was guessed beside them
-    return _with_colors(_closing(replace(mesh, guessed=guessed.astype(bool))))
+    guess = replace(mesh, guessed=guessed.astype(bool))
+    return guessed_patches.with_rim_colors(guessed_patches.closing(guess))
 
 
 def _fill(
@@ -168,70 +168,6 @@ def _relax(level: field_regularizer.Level, voxels: int) -> None:
         field_smoothing.relax(
             level.links, level.y, level.weight, inverse, bent, 1.0, keep, gain, step, level.x
         )
-
-
-def _closing(mesh: Mesh) -> Mesh:
-    """The mesh without the guessed patches that have a free edge, or that touch nothing that was seen."""
-    assert mesh.guessed is not None
-    guess = np.flatnonzero(mesh.guessed)
-    faces = mesh.faces[guess]
-    edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
-    owner = np.tile(np.arange(len(guess), dtype=np.int32), 3)
-    key = _edge_keys(edges)
-    order = np.argsort(key, kind="stable")
-    same = key[order][1:] == key[order][:-1]
-    patch = mesh_islands.linked(owner[order][1:][same], owner[order][:-1][same], len(guess))
-    alone = np.ones(len(key), bool)
-    alone[1:] &= ~same
-    alone[:-1] &= ~same
-    rim = order[alone]  # edges that one guessed triangle has
-    is_attached = np.isin(key[rim], _edge_keys(_edges_at(mesh, np.unique(edges[rim]))))
-    keeps = np.zeros(len(guess), bool)
-    keeps[patch[owner[rim[is_attached]]]] = True
-    keeps[patch[owner[rim[~is_attached]]]] = False
-    kept = ~mesh.guessed
-    kept[guess] = keeps[patch]
-    closed = mesh.of_faces(kept)
-    return closed if keeps[patch].any() else replace(closed, guessed=None)
-
-
-def _edges_at(mesh: Mesh, vertices: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Edges of the seen triangles that touch any of these vertices."""
-    assert mesh.guessed is not None
-    touched = np.zeros(len(mesh.vertices), bool)
-    touched[vertices] = True
-    faces = mesh.faces[~mesh.guessed & touched[mesh.faces].any(axis=1)]
-    return np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
-
-
-def _edge_keys(edges: NDArray[np.int32]) -> NDArray[np.int64]:
-    keys: NDArray[np.int64] = edges.min(axis=1).astype(np.int64) << 32 | edges.max(axis=1)
-    return keys
-
-
-def _with_colors(mesh: Mesh) -> Mesh:
-    """Colours of the guessed surface: those of its rim, diffused inward."""
-    if mesh.guessed is None or mesh.colors is None:
-        return mesh
-    known = np.zeros(len(mesh.vertices), bool)
-    known[mesh.faces[~mesh.guessed]] = True
-    faces = mesh.faces[mesh.guessed]
-    edges = np.concatenate((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]))
-    a, b = np.unique(np.concatenate((edges, edges[:, ::-1])), axis=0).T
-    a, b = a[~known[a]], b[~known[a]]
-    colors = mesh.colors.astype(np.float64)
-    has = known.copy()
-    for _ in range(4 * MOST_VOXELS):
-        use = has[b]
-        count = np.bincount(a[use], minlength=len(known))
-        sums = [np.bincount(a[use], colors[b[use], channel], len(known)) for channel in range(3)]
-        reached = count > 0
-        change = np.stack(sums, axis=1)[reached] / count[reached, None] - colors[reached]
-        colors[reached] += change
-        if (reached <= has).all() and (not len(change) or np.abs(change).max() < 0.5):
-            break
-        has |= reached
-    return replace(mesh, colors=np.round(colors).astype(np.uint8))
 
 
 def _reach(voxels: int) -> float:
