@@ -52,6 +52,20 @@ def test_pcd(mesh: Mesh, tmp_path: Path) -> None:
     assert b"# keyframes 9\n" in (tmp_path / "m.pcd").read_bytes()
 
 
+def test_pcd_holds_the_bytes_of_the_format(mesh: Mesh, tmp_path: Path) -> None:
+    """Read by its header, without a library."""
+    head, _, body = mesh.save_points(tmp_path / "m.pcd").read_bytes().partition(b"DATA binary\n")
+    lines = dict(line.split(" ", 1) for line in head.decode().splitlines())
+    assert lines["FIELDS"] == "x y z normal_x normal_y normal_z rgb"
+    assert (lines["SIZE"], lines["COUNT"]) == (" ".join("4444444"), " ".join("1111111"))
+    assert (lines["TYPE"], lines["POINTS"]) == (" ".join("FFFFFFF"), "500")
+    rows = np.frombuffer(body, "<f4").reshape(500, 7)
+    assert (rows[:, :3] == mesh.vertices).all()
+    assert (rows[:, 3:6] == mesh.normals).all()
+    bits = np.ascontiguousarray(rows[:, 6]).view("<u4")
+    assert (np.stack((bits >> 16, bits >> 8, bits), axis=1) & 255 == mesh.colors).all()
+
+
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 def test_las_and_laz(mesh: Mesh, tmp_path: Path, suffix: str) -> None:
     read = laspy.read(mesh.save_points(tmp_path / f"m{suffix}"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Patches of guessed triangles, which hang together edge by edge: those that close a hole, and their colours."""
+"""Patches of guessed triangles, joined edge by edge: which of them close a hole, and their colours."""
 
 from dataclasses import replace
 

@@ -63,11 +63,6 @@ def _glb(mesh: "Mesh") -> bytes:
         normals=(mesh.normals @ turn.T).astype(np.float32),
         colors=None if mesh.colors is None else _SRGB_TO_LINEAR[mesh.colors],
     )
-    facts = facts_of(mesh)
-
-    def describe(tree: dict[str, Any]) -> None:
-        tree["asset"] = {"version": "2.0", "generator": facts.pop("generator"), "extras": facts}
-
     up = f"map's {described(mesh.up)}" + (", here +y" if mesh.up else "")
     if mesh.guessed is None:
         shape = turned.to_trimesh()
@@ -76,7 +71,17 @@ def _glb(mesh: "Mesh") -> bytes:
         shape = _scene(turned)
         for one in shape.geometry.values():
             one.metadata["up"] = up
-    return bytes(shape.export(file_type="glb", include_normals=True, tree_postprocessor=describe))
+    return bytes(shape.export(file_type="glb", include_normals=True, tree_postprocessor=describing(mesh)))
+
+
+def describing(mesh: "Mesh") -> Callable[[dict[str, Any]], None]:
+    """Function that writes what is known about a mesh into the head of its GLB file."""
+
+    def describe(tree: dict[str, Any]) -> None:
+        facts = facts_of(mesh)
+        tree["asset"] = {"version": "2.0", "generator": facts.pop("generator"), "extras": facts}
+
+    return describe
 
 
 def _scene(mesh: "Mesh") -> Any:
