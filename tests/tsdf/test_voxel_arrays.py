@@ -1,16 +1,22 @@
 # SPDX-License-Identifier: MIT
 """Voxels in a file have the numbers and places that the map gives them."""
 
+import hashlib
 from pathlib import Path
 
 import numpy as np
 import pytest
+import vdb_reader
 from formula_scenes import sphere_views, volume_of
 
-from tsfusion.core.errors import OutputError
+from tsfusion import Volume
+from tsfusion.core.errors import InvalidConfig, OutputError
+from tsfusion.geometry import openvdb_files
 from tsfusion.tsdf import voxel_arrays
+from tsfusion.tsdf.voxel_arrays import FieldName
 
 VIEWS = sphere_views(0.4, 5)
+READ_BY_OPENVDB = "98f99f7fcded5fc87fb57fab9e366a385fb7f2b3b8ee23e39cdc6ff7754a2b73"
 
 
 @pytest.mark.parametrize("dense", [False, True])
@@ -54,3 +60,79 @@ def test_maps_without_colour_and_those_that_cannot_be_written(
     with pytest.raises(OutputError, match="cannot write"):
         volume.save_voxels(tmp_path / "none" / "a.npz")
     assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.fixture(scope="module")
+def sphere() -> Volume:
+    return volume_of(VIEWS, voxel_size=0.04)
+
+
+@pytest.mark.parametrize("field", ["tsdf", "distance"])
+@pytest.mark.parametrize("dense", [False, True])
+def test_zarr_holds_the_same_arrays(sphere: Volume, tmp_path: Path, field: FieldName, dense: bool) -> None:
+    zarr = pytest.importorskip("zarr")
+    arrays, group = (
+        sphere.save_voxels(tmp_path / name, dense=dense, field=field, max_distance=0.2)
+        for name in ("a.npz", "a.zarr")
+    )
+    sphere.save_voxels(group, dense=dense, field=field, max_distance=0.2)  # in the place of the one before
+    expected, found = np.load(arrays), zarr.open_group(group, mode="r")
+    assert sorted(expected) == sorted(found)
+    assert field in found
+    for name in expected:
+        assert expected[name].dtype == found[name].dtype
+        np.testing.assert_array_equal(expected[name], found[name][...])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "a.zarr"]
+
+
+def test_the_distance_field_in_a_file_is_the_maps(sphere: Volume, tmp_path: Path) -> None:
+    found = np.load(sphere.save_voxels(tmp_path / "a.npz", field="distance", max_distance=0.2))
+    blocks = list(sphere.distance_blocks(max_distance=0.2))
+    assert (found["blocks"] == np.concatenate([one.blocks for one in blocks])).all()
+    assert (found["distance"] == np.concatenate([one.distance for one in blocks])).all()
+    whole = np.load(sphere.save_voxels(tmp_path / "b.npz", field="distance", max_distance=0.2, dense=True))
+    assert (whole["distance"] == sphere.distance_field(max_distance=0.2).distance).all()
+
+
+def test_other_files_and_fields_are_refused(sphere: Volume, tmp_path: Path) -> None:
+    for name, how in (("a.txt", {}), ("a.vdb", {"dense": True}), ("a.npz", {"field": "weight"})):
+        with pytest.raises(InvalidConfig, match=r"voxels are written to \.npz, \.zarr, \.vdb"):
+            sphere.save_voxels(tmp_path / name, **how)
+    pytest.importorskip("zarr")
+    (tmp_path / "b.zarr").write_text("mine")
+    with pytest.raises(OutputError, match="it is a file, not a folder"):
+        sphere.save_voxels(tmp_path / "b.zarr")
+    with pytest.raises(OutputError, match="cannot write"):
+        sphere.save_voxels(tmp_path / "none" / "a.vdb")
+    with pytest.raises(OutputError, match="no surface with so much weight"):
+        sphere.save_voxels(tmp_path / "a.npz", field="distance", min_weight=1e5)
+    assert [path.name for path in tmp_path.iterdir()] == ["b.zarr"]
+
+
+@pytest.mark.parametrize("field", ["tsdf", "distance"])
+def test_an_openvdb_file_holds_the_field(sphere: Volume, tmp_path: Path, field: FieldName) -> None:
+    grid = vdb_reader.read(sphere.save_voxels(tmp_path / "a.vdb", field=field, max_distance=0.2))
+    expected = np.load(sphere.save_voxels(tmp_path / "a.npz", field=field, max_distance=0.2))
+    assert grid.name == field
+    assert (grid.voxel_size, grid.translation) == (0.04, 0.02)
+    values = np.nan_to_num(expected[field], nan=grid.background)
+    assert {tuple(block) for block in expected["blocks"].tolist()} == set(grid.leaves)
+    for block, leaf in zip(expected["blocks"].tolist(), values, strict=True):
+        assert (grid.leaves[tuple(block)] == leaf).all()
+
+
+def test_openvdb_has_read_this_file(tmp_path: Path) -> None:
+    """OpenVDB 12.0 has read the file of these bytes, and found these values."""
+    random = np.random.default_rng(0)
+    blocks = np.unique(random.integers(-600, 600, (40, 3)).astype(np.int32), axis=0)
+    blocks = blocks[openvdb_files.order_of(blocks)]
+    values = random.integers(-30, 30, (len(blocks), 8, 8, 8)).astype(np.float32) / 16
+    values[random.random(values.shape) < 0.5] = 3
+    path = tmp_path / "a.vdb"
+    parts = [(blocks[:17], values[:17]), (blocks[17:], values[17:])]
+    openvdb_files.write(path, parts, name="tsdf", voxel_size=0.0625, background=3.0)
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == READ_BY_OPENVDB
+    grid = vdb_reader.read(path)
+    for block, leaf in zip(blocks.tolist(), values, strict=True):
+        assert (grid.leaves[tuple(block)] == leaf).all()
+    assert len(grid.leaves) == len(blocks)

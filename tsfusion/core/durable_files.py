@@ -5,6 +5,7 @@ import errno
 import os
 import re
 import shlex
+import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -64,6 +65,32 @@ def replacing(path: Path, *, private: bool = False) -> Iterator[BinaryIO]:
         with suppress(OSError):
             partial.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def replacing_folder(path: Path) -> Iterator[Path]:
+    """A new folder for the block to fill, which takes the place of `path` at the end of the block.
+
+    After an error the folder before it stays as it was. A file of this name is not replaced.
+
+    Raises:
+        OSError: when the disk refuses, or `path` is a file.
+    """
+    partial, before = (path.with_name(f".{path.name}.{kind}") for kind in ("partial", "before"))
+    if path.exists() and not path.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a folder")
+    try:
+        for one in (partial, before):
+            shutil.rmtree(one, ignore_errors=True)
+        partial.mkdir()
+        yield partial
+        if path.exists():
+            os.replace(path, before)
+        os.replace(partial, path)
+        sync_folder(path.parent)
+    finally:  # an interrupted block leaves no part either
+        for one in (partial, before):
+            shutil.rmtree(one, ignore_errors=True)
 
 
 def sweep(folder: Path, pattern: str) -> None:

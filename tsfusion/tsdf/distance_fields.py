@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, MapError
+from tsfusion.geometry import openvdb_files
 from tsfusion.geometry.map_grids import FREE, OCCUPIED, UNSEEN, DistanceField
 from tsfusion.kernels import distance_transform as kernels
 from tsfusion.kernels.integrate import QUANTA_PER_VOXEL
@@ -86,20 +87,34 @@ def in_blocks(store: BlockStore, max_distance: float, min_weight: float) -> Iter
     """Distances of the whole map in memory for one tile: see `ReadableMap.distance_blocks`."""
     reach = Reach(max_distance, store.voxel_size)
     _checked_shape(np.full(3, 8 * _TILE + 2 * (reach.margin + 8)), whole=True)
-    rings = -(-reach.margin // (8 * _TILE))
-    steps = np.array(list(np.ndindex(*(2 * rings + 1,) * 3)), np.int32) - rings
-    own = unpack_keys(np.sort(store.keys)) // _TILE
-    tiles = np.unique((np.unique(own, axis=0)[:, None] + steps).reshape(-1, 3), axis=0)
-    for tile in tiles:
-        corner = tile.astype(np.int64) * _TILE * 8 * store.voxel_size
-        edges = np.concatenate([corner, corner + _TILE * 8 * store.voxel_size])
-        field = in_box(store, edges.tolist(), max_distance, min_weight, subvoxel=True)
-        cells = field.distance.reshape(_TILE, 8, _TILE, 8, _TILE, 8).transpose(0, 2, 4, 1, 3, 5)
-        near = np.argwhere((cells < np.float32(max_distance)).any(axis=(3, 4, 5)))
-        for i in range(0, len(near), _PART):
-            part = near[i : i + _PART]
-            x, y, z = part.T
-            yield FieldBlocks((part + tile * _TILE).astype(np.int32), np.ascontiguousarray(cells[x, y, z]))
+    blocks = unpack_keys(store.keys)
+    rings = -(-reach.margin // 8)
+    around = -(-rings // _TILE)  # tiles
+    steps = np.array(list(np.ndindex((2 * around + 1,) * 3)), np.int32) - around
+    own = np.unique(blocks // _TILE, axis=0)
+    tiles = np.unique((own[:, None] + steps).reshape(-1, 3), axis=0)
+    for tile in tiles[openvdb_files.order_of(tiles * _TILE)]:
+        first, end = tile * _TILE, (tile + 1) * _TILE
+        near = blocks[((blocks >= first - rings) & (blocks < end + rings)).all(axis=1)]
+        if len(near):
+            first = np.maximum(first, near.min(axis=0) - rings)
+            end = np.minimum(end, near.max(axis=0) + rings + 1)
+            yield from _near(store, first, end, reach, min_weight)
+
+
+def _near(
+    store: BlockStore, first: NDArray[np.int32], end: NDArray[np.int32], reach: Reach, min_weight: float
+) -> Iterator[FieldBlocks]:
+    """The blocks in a box of blocks in which a distance is less than the largest."""
+    edges = 8 * store.voxel_size * np.concatenate([first, end])
+    field = in_box(store, edges.tolist(), reach.metres, min_weight, subvoxel=True)
+    sides = (end - first).tolist()
+    cells = field.distance.reshape(sides[0], 8, sides[1], 8, sides[2], 8).transpose(0, 2, 4, 1, 3, 5)
+    places = np.argwhere((np.abs(cells) < np.float32(reach.metres)).any(axis=(3, 4, 5)))
+    for i in range(0, len(places), _PART):
+        part = places[i : i + _PART]
+        x, y, z = part.T
+        yield FieldBlocks((part + first).astype(np.int32), np.ascontiguousarray(cells[x, y, z]))
 
 
 def occupancy_of(values: NDArray[np.float32]) -> NDArray[np.int8]:

@@ -377,18 +377,30 @@ class ReadableMap:
         path: str | os.PathLike[str],
         *,
         dense: bool = False,
+        field: voxel_arrays.FieldName = "tsdf",
+        max_distance: float = 0.5,
+        min_weight: float | None = None,
         watch: voxel_arrays.Watch = lambda _done, _all: None,
     ) -> Path:
-        """Write an `.npz` file of voxels as `tsdf/voxel_arrays.py` describes; complete or not at all.
+        """Write voxels for NumPy (.npz), zarr (.zarr, a folder) or OpenVDB (.vdb): complete or not at all.
+
+        `tsdf/voxel_arrays.py` describes the arrays.
 
         Args:
-            dense: one array around the whole map, instead of its blocks.
-            watch: told the bytes of the arrays that are written, and all of them.
+            dense: one array around the whole map, instead of its blocks; not of OpenVDB.
+            field: `tsdf`, signed distances as fused with weights and colours, or `distance`, the Euclidean
+                distance field.
+            max_distance, min_weight: of the distance field, as for `distance_blocks`.
+            watch: told the bytes of the arrays that are written, and all of them (not of OpenVDB).
 
         Raises:
-            OutputError: for an empty map, a box that is too large, or a path that cannot be written.
+            InvalidConfig: for another suffix or field; OutputError: for an empty map, a box that is too
+                large, or a path that cannot be written; MissingDependency: zarr is not installed.
         """
-        voxel_arrays.write(self._store, Path(path), dense=dense, watch=watch)
+        voxel_arrays.write(
+            self._store, Path(path), dense=dense, field=field, max_distance=max_distance,
+            min_weight=self._checked_min_weight(min_weight), watch=watch,
+        )  # fmt: skip
         return Path(path)
 
     def map_hash(self) -> str:

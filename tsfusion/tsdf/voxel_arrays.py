@@ -1,30 +1,36 @@
 # SPDX-License-Identifier: MIT
-"""A map as arrays of voxels in an `.npz` file, for NumPy and everything that reads it.
+"""A map as arrays of voxels in a file: `.npz` for NumPy, `.zarr` for what reads parts, `.vdb` for OpenVDB.
 
-Both kinds hold `voxel_size` (metres) and, for each voxel, `tsdf` float32 (signed distance to the surface in
-metres, positive in front of it, NaN where nothing was seen), `weight` float32 (votes, in full-confidence
-samples) and, where the map has colour, `color` uint8 RGB (0 where none was seen).
+Both kinds of arrays hold `voxel_size` (metres) and, for each voxel, `tsdf` float32 (signed distance to the
+surface in metres, positive in front of it, NaN where nothing was seen), `weight` float32 (votes, in
+full-confidence samples) and, where the map has colour, `color` uint8 RGB (0 where none was seen). Of the
+distance field they hold `distance` float32 (metres, at most `max_distance`) instead.
 
 Blocks: `blocks` (n, 3) int32, and `tsdf`, `weight` (n, 8, 8, 8), `color` (n, 8, 8, 8, 3). The centre of voxel
 (i, j, k) of block b is at (8 · blocks[b] + (i, j, k) + 0.5) · voxel_size.
 
 Dense: `tsdf`, `weight` (X, Y, Z), `color` (X, Y, Z, 3), and `origin` (3,) float64: the centre of voxel
 (i, j, k) is at origin + ((i, j, k) + 0.5) · voxel_size.
+
+OpenVDB: one grid, `tsdf` or `distance`; where nothing was seen, or nothing is near, it has its background.
 """
 
+import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from tsfusion.core import durable_files
-from tsfusion.core.errors import OutputError
-from tsfusion.kernels.integrate import QUANTA_PER_VOXEL, WEIGHT_MASK
+from tsfusion.core.errors import InvalidConfig, MissingDependency, OutputError
+from tsfusion.geometry import openvdb_files
+from tsfusion.kernels.integrate import MAX_DISTANCE, QUANTA_PER_VOXEL, WEIGHT_MASK
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
+from tsfusion.tsdf import distance_fields
 from tsfusion.tsdf.block_store import BlockStore, unpack_keys
 from tsfusion.tsdf.surface_values import values_of
 
@@ -47,23 +53,73 @@ _FIELDS = {
     "tsdf": _Field(np.float32, np.nan),
     "weight": _Field(np.float32, 0),
     "color": _Field(np.uint8, 0, (3,)),
+    "distance": _Field(np.float32, np.nan),
 }
 
+FieldName = Literal["tsdf", "distance"]
+FORMATS = (".npz", ".zarr", ".vdb")
 Watch = Callable[[int, int], None]  # bytes of the arrays written, of all
 
 
-def write(store: BlockStore, path: Path, *, dense: bool, watch: Watch = lambda _done, _all: None) -> None:
+class _Voxels(NamedTuple):
+    """Arrays of voxels, of which no more than a part is in memory."""
+
+    plain: dict[str, NDArray[Any]]  # what stands beside them
+    names: list[str]  # of `_FIELDS`
+    shape: tuple[int, ...]  # without a field's own
+    parts: Callable[[str], Iterator[NDArray[Any]]]  # of a field, in order along the first axis
+
+
+def write(
+    store: BlockStore,
+    path: Path,
+    *,
+    dense: bool,
+    field: FieldName = "tsdf",
+    max_distance: float = 0.5,
+    min_weight: float = 0.0,
+    watch: Watch = lambda _done, _all: None,
+) -> None:
     """Write the voxels of a map; complete or not at all, in little memory.
 
     Args:
         dense: one box around the whole map, instead of its blocks.
+        field: signed distances as fused, with weights and colours; or the distance field.
+        max_distance, min_weight: of the distance field, as for `ReadableMap.distance_blocks`.
 
     Raises:
-        OutputError: when it cannot be written, a map is empty, or the box has more than `MOST_DENSE` voxels.
+        InvalidConfig: for another suffix or field; OutputError: when it cannot be written, a map is empty, or
+            the box has more than `MOST_DENSE` voxels; MissingDependency: zarr is not installed.
     """
-    used = store.used()
-    if not len(used):
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS or field not in get_args(FieldName) or (dense and suffix == ".vdb"):
+        raise InvalidConfig(
+            f"voxels are written to {', '.join(FORMATS)}, a .vdb file never dense, and their field is one of "
+            f"{', '.join(get_args(FieldName))}; got {path}, {field!r}"
+        )
+    if not store.count or not len(used := store.used()):
         raise OutputError(f"nothing to write to {path}: the map is empty")
+    near = distance_fields.in_blocks(store, max_distance, min_weight) if field == "distance" else iter(())
+    if suffix == ".vdb":
+        _write_vdb(path, store, used, near if field == "distance" else None, max_distance)
+        return
+    writer = _write_zarr if suffix == ".zarr" else _write_npz
+    try:
+        with tempfile.TemporaryFile(dir=path.parent) as spool:
+            if field == "tsdf":
+                voxels = _fused(store, used, dense=dense)
+            elif dense:
+                voxels = _dense_distances(store, max_distance, min_weight)
+            else:
+                voxels = _spooled_distances(store, near, max_distance, spool)
+            each = [np.dtype((_FIELDS[n].dtype, _FIELDS[n].shape)).itemsize for n in voxels.names]
+            writer(path, voxels, _Progress(watch, int(np.prod(voxels.shape)) * sum(each)))
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _fused(store: BlockStore, used: NDArray[np.int64], *, dense: bool) -> _Voxels:
+    """The sums of a map as values."""
     blocks = unpack_keys(store.keys[used])
     low, high = blocks.min(axis=0), blocks.max(axis=0) + 1
     shape = tuple(int(length) for length in 8 * (high - low)) if dense else (len(used), 8, 8, 8)
@@ -74,18 +130,97 @@ def write(store: BlockStore, path: Path, *, dense: bool, watch: Watch = lambda _
         )
     plain: dict[str, Any] = {"voxel_size": np.float64(store.voxel_size)}
     plain |= {"origin": 8 * low * store.voxel_size} if dense else {"blocks": blocks}
-    fields = {name: field for name, field in _FIELDS.items() if store.color or name != "color"}
-    each = [np.dtype((field.dtype, field.shape)).itemsize for field in fields.values()]
+    names = ["tsdf", "weight", "color"] if store.color else ["tsdf", "weight"]
+    if dense:
+        return _Voxels(plain, names, shape, lambda name: _slabs(store, used, blocks, name))
+    return _Voxels(plain, names, shape, lambda name: _blocks(store, used, name))
+
+
+def _dense_distances(store: BlockStore, max_distance: float, min_weight: float) -> _Voxels:
+    """The distance field around a map."""
+    found = distance_fields.in_box(store, None, max_distance, min_weight, subvoxel=True)
+    plain = {"voxel_size": np.float64(store.voxel_size), "origin": found.origin}
+    plain["max_distance"] = np.float64(max_distance)
+    slabs = np.array_split(found.distance, found.distance.shape[0] // 8)
+    return _Voxels(plain, ["distance"], found.distance.shape, lambda _: iter(slabs))
+
+
+def _spooled_distances(
+    store: BlockStore, near: Iterator[distance_fields.FieldBlocks], max_distance: float, spool: IO[bytes]
+) -> _Voxels:
+    """The distance field near a map's surfaces, which waits in a file until it is known how long it is."""
+    blocks = []
+    for one in near:
+        spool.write(one.distance.data)
+        blocks.append(one.blocks)
+    plain = {"voxel_size": np.float64(store.voxel_size), "max_distance": np.float64(max_distance)}
+    if not blocks:
+        raise OutputError("nothing to write: the map has no surface with so much weight; lower min_weight")
+    plain["blocks"] = np.concatenate(blocks)
+    count = len(plain["blocks"])
+
+    def parts(_: str) -> Iterator[NDArray[Any]]:
+        spool.seek(0)
+        for i in range(0, count, _CHUNK):
+            part = min(_CHUNK, count - i)
+            yield np.frombuffer(spool.read(part * 2048), np.float32).reshape(part, 8, 8, 8)
+
+    return _Voxels(plain, ["distance"], (count, 8, 8, 8), parts)
+
+
+def _write_npz(path: Path, voxels: _Voxels, progress: "_Progress") -> None:
+    with durable_files.replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
+        for name, value in voxels.plain.items():
+            _write_array(archive, name, np.shape(value), iter([np.asarray(value)]))
+        for name in voxels.names:
+            shape = voxels.shape + _FIELDS[name].shape
+            _write_array(archive, name, shape, map(progress, voxels.parts(name)))
+
+
+def _write_zarr(path: Path, voxels: _Voxels, progress: "_Progress") -> None:
+    """A folder in which each array has chunks of `_CHUNK` blocks, or of 8 planes across x."""
     try:
-        with durable_files.replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
-            for name, value in plain.items():
-                _write_array(archive, name, np.shape(value), iter([np.asarray(value)]))
-            progress = _Progress(watch, int(np.prod(shape)) * sum(each))
-            for name, field in fields.items():
-                parts = _slabs(store, used, blocks, name) if dense else _blocks(store, used, name)
-                _write_array(archive, name, shape + field.shape, map(progress, parts))
-    except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}") from error
+        import zarr
+    except ImportError as error:
+        raise MissingDependency(
+            f"writing {path} needs zarr (Python 3.11 or later): pip install 'tsfusion[zarr]'"
+        ) from error
+    with durable_files.replacing_folder(path) as folder:
+        group = zarr.open_group(folder, mode="w")
+        for name, value in voxels.plain.items():
+            group.create_array(name, data=np.asarray(value))
+        for name in voxels.names:
+            field = _FIELDS[name]
+            first = min(8 if "origin" in voxels.plain else _CHUNK, voxels.shape[0])
+            array = group.create_array(
+                name, shape=voxels.shape + field.shape, chunks=(first, *voxels.shape[1:], *field.shape),
+                dtype=np.dtype(field.dtype), fill_value=field.unseen,
+            )  # fmt: skip
+            at = 0
+            for part in map(progress, voxels.parts(name)):
+                array[at : at + len(part)] = part.reshape(len(part), *voxels.shape[1:], *field.shape)
+                at += len(part)
+
+
+def _write_vdb(
+    path: Path,
+    store: BlockStore,
+    used: NDArray[np.int64],
+    near: Iterator[distance_fields.FieldBlocks] | None,
+    max_distance: float,
+) -> None:
+    """One grid for OpenVDB."""
+    size = store.voxel_size
+    if near is not None:
+        openvdb_files.write(path, near, name="distance", voxel_size=size, background=max_distance)
+        return
+    beyond = size * (MAX_DISTANCE + 1) / QUANTA_PER_VOXEL  # no distance that was fused is as large
+    used = used[openvdb_files.order_of(unpack_keys(store.keys[used]))]
+    parts = (
+        (unpack_keys(store.keys[part]), np.nan_to_num(_values(store, part, "tsdf"), nan=beyond))
+        for part in (used[i : i + _CHUNK] for i in range(0, len(used), _CHUNK))
+    )
+    openvdb_files.write(path, parts, name="tsdf", voxel_size=size, background=beyond)
 
 
 class _Progress:
