@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+import vdb_reader
 from command_processes import Here
 from corrected_maps import fresh_map
 from formula_scenes import volume_of
@@ -217,6 +218,35 @@ def test_convert_writes_voxels_meshes_and_maps(here: Here, state: Path) -> None:
     assert "--dense has no effect" in here("map", "convert", yard, "mesh.glb", "--dense").stderr
     assert here("map", "convert", state_folder.map_folder(state, "house"), "house.tsf").returncode == 0
     assert Volume.load("house.tsf").map_hash() == hash_of(range(10, 14))
+
+
+def test_convert_writes_slices_and_fields(here: Here, state: Path) -> None:
+    yard, volume = file_of(state, "yard"), Volume.load(file_of(state, "yard"))
+    how = ("--heights", 0.5, 1.2, "--up", "z")
+    done = here("map", "convert", yard, "room.yaml", *how, "--json")
+    assert json.loads(done.stdout)["files"] == ["room.yaml", "room.pgm"]
+    assert "made without --space-carving" in done.stderr
+    expected = volume.occupancy_slice(0.5, 1.2, up="z")
+    assert Path("room.pgm").read_bytes().endswith(expected.pixels().tobytes())
+    assert here("map", "convert", yard, "room.npz", *how, "--field", "distance").returncode == 0
+    assert (np.load("room.npz")["distance"] == volume.distance_slice(0.5, 1.2, up="z").distance).all()
+    for name in ("field.npz", "field.vdb"):
+        done = here("map", "convert", yard, name, "--field", "distance", "--max-distance", 0.2)
+        assert (done.returncode, done.stderr) == (0, "")
+    assert float(np.load("field.npz")["max_distance"]) == 0.2
+    grid = vdb_reader.read(Path("field.vdb"))
+    assert len(grid.leaves) == len(np.load("field.npz")["blocks"])
+    for flags, message in (
+        (("a.vdb", "--up", "z"), "--up goes with --heights"),
+        (("a.ply", "--field", "distance"), "--field has no effect"),
+        (("a.pgm", *how, "--field", "distance"), "write distances to"),
+        (("a.npz", "--max-distance", 1), "--max-distance goes with"),
+        (("a.vdb", *how), "expected a name ending in .pgm"),
+        (("a.png", *how[:3], "--up", "w"), "up must be"),
+    ):
+        refused = here("map", "convert", yard, *flags)
+        assert (refused.returncode, message in refused.stderr) == (1, True), refused.stderr
+    assert not list(Path().glob("a.*"))
 
 
 def test_a_resumed_map_takes_keyframes(here: Here, state: Path, tmp_path: Path) -> None:

@@ -100,13 +100,17 @@ def test_other_files_and_fields_are_refused(sphere: Volume, tmp_path: Path) -> N
             sphere.save_voxels(tmp_path / name, **how)
     pytest.importorskip("zarr")
     (tmp_path / "b.zarr").write_text("mine")
+    (tmp_path / "c.zarr").mkdir()
+    (tmp_path / "c.zarr" / "mine").write_text("mine")
+    with pytest.raises(OutputError, match="a folder of something else"):
+        sphere.save_voxels(tmp_path / "c.zarr")
     with pytest.raises(OutputError, match="it is a file, not a folder"):
         sphere.save_voxels(tmp_path / "b.zarr")
     with pytest.raises(OutputError, match="cannot write"):
         sphere.save_voxels(tmp_path / "none" / "a.vdb")
     with pytest.raises(OutputError, match="no surface with so much weight"):
         sphere.save_voxels(tmp_path / "a.npz", field="distance", min_weight=1e5)
-    assert [path.name for path in tmp_path.iterdir()] == ["b.zarr"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["b.zarr", "c.zarr"]
 
 
 @pytest.mark.parametrize("field", ["tsdf", "distance"])

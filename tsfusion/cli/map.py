@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tsfusion.cli import forget, map_align, map_view, opened_maps, options, verbs
+from tsfusion.cli import forget, map_align, map_convert, map_view, opened_maps, options, verbs
 from tsfusion.core.counts import count_of
 
 if TYPE_CHECKING:
@@ -211,54 +211,55 @@ def diff(
         typer.echo(map_view.difference(found))
 
 
-@verbs.verb(
-    app,
-    "tsfusion map convert out/latest/map.tsf voxels.npz",
-    "tsfusion map convert my-maps yard.tsf --map yard",
-)
+@verbs.verb(app, *map_convert.EXAMPLES)
 def convert(
     path: Where,
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="A .npz, .tsf, .ply, .glb, .obj or .stl file.")],
+    out: map_convert.Out,
     *,
-    dense: Annotated[
-        bool, typer.Option("--dense", help="One array around the map, not its blocks (.npz).")
-    ] = False,
+    dense: map_convert.Dense = False,
+    field: map_convert.Field = None,
+    max_distance: map_convert.MaxDistance = None,
+    heights: map_convert.Heights = None,
+    box: map_convert.SliceBox = None,
+    up: options.UpDirection = None,
+    resolution: map_convert.Resolution = None,
     map_: Map = None,
     json: options.Json = False,
 ) -> None:
-    """Write a map as voxels for NumPy, as a mesh, or as a file of its own.
+    """Write a map as voxels, as a slice, as a mesh, or as a file of its own.
 
-    .npz: tsdf (n, 8, 8, 8) float32 in metres, positive in front of the
-    surface, NaN where nothing was seen; weight likewise; color uint8 RGB;
-    blocks (n, 3) int32; voxel_size. Voxel (i, j, k) of block b has its
+    .npz, .zarr: tsdf (n, 8, 8, 8) float32 in metres, positive in front of
+    the surface, NaN where nothing was seen; weight likewise; color uint8
+    RGB; blocks (n, 3) int32; voxel_size. Voxel (i, j, k) of block b has its
     centre at (8 b + (i, j, k) + 0.5) voxel_size. --dense: tsdf (X, Y, Z)
-    and origin instead, centres at origin + ((i, j, k) + 0.5) voxel_size.
+    and origin instead. .vdb: a grid for OpenVDB.
 
+    --heights: free, occupied or unseen cells as ROS's map_server reads them
+    (.yaml and .pgm) or as a picture (.png); --field distance: distances.
     .tsf: of a state folder, with all that its journal holds.
     Meshes: `tsfusion mesh` has more choices.
     """
     from tsfusion.cli import output, progress
-    from tsfusion.core.errors import InvalidConfig
-    from tsfusion.core.output_folder import check_writable
-    from tsfusion.geometry.mesh import FORMATS
     from tsfusion.pipelines import mesh_files
 
-    suffix = out.suffix.lower()
-    check_writable(out, (".npz", ".tsf", *FORMATS))
-    if dense and suffix != ".npz":
-        raise InvalidConfig(f"--dense has no effect on {out}: only a .npz file has arrays")
+    suffix, files = out.suffix.lower(), [out]
+    given = {"heights": heights, "box": box, "up": up, "resolution": resolution}
+    map_convert.check(out, dense=dense, field=field, max_distance=max_distance, given=given)
     volume = _load(path, map_, quiet=json)
-    if suffix == ".tsf":
+    if heights is not None:
+        files = map_convert.write_slice(volume, out, field, max_distance, given)
+    elif suffix == ".tsf":
         volume.save(out)
-    elif suffix == ".npz":
+    elif suffix in (".npz", ".zarr", ".vdb"):
+        chosen = {} if max_distance is None else {"max_distance": max_distance}
         with progress.reading(f"writing {out}", quiet=json) as watch:
-            volume.save_voxels(out, dense=dense, watch=watch)
+            volume.save_voxels(out, dense=dense, field=field or "tsdf", watch=watch, **chosen)
     else:
         mesh_files.write(volume.extract_mesh(), [out])
     if json:
-        output.as_json({"path": str(out), **map_view.figures(volume)})
+        output.as_json({"path": str(out), "files": [str(file) for file in files], **map_view.figures(volume)})
     else:
-        typer.echo(map_view.line(out, volume))
+        typer.echo("\n".join(map_view.line(file, volume) for file in files))
 
 
 @verbs.verb(

@@ -185,6 +185,8 @@ def _write_zarr(path: Path, voxels: _Voxels, progress: "_Progress") -> None:
         raise MissingDependency(
             f"writing {path} needs zarr (Python 3.11 or later): pip install 'tsfusion[zarr]'"
         ) from error
+    if path.is_dir() and any(path.iterdir()) and not (path / "zarr.json").exists():
+        raise OutputError(f"cannot write {path}: it is a folder of something else; choose another name")
     with durable_files.replacing_folder(path) as folder:
         group = zarr.open_group(folder, mode="w")
         for name, value in voxels.plain.items():

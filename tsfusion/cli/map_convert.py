@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion map convert`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from tsfusion.cli import options
+
+if TYPE_CHECKING:
+    from tsfusion.tsdf.volume import Volume
+
+EXAMPLES = (
+    "tsfusion map convert out/latest/map.tsf field.vdb --field distance",
+    "tsfusion map convert my-maps yard.yaml --map yard --heights 0.1 1.8 --up z",
+)
+Out = Annotated[
+    Path,
+    typer.Argument(metavar="OUT", help=".npz .zarr .vdb .tsf .ply .glb .obj; slice: .yaml .pgm .png .npz"),
+]
+Dense = Annotated[
+    bool, typer.Option("--dense", help="One array around the map, not its blocks (.npz, .zarr).")
+]
+Field = Annotated[
+    Literal["tsdf", "distance"] | None,
+    typer.Option(help="Distances as fused, or Euclidean; of a slice occupancy, or distance."),
+]
+MaxDistance = Annotated[
+    float | None,
+    typer.Option(metavar="METRES", help="Of --field distance; default 0.5, of a slice 2."),
+]
+Heights = Annotated[
+    tuple[float, float] | None,
+    typer.Option(metavar="LOW HIGH", help="A slice: what stands between two heights, metres."),
+]
+SliceBox = Annotated[
+    tuple[float, float, float, float] | None,
+    typer.Option("--box", metavar="U0 V0 U1 V1", help="Of a slice, metres; default all of it."),
+]
+Resolution = Annotated[float | None, typer.Option(metavar="METRES", help="Cell of a slice; default a voxel.")]
+
+
+def check(
+    out: Path, *, dense: bool, field: str | None, max_distance: float | None, given: dict[str, Any]
+) -> None:
+    """Refuse what cannot be written, and flags without effect, before the map is read.
+
+    Args:
+        given: flags that are of a slice alone, `heights` among them.
+    """
+    from tsfusion.core.errors import InvalidConfig
+    from tsfusion.core.output_folder import check_writable
+    from tsfusion.geometry.map_grids import SLICE_FORMATS
+    from tsfusion.geometry.mesh import FORMATS
+    from tsfusion.tsdf.voxel_arrays import FORMATS as VOXELS
+
+    suffix, is_slice = out.suffix.lower(), given["heights"] is not None
+    if not (suffix == ".zarr" and out.is_dir()):  # one that is there is replaced
+        check_writable(out, SLICE_FORMATS if is_slice else (*VOXELS, ".tsf", *FORMATS))
+    if dense and (is_slice or suffix not in (".npz", ".zarr")):
+        raise InvalidConfig(
+            f"--dense has no effect on {out}: only a .npz or .zarr file has arrays of the map"
+        )
+    if field is not None and not is_slice and suffix not in VOXELS:
+        raise InvalidConfig(f"--field has no effect on {out}: only {', '.join(VOXELS)} files have a field")
+    if field == "distance" and suffix in (".yaml", ".pgm"):
+        raise InvalidConfig(f"{out} would be a map of what is occupied: write distances to .png or .npz")
+    if max_distance is not None and field != "distance":
+        raise InvalidConfig("--max-distance goes with --field distance")
+    for name, value in given.items():
+        if value is not None and not is_slice:
+            raise InvalidConfig(f"--{name} goes with --heights LOW HIGH: it is of a slice")
+
+
+def write_slice(
+    volume: "Volume", out: Path, field: str | None, max_distance: float | None, given: dict[str, Any]
+) -> list[Path]:
+    """Write a slice; returns the files."""
+    how = {name: given[name] for name in ("box", "resolution")} | {"up": options.up_direction(given["up"])}
+    if field == "distance":
+        if max_distance is not None:
+            how["max_distance"] = max_distance
+        return volume.distance_slice(*given["heights"], **how).save(out)
+    found = volume.occupancy_slice(*given["heights"], **how)
+    if not found.knows_free_space:
+        typer.echo(
+            "note: the map was made without --space-carving: it knows free space near surfaces alone",
+            err=True,
+        )
+    return found.save(out)
