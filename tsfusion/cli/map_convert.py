@@ -78,14 +78,13 @@ def write_slice(
 ) -> list[Path]:
     """Write a slice; returns the files."""
     how = {name: given[name] for name in ("box", "resolution")} | {"up": options.up_direction(given["up"])}
-    if field == "distance":
-        if max_distance is not None:
-            how["max_distance"] = max_distance
-        return volume.distance_slice(*given["heights"], **how).save(out)
-    found = volume.occupancy_slice(*given["heights"], **how)
-    if not found.knows_free_space:
-        typer.echo(
-            "note: the map was made without --space-carving: it knows free space near surfaces alone",
-            err=True,
-        )
-    return found.save(out)
+    if field == "distance" and max_distance is not None:
+        how["max_distance"] = max_distance
+    found = volume.current_slice(*given["heights"], **how)
+    low, high = found.extent
+    notes = [f"heights count from the map's origin; the map lies between {low:.2f} and {high:.2f} m"]
+    if field != "distance" and not volume.config.space_carving:
+        notes.append("the map was made without --space-carving: it knows free space near surfaces alone")
+    for note in notes:
+        typer.echo(f"note: {note}", err=True)
+    return (found.distances() if field == "distance" else found.occupancy()).save(out)

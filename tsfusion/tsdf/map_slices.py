@@ -86,6 +86,14 @@ class CurrentSlice:
         self._read(np.arange(count, dtype=np.int32))
         self._count((0, 0, rows, columns))
 
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Heights between which the map's blocks lie, metres; (inf, -inf) where there are none."""
+        axis, block = self.grid.axes[2], 8 * self._store.voxel_size
+        centres = (unpack_keys(self._store.keys) + 0.5) * block @ axis
+        half = block / 2 * float(np.abs(axis).sum())
+        return float(centres.min(initial=np.inf)) - half, float(centres.max(initial=-np.inf)) + half
+
     def update(self, blocks: NDArray[np.int32]) -> bool:
         """Follow the map after a change; returns whether the slice has changed.
 
