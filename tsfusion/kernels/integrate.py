@@ -38,6 +38,7 @@ MAX_DISTANCE = 1023  # quanta: the widest half-width, 16 voxels, and one to spar
 FREE_SHIFT = 1  # a vote for free space before the band is half of one for a surface
 COLOR_LIMIT = 1 << 15  # votes after which a voxel's colour is settled and takes no more
 CUBE = 512
+CHANGED = 255  # a block is dirty for all that follow its changes: a bit each
 
 # `touched`: how many blocks, whether more are missing than may be, whether a colour was taken away that was
 # not there, how many blocks are missing, and then the slots of the touched ones
@@ -77,7 +78,7 @@ def touch(
             place = ti.atomic_add(touched[TOUCHED_COUNT], 1)
             touched[TOUCHED_HEADER + place] = slot
             places[slot] = place
-            dirty[slot] = ti.u8(1)
+            dirty[slot] = ti.u8(CHANGED)
 
 
 @ti.func

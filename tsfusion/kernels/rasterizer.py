@@ -46,29 +46,37 @@ def fill(seen: ti.types.ndarray(), a, b, c, triangle, focal, width, height):
     low = ti.ceil(tm.max(ti.min(ti.min(pa, pb), pc), 0.0))
     high = ti.floor(ti.min(ti.max(ti.max(pa, pb), pc), tm.vec2(width - 1, height - 1)))
     if area != 0.0 and low.x <= high.x and low.y <= high.y:
-        # Shares of the corners, and 1 / depth, are linear in the image: a value at `low`, and steps.
+        # Shares of the corners, and 1 / depth, are linear in the image: values at `low`, and steps.
         share = 1.0 / area
-        wa, wb, wc = edge(pb, pc, low) * share, edge(pc, pa, low) * share, edge(pa, pb, low) * share
-        wa_u, wa_v = (pb.y - pc.y) * share, (pc.x - pb.x) * share
-        wb_u, wb_v = (pc.y - pa.y) * share, (pa.x - pc.x) * share
-        wc_u, wc_v = (pa.y - pb.y) * share, (pb.x - pa.x) * share
-        least_a = -OVERLAP * (ti.abs(wa_u) + ti.abs(wa_v))
-        least_b = -OVERLAP * (ti.abs(wb_u) + ti.abs(wb_v))
-        least_c = -OVERLAP * (ti.abs(wc_u) + ti.abs(wc_v))
-        za, zb, zc = 1.0 / a.z, 1.0 / b.z, 1.0 / c.z
+        w = tm.vec3(edge(pb, pc, low), edge(pc, pa, low), edge(pa, pb, low)) * share
+        right = tm.vec3(pb.y - pc.y, pc.y - pa.y, pa.y - pb.y) * share
+        down = tm.vec3(pc.x - pb.x, pa.x - pc.x, pb.x - pa.x) * share
+        least = -OVERLAP * (ti.abs(right) + ti.abs(down))
+        inverse = tm.vec3(1.0 / a.z, 1.0 / b.z, 1.0 / c.z)
+        per_right = 1.0 / right
+        u0 = ti.cast(low.x, ti.i32)
         for v in range(ti.cast(low.y, ti.i32), ti.cast(high.y, ti.i32) + 1):
-            down = ti.cast(v, ti.f32) - low.y
-            for u in range(ti.cast(low.x, ti.i32), ti.cast(high.x, ti.i32) + 1):
-                right = ti.cast(u, ti.f32) - low.x
-                w = wa + wa_v * down + wa_u * right
-                x = wb + wb_v * down + wb_u * right
-                y = wc + wc_v * down + wc_u * right
-                if w >= least_a and x >= least_b and y >= least_c:
-                    depth = 1.0 / (w * za + x * zb + y * zc)
-                    bits = ti.cast(ti.bit_cast(ti.cast(depth, ti.f32), ti.i32), ti.i64)
-                    key = (bits << 32) | ti.cast(triangle, ti.i64)
-                    if key < seen[v, u]:
-                        ti.atomic_min(seen[v, u], key)
+            row = w + down * (ti.cast(v, ti.f32) - low.y)
+            first, last = ti.f32(0.0), high.x - low.x
+            for k in ti.static(range(3)):
+                bound = (least[k] - row[k]) * per_right[k]
+                if right[k] > 0.0:
+                    first = ti.max(first, bound)
+                elif right[k] < 0.0:
+                    last = ti.min(last, bound)
+                elif row[k] < least[k]:
+                    last = -1.0
+            near = tm.dot(row, inverse)
+            nearer = tm.dot(right, inverse)
+            first = ti.min(first, high.x - low.x + 1.0)  # far beyond it where an edge is nearly level
+            for n in range(
+                ti.cast(ti.ceil(first), ti.i32), ti.cast(ti.floor(ti.max(last, -1.0)), ti.i32) + 1
+            ):
+                depth = 1.0 / (near + nearer * ti.cast(n, ti.f32))
+                bits = ti.cast(ti.bit_cast(ti.cast(depth, ti.f32), ti.i32), ti.i64)
+                key = (bits << 32) | ti.cast(triangle, ti.i64)
+                if key < seen[v, u0 + n]:
+                    ti.atomic_min(seen[v, u0 + n], key)
 
 
 @ti.kernel

@@ -17,6 +17,7 @@ from tsfusion.tsdf.checkpoint import LAYER_DTYPES
 from tsfusion.tsdf.growing_array import MAX_ITEMS, FileArray, GrowingArray
 from tsfusion.tsdf.residency import Residency
 
+MESHED, ASKED = 1, 2  # who follows the changes of blocks: `Volume.take_dirty`, what is kept of answers
 _FIRST_CAPACITY = 1024
 _CHUNK = 1024  # blocks read at a time where a whole layer would be copied
 _HASH_BYTES = 4 * 12  # most that a block takes in the hash, which is a quarter full or fuller
@@ -29,8 +30,8 @@ class BlockStore:
 
     Layers, (slot, 512): `sums` int64; with colour `color_rgn` int64 and `color_b` int32; when smoothing
     `correction` float32 (see kernels/integrate.py and kernels/ray_smoothing.py). Beside them, one number a
-    block: `dirty` uint8, and int32 `stamps` (the last keyframe that touched it), `places` (where in that
-    keyframe's list), `bounds` (no voxel has more weight than this).
+    block: `dirty` uint8 (a bit for each that follows the changes), and int32 `stamps` (the last keyframe that
+    touched it), `places` (where in that keyframe's list), `bounds` (no voxel has more weight than this).
     A layer the map does not have is one row of zeros, so that kernels can be handed it.
 
     With a `cache` the layers lie in files, and blocks that no keyframe has changed for long leave memory:
@@ -43,6 +44,7 @@ class BlockStore:
         self.voxel_size = voxel_size
         self.color, self.corrected = color, corrected
         self.count = 0
+        self.drops = 0  # how often blocks have gone, or moved to other slots
         self.most_blocks = MAX_ITEMS
         self.pause: Callable[[], None] = lambda: None  # between two steps of a long pass that only reads
         self.hash_keys = np.zeros(4 * _FIRST_CAPACITY, np.int64)
@@ -201,6 +203,7 @@ class BlockStore:
         for array in (self._keys, self._dirty, self._stamps, self._places, self._bounds):
             array.array[count : self.count] = 0
         self.count = count
+        self.drops += 1
         self.hash_keys[:] = self.hash_slots[:] = 0
         self._hash(0)
 
@@ -230,10 +233,10 @@ class BlockStore:
             self.bounds[chunk] = (self.sums[chunk] & WEIGHT_MASK).max(axis=1)
             self.keep_within_memory()
 
-    def take_dirty(self) -> NDArray[np.int64]:
-        """Slots of the blocks changed since the last call."""
-        slots = np.flatnonzero(self.dirty[: self.count])
-        self.dirty[slots] = 0
+    def take_dirty(self, follower: int) -> NDArray[np.int64]:
+        """Slots of the blocks changed since the last call for this follower: `MESHED` or `ASKED`."""
+        slots = np.flatnonzero(self.dirty[: self.count] & follower)
+        self.dirty[slots] &= 255 - follower
         return slots
 
     def used(self) -> NDArray[np.int64]:

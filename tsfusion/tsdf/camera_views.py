@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""What a pinhole camera sees of a mesh of the map; the work is in `kernels/rasterizer.py`."""
+"""What a pinhole camera sees of a map's surface; the work is in `kernels/rasterizer.py`."""
+
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,8 +10,26 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.map_answers import View
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.kernels import rasterizer
+from tsfusion.tsdf.block_store import unpack_keys
+from tsfusion.tsdf.surface_tiles import SurfaceTiles
 
 NEAR = 0.05  # metres in front of the eye where the view starts
+MOST_TRIANGLES = 1 << 21  # that are drawn at a time
+_NOTHING = Mesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.float32))
+
+
+def cast(
+    tiles: SurfaceTiles, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
+) -> View:
+    """The view, (H, W), of a surface: of the tiles before the camera."""
+    camera = intrinsics, T_world_camera, shape
+    parts = _parts(tiles, _in_view(tiles, *camera))
+    seen = look_at(next(parts, _NOTHING), *camera)
+    for mesh in parts:
+        seen = _nearer(seen, look_at(mesh, *camera))
+    if tiles.has_color and seen.colors is None:
+        return View(seen.depth, seen.normals, np.zeros((*shape, 3), np.uint8))
+    return seen
 
 
 def look_at(
@@ -29,15 +49,63 @@ def look_at(
     vertices = np.ascontiguousarray(p, np.float32)
     seen = np.full(shape, rasterizer.EMPTY, np.int64)
     rasterizer.rasterise(seen, vertices, faces, focal, NEAR)
-    has_color = mesh.colors is not None
-    found = View(
-        np.zeros(shape, np.float32),
-        np.zeros((*shape, 3), np.float32),
-        np.zeros((*shape, 3), np.uint8) if has_color else None,
-    )
+    depth, normals = np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32)
+    colors = np.zeros((*shape, 3) if mesh.colors is not None else (1, 0, 3), np.uint8)
     rasterizer.look_up(
-        seen, vertices, faces, mesh.normals, mesh.colors if has_color else np.empty((0, 3), np.uint8), focal,
-        rasterizer.EMPTY, found.depth, found.normals,
-        found.colors if has_color else np.empty((0, 0, 3), np.uint8),
+        seen, vertices, faces, mesh.normals, colors[0] if mesh.colors is None else mesh.colors, focal,
+        rasterizer.EMPTY, depth, normals, colors,
     )  # fmt: skip
-    return found
+    return View(depth, normals, None if mesh.colors is None else colors)
+
+
+def _in_view(
+    tiles: SurfaceTiles, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
+) -> NDArray[np.int64]:
+    """Numbers of the tiles that may be seen, the nearest first."""
+    numbers, side = tiles.numbers(), tiles.side_m
+    centres = (unpack_keys(numbers) + 0.5) * side - T_world_camera[:3, 3]
+    centres = centres @ T_world_camera[:3, :3]
+    K, (height, width) = intrinsics, shape
+    down = np.sort([-0.5 - K.cy, height - 0.5 - K.cy] / np.float64(K.fy))
+    planes = np.array([  # inwards, through the eye and the sides of the image
+        (1, 0, (0.5 + K.cx) / K.fx), (-1, 0, (width - 0.5 - K.cx) / K.fx), (0, 1, -down[0]), (0, -1, down[1]),
+        (0, 0, 1),
+    ])  # fmt: skip
+    planes /= np.linalg.norm(planes, axis=1, keepdims=True)
+    radius = 0.5 * np.sqrt(3) * side * 1.05  # cells reach a voxel further
+    shown = np.flatnonzero((centres @ planes.T > -radius).all(axis=1))
+    nearest_first = np.argsort(centres[shown, 2], kind="stable")
+    return np.asarray(numbers[shown[nearest_first]])
+
+
+def _parts(tiles: SurfaceTiles, numbers: NDArray[np.int64]) -> Iterator[Mesh]:
+    """Meshes of tiles, joined up to `MOST_TRIANGLES`."""
+    part: list[Mesh] = []
+    triangles = 0
+    for number in numbers.tolist():
+        part.append(tiles.mesh(number))
+        triangles += len(part[-1].faces)
+        if triangles >= MOST_TRIANGLES:
+            yield _joined(part)
+            part, triangles = [], 0
+    if triangles:
+        yield _joined(part)
+
+
+def _joined(meshes: list[Mesh]) -> Mesh:
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)]).tolist()
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + np.int32(s) for mesh, s in zip(meshes, starts, strict=False)]),
+        np.concatenate([mesh.normals for mesh in meshes]),
+        None if meshes[0].colors is None else np.concatenate([mesh.colors for mesh in meshes]),
+    )
+
+
+def _nearer(one: View, other: View) -> View:
+    """Of two views of a camera, what is nearer, pixel by pixel."""
+    is_other = (other.depth > 0) & ((one.depth == 0) | (other.depth < one.depth))
+    for ours, theirs in ((one.depth, other.depth), (one.normals, other.normals), (one.colors, other.colors)):
+        if ours is not None and theirs is not None:
+            ours[is_other] = theirs[is_other]
+    return one

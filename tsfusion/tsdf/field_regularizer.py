@@ -48,6 +48,11 @@ class FieldSettings:
         """Levels of cells of twice the size to start from, where λ against the data is 16 times smaller."""
         return int(self.smoothness >= COARSE_FROM)
 
+    @property
+    def halo(self) -> int:
+        """Blocks around those that are solved, on each side, that are solved with them."""
+        return 2 + self.coarser
+
 
 def solve(
     keys: NDArray[np.int64],
@@ -153,7 +158,7 @@ class _Batch:
         self, wanted: NDArray[np.int64], store: BlockStore, min_weight: float, settings: FieldSettings
     ) -> None:
         self.wanted, self.settings, self.pause = wanted, settings, store.pause
-        self.keys = keys = around(wanted, store, 2 + settings.coarser)
+        self.keys = keys = around(wanted, store, settings.halo)
         self.values = values_of(keys, store, min_weight)
         self.levels = self._list(store)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core import process
 from tsfusion.core.errors import MapFull, WeightOverflow
-from tsfusion.kernels.integrate import COLOR_LIMIT, WEIGHT_LIMIT, WEIGHT_MASK
+from tsfusion.kernels.integrate import CHANGED, COLOR_LIMIT, WEIGHT_LIMIT, WEIGHT_MASK
 from tsfusion.kernels.sensor_noise import WEIGHT_ONE
 from tsfusion.tsdf.block_store import BlockStore
 
@@ -82,7 +82,7 @@ def _add_rows(
     """Add rows `theirs` of the other map to the rows `slots`, which are distinct."""
     store.sums[slots] += other.sums[theirs]
     store.bounds[slots] = (store.sums[slots] & WEIGHT_MASK).max(axis=1)
-    store.dirty[slots] = 1
+    store.dirty[slots] = CHANGED
     if store.color:
         _add_colors(store, other, slots, theirs)
     if store.corrected:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig
+from tsfusion.kernels.integrate import CHANGED
 from tsfusion.tsdf.block_store import BlockStore, unpack_keys
 
 _CHUNK = 1024  # blocks at a time
@@ -52,4 +53,4 @@ def copy(store: BlockStore, into: BlockStore, first: NDArray[np.int64], end: NDA
             layer[here : into.count] = np.where(inside, store.layers()[name][slots], 0)
         store.keep_within_memory()
     into.measure_bounds()
-    into.dirty[: into.count] = 1
+    into.dirty[: into.count] = CHANGED

@@ -11,6 +11,7 @@ from tsfusion.tsdf.block_store import BlockStore
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
 
 _PART = 1 << 14  # points at a time where their blocks may have to come from a file
+_MOST_SOLVED = 1 << 14  # blocks whose values are gathered at a time: 32 MB
 
 
 def sample(
@@ -24,8 +25,7 @@ def sample(
     length = _PART if store.is_in_files else max(count, 1)
     for first in range(0, count, length):
         part = slice(first, first + length)
-        found = Samples(whole.distance[part], whole.weight[part], whole.gradient[part])
-        _fill(found, points[part], store, min_weight, view)
+        _fill(_part(whole, part), points[part], store, min_weight, view)
         store.keep_within_memory()
     return whole
 
@@ -33,27 +33,33 @@ def sample(
 def _fill(
     found: Samples, points: NDArray[np.floating], store: BlockStore, min_weight: float, view: SurfaceView
 ) -> None:
-    per_metre = 1 / store.voxel_size
     kind, values, row_of = point_sampling.FUSED, store.correction, np.empty(0, np.int32)
     if view is not values_of:
-        kind, values, row_of = point_sampling.SOLVED, *_solved(points, store, min_weight, view)
+        slots = _needed(points, store)
+        if len(slots) > _MOST_SOLVED and len(points) > 1:
+            half = len(points) // 2
+            for part in (slice(0, half), slice(half, None)):
+                _fill(_part(found, part), points[part], store, min_weight, view)
+            return
+        kind, values = point_sampling.SOLVED, view(store.keys[slots], store, min_weight)
+        row_of = np.zeros(store.count, np.int32)
+        row_of[slots] = np.arange(len(slots))
     elif store.corrected:
         kind = point_sampling.CORRECTED
     point_sampling.interpolate(
-        points, per_metre, store.hash_keys, store.hash_slots, store.sums,
+        points, 1 / store.voxel_size, store.hash_keys, store.hash_slots, store.sums,
         max(1, int(np.ceil(min_weight * WEIGHT_ONE))), kind, values, row_of,
         found.distance, found.weight, found.gradient,
     )  # fmt: skip
 
 
-def _solved(
-    points: NDArray[np.floating], store: BlockStore, min_weight: float, view: SurfaceView
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Values of the blocks that the points need, and the row of each slot."""
+def _needed(points: NDArray[np.floating], store: BlockStore) -> NDArray[np.intp]:
+    """Slots of the blocks that the points need, in the order of their keys."""
     is_needed = np.zeros(store.count, np.uint8)
     point_sampling.list_blocks(points, 1 / store.voxel_size, store.hash_keys, store.hash_slots, is_needed)
     slots = np.flatnonzero(is_needed)
-    slots = slots[np.argsort(store.keys[slots])]
-    row_of = np.zeros(store.count, np.int32)
-    row_of[slots] = np.arange(len(slots))
-    return view(store.keys[slots], store, min_weight), row_of
+    return slots[np.argsort(store.keys[slots])]
+
+
+def _part(found: Samples, part: slice) -> Samples:
+    return Samples(found.distance[part], found.weight[part], found.gradient[part])

@@ -5,6 +5,7 @@ import hashlib
 import math
 import os
 import struct
+from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -38,14 +39,17 @@ from tsfusion.tsdf import (
     point_samples,
     voxel_arrays,
 )
-from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
+from tsfusion.tsdf.block_store import ASKED, BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.distance_fields import FieldBlocks
 from tsfusion.tsdf.map_blocks import Blocks
 from tsfusion.tsdf.map_difference import MapDifference
 from tsfusion.tsdf.map_slices import CurrentSlice
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
 from tsfusion.tsdf.mesh_tiles import tiles
+from tsfusion.tsdf.surface_tiles import SurfaceTiles
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
+
+MOST_SURFACES = 2  # that answers are kept of
 
 
 class ReadableMap:
@@ -66,6 +70,7 @@ class ReadableMap:
         self.held = HeldSensor()
         self._store = store
         self._mesh_buffers = MeshBuffers()
+        self._tiles = OrderedDict[tuple[Surface, float], SurfaceTiles]()
 
     def extract_mesh(
         self,
@@ -183,7 +188,9 @@ class ReadableMap:
             min_weight, surface: as for `extract_mesh`.
         """
         least = self._checked_min_weight(min_weight)
-        return point_samples.sample(checked_points(points), self._store, least, self._view(surface))
+        return point_samples.sample(
+            checked_points(points), self._store, least, self._tiles_of(surface, least).values
+        )
 
     def raycast(
         self,
@@ -205,7 +212,7 @@ class ReadableMap:
             min_weight, surface: as for `extract_mesh`.
         """
         camera = checked_camera(intrinsics, T_world_camera, shape)
-        return camera_views.look_at(self.extract_mesh(min_weight, surface=surface), *camera)
+        return camera_views.cast(self._tiles_of(surface, self._checked_min_weight(min_weight)), *camera)
 
     def point_cloud(self, *, min_weight: float | None = None, surface: Surface | None = None) -> PointCloud:
         """Points of the surface, a vertex of its mesh each: at most three a voxel.
@@ -450,6 +457,25 @@ class ReadableMap:
         return field_regularizer.FieldSettings(
             model.field_smoothness, model.field_edge, model.field_reweightings
         )
+
+    @property
+    def _reading_bytes(self) -> int:
+        """Memory for meshes, and of what is kept of answers."""
+        return self._mesh_buffers.nbytes + sum(kept.nbytes for kept in self._tiles.values())
+
+    def _tiles_of(self, surface: Surface | None, min_weight: float) -> SurfaceTiles:
+        """What is kept of a surface for the next question, without what has changed since the last one."""
+        view, which = self._view(surface), (surface or self.model.surface, min_weight)
+        changed = np.sort(self._store.keys[self._store.take_dirty(ASKED)])
+        for kept in self._tiles.values():
+            kept.forget(changed)
+        if which not in self._tiles:
+            reach = {"raw": 0, "normal": 1, "field": self._field.halo}[which[0]]
+            self._tiles[which] = SurfaceTiles(self._store, view, min_weight, reach)
+        self._tiles.move_to_end(which)
+        while len(self._tiles) > MOST_SURFACES:
+            self._tiles.popitem(last=False)
+        return self._tiles[which]
 
     def _view(self, surface: Surface | None) -> SurfaceView:
         """The function that reads a surface's signed distances from the map."""

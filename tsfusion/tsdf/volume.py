@@ -28,7 +28,7 @@ from tsfusion.kernels import runtime
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.voxel_traversal import COUNT
 from tsfusion.tsdf import checkpoint, map_addition, map_crop, map_history, saved_map
-from tsfusion.tsdf.block_store import BlockStore, unpack_keys
+from tsfusion.tsdf.block_store import MESHED, BlockStore, unpack_keys
 from tsfusion.tsdf.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.ray_buffers import RayBuffers, keyframes_of_every_kind
 from tsfusion.tsdf.readable_map import ReadableMap
@@ -228,7 +228,7 @@ class Volume(ReadableMap):
 
     def take_dirty(self) -> NDArray[np.int32]:
         """Coordinates of the blocks changed since the last call: (n, 3) int32, in units of 8 voxels."""
-        keys = np.concatenate([self._store.keys[self._store.take_dirty()], *self._released])
+        keys = np.concatenate([self._store.keys[self._store.take_dirty(MESHED)], *self._released])
         self._released.clear()
         return unpack_keys(keys)
 
@@ -241,7 +241,7 @@ class Volume(ReadableMap):
             return 0
         store = self._store
         empty = np.setdiff1d(np.arange(store.count), store.used(), assume_unique=True)
-        self._released.append(store.keys[empty[store.dirty[empty] != 0]])
+        self._released.append(store.keys[empty[store.dirty[empty] & MESHED != 0]])
         store.release(empty)
         self._has_retracted = False
         return len(empty)
@@ -255,7 +255,7 @@ class Volume(ReadableMap):
             voxels=store.count * CUBE,
             bytes=store.nbytes,
             bytes_per_block=store.bytes_per_block,
-            scratch_bytes=self._ray_buffers.nbytes + self._mesh_buffers.nbytes,
+            scratch_bytes=self._ray_buffers.nbytes + self._reading_bytes,
             resident_bytes=store.resident_bytes,
         )
 

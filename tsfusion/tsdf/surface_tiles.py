@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: MIT
+"""A surface's values and meshes in cubes of 8³ blocks, kept while the map stays as it is.
+
+What a cube holds depends on the map alone: not on what was asked before, nor on how the map came about.
+"""
+
+from collections import OrderedDict
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.kernels.integrate import CUBE
+from tsfusion.tsdf import field_regularizer, mesh_extraction
+from tsfusion.tsdf.block_store import BlockStore, pack_keys, unpack_keys
+from tsfusion.tsdf.surface_values import SurfaceView, values_of
+
+SIDE = 8  # blocks
+MOST_BYTES = 32 << 20  # of values that are kept, and of meshes
+
+_INSIDE = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+class SurfaceTiles:
+    """Values and meshes of one surface.
+
+    Args:
+        view: reads its values.
+        reach: blocks whose sums a block's values depend on lie so many blocks away at the most.
+    """
+
+    def __init__(self, store: BlockStore, view: SurfaceView, min_weight: float, reach: int) -> None:
+        self._store, self._view, self._min_weight, self._reach = store, view, min_weight, reach
+        self._values = _Kept[_Values]()
+        self._meshes = _Kept[_Piece]()
+        self._buffers = mesh_extraction.MeshBuffers()
+        self._listed, self._numbers = 0, np.empty(0, np.int64)
+        self._drops = store.drops
+
+    @property
+    def values(self) -> SurfaceView:
+        """The function that reads these values."""
+        return values_of if self._view is values_of else self._read
+
+    @property
+    def has_color(self) -> bool:
+        return self._store.color
+
+    @property
+    def side_m(self) -> float:
+        """Side of a cube, metres."""
+        return 8 * SIDE * self._store.voxel_size
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of what is kept."""
+        return self._values.nbytes + self._meshes.nbytes + self._buffers.nbytes
+
+    def forget(self, changed: NDArray[np.int64]) -> None:
+        """Let go of what depends on blocks that have changed: sorted keys."""
+        if self._drops != self._store.drops:  # blocks have gone
+            self._drops = self._store.drops
+            self._values.clear()
+            self._meshes.clear()
+            self._listed, self._numbers = 0, self._numbers[:0]
+        elif len(changed):
+            reached = field_regularizer.around(changed, self._store, self._reach)
+            self._values.forget(_tiles_of(reached))
+            self._meshes.forget(_tiles_of(field_regularizer.around(reached, self._store, 1)))
+
+    def numbers(self) -> NDArray[np.int64]:
+        """(n,) sorted numbers of the cubes with a block of the map."""
+        if self._listed < self._store.count:  # new blocks come last
+            new = _tiles_of(self._store.keys[self._listed :])
+            self._numbers = np.union1d(self._numbers, new)
+            self._listed = self._store.count
+        return self._numbers
+
+    def mesh(self, number: int) -> Mesh:
+        """The mesh of a cube's cells."""
+        piece = self._meshes.get(number)
+        if piece is None:
+            keys = self._keys(number)
+            made = mesh_extraction.extract(keys, self._store, self._min_weight, self._buffers, self.values)
+            piece = self._meshes.put(number, _Piece(made))
+        return piece.mesh
+
+    def _read(
+        self,
+        keys: NDArray[np.int64],
+        store: BlockStore,
+        min_weight: float,
+        out: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.float32]:
+        """See `SurfaceView`; `store` and `min_weight` are those that it was made with."""
+        if out is None:
+            out = np.empty((len(keys), CUBE), np.float32)
+        order = np.argsort(tiles := _tile_of(keys), kind="stable")
+        cuts = np.flatnonzero(np.diff(tiles[order])) + 1
+        for rows in np.split(order, cuts) if len(keys) else ():
+            number = int(tiles[rows[0]])
+            solved = self._values.get(number)
+            if solved is None:
+                own = self._keys(number)
+                solved = self._values.put(number, _Values(own, self._view(own, store, min_weight)))
+            out[rows] = solved.of(keys[rows])
+        return out[: len(keys)]
+
+    def _keys(self, number: int) -> NDArray[np.int64]:
+        """Sorted keys of the map's blocks in a cube."""
+        corner = SIDE * unpack_keys(np.array([number]))
+        keys = pack_keys(corner + _INSIDE)
+        return keys[self._store.slots_of(keys) >= 0]
+
+
+class _Sized(Protocol):
+    nbytes: int
+
+
+class _Values:
+    """Sorted keys of blocks, and a row of values of each."""
+
+    def __init__(self, keys: NDArray[np.int64], values: NDArray[np.float32]) -> None:
+        self.keys, self.values = keys, values
+        self.nbytes = keys.nbytes + values.nbytes
+
+    def of(self, keys: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Rows of some blocks; NaN for one that is not there."""
+        if not len(self.keys):
+            return np.full((len(keys), CUBE), np.nan, np.float32)
+        at = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+        rows = self.values[at]
+        rows[self.keys[at] != keys] = np.nan
+        return rows
+
+
+class _Piece:
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        arrays = (mesh.vertices, mesh.faces, mesh.normals, mesh.colors)
+        self.nbytes = sum(array.nbytes for array in arrays if array is not None)
+
+
+Item = TypeVar("Item", bound=_Sized)
+
+
+class _Kept(Generic[Item]):
+    """Things by number; those asked for longest ago go when they are too many."""
+
+    def __init__(self) -> None:
+        self._items: OrderedDict[int, Item] = OrderedDict()
+        self.nbytes = 0
+
+    def get(self, number: int) -> Item | None:
+        if number in self._items:
+            self._items.move_to_end(number)
+        return self._items.get(number)
+
+    def put(self, number: int, item: Item) -> Item:
+        self._items[number] = item
+        self.nbytes += item.nbytes
+        while self.nbytes > MOST_BYTES and len(self._items) > 1:
+            self.nbytes -= self._items.popitem(last=False)[1].nbytes
+        return item
+
+    def forget(self, numbers: NDArray[np.int64]) -> None:
+        for number in self._items.keys() & set(numbers.tolist()):
+            self.nbytes -= self._items.pop(number).nbytes
+
+    def clear(self) -> None:
+        self._items.clear()
+        self.nbytes = 0
+
+
+def _tile_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Number of the cube that each block lies in."""
+    return pack_keys(unpack_keys(keys) >> 3)
+
+
+def _tiles_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.unique(_tile_of(keys))
