@@ -17,7 +17,9 @@ EXAMPLES = (
 )
 Out = Annotated[
     Path,
-    typer.Argument(metavar="OUT", help=".npz .zarr .vdb .tsf .ply .glb .obj; slice: .yaml .pgm .png .npz"),
+    typer.Argument(
+        metavar="OUT", help=".npz .zarr .vdb .tsf .ply .glb .obj .stl; slice: .yaml .pgm .png .npz"
+    ),
 ]
 Dense = Annotated[
     bool, typer.Option("--dense", help="One array around the map, not its blocks (.npz, .zarr).")

@@ -219,7 +219,7 @@ def _write_vdb(
     beyond = size * (MAX_DISTANCE + 1) / QUANTA_PER_VOXEL  # no distance that was fused is as large
     used = used[openvdb_files.order_of(unpack_keys(store.keys[used]))]
     parts = (
-        (unpack_keys(store.keys[part]), np.nan_to_num(_values(store, part, "tsdf"), nan=beyond))
+        (unpack_keys(store.keys[part]), np.nan_to_num(decoded(store, part, "tsdf"), nan=beyond))
         for part in (used[i : i + _CHUNK] for i in range(0, len(used), _CHUNK))
     )
     openvdb_files.write(path, parts, name="tsdf", voxel_size=size, background=beyond)
