@@ -15,6 +15,7 @@ EXAMPLES = (
     "tsfusion map convert out/latest/map.tsf field.vdb --field distance",
     "tsfusion map convert my-maps yard.yaml --map yard --heights 0.1 1.8 --up z",
 )
+_FORMATS = ".npz .zarr .vdb .tsf .ply .glb .obj .stl; slice: .yaml .pgm .png .npz"
 Out = Annotated[
     Path,
     typer.Argument(
