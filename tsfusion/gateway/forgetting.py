@@ -58,6 +58,13 @@ class Request:
         self.erasing: Iterator[int] | None = None
         self.erased = 0
 
+    def is_answered(self, in_map: Callable[[bytes], int]) -> bool:
+        """Whether the fuser has answered every record that was found; `in_map` as of `Forgetting.step`."""
+        return all(
+            in_map(one.session) >= max(np.frombuffer(one.seqs, np.int64), default=0)
+            for one in self.found.sessions
+        )
+
 
 class Forgetting:
     """The requests of one map, one after another. Call `step` again and again.
@@ -99,11 +106,13 @@ class Forgetting:
             request = self._requests[0]
             request.stage = {"find": "ask", "save": "settle"}.get(request.stage, request.stage)  # type: ignore[assignment]
 
-    def step(self, *, settled: bool, unavailable: int) -> None:
+    def step(self, *, settled: bool, in_map: Callable[[bytes], int], unavailable: int) -> None:
         """Do the next piece of work of the first request.
 
         Args:
-            settled: whether the map has done all that its journal's records ask.
+            settled: whether the map has done all that the server's own records ask.
+            in_map: the highest number of a session that the fuser has answered. What it has not cannot be
+                erased: after a crash nobody would hand it out, and it would count as lost.
             unavailable: keyframes that stay where they were fused though they should not.
         """
         if not self._requests:
@@ -114,7 +123,7 @@ class Forgetting:
             request.unavailable = unavailable
             if self._send(Find(self._number, request.selection)):
                 request.stage = "find"
-        elif request.stage == "settle" and settled:
+        elif request.stage == "settle" and settled and request.is_answered(in_map):
             if unavailable > request.unavailable:
                 count = count_of(unavailable - request.unavailable, "keyframe")
                 stay = f"{count} cannot be taken out of the map: the log says why"

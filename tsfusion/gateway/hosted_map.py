@@ -252,7 +252,11 @@ class HostedMap:
         elif self.fuser.ready:
             moves, own = self.outcomes.moves, self.sessions.get(SERVER_SESSION)
             is_answered = own is None or own.in_map >= own.durable
-            self.forgetting.step(settled=is_answered and not moves.waiting, unavailable=moves.unavailable)
+            self.forgetting.step(
+                settled=is_answered and not moves.waiting,
+                in_map=lambda key: session.in_map if (session := self.sessions.get(key)) else 0,
+                unavailable=moves.unavailable,
+            )
 
     def _on_saved(self, saved: fuser_messages.Saved) -> None:
         self._checkpoints += saved.written
