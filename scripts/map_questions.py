@@ -79,9 +79,13 @@ def view_rows(volume: Volume, keyframes: list[Keyframe], options: argparse.Names
             view, cpu, wall = best_of(
                 options.repeats, lambda: volume.raycast(camera, pose, SHAPE, surface=surface)  # noqa: B023
             )  # fmt: skip
+            volume.retract(keyframe)
+            volume.integrate(keyframe)
+            _, changed, _ = best_of(1, lambda: volume.raycast(camera, pose, SHAPE, surface=surface))  # noqa: B023
             hit = float((view.depth > 0).mean())
             yield {"question": "raycast", "by": "tsfusion", "surface": surface, "first_cpu_ms": first,
-                   "cpu_ms": cpu, "wall_ms": wall, "hit": hit}  # fmt: skip
+                   "cpu_ms": cpu, "wall_ms": wall,
+                   "after_keyframe_cpu_ms": changed, "hit": hit}  # fmt: skip
     if find_spec("open3d"):
         for keyframe in keyframes:
             yield from open3d_rows(volume, camera, keyframe.T_world_camera, options.repeats)

@@ -66,6 +66,19 @@ def test_a_wall_from_behind_or_behind_the_camera_is_not_seen(volume: Volume) -> 
         assert not volume.raycast(CAMERA, T, SHAPE).depth.any()
 
 
+@pytest.mark.parametrize(
+    "camera",
+    [(1e-30, 1.0, 0.0, 0.0), (1e30, 1e30, 0.0, 0.0), (1.0, 1e-30, 1e30, 0.0), (100.0, 100.0, -1e30, 1e30)],
+)
+def test_an_absurd_camera_sees_something_or_nothing(volume: Volume, camera: tuple[float, ...]) -> None:
+    for near in (0.0, 0.94, 0.96, 1.0):  # also with the wall in the near plane
+        T = np.eye(4)
+        T[2, 3] = near
+        view = volume.raycast(camera, T, SHAPE)
+        assert (view.depth >= 0).all()
+        assert not np.isnan(view.normals).any()
+
+
 def test_a_map_without_colour_shows_none() -> None:
     view = wall_map(color=False).raycast(CAMERA, np.eye(4), SHAPE)
     assert view.colors is None

@@ -68,14 +68,16 @@ def fill(seen: ti.types.ndarray(), a, b, c, triangle, focal, width, height):
                     last = -1.0
             near = tm.dot(row, inverse)
             nearer = tm.dot(right, inverse)
-            first = ti.min(first, high.x - low.x + 1.0)  # far beyond it where an edge is nearly level
-            for n in range(
-                ti.cast(ti.ceil(first), ti.i32), ti.cast(ti.floor(ti.max(last, -1.0)), ti.i32) + 1
-            ):
-                depth = 1.0 / (near + nearer * ti.cast(n, ti.f32))
-                bits = ti.cast(ti.bit_cast(ti.cast(depth, ti.f32), ti.i32), ti.i64)
+            # Held first as floats, as an int cannot hold what an edge that is nearly level gives, and then as
+            # ints, as a float may be none.
+            wide = high.x - low.x
+            start = ti.max(ti.cast(ti.ceil(ti.min(first, wide + 1.0)), ti.i32), 0)
+            stop = ti.min(ti.cast(ti.floor(ti.max(last, -1.0)), ti.i32), ti.cast(wide, ti.i32))
+            for n in range(start, stop + 1):
+                per_depth = near + nearer * ti.cast(n, ti.f32)
+                bits = ti.cast(ti.bit_cast(ti.cast(1.0 / per_depth, ti.f32), ti.i32), ti.i64)
                 key = (bits << 32) | ti.cast(triangle, ti.i64)
-                if key < seen[v, u0 + n]:
+                if per_depth > 0.0 and key < seen[v, u0 + n]:
                     ti.atomic_min(seen[v, u0 + n], key)
 
 

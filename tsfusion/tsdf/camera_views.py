@@ -23,10 +23,11 @@ def cast(
 ) -> View:
     """The view, (H, W), of a surface: of the tiles before the camera."""
     camera = intrinsics, T_world_camera, shape
-    parts = _parts(tiles, _in_view(tiles, *camera))
-    seen = look_at(next(parts, _NOTHING), *camera)
-    for mesh in parts:
-        seen = _nearer(seen, look_at(mesh, *camera))
+    with np.errstate(over="ignore", invalid="ignore"):  # a focal length may be next to none
+        parts = _parts(tiles, _in_view(tiles, *camera))
+        seen = look_at(next(parts, _NOTHING), *camera)
+        for mesh in parts:
+            seen = _nearer(seen, look_at(mesh, *camera))
     if tiles.has_color and seen.colors is None:
         return View(seen.depth, seen.normals, np.zeros((*shape, 3), np.uint8))
     return seen
