@@ -43,11 +43,11 @@ def look_at(
     """
     height, width = shape
     K, focal = intrinsics, intrinsics.fx
-    p = (mesh.vertices.astype(np.float64) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
-    p[:, 0] += (K.cx - 0.5 * (width - 1)) / focal * p[:, 2]
-    p[:, 1] = K.fy / focal * p[:, 1] + (K.cy - 0.5 * (height - 1)) / focal * p[:, 2]
+    shear = np.diag([1, K.fy / focal, 1])  # from the right: rows are points
+    shear[2, :2] = (K.cx - 0.5 * (width - 1)) / focal, (K.cy - 0.5 * (height - 1)) / focal
+    from_eye = (mesh.vertices - T_world_camera[:3, 3]).astype(np.float32)
+    vertices = from_eye @ (T_world_camera[:3, :3] @ shear).astype(np.float32)
     faces = np.ascontiguousarray(mesh.faces if K.fy > 0 else mesh.faces[:, ::-1], np.int32)
-    vertices = np.ascontiguousarray(p, np.float32)
     seen = np.full(shape, rasterizer.EMPTY, np.int64)
     rasterizer.rasterise(seen, vertices, faces, focal, NEAR)
     depth, normals = np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32)
