@@ -466,9 +466,13 @@ class ReadableMap:
     def _tiles_of(self, surface: Surface | None, min_weight: float) -> SurfaceTiles:
         """What is kept of a surface for the next question, without what has changed since the last one."""
         view, which = self._view(surface), (surface or self.model.surface, min_weight)
-        changed = np.sort(self._store.keys[self._store.take_dirty(ASKED)])
-        for kept in self._tiles.values():
-            kept.forget(changed)
+        try:
+            changed = np.sort(self._store.keys[self._store.take_dirty(ASKED)])
+            for kept in self._tiles.values():
+                kept.forget(changed)
+        except BaseException:  # Ctrl-C, too: nobody may be answered from before a change
+            self._tiles.clear()
+            raise
         if which not in self._tiles:
             reach = {"raw": 0, "normal": 1, "field": self._field.halo}[which[0]]
             self._tiles[which] = SurfaceTiles(self._store, view, min_weight, reach)
