@@ -64,6 +64,23 @@ def test_answers_follow_the_map(views: list[Keyframe], points: np.ndarray) -> No
     assert not np.array_equal(before[0].distance, after[0].distance)  # type: ignore[union-attr]
 
 
+def test_a_question_cut_off_leaves_no_old_answers(
+    views: list[Keyframe], points: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    volume = Volume(VOXEL, threads=2)
+    volume.integrate(views[0])
+    volume.sample(points)
+    volume.integrate(views[1])
+    with monkeypatch.context() as patch:
+        patch.setattr(surface_tiles.SurfaceTiles, "forget", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            volume.sample(points)
+    assert_same(iter([volume.sample(points)]), iter([copy_of(volume).sample(points)]))
+
+
 def test_an_answer_does_not_depend_on_what_was_asked_before(
     views: list[Keyframe], points: np.ndarray
 ) -> None:
