@@ -26,9 +26,10 @@ def line(out: Path, volume: "Volume") -> str:
     from tsfusion.cli.output import size
 
     stats = volume.stats()
+    nbytes = sum(one.stat().st_size for one in (out, *out.rglob("*")) if one.is_file())  # of a folder, too
     return (
         f"{out}: {count_of(stats.keyframes, 'keyframe')}, {count_of(stats.blocks, 'block')}, "
-        f"{size(out.stat().st_size)}, hash {volume.map_hash()}"
+        f"{size(nbytes)}, hash {volume.map_hash()}"
     )
 
 
