@@ -2,6 +2,7 @@
 """Voxels in a file have the numbers and places that the map gives them."""
 
 import hashlib
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import vdb_reader
 from formula_scenes import sphere_views, volume_of
 
 from tsfusion import Volume
-from tsfusion.core.errors import InvalidConfig, OutputError
+from tsfusion.core.errors import InvalidConfig, MissingDependency, OutputError
 from tsfusion.geometry import openvdb_files
 from tsfusion.tsdf import voxel_arrays
 from tsfusion.tsdf.voxel_arrays import FieldName
@@ -111,6 +112,15 @@ def test_other_files_and_fields_are_refused(sphere: Volume, tmp_path: Path) -> N
     with pytest.raises(OutputError, match="no surface with so much weight"):
         sphere.save_voxels(tmp_path / "a.npz", field="distance", min_weight=1e5)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b.zarr", "c.zarr"]
+
+
+def test_without_zarr_the_command_is_named(
+    sphere: Volume, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(MissingDependency, match=r"pip install '\.\[zarr\]'"):
+        sphere.save_voxels(tmp_path / "a.zarr")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("field", ["tsdf", "distance"])
