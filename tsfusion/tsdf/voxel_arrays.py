@@ -183,7 +183,8 @@ def _write_zarr(path: Path, voxels: _Voxels, progress: "_Progress") -> None:
         import zarr
     except ImportError as error:
         raise MissingDependency(
-            f"writing {path} needs zarr (Python 3.11 or later): pip install '.[zarr]' in your clone of tsfusion"
+            f"writing {path} needs zarr and Python 3.11 or later: pip install '.[zarr]' in your clone of "
+            "tsfusion"
         ) from error
     if path.is_dir() and any(path.iterdir()) and not (path / "zarr.json").exists():
         raise OutputError(f"cannot write {path}: it is a folder of something else; choose another name")
