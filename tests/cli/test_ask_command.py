@@ -21,6 +21,7 @@ from tsfusion.pipelines import point_files
 from tsfusion.wire.questions import MOST_POINTS
 
 POINTS = np.array([[0.0, 0.0, 1.2], [0.1, 0.05, 1.27], [9.0, 9.0, 9.0]])
+SLICE = ("--slice", "-0.3", "0.3", "--up", "-y", "--box", "-1", "-2", "2", "0")
 VIEW = ("--view", *["0", "0", "0", "0", "0", "0", "1"], "--size", "64x48")
 
 
@@ -63,14 +64,29 @@ def test_a_file_and_a_server_answer_alike(
         assert "3 points, of which the map has seen 2" in table.stderr
         done = here("ask", source, tmp_path / f"{name}.npz", "--points", tmp_path / "points.npy", "--json")
         assert json.loads(done.stdout)["states"][0]["keyframes"] == 3
+        sliced = here("ask", source, tmp_path / f"{name}-slice.npz", "--distances", *SLICE)
+        assert sliced.returncode == 0, sliced.stderr
         view = here("ask", source, tmp_path / f"{name}-view.npz", *VIEW)
         assert view.returncode == 0, view.stderr
         assert "64×48 pixels, the surface in" in view.stdout
-    for suffix in (".npz", "-view.npz"):
+    for suffix in (".npz", "-view.npz", "-slice.npz"):
         one, other = (np.load(tmp_path / f"{name}{suffix}") for name in ("file", "live"))
         assert set(one) == set(other)
         for key in one:
             np.testing.assert_allclose(one[key], other[key], atol=1e-6)
+
+
+def test_a_slice_for_map_server(here: Here, live: Server, tmp_path: Path) -> None:
+    done = here("ask", live.address, tmp_path / "slice.pgm", *SLICE)
+    assert done.returncode == 0, done.stderr
+    assert "% occupied" in done.stdout
+    assert "free space is known near surfaces alone" in done.stdout
+    assert cv2.imread(str(tmp_path / "slice.pgm")).shape[:2] == (50, 75)
+    assert "image: " in (tmp_path / "slice.yaml").read_text()
+    shares = json.loads(here("ask", live.address, tmp_path / "slice.png", *SLICE, "--json").stdout)
+    assert shares["free"] + shares["occupied"] + shares["unseen"] == pytest.approx(1)
+    done = here("ask", live.address, tmp_path / "no.png", "--slice", "0", "1")
+    assert (done.returncode, "--up" in done.stderr) == (1, True)
 
 
 def test_one_point_in_words_and_for_a_program(here: Here, live: Server) -> None:
@@ -114,6 +130,11 @@ def test_a_ply_and_a_table(saved: Path, here: Here, tmp_path: Path) -> None:
         (("--at", "0", "0", "1", "--size", "9x9"), "without --view"),
         (VIEW, "needs a file"),
         (("view.gif", *VIEW), "ending in .png, .npz"),
+        (SLICE, "needs a file"),
+        (("slice.pgm", "--distances", *SLICE), "ending in .png, .npz"),
+        (("slice.png", *SLICE, "--surface", "raw"), "no effect on a slice"),
+        (("--at", "0", "0", "1", "--up", "z"), "without --slice"),
+        (("slice.png", *SLICE, "--resolution", "0.001"), "resolution"),
         (("view.png", "--view", *["0", "0", "0", "0", "0", "0", "2"]), "length 1"),
         (("view.png", *VIEW[:-1], "big"), "WIDTHxHEIGHT"),
         (("out.doc", "--at", "0", "0", "1"), "ending in .csv"),

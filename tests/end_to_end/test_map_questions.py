@@ -24,9 +24,10 @@ from tsfusion.core.errors import TransportError
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.wire import key_folder, messages, questions, sockets
 from tsfusion.wire.curve import client_keys
+from tsfusion.wire.forgetting import Selection
 from tsfusion.wire.messages import Command, Reply
-from tsfusion.wire.queries import CommandRefused, fetch_health
-from tsfusion.wire.questions import MOST_POINTS, Raycast, Sample
+from tsfusion.wire.queries import CommandRefused, fetch_health, forget
+from tsfusion.wire.questions import MOST_POINTS, Field, Raycast, Sample, Slice
 
 COUNT = 4
 EASY = 30.0  # seconds for an answer that is there in milliseconds
@@ -84,11 +85,50 @@ def test_answers_are_those_of_the_map_itself(server: Server) -> None:
 def equal(one: Any, other: Any) -> None:
     """Two results of the same kind, array by array."""
     assert type(one) is type(other)
-    for name, array in vars(other).items():
-        if array is None:
-            assert getattr(one, name) is None
+    for name, value in vars(other).items():
+        found = getattr(one, name)
+        if isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(found, value, strict=True)
+        elif hasattr(value, "__dict__"):
+            equal(found, value)
         else:
-            np.testing.assert_array_equal(getattr(one, name), array, strict=True)
+            assert found == value
+
+
+SLICE: dict[str, Any] = {"up": "-y", "box": (-1, -2, 2, 0), "resolution": 0.05, "max_distance": 0.4}
+BOX = (-0.4, -0.4, 1.0, 0.4, 0.4, 1.4)
+
+
+def test_slices_follow_the_map(tmp_path: Path) -> None:
+    """Each time they are those of the map as it is then, also after keyframes were forgotten."""
+    volume = Volume(VOLUME)
+    with serving(tmp_path) as running, MapClient(running.address, timeout=EASY) as asked:
+        for i in range(COUNT):
+            with Client(running.address) as client:
+                client.send(gray(i))
+                client.wait_settled(DEADLINE)
+            volume.integrate(gray(i))
+            same_slices(asked, volume)
+        forget(running.address, Selection(numbers=((1, 1),), session=session_of(running)))
+        until(lambda: asked.sample(points(1)).state.keyframes == COUNT - 1)
+        volume.retract(gray(0))
+        same_slices(asked, volume)
+        whole = asked.distance_slice(-0.2, 0.2, up="-y").result  # around the map, with its own voxels
+        equal(whole, volume.distance_slice(-0.2, 0.2, up="-y"))
+
+
+def session_of(server: Server) -> str:
+    """The first session that sent something, as a person names it."""
+    clients = fetch_health(server.address).clients
+    return min(clients, key=lambda one: -one.heard_s).session
+
+
+def same_slices(asked: MapClient, volume: Volume) -> None:
+    equal(asked.occupancy_slice(-0.2, 0.2, **SLICE).result, volume.occupancy_slice(-0.2, 0.2, **SLICE))
+    equal(asked.distance_slice(-0.2, 0.2, **SLICE).result, volume.distance_slice(-0.2, 0.2, **SLICE))
+    field = asked.distance_field(BOX, max_distance=0.3)
+    equal(field.result, volume.distance_field(BOX, max_distance=0.3))
+    assert field.state.keyframes == volume.keyframes
 
 
 def test_the_client_needs_no_taichi() -> None:
@@ -127,6 +167,8 @@ class Raw:
 GOOD = points(3).tobytes()
 SAMPLE = Sample(points=3, crc=questions.crc_of([GOOD]))
 LOOK = Raycast(intrinsics=(40, 40, 31.5, 23.5), pose=tuple(np.eye(4).ravel().tolist()), shape=(4, 4))
+FLAT = Slice(kind="distance", low=0.0, high=0.1, up=(0.0, -1.0, 0.0), box=(-1, -1, 1, 1), resolution=0.05)
+AROUND = Field(box=BOX, max_distance=0.3)
 NAN = np.array([[0, np.nan, 1]], "<f4").tobytes()
 
 
@@ -150,6 +192,10 @@ def changed(question: Any, **fields: Any) -> Any:
         (changed(LOOK, shape=(4096, 4096)), [], "1048576 pixels"),
         (changed(LOOK, pose=(float("nan"),) * 16), [], ""),
         (changed(LOOK, intrinsics=(0.0, 1.0, float("inf"), 1.0)), [], "intrinsics"),
+        (changed(FLAT, up=(0.0, 0.0, 0.0)), [], "direction"),
+        (changed(FLAT, low=float("nan")), [], "finite"),
+        (changed(FLAT, resolution=1e-4), [], "1048576 cells"),
+        (changed(AROUND, max_distance=1e9), [], "max_distance"),
         (None, [], "nothing was asked"),
     ],
 )
@@ -180,6 +226,20 @@ def test_bad_times_and_bad_messages(server: Server) -> None:
         link.send(messages.encode(Command(name="ping")), b"more")
         assert link.ask(SAMPLE, GOOD).answer is not None
     assert fetch_health(server.address).refused["control"] == refused + 2
+
+
+def test_what_is_too_large_is_an_error_of_the_fuser(server: Server) -> None:
+    """What only the map knows: how large its voxels are, and whether there are so many."""
+    before = counts(server).get("failed", 0)
+    with MapClient(server.address, timeout=EASY) as asked:
+        for box, farthest in ((BOX, 20.0), ((-90, -90, -90, 90, 90, 90), 0.1)):
+            with pytest.raises(CommandRefused, match="4194304 voxels"):
+                asked.distance_field(box, max_distance=farthest)
+        with pytest.raises(CommandRefused, match="at most 1048576 cells"):
+            asked.occupancy_slice(0, 0.1, up="-y", box=(-900, -900, 900, 900))
+        with pytest.raises(CommandRefused, match="resolution"):
+            asked.distance_slice(0, 0.1, up="-y", resolution=0.001, box=(-0.01, -0.01, 0.01, 0.01))
+    assert counts(server)["failed"] == before + 4
 
 
 def test_what_the_client_does_not_ask(server: Server) -> None:

@@ -69,7 +69,7 @@ verbs.verb(
 )(mesh.mesh)  # fmt: skip
 verbs.verb(
     app, "tsfusion ask tcp://server:5555 --at 1.2 0 0.5",
-    "tsfusion ask out/latest/map.tsf view.png --view 0 0 0 0 0 0 1", panel=OWN,
+    "tsfusion ask out/latest/map.tsf room.pgm --slice 0.1 1.5 --up z", panel=OWN,
 )(ask.ask)  # fmt: skip
 app.add_typer(map.app, name="map", rich_help_panel=OWN)
 verbs.verb(

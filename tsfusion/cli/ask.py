@@ -40,8 +40,28 @@ def ask(
         Pose | None,
         typer.Option(metavar="X…QW", help="View from the pose X Y Z QX QY QZ QW."),
     ] = None,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Its pixels.")] = "640x480",
-    intrinsics: options.Intrinsics = None,
+    slice_: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--slice", metavar="LOW HIGH", help="What stands between two heights, metres."),
+    ] = None,
+    distances: Annotated[
+        bool, typer.Option("--distances", help="And how far that is from each cell.")
+    ] = False,
+    box: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option(metavar="U V U V", help="Its corners; else around the map."),
+    ] = None,
+    resolution: Annotated[
+        float | None, typer.Option(metavar="METRES", help="Edge of its cells; else a voxel's.")
+    ] = None,
+    up: Annotated[
+        str | None, typer.Option(metavar="AXIS", help="Which way is up: z, -y, … or X,Y,Z.")
+    ] = None,
+    size: Annotated[str, options.option("--size", "WxH", "Pixels of the view.", rare=True)] = "640x480",
+    intrinsics: Annotated[
+        str | None,
+        options.option("--intrinsics", "FX,FY,CX,CY", "Camera of the view, in pixels.", rare=True),
+    ] = None,
     surface: Annotated[
         SurfaceName,
         options.option("--surface", "MODE", "raw: as fused; normal, field: smoothed, slower.", rare=True),
@@ -60,31 +80,49 @@ def ask(
 ) -> None:
     """Ask a map how far its surface is, or what a camera sees of it.
 
-    A live server answers between two keyframes. Metres in the map's frame; a
-    distance is positive before a surface, and nan where nothing was seen.
+    A live server answers between two keyframes, or status is 1 after --timeout.
+    Metres of the map; a distance is positive before a surface, nan = unseen.
 
-    Points come out as a table, on stdout or in OUT (.csv, .npz; .npy: distances
-    alone), a view in OUT: .png, or .npz with its depth.
-
-    Exit status 1 also when a server does not answer in --timeout seconds.
+    Points: a table on stdout, or OUT (.csv, .npz; .npy: distances alone).
+    A view: OUT .png, or .npz with its depth. A slice: .pgm and .yaml for ROS's
+    map_server, .png, .npz; a live one needs --up.
     """
     from tsfusion.core.errors import InvalidConfig
+    from tsfusion.geometry.map_grids import SLICE_FORMATS
+    from tsfusion.pipelines.point_files import VIEWS
 
-    if sum(one is not None for one in (at, points, view)) != 1:
-        raise InvalidConfig("ask one thing: --at X Y Z, --points FILE or --view X Y Z QX QY QZ QW")
+    if sum(one is not None for one in (at, points, view, slice_)) != 1:
+        raise InvalidConfig(
+            "ask one thing: --at X Y Z, --points FILE, --view X Y Z QX QY QZ QW or --slice LOW HIGH"
+        )
     if "://" not in where:
         options.refuse(
             context, ("control", "key", "server_key", "timeout"),
             f"has no effect on {where}: only a live server (tcp://…) has one",
         )  # fmt: skip
     link = {"control": control, "key": key, "server_key": server_key, "timeout": timeout}
-    how = {"surface": surface, "min_weight": min_weight}
-    if view is not None:
-        camera = _camera(view, size, intrinsics)
+    if view is None:
+        options.refuse(context, ("size", "intrinsics"), "has no effect without --view")
+    if slice_ is None:
+        options.refuse(context, ("distances", "box", "resolution", "up"), "has no effect without --slice")
+    else:
+        options.refuse(context, ("surface",), "has no effect on a slice: it is of the map as it was fused")
+    how: dict[str, Any] = {"min_weight": min_weight}
+    if slice_ is not None:
+        file = _checked(out, "a slice", (".png", ".npz") if distances else SLICE_FORMATS)
+        if up is None and "://" in where:
+            raise InvalidConfig("say which way is up in a live map, such as --up z or --up -y")
+        how |= {"box": box, "resolution": resolution, "up": options.up_direction(up)}
         with _map(where, map_, link, quiet=json) as asked:
-            _write_view(asked.raycast(*camera, **how), _checked(out, "a view"), json=json)
+            question = asked.distance_slice if distances else asked.occupancy_slice
+            _write_slice(question(*slice_, **how), file, json=json)
         return
-    options.refuse(context, ("size", "intrinsics"), "has no effect without --view")
+    how["surface"] = surface
+    if view is not None:
+        file, camera = _checked(out, "a view", VIEWS), _camera(view, size, intrinsics)
+        with _map(where, map_, link, quiet=json) as asked:
+            _write_view(asked.raycast(*camera, **how), file, json=json)
+        return
     _ask_points(where, map_, link, how, at=at, points=points, out=out, json=json)
 
 
@@ -166,19 +204,39 @@ def _map(where: str, map_: str | None, link: dict[str, Any], *, quiet: bool) -> 
         yield SavedMapAnswers(Volume.load(file, memory_bytes=opened_maps.memory_for(file)))
 
 
-# --- views ---
+# --- pictures ---
 
 
-def _checked(out: Path | None, what: str) -> Path:
+def _checked(out: Path | None, what: str, suffixes: tuple[str, ...]) -> Path:
     """The file for an answer that no terminal shows."""
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
-    from tsfusion.pipelines import point_files
 
     if out is None:
-        raise InvalidConfig(f"{what} needs a file: give OUT, such as view.png")
-    check_writable(out, point_files.VIEWS)
+        raise InvalidConfig(f"{what} needs a file: give OUT, such as out.png")
+    check_writable(out, suffixes)
     return out
+
+
+def _write_slice(answer: "Answered[Any]", out: Path, *, json: bool) -> None:
+    """Write a slice of either kind, and say what it shows."""
+    from tsfusion.cli import output
+    from tsfusion.geometry.map_grids import FREE, OCCUPIED, UNSEEN
+
+    found = answer.result
+    files = found.save(out)
+    rows, columns = found.cells.shape
+    names = {"free": FREE, "occupied": OCCUPIED, "unseen": UNSEEN}
+    shares = {name: float((found.cells == state).mean()) for name, state in names.items()}
+    if json:
+        figures = {"rows": rows, "columns": columns, "resolution_m": found.grid.resolution, **shares}
+        output.as_json({"files": list(map(str, files)), **figures, **_figures([answer])})
+        return
+    said = ", ".join(f"{100 * share:.0f} % {name}" for name, share in shares.items())
+    if not getattr(found, "knows_free_space", True):
+        said += " (fused without --space-carving: free space is known near surfaces alone)"
+    cells = f"{columns}×{rows} cells of {found.grid.resolution:g} m"
+    typer.echo(f"{' and '.join(map(str, files))}: {cells}, {said}; {_state([answer])}")
 
 
 def _camera(view: Pose, size: str, intrinsics: str | None) -> tuple[Any, Any, tuple[int, int]]:

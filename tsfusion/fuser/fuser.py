@@ -39,6 +39,9 @@ from tsfusion.wire.questions import MapState
 from tsfusion.wire.record_header import Refused
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from tsfusion.tsdf.volume import IntegrateStats
 
 _WORKING_MEMORY = 768 << 20  # bytes for keyframes and meshes, beyond those of the map
@@ -101,6 +104,7 @@ class Fuser:
             interval=begin.mesh_interval,
             sparing=lambda: self._memory_beyond(-_FOR_KEYFRAMES),
             send=self._send,
+            on_taken=self._note_taken,
         )
         self._answers: QuestionAnswers | None = None
         if inbox is not None:
@@ -133,6 +137,10 @@ class Fuser:
             stats.bytes,
             self._mover.progress(),
         )
+
+    def _note_taken(self, blocks: "NDArray[np.int32]") -> None:
+        if self._answers is not None:
+            self._answers.slices.note_taken(blocks)
 
     def answer(self) -> None:
         """Answer the questions that wait, before anything else is done."""

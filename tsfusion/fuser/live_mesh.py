@@ -30,6 +30,7 @@ class LiveMesh:
         interval: seconds between two meshes, at least.
         sparing: limits the memory while a mesh is made, so that the next keyframe finds some.
         send: takes a message and its frames.
+        on_taken: told of the changed blocks that were taken.
     """
 
     def __init__(
@@ -39,8 +40,10 @@ class LiveMesh:
         interval: float,
         sparing: Callable[[], AbstractContextManager[None]],
         send: Callable[..., None],
+        on_taken: Callable[[NDArray[np.int32]], None] = lambda _blocks: None,
     ) -> None:
         self._volume, self._interval, self._sparing, self._send = volume, interval, sparing, send
+        self._on_taken = on_taken
         self._watched = False
         self._answered = self._meshed = 0  # records of this process
         self._is_behind = False
@@ -87,6 +90,7 @@ class LiveMesh:
 
         started = time.monotonic()
         blocks = self._volume.take_dirty()
+        self._on_taken(blocks)
         cells = cells_of(blocks)
         mesh = self._volume.extract_mesh(blocks=cells, surface="raw")
         self._note_meshed()

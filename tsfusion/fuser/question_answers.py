@@ -11,16 +11,20 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.core.errors import TsfusionError
+from tsfusion.core.errors import InvalidConfig, TsfusionError
 from tsfusion.core.token_bucket import Bucket
 from tsfusion.fuser.inbox import Inbox
+from tsfusion.fuser.kept_slices import KeptSlices
 from tsfusion.fuser.messages import FuserAnswer, FuserQuestion
 from tsfusion.wire import questions
-from tsfusion.wire.questions import Answer, MapState, Raycast
+from tsfusion.wire.questions import MOST_VOXELS, Answer, Field, MapState, Raycast, Slice
 
 if TYPE_CHECKING:
+    from tsfusion.geometry.map_grids import SliceGrid
+    from tsfusion.tsdf.map_slices import CurrentSlice
     from tsfusion.tsdf.volume import Volume
 
 _SHARE = 0.25  # of a busy fuser's time
@@ -49,6 +53,7 @@ class QuestionAnswers:
     ) -> None:
         self._volume, self._inbox, self._state, self._send = volume, inbox, state, send
         self._aside = aside
+        self.slices = KeptSlices(volume)
         self._share = Bucket(_SHARE, time.monotonic(), burst=_BURST_S)
         self._is_answering = False
         self._next_look = 0.0  # time.monotonic()
@@ -87,7 +92,7 @@ class QuestionAnswers:
             self._send(FuserAnswer(asked.number, error=questions.LATE, late=True), [])
             return
         try:
-            arrays = answer_of(self._volume, asked.question, frames)
+            arrays = answer_of(self._volume, self.slices, asked.question, frames)
             layouts, packed = questions.pack(arrays, compress=asked.compress)
         except MemoryError as error:
             why = f"not enough memory for that: {error}; raise fuser_memory_bytes"
@@ -107,8 +112,14 @@ class QuestionAnswers:
             self._send(FuserAnswer(asked.number, answer), packed)
 
 
-def answer_of(volume: "Volume", question: questions.Question, frames: list[memoryview]) -> _Arrays:
-    """What a map answers, by name: the fields of `geometry.map_answers`."""
+def answer_of(
+    volume: "Volume", slices: KeptSlices, question: questions.Question, frames: list[memoryview]
+) -> _Arrays:
+    """What a map answers, by name: the fields of `geometry.map_answers` and `geometry.map_grids`."""
+    if isinstance(question, Slice):
+        return _slice_of(slices.get(question), question.kind)
+    if isinstance(question, Field):
+        return _field_of(volume, question)
     how: dict[str, Any] = {"min_weight": question.min_weight, "surface": question.surface}
     if isinstance(question, Raycast):
         view = volume.raycast(question.intrinsics, question.matrix, question.shape, **how)
@@ -116,3 +127,35 @@ def answer_of(volume: "Volume", question: questions.Question, frames: list[memor
         return {name: array for name, array in found.items() if array is not None}
     samples = volume.sample(questions.points_of(frames), **how)
     return {"distance": samples.distance, "weight": samples.weight, "gradient": samples.gradient}
+
+
+def _slice_of(current: "CurrentSlice", kind: str) -> _Arrays:
+    if kind == "occupancy":
+        occupancy = current.occupancy()
+        own = {"cells": occupancy.cells, "knows_free_space": np.asarray(occupancy.knows_free_space)}
+        return {**own, **_figures(occupancy.grid)}
+    found = current.distances()
+    own = {"cells": found.cells, "distance": found.distance}
+    return {**own, "max_distance": np.float64(found.max_distance), **_figures(found.grid)}
+
+
+def _figures(grid: "SliceGrid") -> _Arrays:
+    return {name: np.asarray(value, np.float64) for name, value in grid.figures.items()}
+
+
+def _field_of(volume: "Volume", asked: Field) -> _Arrays:
+    edge = volume.config.voxel_size
+    sides = np.diff(np.reshape(asked.box, (2, 3)), axis=0)[0] / edge + 2 * asked.max_distance / edge
+    if not np.prod(np.maximum(sides, 1)) <= MOST_VOXELS:
+        raise InvalidConfig(
+            f"a distance field may have {MOST_VOXELS} voxels, with those around the box that are within "
+            "max_distance: give a smaller box or max_distance"
+        )
+    found = volume.distance_field(
+        asked.box,
+        max_distance=asked.max_distance,
+        subvoxel=asked.subvoxel,
+        min_weight=asked.min_weight,
+    )
+    arrays = vars(found) | {"voxel_size": np.float64(edge), "max_distance": np.float64(found.max_distance)}
+    return {name: np.asarray(array) for name, array in arrays.items()}

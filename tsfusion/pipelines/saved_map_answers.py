@@ -2,13 +2,14 @@
 """A saved map that answers as a live one does, so that whoever asks need not know which it is."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from numpy.typing import ArrayLike
 
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.map_answers import Samples, View
+from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice
 from tsfusion.tsdf.volume import Volume
 from tsfusion.wire.map_client import Answered, Result
 from tsfusion.wire.questions import MapState
@@ -35,6 +36,24 @@ class SavedMapAnswers:
     ) -> Answered[View]:
         """See `MapClient.raycast`."""
         return self._answered(lambda: self._volume.raycast(intrinsics, T_world_camera, shape, **how))
+
+    def occupancy_slice(
+        self, low: float, high: float, *, timeout: float | None = None, **how: Any
+    ) -> Answered[OccupancySlice]:
+        """See `MapClient.occupancy_slice`."""
+        return self._answered(lambda: self._volume.occupancy_slice(low, high, **how))
+
+    def distance_slice(
+        self, low: float, high: float, *, timeout: float | None = None, **how: Any
+    ) -> Answered[DistanceSlice]:
+        """See `MapClient.distance_slice`."""
+        return self._answered(lambda: self._volume.distance_slice(low, high, **how))
+
+    def distance_field(
+        self, box: Sequence[float], *, timeout: float | None = None, **how: Any
+    ) -> Answered[DistanceField]:
+        """See `MapClient.distance_field`."""
+        return self._answered(lambda: self._volume.distance_field(box, **how))
 
     def _answered(self, answer: Callable[[], Result]) -> Answered[Result]:
         began = time.monotonic()

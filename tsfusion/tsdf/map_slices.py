@@ -56,6 +56,7 @@ class CurrentSlice:
         max_distance: float,
         min_weight: float,
         knows_free_space: bool,
+        most_cells: int = MOST_CELLS,
     ) -> None:
         low, high = _checked_heights(heights)
         self._store, self._least = store, max(1, math.ceil(min_weight * WEIGHT_ONE))
@@ -65,7 +66,7 @@ class CurrentSlice:
         first, end = _cell_range(_box_around(store, axes) if box is None else box, edge)
         self._margin = margin = self._reach.margin
         self._first = first - margin  # row, column of the first cell that is read
-        self._shape = rows, columns = _checked_shape(end - first + 2 * margin)
+        self._shape = rows, columns = _checked_shape(end - first + 2 * margin, most_cells)
         self.grid = SliceGrid(
             (float(first[1] * edge), float(first[0] * edge)), edge,
             (rows - 2 * margin, columns - 2 * margin), low, high, axes,
@@ -208,12 +209,12 @@ def _checked_resolution(resolution: float | None, voxel_size: float) -> float:
     return edge
 
 
-def _checked_shape(shape: NDArray[np.int64]) -> tuple[int, int]:
+def _checked_shape(shape: NDArray[np.int64], most: int) -> tuple[int, int]:
     rows, columns = (int(number) for number in shape)
-    if rows * columns > MOST_CELLS:
+    if rows * columns > most:
         raise InvalidConfig(
             f"a slice of {rows} × {columns} cells, with those around from which distances come, is too "
-            f"large (at most {MOST_CELLS} cells): give a smaller box, a coarser resolution or a smaller "
+            f"large (at most {most} cells): give a smaller box, a coarser resolution or a smaller "
             "max_distance"
         )
     return rows, columns

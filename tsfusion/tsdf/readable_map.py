@@ -290,6 +290,7 @@ class ReadableMap:
         resolution: float | None = None,
         max_distance: float = 2.0,
         min_weight: float | None = None,
+        most_cells: int = map_slices.MOST_CELLS,
     ) -> CurrentSlice:
         """Occupancy and horizontal distances between two heights, which can follow the map.
 
@@ -301,6 +302,7 @@ class ReadableMap:
                 the map is meshed.
             resolution: metres, edge of a cell; None = the voxel size. A cell holds the least of its voxels.
             max_distance, min_weight: as for `distance_field`.
+            most_cells: with those around the box from which distances come; for more there is an error.
 
         Raises:
             InvalidConfig: for another box, or too many cells; MapError: for an empty map and no box, or when
@@ -315,6 +317,7 @@ class ReadableMap:
             max_distance=max_distance,
             min_weight=self._checked_min_weight(min_weight),
             knows_free_space=self.config.space_carving,
+            most_cells=most_cells,
         )
 
     def occupancy_slice(

@@ -228,9 +228,16 @@ class Volume(ReadableMap):
 
     def take_dirty(self) -> NDArray[np.int32]:
         """Coordinates of the blocks changed since the last call: (n, 3) int32, in units of 8 voxels."""
-        keys = np.concatenate([self._store.keys[self._store.take_dirty(MESHED)], *self._released])
+        blocks = self.changed_blocks()
+        self._store.take_dirty(MESHED)
         self._released.clear()
-        return unpack_keys(keys)
+        return blocks
+
+    def changed_blocks(self) -> NDArray[np.int32]:
+        """The blocks that `take_dirty` would take, which still will."""
+        store = self._store
+        changed = np.flatnonzero(store.dirty[: store.count] & MESHED)
+        return unpack_keys(np.concatenate([store.keys[changed], *self._released]))
 
     def release_empty(self) -> int:
         """Give up the blocks that `retract` has left without votes; returns how many.

@@ -4,7 +4,7 @@
 import time
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 from msgspec import Struct
@@ -12,15 +12,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from tsfusion.core.config import DEFAULT_MAP, Surface
 from tsfusion.core.errors import AnswerLate, DecodeError, InvalidConfig, ServerUnreachable, TransportError
+from tsfusion.geometry import up_direction
 from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.map_answers import Samples, View, checked_camera, checked_points
+from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice, SliceGrid
+from tsfusion.geometry.up_direction import Up
 from tsfusion.wire import messages, questions, sockets
 from tsfusion.wire.curve import ClientKeys
 from tsfusion.wire.messages import Command, Reply
 from tsfusion.wire.queries import CommandRefused, Exchange, open_connection
-from tsfusion.wire.questions import Answer, MapState, Question, Raycast, Sample
+from tsfusion.wire.questions import Answer, Field, MapState, Question, Raycast, Sample, Slice
 
 Result = TypeVar("Result")
+_GRID = ("origin", "resolution", "heights", "axes")
 
 
 class Answered(Struct, Generic[Result], frozen=True, kw_only=True, eq=False):
@@ -144,6 +148,81 @@ class MapClient:
         colors = arrays.pop("colors", None)
         return _answered(View(**_all(arrays, "depth", "normals"), colors=colors), answer, delay)
 
+    def occupancy_slice(self, low: float, high: float, **how: Any) -> Answered[OccupancySlice]:
+        """What stands between two heights; see `Volume.occupancy_slice`. Arguments as of `distance_slice`."""
+        answer, arrays, delay = self._ask_slice("occupancy", low, high, **how)
+        found = _all(arrays, "cells", "knows_free_space", *_GRID)
+        sliced = OccupancySlice(_grid(found), found["cells"], bool(found["knows_free_space"]))
+        return _answered(sliced, answer, delay)
+
+    def distance_slice(self, low: float, high: float, **how: Any) -> Answered[DistanceSlice]:
+        """Horizontal distances to what stands between two heights; see `Volume.distance_slice`.
+
+        The server keeps the slices of a `box` that were asked last, and brings them up to date: the first
+        answer takes it longest. Raises as `sample`.
+
+        Args:
+            low, high: metres along `up`.
+            how: `up`: needed here, such as "z"; `box`, `resolution`, `max_distance`, `min_weight`: as of
+                `Volume.current_slice`; `timeout`: seconds.
+        """
+        answer, arrays, delay = self._ask_slice("distance", low, high, **how)
+        found = _all(arrays, "cells", "distance", "max_distance", *_GRID)
+        farthest = float(found["max_distance"])
+        sliced = DistanceSlice(_grid(found), found["distance"], found["cells"], farthest)
+        return _answered(sliced, answer, delay)
+
+    def _ask_slice(
+        self,
+        kind: Literal["occupancy", "distance"],
+        low: float,
+        high: float,
+        *,
+        up: Up | str,
+        box: Sequence[float] | None = None,
+        resolution: float | None = None,
+        max_distance: float = 2.0,
+        min_weight: float | None = None,
+        timeout: float | None = None,
+    ) -> tuple[Answer, dict[str, NDArray[Any]], float]:
+        given = up_direction.parse(up) if isinstance(up, str) else up
+        question = Slice(
+            kind=kind,
+            low=float(low),
+            high=float(high),
+            up=given.direction,
+            box=None if box is None else _numbers(box, 4),  # type: ignore[arg-type]
+            resolution=resolution,
+            max_distance=max_distance,
+            min_weight=min_weight,
+        )
+        return self._ask(question, [], timeout)
+
+    def distance_field(
+        self,
+        box: Sequence[float],
+        *,
+        max_distance: float = 0.5,
+        subvoxel: bool = True,
+        min_weight: float | None = None,
+        timeout: float | None = None,
+    ) -> Answered[DistanceField]:
+        """Distance of each voxel in a box to the nearest surface; see `Volume.distance_field`.
+
+        Its cost grows with the cube of `max_distance`, which is less here by custom. Raises as `sample`.
+        """
+        question = Field(
+            box=_numbers(box, 6),  # type: ignore[arg-type]
+            max_distance=max_distance,
+            subvoxel=subvoxel,
+            min_weight=min_weight,
+        )
+        answer, arrays, delay = self._ask(question, [], timeout)
+        found = _all(arrays, "distance", "occupancy", "origin", "voxel_size", "max_distance")
+        edge, farthest = float(found["voxel_size"]), float(found["max_distance"])
+        field = DistanceField(found["origin"], edge, found["distance"], found["occupancy"], farthest)
+        return _answered(field, answer, delay)
+
     def _ask(
         self, question: Question, frames: Sequence[Any], timeout: float | None
     ) -> tuple[Answer, dict[str, NDArray[Any]], float]:
@@ -209,6 +288,21 @@ def _all(arrays: dict[str, NDArray[Any]], *names: str) -> dict[str, NDArray[Any]
     if sorted(arrays) != sorted(names):
         raise TransportError(f"an answer has {', '.join(arrays) or 'nothing'} instead of {', '.join(names)}")
     return arrays
+
+
+def _numbers(given: Sequence[float], count: int) -> tuple[float, ...]:
+    numbers = np.asarray(given, np.float64)
+    if numbers.shape != (count,):
+        raise InvalidConfig(f"a box must be {count} numbers in metres, got {given}")
+    return tuple(numbers.tolist())
+
+
+def _grid(found: dict[str, NDArray[Any]]) -> SliceGrid:
+    """The cells of a slice, from the arrays of an answer: `SliceGrid.figures`."""
+    rows, columns = found["cells"].shape
+    u, v = found["origin"].tolist()
+    low, high = found["heights"].tolist()
+    return SliceGrid((u, v), float(found["resolution"]), (rows, columns), low, high, found["axes"])
 
 
 def _answered(result: Result, answer: Answer, delay_s: float) -> Answered[Result]:

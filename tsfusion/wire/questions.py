@@ -23,6 +23,9 @@ from tsfusion.wire.sockets import CONTROL_MAX_BYTES
 
 MOST_POINTS = 20_000  # of a question
 MOST_PIXELS = 1 << 20  # of a view
+MOST_CELLS = 1 << 20  # of a slice, with those around it from which its distances come
+MOST_VOXELS = 1 << 22  # of a distance field, likewise
+FARTHEST_M = 100.0  # that a distance field reaches
 MOST_FRAMES = 4  # that its points come in
 LONGEST_S = 60.0  # that a question may wait
 LATE = "its time was over before the map came to it"
@@ -91,7 +94,55 @@ class Raycast(Struct, frozen=True, tag="raycast", omit_defaults=True):
         return np.array(self.pose, np.float64).reshape(4, 4)
 
 
-Question = Sample | Raycast
+class Slice(Struct, frozen=True, tag="slice", omit_defaults=True):
+    """What stands between two heights? Arguments as of `Volume.current_slice`.
+
+    Attributes:
+        kind: `occupancy`, or also distances.
+        up: a direction in the map's frame. It is not looked for here: that takes the whole mesh.
+    """
+
+    kind: Literal["occupancy", "distance"]
+    low: float
+    high: float
+    up: tuple[float, float, float]
+    box: tuple[float, float, float, float] | None = None
+    resolution: float | None = None
+    max_distance: float = 2.0
+    min_weight: float | None = None
+
+    def problem(self, frames: Sequence[Any]) -> str:
+        """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        numbers = (self.low, self.high, *self.up, *(self.box or ()), self.resolution or 0, self.max_distance)
+        if frames or not all(map(math.isfinite, numbers)):
+            return "a slice has finite numbers and no points"
+        if np.linalg.norm(self.up) < 1e-6:
+            return f"up must be a direction, got {self.up}"
+        if self.box is not None and self.resolution is not None:
+            u0, v0, u1, v1 = self.box
+            if not (u1 - u0) * (v1 - v0) <= MOST_CELLS * self.resolution**2:
+                return f"a slice may have {MOST_CELLS} cells: give a smaller box or a coarser resolution"
+        return _problem_of_weight(self.min_weight)
+
+
+class Field(Struct, frozen=True, tag="field", omit_defaults=True):
+    """How far is the surface from each voxel of a box? Arguments as of `Volume.distance_field`."""
+
+    box: tuple[float, float, float, float, float, float]
+    max_distance: float
+    subvoxel: bool = True
+    min_weight: float | None = None
+
+    def problem(self, frames: Sequence[Any]) -> str:
+        """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        if frames or not all(map(math.isfinite, self.box)):
+            return "a distance field has a box of finite numbers and no points"
+        if not 0 < self.max_distance <= FARTHEST_M:
+            return f"max_distance must be > 0 and up to {FARTHEST_M:g} m, got {self.max_distance}"
+        return _problem_of_weight(self.min_weight)
+
+
+Question = Sample | Raycast | Slice | Field
 
 
 class ArrayLayout(Struct, frozen=True, array_like=True):
@@ -129,7 +180,6 @@ class Answer(Struct, frozen=True, kw_only=True):
         crc: CRC-32 of all frames.
         waited_s: from when the server got the question until it was looked at.
         took_s: to answer it.
-        values: that are no arrays, by name.
     """
 
     arrays: tuple[ArrayLayout, ...]
@@ -137,7 +187,6 @@ class Answer(Struct, frozen=True, kw_only=True):
     crc: int
     waited_s: float = 0.0
     took_s: float = 0.0
-    values: dict[str, Any] = {}
 
 
 def crc_of(frames: Sequence[Any]) -> int:
