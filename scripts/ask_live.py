@@ -88,8 +88,8 @@ class Planner:
         self._client.close()
 
 
-def kinds(keyframes: list[Keyframe]) -> dict[str, Ask]:
-    """The questions: points around the sensors' paths, and views from there."""
+def kinds(keyframes: list[Keyframe], voxel_size: float) -> dict[str, Ask]:
+    """The questions: points near the surface, a view, a slice and a box around the first sensor."""
     from tsfusion.geometry.measured_points import points_world
 
     clouds = [points_world(one)[::97] for one in keyframes]
@@ -103,12 +103,18 @@ def kinds(keyframes: list[Keyframe]) -> dict[str, Ask]:
 
     first = keyframes[0]
     assert first.intrinsics is not None
-    camera, pose = first.intrinsics, first.T_world_camera
+    camera, pose, eye = first.intrinsics, first.T_world_camera, first.T_world_camera[:3, 3]
     return {
         "1 point": some(1),
         "100 points": some(100),
         "10000 points": some(10_000),
         "view of 640×480": lambda client: client.raycast(camera, pose, (480, 640)),
+        "slice of 20×20 m at 5 cm": lambda client: client.distance_slice(
+            eye[1] - 1, eye[1] + 0.5, up="y", box=(-10, -10, 10, 10), resolution=max(0.05, voxel_size)
+        ),
+        "field of 1×1×1 m": lambda client: client.distance_field(
+            [*(eye - 0.5), *(eye + 0.5)], max_distance=0.5
+        ),
     }
 
 
@@ -173,11 +179,14 @@ def main() -> int:
     keyframes, source = _keyframes()
     count = int(options.seconds * options.rate)
     with tempfile.TemporaryDirectory(prefix="tsfusion-ask-") as scratch, ExitStack() as stack:
-        volume = VolumeConfig(voxel_size=options.voxel_size)
+        cores = len(os.sched_getaffinity(0))
+        volume = VolumeConfig(voxel_size=options.voxel_size, threads=cores)
         asked, plain = (
             stack.enter_context(serving(Path(scratch) / name, volume)) for name in ("asked", "plain")
         )
-        chosen = {name: ask for name, ask in kinds(keyframes).items() if options.kind in name}
+        chosen = {
+            name: ask for name, ask in kinds(keyframes, options.voxel_size).items() if options.kind in name
+        }
         planner = Planner(asked.address, chosen)
         stack.callback(planner.close)
         scanner = Scanner()
@@ -197,18 +206,12 @@ def main() -> int:
             name: msgspec.to_builtins(fetch_health(server.address).maps["default"].delay_ms)
             for name, server in (("with_questions", asked), ("without", plain))
         }
-    common = {"source": source, "voxel_size": options.voxel_size, **surroundings(os.cpu_count() or 1)}
+    common = {"source": source, "voxel_size": options.voxel_size, **surroundings(cores)}
     for line in planner.lines():
         print(json.dumps({**line, **common}), flush=True)
-    busy = [
-        delay
-        for name, all_ in planner.delays.items()
-        if "point" in name and "while" in name
-        for delay, *_ in all_
-    ]
-    p95 = round(1e3 * float(np.percentile(busy, 95)), 2)
+    p95 = max((one["delay_ms"]["p95"] for one in planner.lines() if "come" in one["question"]), default=0)
     met = p95 <= TARGET_MS and not planner.failed
-    last = {"points_p95_ms": p95, "target_ms": TARGET_MS, "failed": planner.failed, "met": met}
+    last = {"worst_p95_ms": p95, "target_ms": TARGET_MS, "failed": planner.failed, "met": met}
     print(json.dumps({"keyframe_delay_ms": delays, "rate": options.rate, **last}))
     return 0 if met else 1
 

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: MIT
 """When a fuser answers questions: before all else, for a share of its time, and inside of long passes."""
 
+import struct
 import time
 from collections import deque
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,8 +14,9 @@ from keyframes_and_servers import CAMERA, SHAPE, VOLUME, wall
 
 from tsfusion import Volume
 from tsfusion.fuser import question_answers
+from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.inbox import Inbox
-from tsfusion.fuser.messages import Finish, FuserAnswer, FuserQuestion, Publish, encode
+from tsfusion.fuser.messages import NOT_WORKING, Finish, FuserAnswer, FuserQuestion, Publish, encode
 from tsfusion.fuser.question_answers import QuestionAnswers
 from tsfusion.wire import questions
 from tsfusion.wire.questions import MapState, Sample
@@ -40,7 +43,9 @@ def volume() -> Volume:
 class Desk:
     """The answers to what is put into an inbox."""
 
-    def __init__(self, volume: Volume) -> None:
+    def __init__(self, volume: Volume, file: Path) -> None:
+        file.write_bytes(struct.pack("<q", NOT_WORKING))
+        self.at_work = CurrentKeyframe(str(file))
         self.context: zmq.Context[Any] = zmq.Context()
         self.gateway, link = (self.context.socket(zmq.PAIR) for _ in range(2))
         self.gateway.bind("inproc://desk")
@@ -52,6 +57,7 @@ class Desk:
             volume,
             self.inbox,
             state=lambda: MapState(keyframes=volume.keyframes),
+            at_work=self.at_work,
             send=lambda message, _frames: self.sent.append(message),
         )
 
@@ -66,8 +72,8 @@ class Desk:
 
 
 @pytest.fixture
-def desk(volume: Volume) -> Any:
-    made = Desk(volume)
+def desk(volume: Volume, tmp_path: Path) -> Any:
+    made = Desk(volume, tmp_path / "working")
     yield made
     for link in made.links:
         link.close()
@@ -95,8 +101,27 @@ def test_orders_that_wait_have_the_larger_share(desk: Desk, monkeypatch: pytest.
     desk.answers.give()
     assert 1 <= len(desk.numbers) <= 2
     desk.inbox.orders.clear()
+    desk.at_work.set(7)  # now a keyframe is under way: it has its share, too
+    desk.answers.give()
+    assert len(desk.numbers) < 8
+    assert desk.at_work.is_set
+    desk.at_work.set(NOT_WORKING)
     desk.answers.give()
     assert desk.numbers == list(range(1, 9))
+
+
+def test_what_comes_during_an_answer_has_its_share(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    def answer(*_: Any) -> Any:
+        time.sleep(0.1)
+        if not desk.inbox.orders:
+            desk.put(Publish(True))
+        return {}
+
+    monkeypatch.setattr(question_answers, "answer_of", answer)
+    desk.put(*map(asked, range(1, 9)))
+    desk.answers.give()
+    assert desk.numbers == [1]
+    assert len(desk.inbox.orders) == 1
 
 
 def test_a_question_that_fails_is_answered_with_the_reason(

@@ -21,6 +21,11 @@ class CurrentKeyframe:
         except (OSError, ValueError) as error:  # ValueError: the file is too short
             raise MapError(f"cannot share memory with the gateway: {error}") from error
 
+    @property
+    def is_set(self) -> bool:
+        """Whether the process is at a keyframe."""
+        return bool(struct.unpack_from("<q", self._word, 0) != (NOT_WORKING,))
+
     @contextmanager
     def aside(self) -> Iterator[None]:
         """Be at no keyframe for the block: what happens in it is not the keyframe's fault."""

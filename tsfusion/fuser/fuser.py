@@ -109,7 +109,7 @@ class Fuser:
         self._answers: QuestionAnswers | None = None
         if inbox is not None:
             self._answers = QuestionAnswers(
-                self._volume, inbox, state=self._state, aside=self._current.aside, send=self._send
+                self._volume, inbox, state=self._state, at_work=self._current, send=self._send
             )
             self._volume.set_pause(self._answers.give_between)
         self._departures = Departures(begin, self._map.poses, self._map.done, send=self._send)

@@ -8,7 +8,6 @@ two keyframes. While keyframes wait, questions get a share of the time and no mo
 
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, TsfusionError
 from tsfusion.core.token_bucket import Bucket
+from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.inbox import Inbox
 from tsfusion.fuser.kept_slices import KeptSlices
 from tsfusion.fuser.messages import FuserAnswer, FuserQuestion
@@ -38,7 +38,7 @@ class QuestionAnswers:
 
     Args:
         state: of the map, now.
-        aside: entered while a question is answered in the middle of other work.
+        at_work: says whether a keyframe is under way, and hears that a question is no part of it.
         send: takes a message and its frames.
     """
 
@@ -48,11 +48,11 @@ class QuestionAnswers:
         inbox: Inbox,
         *,
         state: Callable[[], MapState],
-        aside: Callable[[], AbstractContextManager[None]] = nullcontext,
+        at_work: CurrentKeyframe,
         send: Callable[[Any, list[Any]], None],
     ) -> None:
         self._volume, self._inbox, self._state, self._send = volume, inbox, state, send
-        self._aside = aside
+        self._at_work = at_work
         self.slices = KeptSlices(volume)
         self._share = Bucket(_SHARE, time.monotonic(), burst=_BURST_S)
         self._is_answering = False
@@ -67,12 +67,13 @@ class QuestionAnswers:
             self._inbox.read()
             while self._inbox.questions and self._may():
                 began = time.monotonic()
+                self._share.wait(0.0, began)  # it is full again after a rest
                 question, frames = self._inbox.questions.popleft()
-                with self._aside():
+                with self._at_work.aside():
                     self._answer(question, [frame.buffer for frame in frames])
-                if self._inbox.orders:
-                    self._share.spend(time.monotonic() - began)
                 self._inbox.read()
+                if self._keyframes_wait:
+                    self._share.spend(time.monotonic() - began)
         finally:
             self._is_answering = False
             self._next_look = time.monotonic() + _LOOK_S
@@ -82,9 +83,14 @@ class QuestionAnswers:
         if time.monotonic() >= self._next_look:
             self.give()
 
+    @property
+    def _keyframes_wait(self) -> bool:
+        """Whether one is under way, or something is ordered."""
+        return bool(self._inbox.orders) or self._at_work.is_set
+
     def _may(self) -> bool:
         """Whether the time of a question has come: keyframes that wait have had theirs."""
-        return not self._inbox.orders or not self._share.wait(1e-6, time.monotonic())
+        return not self._keyframes_wait or not self._share.wait(1e-6, time.monotonic())
 
     def _answer(self, asked: FuserQuestion, frames: list[memoryview]) -> None:
         began_ns = time.monotonic_ns()
