@@ -21,6 +21,7 @@ from tsfusion.cli.health_poll import ServerSnapshot as Seen
 from tsfusion.cli.status_view import MAX_CLIENTS, render
 from tsfusion.core.errors import TransportError
 from tsfusion.wire.health import Health
+from tsfusion.wire.keyframe_times import Spread
 from tsfusion.wire.messages import Command, Reply
 
 NOBODY = "tcp://127.0.0.1:9"
@@ -86,6 +87,13 @@ def test_a_screen_shows_it_all() -> None:
 def test_a_screen_says_what_corrections_have_to_move() -> None:
     text = screen(health(maps={"default": map_health(corrections_waiting=31, corrections_unavailable=2)}))
     assert "31 keyframes still to be moved to corrected poses, 2 corrected keyframes that cannot be" in text
+
+
+def test_a_screen_says_how_questions_are_answered() -> None:
+    took = Spread(count=7, p50=1.25, p95=8.0, max=21.0)
+    asked = map_health(rejected={}, quarantined=0, questions={"answered": 7, "late": 1}, question_ms=took)
+    text = screen(health(maps={"default": asked}))
+    assert "questions 7 × answered, 1 × late, answered in 1.2 ms (p95 8.0, at most 21.0)" in text
 
 
 def test_a_server_that_is_well_says_little() -> None:

@@ -77,7 +77,9 @@ def test_a_snapshot_becomes_figures() -> None:
         client("drone", waiting=7, state="gone"),
         refused={"header": 4}, duplicates=9, problems=("disk full",), ready=False,
         maps={
-            "yard": map_health(state="busy", waiting=2, fuser_restarts=1, corrections=4),
+            "yard": map_health(
+                state="busy", waiting=2, fuser_restarts=1, corrections=4, questions={"answered": 7, "late": 1}
+            ),
             "shed": map_health(last_keyframe_s=None),
         },
     )  # fmt: skip
@@ -94,6 +96,7 @@ def test_a_snapshot_becomes_figures() -> None:
         ("tsfusion_journal_bytes", "yard"): 3 * MIB, ("tsfusion_map_bytes", "yard"): 10 * MIB,
         ("tsfusion_map_blocks", "yard"): 1234, ("tsfusion_corrections_total", "yard"): 4,
         ("tsfusion_fuser_restarts_total", "yard"): 1,
+        ("tsfusion_questions_total", "yard", "answered"): 7, ("tsfusion_questions_total", "yard", "late"): 1,
         ("tsfusion_last_keyframe_age_seconds", "yard"): 5, ("tsfusion_delay_bound_seconds", "yard"): 0.0005,
         ("tsfusion_map_state", "yard", "busy"): 1, ("tsfusion_map_state", "yard", "idle"): 0,
         ("tsfusion_client_sessions", "cart"): 2, ("tsfusion_client_connected_sessions", "drone"): 1,

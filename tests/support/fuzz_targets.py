@@ -6,6 +6,7 @@ A case that is wrong in another way raises `Broken`.
 
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import fuzz_mutate
@@ -20,7 +21,7 @@ from tsfusion.core.errors import CheckpointError, DecodeError, InvalidKeyframe, 
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.geometry import se3
 from tsfusion.tsdf import checkpoint
-from tsfusion.wire import codec, corrections, keyframe_times, messages
+from tsfusion.wire import codec, corrections, keyframe_times, messages, questions
 from tsfusion.wire.codec import measurement
 from tsfusion.wire.health import ClientHealth, Health, MapHealth, MeshLayout
 from tsfusion.wire.record_header import CorrectionHeader, Refused, stamp, unpack
@@ -113,6 +114,8 @@ def run_message(content: bytes) -> str:
 
 # --- control messages ---
 
+_POINT = memoryview(np.zeros(3, "<f4")).cast("B")  # that comes with a question
+
 
 def _control_seeds() -> list[bytes]:
     session = bytes(range(16))
@@ -133,6 +136,10 @@ def _control_seeds() -> list[bytes]:
         messages.Hello(session, 1, "room"),
         messages.Ping(session, 1, -5, 7, 3, {"thin": 2}),
         messages.Command(name="mesh", min_weight=0.5),
+        *(
+            messages.Command(name="ask", question=one, number=7, timeout_s=0.5, compress=True)
+            for one in _questions()
+        ),
         messages.Welcome("e", 1, 2, 1, 8, 1 << 24, 1 << 25),
         messages.Ack(session, 2, 1, (keyframe_times.Stamps(2, 3, 4), keyframe_times.Stamps(1)), True),
         messages.Nack(session, 3, "door", "size", "too large"),
@@ -141,12 +148,32 @@ def _control_seeds() -> list[bytes]:
         messages.Pong("e", 1, 2, 3, 4, 5),
         messages.Reply(name="health", health=health),
         messages.Reply(name="mesh", mesh=layout),
+        messages.Reply(
+            name="ask",
+            number=7,
+            answer=questions.Answer(
+                arrays=(questions.ArrayLayout("distance", "float32", (3,), True),),
+                crc=5,
+                waited_s=0.1,
+                state=questions.MapState(keyframes=3, changes=4, epoch="e", segment=1, offset=9),
+            ),
+        ),
     ]
     return [messages.encode(one) for one in said]
 
 
+def _questions() -> list[questions.Question]:
+    pose = tuple(np.eye(4).ravel().tolist())
+    return [
+        questions.Sample(points=1, crc=questions.crc_of([_POINT]), min_weight=0.5, surface="raw"),
+        questions.Raycast(intrinsics=(1.0, 1.0, 0.0, 0.0), pose=pose, shape=(2, 3)),
+        questions.Slice(kind="distance", low=0.0, high=1.0, up=(0.0, 0.0, 1.0), box=(0.0, 0.0, 1.0, 1.0)),
+        questions.Field(box=(0.0, 0.0, 0.0, 1.0, 1.0, 1.0), max_distance=0.5),
+    ]
+
+
 def run_control(content: bytes) -> str:
-    """Both ends' decoders; what they accept can be said again."""
+    """Both ends' decoders; what they accept can be said again. Questions are checked as a gateway does."""
     outcomes = []
     for decode in (messages.decode_to_server, messages.decode_to_client):
         try:
@@ -155,6 +182,11 @@ def run_control(content: bytes) -> str:
             outcomes.append(str(error)[:80])
             continue
         outcomes.append(type(message).__name__)
+        if isinstance(message, messages.Command) and message.question is not None:
+            outcomes.append(message.question.problem([_POINT])[:80])
+        if isinstance(message, messages.Reply) and message.answer is not None:
+            with suppress(DecodeError):
+                questions.unpack(message.answer, [_POINT])
         if type(decode(messages.encode(message))) is not type(message):
             raise Broken(f"{message!r} is not what it says")
     return " | ".join(outcomes)

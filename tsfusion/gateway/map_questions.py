@@ -116,7 +116,7 @@ class MapQuestions:
             return f"a client may ask {self._rate:g} questions a second (quota_questions)"
         of_map = [one for one in self._waiting.values() if one.command.map == command.map]
         own = sum(one.owner == waiting.owner for one in self._waiting.values())
-        if own + self._unread.count(waiting.owner) >= MOST_OF_A_CLIENT:
+        if own + self._unread.count(waiting.owner + b"\0") >= MOST_OF_A_CLIENT:
             return f"{MOST_OF_A_CLIENT} questions of this client are under way"
         if len(of_map) >= MOST_WAITING:
             return "too many questions at once"
@@ -153,7 +153,7 @@ class MapQuestions:
         waiting.counts.add("answered", seconds)
         self._metrics.observe_question(waiting.command.map, seconds)
         reply = messages.Reply(name="ask", number=waiting.command.number, answer=answer.answer)
-        reader = waiting.owner + answer.number.to_bytes(8, "big")
+        reader = waiting.owner + b"\0" + answer.number.to_bytes(8, "big")
         self._ports.reply(waiting.identity, reply, self._unread.wrap(reader, frames) if frames else ())
 
     def step(self) -> None:

@@ -278,6 +278,10 @@ class Volume(ReadableMap):
         for surface in {"raw", self.model.surface}:
             throwaway.sample(np.zeros((1, 3), np.float32), surface=surface, min_weight=0)
         throwaway.raycast((1, 1, 0, 0), np.eye(4), (1, 1), surface="raw")
+        edge = self.config.voxel_size
+        throwaway.distance_field([0.0, 0, 0, edge, edge, edge], max_distance=edge)
+        current = throwaway.current_slice(0.0, edge, up="z", box=(0.0, 0, edge, edge), max_distance=edge)
+        current.update(np.zeros((1, 3), np.int32))
 
     def save(self, path: str | os.PathLike[str], meta: dict[str, Any] | None = None) -> Path:
         """Write a checkpoint: complete and on disk, or not at all.

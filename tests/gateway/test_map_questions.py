@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: MIT
+"""Questions at the gateway: how many may be under way, and that none stays without a reply."""
+
+import time
+from collections import Counter
+from typing import Any, cast
+
+import pytest
+import zmq
+
+from tsfusion.fuser.messages import FuserAnswer, FuserQuestion
+from tsfusion.gateway import map_questions
+from tsfusion.gateway.map_questions import MOST_OF_A_CLIENT, MOST_WAITING, MapQuestions
+from tsfusion.gateway.memory_guard import PendingReplies
+from tsfusion.gateway.metrics import Metrics
+from tsfusion.gateway.question_counts import QuestionCounts
+from tsfusion.wire import messages
+from tsfusion.wire.messages import Command
+from tsfusion.wire.questions import Answer, MapState, Raycast
+
+LOOK = Raycast(intrinsics=(1, 1, 0, 0), pose=(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1), shape=(1, 1))
+
+
+class Desk:
+    """Questions about a map whose fuser is this object, and the replies to them."""
+
+    ready, failed = True, ""
+
+    def __init__(self, most_bytes: int = 1 << 30, rate: float = 1e6) -> None:
+        self.fuser = self
+        self.questions = QuestionCounts()
+        self.passed_on: list[FuserQuestion] = []
+        self.replies: list[messages.Reply] = []
+        self.frames: list[Any] = []
+        self.refused: Counter[str] = Counter()
+        self.unread = PendingReplies()
+        self.asked = MapQuestions(
+            cast("Any", self), Metrics(), self.refused, unread=self.unread, max_bytes=most_bytes, rate=rate
+        )
+
+    def send(self, message: FuserQuestion, frames: Any = ()) -> bool:
+        self.passed_on.append(message)
+        return True
+
+    def reply(self, identity: bytes, message: messages.Reply, frames: Any = ()) -> None:
+        self.replies.append(message)
+        self.frames += frames  # which nobody reads
+
+    def ask(self, identity: bytes, client: str = "", **fields: Any) -> bool:
+        """Whether the question was passed on."""
+        before = len(self.passed_on)
+        command = Command(name="ask", question=LOOK, **{"number": 3, **fields})
+        self.asked.ask(identity, command, [], cast("Any", self), client)
+        return len(self.passed_on) > before
+
+    def answer(self, nbytes: int = 0) -> None:
+        """The one that was passed on last."""
+        answer = Answer(arrays=(), state=MapState(keyframes=1), crc=0)
+        frames = [zmq.Frame(bytes(nbytes))] if nbytes else []
+        self.asked.on_answer(FuserAnswer(self.passed_on[-1].number, answer), frames)
+
+    @property
+    def error(self) -> str:
+        return self.replies[-1].error or ""
+
+
+def test_a_client_has_a_few_under_way_over_all_its_connections() -> None:
+    desk = Desk()
+    assert all(desk.ask(b"%d" % i, "robot") for i in range(MOST_OF_A_CLIENT))
+    assert not desk.ask(b"other", "robot")
+    assert (desk.error, desk.replies[-1].retry) == (
+        "4 questions of this client are under way; ask again",
+        True,
+    )
+    assert desk.ask(b"other", "robot2")
+    desk.passed_on.pop()
+    desk.answer()
+    assert desk.ask(b"other", "robot")
+    assert desk.refused == {"question": 1}
+    assert desk.questions.by_outcome == {"refused": 1, "answered": 1}
+    assert desk.questions.delay_ms.count == 1
+
+
+def test_all_clients_together_fill_no_fuser() -> None:
+    desk = Desk()
+    assert sum(desk.ask(b"%d" % (i // 2)) for i in range(2 * MOST_WAITING)) == MOST_WAITING
+    assert desk.error == "too many questions at once; ask again"
+
+
+def test_answers_that_nobody_reads_fill_no_memory() -> None:
+    """Neither those of one client, nor those of many."""
+    desk = Desk(most_bytes=1000)
+    for _ in range(MOST_OF_A_CLIENT):
+        assert desk.ask(b"slow")
+        desk.answer(200)
+    assert not desk.ask(b"slow")
+    assert "of this client" in desk.error
+    assert desk.ask(b"another")
+    desk.answer(300)
+    assert not desk.ask(b"third")
+    assert "fill the memory" in desk.error
+
+
+def test_a_question_ends_with_its_time_or_with_the_fuser(monkeypatch: pytest.MonkeyPatch) -> None:
+    desk = Desk()
+    now = time.monotonic_ns()
+    monkeypatch.setattr(map_questions.time, "monotonic_ns", lambda: now)
+    assert desk.ask(b"1", timeout_s=0.5)
+    assert desk.ask(b"1", timeout_s=5.0)
+    now += 10**9
+    desk.asked.step()
+    assert [(one.late, one.number) for one in desk.replies] == [(True, 3)]
+    desk.passed_on.pop()
+    desk.answer()  # too late
+    assert len(desk.replies) == 1
+    desk.asked.give_up("default")
+    assert desk.error == "the fuser restarts; ask again"
+    desk.ready = False
+    assert not desk.ask(b"1")
+    assert desk.replies[-1].retry
+    assert desk.questions.by_outcome == {"late": 1, "failed": 1, "refused": 1}
+
+
+def test_the_rate_is_each_clients_own() -> None:
+    desk = Desk(rate=1e-3)
+    assert desk.ask(b"1", "robot")
+    assert not desk.ask(b"2", "robot")
+    assert "0.001 questions a second" in desk.error
+    assert desk.ask(b"3", "cart")
