@@ -15,8 +15,9 @@ from tsfusion.kernels.voxel_traversal import RUN, vec3i
 from tsfusion.kernels.voxel_values import BANDS
 
 UNSEEN = 1  # voxels to solve
-FIXED = 2  # seen voxels beside them
-HELD = 1e6  # weight of a value that stays as it is, in units of the smoothness
+BESIDE = 2  # seen voxels beside them
+RING = 4  # seen voxels that count, before or behind an unseen one
+SEEN_WEIGHT = 0.2  # of a seen value against the smoothness: noise at the rim does not lead the way
 EARLY = 1 << 20  # layer of a voxel that has no value yet
 
 vec3f = ti.types.vector(3, ti.f32)
@@ -146,7 +147,7 @@ def number_marked(
     number: ti.types.ndarray(dtype=ti.i32, ndim=2),
     counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
-    """Number the voxels to solve and the seen ones up to two before or behind them along an axis."""
+    """Number the voxels to solve and the seen ones up to `RING` before or behind them along an axis."""
     for run in range(values.shape[0] * RUN):  # run loop: kernels/__init__.py
         if run % RUN == 0:
             b = run // RUN
@@ -154,14 +155,14 @@ def number_marked(
             for o in range(CUBE):
                 taken = ti.cast(marks[b, o], ti.i32)
                 if taken == 0 and values[b, o] == values[b, o]:
-                    for k in range(12):
+                    for k in range(6 * RING):
                         q = voxel_of(o)
-                        q[k // 4] += (k % 4 - 2) + ti.cast(k % 4 >= 2, ti.i32)
+                        q[k // (2 * RING)] += k % RING + 1 if k // RING % 2 == 0 else -(k % RING + 1)
                         row = around[b, ((q[0] >> 3) + 1) * 9 + ((q[1] >> 3) + 1) * 3 + (q[2] >> 3) + 1]
                         if row >= 0:
                             i = ((q[0] & 7) << 6) | ((q[1] & 7) << 3) | (q[2] & 7)
                             if marks[row, i] == UNSEEN:
-                                taken = FIXED
+                                taken = BESIDE
                 number[b, o] = ti.select(taken > 0, n, -1)
                 n += ti.cast(taken > 0, ti.i32)
             counts[b] = n
@@ -192,7 +193,7 @@ def list_marked(
                     value = ti.select(seen, values[b, o], 0.0)
                     y[i] = value
                     x[i] = value
-                    weight[i] = ti.select(seen, ti.f32(HELD), 0.0)
+                    weight[i] = ti.select(seen, ti.f32(SEEN_WEIGHT), 0.0)
                     layer[i] = ti.select(seen, 0, EARLY)
                     for side in ti.static(range(6)):
                         links[i, side] = neighbour(

@@ -2,8 +2,8 @@
 """Holes closed by the field: a guess of the surface where nothing was seen, and which triangles are guessed.
 
 1. A rim is where a surface breaks off: a seen voxel that it passes, beside an unseen one.
-2. The unseen voxels within half a hole of a rim get values: paper eq. 3 with seen voxels held and no weight
-   elsewhere, so that second differences are least; a plane or a ramp goes on as it is.
+2. The unseen voxels within half a hole of a rim get values: paper eq. 3 with seen voxels as data and no
+   weight elsewhere, so that second differences are least; a ramp goes on as it is. Seen voxels keep theirs.
 3. Marching cubes meshes seen and guessed voxels together. A triangle is guessed if its cell has a voxel that
    nobody saw; all others are those of the mesh without guesses.
 4. A guessed patch stays if it closes (`geometry/guessed_patches.py`).
@@ -154,7 +154,7 @@ def _list(
 
 
 def _relax(level: field_regularizer.Level, voxels: int) -> None:
-    """Least second differences between the held values: as many steps as a hole of this width needs."""
+    """Least second differences between the seen values: as many steps as a hole of this width needs."""
     total = len(level.x)
     omega, bent = np.zeros((total, 3), np.float32), np.zeros((total, 3), np.float32)
     inverse, step = np.zeros(total, np.float32), np.zeros(total, np.float32)
