@@ -103,7 +103,8 @@ def off(
     """Distance of points from a surface: from the plane of the nearest of its points, if that is near."""
     distance, nearest = cKDTree(of[0]).query(points)
     plane = np.abs(((points - of[0][nearest]) * of[1][nearest]).sum(axis=1))
-    return np.where(distance < 3 * SPACING, plane, distance)
+    found: NDArray[np.float64] = np.where(distance < 3 * SPACING, plane, distance)
+    return found
 
 
 def thinned(mesh: Mesh, targets: list[dict[str, float]]) -> Iterator[dict[str, Any]]:

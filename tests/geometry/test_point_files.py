@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tsfusion import Mesh, MissingDependency
 from tsfusion.core.errors import OutputError
 from tsfusion.geometry import point_files
+from tsfusion.geometry.map_answers import PointCloud
 from tsfusion.geometry.provenance import Provenance
 
 
@@ -91,6 +92,15 @@ def test_las_holds_the_bytes_of_the_standard(mesh: Mesh, tmp_path: Path) -> None
     box = [mesh.vertices.max(axis=0), mesh.vertices.min(axis=0)]
     assert pytest.approx(np.array(box), abs=1e-4) == np.reshape(numbers[6:], (3, 2)).T
     assert (np.ascontiguousarray(rows[:, 30:36]).view("<u2") == mesh.colors.astype(int) * 257).all()
+
+
+def test_the_cloud_of_a_map_is_saved_with_what_it_has(mesh: Mesh, tmp_path: Path) -> None:
+    weights = np.ones(len(mesh.vertices), np.float32)
+    cloud = PointCloud(mesh.vertices, mesh.normals, weights, mesh.colors)
+    read = meshio.read(cloud.save(tmp_path / "m.ply"))
+    assert (read.points == mesh.vertices).all()
+    assert (columns(read.point_data, "nx ny nz") == mesh.normals).all()
+    assert b"comment unit metre\n" in (tmp_path / "m.ply").read_bytes()
 
 
 def test_points_alone_are_enough(mesh: Mesh, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from tsfusion.geometry.mesh_simplification import border_edges
 from tsfusion.tsdf import hole_filling
 from tsfusion.tsdf.block_store import pack_keys
 from tsfusion.tsdf.hole_filling import extract_filled
-from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
+from tsfusion.tsdf.mesh_extraction import extract
 from tsfusion.tsdf.surface_values import values_of
 
 SIDE = 64  # voxels
@@ -34,7 +34,7 @@ def meshes(distance: NDArray[np.float64], seen: NDArray[np.bool_], voxels: int) 
     used = rows.any(axis=1)
     store = store_of(pack_keys(blocks[used]), np.ascontiguousarray(rows[used]))
     plain = extract(np.sort(store.keys), store, 1.0)
-    return plain, extract_filled(store, 1.0, values_of, voxels, MeshBuffers())
+    return plain, extract_filled(store, 1.0, values_of, voxels)
 
 
 def points() -> NDArray[np.float64]:

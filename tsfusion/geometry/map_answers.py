@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: MIT
 """What a map answers: samples of its distance field, and what a camera would see of it."""
 
+import os
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import InvalidConfig, InvalidKeyframe, MissingDependency
+from tsfusion.geometry import point_files
 from tsfusion.geometry.keyframe import MAX_IMAGE_SIDE, Intrinsics, check_intrinsics, check_pose, intrinsics_of
+from tsfusion.geometry.provenance import generator
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +61,16 @@ class PointCloud:
     normals: NDArray[np.float32]
     weights: NDArray[np.float32]
     colors: NDArray[np.uint8] | None = None
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the points with normals and colours as PLY, PCD, LAS or LAZ by the file's suffix.
+
+        Raises:
+            OutputError: for another suffix, no points, or a path that cannot be written.
+            MissingDependency: for LAS and LAZ without laspy.
+        """
+        facts = {"generator": generator(), "unit": "metre"}
+        return point_files.save(path, self.points, normals=self.normals, colors=self.colors, facts=facts)
 
     def to_open3d(self) -> Any:
         """Make an `open3d.t.geometry.PointCloud` with `normals`, `weights` and `colors` (float32, 0 to 1).

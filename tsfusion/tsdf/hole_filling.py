@@ -41,11 +41,9 @@ def checked(voxels: int) -> int:
     return voxels
 
 
-def extract_filled(
-    store: BlockStore, min_weight: float, view: SurfaceView, voxels: int, buffers: MeshBuffers
-) -> Mesh:
+def extract_filled(store: BlockStore, min_weight: float, view: SurfaceView, voxels: int) -> Mesh:
     """The mesh of the whole map with its holes up to so many voxels closed; `guessed` says where."""
-    own = np.sort(store.keys)
+    own, buffers = np.sort(store.keys), MeshBuffers()
     seen = view(own, store, min_weight)
     more, filled = _fill(own, seen, voxels)
     union = np.union1d(own, more)
@@ -64,19 +62,16 @@ def extract_filled(
             out[at] = np.where(np.isnan(filled), out[at], filled)
         return out[: len(keys)]
 
-    try:
-        plain, _ = extract_rows(own, store, min_weight, buffers, both, keys=own)
-        mesh, _ = extract_rows(union, store, min_weight, buffers, both, keys=union)
-        unseen = np.zeros((len(union) + 1, 8), np.uint64)
-        bits = np.packbits(~np.isnan(filled), axis=1, bitorder="little")
-        unseen[np.searchsorted(union, more)] = bits.view("<u8")
-        guessed = np.zeros(len(mesh.faces), np.uint8)
-        kernels.mark_guessed_faces(
-            len(union), buffers.around.array, unseen, buffers.inside.array, buffers.active.array,
-            buffers.first.array, marching_tables.TRIANGLE_COUNT, guessed,
-        )  # fmt: skip
-    finally:
-        buffers.release()
+    plain, _ = extract_rows(own, store, min_weight, buffers, both, keys=own)
+    mesh, _ = extract_rows(union, store, min_weight, buffers, both, keys=union)
+    unseen = np.zeros((len(union) + 1, 8), np.uint64)
+    bits = np.packbits(~np.isnan(filled), axis=1, bitorder="little")
+    unseen[np.searchsorted(union, more)] = bits.view("<u8")
+    guessed = np.zeros(len(mesh.faces), np.uint8)
+    kernels.mark_guessed_faces(
+        len(union), buffers.around.array, unseen, buffers.inside.array, buffers.active.array,
+        buffers.first.array, marching_tables.TRIANGLE_COUNT, guessed,
+    )  # fmt: skip
     seen_vertices = np.unique(mesh.faces[guessed == 0])
     mesh.normals[seen_vertices] = plain.normals  # not bent by what was guessed beside them
     guess = replace(mesh, guessed=guessed.astype(bool))

@@ -100,8 +100,7 @@ class ReadableMap:
             if blocks is not None:
                 raise InvalidConfig("holes are filled in the mesh of a whole map, not of some blocks")
             voxels = hole_filling.checked(fill_holes)
-            view = self._view(surface)
-            filled = hole_filling.extract_filled(store, min_weight, view, voxels, self._mesh_buffers)
+            filled = hole_filling.extract_filled(store, min_weight, self._view(surface), voxels)
             return replace(filled, held=self.held)
         if blocks is None and store.is_in_files and store.count:
             whole = joined(list(tiles(store, min_weight, self._view(surface))))
