@@ -50,7 +50,7 @@ def test_a_file_says_where_its_mesh_comes_from(here: Here, saved: Path, tmp_path
     volume = Volume.load(saved, threads=2)
     figures(here, saved, tmp_path / "m.ply")
     head = (tmp_path / "m.ply").read_bytes().partition(b"end_header")[0].decode()
-    for line in (f"source {saved}", f"keyframes {volume.keyframes}", f"map_hash {volume.map_hash()}"):
+    for line in ("source map.tsf", f"keyframes {volume.keyframes}", f"map_hash {volume.map_hash()}"):
         assert f"comment {line}\n" in head
 
 

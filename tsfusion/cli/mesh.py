@@ -199,7 +199,7 @@ def _of_server(
 
     name = map_name or DEFAULT_MAP
     made = fetch_mesh(address, control=control, map_name=name, min_weight=min_weight, keys=keys)
-    return replace(made, provenance=Provenance(source=f"{address}, map {name}"))
+    return replace(made, provenance=Provenance(source=f"live map {name}"))
 
 
 def _extracted(volume: "Volume", source: str, fill_holes: int | None, json: bool) -> "Mesh":

@@ -11,7 +11,7 @@ class Provenance:
     """Where a surface comes from; None = it is not known.
 
     Attributes:
-        source: file, folder or address of the map.
+        source: name of the map, or of its file or folder: not where that lies, as files are sent around.
         keyframes: number that the map was made from.
         map_hash: `map_hash()` of the map.
         world: coordinate frames of its scans; empty = poses were given from elsewhere.

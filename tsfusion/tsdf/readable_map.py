@@ -139,11 +139,11 @@ class ReadableMap:
         """What a file of its surface says about the map; its hash is taken anew.
 
         Args:
-            source: file or folder that the map came from.
+            source: file or folder that the map came from; its name is told, not where it lies.
         """
         worlds = {one.world for one in map_history.of_clients(map_history.sessions(self.meta)) if one.world}
         return Provenance(
-            source=source,
+            source=None if source is None else Path(source).resolve().name,
             keyframes=self.keyframes,
             map_hash=self.map_hash(),
             world=" ".join(sorted(worlds)),
