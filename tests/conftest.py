@@ -20,7 +20,7 @@ from tsfusion.core import logs
 from tsfusion.core.errors import MissingDependency
 
 os.environ["PYTHONPATH"] = os.pathsep.join(sys.path)  # programs that tests start find what tests find
-OPTIONAL = ("kiss_icp", "open3d", "pooch", "pyrealsense2", "rosbags", "scipy")
+OPTIONAL = ("kiss_icp", "open3d", "pooch", "pyrealsense2", "rosbags", "scipy", "xatlas")
 STDERR = pytest.StashKey[Any]()
 DATA = Path(os.environ.get("TSFUSION_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

@@ -35,12 +35,12 @@ def _ply(mesh: "Mesh") -> bytes:
         shape.face_attributes["guessed"] = mesh.guessed.astype(np.uint8)
     content = bytes(shape.export(file_type="ply", vertex_normal=True))
     head, before, rest = content.partition(_PLY_FORMAT)
-    return b"".join((head, before, _lines(mesh, b"comment "), rest))
+    return b"".join((head, before, comments(mesh, b"comment "), rest))
 
 
 def _obj(mesh: "Mesh") -> bytes:
     shape = mesh.to_trimesh() if mesh.guessed is None else _scene(mesh)
-    return _lines(mesh, b"# ") + str(shape.export(file_type="obj", include_normals=True)).encode()
+    return comments(mesh, b"# ") + str(shape.export(file_type="obj", include_normals=True)).encode()
 
 
 def _stl(mesh: "Mesh") -> bytes:
@@ -117,7 +117,7 @@ def facts_of(mesh: "Mesh") -> dict[str, str]:
     return facts
 
 
-def _lines(mesh: "Mesh", comment: bytes) -> bytes:
+def comments(mesh: "Mesh", comment: bytes) -> bytes:
     """Comments with what the file says about itself."""
     lines = [f"{name} {value}".encode() for name, value in facts_of(mesh).items()]
     return b"".join(comment + line + b"\n" for line in lines)

@@ -36,7 +36,22 @@ def cast(
 def look_at(
     mesh: Mesh, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
 ) -> View:
-    """The view of a mesh, (H, W): depth, normals and colours of the first front side.
+    """The view of a mesh, (H, W): depth, normals and colours of the first front side."""
+    focal = intrinsics.fx
+    seen, vertices, faces = rasterised(mesh, intrinsics, T_world_camera, shape)
+    depth, normals = np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32)
+    colors = np.zeros((*shape, 3) if mesh.colors is not None else (1, 0, 3), np.uint8)
+    rasterizer.look_up(
+        seen, vertices, faces, mesh.normals, colors[0] if mesh.colors is None else mesh.colors, focal,
+        rasterizer.EMPTY, depth, normals, colors,
+    )  # fmt: skip
+    return View(depth, normals, None if mesh.colors is None else colors)
+
+
+def rasterised(
+    mesh: Mesh, intrinsics: Intrinsics, T_world_camera: NDArray[np.float64], shape: tuple[int, int]
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int32]]:
+    """What each pixel sees, as `rasterizer.rasterise` writes it, and the vertices and faces that it drew.
 
     The rasteriser knows one focal length and a centred image. A shear of space that keeps z makes any
     pinhole camera such a one.
@@ -50,13 +65,7 @@ def look_at(
     faces = np.ascontiguousarray(mesh.faces if K.fy > 0 else mesh.faces[:, ::-1], np.int32)
     seen = np.full(shape, rasterizer.EMPTY, np.int64)
     rasterizer.rasterise(seen, vertices, faces, focal, NEAR)
-    depth, normals = np.zeros(shape, np.float32), np.zeros((*shape, 3), np.float32)
-    colors = np.zeros((*shape, 3) if mesh.colors is not None else (1, 0, 3), np.uint8)
-    rasterizer.look_up(
-        seen, vertices, faces, mesh.normals, colors[0] if mesh.colors is None else mesh.colors, focal,
-        rasterizer.EMPTY, depth, normals, colors,
-    )  # fmt: skip
-    return View(depth, normals, None if mesh.colors is None else colors)
+    return seen, vertices, faces
 
 
 def _in_view(

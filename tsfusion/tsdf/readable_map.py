@@ -48,6 +48,7 @@ from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
 from tsfusion.tsdf.mesh_tiles import tiles
 from tsfusion.tsdf.surface_tiles import SurfaceTiles
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
+from tsfusion.tsdf.texture_images import Keyframes
 
 MOST_SURFACES = 2  # that answers are kept of
 
@@ -79,6 +80,7 @@ class ReadableMap:
         surface: Surface | None = None,
         *,
         fill_holes: int | None = None,
+        texture: Keyframes | None = None,
     ) -> Mesh:
         """The surface, by marching cubes over the whole map or over the cells of some blocks.
 
@@ -90,10 +92,18 @@ class ReadableMap:
             fill_holes: close holes and gaps up to so many voxels wide with a guess that continues the field
                 (`tsdf/hole_filling.py`); the mesh's `guessed` says which triangles these are. Of a whole map
                 only, and all of its field has to fit into memory.
+            texture: the map's keyframes at their poses, a list or anything that can be read again and again:
+                the mesh is a `TexturedMesh` with colours as sharp as their images (`texturing.textured`).
 
         Raises:
             InvalidConfig: for a value out of range, or `fill_holes` with `blocks`.
+            MapError, MissingDependency: as `texturing.textured`.
         """
+        if texture is not None:
+            from tsfusion.tsdf import texturing
+
+            plain = self.extract_mesh(min_weight, blocks, surface, fill_holes=fill_holes)
+            return texturing.textured(plain, texture, self.config.voxel_size)
         min_weight = self._checked_min_weight(min_weight)
         store = self._store
         if fill_holes is not None:

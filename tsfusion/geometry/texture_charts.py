@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: MIT
+"""Charts: pieces of a mesh that lie flat without folding, to be laid out on a texture.
+
+Every triangle is seen along the one of six directions that it faces most: the two ways along three right
+angles that most of the surface follows, as walls and floors do. Neighbours that are seen along the same
+direction are one chart. Tens of thousands of small triangles take a second, where a general unwrapper fits a
+plane to each piece for a minute, and leaves thousands of pieces.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.geometry import mesh_islands
+
+_DIRECTIONS = 600  # tried for the main one
+_TURNS = 90  # tried for the others, a degree each
+_NORMALS = 20_000  # at most, of which the directions are found
+_STEEPEST = 0.2  # cosine between a triangle and the direction that it is seen along, at least
+_NEVER = 9.0  # cost of a direction that is too steep
+_SMOOTHNESS = 0.35  # cost of a neighbour that is seen along another direction
+_SWEEPS = 30
+
+
+class Charts(NamedTuple):
+    """Pieces of a mesh of m faces.
+
+    Attributes:
+        number: (m,) int32, of each face's chart.
+        corners: (m, 3, 2) float64, metres: the faces as their charts see them.
+    """
+
+    number: NDArray[np.int32]
+    corners: NDArray[np.float64]
+
+
+def find(vertices: NDArray[np.float32], faces: NDArray[np.int32], normals: NDArray[np.float32]) -> Charts:
+    """The charts of a mesh, as few as smoothing makes them; the same mesh has the same ones."""
+    corners = vertices.astype(np.float64)[faces]
+    flat = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    smooth = _unit(normals.astype(np.float64)[faces].sum(axis=1))
+    axes = _main_axes(smooth)
+    pairs = _neighbours(faces, len(vertices))
+    seen_along = _labels(flat @ axes.T, smooth @ axes.T, pairs)
+    sideways = np.array([_plane(axis, axes[(2 * (i // 2) + 2) % 6]) for i, axis in enumerate(axes)])
+    return Charts(connected(seen_along, pairs), np.einsum("fkx,fax->fka", corners, sideways[seen_along]))
+
+
+def split(charts: Charts, faces: NDArray[np.int32], vertices: int, covered: NDArray[np.bool_]) -> Charts:
+    """The charts where some faces, which lie below others of their chart, are charts of their own."""
+    label = 2 * charts.number.astype(np.int64) + covered
+    return charts._replace(number=connected(label, _neighbours(faces, vertices)))
+
+
+def connected(label: NDArray[np.integer], pairs: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Number the pieces of neighbouring faces with equal labels: (m,) int32.
+
+    Args:
+        pairs: (k, 2) neighbours.
+    """
+    a, b = pairs[label[pairs[:, 0]] == label[pairs[:, 1]]].T
+    lowest = mesh_islands.pieces(np.stack([a, b, b], axis=1), len(label))
+    return np.unique(lowest, return_inverse=True)[1].astype(np.int32)
+
+
+def _neighbours(faces: NDArray[np.int32], vertices: int) -> NDArray[np.int32]:
+    """(k, 2) int32 faces that share an edge."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    key = edges[:, 0].astype(np.int64) * vertices + edges[:, 1]
+    order = np.argsort(key, kind="stable")
+    face = np.tile(np.arange(len(faces), dtype=np.int32), 3)[order]
+    same = np.diff(key[order]) == 0
+    return np.stack([face[:-1][same], face[1:][same]], axis=1)
+
+
+def _main_axes(normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(6, 3) unit vectors: the direction most normals follow, its opposite, and those across it."""
+    some = normals[:: max(1, len(normals) // _NORMALS)]
+    step = np.arange(_DIRECTIONS) + 0.5  # a spiral of even steps over the sphere
+    height, turn = 1 - 2 * step / _DIRECTIONS, np.pi * (1 + 5**0.5) * step
+    ring = np.sqrt(1 - height**2)
+    tried = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1)
+    main = tried[_followed(some, tried).argmax()]
+    for _ in range(5):
+        along = some @ main
+        near = np.abs(along) > 0.95
+        if near.any():
+            main = _unit((some[near] * np.sign(along[near])[:, None]).sum(axis=0))
+    across = _plane(main, np.eye(3)[np.abs(main).argmin()])
+    angles = np.radians(np.arange(_TURNS))
+    around = np.cos(angles)[:, None] * across[0] + np.sin(angles)[:, None] * across[1]
+    second = around[(_followed(some, around) + _followed(some, np.cross(main, around))).argmax()]
+    third = np.cross(main, second)
+    return np.stack([main, -main, second, -second, third, -third])
+
+
+def _followed(normals: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How much of the normals lies near each direction or its opposite."""
+    return np.asarray(np.maximum(np.abs(normals @ directions.T) - 0.9, 0).sum(axis=0))
+
+
+def _plane(axis: NDArray[np.float64], hint: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(2, 3): right and up of what is seen by one who looks against an axis."""
+    first = _unit(hint - axis * (axis @ hint))
+    return np.stack([first, np.cross(axis, first)])
+
+
+def _labels(
+    flat: NDArray[np.float64], smooth: NDArray[np.float64], pairs: NDArray[np.int32]
+) -> NDArray[np.intp]:
+    """The direction of each face: (m,), by the cosines (m, 6) with its plane and with its normals.
+
+    Iterated conditional modes (Besag 1986), half of the faces at a time.
+    """
+    cost = np.where(flat > _STEEPEST, 1 - smooth, _NEVER)
+    label = cost.argmin(axis=1)
+    turn = np.arange(len(label)) % 2
+    for sweep in range(_SWEEPS):
+        votes = np.zeros(len(label) * 6)
+        for own, other in ((0, 1), (1, 0)):
+            at = pairs[:, own].astype(np.int64) * 6 + label[pairs[:, other]]
+            votes += np.bincount(at, minlength=len(votes))
+        better = (cost - _SMOOTHNESS * votes.reshape(-1, 6)).argmin(axis=1)
+        changed = (better != label) & (turn == sweep % 2)
+        label[changed] = better[changed]
+    return np.asarray(label, np.intp)
+
+
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12))

@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: MIT
+"""Meshes with a texture, and their files."""
+
+import dataclasses
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core import durable_files, process
+from tsfusion.core.errors import OutputError
+from tsfusion.geometry import mesh_encoding
+from tsfusion.geometry.mesh import Mesh
+
+TEXTURED = (".glb", ".obj")
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """Pictures of a mesh's surface.
+
+    Attributes:
+        corners: (m, 3, 2) float32, where each face's corners lie on its page: from 0 to 1 to the right and
+            down (as glTF has it).
+        page: (m,) int32, of each face.
+        pages: (H, W, 3) uint8 RGB (sRGB).
+    """
+
+    corners: NDArray[np.float32]
+    page: NDArray[np.int32]
+    pages: list[NDArray[np.uint8]]
+
+    def of_faces(self, kept: NDArray[np.bool_]) -> "Texture":
+        """The texture of some faces, a (m,) bool, on the same pages."""
+        return dataclasses.replace(self, corners=self.corners[kept], page=self.page[kept])
+
+
+@dataclass(frozen=True, eq=False)
+class TexturedMesh(Mesh):
+    """A mesh whose surface shows what the cameras saw.
+
+    Attributes:
+        texture: its pictures. `colors` are theirs at the vertices: what a PLY file holds.
+        seen: share of the surface that an image shows; the rest has the map's colours.
+    """
+
+    texture: Texture = field(kw_only=True)
+    seen: float = field(default=1.0, kw_only=True)
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write as `Mesh.save` does, GLB and OBJ with the texture.
+
+        A GLB holds its pictures; beside an OBJ lie `NAME.mtl` and `NAME-0.png`. Other files have the colours
+        at the vertices.
+
+        Raises:
+            OutputError: as `Mesh.save`.
+        """
+        path = Path(path)
+        if path.suffix.lower() not in TEXTURED or not len(self.faces):
+            return super().save(path)
+        is_glb = path.suffix.lower() == ".glb"
+        contents = {path: self.encode(".glb")} if is_glb else self._as_obj(path)
+        try:
+            for place, content in contents.items():
+                with durable_files.replacing(place) as file:
+                    file.write(content)
+        except OSError as error:
+            raise OutputError(f"cannot write {path}: {error.strerror}") from error
+        return path
+
+    def encode(self, suffix: str) -> bytes:
+        """Encode as `Mesh.encode` does, a `.glb` with the texture."""
+        if suffix != ".glb":
+            return super().encode(suffix)
+        turn = np.eye(3) if self.up is None else self.up.to_y()
+        scene, describe = self._scene("page", turn), mesh_encoding.describing(self)
+        return bytes(scene.export(file_type="glb", include_normals=True, tree_postprocessor=describe))
+
+    def sample(self, face: NDArray[np.integer], weight: NDArray[np.floating]) -> NDArray[np.float32]:
+        """(n, 3) float32 RGB, 0 to 255, of the texture at points of the surface.
+
+        Args:
+            face: (n,) the face of each point; `weight`: (n, 3) its barycentric weights there.
+        """
+        found = np.empty((len(face), 3), np.float32)
+        at = (np.asarray(weight, np.float32)[..., None] * self.texture.corners[face]).sum(axis=1)
+        for number, page in enumerate(self.texture.pages):
+            rows = np.flatnonzero(self.texture.page[face] == number)
+            height, width = page.shape[:2]
+            u, v = at[rows, 0] * width - 0.5, at[rows, 1] * height - 0.5
+            i, j = np.floor(u).astype(np.intp), np.floor(v).astype(np.intp)
+            s, t = (u - i)[:, None], (v - j)[:, None]
+            left, right = np.clip(i, 0, width - 1), np.clip(i + 1, 0, width - 1)
+            high, low = np.clip(j, 0, height - 1), np.clip(j + 1, 0, height - 1)
+            found[rows] = (1 - t) * ((1 - s) * page[high, left] + s * page[high, right])
+            found[rows] += t * ((1 - s) * page[low, left] + s * page[low, right])
+        return found
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """As of a mesh, and of the texture: its pages, and the share of the surface that an image shows."""
+        texture = {
+            "pages": [list(page.shape[1::-1]) for page in self.texture.pages],
+            "seen": round(self.seen, 4),
+        }
+        return {**super().figures, "texture": texture}
+
+    def of_faces(self, kept: NDArray[np.bool_]) -> "TexturedMesh":
+        """As `Mesh.of_faces`."""
+        part = super().of_faces(kept)
+        return dataclasses.replace(self, **fields_of(part), texture=self.texture.of_faces(kept))
+
+    def page_mesh(self, page: int, *, turn: NDArray[np.float64] | None = None, name: str = "page") -> Any:
+        """The faces of a page as a `trimesh.Trimesh` with texture; vertices on a seam are doubled.
+
+        Args:
+            turn: (3, 3) rotation of the frame.
+            name: of its material, before the page's number.
+        """
+        with process.uninterrupted():  # trimesh ignores exceptions while it is imported
+            import trimesh
+            from PIL import Image
+
+        chosen = self.texture.page == page
+        faces, uv = self.faces[chosen].ravel(), self.texture.corners[chosen].reshape(-1, 2)
+        rows = np.empty(len(faces), [("vertex", np.int32), ("u", np.float32), ("v", np.float32)])
+        rows["vertex"], rows["u"], rows["v"] = faces, uv[:, 0], uv[:, 1]
+        found, place = np.unique(rows, return_inverse=True)
+        turn = np.eye(3) if turn is None else turn
+        material = trimesh.visual.material.PBRMaterial(
+            name=f"{name}-{page}",
+            baseColorTexture=Image.fromarray(self.texture.pages[page]),
+            metallicFactor=0.0,
+            roughnessFactor=1.0,
+        )
+        return trimesh.Trimesh(
+            (self.vertices[found["vertex"]] @ turn.T).astype(np.float32),
+            place.reshape(-1, 3),
+            vertex_normals=(self.normals[found["vertex"]] @ turn.T).astype(np.float32),
+            visual=trimesh.visual.TextureVisuals(
+                uv=np.stack([found["u"], 1 - found["v"]], axis=1), material=material
+            ),
+            process=False,
+        )
+
+    def _scene(self, name: str, turn: NDArray[np.float64] | None = None) -> Any:
+        import trimesh
+
+        pages = map(int, np.unique(self.texture.page))
+        return trimesh.Scene({f"{name}-{page}": self.page_mesh(page, turn=turn, name=name) for page in pages})
+
+    def _as_obj(self, path: Path) -> dict[Path, bytes]:
+        """Contents of the files of an OBJ, the OBJ itself last."""
+        from trimesh.exchange.obj import export_obj
+
+        library = path.with_suffix(".mtl").name
+        scene = self._scene(path.stem)
+        text, others = export_obj(scene, include_normals=True, return_texture=True, mtl_name=library)
+        return {
+            **{path.with_name(name): found for name, found in others.items()},
+            path: mesh_encoding.comments(self, b"# ") + text.encode(),
+        }
+
+
+def barycentric(
+    ray: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(n, 3) weights of corners (n, 3) where rays from the origin meet their triangles' planes.
+
+    They are kept inside the triangles (Möller and Trumbore 1997).
+    """
+    across = (np.cross(b, c), np.cross(c, a), np.cross(a, b))
+    weight = np.stack([(ray * normal).sum(axis=1) for normal in across], axis=1)
+    total = weight.sum(axis=1, keepdims=True)
+    weight = np.divide(weight, total, out=np.full_like(weight, 1 / 3), where=total != 0)
+    return np.asarray(weight.clip(0, 1))
+
+
+def fields_of(mesh: Mesh) -> dict[str, Any]:
+    """The fields of a mesh without texture."""
+    return {one.name: getattr(mesh, one.name) for one in dataclasses.fields(Mesh)}
