@@ -12,6 +12,7 @@ import trimesh
 
 from tsfusion.core.errors import OutputError
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.textured_mesh import Texture, TexturedMesh
 from tsfusion.geometry.up_direction import Up, parse
 from tsfusion.pipelines import mesh_preview
 from tsfusion.pipelines.mesh_preview import PreviewCamera, choose_camera, draw
@@ -164,3 +165,24 @@ def test_pixels_equal_the_twin_on_a_heap_of_triangles() -> None:
     assert (seen >= 0).mean() > 0.3
     different = np.abs(image[..., 3] - depth) > 1e-3 * np.maximum(depth, 1)
     assert different.mean() < 0.005  # pixels that an edge runs through
+
+
+def test_a_texture_is_drawn_instead_of_the_colours_at_the_vertices() -> None:
+    vertices = np.array([(-1, -1, 2), (1, -1, 2), (1, 1, 2), (-1, 1, 2)], np.float32)
+    page = np.zeros((2, 2, 3), np.uint8)
+    page[:, 0], page[:, 1] = (255, 0, 0), (0, 0, 255)
+    uv = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
+    faces = np.array([(0, 2, 1), (0, 3, 2)], np.int32)
+    mesh = TexturedMesh(
+        vertices,
+        faces,
+        np.tile(np.array((0, 0, -1), np.float32), (4, 1)),
+        np.full((4, 3), (90, 120, 150), np.uint8) + np.arange(12, dtype=np.uint8).reshape(4, 3),
+        texture=Texture(uv[faces], np.zeros(2, np.int32), [page]),
+    )
+    camera = PreviewCamera(np.eye(4))
+    left, right = draw(mesh, camera, 64, 48, texture=True)[24, [20, 43], :3]
+    assert left[0] > 0.3 > 10 * left[2]
+    assert right[2] > 0.3 > 10 * right[0]
+    plain = draw(mesh, camera, 64, 48)[24, 20, :3]
+    assert plain[2] > 0.1

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 ColorBy = Literal["client", "session"]
 Box = tuple[float, float, float, float, float, float]
 
-_OF_A_JOURNAL = ("until", "only", "color_by")
-_OF_A_WHOLE_MESH = ("preview", "fill_holes", "mark_guesses", "simplify")
+_OF_A_JOURNAL = ("until", "only", "color_by", "texture", "texture_size")
+_OF_A_WHOLE_MESH = ("preview", "texture", "fill_holes", "mark_guesses", "simplify")
 
 
 @options.takes_map_settings
@@ -73,6 +73,13 @@ def mesh(
         str | None,
         options.option("--simplify", "TARGET", "25%, 50000 triangles, or off by 5mm."),
     ] = None,
+    texture: Annotated[
+        bool, typer.Option("--texture", help="Colour as sharp as the journal's images.")
+    ] = False,
+    texture_size: Annotated[
+        int | None,
+        options.option("--texture-size", "TEXELS", "Side of a picture, at most (4096).", rare=True),
+    ] = None,
     preview: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw a picture, too.")] = None,
     memory: Annotated[
         str | None,
@@ -99,6 +106,10 @@ def mesh(
     from tsfusion.core.output_folder import check_writable
     from tsfusion.pipelines import mesh_files, mesh_finishing
 
+    if texture and color_by is not None:
+        raise InvalidConfig("--texture shows what the cameras saw, --color-by who saw it: give one of them")
+    if texture_size is not None and not texture:
+        raise InvalidConfig("--texture-size goes with --texture")
     given_up = options.up_direction(up)
     check_writable(out, mesh_files.SURFACES)
     if preview is not None:
@@ -145,6 +156,8 @@ def mesh(
         made = replace(made, known_up=given_up)
     with _stage(f"finishing the mesh of {source}", json or finishing.is_nothing):
         made, dropped = finishing.apply(made)
+    if texture:  # a live server has none
+        made = _textured(made, Path(source), map_, found, size=texture_size, view=view, quiet=json)
     files = [out] if preview is None else [out, preview]
     left_out = mesh_files.write(made, files, keep_islands=keep_islands if min_component is None else True)
     written = made.without_islands() if out.name in left_out["files"] else made
@@ -218,6 +231,32 @@ def _stage(text: str, quiet: bool) -> Iterator[None]:
     with progress.shown(quiet=quiet) as display:
         display.stage(text)
         yield
+
+
+def _textured(
+    made: "Mesh",
+    source: Path,
+    name: str | None,
+    found: "JournalMap",
+    *,
+    size: int | None,
+    view: dict[str, Any],
+    quiet: bool,
+) -> "Mesh":
+    """The mesh with a texture from the journal's images."""
+    from tsfusion.cli import opened_maps, progress
+    from tsfusion.journal import state_folder
+    from tsfusion.pipelines import journal_textures
+    from tsfusion.tsdf.texturing import TextureSettings
+
+    settings = TextureSettings() if size is None else TextureSettings(size=size)
+    place, chosen = state_folder.resolve_map(source, name), {key: view[key] for key in ("until", "only")}
+    with progress.shown(quiet=quiet) as display:
+        display.stage(f"texture of {source}")
+        return journal_textures.textured(
+            made, place, found.volume.config.voxel_size, settings, **chosen,
+            reading=partial(display.show_bytes, opened_maps.JOURNAL), watch=display.show_steps,
+        )  # fmt: skip
 
 
 def _write_tiles(

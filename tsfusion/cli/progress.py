@@ -66,6 +66,10 @@ class Quiet:
         """Show how much is read, after `text`."""
         self.show([_byte_row(text, done, total, self.rates)])
 
+    def show_steps(self, text: str, done: int, total: int) -> None:
+        """Show how many steps are done, after `text`."""
+        self.show([_Row(text, f"{done}{_of(total)}", _share(done, total))])
+
     def show(self, rows: "list[_Row]") -> None:
         """Show these rows in place of the last ones."""
 

@@ -110,6 +110,9 @@ def mesh_notes(figures: dict[str, Any]) -> list[str]:
             else "--keep-islands keeps them"
         )
         notes.append(f"{grouped(left_out)} islands left out of {files} ({why})")
+    if texture := figures.get("texture"):
+        pages = ", ".join(f"{width}×{height}" for width, height in texture["pages"])
+        notes.append(f"texture {pages}; images show {100 * texture['seen']:.0f} % of the surface")
     if figures["up"] is None:
         notes.append("up is not known: GLB and pictures keep the map's axes (--up z, for instance, gives it)")
     return notes

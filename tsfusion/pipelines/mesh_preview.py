@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tsfusion.core import durable_files
 from tsfusion.core.errors import OutputError
 from tsfusion.geometry.mesh import Mesh
+from tsfusion.geometry.textured_mesh import TexturedMesh, barycentric
 
 BACKGROUND = (0.93, 0.94, 0.96)  # linear RGB
 _RAMP = (0.12, 0.8)  # of the colour map: its ends are too dark to shade, and too pale for the background
@@ -20,6 +21,7 @@ _OVERSAMPLING = 2
 _ELEVATIONS = (28.0, 42.0, 58.0)  # degrees above the ground
 _AZIMUTHS = 12
 _NEAR = 0.05  # metres
+_BAND = 64  # rows of a picture that are painted at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,17 +58,26 @@ def render(
         raise OutputError(f"nothing to draw in {path}: the mesh has no triangles (yet)")
     up = np.array((0.0, 0.0, 1.0) if mesh.up is None else mesh.up.direction)
     camera = camera or choose_camera(mesh, up, aspect=width / height)
-    image = draw(mesh, camera, width * _OVERSAMPLING, height * _OVERSAMPLING, up=up)
+    image = draw(mesh, camera, width * _OVERSAMPLING, height * _OVERSAMPLING, up=up, texture=True)
     _write_png(_develop(image, _OVERSAMPLING), path)
     return path
 
 
 def draw(
-    mesh: Mesh, camera: PreviewCamera, width: int, height: int, *, up: NDArray[np.float64] | None = None
+    mesh: Mesh,
+    camera: PreviewCamera,
+    width: int,
+    height: int,
+    *,
+    up: NDArray[np.float64] | None = None,
+    texture: bool = False,
 ) -> NDArray[np.float32]:
     """(height, width, 4) float32: linear RGB in 0…1 and depth z in metres (0 where nothing is seen).
 
     The same bytes whatever the thread count: a pixel keeps the smallest depth, then the smallest triangle.
+
+    Args:
+        texture: draw the texture of a mesh that has one, instead of the colours at its vertices.
     """
     from tsfusion.kernels import runtime
 
@@ -85,12 +96,41 @@ def draw(
     colors = mesh.colors
     if colors is None or not np.ptp(colors, axis=0).any():
         colors = height_colors(mesh.vertices, up)
+    is_textured = texture and isinstance(mesh, TexturedMesh)
+    if is_textured:
+        colors = np.full(mesh.vertices.shape, 255, np.uint8)
     up_camera = R.T @ up
     rasterizer.shade(
         image, seen, vertices, faces, _float32(mesh.normals @ R), np.ascontiguousarray(colors),
         focal, *(float(x) for x in up_camera), rasterizer.EMPTY,
     )  # fmt: skip
+    if is_textured and isinstance(mesh, TexturedMesh):
+        _paint(image, seen, mesh, vertices, focal)
     return image
+
+
+def _paint(
+    image: NDArray[np.float32],
+    seen: NDArray[np.int64],
+    mesh: TexturedMesh,
+    vertices: NDArray[np.float32],
+    focal: float,
+) -> None:
+    """Multiply the light in a picture by the texture, a band of rows at a time.
+
+    Args:
+        vertices: in camera coordinates.
+    """
+    height, width = seen.shape
+    for start in range(0, height, _BAND):
+        v, u = np.nonzero(image[start : start + _BAND, :, 3])
+        v += start
+        face = seen[v, u].astype(np.int32)  # the low half
+        ray = np.stack(
+            [(u - 0.5 * (width - 1)) / focal, (v - 0.5 * (height - 1)) / focal, np.ones(len(u))], 1
+        )
+        weight = barycentric(ray, *(vertices[mesh.faces[face, k]].astype(np.float64) for k in range(3)))
+        image[v, u, :3] *= (mesh.sample(face, weight) / 255) ** 2.2
 
 
 def height_colors(vertices: NDArray[np.float32], up: NDArray[np.float64]) -> NDArray[np.uint8]:
