@@ -14,6 +14,7 @@ from tsfusion.core.errors import OutputError
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.textured_mesh import Texture, TexturedMesh
 from tsfusion.geometry.up_direction import Up, parse
+from tsfusion.kernels import rasterizer
 from tsfusion.pipelines import mesh_preview
 from tsfusion.pipelines.mesh_preview import PreviewCamera, choose_camera, draw
 
@@ -186,3 +187,28 @@ def test_a_texture_is_drawn_instead_of_the_colours_at_the_vertices() -> None:
     assert right[2] > 0.3 > 10 * right[0]
     plain = draw(mesh, camera, 64, 48)[24, 20, :3]
     assert plain[2] > 0.1
+
+
+def test_corners_are_darker_than_open_walls() -> None:
+    """By ambient occlusion: a flat wall keeps its light, its edge loses some; depths stay as they were."""
+    room, camera = box_room(), PreviewCamera(look((0, -1, 1.4), (0, 1, 0)), fov=math.radians(90))
+    plain = draw(room, camera, 160, 120)
+    shaded = plain.copy()
+    rasterizer.occlude(shaded, 1, 80.0, 0.5, 4.0)
+    with np.errstate(invalid="ignore"):
+        kept = shaded[..., 0] / plain[..., 0]
+    wall, edge = kept[50:70, 70:90], kept[60, 24:30]  # the far wall; where it meets another, 2 m to the left
+    assert (wall == 1).all()
+    assert edge.min() < 0.8
+    assert (kept <= 1).all()
+    assert (shaded[..., 3] == plain[..., 3]).all()
+
+
+def test_shade_of_a_pixel_equals_the_twin() -> None:
+    room, camera = box_room(), PreviewCamera(look((0.4, -1, 1.2), (0, 1, 0)), fov=math.radians(90))
+    plain = draw(room, camera, 80, 60)
+    shaded = plain.copy()
+    rasterizer.occlude(shaded, 1, 40.0, 0.7, 3.0)
+    for v, u in ((30, 40), (45, 20), (5, 5), (33, 11), (50, 12)):
+        light = kernel_twins.occlusion(plain[..., 3], v, u, 40.0, 0.7, 3.0)
+        assert shaded[v, u, :3] == pytest.approx(light * plain[v, u, :3], abs=2e-3)

@@ -379,3 +379,35 @@ def shade(corners: Any, normals: Any, colors: Any, ray: Any, up: Any) -> NDArray
     light = 0.25 + 0.45 * facing + 0.35 * (0.5 + 0.5 * normal @ up)
     result: NDArray[np.float64] = np.minimum(light * (weights @ np.asarray(colors, float) / 255) ** 2.2, 1.0)
     return result
+
+
+def occlusion(depth: Any, v: int, u: int, focal: float, radius: float, strength: float) -> float:
+    """Twin of `kernels.rasterizer.occlude` for one pixel: the share of its light that is left."""
+    from tsfusion.kernels import rasterizer
+
+    height, width = depth.shape
+
+    def point(row: int, column: int) -> NDArray[np.float64]:
+        x, y = (column - (width - 1) / 2) / focal, (row - (height - 1) / 2) / focal
+        return float(depth[row, column]) * np.array((x, y, 1.0))
+
+    def step(dv: int, du: int) -> NDArray[np.float64]:
+        ways = []
+        if v + dv < height and u + du < width:
+            ways.append(point(v + dv, u + du) - point(v, u))
+        if v >= dv and u >= du:
+            ways.append(point(v, u) - point(v - dv, u - du))
+        return min(ways, key=lambda way: abs(way[2]))
+
+    here, normal = point(v, u), np.cross(step(1, 0), step(0, 1))
+    normal /= np.linalg.norm(normal)
+    reach, hidden = min(focal * radius / here[2], 0.2 * width), 0.0
+    for k in range(rasterizer.TAPS):
+        far, turn = reach * np.sqrt((k + 0.5) / rasterizer.TAPS), rasterizer.GOLDEN * k
+        y, x = v + round(far * np.sin(turn)), u + round(far * np.cos(turn))
+        if 0 <= y < height and 0 <= x < width and depth[y, x] > 0:
+            way = point(y, x) - here
+            length = float(np.linalg.norm(way))
+            if 0 < length < radius:
+                hidden += max(way @ normal / length - rasterizer.FLAT, 0.0) * (1 - length / radius)
+    return max(1 - strength * hidden / rasterizer.TAPS, 0.0)

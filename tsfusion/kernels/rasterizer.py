@@ -14,6 +14,9 @@ from tsfusion.kernels.voxel_traversal import RUN
 EMPTY = (1 << 63) - 1
 OVERLAP = 5e-4  # pixels that a triangle is wider by: where neighbours are rounded otherwise there is no gap
 BANDS = 64  # of rows of the image: units of parallel work
+TAPS = 20  # places around a pixel that are looked at for what shades it
+FLAT = 0.08  # sine of the rise that shades nothing: that of noise
+GOLDEN = 2.399963  # angle between taps of a spiral, radians (Vogel 1979)
 
 
 @ti.func
@@ -220,3 +223,61 @@ def shade(
                 color = (wa * colors[ia, k] + wb * colors[ib, k] + wc * colors[ic, k]) / 255.0
                 image[v, u, k] = ti.min(light * color**2.2, 1.0)
             image[v, u, 3] = wa * a.z + wb * b.z + wc * c.z
+
+
+@ti.func
+def point_at(image: ti.types.ndarray(), v, u, focal):
+    """Point that a pixel sees, camera coordinates; z = 0 where it sees nothing."""
+    x = (u - 0.5 * (image.shape[1] - 1)) / focal
+    y = (v - 0.5 * (image.shape[0] - 1)) / focal
+    return image[v, u, 3] * tm.vec3(x, y, 1.0)
+
+
+@ti.func
+def step_between(image: ti.types.ndarray(), v, u, dv, du, focal):
+    """Vector along the surface from pixel (v, u) towards (v + dv, u + du), by the side that is less steep."""
+    height, width = image.shape[0], image.shape[1]
+    here = point_at(image, v, u, focal)
+    ahead = point_at(image, ti.min(v + dv, height - 1), ti.min(u + du, width - 1), focal) - here
+    behind = here - point_at(image, ti.max(v - dv, 0), ti.max(u - du, 0), focal)
+    has_ahead = v + dv < height and u + du < width
+    has_behind = v >= dv and u >= du
+    return ahead if has_ahead and (not has_behind or abs(ahead.z) <= abs(behind.z)) else behind
+
+
+@ti.kernel
+def occlude(
+    image: ti.types.ndarray(dtype=ti.f32, ndim=3),
+    samples: ti.i32,
+    focal: ti.f32,
+    radius: ti.f32,
+    strength: ti.f32,
+):
+    """Darken `image` (H, W, 4), in place, where surfaces within `radius` metres stand before the sky.
+
+    Ambient occlusion from the depths alone (McGuire et al., "The alchemy screen-space ambient obscurance
+    algorithm", 2011), found once for each square of `samples`² of them.
+    """
+    height, width = image.shape[0], image.shape[1]
+    for i, j in ti.ndrange(height // samples, width // samples):
+        v, u = i * samples, j * samples
+        here = point_at(image, v, u, focal)
+        if here.z > 0.0:
+            normal = tm.cross(step_between(image, v, u, 1, 0, focal), step_between(image, v, u, 0, 1, focal))
+            normal /= ti.max(normal.norm(), 1e-12)
+            reach = ti.min(focal * radius / here.z, 0.2 * width)  # pixels
+            hidden = 0.0
+            for k in range(TAPS):
+                far = reach * ti.sqrt((k + 0.5) / TAPS)
+                y = v + ti.cast(ti.round(far * ti.sin(GOLDEN * k)), ti.i32)
+                x = u + ti.cast(ti.round(far * ti.cos(GOLDEN * k)), ti.i32)
+                if 0 <= y < height and 0 <= x < width and image[y, x, 3] > 0.0:
+                    way = point_at(image, y, x, focal) - here
+                    length = way.norm()
+                    if 0.0 < length < radius:
+                        rise = tm.dot(way, normal) / length
+                        hidden += ti.max(rise - FLAT, 0.0) * (1.0 - length / radius)
+            light = ti.max(1.0 - strength * hidden / TAPS, 0.0)
+            for y, x, c in ti.static(ti.ndrange(2, 2, 3)):
+                if y < samples and x < samples:
+                    image[v + y, u + x, c] *= light

@@ -22,6 +22,7 @@ _ELEVATIONS = (28.0, 42.0, 58.0)  # degrees above the ground
 _AZIMUTHS = 12
 _NEAR = 0.05  # metres
 _BAND = 64  # rows of a picture that are painted at a time
+_SHADING = (0.06, 4.0)  # ambient occlusion: its reach as a share of the mesh's diagonal, and its strength
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +57,28 @@ def render(
     path = Path(path)
     if not len(mesh.faces):
         raise OutputError(f"nothing to draw in {path}: the mesh has no triangles (yet)")
-    up = np.array((0.0, 0.0, 1.0) if mesh.up is None else mesh.up.direction)
+    up = up_of(mesh)
     camera = camera or choose_camera(mesh, up, aspect=width / height)
-    image = draw(mesh, camera, width * _OVERSAMPLING, height * _OVERSAMPLING, up=up, texture=True)
-    _write_png(_develop(image, _OVERSAMPLING), path)
+    write_png(picture(mesh, camera, width, height, up=up), path)
     return path
+
+
+def up_of(mesh: Mesh) -> NDArray[np.float64]:
+    """(3,) the direction that is above in a picture: `mesh.up`, or +z where that is not known."""
+    return np.array((0.0, 0.0, 1.0) if mesh.up is None else mesh.up.direction)
+
+
+def picture(
+    mesh: Mesh, camera: PreviewCamera, width: int, height: int, *, up: NDArray[np.float64]
+) -> NDArray[np.uint8]:
+    """(height, width, 3) uint8 sRGB: `draw` with smooth edges, and darker where surfaces are near others."""
+    image = draw(mesh, camera, width * _OVERSAMPLING, height * _OVERSAMPLING, up=up, texture=True)
+    from tsfusion.kernels import rasterizer
+
+    reach, strength = _SHADING
+    radius = reach * float(np.linalg.norm(np.ptp(core(mesh), axis=0)))
+    rasterizer.occlude(image, _OVERSAMPLING, _focal(camera, image.shape[1]), radius, strength)
+    return _develop(image, _OVERSAMPLING)
 
 
 def draw(
@@ -79,17 +97,10 @@ def draw(
     Args:
         texture: draw the texture of a mesh that has one, instead of the colours at its vertices.
     """
-    from tsfusion.kernels import runtime
-
-    runtime.start()
     from tsfusion.kernels import rasterizer
 
+    vertices, seen = _see(mesh, camera, width, height)
     R = camera.T_world_camera[:3, :3]
-    vertices = _float32((mesh.vertices - camera.T_world_camera[:3, 3]) @ R)
-    focal = 0.5 * width / math.tan(0.5 * camera.fov)
-    seen = np.full((height, width), rasterizer.EMPTY, np.int64)
-    faces = np.ascontiguousarray(mesh.faces, np.int32)
-    rasterizer.rasterise(seen, vertices, faces, focal, camera.near)
     image = np.zeros((height, width, 4), np.float32)
     image[..., :3] = BACKGROUND
     up = np.array((0.0, 0.0, 1.0)) if up is None else up
@@ -101,11 +112,11 @@ def draw(
         colors = np.full(mesh.vertices.shape, 255, np.uint8)
     up_camera = R.T @ up
     rasterizer.shade(
-        image, seen, vertices, faces, _float32(mesh.normals @ R), np.ascontiguousarray(colors),
-        focal, *(float(x) for x in up_camera), rasterizer.EMPTY,
+        image, seen, vertices, _faces(mesh), _float32(mesh.normals @ R), np.ascontiguousarray(colors),
+        _focal(camera, width), *(float(x) for x in up_camera), rasterizer.EMPTY,
     )  # fmt: skip
     if is_textured and isinstance(mesh, TexturedMesh):
-        _paint(image, seen, mesh, vertices, focal)
+        _paint(image, seen, mesh, vertices, _focal(camera, width))
     return image
 
 
@@ -133,6 +144,29 @@ def _paint(
         image[v, u, :3] *= (mesh.sample(face, weight) / 255) ** 2.2
 
 
+def _see(
+    mesh: Mesh, camera: PreviewCamera, width: int, height: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Vertices in camera coordinates (n, 3), and what each pixel sees (height, width); see `rasterise`."""
+    from tsfusion.kernels import rasterizer, runtime
+
+    runtime.start()
+    T = camera.T_world_camera
+    vertices = _float32((mesh.vertices - T[:3, 3]) @ T[:3, :3])
+    seen = np.full((height, width), rasterizer.EMPTY, np.int64)
+    rasterizer.rasterise(seen, vertices, _faces(mesh), _focal(camera, width), camera.near)
+    return vertices, seen
+
+
+def _focal(camera: PreviewCamera, width: int) -> float:
+    """Focal length of a picture of so many pixels, pixels."""
+    return 0.5 * width / math.tan(0.5 * camera.fov)
+
+
+def _faces(mesh: Mesh) -> NDArray[np.int32]:
+    return np.ascontiguousarray(mesh.faces, np.int32)
+
+
 def height_colors(vertices: NDArray[np.float32], up: NDArray[np.float64]) -> NDArray[np.uint8]:
     """(n, 3) uint8 RGB for a mesh without colour: dark blue is low, light green high."""
     import cv2
@@ -147,33 +181,39 @@ def height_colors(vertices: NDArray[np.float32], up: NDArray[np.float64]) -> NDA
 
 def choose_camera(mesh: Mesh, up: NDArray[np.float64], *, aspect: float) -> PreviewCamera:
     """The view from above, among a ring of them, in which most of the picture shows a front side."""
-    sample = _core(mesh.vertices)
-    best, best_score = PreviewCamera(np.eye(4)), -1.0
-    for elevation in _ELEVATIONS:
+    return orbit(core(mesh), up, *choose_angles(mesh, up, aspect=aspect), aspect)
+
+
+def choose_angles(mesh: Mesh, up: NDArray[np.float64], *, aspect: float) -> tuple[float, float]:
+    """Azimuth and elevation, radians, of the view that `choose_camera` takes."""
+    sample = core(mesh)
+    best, best_score = (0.0, 0.0), -1.0
+    for elevation in np.radians(_ELEVATIONS):
         for azimuth in np.arange(_AZIMUTHS) * (2 * math.pi / _AZIMUTHS):
-            camera = _orbit(sample, up, azimuth, math.radians(elevation), aspect)
-            score = _score(mesh, camera, aspect)
+            score = _score(mesh, orbit(sample, up, azimuth, elevation, aspect), aspect)
             if score > best_score:
-                best, best_score = camera, score
+                best, best_score = (float(azimuth), float(elevation)), score
     return best
 
 
 def _score(mesh: Mesh, camera: PreviewCamera, aspect: float) -> float:
     """The share of the pixels that see a front side."""
-    depth = draw(mesh, camera, int(96 * aspect), 96)[..., 3]
-    return float(np.count_nonzero(depth)) / depth.size
+    from tsfusion.kernels.rasterizer import EMPTY
+
+    _, seen = _see(mesh, camera, int(96 * aspect), 96)
+    return float(np.count_nonzero(seen != EMPTY)) / seen.size
 
 
-def _core(vertices: NDArray[np.float32]) -> NDArray[np.float64]:
+def core(mesh: Mesh) -> NDArray[np.float64]:
     """At most 20 000 vertices without the strays: those about the 3 % to 97 % range of each axis."""
-    sample = vertices[:: max(1, len(vertices) // 20_000)].astype(np.float64)
+    sample = mesh.vertices[:: max(1, len(mesh.vertices) // 20_000)].astype(np.float64)
     low, high = np.percentile(sample, (3, 97), axis=0)
     margin = 0.05 * (high - low)
     inside = ((sample >= low - margin) & (sample <= high + margin)).all(axis=1)
     return sample[inside] if inside.any() else sample
 
 
-def _orbit(
+def orbit(
     points: NDArray[np.float64], up: NDArray[np.float64], azimuth: float, elevation: float, aspect: float
 ) -> PreviewCamera:
     """A camera that looks down on `points` at the given angles, as near as shows all of them."""
@@ -206,7 +246,7 @@ def _develop(image: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
     return encoded
 
 
-def _write_png(rgb: NDArray[np.uint8], path: Path) -> None:
+def write_png(rgb: NDArray[np.uint8], path: Path) -> None:
     import cv2
 
     done, encoded = cv2.imencode(".png", rgb[..., ::-1])
