@@ -21,7 +21,12 @@ from small_recordings import first_views
 from tsfusion import Volume, VolumeConfig
 from tsfusion.core.output_folder import building
 
-RESULTS = {"mesh.ply", "mesh.glb", "preview.png", "delay.csv", "delay.png", "run.json", "map.tsf"}
+RESULTS = {
+    "mesh.ply", "mesh.glb", "preview.png", "delay.csv", "delay.png", "growth.csv", "keyframes.txt",
+    "error.npy",
+    "run.json", "map.tsf", "report.html", *(f"report-side{side}.png" for side in (1, 2, 3, 4)),
+    "report-error1.png", "report-error2.png",
+}  # fmt: skip
 VOXEL = 0.08
 
 

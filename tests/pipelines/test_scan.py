@@ -86,7 +86,8 @@ def test_a_scan_leaves_mesh_trajectory_and_figures(walk: Path, tmp_path: Path) -
     run = figures(scan(walk, "--localizer", "rgbd", "--out", out, "--state", state, "--json"))
     assert {path.name for path in out.iterdir()} == {
         "mesh.ply", "mesh.glb", "preview.png", "delay.csv", "delay.png", "run.json", "trajectory.txt",
-        "keyframes.txt", "map.tsf",
+        "keyframes.txt", "map.tsf", "reference.txt", "growth.csv", "report.html",
+        *(f"report-side{side}.png" for side in (1, 2, 3, 4)),
     }  # fmt: skip
     assert run == json.loads((out / "run.json").read_text())
     assert (run["frames"], run["frames_tracked"], run["complete"], run["left"]) == (12, 12, True, 0)

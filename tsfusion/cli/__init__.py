@@ -26,6 +26,7 @@ from tsfusion.cli import (
     map,
     mesh,
     replay,
+    report,
     scan,
     serve,
     spool,
@@ -63,6 +64,9 @@ verbs.verb(
 verbs.verb(
     app, "tsfusion check my-recording", "tsfusion check my-recording --trajectory slam.txt", panel=OWN
 )(check.check)
+verbs.verb(
+    app, "tsfusion report out/latest", "tsfusion report my-maps --map yard --out yard.html", panel=OWN
+)(report.report)
 verbs.verb(
     app, "tsfusion mesh out/latest/map.tsf room.glb", "tsfusion mesh tcp://server:5555 yard.ply --map yard",
     panel=OWN,

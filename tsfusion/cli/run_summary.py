@@ -72,17 +72,20 @@ def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
             f"spool      {count_of(result.left, 'keyframe is', 'keyframes are')} not acknowledged{why}: "
             f"`tsfusion spool send --spool {spool}` or the next scan sends them"
         )
-    lines.append(_results(result.folder))
     if connect is not None and result.keyframes_durable:
         lines.append(
             f"mesh       tsfusion mesh {connect} {result.maps[0].name}.glb --map {result.maps[0].name}"
         )
+    lines.append(_results(result.folder))
     typer.echo("\n".join(lines))
 
 
 def _results(folder: str) -> str:
+    """The files of a run; what to look at comes last, on its own line."""
     files = sorted(path.name for path in Path(folder).iterdir() if path.is_file())
-    return f"results    {folder}/: {' '.join(files)}"
+    rest = " ".join(name for name in files if not name.startswith("report"))
+    report = f"\nreport     {folder}/report.html" if "report.html" in files else ""
+    return f"results    {folder}/: {rest}{report}"
 
 
 def explained(counts: dict[str, int]) -> str:

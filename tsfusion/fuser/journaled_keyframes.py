@@ -123,6 +123,10 @@ class JournaledKeyframes:
         assert T is not None  # others are left out
         return FinalKeyframe(replace(found, T_world_camera=T), self.sessions[place.session])
 
+    def poses(self) -> NDArray[np.float64]:
+        """(n, 4, 4) final poses of all, T_world_camera; nothing is read for it."""
+        return np.array([self._pose(place) for place in self._places]).reshape(-1, 4, 4)
+
     def keep_only(self, sessions: Collection[bytes]) -> None:
         """Leave out the keyframes of other sessions. Corrections count whoever sent them."""
         self._places = [place for place in self._places if place.session in sessions]

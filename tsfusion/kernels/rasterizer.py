@@ -14,7 +14,7 @@ from tsfusion.kernels.voxel_traversal import RUN
 EMPTY = (1 << 63) - 1
 OVERLAP = 5e-4  # pixels that a triangle is wider by: where neighbours are rounded otherwise there is no gap
 BANDS = 64  # of rows of the image: units of parallel work
-TAPS = 20  # places around a pixel that are looked at for what shades it
+TAPS = 14  # places around a pixel that are looked at for what shades it
 FLAT = 0.08  # sine of the rise that shades nothing: that of noise
 GOLDEN = 2.399963  # angle between taps of a spiral, radians (Vogel 1979)
 

@@ -6,6 +6,10 @@ import logging
 import os
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
+
+import numpy as np
+from numpy.typing import NDArray
 
 from tsfusion.client import ClientStats
 from tsfusion.core import process
@@ -17,7 +21,7 @@ from tsfusion.datasets import Dataset
 from tsfusion.datasets.dataset import force_of
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.up_direction import HeldSensor, Up
-from tsfusion.pipelines import engine, map_size, replay_results, run_files, target_server
+from tsfusion.pipelines import engine, map_growth, map_size, replay_results, run_files, target_server
 from tsfusion.pipelines.engine import AHEAD, Engine, Progress
 from tsfusion.pipelines.replay_results import ReplaySummary
 from tsfusion.pipelines.target_server import Target
@@ -43,8 +47,9 @@ def replay(
 ) -> ReplaySummary:
     """Send every keyframe of `dataset` to a server and leave the results in the folder `out`.
 
-    `mesh.ply`, `mesh.glb`, `preview.png`, `delay.csv`, `delay.png` and `run.json`, with a server of its own
-    also `map.tsf`, appear together when all of it went well, and not at all otherwise.
+    `mesh.ply`, `mesh.glb`, `preview.png`, `keyframes.txt`, `delay.csv`, `delay.png`, `growth.csv`, `run.json`
+    and `report.html` with its pictures, with a server of its own also `map.tsf`, and of a world whose surface
+    is known `error.npy`, appear together when all of it went well, and not at all otherwise.
 
     Args:
         out: None = a new folder `out/DATE_TIME`; see `output_folder.results`.
@@ -64,7 +69,9 @@ def replay(
             keyframes of another world.
         DatasetError: a keyframe cannot be read.
     """
-    with results(out, overwrite=overwrite) as (work, folder):
+    stamps: list[int] = []
+    poses: list[NDArray[np.float64]] = []
+    with results(out, overwrite=overwrite) as (work, folder), ExitStack() as watching:
         first = dataset[0]  # a dataset that cannot be read is an error before a server starts
         if connect is None:
             map_size.check_fits(first, volume)
@@ -87,12 +94,16 @@ def replay(
                 f"scanning {dataset.name}" + (f" into the map {target.link.map}" if connect else "")
             )
             held, started = HeldSensor(), time.monotonic()
+            growth = watching.enter_context(map_growth.watch(target, target.link.map))
             for index, keyframe in enumerate(_keyframes(dataset, first, running, rate)):
                 running.wait_turn(AHEAD if rate is None else target.link.backlog)
                 sender.send(dataclasses.replace(keyframe, captured_ns=time.monotonic_ns()))
                 held.add(keyframe.T_world_camera, dataset.sensor, force_of(dataset, index))
+                stamps.append(keyframe.timestamp_ns)
+                poses.append(keyframe.T_world_camera)
             running.wait_fused()
             seconds = time.monotonic() - started
+            watching.close()
             peak = process.peak_rss_bytes()  # of sending: drawing the result is not the scanner's work
             progress.stage("writing the results")
             running.wait_meshed([sender])
@@ -102,13 +113,19 @@ def replay(
             )
         if not len(written.mesh.faces):
             raise OutputError(run_files.no_surface(sender.stats, sender.first_rejection))
+        error_mm = replay_results.error_of(dataset, written.mesh)
         result = replay_results.summarise(
-            dataset, sender, written, folder=folder,
+            dataset, sender, written, error_mm, folder=folder,
             seconds=seconds, rate=rate, peak_rss_bytes=peak,
             server_start_seconds=target.child.start_seconds if target.child else None,
         )  # fmt: skip
         run_files.write_ledger(work, sender.records)
+        growth.write_csv(work / "growth.csv")
+        run_files.write_keyframes(work / "keyframes.txt", stamps, poses)
+        if error_mm is not None:
+            np.save(work / "error.npy", (error_mm / 1000).astype(np.float32))
         run_files.write_record(work, result)
+        run_files.write_report(work, {"mesh.ply": written.mesh})
         return result
 
 

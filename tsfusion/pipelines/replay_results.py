@@ -13,7 +13,7 @@ from tsfusion.datasets import Dataset
 from tsfusion.datasets.cameras import camera_line
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.pipelines import latency_ledger, run_files, shortfall
-from tsfusion.pipelines.run_files import WrittenMap
+from tsfusion.pipelines.run_files import Circumstances, WrittenMap
 from tsfusion.wire.health import Status
 from tsfusion.wire.keyframe_times import Spread
 
@@ -60,12 +60,14 @@ class ReplaySummary(msgspec.Struct, frozen=True, kw_only=True):
     peak_rss_bytes: dict[str, int]
     config: dict[str, Any]
     versions: dict[str, str]
+    made: Circumstances | None = None
 
 
 def summarise(
     dataset: Dataset,
     sender: Client,
     written: WrittenMap,
+    error_mm: NDArray[np.float64] | None,
     *,
     folder: Path,
     seconds: float,
@@ -77,13 +79,14 @@ def summarise(
 
     Args:
         written: the map that the keyframes went into.
+        error_mm: of its mesh's vertices (`error_of`); None = the true surface is not known.
         folder: of the results.
         seconds: from the first keyframe handed over to the last one fused.
         rate: keyframes a second that were asked for; None = as fast as they are fused.
         peak_rss_bytes: of the sending process.
         server_start_seconds: of the own server; None = the server was there already.
     """
-    status, mesh, figures = written
+    status, _, figures = written
     stats, delays = sender.stats, latency_ledger.summarise(sender.records)
     return ReplaySummary(
         dataset=dataset.name,
@@ -104,10 +107,11 @@ def summarise(
         stages_ms=delays.stages_ms,
         clock_bound_ms=delays.clock_bound_ms,
         mesh=figures,
-        accuracy=measure(dataset, mesh) if isinstance(dataset, DatasetWithSurface) else None,
+        accuracy=None if error_mm is None else measure(error_mm),
         peak_rss_bytes={**server_rss(status), "client": peak_rss_bytes},
         config={**status.config, "rate": rate},
         versions=run_files.versions(),
+        made=run_files.circumstances(),
     )
 
 
@@ -117,9 +121,15 @@ def server_rss(status: Status) -> dict[str, int]:
     return {"server": gateway + fuser, "gateway": gateway, "fuser": fuser}
 
 
-def measure(surface: DatasetWithSurface, mesh: Mesh) -> Accuracy:
-    """Distance from the mesh's vertices to the known surface."""
-    error_mm = 1000 * np.abs(surface.distance(mesh.vertices.astype(np.float64)))
+def error_of(dataset: Dataset, mesh: Mesh) -> NDArray[np.float64] | None:
+    """(n,) millimetres from the mesh's vertices to the true surface; None = it is not known."""
+    if not isinstance(dataset, DatasetWithSurface):
+        return None
+    return 1000 * np.abs(dataset.distance(mesh.vertices.astype(np.float64)))
+
+
+def measure(error_mm: NDArray[np.float64]) -> Accuracy:
+    """Figures of (n,) distances from the true surface, millimetres."""
     p50, p95 = np.percentile(error_mm, (50, 95))
     rmse = np.sqrt(np.mean(error_mm**2))
     figures = [round(float(x), 3) for x in (error_mm.mean(), p50, p95, rmse, error_mm.max())]

@@ -2,15 +2,27 @@
 """The files that every whole run leaves: meshes with their pictures, the latency ledger, `run.json`."""
 
 import dataclasses
+import logging
+import os
 import platform
+import shlex
+import sys
+import time
+from contextlib import suppress
 from importlib import metadata
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from tsfusion.client import ClientStats
+from tsfusion.core import process
 from tsfusion.core.output_folder import RECORD
+from tsfusion.datasets.dataset import NOMINAL_NS
+from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.geometry import up_direction
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import HeldSensor, Up
@@ -20,7 +32,20 @@ from tsfusion.wire.health import Status
 from tsfusion.wire.keyframe_times import KeyframeTimes
 
 MAP = "map.tsf"
+REPORT = "report.html"
+log = logging.getLogger(__name__)
 _MESH_FILES = (("mesh", ".ply"), ("mesh", ".glb"), ("preview", ".png"))
+
+
+class Circumstances(msgspec.Struct, frozen=True, kw_only=True):
+    """When and where a run ended, and how it was started. `finished` is local time."""
+
+    finished: str
+    command: str  # empty = it was not started by the `tsfusion` command
+    host: str
+    cpu: str
+    cores: int
+    memory_bytes: int
 
 
 class WrittenMap(NamedTuple):
@@ -71,6 +96,55 @@ def write_record(work: Path, summary: msgspec.Struct) -> None:
     """Write `run.json`."""
     text = msgspec.json.format(msgspec.json.encode(summary), indent=2)
     (work / RECORD).write_bytes(text + b"\n")
+
+
+def write_keyframes(path: Path, stamps_ns: list[int], poses: list[NDArray[np.float64]]) -> None:
+    """Write the poses that keyframes were sent with, as `read_tum` reads them.
+
+    Where their times do not grow, as in a recording without times, they are made up.
+    """
+    if any(later <= earlier for earlier, later in pairwise(stamps_ns)):
+        stamps_ns = [(index + 1) * NOMINAL_NS for index in range(len(poses))]
+    write_tum(path, stamps_ns, poses)
+
+
+def write_report(work: Path, meshes: dict[str, Mesh]) -> None:
+    """Write `report.html` and its pictures. A failure of that is logged: it costs no results.
+
+    Args:
+        meshes: that were just written to `work`, by the name of their file.
+    """
+    from tsfusion.pipelines.report import run_report
+
+    try:
+        run_report.write(work, work / REPORT, meshes=meshes)
+    except Exception:
+        log.exception("the report could not be written; `tsfusion report` tries again")
+
+
+def circumstances() -> Circumstances:
+    """Those of this process, now."""
+    started = Path(sys.argv[0])
+    is_command = started.stem == "tsfusion" or (
+        started.name == "__main__.py" and started.parent.name == "tsfusion"
+    )
+    return Circumstances(
+        finished=time.strftime("%Y-%m-%d %H:%M"),
+        command=shlex.join(["tsfusion", *sys.argv[1:]]) if is_command else "",
+        host=platform.node(),
+        cpu=_cpu(),
+        cores=os.cpu_count() or 0,
+        memory_bytes=process.physical_memory_bytes(),
+    )
+
+
+def _cpu() -> str:
+    """Name of the processor; where the system does not tell, its architecture."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.machine()
 
 
 def no_surface(stats: ClientStats, rejection: str) -> str:

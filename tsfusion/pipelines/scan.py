@@ -30,10 +30,12 @@ from tsfusion.core.errors import (
 from tsfusion.core.output_folder import results
 from tsfusion.datasets.cameras import described
 from tsfusion.geometry.frame import Frame
+from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.sample_ranges import wrong_unit
 from tsfusion.geometry.up_direction import HeldSensor, Up
 from tsfusion.pipelines import (
     engine,
+    map_growth,
     map_size,
     run_files,
     scan_alignment,
@@ -77,9 +79,10 @@ def scan(
 ) -> ScanSummary:
     """Take a source's frames to its end, or until it is closed, and leave the results in the folder `out`.
 
-    `trajectory.txt`, `keyframes.txt` (and `trajectory-corrected.txt` where loops were closed), `delay.csv`,
-    `delay.png` and `run.json`; with a server of its own also `mesh.ply`, `mesh.glb`, `preview.png` and
-    `map.tsf`. A second submap's have `-2` before the ending, and so on.
+    `trajectory.txt`, `keyframes.txt` (and `trajectory-corrected.txt` where loops were closed, `reference.txt`
+    where the source has other poses), `delay.csv`, `delay.png`, `growth.csv`, `run.json`, and `report.html`
+    with its pictures; with a server of its own also `mesh.ply`, `mesh.glb`, `preview.png` and `map.tsf`. A
+    second submap's have `-2` before the ending, and so on.
 
     Args:
         out: None = a new folder `out/DATE_TIME`; see `output_folder.results`.
@@ -146,6 +149,7 @@ def scan(
             pace = running.wait_turn if own and not source.live else running.check
             progress.stage(f"scanning {source.name}" + ("" if own else f" into the map {map_name}"))
             started = time.monotonic()
+            growth = stack.enter_context(map_growth.watch(target, map_name))
             _run_scanner(scanner, frames, pace, failure)
             peak = process.peak_rss_bytes()
             if not any(submap.located for submap in scanner.submaps):
@@ -153,24 +157,28 @@ def scan(
             scanner.finish()
             failure = _settle(scanner, running, leftovers, progress, own=own) or failure
             seconds = time.monotonic() - started
+            growth.stop()
             progress.stage("writing the results")
             complete = not failure
             write = partial(
                 _write, work, target, sensor=source.sensor,
                 up=up, min_weight=min_weight, keep_islands=keep_islands,
             )  # fmt: skip
-            maps = [write(submap, number) for number, submap in enumerate(scanner.submaps, 1)]
+            meshes: dict[str, Mesh] = {}
+            maps = [write(submap, number, meshes) for number, submap in enumerate(scanner.submaps, 1)]
             if own and not any(found.mesh["triangles"] for found in maps if found.mesh):
                 stats = scanner.state().stats
                 failure.append(OutputError(run_files.no_surface(stats, scanner.first_rejection)))
             records = scan_results.records(scanner.submaps)
             run_files.write_ledger(work, records)
+            growth.write_csv(work / "growth.csv")
             result = scan_results.summarise(
                 source, scanner, maps, records, folder=folder, camera=_camera(source, first),
                 localizer=registry.localizer_name(config, first), spool=spool, complete=complete,
                 seconds=seconds, peak_rss_bytes=peak, config=config, volume=volume if own else None,
             )  # fmt: skip
         run_files.write_record(work, result)
+        run_files.write_report(work, meshes)
     if unplaced and not failure:
         raise AlignmentRefused(f"the scan is in the map {map_name}, as its place was not found: {unplaced}")
     if failure:
@@ -350,11 +358,19 @@ def _refused_worlds(clients: list[Client]) -> list[Exception]:
 
 
 def _write(
-    work: Path, target: Target, submap: Submap, number: int, *, sensor: str, **options: Any
+    work: Path,
+    target: Target,
+    submap: Submap,
+    number: int,
+    meshes: dict[str, Mesh],
+    *,
+    sensor: str,
+    **options: Any,
 ) -> MapResult:
     """Write the files of one submap, and give its figures.
 
     Args:
+        meshes: takes its mesh, by the name of the file.
         options: as of `run_files.write_map`.
     """
     if not submap.located:
@@ -369,4 +385,6 @@ def _write(
     for T, force in zip(poses, submap.located.forces(), strict=True):
         held.add(T, sensor, force)
     written = run_files.write_map(work, target, submap.name, held, suffix=suffix, **options)
+    if len(written.mesh.faces):
+        meshes[f"mesh{suffix}.ply"] = written.mesh
     return scan_results.describe(submap, written)

@@ -12,7 +12,7 @@ from tsfusion.core.config import ScanConfig, VolumeConfig
 from tsfusion.datasets.trajectory_files import write_tum
 from tsfusion.evaluation.trajectory_error import TrajectoryError, absolute_error
 from tsfusion.pipelines import latency_ledger, run_files, shortfall
-from tsfusion.pipelines.run_files import WrittenMap
+from tsfusion.pipelines.run_files import Circumstances, WrittenMap
 from tsfusion.scanner.localization.localizer import PoseCorrections
 from tsfusion.scanner.scanner import Scanner, Submap
 from tsfusion.scanner.sources.source import Source
@@ -63,18 +63,23 @@ class ScanSummary(msgspec.Struct, frozen=True, kw_only=True):
     peak_rss_bytes: dict[str, int]
     config: dict[str, Any]
     versions: dict[str, str]
+    made: Circumstances | None = None
 
 
 def write_trajectory(work: Path, submap: Submap, suffix: str) -> None:
     """Write `trajectory.txt` of all frames and `keyframes.txt` of those in the map, in the TUM format.
 
-    Where loops were closed, `trajectory-corrected.txt` too.
+    Where loops were closed, `trajectory-corrected.txt` too; where the source has poses of its own that are
+    not these, `reference.txt`.
     """
     track = submap.located
     stamps, tracked = track.stamps_ns, list(track.poses())
     chosen = np.flatnonzero(track.seqs >= 0).tolist()
     write_tum(work / f"trajectory{suffix}.txt", stamps, tracked)
     write_tum(work / f"keyframes{suffix}.txt", [stamps[i] for i in chosen], [tracked[i] for i in chosen])
+    which, references = track.with_reference()
+    if len(which) and not np.array_equal(track.poses()[which], references):
+        write_tum(work / f"reference{suffix}.txt", [stamps[i] for i in which.tolist()], list(references))
     if submap.corrections is not None and submap.corrections.loops:
         now = list(track.poses(submap.corrections))
         write_tum(work / f"trajectory-corrected{suffix}.txt", stamps, now)
@@ -152,6 +157,7 @@ def summarise(
         peak_rss_bytes={"client": peak_rss_bytes},
         config={name: msgspec.to_builtins(each) for name, each in settings.items()},
         versions=run_files.versions(),
+        made=run_files.circumstances(),
     )
 
 

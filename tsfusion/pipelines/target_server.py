@@ -56,6 +56,11 @@ class ServerChild:
         self.control = ""
         self.start_seconds = 0.0  # from its start until it was ready
 
+    @property
+    def pid(self) -> int:
+        """Number of its process."""
+        return self._process.pid
+
     def wait_ready(self) -> None:
         """Read the line that says the server is ready; raise TransportError when it ends or stays silent."""
         started = time.monotonic()
@@ -204,9 +209,9 @@ class Target:
         address, control, keys = self.link.address, self.link.control, self.keys
         return fetch_status(address, control=control, map_name=map_name, timeout=timeout, keys=keys)
 
-    def health(self) -> Health:
+    def health(self, *, timeout: float = 10.0) -> Health:
         """The server's health; see `fetch_health`."""
-        return fetch_health(self.link.address, control=self.link.control, keys=self.keys)
+        return fetch_health(self.link.address, control=self.link.control, timeout=timeout, keys=self.keys)
 
     def mesh(self, map_name: str, *, min_weight: float | None) -> Mesh:
         """The mesh of a map, as of now; see `fetch_mesh`."""

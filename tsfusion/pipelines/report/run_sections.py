@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: MIT
+"""Sections of a report that show how a run went: delay, growth, trajectory error, keyframes, settings."""
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError
+from tsfusion.core.readable_numbers import counted, grouped, size
+from tsfusion.evaluation import trajectory_error
+from tsfusion.pipelines import latency_ledger
+from tsfusion.pipelines.report import charts, page
+from tsfusion.pipelines.report.charts import Axis, Chart
+from tsfusion.pipelines.report.findings import MapFindings, RunFindings
+from tsfusion.wire.keyframe_times import DELAY, STAGES, KeyframeTimes, spread
+from tsfusion.wire.messages import SKIP_REASONS
+
+_COLUMNS = 200  # of a chart by keyframe: more keyframes are drawn together
+_BINS = 50
+_STYLES = dict(zip(STAGES, ("k1", "k2", "k3", "k4", "k5", "k6"), strict=True))
+_WAY = ("encode", "wire", "journal", "queue", "fuse")  # the stages whose sum is the delay
+_MEANING = {
+    "encode": "captured → sent", "wire": "sent → received", "journal": "received → on the disk",
+    "queue": "on the disk → fuse start", "fuse": "fuse start → fused", "mesh": "fused → meshed",
+}  # fmt: skip
+
+
+def delay(found: RunFindings) -> str:
+    """Delay of each keyframe by stage, its distribution, and a table."""
+    record, times = found.record, found.times
+    figures = {name: spread for name, spread in (record.get("stages_ms") or {}).items() if name in STAGES}
+    total = record.get("delay_ms") or {}
+    if not total.get("count"):
+        return page.note("Not known: no keyframe was fused while this run was there to see it.")
+    if not figures and times:
+        figures = {
+            name: msgspec.to_builtins(spread(latency_ledger.durations_ms(times, *ends)))
+            for name, ends in STAGES.items()
+        }
+    rows = [
+        (f"{name}: {_MEANING[name]}", *map(_ms, (one[k] for k in ("mean", "p50", "p95", "p99", "max"))))
+        for name, one in figures.items()
+        if one.get("count")
+    ]
+    styles = [_STYLES[name] for name, one in figures.items() if one.get("count")]
+    rows.append(("delay: captured → fused", *(_ms(total[k]) for k in ("mean", "p50", "p95", "p99", "max"))))
+    table = page.table(("milliseconds", "mean", "p50", "p95", "p99", "max"), rows, styles=[*styles, "k0"])
+    bound = record.get("clock_bound_ms")
+    words = "" if bound is None else f"Times between two machines or processes are right to ± {bound:.2f} ms."
+    drawn = ""
+    if times:
+        drawn = _delay_by_keyframe(times) + _delay_histogram(times)
+    return f"{drawn}{table}{page.note(words) if words else ''}"
+
+
+def _delay_by_keyframe(times: Sequence[KeyframeTimes]) -> str:
+    delays = latency_ledger.durations_ms(times, *DELAY)
+    columns = min(len(times), _COLUMNS)
+    edges = np.linspace(0, len(times), columns + 1)
+    which = np.minimum((np.arange(len(times)) * columns) // len(times), columns - 1)
+    heights = [_mean(latency_ledger.durations_ms(times, *STAGES[name]), which, columns) for name in _WAY]
+    worst = np.full(columns, -np.inf)
+    np.fmax.at(worst, which, delays)
+    worst[~np.isfinite(worst)] = np.nan
+    tops = np.cumsum(heights, axis=0)
+    most = max(float(tops.max(initial=0)), float(np.nanmax(worst)) if np.isfinite(worst).any() else 0.0, 1.0)
+    chart = Chart(
+        Axis(0, len(times), "keyframe", 10),
+        Axis(0, most * 1.08, "ms"),
+        "Delay by keyframe",
+        width=1060,
+        height=300,
+    )
+    for name, low, high in zip(_WAY, np.vstack((np.zeros(columns), tops[:-1])), tops, strict=True):
+        chart.bars(edges, low, high, _STYLES[name])
+    entries = [(_STYLES[name], name) for name in _WAY]
+    per = len(times) / columns
+    if per > 1:
+        chart.line((edges[:-1] + edges[1:]) / 2, worst, "k0 thin")
+        entries.append(("k0 thin", f"slowest of about {per:.0f} keyframes (bars: their mean)"))
+    if 1.5 * most > latency_ledger.TARGET_MS:
+        chart.level(latency_ledger.TARGET_MS, f"{latency_ledger.TARGET_MS:.0f} ms")
+    return page.chart(chart.svg(), "Delay of each keyframe", legend=charts.legend(entries), is_wide=True)
+
+
+def _delay_histogram(times: Sequence[KeyframeTimes]) -> str:
+    delays = latency_ledger.durations_ms(times, *DELAY)
+    delays = delays[np.isfinite(delays)]
+    if len(delays) < 2:
+        return ""
+    p50, p95, p99 = np.percentile(delays, (50, 95, 99))
+    end = max(min(float(delays.max()), 2.5 * float(p99)), 1e-3)
+    bins = int(min(_BINS, max(8, 2 * len(delays) ** 0.5)))
+    counts, edges = np.histogram(np.minimum(delays, end), bins=bins, range=(0, end))
+    more = "" if end >= delays.max() else " (the last bar: that, or more)"
+    chart = Chart(
+        Axis(0, end, f"delay, ms{more}", 10), Axis(0, float(counts.max()) * 1.3, "keyframes"),
+        "Distribution of the delay", width=1060, height=230,
+    )  # fmt: skip
+    chart.bars(edges, np.zeros(bins), counts.astype(np.float64), "k5 apart")
+    chart.mark(float(p50), f"p50 {p50:.0f} ms")
+    chart.mark(min(float(p95), end), f"p95 {p95:.0f} ms", 1)
+    return page.chart(chart.svg(), "Its distribution", is_wide=True)
+
+
+def _mean(values: NDArray[np.float64], which: NDArray[np.int64], columns: int) -> NDArray[np.float64]:
+    known = np.isfinite(values)
+    count = np.bincount(which[known], minlength=columns)
+    total = np.bincount(which[known], values[known].clip(min=0), columns)
+    mean: NDArray[np.float64] = total / np.maximum(count, 1)
+    return mean
+
+
+def growth(found: RunFindings) -> str:
+    """Blocks, memory and waiting keyframes over time."""
+    columns = found.growth
+    seconds = columns.get("seconds", np.zeros(0))
+    if len(seconds) < 2:
+        return page.note("Not known: the run was too short, or is of a version that did not write it down.")
+    end = float(seconds.max())
+    shown = []
+    memory = [(columns[name] / 1e6, style, text) for name, style, text in _MEMORY if name in columns]
+    if memory:
+        shown.append(_over_time(seconds, end, memory, "MB", "Memory"))
+    if "blocks" in columns:
+        shown.append(_over_time(seconds, end, [(columns["blocks"], "k5", "")], "blocks of 8³ voxels", "Map"))
+    if "waiting" in columns and columns["waiting"].max() > 3:
+        waiting = [(columns["waiting"], "k6", "")]
+        shown.append(_over_time(seconds, end, waiting, "keyframes", "Keyframes that wait to be fused"))
+    return page.pair(*shown)
+
+
+_MEMORY = (("map_bytes", "k5", "map"), ("server_bytes", "k1", "server, both processes"))
+
+
+def _over_time(
+    seconds: NDArray[np.float64],
+    end: float,
+    lines: list[tuple[NDArray[np.float64], str, str]],
+    unit: str,
+    title: str,
+) -> str:
+    most = max(float(values.max()) for values, _, _ in lines)
+    chart = Chart(Axis(0, end, "s"), Axis(0, 1.08 * most or 1.0, unit), title)
+    for values, style, _ in lines:
+        chart.line(seconds, values, style)
+    entries = [(style, text) for _, style, text in lines if text]
+    return page.chart(chart.svg(), title, legend=charts.legend(entries) if entries else "")
+
+
+def trajectory_errors(found: MapFindings, *, is_given: bool) -> str:
+    """The table of trajectory errors, and the error along the way; empty where there is no reference."""
+    rows, lines = [], []
+    for key, name, text in _ERRORS:
+        error = found.figures.get(key)
+        if not error or is_given:
+            continue
+        rows.append((text, *(_metres(error[k]) for k in ("rmse", "mean", "median", "std", "min", "max")),
+                     f"{error['drift_percent']:.2g} %", f"{error['length']:.3g} m"))  # fmt: skip
+        if (line := _error_along(found, name)) is not None:
+            lines.append((*line, f"k{6 if key == 'corrected_error' else 5}", text))
+    if not rows:
+        return ""
+    head = ("absolute trajectory error", "RMSE", "mean", "median", "std", "min", "max", "drift", "length")
+    table = page.table(head, rows)
+    if not lines:
+        return table
+    unit, factor = ("mm", 1000.0) if max(float(each[1].max()) for each in lines) < 1 else ("m", 1.0)
+    end = max(float(each[0].max()) for each in lines)
+    most = factor * max(float(each[1].max()) for each in lines)
+    chart = Chart(
+        Axis(0, end, "way, m", 10), Axis(0, 1.08 * most, f"error, {unit}"), "Error along the way",
+        width=1060, height=250,
+    )  # fmt: skip
+    for way, error, style, _ in lines:
+        chart.line(way, factor * error, style)
+    entries = [(style, text) for _, _, style, text in lines]
+    return table + page.chart(chart.svg(), "Error along the way", legend=charts.legend(entries), is_wide=True)
+
+
+_ERRORS = (
+    ("trajectory_error", "trajectory", "as tracked"),
+    ("corrected_error", "trajectory-corrected", "after loop closure"),
+)
+
+
+def _error_along(found: MapFindings, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Metres of way, and metres of error after alignment, of the frames with a reference."""
+    if name not in found.paths or "reference" not in found.paths:
+        return None
+    (stamps, poses), (stamps_true, truth) = found.paths[name], found.paths["reference"]
+    assert stamps is not None  # both are of the TUM format
+    assert stamps_true is not None
+    try:
+        a, b = trajectory_error.associate(stamps, stamps_true, 1000)
+    except DatasetError:
+        return None
+    aligned, places = trajectory_error.aligned_to(poses[a], truth[b])[:, :3, 3], truth[b][:, :3, 3]
+    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)]), np.linalg.norm(aligned - places, axis=1)
+
+
+def keyframes(record: dict[str, Any]) -> str:
+    """What became of frames and keyframes."""
+    rejected = record.get("keyframes_rejected") or {}
+    named = {
+        f"{name} ({SKIP_REASONS[name]})" if name in SKIP_REASONS else name: n for name, n in rejected.items()
+    }
+    frames = f"{record['frames_tracked']} of {record['frames']} localised" if "frames" in record else ""
+    tracking = record.get("tracking_cpu_ms")
+    fused, sent = record.get("keyframes_fused", 0), record.get("keyframes_sent", 0)
+    rate = fused / record["seconds"] if record.get("seconds") else 0.0
+    return page.facts([
+        ("frames", frames),
+        ("left out", counted(record.get("frames_skipped") or {})),
+        ("localizer", str(record.get("localizer", ""))),
+        ("tracking", f"{tracking:.1f} CPU ms a frame" if tracking else ""),
+        ("keyframes", f"{fused} of {sent} sent are fused"),
+        ("chosen by", counted(record.get("keyframes_by_rule") or {})),
+        ("not in the map", counted(named)),
+        ("time", f"{record['seconds']:.1f} s, {rate:.2g} keyframes/s" if record.get("seconds") else ""),
+    ])  # fmt: skip
+
+
+def setting(record: dict[str, Any]) -> str:
+    """Where it ran, with what, and its settings."""
+    made, versions = record.get("made") or {}, record.get("versions") or {}
+    machine = [made.get("cpu", ""), f"{made['cores']} cores" if made.get("cores") else "",
+               size(made["memory_bytes"]) if made.get("memory_bytes") else ""]  # fmt: skip
+    memory = ", ".join(f"{name} {size(peak)}" for name, peak in (record.get("peak_rss_bytes") or {}).items())
+    rows = [
+        ("command", made.get("command", "")),
+        ("camera", str(record.get("camera", ""))),
+        ("folder", str(record.get("folder", ""))),
+        ("machine", ", ".join(filter(None, map(str, machine)))),
+        ("host", str(made.get("host", ""))),
+        ("peak memory", memory),
+        ("software", ", ".join(f"{name} {version}" for name, version in versions.items())),
+    ]
+    settings = json.dumps(record.get("config") or {}, indent=2, ensure_ascii=False)
+    details = page.folded("all settings", settings) if record.get("config") else ""
+    return page.facts([(name, str(text)) for name, text in rows]) + details
+
+
+def files(found: RunFindings) -> str:
+    """Files of the folder with their sizes."""
+    return page.facts((name, size(nbytes)) for name, nbytes in found.files.items())
+
+
+def map_facts(figures: dict[str, Any]) -> str:
+    """Figures of a map."""
+    mesh = figures.get("mesh") or {}
+    extent = " × ".join(f"{length:.2f}" for length in mesh.get("extent_m", ()))
+    up = mesh.get("up")
+    islands = mesh.get("islands")
+    direction = " ".join(f"{round(x, 3) + 0.0:.3f}" for x in up["direction"]) if up else ""
+    return page.facts([
+        ("extent", f"{extent} m" if extent else ""),
+        ("mesh", f"{grouped(mesh['vertices'])} vertices, {grouped(mesh['triangles'])} triangles"
+         if mesh else ""),
+        ("islands", f"{grouped(islands)} ({grouped(mesh['island_triangles'])} triangles)" if islands else ""),
+        ("up", f"{direction} (by {up['found_by']})" if up else ""),
+        ("blocks", grouped(figures["blocks"]) if figures.get("blocks") else ""),
+        ("hash", str(figures.get("map_hash", ""))),
+        ("loops closed", str(figures.get("loops") or "")),
+        ("keyframes moved", f"{figures['keyframes_moved']} in {figures['moving_s']:.1f} s"
+         if figures.get("keyframes_moved") else ""),
+    ])  # fmt: skip
+
+
+def _ms(value: float) -> str:
+    return f"{value:.1f}"
+
+
+def _metres(value: float) -> str:
+    return f"{1000 * value:.1f} mm" if abs(value) < 1 else f"{value:.2f} m"
