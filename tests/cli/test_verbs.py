@@ -136,4 +136,4 @@ def test_bash_completes_verbs_flags_and_values(tmp_path: Path) -> None:
         ["bash", tmp_path / "script.sh"], capture_output=True, text=True, timeout=60, check=False,
         env={**env, "HOME": str(tmp_path), "PATH": f"{tmp_path}:{env['PATH']}"}, stdin=subprocess.DEVNULL,
     )  # fmt: skip
-    assert done.stdout.splitlines() == ["replay", "--voxel-size", "realsense", "verify"], done.stderr
+    assert done.stdout.splitlines() == ["replay report", "--voxel-size", "realsense", "verify"], done.stderr

@@ -46,10 +46,7 @@ app = typer.Typer(
     name="tsfusion",
     cls=verbs.Group,
     help="Depth sensors in, one exact 3-D map out.",
-    epilog=(
-        "Each flag is an environment variable, too: TSFUSION_VOXEL_SIZE for --voxel-size. "
-        "`tsfusion config dump` writes every setting."
-    ),
+    epilog="Flags are environment variables, too: TSFUSION_VOXEL_SIZE for --voxel-size.",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 verbs.verb(app, "tsfusion demo", "tsfusion demo --world street --rate 2", panel=START)(replay.demo)

@@ -245,7 +245,8 @@ def _develop(image: NDArray[np.float32], factor: int) -> NDArray[np.uint8]:
     size = (image.shape[1] // factor, image.shape[0] // factor)
     linear = cv2.resize(image[..., :3], size, interpolation=cv2.INTER_AREA)
     encoded = cv2.pow(np.clip(linear, 0, 1, out=linear), 1 / 2.2)
-    return cv2.convertScaleAbs(encoded, alpha=255)
+    rgb: NDArray[np.uint8] = cv2.convertScaleAbs(encoded, alpha=255)
+    return rgb
 
 
 def write_png(rgb: NDArray[np.uint8], path: Path) -> None:

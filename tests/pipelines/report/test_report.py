@@ -16,11 +16,11 @@ from command_processes import tsfusion
 from headless_browser import browser
 
 from tsfusion.core.errors import OutputError
-from tsfusion.datasets.trajectory_files import write_tum
+from tsfusion.datasets.trajectory_files import read_poses, write_tum
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.geometry.up_direction import parse
 from tsfusion.pipelines import latency_ledger
-from tsfusion.pipelines.report import run_report, scene
+from tsfusion.pipelines.report import map_report, run_report, scene
 from tsfusion.wire.keyframe_times import KeyframeTimes
 
 _EMPTY = frozenset(("meta", "img", "br", "input", "image", "path"))  # elements without an end
@@ -286,3 +286,25 @@ def test_the_page_in_a_browser(folder: Path) -> None:
         assert chromium.errors == []
         assert {url.partition(":")[0] for url in chromium.requests} <= {"file", "data"}
         assert len({url for url in chromium.requests if url.startswith("file:")}) == 1
+
+
+def test_a_state_folder_and_a_file_have_a_report(tmp_path: Path) -> None:
+    """With the keyframes of its journal, whose they are, and the hash of the map that they make."""
+    state = tmp_path / "my-maps"
+    done = tsfusion(
+        "replay", "synthetic:room", "--max-frames", 4, "--voxel-size", 0.1, "--state", state,
+        "--out", tmp_path / "out", "--json",
+    )  # fmt: skip
+    run = json.loads(done.stdout)
+    about = map_report.read(state, None)
+    assert about.poses is not None
+    assert np.allclose(about.poses, read_poses(tmp_path / "out" / "keyframes.txt")[1], atol=1e-8)
+    file = tmp_path / "out" / "map.tsf"
+    for source, words in ((state, ("000001.mcap", "closed")), (file, ("no journal",))):
+        page = tmp_path / f"{source.name}.html"
+        done = tsfusion("report", source, "--out", page, "--json")
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout)["files"][-1] == str(page)
+        found = Structure(page.read_text(encoding="utf-8"))
+        assert run["map_hash"] in found.text
+        assert all(word in found.text for word in words)

@@ -86,7 +86,6 @@ def _page(about: AboutMap, keyframes: int, figures: dict[str, object]) -> Page:
     summary, journal = about.summary, about.journal
     mesh = figures["mesh"]
     assert isinstance(mesh, dict)
-    extent = "\u2009×\u2009".join(f"{length:.1f}" for length in mesh["extent_m"])
     damaged = [] if journal is None else [one for one in journal.problems if one.kind == "damage"]
     warnings = [f"The journal is damaged: {one.what} ({one.segment})." for one in damaged]
     if summary.rejected:
@@ -105,7 +104,7 @@ def _page(about: AboutMap, keyframes: int, figures: dict[str, object]) -> Page:
         warnings=warnings,
         tiles=[
             ("keyframes", grouped(keyframes), f"of {count_of(len(summary.sessions), 'session')}"),
-            ("map", f"{extent} m", f"{grouped(mesh['triangles'])} triangles"),
+            ("map", run_sections.extent(mesh), f"{grouped(mesh['triangles'])} triangles"),
             ("blocks", grouped(summary.blocks), f"of 8³ voxels of {summary.settings['voxel_size']:g} m"),
             ("map file", size(summary.nbytes), f"voxels in memory {size(summary.voxel_bytes)}"),
             *(

@@ -114,10 +114,8 @@ def _tiles(found: RunFindings) -> list[tuple[str, str, str]]:
     if seconds := record.get("seconds"):
         tiles.append(("time", f"{seconds:.1f} s", f"{fused / seconds:.2g} keyframes/s"))
     if mesh := first.figures.get("mesh"):
-        extent = " × ".join(f"{length:.1f}" for length in mesh["extent_m"])
-        tiles.append(
-            ("map", f"{extent} m".replace(" × ", "\u2009×\u2009"), f"{grouped(mesh['triangles'])} triangles")
-        )
+        triangles = f"{grouped(mesh['triangles'])} triangles"
+        tiles.append(("map", run_sections.extent(mesh), triangles))
     if accuracy := record.get("accuracy"):
         tiles.append(
             (

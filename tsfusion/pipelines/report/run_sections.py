@@ -254,12 +254,12 @@ def files(found: RunFindings) -> str:
 def map_facts(figures: dict[str, Any]) -> str:
     """Figures of a map."""
     mesh = figures.get("mesh") or {}
-    extent = " × ".join(f"{length:.2f}" for length in mesh.get("extent_m", ()))
+    size_m = " × ".join(f"{length:.2f}" for length in mesh.get("extent_m", ()))
     up = mesh.get("up")
     islands = mesh.get("islands")
     direction = " ".join(f"{round(x, 3) + 0.0:.3f}" for x in up["direction"]) if up else ""
     return page.facts([
-        ("extent", f"{extent} m" if extent else ""),
+        ("extent", f"{size_m} m" if size_m else ""),
         ("mesh", f"{grouped(mesh['vertices'])} vertices, {grouped(mesh['triangles'])} triangles"
          if mesh else ""),
         ("islands", f"{grouped(islands)} ({grouped(mesh['island_triangles'])} triangles)" if islands else ""),
@@ -270,6 +270,12 @@ def map_facts(figures: dict[str, Any]) -> str:
         ("keyframes moved", f"{figures['keyframes_moved']} in {figures['moving_s']:.1f} s"
          if figures.get("keyframes_moved") else ""),
     ])  # fmt: skip
+
+
+def extent(mesh: dict[str, Any]) -> str:
+    """Extent of a mesh in a few characters."""
+    lengths = (f"{length:.{0 if length >= 10 else 1}f}" for length in mesh["extent_m"])
+    return "\u2009×\u2009".join(lengths) + " m"
 
 
 def _ms(value: float) -> str:
