@@ -80,7 +80,7 @@ class ShownMap:
             else ""
         )
         return (
-            '<div class="viewer only-screen"><div class="controls"><label>colour by '
+            '<div class="viewer"><div class="controls"><label>colour by '
             f'<select>{options}</select></label><label><input type="checkbox"> walls from behind, too</label>'
             '<button type="button">reset the view</button></div><canvas tabindex="0" '
             'aria-label="3-D view of the mesh"></canvas><p class="trouble" role="status"></p>'

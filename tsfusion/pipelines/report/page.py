@@ -41,7 +41,7 @@ class Page:
         sections = "".join(
             f"<section><h2>{escape(title)}</h2>{body}</section>" for title, body in self.sections if body
         )
-        viewer = f"<script>{_resource('viewer.js')}</script>" if 'class="viewer ' in sections else ""
+        viewer = f"<script>{_resource('viewer.js')}</script>" if 'class="viewer"' in sections else ""
         colors = json.dumps(ramp().ravel().tolist(), separators=(",", ":")) if viewer else "[]"
         return (
             '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
