@@ -17,7 +17,7 @@ from keyframes_and_servers import DEADLINE, VOLUME, Server, serving, wall
 from tsfusion import Client, Volume
 from tsfusion.core.errors import DatasetError
 from tsfusion.geometry.map_answers import View
-from tsfusion.pipelines import point_files
+from tsfusion.pipelines import answer_files
 from tsfusion.wire.questions import MOST_POINTS
 
 POINTS = np.array([[0.0, 0.0, 1.2], [0.1, 0.05, 1.27], [9.0, 9.0, 9.0]])
@@ -58,7 +58,7 @@ def test_a_file_and_a_server_answer_alike(
         table = here("ask", source, "--points", tmp_path / "points.npy")
         assert table.returncode == 0, table.stderr
         rows = np.loadtxt(table.stdout.splitlines(), delimiter=",", skiprows=1)
-        assert table.stdout.splitlines()[0] == ",".join(point_files.COLUMNS)
+        assert table.stdout.splitlines()[0] == ",".join(answer_files.COLUMNS)
         np.testing.assert_array_equal(rows[:, :3], POINTS)
         np.testing.assert_allclose(rows[:, 3], expected.distance, atol=1e-6)
         assert "3 points, of which the map has seen 2" in table.stderr
@@ -169,7 +169,7 @@ def test_nobody_there_is_known_in_time(here: Here) -> None:
 def test_wrong_points_are_named(tmp_path: Path, text: str, why: str) -> None:
     (tmp_path / "points.csv").write_text(text)
     with pytest.raises(DatasetError, match=why):
-        point_files.read(str(tmp_path / "points.csv"))
+        answer_files.read(str(tmp_path / "points.csv"))
 
 
 @pytest.mark.parametrize("content", [b"", b"\x93NUMPY", np.zeros((2, 2))])
@@ -180,16 +180,16 @@ def test_wrong_arrays_are_named(tmp_path: Path, content: Any) -> None:
     else:
         np.save(path, content)
     with pytest.raises(DatasetError, match=r"points\.npy"):
-        point_files.read(str(path))
+        answer_files.read(str(path))
 
 
 def test_a_picture_shows_colours_or_the_shape(tmp_path: Path) -> None:
     depth = np.array([[0, 1.0]], np.float32)
     normals = np.array([[[0, 0, 0], [0, 0, -1]]], np.float32)
     red = np.array([[[0, 0, 0], [200, 10, 20]]], np.uint8)
-    point_files.write_view(tmp_path / "view.png", View(depth, normals, red))
+    answer_files.write_view(tmp_path / "view.png", View(depth, normals, red))
     assert cv2.imread(str(tmp_path / "view.png")).tolist() == [[[255, 255, 255], [20, 10, 200]]]
-    (background, wall_) = point_files.picture(View(depth, normals))[0].tolist()
+    (background, wall_) = answer_files.picture(View(depth, normals))[0].tolist()
     assert background == [255, 255, 255]
     assert len(set(wall_)) == 1
     assert 60 < wall_[0] < 255

@@ -89,7 +89,7 @@ def ask(
     """
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.geometry.map_grids import SLICE_FORMATS
-    from tsfusion.pipelines.point_files import VIEWS
+    from tsfusion.pipelines.answer_files import VIEWS
 
     if sum(one is not None for one in (at, points, view, slice_)) != 1:
         raise InvalidConfig(
@@ -142,24 +142,24 @@ def _ask_points(
 
     from tsfusion.core.errors import InvalidConfig
     from tsfusion.core.output_folder import check_writable
-    from tsfusion.pipelines import point_files
+    from tsfusion.pipelines import answer_files
 
     if out is not None:
-        check_writable(out, point_files.SAMPLES)
-    chosen = np.array([at], np.float64) if points is None else point_files.read(points)
+        check_writable(out, answer_files.SAMPLES)
+    chosen = np.array([at], np.float64) if points is None else answer_files.read(points)
     if not np.isfinite(chosen).all():
         raise InvalidConfig("--at must be three finite numbers")
     with _map(where, map_, link, quiet=json) as asked:
         answers = _in_parts(asked, chosen, how)
     found = _joined(answers)
     if out is not None:
-        point_files.write_samples(out, chosen, found)
+        answer_files.write_samples(out, chosen, found)
     if json:
         _print_json(answers, chosen, found, out)
     elif out is not None:
         typer.echo(f"{out}: {_counts(found)}; {_state(answers)}")
     elif points is not None:
-        typer.echo(point_files.csv_text(chosen, found), nl=False)
+        typer.echo(answer_files.csv_text(chosen, found), nl=False)
         typer.echo(f"{_counts(found)}; {_state(answers)}", err=True)
     else:
         typer.echo("\n".join([*_sentences(chosen, found), _state(answers)]))
@@ -268,10 +268,10 @@ def _camera(view: Pose, size: str, intrinsics: str | None) -> tuple[Any, Any, tu
 
 def _write_view(answer: "Answered[Any]", out: Path, *, json: bool) -> None:
     from tsfusion.cli import output
-    from tsfusion.pipelines import point_files
+    from tsfusion.pipelines import answer_files
 
     found = answer.result
-    point_files.write_view(out, found)
+    answer_files.write_view(out, found)
     height, width = found.depth.shape
     hit = found.depth[found.depth > 0]
     share = float(len(hit) / found.depth.size)

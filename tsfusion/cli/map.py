@@ -228,16 +228,12 @@ def convert(
 ) -> None:
     """Write a map as voxels, as a slice, as a mesh, or as a file of its own.
 
-    .npz, .zarr: tsdf (n, 8, 8, 8) float32 in metres, positive in front of
-    the surface, NaN where nothing was seen; weight likewise; color uint8
-    RGB; blocks (n, 3) int32; voxel_size. Voxel (i, j, k) of block b has its
-    centre at (8 b + (i, j, k) + 0.5) voxel_size. --dense: tsdf (X, Y, Z)
-    and origin instead. .vdb: a grid for OpenVDB.
-
-    --heights: free, occupied or unseen cells as ROS's map_server reads them
-    (.yaml and .pgm) or as a picture (.png); --field distance: distances.
-    .tsf: of a state folder, with all that its journal holds.
-    Meshes: `tsfusion mesh` has more choices.
+    .npz and .zarr hold blocks of 8³ voxels, or with --dense one array around
+    the map: docs/maps.md. .vdb is for OpenVDB. --heights: free, occupied or
+    unseen cells as ROS's map_server reads them (.yaml and .pgm), or a picture
+    (.png); with --field distance how far the next obstacle is. .tsf: of a
+    state folder, with all that its journal holds. Meshes: `tsfusion mesh` has
+    more choices.
     """
     from tsfusion.cli import output, progress
     from tsfusion.pipelines import mesh_files

@@ -18,28 +18,26 @@ EXAMPLES = (
 _FORMATS = ".npz .zarr .vdb .tsf .ply .glb .obj .stl; slice: .yaml .pgm .png .npz"
 Out = Annotated[
     Path,
-    typer.Argument(
-        metavar="OUT", help=".npz .zarr .vdb .tsf .ply .glb .obj .stl; slice: .yaml .pgm .png .npz"
-    ),
+    typer.Argument(metavar="OUT", help=_FORMATS),
 ]
 Dense = Annotated[
-    bool, typer.Option("--dense", help="One array around the map, not its blocks (.npz, .zarr).")
+    bool, typer.Option("--dense", help="One array, not blocks (.npz, .zarr).")
 ]
 Field = Annotated[
     Literal["tsdf", "distance"] | None,
-    typer.Option(help="Distances as fused, or Euclidean; of a slice occupancy, or distance."),
+    typer.Option(help="As fused, or Euclidean distances."),
 ]
 MaxDistance = Annotated[
     float | None,
-    typer.Option(metavar="METRES", help="Of --field distance; default 0.5, of a slice 2."),
+    typer.Option(metavar="METRES", help="Of distances: 0.5, of a slice 2."),
 ]
 Heights = Annotated[
     tuple[float, float] | None,
-    typer.Option(metavar="LOW HIGH", help="A slice: what stands between two heights, metres."),
+    typer.Option(metavar="LOW HIGH", help="A slice between two heights, metres."),
 ]
 SliceBox = Annotated[
     tuple[float, float, float, float] | None,
-    typer.Option("--box", metavar="U0 V0 U1 V1", help="Of a slice, metres; default all of it."),
+    typer.Option("--box", metavar="U0 V0 U1 V1", help="Of a slice, metres; default: all."),
 ]
 Resolution = Annotated[float | None, typer.Option(metavar="METRES", help="Cell of a slice; default a voxel.")]
 
