@@ -20,9 +20,7 @@ Out = Annotated[
     Path,
     typer.Argument(metavar="OUT", help=_FORMATS),
 ]
-Dense = Annotated[
-    bool, typer.Option("--dense", help="One array, not blocks (.npz, .zarr).")
-]
+Dense = Annotated[bool, typer.Option("--dense", help="One array, not blocks (.npz, .zarr).")]
 Field = Annotated[
     Literal["tsdf", "distance"] | None,
     typer.Option(help="As fused, or Euclidean distances."),

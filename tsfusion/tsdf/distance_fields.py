@@ -58,7 +58,7 @@ class Reach:
 def in_box(
     store: BlockStore, box: Sequence[float] | None, max_distance: float, min_weight: float, *, subvoxel: bool
 ) -> DistanceField:
-    """Distances in a box, or around the whole map: see `ReadableMap.distance_field`."""
+    """Distances in a box, or around the whole map: see `AskableMap.distance_field`."""
     size = store.voxel_size
     reach = Reach(max_distance, size)
     first, end = _bounds(store) if box is None else voxel_range(box, size)
@@ -84,7 +84,7 @@ def in_box(
 
 
 def in_blocks(store: BlockStore, max_distance: float, min_weight: float) -> Iterator[FieldBlocks]:
-    """Distances of the whole map in memory for one tile: see `ReadableMap.distance_blocks`."""
+    """Distances of the whole map in memory for one tile: see `AskableMap.distance_blocks`."""
     reach = Reach(max_distance, store.voxel_size)
     _checked_shape(np.full(3, 8 * _TILE + 2 * (reach.margin + 8)), whole=True)
     blocks = unpack_keys(store.keys)

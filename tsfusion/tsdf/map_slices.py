@@ -42,7 +42,7 @@ def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
 class CurrentSlice:
     """A slice that follows the map: `update` it with the blocks that have changed.
 
-    Made by `ReadableMap.current_slice`. After `update` it holds what a new one would.
+    Made by `AskableMap.current_slice`. After `update` it holds what a new one would.
     """
 
     def __init__(

@@ -28,10 +28,10 @@ from tsfusion.kernels import runtime
 from tsfusion.kernels.integrate import CUBE
 from tsfusion.kernels.voxel_traversal import COUNT
 from tsfusion.tsdf import checkpoint, map_addition, map_crop, map_history, saved_map
+from tsfusion.tsdf.askable_map import AskableMap
 from tsfusion.tsdf.block_store import MESHED, BlockStore, unpack_keys
 from tsfusion.tsdf.integrator import Integrator, KeyframeQuota
 from tsfusion.tsdf.ray_buffers import RayBuffers, keyframes_of_every_kind
-from tsfusion.tsdf.readable_map import ReadableMap
 from tsfusion.tsdf.residency import checked_cache
 
 log = logging.getLogger(__name__)
@@ -62,7 +62,7 @@ class VolumeStats(msgspec.Struct, frozen=True):
     resident_bytes: int  # of `bytes`, those in memory: all, unless the map has `memory_bytes`
 
 
-class Volume(ReadableMap):
+class Volume(AskableMap):
     """A sparse volume that keyframes are added to, and exactly removed from.
 
     Give a `VolumeConfig`, or the edge of a voxel in metres and other fields by name:

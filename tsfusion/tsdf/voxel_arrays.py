@@ -85,7 +85,7 @@ def write(
     Args:
         dense: one box around the whole map, instead of its blocks.
         field: signed distances as fused, with weights and colours; or the distance field.
-        max_distance, min_weight: of the distance field, as for `ReadableMap.distance_blocks`.
+        max_distance, min_weight: of the distance field, as for `AskableMap.distance_blocks`.
 
     Raises:
         InvalidConfig: for another suffix or field; OutputError: when it cannot be written, a map is empty, or

@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: MIT
+"""What a map is asked: distances at points, views, free space, distance fields, its points and voxels."""
+
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tsfusion.core.config import Surface, VolumeConfig
+from tsfusion.core.errors import MapError
+from tsfusion.geometry import up_direction
+from tsfusion.geometry.keyframe import Intrinsics
+from tsfusion.geometry.map_answers import PointCloud, Samples, View, checked_camera, checked_points
+from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice
+from tsfusion.geometry.up_direction import Up
+from tsfusion.tsdf import camera_views, distance_fields, map_blocks, map_slices, point_samples
+from tsfusion.tsdf.block_store import ASKED, BlockStore
+from tsfusion.tsdf.distance_fields import FieldBlocks
+from tsfusion.tsdf.map_blocks import Blocks
+from tsfusion.tsdf.map_slices import CurrentSlice
+from tsfusion.tsdf.readable_map import ReadableMap
+from tsfusion.tsdf.surface_tiles import SurfaceTiles
+
+MOST_SURFACES = 2  # that answers are kept of
+
+
+class AskableMap(ReadableMap):
+    """A map that answers questions, and keeps what it solved and meshed for the next one."""
+
+    def __init__(self, config: VolumeConfig, store: BlockStore) -> None:
+        super().__init__(config, store)
+        self._tiles = OrderedDict[tuple[Surface, float], SurfaceTiles]()
+
+    def sample(
+        self, points: ArrayLike, *, min_weight: float | None = None, surface: Surface | None = None
+    ) -> Samples:
+        """The signed distance, its weight and its gradient at points, between voxel centres interpolated.
+
+        Args:
+            points: (n, 3) float32 or float64 metres.
+            min_weight, surface: as for `extract_mesh`.
+        """
+        least = self._checked_min_weight(min_weight)
+        return point_samples.sample(
+            checked_points(points), self._store, least, self._tiles_of(surface, least).values
+        )
+
+    def signed_distance(
+        self, points: NDArray[np.floating], min_weight: float | None = None
+    ) -> NDArray[np.float32]:
+        """Signed distances that the map holds at points of the world: positive in the free space it saw.
+
+        Args:
+            points: (n, 3) metres; each takes the value of the voxel that it lies in.
+            min_weight: as for `extract_mesh`.
+
+        Returns:
+            (n,) metres; NaN where the map saw nothing, which is all but a band around its surfaces.
+        """
+        centres = np.floor(checked_points(points) / self.config.voxel_size) + 0.5
+        return self.sample(centres * self.config.voxel_size, min_weight=min_weight, surface="raw").distance
+
+    def raycast(
+        self,
+        intrinsics: Intrinsics | ArrayLike,
+        T_world_camera: ArrayLike,
+        shape: tuple[int, int],
+        *,
+        min_weight: float | None = None,
+        surface: Surface | None = None,
+    ) -> View:
+        """What a pinhole camera sees of the surface: depth, normals, and colours if the map has them.
+
+        A surface is seen from its front alone, which is where the sensors were.
+
+        Args:
+            intrinsics: `Intrinsics`, a (3, 3) camera matrix, or fx, fy, cx, cy; pixels.
+            T_world_camera: (4, 4) pose, camera axes x right, y down, z forward.
+            shape: (height, width), pixels.
+            min_weight, surface: as for `extract_mesh`.
+        """
+        camera = checked_camera(intrinsics, T_world_camera, shape)
+        return camera_views.cast(self._tiles_of(surface, self._checked_min_weight(min_weight)), *camera)
+
+    def point_cloud(self, *, min_weight: float | None = None, surface: Surface | None = None) -> PointCloud:
+        """Points of the surface, a vertex of its mesh each: at most three a voxel.
+
+        Args:
+            min_weight, surface: as for `extract_mesh`.
+        """
+        mesh = self.extract_mesh(min_weight, surface=surface)
+        weights = self.sample(mesh.vertices, min_weight=min_weight, surface="raw").weight
+        return PointCloud(mesh.vertices, mesh.normals, weights, mesh.colors)
+
+    def blocks(self) -> Blocks:
+        """The blocks of voxels as NumPy arrays: the stored sums without copying, and decoded on request."""
+        return Blocks(self._store)
+
+    def to_open3d(self) -> Any:
+        """Make an `open3d.t.geometry.VoxelBlockGrid` of the map as it was fused.
+
+        Open3D's meshes and points of it lie half a voxel too low along x, y and z, since Open3D takes a
+        voxel's value for that of its lowest corner: `translate` them. A distance of 8 voxels is 1 there
+        (`trunc_voxel_multiplier=8`, the default). `extract_mesh().to_open3d()` and
+        `point_cloud().to_open3d()` need no such care.
+
+        Raises:
+            MissingDependency: without Open3D.
+        """
+        return map_blocks.to_voxel_block_grid(self._store)
+
+    def distance_field(
+        self,
+        box: Sequence[float] | None = None,
+        *,
+        max_distance: float = 2.0,
+        subvoxel: bool = True,
+        min_weight: float | None = None,
+    ) -> DistanceField:
+        """Euclidean distance to the nearest surface, of every voxel in a box.
+
+        Surfaces around the box count, too: a voxel has the same distance in whatever box.
+
+        Args:
+            box: x0, y0, z0, x1, y1, z1 in metres, one voxel thick for a plane; None = around the whole map.
+            max_distance: metres; what is farther has this distance.
+            subvoxel: distances to the surface where it lies in the voxels; else between voxels' centres, as
+                SciPy's `distance_transform_edt`.
+            min_weight: as for `extract_mesh`.
+
+        Raises:
+            InvalidConfig: for another box, or one of too many voxels; MapError: no box, and an empty map.
+        """
+        weight = self._checked_min_weight(min_weight)
+        return distance_fields.in_box(self._store, box, max_distance, weight, subvoxel=subvoxel)
+
+    def distance_blocks(
+        self, *, max_distance: float = 0.5, min_weight: float | None = None
+    ) -> Iterator[FieldBlocks]:
+        """The distance field of the whole map, blocks of 8³ voxels nearer than `max_distance` to a surface.
+
+        Memory holds one tile of 16³ blocks and what lies around it, however large the map is. The values are
+        those of `distance_field`.
+
+        Raises:
+            InvalidConfig: for a `max_distance` of too many voxels.
+        """
+        weight = self._checked_min_weight(min_weight)
+        return distance_fields.in_blocks(self._store, max_distance, weight)
+
+    def current_slice(
+        self,
+        low: float,
+        high: float,
+        *,
+        box: Sequence[float] | None = None,
+        up: Up | str | None = None,
+        resolution: float | None = None,
+        max_distance: float = 2.0,
+        min_weight: float | None = None,
+        most_cells: int = map_slices.MOST_CELLS,
+    ) -> CurrentSlice:
+        """Occupancy and horizontal distances between two heights, which can follow the map.
+
+        Args:
+            low, high: metres along `up` in the map's frame.
+            box: u0, v0, u1, v1 in metres along the slice's own axes (`SliceGrid`; they are x and y where z is
+                up); None = around the whole map.
+            up: away from the ground, such as `"z"`, `"-y"` or `"0,-0.9,0.1"`; None = it is found, for which
+                the map is meshed.
+            resolution: metres, edge of a cell; None = the voxel size. A cell holds the least of its voxels.
+            max_distance, min_weight: as for `distance_field`.
+            most_cells: with those around the box from which distances come; for more there is an error.
+
+        Raises:
+            InvalidConfig: for another box, or too many cells; MapError: for an empty map and no box, or when
+                nobody can tell which way is up.
+        """
+        return CurrentSlice(
+            self._store,
+            (low, high),
+            box,
+            map_slices.axes_of(np.array(self._up(up).direction)),
+            resolution=resolution,
+            max_distance=max_distance,
+            min_weight=self._checked_min_weight(min_weight),
+            knows_free_space=self.config.space_carving,
+            most_cells=most_cells,
+        )
+
+    def occupancy_slice(
+        self, low: float, high: float, *, need_free: bool = False, **options: Any
+    ) -> OccupancySlice:
+        """A costmap: free, occupied or unseen between two heights; `save` writes it for ROS's map_server.
+
+        A cell is occupied where a surface, or what lies behind one, was seen between the heights; free where
+        half of its samples or more were seen, and no surface. Made without `space_carving`, a map knows free
+        space in a band before surfaces alone.
+
+        Args:
+            low, high, options: as for `current_slice`.
+            need_free: refuse a map that was made without `space_carving`.
+
+        Raises:
+            MapError: for such a map, or as `current_slice` does.
+        """
+        if need_free and not self.config.space_carving:
+            raise MapError(
+                "the map was made without space_carving: it knows free space near surfaces alone; fuse it "
+                "anew with space_carving=True (--space-carving)"
+            )
+        options = {"max_distance": self.config.voxel_size, **options}  # nobody asks for distances
+        return self.current_slice(low, high, **options).occupancy()
+
+    def distance_slice(self, low: float, high: float, **options: Any) -> DistanceSlice:
+        """Horizontal distance of each cell to what stands between two heights.
+
+        Args:
+            low, high, options: as for `current_slice`.
+        """
+        return self.current_slice(low, high, **options).distances()
+
+    def _up(self, given: Up | str | None) -> Up:
+        """Up as given, or found."""
+        if isinstance(given, str):
+            given = up_direction.parse(given)
+        up = given or up_direction.find(self.extract_mesh(surface="raw"), self.held)
+        if up is None:
+            raise MapError('nobody can tell which way is up in this map: give it, such as up="z" or up="-y"')
+        return up
+
+    @property
+    def _reading_bytes(self) -> int:
+        """Memory for meshes, and of what is kept of answers."""
+        return self._mesh_buffers.nbytes + sum(kept.nbytes for kept in self._tiles.values())
+
+    def _tiles_of(self, surface: Surface | None, min_weight: float) -> SurfaceTiles:
+        """What is kept of a surface for the next question, without what has changed since the last one."""
+        view, which = self._view(surface), (surface or self.model.surface, min_weight)
+        try:
+            changed = np.sort(self._store.keys[self._store.take_dirty(ASKED)])
+            for kept in self._tiles.values():
+                kept.forget(changed)
+        except BaseException:  # Ctrl-C, too: nobody may be answered from before a change
+            self._tiles.clear()
+            raise
+        if which not in self._tiles:
+            reach = {"raw": 0, "normal": 1, "field": self._field.halo}[which[0]]
+            self._tiles[which] = SurfaceTiles(self._store, view, min_weight, reach)
+        self._tiles.move_to_end(which)
+        while len(self._tiles) > MOST_SURFACES:
+            self._tiles.popitem(last=False)
+        return self._tiles[which]
