@@ -7,7 +7,7 @@ the order, and tells a keyframe that is missing or there twice.
 
 import hashlib
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -66,6 +66,9 @@ class SumMap:
 
     def limit_memory(self, nbytes: int) -> None:
         """It takes none."""
+
+    def set_pause(self, pause: Callable[[], None]) -> None:
+        """Nothing takes long."""
 
     def release_empty(self) -> int:
         """Release nothing: this map has no blocks."""

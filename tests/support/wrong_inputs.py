@@ -237,8 +237,8 @@ map crop file --box 0 0 0 1 1 --out a.tsf | '--box' | a valid | 2
 map crop file --box 0 0 0 1 1 1 --out folder.ply | cannot write folder.ply | a name ending in .tsf
 map diff missing file | missing does not exist | expected a map (.tsf) or a state folder
 map diff file file --out a.txt | cannot write a.txt | a name ending in .ply, .glb, .obj, .stl, .png
-map convert file a.txt | cannot write a.txt | a name ending in .npz, .tsf, .ply
-map convert file a.ply --dense | --dense has no effect on a.ply | only a .npz file
+map convert file a.txt | cannot write a.txt | a name ending in .npz, .zarr, .vdb, .tsf, .ply
+map convert file a.ply --dense | --dense has no effect on a.ply | only a .npz or .zarr file
 map resume garbage.tsf --state s | garbage.tsf is not a tsfusion map | expected the map.tsf
 map resume missing --state s | missing does not exist | expected a map (.tsf) or a state folder
 journal info missing | missing does not exist | expected a state folder
