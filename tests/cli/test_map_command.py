@@ -304,3 +304,12 @@ def test_a_map_of_no_server_is_resumed_for_given_poses(here: Here, tmp_path: Pat
     assert (session["last"], session["world"]) == (0, "")
     assert "--map" not in here("map", "resume", "map.tsf", "--state", "own", "--map", "No/Name").stdout
     assert not Path("own/maps/No").exists()
+
+
+def test_a_slice_beside_the_map_is_refused(here: Here) -> None:
+    volume = Volume(0.08, threads=2)
+    volume.integrate(wall())
+    volume.save("map.tsf")
+    done = here("map", "convert", "map.tsf", "yard.yaml", "--heights", 100, 101, "--up", "-y")
+    assert (done.returncode, Path("yard.yaml").exists()) == (1, False)
+    assert "nothing of the map lies between 100 and 101 m" in done.stderr

@@ -76,11 +76,19 @@ def write_slice(
     volume: "Volume", out: Path, field: str | None, max_distance: float | None, given: dict[str, Any]
 ) -> list[Path]:
     """Write a slice; returns the files."""
+    from tsfusion.core.errors import OutputError
+
     how = {name: given[name] for name in ("box", "resolution")} | {"up": options.up_direction(given["up"])}
     if field == "distance" and max_distance is not None:
         how["max_distance"] = max_distance
     found = volume.current_slice(*given["heights"], **how)
     low, high = found.extent
+    bottom, top = given["heights"]
+    if bottom >= high or top <= low:
+        raise OutputError(
+            f"nothing of the map lies between {bottom:g} and {top:g} m above its origin; it lies between "
+            f"{low:.2f} and {high:.2f} m: give other --heights"
+        )
     notes = [f"heights count from the map's origin; the map lies between {low:.2f} and {high:.2f} m"]
     if field != "distance" and not volume.config.space_carving:
         notes.append("the map was made without --space-carving: it knows free space near surfaces alone")
