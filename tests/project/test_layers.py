@@ -19,7 +19,7 @@ ROWS = (
     ("pipelines",),
     ("scanner", "server"),
     ("gateway", "client", "evaluation"),
-    ("fuser", "delivery", "datasets"),
+    ("fuser", "delivery", "datasets", "viewer"),
     ("journal",),
     ("tsdf", "wire"),
     ("kernels", "geometry"),

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""The live page: a map that grows in a browser."""
