@@ -198,13 +198,8 @@ def test_what_cannot_be_meant(shared: Server, here: Here) -> None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("most", [50, 2000])
 def test_a_window_in_a_journal_with_a_limit(tmp_path: Path, most: int) -> None:
-    limits = {
-        "keep_keyframes": most,
-        "journal_bytes": 1 << 20,
-        "segment_bytes": 1 << 16,
-        "checkpoint_every": 20,
-    }
-    with serving(tmp_path, keep_keyframes=most, **limits) as server:  # type: ignore[arg-type]
+    limits = {"journal_bytes": 1 << 20, "segment_bytes": 1 << 16, "checkpoint_every": 20}
+    with serving(tmp_path, keep_keyframes=most, **limits) as server:
         with Client(server.address) as client:
             for i in range(1500):
                 client.send(wall(i))
