@@ -15,13 +15,16 @@ from tsfusion.geometry.keyframe import Intrinsics
 from tsfusion.geometry.map_answers import PointCloud, Samples, View, checked_camera, checked_points
 from tsfusion.geometry.map_grids import DistanceField, DistanceSlice, OccupancySlice
 from tsfusion.geometry.up_direction import Up
-from tsfusion.tsdf import camera_views, distance_fields, map_blocks, map_slices, point_samples
-from tsfusion.tsdf.block_store import ASKED, BlockStore
+from tsfusion.tsdf import camera_views, distance_fields, map_blocks, map_cells, map_slices, point_samples
+from tsfusion.tsdf.block_store import ASKED, BlockStore, pack_keys, unpack_keys
 from tsfusion.tsdf.distance_fields import FieldBlocks
 from tsfusion.tsdf.map_blocks import Blocks
+from tsfusion.tsdf.map_cells import CellMeshes
 from tsfusion.tsdf.map_slices import CurrentSlice
+from tsfusion.tsdf.mesh_extraction import extract_cells
 from tsfusion.tsdf.readable_map import ReadableMap
 from tsfusion.tsdf.surface_tiles import SurfaceTiles
+from tsfusion.tsdf.surface_values import SurfaceView
 
 MOST_SURFACES = 2  # that answers are kept of
 
@@ -221,6 +224,74 @@ class AskableMap(ReadableMap):
             low, high, options: as for `current_slice`.
         """
         return self.current_slice(low, high, **options).distances()
+
+    def mesh_cells(self, cells: NDArray[np.int32], surface: Surface | None = None) -> CellMeshes:
+        """The mesh of `extract_mesh(blocks=cells)`, and which of its faces are each cell's.
+
+        Args:
+            cells: (n, 3) int32 block coordinates; of a block that the map does not have there are none.
+        """
+        keys = np.unique(pack_keys(cells))
+        return self._mesh_keys(keys, self._checked_min_weight(None), self._view(surface))
+
+    def _mesh_keys(self, keys: NDArray[np.int64], min_weight: float, view: SurfaceView) -> CellMeshes:
+        is_there = self._store.slots_of(keys) >= 0
+        with self._own_buffers() as buffers:
+            mesh, first = extract_cells(keys[is_there], self._store, min_weight, buffers, view)
+        faces = np.zeros(len(keys) + 1, np.int32)
+        faces[1:][is_there] = np.diff(first)
+        return CellMeshes(unpack_keys(keys), np.cumsum(faces, dtype=np.int32), mesh)
+
+    def next_cells(
+        self,
+        first: Sequence[int] | None = None,
+        *,
+        since: int | None = None,
+        surface: Surface | None = None,
+        most: int = 256,
+    ) -> tuple[CellMeshes, NDArray[np.int32] | None]:
+        """Some of the map's cells in the order of their keys, and where the others begin; None = nowhere.
+
+        What they show depends on the map alone, of whatever surface; `extract_mesh` of some blocks may be
+        a hundredth of a voxel from it.
+
+        Args:
+            first: block coordinates of where to begin; None = with the first cell.
+            since: only cells that changes after this `stamp` reach; cells of blocks that have gone since
+                are not among them: `drops` says whether there are any.
+            most: cells at once.
+        """
+        store, surface = self._store, surface or self.model.surface
+        start = 0 if first is None else int(pack_keys(np.array([first], np.int32))[0])
+        if since is None:
+            keys, rest = map_cells.listed(store, start, most)
+        else:
+            reach = {"raw": 0, "normal": 1, "field": self._field.coarser + 1}[surface]
+            keys, rest = map_cells.listed_since(
+                store,
+                start,
+                most,
+                since,
+                to_cells=lambda keys: pack_keys(self._cells_reached(unpack_keys(keys), surface)),
+                reach=reach,
+            )
+        least = self._checked_min_weight(None)
+        found = self._mesh_keys(keys, least, self._tiles_of(surface, least).values)
+        return found, None if rest is None else unpack_keys(np.array([rest]))[0]
+
+    def cell_stamps(self, cells: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """The stamps of the last changes to (n, 3) cells as fused, and to their own blocks: (n,) each."""
+        return map_cells.stamps_of(self._store, pack_keys(cells))
+
+    @property
+    def stamp(self) -> int:
+        """Number of the last keyframe that was added or taken away; a map that is opened begins at 0."""
+        return self._store.stamp
+
+    @property
+    def drops(self) -> int:
+        """How often blocks have gone: cells that read them have changed, too, and no stamp says so."""
+        return self._store.drops
 
     def _up(self, given: Up | str | None) -> Up:
         """Up as given, or found."""

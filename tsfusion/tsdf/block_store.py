@@ -45,6 +45,7 @@ class BlockStore:
         self.color, self.corrected = color, corrected
         self.count = 0
         self.drops = 0  # how often blocks have gone, or moved to other slots
+        self.stamp = 0  # number of the last keyframe, added or taken away; a map that is opened begins at 0
         self.most_blocks = MAX_ITEMS
         self.pause: Callable[[], None] = lambda: None  # between two steps of a long pass that only reads
         self.hash_keys = np.zeros(4 * _FIRST_CAPACITY, np.int64)

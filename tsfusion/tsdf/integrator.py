@@ -58,7 +58,6 @@ class Integrator:
         self._buffers = buffers
         self._config = config
         self._model = config.model()
-        self._stamp = 0
         self._admitted = 0  # blocks of the map that deferred rays have been added to
         self._room = 0  # blocks that the keyframe may still add to the map, for its sender's share of it
         self._affordable = 0  # blocks that it may still add, for what they cost
@@ -109,7 +108,7 @@ class Integrator:
 
     def _begin(self) -> None:
         """Empty the list of touched blocks."""
-        self._stamp += 1
+        self._store.stamp += 1
         self._buffers.touched[:TOUCHED_HEADER] = 0
         self._buffers.reserve_touched(self._store.count)
 
@@ -247,6 +246,6 @@ class Integrator:
         store, buffers = self._store, self._buffers
         integrate.add_rays(
             buffers.rays, buffers.bands, buffers.deferred, which, *part, sign, oldest, store.hash_keys,
-            store.hash_slots, buffers.missing, most_missing, self._stamp, store.stamps, store.places,
+            store.hash_slots, buffers.missing, most_missing, store.stamp, store.stamps, store.places,
             store.dirty, buffers.touched, store.sums, int(buffers.colored), store.color_rgn, store.color_b,
         )  # fmt: skip

@@ -88,9 +88,22 @@ def extract(
     view: SurfaceView = values_of,
 ) -> Mesh:
     """Mesh of the cells of the map's blocks `wanted` (sorted distinct keys)."""
+    return extract_cells(wanted, store, min_weight, buffers, view)[0]
+
+
+def extract_cells(
+    wanted: NDArray[np.int64],
+    store: BlockStore,
+    min_weight: float,
+    buffers: MeshBuffers | None = None,
+    view: SurfaceView = values_of,
+) -> tuple[Mesh, NDArray[np.int32]]:
+    """The mesh as of `extract`, and (n + 1,) where the faces of each block's cells begin."""
     buffers = buffers or MeshBuffers()
     try:
-        return extract_rows(wanted, store, min_weight, buffers, view)[0]
+        mesh, keys = extract_rows(wanted, store, min_weight, buffers, view)
+        first = buffers.first.array[np.searchsorted(keys, wanted), 1]
+        return mesh, np.append(first, np.int32(len(mesh.faces)))
     finally:
         buffers.release()  # also of a mesh that there was no memory for
 

@@ -5,6 +5,8 @@ import hashlib
 import math
 import os
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -104,12 +106,18 @@ class ReadableMap:
             reachable = (np.abs(np.asarray(blocks, np.int64)) < 1 << 18).all(axis=1)  # others have no key
             chosen = np.unique(pack_keys(blocks[reachable]))
             chosen = chosen[store.slots_of(chosen) >= 0]
-        buffers, self._mesh_buffers = self._mesh_buffers, MeshBuffers()  # who asks in a pause has others
-        try:
+        with self._own_buffers() as buffers:
             mesh = extract(np.sort(chosen), self._store, min_weight, buffers, self._view(surface))
+        return mesh if blocks is not None else replace(mesh, held=self.held)
+
+    @contextmanager
+    def _own_buffers(self) -> Iterator[MeshBuffers]:
+        """Working memory for a mesh; who asks in a pause has others."""
+        buffers, self._mesh_buffers = self._mesh_buffers, MeshBuffers()
+        try:
+            yield buffers
         finally:
             self._mesh_buffers = buffers
-        return mesh if blocks is not None else replace(mesh, held=self.held)
 
     def mesh_parts(
         self, folder: str | os.PathLike[str], min_weight: float | None = None, *, up: Up | None = None
@@ -148,9 +156,13 @@ class ReadableMap:
         They and their neighbours towards −x, −y, −z; the field carries a change into the blocks around first.
         Of what is meshed raw, normals at the rim may be a keyframe behind.
         """
-        if self.model.surface == "normal":
+        return self._cells_reached(dirty, self.model.surface)
+
+    def _cells_reached(self, dirty: NDArray[np.int32], surface: Surface) -> NDArray[np.int32]:
+        """As `cells_to_mesh`, of a surface."""
+        if surface == "normal":
             dirty = unpack_keys(field_regularizer.around(pack_keys(dirty), self._store, 1))
-        if self.model.surface == "field":
+        if surface == "field":
             dirty = unpack_keys(field_regularizer.spread(pack_keys(dirty), self._store, self._field))
         return cells_of(dirty)
 
