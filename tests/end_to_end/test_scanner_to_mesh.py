@@ -40,6 +40,7 @@ from tsfusion.fuser import messages as fuser_messages
 from tsfusion.journal import state_folder
 from tsfusion.journal.recording import JournalRecording
 from tsfusion.wire import codec, messages, sockets
+from tsfusion.wire.mesh_updates import Meshed
 from tsfusion.wire.messages import Command
 from tsfusion.wire.queries import fetch_health, fetch_mesh, fetch_status, request
 
@@ -237,7 +238,7 @@ def test_viewers_get_what_changed(shared: Server) -> None:
                 assert i < 100
         topic, head, cells, vertices, faces, *_ = viewer.recv_multipart()
     meshed = fuser_messages.to_gateway.decode(head)
-    assert isinstance(meshed, fuser_messages.Meshed)
+    assert isinstance(meshed, Meshed)
     assert meshed.layout is not None
     sizes = (12 * meshed.layout.vertices, 12 * meshed.layout.faces)
     assert (topic, len(vertices), len(faces)) == (b"mesh/default/", *sizes)

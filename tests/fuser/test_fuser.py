@@ -37,6 +37,7 @@ from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.journal import Journal, Position
 from tsfusion.journal.state_folder import MAP_FILE, PREVIOUS_FILE
 from tsfusion.wire import codec, corrections, record_header
+from tsfusion.wire.mesh_updates import Meshed
 from tsfusion.wire.messages import Command
 from tsfusion.wire.queries import fetch_health
 
@@ -172,7 +173,7 @@ def test_watchers_get_the_triangles(tmp_path: Path) -> None:
     fuser.handle(order(0, position))
     fuser.mesh()
     meshed, frames = link.sent[-1]
-    assert isinstance(meshed, messages.Meshed)
+    assert isinstance(meshed, Meshed)
     assert meshed.layout is not None
     assert [memoryview(frame).nbytes % 3 for frame in frames] == [0] * 5
 
@@ -181,6 +182,7 @@ def test_what_was_meshed_as_fused_is_refined_bit_by_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tsfusion.fuser.live_mesh._REFINED_AT_ONCE", 10)
+    monkeypatch.setattr("tsfusion.fuser.live_mesh._QUIET_S", 0.0)
     position, fuser, link = opened_with_one(tmp_path)
     fuser.handle(messages.Publish(True))
     fuser.handle(order(0, position))

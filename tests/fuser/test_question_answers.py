@@ -5,7 +5,7 @@ import struct
 import time
 from collections import deque
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,8 +16,11 @@ from tsfusion import Volume
 from tsfusion.fuser import question_answers
 from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.inbox import Inbox
+from tsfusion.fuser.keyframe_poses import KeyframePoses
 from tsfusion.fuser.messages import NOT_WORKING, Finish, FuserAnswer, FuserQuestion, Publish, encode
 from tsfusion.fuser.question_answers import QuestionAnswers
+from tsfusion.fuser.touched_by import TouchedBy
+from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.wire import questions
 from tsfusion.wire.questions import MapState, Sample
 
@@ -56,6 +59,7 @@ class Desk:
         self.answers = QuestionAnswers(
             volume,
             self.inbox,
+            WatchedMap(volume, KeyframePoses(None, {}), TouchedBy(), cast("Any", None)),
             state=lambda: MapState(keyframes=volume.keyframes),
             at_work=self.at_work,
             send=lambda message, _frames: self.sent.append(message),

@@ -10,6 +10,7 @@ from tsfusion.gateway.admission import Admission
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.ports import Ports, Subscriptions
 from tsfusion.gateway.sessions import Sessions
+from tsfusion.wire import sockets
 from tsfusion.wire.messages import Ping
 
 SESSION = bytes(range(16))
@@ -134,25 +135,25 @@ def test_topics_are_few_and_those_of_open_maps_have_room() -> None:
     topics = Subscriptions()
     taken = [topics.add(f"mesh/map{i}/".encode(), ["yard"]) for i in range(1000)]
     assert taken.count(True) == len(topics) == 256
-    assert not topics.watched("yard")
+    assert not topics.watched(sockets.mesh_topic("yard"))
     assert topics.add(b"mesh/yard/", ["yard"])
-    assert topics.watched("yard")
+    assert topics.watched(sockets.mesh_topic("yard"))
     topics.discard(b"mesh/yard/")
-    assert not topics.watched("yard")
-    assert topics.watched("map1")
+    assert not topics.watched(sockets.mesh_topic("yard"))
+    assert topics.watched(sockets.mesh_topic("map1"))
 
 
 def test_subscriptions_that_were_denied_make_nobody_watch_and_take_nothing_away() -> None:
     """A connection that ends takes its subscriptions back, and nobody says whose they were."""
     topics, topic = Subscriptions(), b"mesh/yard/"
     assert not topics.add(topic, ["yard"], granted=False)
-    assert not topics.watched("yard")
+    assert not topics.watched(sockets.mesh_topic("yard"))
     assert topics.add(topic, ["yard"])
     topics.discard(topic)  # of the one or the other
-    assert topics.watched("yard")
+    assert topics.watched(sockets.mesh_topic("yard"))
     topics.discard(topic)
-    assert not topics.watched("yard")
+    assert not topics.watched(sockets.mesh_topic("yard"))
     assert topics.add(topic, ["yard"])
     assert topics.add(topic, ["yard"])
     topics.discard(topic, granted=True)
-    assert topics.watched("yard")
+    assert topics.watched(sockets.mesh_topic("yard"))

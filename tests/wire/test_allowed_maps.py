@@ -33,7 +33,10 @@ def test_names(patterns: tuple[str, ...] | None, inside: list[str], outside: lis
         (b"mesh/ya", [b"mesh/yard-"]),
         (b"mesh/yard/", []),
         (b"mesh/", [b"mesh/house/", b"mesh/yard-"]),
-        (b"", [b"mesh/house/", b"mesh/yard-"]),
+        (b"scan/house/", [b"scan/house/"]),
+        (b"scan/hut/", []),
+        (b"scan/", [b"scan/house/", b"scan/yard-"]),
+        (b"", [b"mesh/house/", b"scan/house/", b"mesh/yard-", b"scan/yard-"]),
         (b"other", []),
     ],
 )

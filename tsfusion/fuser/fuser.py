@@ -31,6 +31,8 @@ from tsfusion.fuser.live_mesh import LiveMesh, mesh_frames
 from tsfusion.fuser.map_checkpoints import MapCheckpoints
 from tsfusion.fuser.pose_mover import REST_FACTOR, PoseMover
 from tsfusion.fuser.question_answers import QuestionAnswers
+from tsfusion.fuser.touched_by import TouchedBy
+from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.geometry.sample_ranges import NO_SAMPLES
 from tsfusion.journal import Position, state_folder
@@ -99,17 +101,21 @@ class Fuser:
         self._volume = self._map.volume
         self._volume.warm_up()
         self._volume.limit_memory(begin.memory_bytes)
+        self._touched_by = TouchedBy()
         self._live_mesh = LiveMesh(
             self._volume,
             interval=begin.mesh_interval,
             sparing=lambda: self._memory_beyond(-_FOR_KEYFRAMES),
             send=self._send,
+            touched_by=self._touched_by,
+            epoch=self._epoch,
             on_taken=self._note_taken,
         )
         self._answers: QuestionAnswers | None = None
         if inbox is not None:
+            watched = WatchedMap(self._volume, self._map.poses, self._touched_by, self._live_mesh)
             self._answers = QuestionAnswers(
-                self._volume, inbox, state=self._state, at_work=self._current, send=self._send
+                self._volume, inbox, watched, state=self._state, at_work=self._current, send=self._send
             )
             self._volume.set_pause(self._answers.give_between)
         self._departures = Departures(begin, self._map.poses, self._map.done, send=self._send)
@@ -121,6 +127,7 @@ class Fuser:
             integrate=lambda keyframe, session: self._integrate(keyframe, self._map.done[session].client),
             is_away=self._journal_is_away,
             say=self._send,
+            begin=self._note_next,
             moves=begin.moves,
             expects=lambda: int(window.is_behind),
             rest_factor=_WINDOW_REST_FACTOR if window.is_set else REST_FACTOR,
@@ -141,6 +148,10 @@ class Fuser:
     def _note_taken(self, blocks: "NDArray[np.int32]") -> None:
         if self._answers is not None:
             self._answers.slices.note_taken(blocks)
+
+    def _note_next(self, session: bytes) -> None:
+        """Note whose keyframe changes the map next."""
+        self._touched_by.note(self._volume.stamp + 1, session)
 
     def answer(self) -> None:
         """Answer the questions that wait, before anything else is done."""
@@ -180,6 +191,8 @@ class Fuser:
         if self.is_held:
             return _RETRY_MS
         waits = [self._departures.wait_ms]
+        if self._live_mesh.refine_waits:
+            waits.append(round(1000 * self._live_mesh.refine_wait) + 1)
         if self._mover.waiting:
             waits.append(round(1000 * self._mover.seconds_left) + 1)
         return min((wait for wait in waits if wait is not None), default=None)
@@ -199,8 +212,8 @@ class Fuser:
 
     @property
     def refine_due(self) -> bool:
-        """Whether viewers have cells that do not yet show the surface that the settings ask for."""
-        return self._live_mesh.refine_due
+        """Whether it is time to mesh some cells again with the surface that the settings ask for."""
+        return self._live_mesh.refine_waits and not self._live_mesh.refine_wait
 
     def refine(self) -> None:
         """Mesh some cells again. Call it only while there is nothing else to do."""
@@ -277,6 +290,7 @@ class Fuser:
                 poses.leave_out()
                 return None, ""
             found = poses.placed(order.session, found)
+            self._note_next(order.session)
             if not self._integrate(found, order.client).samples:
                 return NO_SAMPLES, self._volume.why_no_samples(found)
             poses.add(order.session, order.seq, order.position, found)

@@ -10,7 +10,7 @@ order in which records of several sessions are taken makes no difference.
 """
 
 from array import array
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from heapq import heapify, heappop, heappush
@@ -61,6 +61,26 @@ class KeptKeyframes(NamedTuple):
     segments: NDArray[np.int64]
     offsets: NDArray[np.int64]
     centers: NDArray[np.float64]
+
+
+class FusedKeyframes(NamedTuple):
+    """Some of a map's keyframes, and where they are.
+
+    Attributes:
+        sessions: whose they are.
+        session: (n,) int32, the place in `sessions` of each keyframe's.
+        seqs: (n,) int64 numbers.
+        poses: (n, 12) float64: the upper three rows of `T_world_camera`.
+        T_map_odometry: (k, 4, 4) float64: what the poses of each session's next keyframes are multiplied by.
+        last: session and number of the last that was looked at; None = there are no more.
+    """
+
+    sessions: list[bytes]
+    session: NDArray[np.int32]
+    seqs: NDArray[np.int64]
+    poses: NDArray[np.float64]
+    T_map_odometry: NDArray[np.float64]
+    last: tuple[bytes, int] | None
 
 
 class _SessionPoses:
@@ -195,6 +215,42 @@ class KeyframePoses:
         poses.segments.append(position.segment)
         poses.offsets.append(position.offset)
         poses.fused.extend(keyframe.T_world_camera[:3].ravel())
+
+    def fused_after(self, session: bytes, seq: int, most: int) -> "FusedKeyframes":
+        """Where keyframes are fused now, in the order of sessions and numbers: those behind this one.
+
+        Args:
+            most: how many are looked at.
+        """
+        sessions = sorted(key for key in self._sessions if key >= session)
+        chosen: list[bytes] = []
+        numbers, poses, rows = [np.zeros(0, np.int64)], [np.zeros((0, _POSE))], [np.zeros(0, np.int32)]
+        last, left = (session, seq), most
+        for key in sessions:
+            one = self._sessions[key]
+            start = bisect_right(one.seqs, seq) if key == session else 0
+            stop = min(start + left, len(one.seqs))
+            seqs = np.array(one.seqs[start:stop], np.int64)
+            fused = np.array(one.fused[_POSE * start : _POSE * stop]).reshape(-1, _POSE)
+            is_in_map = ~np.isnan(fused[:, 0])
+            numbers.append(seqs[is_in_map])
+            poses.append(fused[is_in_map])
+            rows.append(np.full(len(numbers[-1]), len(chosen), np.int32))
+            chosen.append(key)
+            left -= stop - start
+            last = (key, int(seqs[-1]) if len(seqs) else seq if key == session else 0)
+            if stop < len(one.seqs):
+                break
+        is_end = not sessions or (key == sessions[-1] and stop == len(one.seqs))
+        moved = [self._sessions[key].T_map_odometry for key in chosen]
+        return FusedKeyframes(
+            chosen,
+            np.concatenate(rows),
+            np.concatenate(numbers),
+            np.concatenate(poses),
+            np.array([np.eye(4) if T is None else T for T in moved]).reshape(-1, 4, 4),
+            None if is_end else last,
+        )
 
     def pose_of(self, session: bytes, seq: int) -> NDArray[np.float64] | None:
         """Where a keyframe is, or is to be: (4, 4) float64; None = it is not in the map, or not known."""

@@ -4,20 +4,24 @@
 import logging
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tsfusion.fuser import messages as fuser_messages
+from tsfusion.fuser.touched_by import TouchedBy
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.wire.health import MeshLayout
+from tsfusion.wire.mesh_updates import Meshed, MeshUpdate
 
 if TYPE_CHECKING:
+    from tsfusion.tsdf.map_cells import CellMeshes
     from tsfusion.tsdf.volume import Volume
 
 _REFINED_AT_ONCE = 256  # blocks: about 50 ms
+_QUIET_S = 1.0  # without a record: the next one is not near
+_REFINE_REST_FACTOR = 40.0  # else no more for so many times as long as it took: few keyframes wait for it
 _REST_FACTOR = 3  # no mesh for three times as long as the last took: a quarter of a busy fuser's time
 
 log = logging.getLogger(__name__)
@@ -30,6 +34,8 @@ class LiveMesh:
         interval: seconds between two meshes, at least.
         sparing: limits the memory while a mesh is made, so that the next keyframe finds some.
         send: takes a message and its frames.
+        touched_by: whose keyframes the map has.
+        epoch: of this process.
         on_taken: told of the changed blocks that were taken.
     """
 
@@ -40,26 +46,32 @@ class LiveMesh:
         interval: float,
         sparing: Callable[[], AbstractContextManager[None]],
         send: Callable[..., None],
+        touched_by: TouchedBy,
+        epoch: str,
         on_taken: Callable[[NDArray[np.int32]], None] = lambda _blocks: None,
     ) -> None:
         self._volume, self._interval, self._sparing, self._send = volume, interval, sparing, send
-        self._on_taken = on_taken
+        self._touched_by, self._epoch, self._on_taken = touched_by, epoch, on_taken
+        self.number = 0  # of the newest update
+        self._sent_until = volume.stamp, volume.drops
         self._watched = False
         self._answered = self._meshed = 0  # records of this process
         self._is_behind = False
-        self._next = 0.0  # time.monotonic()
+        self._next = self._quiet_from = self._next_refined = 0.0  # time.monotonic()
         self._unrefined = np.zeros((0, 3), np.int32)  # cells that viewers have with the raw surface
 
     def watch(self, wanted: bool) -> None:
         """Send the triangles, too, or no more."""
         self._watched = wanted
-        if not wanted:
+        if not wanted and self.refine_waits:
             self._unrefined = self._unrefined[:0]
+            self.number += 1  # who comes back knows that something was missed
 
     def note_answer(self) -> None:
         """Note that one more record was answered."""
         self._answered += 1
         self._is_behind = True
+        self._quiet_from = time.monotonic() + _QUIET_S
 
     def note_move(self) -> None:
         """Note that a keyframe was moved."""
@@ -80,10 +92,11 @@ class LiveMesh:
         except MemoryError as error:
             log.error("no memory to mesh the changed part of the map: %s", error)
             self._note_meshed()
-            self._send(self._message(time.monotonic_ns()))
+            self._send(self._message(time.monotonic_ns()))  # with a number, which viewers miss
 
     def _note_meshed(self) -> None:
         self._meshed, self._is_behind = self._answered, False
+        self._sent_until = self._volume.stamp, self._volume.drops
 
     def _update(self) -> None:
         from tsfusion.tsdf.block_store import cells_of
@@ -92,43 +105,77 @@ class LiveMesh:
         blocks = self._volume.take_dirty()
         self._on_taken(blocks)
         cells = cells_of(blocks)
-        mesh = self._volume.extract_mesh(blocks=cells, surface="raw")
+        found = self._volume.mesh_cells(cells, "raw")
         self._note_meshed()
         pause = max(self._interval, _REST_FACTOR * (time.monotonic() - started))
         self._next = time.monotonic() + pause
         meshed_ns = time.monotonic_ns()
-        if self._watched:
-            self._publish(meshed_ns, len(blocks), cells, mesh)
-            if self._volume.model.surface != "raw":
-                unrefined = np.concatenate([self._unrefined, self._volume.cells_to_mesh(blocks)])
-                self._unrefined = np.unique(unrefined, axis=0)
-        else:
+        if not self._watched:
             self._send(self._message(meshed_ns))
+            return
+        if self._volume.model.surface != "raw":
+            unrefined = np.concatenate([self._unrefined, self._volume.cells_to_mesh(blocks)])
+            self._unrefined = np.unique(unrefined, axis=0)
+        self._publish(meshed_ns, len(blocks), found, refined=self._volume.model.surface == "raw")
 
     @property
-    def refine_due(self) -> bool:
+    def refine_waits(self) -> bool:
         """Whether viewers have cells that do not yet show the surface that the settings ask for."""
         return len(self._unrefined) > 0
+
+    @property
+    def refine_wait(self) -> float:
+        """Seconds until it is time to refine some: a keyframe that comes meanwhile would have to wait."""
+        return max(min(self._quiet_from, self._next_refined) - time.monotonic(), 0.0)
 
     def refine(self) -> None:
         """Mesh some cells again, with the surface that the settings ask for.
 
         Call it only while there is nothing else to do: a keyframe that comes meanwhile waits.
         """
+        began = time.monotonic()
         cells, self._unrefined = self._unrefined[:_REFINED_AT_ONCE], self._unrefined[_REFINED_AT_ONCE:]
-        with suppress(MemoryError), self._sparing():  # the raw surface stays
-            self._publish(time.monotonic_ns(), 0, cells, self._volume.extract_mesh(blocks=cells))
+        try:
+            with self._sparing():
+                found = self._volume.mesh_cells(cells)
+                self._publish(time.monotonic_ns(), 0, found, refined=True)
+        except MemoryError:  # the raw surface stays
+            self.number += 1
+        now = time.monotonic()
+        self._next_refined = now + _REFINE_REST_FACTOR * (now - began)
 
-    def _publish(self, meshed_ns: int, blocks: int, cells: NDArray[np.int32], mesh: Mesh) -> None:
-        layout, frames = mesh_frames(mesh)
-        frames.insert(0, np.ascontiguousarray(cells).data)
-        self._send(self._message(meshed_ns, blocks, layout), frames)
+    def _publish(self, meshed_ns: int, blocks: int, found: "CellMeshes", *, refined: bool) -> None:
+        changed, touched = self._volume.cell_stamps(found.cells)
+        sessions, client = self._touched_by.of(touched)
+        layout, frames = mesh_frames(found.mesh)
+        frames.insert(0, np.ascontiguousarray(found.cells).data)
+        message = self._message(
+            meshed_ns,
+            blocks,
+            layout,
+            refined=refined,
+            settled=not self.refine_waits,
+            first_face=found.first_face.tobytes(),
+            changed=changed.tobytes(),
+            client=client.tobytes(),
+            sessions=sessions,
+        )
+        self._send(message, frames)
 
     def _message(
-        self, meshed_ns: int, blocks: int = 0, layout: MeshLayout | None = None
-    ) -> fuser_messages.Meshed:
-        stats = self._volume.stats()
-        return fuser_messages.Meshed(self._meshed, meshed_ns, blocks, stats.blocks, stats.bytes, layout)
+        self, meshed_ns: int, blocks: int = 0, layout: MeshLayout | None = None, **fields: Any
+    ) -> Meshed:
+        self.number += 1
+        stats, (sent_until, drops) = self._volume.stats(), self._sent_until
+        update = MeshUpdate(
+            epoch=self._epoch,
+            number=self.number,
+            stamp=self._volume.stamp,
+            sent_until=sent_until,
+            drops=drops,
+            **fields,
+        )
+        return Meshed(self._meshed, meshed_ns, blocks, stats.blocks, stats.bytes, layout, update)
 
 
 def mesh_frames(mesh: Mesh) -> tuple[MeshLayout, list[Any]]:

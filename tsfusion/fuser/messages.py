@@ -15,6 +15,7 @@ from tsfusion.core.errors import CheckpointError, InvalidConfig, MapError, Tsfus
 from tsfusion.journal import Position
 from tsfusion.wire.forgetting import Selection
 from tsfusion.wire.health import MeshLayout
+from tsfusion.wire.mesh_updates import Meshed
 from tsfusion.wire.messages import Command
 from tsfusion.wire.questions import Answer, Question
 
@@ -254,20 +255,6 @@ class Done(Struct, frozen=True, tag="done"):
     fused_ns: int
     reason: str | None = None
     message: str = ""
-
-
-class Meshed(Struct, frozen=True, tag="meshed"):
-    """The mesh has the first `count` keyframes that this process answered; its changed part may follow.
-
-    The changed part comes with the raw surface first, and again, with `blocks` = 0, once it is regularised.
-    """
-
-    count: int
-    meshed_ns: int
-    blocks: int = 0
-    map_blocks: int = 0
-    map_bytes: int = 0
-    layout: MeshLayout | None = None
 
 
 class FuserStatus(Struct, frozen=True):

@@ -36,6 +36,7 @@ class PoseMover:
         integrate: adds a keyframe of a session to the map, within the bounds of its client.
         is_away: whether the journal's folder is not to be found.
         say: takes each message of progress.
+        begin: told whose keyframe is moved next.
         moves: False = none is moved; those that wait for it count as unavailable.
         expects: how many more will wait in a moment; counted, that nobody takes the map for settled.
         rest_factor: after a move, so many times as long as it took none is made while keyframes come.
@@ -50,6 +51,7 @@ class PoseMover:
         integrate: Callable[[Keyframe, bytes], Any],
         is_away: Callable[[], bool],
         say: Callable[[CorrectionProgress], None],
+        begin: Callable[[bytes], None] = lambda _session: None,
         moves: bool = True,
         expects: Callable[[], int] = lambda: 0,
         rest_factor: float = REST_FACTOR,
@@ -57,7 +59,7 @@ class PoseMover:
         self.moved = 0  # keyframes
         self._volume, self._poses, self._folder = volume, poses, folder
         self._integrate, self._is_away, self._say = integrate, is_away, say
-        self._moves = moves
+        self._begin, self._moves = begin, moves
         self._expects, self._rest_factor = expects, rest_factor
         self._seconds = 0.0
         self._next = 0.0  # time.monotonic()
@@ -137,6 +139,7 @@ class PoseMover:
         found = codec.decode(journal.read(self._folder, move.position).frames)
         if not isinstance(found, Keyframe):
             raise JournalError(f"{self._folder} holds no keyframe where number {move.seq} was")
+        self._begin(move.session)
         if move.wanted is not None:
             wanted = replace(found, T_world_camera=move.wanted)
             self._integrate(wanted, move.session)

@@ -19,8 +19,19 @@ from tsfusion.fuser.current_keyframe import CurrentKeyframe
 from tsfusion.fuser.inbox import Inbox
 from tsfusion.fuser.kept_slices import KeptSlices
 from tsfusion.fuser.messages import FuserAnswer, FuserQuestion
+from tsfusion.fuser.watched_map import WatchedMap
 from tsfusion.wire import questions
-from tsfusion.wire.questions import MOST_VOXELS, Answer, Field, MapState, Raycast, Slice
+from tsfusion.wire.questions import (
+    MOST_VOXELS,
+    Answer,
+    Cells,
+    Field,
+    Keyframes,
+    MapState,
+    Raycast,
+    Sample,
+    Slice,
+)
 
 if TYPE_CHECKING:
     from tsfusion.geometry.map_grids import SliceGrid
@@ -37,6 +48,7 @@ class QuestionAnswers:
     """Answers the questions of an inbox.
 
     Args:
+        watched: answers those of who follows the map.
         state: of the map, now.
         at_work: says whether a keyframe is under way, and hears that a question is no part of it.
         send: takes a message and its frames.
@@ -46,13 +58,14 @@ class QuestionAnswers:
         self,
         volume: "Volume",
         inbox: Inbox,
+        watched: WatchedMap,
         *,
         state: Callable[[], MapState],
         at_work: CurrentKeyframe,
         send: Callable[[Any, list[Any]], None],
     ) -> None:
         self._volume, self._inbox, self._state, self._send = volume, inbox, state, send
-        self._at_work = at_work
+        self._watched, self._at_work = watched, at_work
         self.slices = KeptSlices(volume)
         self._share = Bucket(_SHARE, time.monotonic(), burst=_BURST_S)
         self._is_answering = False
@@ -98,7 +111,10 @@ class QuestionAnswers:
             self._send(FuserAnswer(asked.number, error=questions.LATE, late=True), [])
             return
         try:
-            arrays = answer_of(self._volume, self.slices, asked.question, frames)
+            if isinstance(asked.question, Cells | Keyframes):
+                arrays = self._watched.answer(asked.question)
+            else:
+                arrays = answer_of(self._volume, self.slices, asked.question, frames)
             layouts, packed = questions.pack(arrays, compress=asked.compress)
         except MemoryError as error:
             why = f"not enough memory for that: {error}; raise fuser_memory_bytes"
@@ -119,7 +135,10 @@ class QuestionAnswers:
 
 
 def answer_of(
-    volume: "Volume", slices: KeptSlices, question: questions.Question, frames: list[memoryview]
+    volume: "Volume",
+    slices: KeptSlices,
+    question: Sample | Raycast | Slice | Field,
+    frames: list[memoryview],
 ) -> _Arrays:
     """What a map answers, by name: the fields of `geometry.map_answers` and `geometry.map_grids`."""
     if isinstance(question, Slice):

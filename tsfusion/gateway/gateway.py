@@ -35,6 +35,7 @@ from tsfusion.gateway.memory_guard import PendingReplies
 from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Flood, Ports, Subscriptions, receive_some
 from tsfusion.gateway.problems import Problem, ProblemTimes
+from tsfusion.gateway.scan_updates import ScanUpdates
 from tsfusion.gateway.sessions import Sessions
 from tsfusion.wire import messages, sockets
 from tsfusion.wire.allowed_maps import ALL_MAPS, AllowedMaps
@@ -71,13 +72,16 @@ class Gateway:
         self._admission = Admission(access, self._routes)
         self._refused = self._admission.refused
         self.maps = MapRegistry(context, server, self._routes, metrics)
-        self._intake = KeyframeIntake(server, self.maps, self._admission, self._routes)
+        self._subscriptions = Subscriptions()
+        self._scans = ScanUpdates(ports, self._subscriptions)
+        self._intake = KeyframeIntake(
+            server, self.maps, self._admission, self._routes, on_keyframe=self._scans.note
+        )
         unread, most_unread = PendingReplies(), server.memory_bytes // _REPLIES_SHARE
         self._queries = FuserQueries(ports, unread, most_unread)
         self._questions = MapQuestions(
             ports, metrics, self._refused, unread=unread, max_bytes=most_unread, rate=server.quota_questions
         )
-        self._subscriptions = Subscriptions()
         self._publishing: dict[str, bool] = {}  # map → whether its fuser was told to send triangles
         self._limits = ConnectionLimits(ports, access, self._refused, server.memory_bytes)
         self._activity = ActivityLog()
@@ -121,6 +125,7 @@ class Gateway:
         for hosted, message in self.maps.step():
             self._pass_to_people(hosted, message)
         self._questions.step()
+        self._scans.step()
         self._update_fusers()
         self._snapshot()
 
@@ -172,7 +177,7 @@ class Gateway:
                 self._queries.give_up(hosted.name)
                 self._questions.give_up(hosted.name)
                 continue
-            watched = self._subscriptions.watched(hosted.name)
+            watched = self._subscriptions.watched(mesh_topic(hosted.name))
             changed = watched != self._publishing.get(hosted.name)
             if changed and hosted.fuser.send(fuser_messages.Publish(watched)):
                 self._publishing[hosted.name] = watched
@@ -280,7 +285,7 @@ class Gateway:
     ) -> None:
         maps = self._admission.maps_of(client)
         if command.name == "ping":
-            self.ports.reply(identity, messages.Reply(name="ping", asks=True))
+            self.ports.reply(identity, messages.Reply(name="ping", asks=True, watches=True))
         elif command.name == "health":
             self.ports.reply(identity, messages.Reply(name="health", health=self.health(maps)))
         elif command.name == "new_map":

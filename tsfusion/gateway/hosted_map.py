@@ -32,6 +32,7 @@ from tsfusion.journal import Journal, ReadingWatcher, state_folder
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import corrections, keyframe_times
 from tsfusion.wire.health import MapHealth, MapState
+from tsfusion.wire.mesh_updates import Meshed, MeshUpdate
 from tsfusion.wire.record_header import CorrectionHeader, RecordHeader, unpack
 
 log = logging.getLogger(__name__)
@@ -41,9 +42,7 @@ _FOR_GONE = "what no checkpoint holds of them is lost, unless they are put back"
 _SAVE_PAUSE = 10.0  # seconds until a checkpoint is tried again that could not be written
 _LONGEST_WAIT = 0.2  # seconds of a step, for a segment of the journal that is put back
 _STALLED_AFTER = 10.0  # seconds in which keyframes wait and none is fused
-ForPeople = tuple[
-    fuser_messages.Meshed | fuser_messages.FuserReply | fuser_messages.FuserAnswer, Sequence[zmq.Frame]
-]
+ForPeople = tuple[Meshed | fuser_messages.FuserReply | fuser_messages.FuserAnswer, Sequence[zmq.Frame]]
 
 
 class HostedMap:
@@ -74,6 +73,7 @@ class HostedMap:
         self._last_keyframe: float | None = None  # time.monotonic()
         self._moved = 0.0  # time.monotonic(): the fuser answered, or had nothing to answer
         self._loss = ""
+        self._newest_mesh: MeshUpdate | None = None
         self._checkpoints = 0  # written since the map was opened
         self._unsaved = ""  # why no checkpoint can be written; empty = it can
         self._save_at = 0.0  # time.monotonic()
@@ -224,8 +224,9 @@ class HostedMap:
                 self._on_saved(message)
             elif isinstance(message, fuser_messages.Found):
                 self.forgetting.on_found(message)
-            elif isinstance(message, fuser_messages.Meshed):
+            elif isinstance(message, Meshed):
                 self.outcomes.on_meshed(message)
+                self._newest_mesh = message.update or self._newest_mesh
                 for_people.append((message, frames))
             elif isinstance(message, fuser_messages.FuserAnswer):
                 for_people.append((message, frames))
@@ -407,6 +408,8 @@ class HostedMap:
             fusing_s=self.fuser.seconds_at_work,
             questions=dict(self.questions.by_outcome),
             question_ms=self.questions.delay_ms,
+            mesh_epoch=self._newest_mesh.epoch if self._newest_mesh else "",
+            mesh_number=self._newest_mesh.number if self._newest_mesh else 0,
         )
 
 

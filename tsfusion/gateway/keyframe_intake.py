@@ -7,6 +7,7 @@ own client: a forged message must not make a client give up a good keyframe.
 
 import logging
 import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import zmq
@@ -20,7 +21,7 @@ from tsfusion.gateway.hosted_map import HostedMap
 from tsfusion.gateway.map_registry import MapRegistry
 from tsfusion.gateway.quotas import Quotas
 from tsfusion.wire import codec, corrections, messages, sockets
-from tsfusion.wire.record_header import Damaged, RecordHeader, Refused, unpack
+from tsfusion.wire.record_header import Damaged, KeyframeHeader, RecordHeader, Refused, unpack
 
 log = logging.getLogger(__name__)
 
@@ -31,10 +32,20 @@ _MOST_DAMAGED = 8  # times that a record may come damaged before it is refused f
 
 
 class KeyframeIntake:
-    """The way from the data socket into the journals."""
+    """The way from the data socket into the journals.
+
+    Args:
+        on_keyframe: told of each keyframe that was journaled: its map, header, frames, and client.
+    """
 
     def __init__(
-        self, server: ServerConfig, maps: MapRegistry, admission: Admission, routes: ClientRoutes
+        self,
+        server: ServerConfig,
+        maps: MapRegistry,
+        admission: Admission,
+        routes: ClientRoutes,
+        *,
+        on_keyframe: Callable[[str, KeyframeHeader, Sequence[Any], str], None],
     ) -> None:
         self.duplicates = 0  # messages with records that were journaled before
         self._server = server
@@ -43,6 +54,7 @@ class KeyframeIntake:
         self._refused = admission.refused
         self._routes = routes
         self._quotas = Quotas(server)
+        self._on_keyframe = on_keyframe
 
     def handle(self, frames: list[zmq.Frame]) -> None:
         """Check one message, and journal its record or answer why not."""
@@ -150,6 +162,8 @@ class KeyframeIntake:
             hosted.accept(header, buffers, client, received_ns)
             if (route := self._routes.get(header.session)) is not None:
                 route.fates.taken()
+            if isinstance(header, KeyframeHeader):
+                self._on_keyframe(header.map, header, buffers, client)
         except Refused as error:
             if isinstance(error, Damaged) and self._comes_again(header):
                 self._ask_again(error, hosted, header, client)

@@ -22,6 +22,7 @@ from tsfusion.journal import read
 from tsfusion.journal.quarantine import Quarantine
 from tsfusion.wire import keyframe_times, messages
 from tsfusion.wire.keyframe_times import Spread
+from tsfusion.wire.mesh_updates import Meshed
 
 log = logging.getLogger(__name__)
 
@@ -204,7 +205,7 @@ class KeyframeOutcomes:
                 "rejected: raise quota_map, or look at what it sends"
             )
 
-    def on_meshed(self, meshed: fuser_messages.Meshed) -> None:
+    def on_meshed(self, meshed: Meshed) -> None:
         """Note that the fuser brought the mesh up to date."""
         self.blocks, self.map_bytes = meshed.map_blocks, meshed.map_bytes
         for _ in range(meshed.count - self._meshed):

@@ -39,7 +39,7 @@ class Flood(NamedTuple):
 
 
 class Ports:
-    """The sockets: keyframes in, control both ways, mesh updates out.
+    """The sockets: keyframes in, control both ways, mesh updates and what scanners see out.
 
     Args:
         grants_topics: asked when sockets are made: whether viewers get only what `grant_topics` says.
@@ -110,7 +110,7 @@ class Ports:
         send_now(self.control, [identity, messages.encode_sealed(message), *frames])
 
     def publish(self, topic: bytes, message: bytes, frames: Sequence[zmq.Frame]) -> None:
-        """Send a mesh update to the viewers that subscribed to its topic, or drop it."""
+        """Send a message to the viewers that subscribed to its topic, or drop it."""
         if not self.viewers.closed:
             send_now(self.viewers, [topic, message, *frames])
 
@@ -257,9 +257,9 @@ class Subscriptions:
             maps: the names of the open maps.
             granted: whether its viewer may have any of it.
         """
-        wanted = any(sockets.mesh_topic(name).startswith(topic) for name in maps)
+        wanted = any(own.startswith(topic) for name in maps for own in sockets.topics_of(name))
         new = topic not in self._granted and topic not in self._denied
-        if not wanted and ((new and len(self) >= _MAX_TOPICS) or not sockets.is_mesh_topic(topic)):
+        if not wanted and ((new and len(self) >= _MAX_TOPICS) or not sockets.is_topic(topic)):
             return False
         (self._granted if granted else self._denied)[topic] += 1
         return granted
@@ -280,7 +280,6 @@ class Subscriptions:
         self._granted.clear()
         self._denied.clear()
 
-    def watched(self, map_name: str) -> bool:
-        """Whether any viewer gets a map's updates."""
-        topic = sockets.mesh_topic(map_name)
+    def watched(self, topic: bytes) -> bool:
+        """Whether any viewer gets what is published under a map's topic."""
         return any(topic.startswith(wanted) for wanted in self._granted)

@@ -3,7 +3,7 @@
 
 from msgspec import Struct
 
-from tsfusion.wire.sockets import mesh_topic
+from tsfusion.wire.sockets import topics_of
 
 
 class AllowedMaps(Struct, frozen=True):
@@ -28,17 +28,22 @@ class AllowedMaps(Struct, frozen=True):
         return f"this key may not use map {name}, but: {self}"
 
     def topics(self, topic: bytes) -> list[bytes]:
-        """The part of a subscription to mesh updates that is allowed: topics that begin with this one."""
+        """The part of a subscription that is allowed: topics that begin with this one."""
         if self.patterns is None:
             return [topic]
         found = []
-        for one in self.patterns:
-            own = mesh_topic(one) if not one.endswith("*") else mesh_topic(one[:-1])[:-1]
+        for own in (own for one in self.patterns for own in _topics_of(one)):
             if own.startswith(topic):
                 found.append(own)
             elif topic.startswith(own):
                 found.append(topic)
         return found
+
+
+def _topics_of(pattern: str) -> list[bytes]:
+    if pattern.endswith("*"):
+        return [topic[:-1] for topic in topics_of(pattern[:-1])]
+    return topics_of(pattern)
 
 
 ALL_MAPS = AllowedMaps()

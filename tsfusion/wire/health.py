@@ -57,6 +57,8 @@ class MapHealth(Struct, frozen=True, kw_only=True):
     moving_s: float = 0.0  # seconds of the fuser for that
     keyframes_forgotten: int = 0  # taken out of the map for good, by `tsfusion map forget` or a setting
     questions: dict[str, int] = {}  # by outcome: answered, refused, late, failed; since the map was opened
+    mesh_epoch: str = ""  # of the newest mesh update (`wire.mesh_updates.MeshUpdate`); empty = none yet
+    mesh_number: int = 0
     question_ms: Spread = Spread()  # from question to answer, in the server, of the newest 1024
 
 

@@ -179,6 +179,7 @@ class Reply(Struct, frozen=True, tag="reply", kw_only=True):
     mesh: "MeshLayout | None" = None
     forgotten: Forgotten | None = None
     asks: bool = False  # of a ping: whether this server's maps can be asked; an older one's cannot
+    watches: bool = False  # likewise: whether its maps can be watched (`questions.Cells` and `Keyframes`)
     number: int = 0  # of the question
     late: bool = False  # whether its time was over
     answer: Answer | None = None  # arrays follow as frames

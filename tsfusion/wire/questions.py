@@ -26,10 +26,14 @@ MOST_PIXELS = 1 << 20  # of a view
 MOST_CELLS = 1 << 20  # of a slice, with those around it from which its distances come
 MOST_VOXELS = 1 << 22  # of a distance field, likewise
 FARTHEST_M = 100.0  # that a distance field reaches
+CELLS_AT_ONCE = 256  # of an answer
+REFINED_AT_ONCE = 64  # likewise, where the surface is not the raw one
+KEYFRAMES_AT_ONCE = 4096
 MOST_FRAMES = 4  # that its points come in
 LONGEST_S = 60.0  # that a question may wait
 LATE = "its time was over before the map came to it"
 _POINTS_A_FRAME = CONTROL_MAX_BYTES // 12
+_FARTHEST_BLOCK = 1 << 20
 _PACKED_FROM = 4096  # bytes: smaller arrays travel as they are
 Pose = Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)]
 
@@ -142,14 +146,55 @@ class Field(Struct, frozen=True, tag="field", omit_defaults=True):
         return _problem_of_weight(self.min_weight)
 
 
-Question = Sample | Raycast | Slice | Field
+class Cells(Struct, frozen=True, tag="cells", omit_defaults=True):
+    """Which triangles do the map's cells have, in the order of their x, y and z, some hundred at once?
+
+    Attributes:
+        first: block coordinates of where to begin; None = with the first cell.
+        since: only cells that changes after this stamp of the map reach (`mesh_updates.MeshUpdate`).
+        surface: None = the one that the map's settings say.
+    """
+
+    first: tuple[int, int, int] | None = None
+    since: int | None = None
+    surface: Literal["raw"] | None = "raw"
+
+    def problem(self, frames: Sequence[Any]) -> str:
+        """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        if frames:
+            return "cells are asked for without points"
+        if any(not -_FARTHEST_BLOCK <= one < _FARTHEST_BLOCK for one in self.first or ()):
+            return f"a map has blocks from {-_FARTHEST_BLOCK} to {_FARTHEST_BLOCK - 1}, got {self.first}"
+        if self.since is not None and not 0 <= self.since < 1 << 31:
+            return f"a stamp is from 0 to {(1 << 31) - 1}, got {self.since}"
+        return ""
+
+
+class Keyframes(Struct, frozen=True, tag="keyframes", omit_defaults=True):
+    """Where are the map's keyframes now? They come in the order of their sessions and numbers.
+
+    `session`, `after`: only those behind this one; empty = from the first one on.
+    """
+
+    session: Annotated[bytes, Meta(max_length=16)] = b""
+    after: int = 0
+
+    def problem(self, frames: Sequence[Any]) -> str:
+        """Why this is not to be asked; empty = it may be. `frames`: what came with it."""
+        if frames:
+            return "keyframes are asked for without points"
+        good = 0 <= self.after < 1 << 63
+        return "" if good else f"a keyframe has a number from 0 to {(1 << 63) - 1}, got {self.after}"
+
+
+Question = Sample | Raycast | Slice | Field | Cells | Keyframes
 
 
 class ArrayLayout(Struct, frozen=True, array_like=True):
     """One array of an answer, in the order of the frames. `packed`: as `array_encoding.pack` makes it."""
 
     name: str
-    dtype: Literal["float32", "float64", "int8", "uint8", "int32", "bool"]
+    dtype: Literal["float32", "float64", "int8", "uint8", "int32", "int64", "bool"]
     shape: tuple[int, ...]
     packed: bool = False
 
@@ -213,7 +258,7 @@ def pack(arrays: dict[str, NDArray[Any]], *, compress: bool) -> tuple[tuple[Arra
     """Arrays for the way: their layouts, and a frame each."""
     layouts, frames = [], []
     for name, array in arrays.items():
-        packed = compress and array.nbytes >= _PACKED_FROM and array.dtype != np.bool_
+        packed = compress and array.nbytes >= _PACKED_FROM and array.dtype != np.bool_ and array.itemsize <= 4
         layouts.append(ArrayLayout(name, array.dtype.name, array.shape, packed))
         frames.append(array_encoding.pack(array) if packed else np.ascontiguousarray(array).data.cast("B"))
     return tuple(layouts), frames

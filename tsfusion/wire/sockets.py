@@ -22,7 +22,7 @@ from tsfusion.wire.curve import ClientKeys, ServerKeys
 CONTROL_MAX_BYTES = 64 << 10
 # XPUB keeps a subscription at some fifty times its size; a greeting with keys needs about 330 bytes.
 TOPIC_MAX_BYTES = 512
-_MESH_TOPIC = b"mesh/"
+_KINDS = (b"mesh/", b"scan/")  # of topics
 # HANDSHAKE_IVL, ms: then a connection that is not made is closed. The others end a connection whose other end
 # has left without a word. Seconds: KEEPALIVE_IDLE and _INTVL between the probes of one that is idle, of which
 # KEEPALIVE_CNT are lost. Milliseconds: TCP_MAXRT without an answer to what is under way.
@@ -49,7 +49,7 @@ _CONNECTING: dict[int, int] = {
 _CONTEXT_FILES = 8  # that libzmq opens for a context, and a few for others
 _RANDOM_PORT_TRIES = 32
 LAST_PORT = 65535
-_MAPS_TOPIC = re.compile(rf"mesh/({MAP_NAME}/?)?".encode())  # or its beginning
+_MAPS_TOPIC = re.compile(rf"(mesh|scan)/({MAP_NAME}/?)?".encode())  # or its beginning
 _HOST6 = r"[0-9A-Fa-f]*:[0-9A-Fa-f:.]*(%[\w.-]+)?"
 _PORT = r"[0-9]{1,5}|\*"
 _ADDRESS = re.compile(rf"tcp://((?P<host>[\w.*-]+)|\[(?P<host6>{_HOST6})\]):(?P<port>{_PORT})", re.ASCII)
@@ -122,22 +122,28 @@ def publisher(
 
 def mesh_topic(map_name: str) -> bytes:
     """Topic of a map's mesh updates. No map's topic is the beginning of another map's."""
-    return _MESH_TOPIC + map_name.encode() + b"/"
+    return topics_of(map_name)[0]
 
 
-def is_mesh_topic(topic: bytes) -> bool:
-    """Whether a subscription is for the updates of one map or of all maps; no other is allowed."""
-    return _MESH_TOPIC.startswith(topic) or _MAPS_TOPIC.fullmatch(topic) is not None
+def scan_topic(map_name: str) -> bytes:
+    """Topic of the keyframes that a map's scanners send."""
+    return topics_of(map_name)[1]
+
+
+def topics_of(map_name: str) -> list[bytes]:
+    """All topics of a map."""
+    return [kind + map_name.encode() + b"/" for kind in _KINDS]
+
+
+def is_topic(topic: bytes) -> bool:
+    """Whether a subscription is for what comes of one map or of all maps; no other is allowed."""
+    return any(kind.startswith(topic) for kind in _KINDS) or _MAPS_TOPIC.fullmatch(topic) is not None
 
 
 def subscriber(
     context: "zmq.Context[Any]", keys: ClientKeys | None = None, *, map_name: str = DEFAULT_MAP
 ) -> AnySocket:
-    """A viewer's socket for a map's updates: topic, `Meshed`, cells (n, 3) int32, then a mesh's frames.
-
-    Use `connect`.
-    The triangles replace all earlier ones in these cells (blocks of 8³ voxels).
-    """
+    """A viewer's socket for a map's mesh updates (`wire/mesh_updates.py`). Use `connect`."""
     made = _make(context, zmq.SUB, {**_CONNECTING, zmq.IMMEDIATE: 0, zmq.RCVHWM: 16}, keys)
     made.setsockopt(zmq.SUBSCRIBE, mesh_topic(map_name))
     return made
@@ -239,6 +245,13 @@ def format_address(host: str, port: int) -> str:
     return f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}"
 
 
+def publish_address(address: str, control: str | None = None, publish: str | None = None) -> str:
+    """Where a server publishes: `publish` if given, else the port after its control address."""
+    if publish is not None:
+        return format_address(*parse_address(publish))
+    return _next_port(control_address(address, control), "mesh updates")
+
+
 def control_address(address: str, control: str | None = None) -> str:
     """The control address of a server: `control` if given, else the port after that of the data address."""
     if control is not None:
@@ -317,7 +330,7 @@ def bind(data: AnySocket, control: AnySocket, publish: AnySocket, listen: str, t
         try:
             bound.append((data, bind_socket(data, format_address(host, port))))
             bound.append((control, bind_socket(control, control_address(bound[0][1], to))))
-            bound.append((publish, bind_socket(publish, _next_port(bound[1][1], "mesh updates"))))
+            bound.append((publish, bind_socket(publish, publish_address("", bound[1][1]))))
             return Addresses(*(address for _, address in bound))
         except (TransportError, InvalidConfig):
             for made, address in bound:

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: MIT
+"""What is answered to those who follow a map: its cells some at a time, and where its keyframes are."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.fuser.keyframe_poses import KeyframePoses
+from tsfusion.fuser.live_mesh import LiveMesh
+from tsfusion.fuser.touched_by import TouchedBy
+from tsfusion.wire.questions import CELLS_AT_ONCE, KEYFRAMES_AT_ONCE, REFINED_AT_ONCE, Cells, Keyframes
+
+if TYPE_CHECKING:
+    from tsfusion.tsdf.volume import Volume
+
+_Arrays = dict[str, NDArray[Any]]
+_SESSION = 16  # bytes
+
+
+class WatchedMap:
+    """A map, and what of it is not in its voxels."""
+
+    def __init__(
+        self, volume: "Volume", poses: KeyframePoses, touched_by: TouchedBy, live_mesh: LiveMesh
+    ) -> None:
+        self._volume, self._poses = volume, poses
+        self._touched_by, self._live_mesh = touched_by, live_mesh
+
+    def answer(self, asked: Cells | Keyframes) -> _Arrays:
+        """The arrays of an answer, by name."""
+        return self._cells(asked) if isinstance(asked, Cells) else self._keyframes(asked)
+
+    def _cells(self, asked: Cells) -> _Arrays:
+        """As `wire.mesh_updates.MeshUpdate` describes them, and `next`: where the others begin.
+
+        `state`: stamp, drops, and the number of the newest mesh update: all later changes come in later ones.
+        """
+        volume, own = self._volume, self._volume.model.surface
+        is_refined = own in (asked.surface or own, "raw")
+        most = CELLS_AT_ONCE if (asked.surface or own) == "raw" else REFINED_AT_ONCE
+        found, following = volume.next_cells(asked.first, since=asked.since, surface=asked.surface, most=most)
+        changed, touched = volume.cell_stamps(found.cells)
+        sessions, client = self._touched_by.of(touched)
+        mesh = found.mesh
+        arrays = {
+            "cells": found.cells,
+            "first_face": found.first_face,
+            "changed": changed,
+            "client": client,
+            "sessions": _bytes_of(sessions),
+            "vertices": mesh.vertices,
+            "faces": mesh.faces,
+            "normals": mesh.normals,
+            **({} if mesh.colors is None else {"colors": mesh.colors}),
+            "next": np.zeros(0, np.int32) if following is None else following,
+            "is_refined": np.asarray(is_refined),
+            "voxel_size": np.float64(volume.config.voxel_size),
+            "state": np.array([volume.stamp, volume.drops, self._live_mesh.number], np.int64),
+        }
+        return {name: np.asarray(array) for name, array in arrays.items()}
+
+    def _keyframes(self, asked: Keyframes) -> _Arrays:
+        """As `FusedKeyframes` describes them."""
+        found = self._poses.fused_after(asked.session, asked.after, KEYFRAMES_AT_ONCE)
+        session, number = found.last or (b"", 0)
+        return {
+            "sessions": _bytes_of(found.sessions),
+            "session": found.session,
+            "seqs": found.seqs,
+            "poses": found.poses,
+            "T_map_odometry": found.T_map_odometry,
+            "last_session": np.array(list(session), np.uint8),
+            "last": np.asarray(number, np.int64),
+        }
+
+
+def _bytes_of(sessions: Any) -> NDArray[np.uint8]:
+    return np.array([list(one) for one in sessions], np.uint8).reshape(-1, _SESSION)
