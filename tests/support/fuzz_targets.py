@@ -169,6 +169,8 @@ def _questions() -> list[questions.Question]:
         questions.Raycast(intrinsics=(1.0, 1.0, 0.0, 0.0), pose=pose, shape=(2, 3)),
         questions.Slice(kind="distance", low=0.0, high=1.0, up=(0.0, 0.0, 1.0), box=(0.0, 0.0, 1.0, 1.0)),
         questions.Field(box=(0.0, 0.0, 0.0, 1.0, 1.0, 1.0), max_distance=0.5),
+        questions.Cells(first=(-1, 2, 3), since=7, surface=None),
+        questions.Keyframes(session=bytes(range(16)), after=5),
     ]
 
 

@@ -34,6 +34,7 @@ LONGEST_S = 60.0  # that a question may wait
 LATE = "its time was over before the map came to it"
 _POINTS_A_FRAME = CONTROL_MAX_BYTES // 12
 _FARTHEST_BLOCK = 1 << 20
+_PACKED = ("float32", "int8", "uint8", "int32")  # what `array_encoding.pack` takes
 _PACKED_FROM = 4096  # bytes: smaller arrays travel as they are
 Pose = Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)]
 
@@ -258,9 +259,10 @@ def pack(arrays: dict[str, NDArray[Any]], *, compress: bool) -> tuple[tuple[Arra
     """Arrays for the way: their layouts, and a frame each."""
     layouts, frames = [], []
     for name, array in arrays.items():
-        packed = compress and array.nbytes >= _PACKED_FROM and array.dtype != np.bool_ and array.itemsize <= 4
+        packed = compress and array.nbytes >= _PACKED_FROM and array.dtype.name in _PACKED
         layouts.append(ArrayLayout(name, array.dtype.name, array.shape, packed))
-        frames.append(array_encoding.pack(array) if packed else np.ascontiguousarray(array).data.cast("B"))
+        plain = np.ascontiguousarray(array).reshape(-1)
+        frames.append(array_encoding.pack(array) if packed else plain.view(np.uint8).data)
     return tuple(layouts), frames
 
 
