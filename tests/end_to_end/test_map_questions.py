@@ -27,7 +27,7 @@ from tsfusion.wire.curve import client_keys
 from tsfusion.wire.forgetting import Selection
 from tsfusion.wire.messages import Command, Reply
 from tsfusion.wire.queries import CommandRefused, fetch_health, forget
-from tsfusion.wire.questions import MOST_POINTS, Field, Raycast, Sample, Slice
+from tsfusion.wire.questions import MOST_POINTS, Cells, Field, Keyframes, Raycast, Sample, Slice
 
 COUNT = 4
 EASY = 30.0  # seconds for an answer that is there in milliseconds
@@ -196,6 +196,13 @@ def changed(question: Any, **fields: Any) -> Any:
         (changed(FLAT, low=float("nan")), [], "finite"),
         (changed(FLAT, resolution=1e-4), [], "1048576 cells"),
         (changed(AROUND, max_distance=1e9), [], "max_distance"),
+        (Cells(), [GOOD], "without points"),
+        (Cells(first=(0, 1 << 20, 0)), [], "blocks from"),
+        (Cells(first=(0, 0, -(1 << 62))), [], "blocks from"),
+        (Cells(since=-1), [], "stamp"),
+        (Cells(since=1 << 31), [], "stamp"),
+        (Keyframes(), [GOOD], "without points"),
+        (Keyframes(after=-1), [], "number"),
         (None, [], "nothing was asked"),
     ],
 )

@@ -179,6 +179,19 @@ def test_updates_alone_are_enough_for_who_misses_none() -> None:
     check(follower.held, process.volume)
 
 
+def test_triangles_of_blocks_that_are_released_go() -> None:
+    process, follower = opened("normal"), Follower()
+    follower.ask(process)
+    for i in (0, 20):
+        process.add(wall(i))
+        process.settle()
+    process.take_away(wall(20))
+    assert process.volume.release_empty()
+    process.settle()
+    follower.read(process)
+    assert follower.held.surfaces == fresh(process.volume)
+
+
 def test_the_last_update_that_is_lost_is_noticed() -> None:
     process, follower = opened("raw"), Follower()
     follower.ask(process)
@@ -277,7 +290,7 @@ def test_what_makes_no_sense_is_missed_and_asked_for() -> None:
         (changed(good, first_face=good.update.first_face[:-4]), frames),
         (changed(good, first_face=bytes(len(good.update.first_face))), frames),
         (changed(good, client=np.full(len(frames[0]) // 12, 7, np.int32).tobytes()), frames),
-        (changed(good, changed=b"123"), frames),
+        (changed(good, client=b"123"), frames),
     ):
         other = Follower()
         other.ask(opened("raw"))

@@ -33,7 +33,7 @@ MAY_REACH_TAICHI = (
 TAICHI_FREE = ("fuser.messages",)
 LIGHT = (
     *("client", "server", "scanner.scanner", "wire.codec"),
-    *("journal", "journal.recording", "datasets", "cli", "wire.map_client"),
+    *("journal", "journal.recording", "datasets", "cli", "wire.map_client", "wire.map_watcher"),
 )
 
 

@@ -145,7 +145,7 @@ class LiveMesh:
         self._next_refined = now + _REFINE_REST_FACTOR * (now - began)
 
     def _publish(self, meshed_ns: int, blocks: int, found: "CellMeshes", *, refined: bool) -> None:
-        changed, touched = self._volume.cell_stamps(found.cells)
+        _, touched = self._volume.cell_stamps(found.cells)
         sessions, client = self._touched_by.of(touched)
         layout, frames = mesh_frames(found.mesh)
         frames.insert(0, np.ascontiguousarray(found.cells).data)
@@ -156,7 +156,6 @@ class LiveMesh:
             refined=refined,
             settled=not self.refine_waits,
             first_face=found.first_face.tobytes(),
-            changed=changed.tobytes(),
             client=client.tobytes(),
             sessions=sessions,
         )

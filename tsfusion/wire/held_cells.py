@@ -18,7 +18,7 @@ class SurfacePart:
 
     Attributes:
         stamp: of the newest keyframe in the map then.
-        changed: (n,) int32: the stamp of the last change to what the cell shows as fused.
+        changed: (n,) int32: the stamp of the last change to what the cell shows as fused, or a later one.
     """
 
     cells: NDArray[np.int32]

@@ -28,7 +28,6 @@ class MeshUpdate(Struct, frozen=True, kw_only=True, omit_defaults=True):
         refined: whether it is the surface that the map's settings ask for.
         settled: whether all cells were sent with that surface since they changed.
         first_face: (n + 1,) int32, little-endian: where the faces of each cell begin.
-        changed: (n,) int32: the stamp of the last change to what the cell shows as fused.
         client: (n,) int32: the row in `sessions` of who saw the cell last; −1 = not known.
         sessions: of scanners.
     """
@@ -41,7 +40,6 @@ class MeshUpdate(Struct, frozen=True, kw_only=True, omit_defaults=True):
     refined: bool = False
     settled: bool = False
     first_face: bytes = b""
-    changed: bytes = b""
     client: bytes = b""
     sessions: tuple[bytes, ...] = ()
 

@@ -29,16 +29,17 @@ def part_of_update(meshed: Meshed, frames: Sequence[Any]) -> SurfacePart:
         mesh = mesh_of(layout, [memoryview(frame) for frame in frames[1:]])
     except TransportError as error:
         raise DecodeError(str(error)) from error
+    cells = _array(frames[0], np.int32, 3).reshape(-1, 3)
     return _checked(
         SurfacePart(
-            cells=_array(frames[0], np.int32, 3).reshape(-1, 3),
+            cells=cells,
             first_face=_array(update.first_face, np.int32),
             mesh=mesh,
             is_refined=update.refined,
             clients=update.sessions,
             client=_array(update.client, np.int32),
             stamp=update.stamp,
-            changed=_array(update.changed, np.int32),
+            changed=np.full(len(cells), update.stamp, np.int32),  # at the latest
         )
     )
 
