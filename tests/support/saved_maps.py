@@ -27,12 +27,14 @@ def make_map(
     client: str = "",
     world: str = "",
     behind: int = 0,
+    refused: Sequence[int] = (),
     config: VolumeConfig = VOLUME,
 ) -> Path:
     """The folder of a map with `wall(i)` for each of these views.
 
     Args:
         behind: number of the last keyframes that the checkpoint is without.
+        refused: numbers of keyframes that the map did not take.
     """
     folder.mkdir(parents=True, exist_ok=True)
     journal = Journal(folder / state_folder.JOURNAL_FOLDER, 1 << 20, sync=False)
@@ -43,8 +45,9 @@ def make_map(
         position = journal.append(frames, session=session, seq=seq, client=client)
         if seq <= start + len(views) - behind:
             keyframe = decode_keyframe(frames)
-            saved.volume.integrate(keyframe)
-            saved.poses.add(session, seq, position, keyframe)
+            if seq not in refused:
+                saved.volume.integrate(keyframe)
+                saved.poses.add(session, seq, position, keyframe)
             saved.done[session] = SessionProgress(seq, client, world)
     journal.close()
     assert saved.save()

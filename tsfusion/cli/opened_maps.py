@@ -12,7 +12,6 @@ from tsfusion.core.counts import count_of
 from tsfusion.core.durable_files import size_of
 
 JOURNAL = "reading the journal"
-_EXPANDS = 8  # a map in memory against its file: more than any
 _LARGE_BYTES = 64 << 20  # of a file: reading it takes seconds
 
 
@@ -23,12 +22,9 @@ def memory_for(file: Path, memory_bytes: int | None = None, *, maps: int = 1) ->
         memory_bytes: that a person gave for it.
         maps: that are open at the same time.
     """
-    from tsfusion.core import process
+    from tsfusion.pipelines import saved_maps
 
-    share = process.physical_memory_bytes() // (2 * maps)
-    if memory_bytes is None and _EXPANDS * size_of(file) > share:
-        return share
-    return memory_bytes
+    return saved_maps.memory_for(file, maps=maps) if memory_bytes is None else memory_bytes
 
 
 @contextmanager

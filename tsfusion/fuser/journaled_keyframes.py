@@ -56,7 +56,9 @@ class FinalKeyframe(NamedTuple):
     session: JournaledSession
 
 
-class _Place(NamedTuple):
+class KeyframePlace(NamedTuple):
+    """A keyframe's session and number, and where its record begins in a file."""
+
     session: bytes
     seq: int
     file: Path
@@ -93,7 +95,7 @@ class JournaledKeyframes:
         self.unreadable = Counter[str]()
         self.recorded = 0
         self._poses = KeyframePoses(None, {})
-        self._places: list[_Place] = []
+        self._places: list[KeyframePlace] = []
         for file, step in place.steps(watch):
             if isinstance(step, journal.Erased):
                 self.recorded += 1
@@ -123,6 +125,10 @@ class JournaledKeyframes:
         assert T is not None  # others are left out
         return FinalKeyframe(replace(found, T_world_camera=T), self.sessions[place.session])
 
+    def places(self) -> list[KeyframePlace]:
+        """Of all, in their order."""
+        return list(self._places)
+
     def poses(self) -> NDArray[np.float64]:
         """(n, 4, 4) final poses of all, T_world_camera; nothing is read for it."""
         return np.array([self._pose(place) for place in self._places]).reshape(-1, 4, 4)
@@ -131,7 +137,7 @@ class JournaledKeyframes:
         """Leave out the keyframes of other sessions. Corrections count whoever sent them."""
         self._places = [place for place in self._places if place.session in sessions]
 
-    def _pose(self, place: _Place) -> NDArray[np.float64] | None:
+    def _pose(self, place: KeyframePlace) -> NDArray[np.float64] | None:
         return self._poses.pose_of(place.session, place.seq)
 
     def _note(self, file: Path, record: Record) -> None:
@@ -154,7 +160,7 @@ class JournaledKeyframes:
             self.unreadable[str(error)] += 1
             return
         session.keyframes += 1
-        self._places.append(_Place(key, seq, file, record.position.offset))
+        self._places.append(KeyframePlace(key, seq, file, record.position.offset))
 
     def _forget(self, record: Record) -> None:
         with suppress(DecodeError):  # `tsfusion journal verify` tells of it

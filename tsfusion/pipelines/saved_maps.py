@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
+from tsfusion.core import process
 from tsfusion.core.config import ClientConfig, override
 from tsfusion.core.durable_files import make_folder, size_of
 from tsfusion.core.errors import CheckpointError, JournalError, OutputError
@@ -20,6 +21,8 @@ from tsfusion.pipelines import settled_maps
 from tsfusion.tsdf import checkpoint, map_history
 from tsfusion.tsdf.block_store import unpack_keys
 from tsfusion.tsdf.checkpoint import CUBE
+
+_EXPANDS = 8  # a map in memory against its file: more than any
 
 
 class SavedMap(Struct, frozen=True):
@@ -92,6 +95,16 @@ def find(path: Path, map_name: str | None = None) -> SavedMap:
         is_a_maps = (folder / state_folder.JOURNAL_FOLDER).is_dir()
         raise CheckpointError(unsaved if is_a_maps else expected, missing=True)
     return SavedMap(file, folder)
+
+
+def memory_for(file: Path, *, maps: int = 1) -> int | None:
+    """Memory that a saved map may take, the rest waits in files; None = all of it, where it surely fits.
+
+    Args:
+        maps: that are open at the same time.
+    """
+    share = process.physical_memory_bytes() // (2 * maps)
+    return share if _EXPANDS * size_of(file) > share else None
 
 
 def missing(header: checkpoint.CheckpointHeader, keyframes: int) -> int:

@@ -33,6 +33,8 @@ class SessionHistory(Struct, frozen=True, eq=False):
         unlisted: up to this number it is not known which: 0 = it is known of all.
         seqs: (n,) int64 numbers of the others in the map, ascending.
         poses: (n, 12) float64: upper three rows of each one's `T_world_camera` in the map.
+        positions: (n, 2) int64: segment of the journal and byte of each one's record.
+        taken_out: (k,) int64 numbers of those that corrections have taken out of it.
         waiting: number of keyframes whose corrected pose is not fused yet.
     """
 
@@ -43,6 +45,8 @@ class SessionHistory(Struct, frozen=True, eq=False):
     unlisted: int
     seqs: NDArray[np.int64]
     poses: NDArray[np.float64]
+    positions: NDArray[np.int64]
+    taken_out: NDArray[np.int64]
     waiting: int
 
 
@@ -54,18 +58,21 @@ def sessions(meta: Mapping[str, Any]) -> list[SessionHistory]:
     found = []
     for name, (last, client, *world) in meta.get("done", {}).items():
         # Of one that is not listed nothing is in the map, or an earlier version fused it
-        nothing = {"seqs": b"", "fused": b"", "unknown": 0 if saved else last}
+        nothing = {**dict.fromkeys(_PLACES, b""), "unknown": 0 if saved else last}
         one: Mapping[str, Any] = listed.get(name, nothing)
         fused = np.frombuffer(one["fused"]).reshape(-1, _POSE)
         there = ~np.isnan(fused[:, 0])
+        seqs, *positions = (np.frombuffer(one[column], np.int64) for column in _PLACES[:3])
         history = SessionHistory(
             session=name,
             client=client,
             world=world[0] if world else "",
             last=last,
             unlisted=one["unknown"],
-            seqs=np.frombuffer(one["seqs"], np.int64)[there],
+            seqs=seqs[there],
             poses=fused[there],
+            positions=np.stack(positions, axis=1)[there],
+            taken_out=seqs[~there],
             waiting=waiting.count(name),
         )
         found.append(history)

@@ -33,7 +33,7 @@ from tsfusion.tsdf import (
 from tsfusion.tsdf.block_store import BlockStore, cells_of, pack_keys, unpack_keys
 from tsfusion.tsdf.map_difference import MapDifference
 from tsfusion.tsdf.mesh_extraction import MeshBuffers, extract
-from tsfusion.tsdf.mesh_tiles import tiles
+from tsfusion.tsdf.mesh_tiles import CellMeshes, tiles
 from tsfusion.tsdf.surface_values import SurfaceView, values_of
 from tsfusion.tsdf.texture_images import Keyframes
 
@@ -118,6 +118,10 @@ class ReadableMap:
             yield buffers
         finally:
             self._mesh_buffers = buffers
+
+    def cell_meshes(self, surface: Surface | None = None) -> CellMeshes:
+        """The triangles of `extract_mesh`, some cells at a time, as long as the map stays as it is."""
+        return CellMeshes(self._store, self._checked_min_weight(None), self._view(surface))
 
     def mesh_parts(
         self, folder: str | os.PathLike[str], min_weight: float | None = None, *, up: Up | None = None
