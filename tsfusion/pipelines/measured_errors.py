@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: MIT
+"""How far points of a map are from the truth, where somebody knows it: a mesh, points, a world, a run."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.core.errors import DatasetError, TsfusionError
+from tsfusion.core.output_folder import RECORD
+from tsfusion.datasets.synthetic.dataset import WORLDS
+from tsfusion.evaluation.mesh_distance import MeshDistance, tree_of
+
+Measure = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+
+MESHES = (".ply", ".glb", ".obj", ".stl")
+_WORLD = "synthetic"
+_AGREES = 1e-5  # metres between a world's distance and what a run wrote down, in float32
+_REACH = 2.0  # voxels: a point farther from every vertex of a run's mesh has no error
+_TRIED = 1000  # vertices
+
+
+def error_measure(truth: str | os.PathLike[str]) -> Measure:
+    """The function that says how far points are from the truth: (n, 3) metres → (n,) metres, unsigned.
+
+    Args:
+        truth: a mesh in the map's frame (PLY, GLB, OBJ, STL), of which the distance is that of the nearest
+            triangle (exact nearby: `evaluation.mesh_distance`); a PLY of points alone, the nearest of which
+            counts; `synthetic:NAME`, the surface of a synthetic world; or the folder of a run whose dataset
+            knows its surface.
+
+    Raises:
+        DatasetError: when there is no truth in it, or it cannot be read.
+        MissingDependency: without scipy.
+    """
+    kind, _, name = str(truth).partition(":")
+    if kind == _WORLD and name:
+        return _of_world(name)
+    path = Path(truth)
+    if path.is_dir():
+        return _of_run(path)
+    if path.suffix.lower() not in MESHES:
+        raise DatasetError(
+            f"a truth is a mesh or points ({', '.join(MESHES)}), a run's folder or {_WORLD}:room, got {truth}"
+        )
+    vertices, faces = _read(path)
+    if len(faces):
+        measure = MeshDistance(vertices, faces)
+        return lambda points: measure(points).astype(np.float32)
+    tree = tree_of(vertices)
+    return lambda points: tree.query(points)[0].astype(np.float32)
+
+
+def _of_world(name: str) -> Measure:
+    if name not in WORLDS:
+        raise DatasetError(f"a synthetic world is one of {', '.join(WORLDS)}, got {name!r}")
+    world = WORLDS[name](1)
+    return lambda points: np.abs(world.distance(points.astype(np.float64))).astype(np.float32)
+
+
+def _of_run(folder: Path) -> Measure:
+    """A run's error: by its dataset's world, where that still is the same; else at its mesh's vertices."""
+    try:
+        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        errors = np.load(folder / "error.npy", allow_pickle=False)
+        voxel_size = float(record["config"]["voxel_size"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DatasetError(
+            f"{folder} holds no error that was measured (error.npy of a run whose dataset knows its surface)"
+        ) from error
+    vertices, _ = _read(folder / "mesh.ply")
+    if errors.shape != (len(vertices),):
+        raise DatasetError(f"{folder}/error.npy is not of the mesh beside it: run it again")
+    kind, _, name = str(record.get("dataset")).partition(" ")
+    if kind == _WORLD and name in WORLDS:
+        measure, some = _of_world(name), slice(None, None, 1 + len(vertices) // _TRIED)
+        if np.allclose(measure(vertices[some].astype(np.float32)), errors[some], rtol=0.0, atol=_AGREES):
+            return measure
+    tree = tree_of(vertices)
+
+    def nearest(points: NDArray[np.float32]) -> NDArray[np.float32]:
+        distance, index = tree.query(points)
+        return np.where(distance <= _REACH * voxel_size, errors[index], np.nan).astype(np.float32)
+
+    return nearest
+
+
+def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """(n, 3) vertices and (m, 3) faces of a file; no faces = it holds points alone."""
+    import trimesh
+
+    try:
+        loaded: Any = trimesh.load(path, process=False)
+        if isinstance(loaded, trimesh.Scene):
+            _check_frame(path, loaded)
+            loaded = loaded.to_mesh()
+        vertices = np.asarray(loaded.vertices, np.float64).reshape(-1, 3)
+        faces = np.asarray(getattr(loaded, "faces", np.zeros((0, 3))), np.int64).reshape(-1, 3)
+    except TsfusionError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise DatasetError(f"cannot read {path}: {reason}") from error
+    if not len(vertices) or not np.isfinite(vertices).all():
+        raise DatasetError(f"{path} has no points" if not len(vertices) else f"{path} has points at infinity")
+    return vertices, faces
+
+
+def _check_frame(path: Path, scene: Any) -> None:
+    """Refuse a GLB that tsfusion has turned: its points are not in the map's frame."""
+    notes = [one.metadata.get("up", "") for one in scene.geometry.values()]
+    if any(str(note).endswith("here +y") for note in notes):
+        raise DatasetError(
+            f"{path} is turned so that up is +y, and is not in the map's frame: give the .ply instead"
+        )
