@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Distance of points from the triangles of a mesh.
 
-Triangles are cut into pieces of like size, whose centres are in a k-d tree. A piece is no nearer than its
-centre less its radius: only those are measured that can be the nearest.
+Each triangle is covered by balls of like size, whose centres are in a k-d tree. A triangle is no nearer than
+a centre less its radius: only those are measured that can be the nearest.
 """
 
 import numpy as np
@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from tsfusion.core.errors import MissingDependency
 
-MOST_CANDIDATES = 256  # pieces a point
-_FIRST_CANDIDATES = 16
+MOST_CANDIDATES = 256  # balls a point
 SLACK = 0.02  # of the distance: what it may be too long
-_PIECES = 200_000  # that a mesh is cut into, about; it has one a triangle at the least
-_MOST_PIECES = 4_000_000
+_FIRST_CANDIDATES = 16
+_BALLS = 400_000  # for large triangles, at most
 
 Triangles = NDArray[np.float64]  # (n, 3, 3)
 
@@ -22,25 +21,24 @@ Triangles = NDArray[np.float64]  # (n, 3, 3)
 class MeshDistance:
     """Unsigned distance from a mesh: exact nearby, elsewhere at most `SLACK` of itself too long.
 
-    Where more than `MOST_CANDIDATES` pieces may be the nearest, as from the centre of a sphere, at most a
-    `piece` too long.
+    Where more than `MOST_CANDIDATES` balls may be the nearest, as from the centre of a sphere, at most a
+    `radius` too long.
 
     Args:
         vertices: (n, 3) metres.
         faces: (m, 3) integers, one at least.
 
     Attributes:
-        piece: radius of the largest piece, metres.
+        radius: of the largest ball, metres.
 
     Raises:
         MissingDependency: without scipy.
     """
 
     def __init__(self, vertices: NDArray[np.floating], faces: NDArray[np.integer]) -> None:
-        self._pieces = _cut(np.asarray(vertices, np.float64)[faces])
-        centres = self._pieces.mean(axis=1)
-        self._radii = np.linalg.norm(self._pieces - centres[:, None], axis=2).max(axis=1)
-        self.piece = float(self._radii.max())
+        self._triangles = np.asarray(vertices, np.float64)[faces]
+        centres, self._of, self._radii = _covered(self._triangles)
+        self.radius = float(self._radii.max())
         self._tree = tree_of(centres)
 
     def __call__(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -49,9 +47,9 @@ class MeshDistance:
         nearest = np.full(len(points), np.inf)
         left, count = np.arange(len(points)), _FIRST_CANDIDATES
         while len(left):
-            count = min(count, len(self._pieces))
+            count = min(count, len(self._of))
             nearest[left], is_sure = self._among(where[left], count)
-            if count in (MOST_CANDIDATES, len(self._pieces)):
+            if count in (MOST_CANDIDATES, len(self._of)):
                 break
             left, count = left[~is_sure], min(4 * count, MOST_CANDIDATES)
         return nearest
@@ -59,7 +57,7 @@ class MeshDistance:
     def _among(
         self, points: NDArray[np.float64], count: int
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Distances from the pieces with the nearest centres, and whether no other can be much nearer."""
+        """Distances from the triangles of the nearest balls, and whether no other can be much nearer."""
         to_centre, index = self._tree.query(points, k=count)
         to_centre, index = to_centre.reshape(len(points), -1), index.reshape(len(points), -1)
         best = self._measure(points, index[:, 0])
@@ -67,15 +65,15 @@ class MeshDistance:
         other = column > 0
         row, column = row[other], column[other]
         np.minimum.at(best, row, self._measure(points[row], index[row, column]))
-        return best, (1 - SLACK) * best <= to_centre[:, -1] - self.piece
+        return best, (1 - SLACK) * best <= to_centre[:, -1] - self.radius
 
-    def _measure(self, points: NDArray[np.float64], piece: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _measure(self, points: NDArray[np.float64], ball: NDArray[np.int64]) -> NDArray[np.float64]:
         from trimesh.triangles import closest_point
 
         if not len(points):
             return np.zeros(0)
-        on_piece = closest_point(self._pieces[piece], points)
-        distance: NDArray[np.float64] = np.linalg.norm(points - on_piece, axis=1)
+        on_mesh = closest_point(self._triangles[self._of[ball]], points)
+        distance: NDArray[np.float64] = np.linalg.norm(points - on_mesh, axis=1)
         return distance
 
 
@@ -90,22 +88,44 @@ def tree_of(points: NDArray[np.float64]) -> "cKDTree":  # type: ignore[name-defi
     return cKDTree(points)
 
 
-def _cut(triangles: Triangles) -> Triangles:
-    """Halve triangles across their longest edges until none is much larger than a share of the surface."""
+def _covered(triangles: Triangles) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    """Balls that cover triangles: (n, 3) centres, (n,) which triangle each is for, and (n,) radii."""
+    edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)  # a vertex and the next
+    longest, base = edges.max(axis=1), edges.argmax(axis=1)
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    longest = 2 * np.sqrt(np.linalg.norm(cross, axis=1).sum() / 2 / _PIECES)
-    done = []
-    while len(triangles):
-        edges = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2)  # a vertex and the next
-        is_large = edges.max(axis=1) > longest
-        done.append(triangles[~is_large])
-        large, from_ = triangles[is_large], edges[is_large].argmax(axis=1)
-        if 2 * len(large) + sum(map(len, done)) > _MOST_PIECES:
-            done.append(large)
+    height = np.linalg.norm(cross, axis=1) / np.maximum(longest, 1e-30)
+    step = 2 * np.sqrt((longest * height).sum() / _BALLS) or longest.max() / _BALLS or 1.0
+    while True:
+        large = np.flatnonzero(longest > step)
+        rows, columns = (np.ceil(size[large] / step).astype(np.int64) for size in (height, longest))
+        rows, columns = np.maximum(rows, 1), columns + 1
+        if not len(large) or (rows * columns).sum() <= _BALLS:
             break
-        rows = np.arange(len(large))
-        middle = (large[rows, from_] + large[rows, (from_ + 1) % 3]) / 2
-        first, second = large.copy(), large.copy()
-        first[rows, from_], second[rows, (from_ + 1) % 3] = middle, middle
-        triangles = np.concatenate([first, second])
-    return np.concatenate(done)
+        step *= 1.5
+    small = np.flatnonzero(longest <= step)
+    centres = triangles[small].mean(axis=1)
+    radii = np.linalg.norm(triangles[small] - centres[:, None], axis=2).max(axis=1)
+    on_large, of_large = _rows_of_points(triangles[large], base[large], rows, columns)
+    reach = np.full(len(of_large), step * np.hypot(1, 0.5))  # up to the next row, half way along this one
+    return (
+        np.concatenate([centres, on_large]),
+        np.concatenate([small, large[of_large]]),
+        np.concatenate([radii, reach]),
+    )
+
+
+def _rows_of_points(
+    triangles: Triangles, base: NDArray[np.int64], rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Points in rows parallel to the longest edge of triangles, from it upwards, and whose each is.
+
+    What lies above a row is beside points of it: towards the corner opposite, rows get shorter on both sides.
+    """
+    of = np.repeat(np.arange(len(triangles)), rows * columns)
+    index = np.arange(len(of)) - np.repeat(np.cumsum(rows * columns) - rows * columns, rows * columns)
+    up = (index // columns[of] / rows[of])[:, None]
+    along = (index % columns[of] / np.maximum(columns[of] - 1, 1))[:, None]
+    start, end, top = (triangles[of, (base[of] + corner) % 3] for corner in range(3))
+    left, right = start + up * (top - start), end + up * (top - end)
+    points: NDArray[np.float64] = left + along * (right - left)
+    return points, of
