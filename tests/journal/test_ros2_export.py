@@ -2,6 +2,7 @@
 """What is exported is what was journaled, to two independent readers of ROS 2 bags."""
 
 import builtins
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,12 @@ import pytest
 from failures import raising
 from keyframes_and_servers import CAMERA, pose, wall
 from mcap.reader import make_reader
+from repository import ROOT
 
 from tsfusion import Keyframe
 from tsfusion.core.errors import JournalError, MissingDependency, OutputError
 from tsfusion.datasets import Dataset, open_dataset
-from tsfusion.geometry.measured_points import points_world
+from tsfusion.geometry.measured_points import points_camera, points_world
 from tsfusion.journal import Journal, read, records, segment_path
 from tsfusion.journal.ros2_export import Export, export
 from tsfusion.journal.ros2_messages import depth_image
@@ -211,6 +213,68 @@ def test_depth_is_millimetres_or_metres(depth: np.ndarray, scale: float, expecte
     given = Keyframe(T_world_camera=pose(), depth=depth, depth_scale=scale, intrinsics=CAMERA)
     assert depth_image(given).dtype == expected.dtype
     assert np.array_equal(depth_image(given), expected, equal_nan=True)
+
+
+def test_a_cloud_of_every_other_pixel_lies_where_the_depth_is(tmp_path: Path) -> None:
+    place = journal_of(tmp_path, {"": [wall(3)]})
+    done = export(place, tmp_path / "out.mcap", lambda *_: None, clouds=True)
+    assert done.messages["/scanner/points"] == 1
+    with rosbags_highlevel.AnyReader([tmp_path / "out.mcap"]) as reader:
+        found = [
+            reader.deserialize(raw, one.msgtype)
+            for one, _, raw in reader.messages()
+            if one.topic == "/scanner/points"
+        ]
+    rows = found[0].data.reshape(-1, found[0].point_step)
+    points = rows[:, :12].copy().view("<f4")
+    depth = wall(3).depth
+    assert depth is not None
+    assert len(points) == np.count_nonzero(depth[::2, ::2])
+    assert np.allclose(points[:, 2], depth[::2, ::2][depth[::2, ::2] > 0] * 0.001)
+    every = points_camera(wall(3)).astype(np.float32)
+    assert {tuple(one) for one in points.round(4)} <= {tuple(one) for one in every.round(4)}
+    assert (rows[:, 12:15] != 0).any()
+
+
+def test_foxglove_s_layout_names_what_an_export_holds(tmp_path: Path) -> None:
+    layout = json.loads((ROOT / "contrib/foxglove/tsfusion.json").read_text(encoding="utf-8"))
+    place = journal_of(tmp_path, {"": [wall(0)]})
+    export(place, tmp_path / "out.mcap", lambda *_: None, clouds=True)
+    messages: dict[str, Any] = {}
+    with rosbags_highlevel.AnyReader([tmp_path / "out.mcap"]) as reader:
+        for one, _, raw in reader.messages():
+            messages[one.topic] = reader.deserialize(raw, one.msgtype)
+
+    panels = layout["configById"]
+    assert sorted(leaves(layout["layout"])) == sorted(panels)
+    named = [one for one in words(panels) if one.startswith("/")]
+    assert set(messages) == {one.split(".")[0] for one in named} | {"/tf", "/scanner/depth/camera_info"}
+    for path in (one for one in named if "." in one):
+        topic, *fields = path.split(".")
+        value = messages[topic]
+        for field in fields:
+            value = getattr(value, field)
+        assert isinstance(value, float)
+    frames = {messages["/tf"].transforms[0].header.frame_id, messages["/tf"].transforms[0].child_frame_id}
+    map_panel = panels["3D!map"]
+    assert {one.removeprefix("frame:") for one in map_panel["transforms"]} == frames
+    assert {map_panel["followTf"], map_panel["layers"]["grid"]["frameId"]} == {"world"}
+    cloud_shown, fields = map_panel["topics"]["/scanner/points"], messages["/scanner/points"].fields
+    assert cloud_shown["colorField"] in [field.name for field in fields]
+
+
+def leaves(split: Any) -> list[str]:
+    """The panels of a layout's tree."""
+    return [split] if isinstance(split, str) else leaves(split["first"]) + leaves(split["second"])
+
+
+def words(tree: Any) -> list[str]:
+    """Every text in a tree of dicts and lists, names too."""
+    if isinstance(tree, dict):
+        return [*tree, *(word for one in tree.values() for word in words(one))]
+    if isinstance(tree, list):
+        return [word for one in tree for word in words(one)]
+    return [tree] if isinstance(tree, str) else []
 
 
 def test_mcap_s_own_reader_takes_the_file(tmp_path: Path) -> None:

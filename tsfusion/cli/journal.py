@@ -107,7 +107,7 @@ def recover(
 @verbs.verb(
     app,
     "tsfusion journal export my-maps yard.mcap --map yard",
-    "tsfusion journal export tsfusion-spool/default waiting.mcap",
+    "tsfusion journal export my-maps yard.mcap --points",
 )
 def export(
     path: Where,
@@ -115,6 +115,9 @@ def export(
         Path, typer.Argument(metavar="OUT.mcap", help="The file to write; replaced if it exists.")
     ],
     map_: Map = None,
+    points: Annotated[
+        bool, typer.Option("--points", help="Depth as points, too: Foxglove draws no depth in 3-D.")
+    ] = False,
     json: options.Json = False,
 ) -> None:
     """Write the keyframes as ROS 2 messages into one MCAP file: Foxglove, RViz and `ros2 bag play` read it.
@@ -126,17 +129,17 @@ def export(
     /NAME/depth/image              16UC1 mm as sent; stereo: 32FC1 m
     /NAME/depth/camera_info        also for the colour image
     /NAME/color/image/compressed   the JPEG as sent
-    /NAME/points                   LiDAR, with rgb where there is colour
+    /NAME/points                   LiDAR, and --points; rgb where there is colour
 
     A message's time is its sensor's clock, or its arrival without one.
-    Needs rosbags, the extra `ros` of tsfusion.
+    Needs rosbags, the extra `ros`. contrib/foxglove has a layout for Foxglove.
 
     Exit status 1: OUT is there, but without the damaged keyframes.
     """
     from tsfusion.journal.ros2_export import export as write
 
     def work(place: "JournalPlace", watch: "Watcher") -> "Export":
-        return write(place, out, watch)
+        return write(place, out, watch, clouds=points)
 
     if _run("exporting", path, map_, work, partial(_describe_export, out), json=json).lost:
         raise typer.Exit(1)

@@ -36,8 +36,11 @@ class Export(Struct, kw_only=True):
     problems: list[Problem]
 
 
-def export(place: JournalPlace, out: Path, watch: Watcher) -> Export:
+def export(place: JournalPlace, out: Path, watch: Watcher, *, clouds: bool = False) -> Export:
     """Write every keyframe of a journal as ROS 2 messages; `out` appears when it is whole.
+
+    Args:
+        clouds: write clouds of depth images, too.
 
     Raises:
         MissingDependency: without rosbags.
@@ -53,7 +56,7 @@ def export(place: JournalPlace, out: Path, watch: Watcher) -> Export:
         raise OutputError(f"cannot write {out}: it is in the journal that is read")
     try:
         with durable_files.replacing(out) as stream:
-            exporter = _Exporter(_Bag(stream, store), Converter(store.types))
+            exporter = _Exporter(_Bag(stream, store), Converter(store.types, clouds=clouds))
             exporter.run(place, watch)
     except OSError as error:
         raise OutputError(f"cannot write {out}: {error.strerror}") from error

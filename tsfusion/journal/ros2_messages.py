@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry.keyframe import Intrinsics, Keyframe
+from tsfusion.geometry.measured_points import depth_metres
 from tsfusion.geometry.trajectory import quaternion
 from tsfusion.journal.mcap_layout import Record
 from tsfusion.wire.record_header import KeyframeHeader
@@ -19,6 +20,7 @@ from tsfusion.wire.record_header import KeyframeHeader
 WORLD = "world"
 _MILLIMETRE = 0.001
 _FLOAT32 = 7  # sensor_msgs/msg/PointField
+_STRIDE = 2  # pixels between the points of a cloud
 
 
 class Outgoing(NamedTuple):
@@ -34,10 +36,11 @@ class Converter:
 
     Args:
         types: classes of the messages by name (a rosbags type store's).
+        clouds: make clouds of depth images, too.
     """
 
-    def __init__(self, types: Any) -> None:
-        self._types = types
+    def __init__(self, types: Any, *, clouds: bool = False) -> None:
+        self._types, self._clouds = types, clouds
 
     def convert(
         self, keyframe: Keyframe, header: KeyframeHeader, record: Record, name: str, stamp_ns: int
@@ -61,6 +64,8 @@ class Converter:
                 yield Outgoing(f"/{name}/color/camera_info", "sensor_msgs/msg/CameraInfo", info)
         if keyframe.color is not None:
             yield self._color(keyframe.color, header, record, f"/{name}/color/image", heading)
+        if self._clouds and keyframe.intrinsics is not None:
+            yield self._cloud(*cloud_of(keyframe), f"/{name}/points", heading)
 
     def _make(self, kind: str, **fields: Any) -> Any:
         return self._types[kind](**fields)
@@ -179,6 +184,17 @@ def depth_image(keyframe: Keyframe) -> NDArray[Any]:
     if keyframe.depth_scale == _MILLIMETRE:
         return keyframe.depth
     return _metres(keyframe.depth * keyframe.depth_scale)
+
+
+def cloud_of(keyframe: Keyframe) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None]:
+    """(n, 3) points of every other row and column of an image, in the camera's frame, and their colours."""
+    z, K = depth_metres(keyframe)[::_STRIDE, ::_STRIDE], keyframe.intrinsics
+    assert K is not None
+    v, u = np.nonzero(z)
+    z = z[v, u]
+    x, y = (_STRIDE * u - K.cx) / K.fx * z, (_STRIDE * v - K.cy) / K.fy * z
+    color = None if keyframe.color is None else keyframe.color[::_STRIDE, ::_STRIDE][v, u]
+    return np.stack([x, y, z], axis=1).astype(np.float32), color
 
 
 def _metres(depth: NDArray[Any]) -> NDArray[np.float32]:
