@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Cut a mesh along the sides of a box: triangles across a side are cut there, exactly."""
+"""Cut a mesh along a plane or the sides of a box: triangles across it are cut there, exactly."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -26,14 +26,22 @@ def cropped(mesh: "Mesh", box: Sequence[float]) -> "Mesh":
     """See `Mesh.cropped`."""
     low, high = checked_box(box)
     for axis in range(3):
-        for side, sign in ((low[axis], 1), (high[axis], -1)):
-            mesh = _cut(mesh, axis, np.float32(side), sign)
+        for side, sign in ((np.float32(low[axis]), 1), (np.float32(high[axis]), -1)):
+            mesh = _cut(mesh, sign * (mesh.vertices[:, axis] - side), (axis, side))
     return mesh
 
 
-def _cut(mesh: "Mesh", axis: int, side: np.float32, sign: int) -> "Mesh":
-    """What lies on one side of a plane across an axis."""
-    height = sign * (mesh.vertices[:, axis] - side)
+def cut(mesh: "Mesh", normal: NDArray[np.float64], offset: float) -> "Mesh":
+    """The part of a mesh where `normal · p ≤ offset`, metres; triangles across that plane are cut there."""
+    return _cut(mesh, np.float32(offset) - mesh.vertices @ normal.astype(np.float32))
+
+
+def _cut(mesh: "Mesh", height: NDArray[np.float32], plane: tuple[int, np.float32] | None = None) -> "Mesh":
+    """What lies above a plane, where vertices have a height ≥ 0.
+
+    Args:
+        plane: the axis that it is across, and where: cut vertices are there to the last bit.
+    """
     kept = height >= 0
     count = kept[mesh.faces].sum(axis=1)
     if (count == 3).all():
@@ -45,7 +53,7 @@ def _cut(mesh: "Mesh", axis: int, side: np.float32, sign: int) -> "Mesh":
     turn = (np.argmax(alone, axis=1)[:, None] + np.arange(3)) % 3
     a, b, c = np.take_along_axis(faces, turn, axis=1).T
     edges = np.concatenate((np.stack((a, b), axis=1), np.stack((a, c), axis=1)))
-    mesh, on = _with_cuts(mesh, edges, height, axis, side)
+    mesh, on = _with_cuts(mesh, edges, height, plane)
     ab, ac = on[: len(a)], on[len(a) :]
     one = count[crossed] == 1
     tip = np.stack((a, ab, ac), axis=1)[one]
@@ -63,8 +71,7 @@ def _with_cuts(
     mesh: "Mesh",
     edges: NDArray[np.int32],
     height: NDArray[np.float32],
-    axis: int,
-    side: np.float32,
+    plane: tuple[int, np.float32] | None,
 ) -> tuple["Mesh", NDArray[np.int64]]:
     """The mesh with a vertex where each edge meets the plane, and their numbers; an edge has one.
 
@@ -74,7 +81,8 @@ def _with_cuts(
     p, q = edges.T
     share = (height[p] / (height[p] - height[q]))[:, None]
     vertices = mesh.vertices[p] + share * (mesh.vertices[q] - mesh.vertices[p])
-    vertices[:, axis] = side
+    if plane is not None:
+        vertices[:, plane[0]] = plane[1]
     normals = (1 - share) * mesh.normals[p] + share * mesh.normals[q]
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-6), mesh.normals[p])

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 """Maps made of a journal: all of it, up to a time, as one scanner saw it, elsewhere, or painted by origin."""
 
-import colorsys
 from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from tsfusion.core.config import VIEW_SETTINGS, VolumeConfig, override
 from tsfusion.core.errors import DecodeError, InvalidKeyframe, JournalError, MapError
 from tsfusion.fuser.journaled_keyframes import FinalKeyframe, JournaledKeyframes, JournaledSession
+from tsfusion.geometry import color_scales
 from tsfusion.geometry.keyframe import Keyframe
 from tsfusion.journal import selection, state_folder
 from tsfusion.journal.state_folder import Watcher
@@ -22,9 +22,6 @@ from tsfusion.pipelines import saved_maps
 from tsfusion.tsdf import checkpoint
 from tsfusion.tsdf.volume import Volume
 
-# Okabe and Ito's colours for everybody's eyes, without black: RGB
-_PALETTE = (0x0072B2, 0xE69F00, 0x009E73, 0xCC79A7, 0x56B4E9, 0xD55E00, 0xF0E442)
-_GOLDEN = 0.618034  # of a turn of hue between further colours
 ColorBy = Literal["client", "session"]
 Watch = Callable[[int, int, int], None]  # keyframes read, in the map, of how many
 
@@ -47,14 +44,14 @@ class Painter:
         name = self._name(found.session)
         self._counts[name] += 1
         keyframe = found.keyframe
-        bgr = _color(list(self._counts).index(name))[::-1]
+        bgr = color_scales.of_number(list(self._counts).index(name))[::-1]
         return replace(keyframe, color=np.full((*keyframe.shape, 3), bgr, np.uint8))
 
     @property
     def legend(self) -> list[dict[str, Any]]:
         """`name`, `color` as #rrggbb and `keyframes` of each origin, in the order in which they came."""
         return [
-            {"name": name, "color": "#{:02x}{:02x}{:02x}".format(*_color(index)), "keyframes": count}
+            {"name": name, "color": color_scales.as_hex(color_scales.of_number(index)), "keyframes": count}
             for index, (name, count) in enumerate(self._counts.items())
         ]
 
@@ -200,12 +197,3 @@ def _is_of_server(saved: Path) -> bool:
     """Whether a map says how far it is with the journal beside it; one that was put there does not."""
     with checkpoint.reading(saved) as (header, _):
         return "done" in header.meta
-
-
-def _color(index: int) -> tuple[int, int, int]:
-    """RGB of an origin."""
-    if index < len(_PALETTE):
-        packed = _PALETTE[index]
-        return packed >> 16, packed >> 8 & 255, packed & 255
-    red, green, blue = colorsys.hsv_to_rgb(index * _GOLDEN % 1, 0.65, 0.9)
-    return round(255 * red), round(255 * green), round(255 * blue)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from html import escape
 from importlib import resources
 
-from tsfusion.pipelines.report.pictures import ramp
+from tsfusion.geometry.color_scales import ramp
 
 # No request leaves the page, whatever text it holds.
 _POLICY = (

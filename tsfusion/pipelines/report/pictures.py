@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.core.errors import OutputError
+from tsfusion.geometry.color_scales import ramp, rounded_up
 from tsfusion.geometry.mesh import Mesh
 from tsfusion.pipelines import mesh_preview
 
@@ -60,19 +61,9 @@ class Sides:
 
 def error_scale(error_mm: NDArray[np.float64]) -> ErrorScale:
     """Colours for (n,) errors in millimetres, nearly all of which fit into the scale."""
-    most = max(float(np.percentile(np.abs(error_mm), _ERROR_SHARE)), 1e-3)
-    power = 10.0 ** math.floor(math.log10(most))
-    end = next(step for step in (1, 2, 3, 4, 5, 8, 10) if step * power >= most) * power
+    end = rounded_up(float(np.percentile(np.abs(error_mm), _ERROR_SHARE)))
     level = np.minimum(np.abs(error_mm) / end, 1.0)
     return ErrorScale(end, np.round(255 * level).astype(np.uint8))
-
-
-def ramp() -> NDArray[np.uint8]:
-    """(256, 3) uint8 RGB of the colour map viridis: dark is little, bright is much, also without colour."""
-    import cv2
-
-    bgr = cv2.applyColorMap(np.arange(256, dtype=np.uint8).reshape(-1, 1), cv2.COLORMAP_VIRIDIS)
-    return np.ascontiguousarray(bgr.reshape(-1, 3)[:, ::-1])
 
 
 def plan(places: NDArray[np.float64]) -> tuple[str, NDArray[np.float64]]:

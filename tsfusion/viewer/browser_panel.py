@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: MIT
+"""What one browser has to itself: its camera, measuring, pictures and downloads."""
+
+import contextlib
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.viewer import map_views
+from tsfusion.viewer.calm_callbacks import calm
+from tsfusion.viewer.map_views import View
+from tsfusion.viewer.state_tables import text
+
+if TYPE_CHECKING:
+    import viser
+
+    from tsfusion.geometry.mesh import Mesh
+
+WHOLE, BY_HAND, _FOLLOW = "Whole map", "By hand", "Follow "
+_SETTLED = 1.5  # seconds after a move of ours, in which a browser still tells older places
+_MOVED = 0.02  # of the distance to the target: further away, somebody moved the camera
+_RENDER = 30.0  # seconds that a browser may take for a picture
+_MARK = (213, 94, 0)
+
+
+class Shown(Protocol):
+    """What a browser's panel asks the page."""
+
+    voxel_size: float
+    map_name: str
+
+    def whole_view(self, aspect: float) -> View | None:
+        """All of the map."""
+        ...
+
+    def scanner_view(self, session: bytes) -> View | None:
+        """From behind a scanner."""
+        ...
+
+    def scanners(self) -> list[tuple[bytes, str]]:
+        """Sessions and names."""
+        ...
+
+    def hit(self, origin: NDArray[np.float64], direction: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """(3,) the point of the surface that a ray meets."""
+        ...
+
+    def shown_mesh(self) -> "Mesh":
+        """What is shown, in the map's frame."""
+        ...
+
+
+class BrowserPanel:
+    """The controls of one browser.
+
+    Args:
+        place: makes the container of the controls current.
+    """
+
+    def __init__(
+        self,
+        client: "viser.ClientHandle",
+        shown: Shown,
+        place: Callable[[], contextlib.AbstractContextManager[Any]],
+    ) -> None:
+        self._client, self._shown = client, shown
+        self._commanded: View | None = None
+        self._moved_at = 0.0
+        self._points: list[NDArray[np.float64]] = []
+        self._marks: list[Any] = []
+        self._is_measuring = False
+        with place():
+            gui = client.gui
+            self._camera: Any = gui.add_dropdown("Camera", (WHOLE, BY_HAND), initial_value=WHOLE)
+            self._measure = gui.add_button("Measure a distance", hint="Click two points of the surface")
+            self._answer = gui.add_html("", visible=False)
+            picture = gui.add_button("Save picture")
+            model = gui.add_button("Save 3-D model", hint="GLB of what is shown: cut, and in these colours")
+            dark = gui.add_checkbox("Dark", False)
+        self._camera.on_update(calm(lambda event: self._forget_view()))
+        self._measure.on_click(calm(lambda event: self._toggle_measuring()))
+        picture.on_click(calm(lambda event: self._save_picture()))
+        model.on_click(calm(lambda event: self._save_model()))
+        dark.on_update(calm(lambda event: set_theme(client.gui, dark=dark.value)))
+        client.camera.fov = map_views.FOV
+        client.camera.on_update(calm(lambda event: self._note_move()))
+
+    def update(self) -> None:
+        """Move the camera with what it follows, and name the scanners that there are."""
+        names = (WHOLE, BY_HAND, *dict.fromkeys(_FOLLOW + name for _, name in self._shown.scanners()))
+        if tuple(self._camera.options) != names:
+            self._camera.options = names
+        view = self._wanted()
+        if view is None or not self._differs(view):
+            return
+        self._commanded, self._moved_at = view, time.monotonic()
+        with self._client.atomic():
+            self._client.camera.position = view.position
+            self._client.camera.look_at = view.target
+            self._client.camera.up_direction = view.up
+
+    def _wanted(self) -> View | None:
+        if self._camera.value == WHOLE:
+            return self._shown.whole_view(self._client.camera.aspect)
+        for session, name in self._shown.scanners():
+            if self._camera.value == _FOLLOW + name:
+                return self._shown.scanner_view(session)
+        return None
+
+    def _differs(self, view: View) -> bool:
+        before = self._commanded
+        if before is None:
+            return True
+        share = 0.05 if self._camera.value == WHOLE else 0.005
+        most = share * float(np.linalg.norm(view.position - view.target))
+        shifts = [float(np.linalg.norm(a - b)) for a, b in zip(view, before, strict=True)]
+        return max(shifts[:2]) > most or shifts[2] > share
+
+    def _forget_view(self) -> None:
+        self._commanded = None
+
+    def _note_move(self) -> None:
+        """Leave the camera to whoever has moved it."""
+        view = self._commanded
+        if view is None or time.monotonic() < self._moved_at + _SETTLED or self._camera.value == BY_HAND:
+            return
+        distance = float(np.linalg.norm(view.position - view.target))
+        if float(np.linalg.norm(self._client.camera.position - view.position)) > _MOVED * distance:
+            self._camera.value = BY_HAND
+
+    def _toggle_measuring(self) -> None:
+        self._is_measuring = not self._is_measuring
+        self._measure.label = "End measuring" if self._is_measuring else "Measure a distance"
+        self._forget_points()
+        if self._is_measuring:
+            self._tell("Click two points of the surface.")
+            self._client.scene.on_click()(calm(self._click))
+        else:
+            self._client.scene.remove_click_callback("all")
+            self._answer.visible = False
+
+    def _click(self, event: Any) -> None:
+        point = self._shown.hit(np.array(event.ray_origin), np.array(event.ray_direction))
+        if point is None:
+            self._tell("There is no surface.")
+            return
+        if len(self._points) == 2:
+            self._forget_points()
+        self._points.append(point)
+        self._mark(point)
+        if len(self._points) == 2:
+            self._mark_distance()
+        else:
+            self._tell("Click the second point.")
+
+    def _mark(self, point: NDArray[np.float64]) -> None:
+        radius = 0.006 * float(np.linalg.norm(point - self._client.camera.position))
+        name = f"/measured/{len(self._points)}"
+        self._marks.append(self._client.scene.add_icosphere(name, radius, color=_MARK, position=point))
+
+    def _mark_distance(self) -> None:
+        a, b = self._points
+        length = float(np.linalg.norm(b - a))
+        name = f"{length:.3f} m" if length >= 1 else f"{100 * length:.1f} cm"
+        scene = self._client.scene
+        line = np.array([[a, b]], np.float32)
+        self._marks.append(
+            scene.add_line_segments("/measured/line", line, _MARK, thickness=3.0, thickness_units="screen")
+        )
+        self._marks.append(
+            scene.add_label("/measured/label", name, position=(a + b) / 2, anchor="bottom-center")
+        )
+        dx, dy, dz = (b - a).tolist()
+        self._tell(f"<b>{name}</b> &nbsp; x {dx:+.3f}, y {dy:+.3f}, z {dz:+.3f} m")
+
+    def _forget_points(self) -> None:
+        self._points.clear()
+        for mark in self._marks:
+            mark.remove()
+        self._marks.clear()
+
+    def _tell(self, content: str) -> None:
+        self._answer.content, self._answer.visible = text(content), True
+
+    def _save_picture(self) -> None:
+        import cv2
+
+        camera = self._client.camera
+        height, width = camera.image_height, camera.image_width
+        image = self._client.get_render(height, width, transport_format="png", timeout=_RENDER)
+        alpha = image[..., 3:].astype(np.float32) / 255
+        flat = np.rint(image[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
+        done, content = cv2.imencode(".png", flat[..., ::-1])
+        if done:
+            self._send("png", bytes(content.tobytes()))
+
+    def _save_model(self) -> None:
+        self._send("glb", self._shown.shown_mesh().encode(".glb"))
+
+    def _send(self, kind: str, content: bytes) -> None:
+        stamp = time.strftime("%Y%m%d_%H%M%S")
+        name = f"{self._shown.map_name or 'map'}_{stamp}.{kind}"
+        self._client.send_file_download(name, content, save_immediately=True)
+
+
+def set_theme(gui: "viser.GuiApi", *, dark: bool) -> None:
+    """Light or dark, without the framework's own signs."""
+    gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False, control_width="medium")

@@ -1,0 +1,20 @@
+# SPDX-License-Identifier: MIT
+"""Callbacks of browsers: what goes wrong in one is a line in the log, and nothing else ends."""
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+log = logging.getLogger(__name__)
+
+
+def calm(callback: Callable[[Any], object]) -> Callable[[Any], None]:
+    """The callback, whose exceptions are logged in a line."""
+
+    def call(event: Any) -> None:
+        try:
+            callback(event)
+        except Exception as error:  # noqa: BLE001 - a browser may leave at any moment, in any call
+            log.warning("a browser's wish could not be granted: %s: %s", type(error).__name__, error)
+
+    return call

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: MIT
+"""From where a map is looked at: all of it from above and aside, or behind a scanner."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tsfusion.viewer.map_tiles import MapTiles
+
+FOV = math.radians(50)  # from top to bottom of the picture
+_ELEVATION = math.radians(42)
+_SIDES = 12  # that are tried
+_SAMPLE = 20  # points of a tile
+_SHARE = (2, 98)  # percent of the points that are in the picture
+_FILLED = 0.92  # of the picture
+
+
+class View(NamedTuple):
+    """A camera: where it is, what it looks at, both (3,) metres, and its up direction."""
+
+    position: NDArray[np.float64]
+    target: NDArray[np.float64]
+    up: NDArray[np.float64]
+
+
+class Sample(NamedTuple):
+    """(n, 3) points of a surface and its normals there."""
+
+    points: NDArray[np.float64]
+    normals: NDArray[np.float64]
+
+
+def sample(tiles: MapTiles) -> Sample:
+    """A few points of each tile, as many as its triangles are its share of the map."""
+    meshes = [tile.mesh for tile in list(tiles.tiles.values())]
+    total = sum(len(mesh.vertices) for mesh in meshes)
+    step = max(1, total // (_SAMPLE * max(len(meshes), 50)))
+    if not meshes:
+        return Sample(np.zeros((0, 3)), np.zeros((0, 3)))
+    points = np.concatenate([mesh.vertices[::step] for mesh in meshes]).astype(np.float64)
+    return Sample(points, np.concatenate([mesh.normals[::step] for mesh in meshes]).astype(np.float64))
+
+
+def whole(surface: Sample, up: NDArray[np.float64], aspect: float) -> View | None:
+    """From above, from the side that shows most of the surface; None = there is nothing to see.
+
+    Args:
+        aspect: width / height of the picture.
+    """
+    if len(surface.points) < 3:
+        return None
+    east = np.cross(up, (1.0, 0, 0) if abs(up[0]) < 0.7 else (0.0, 1, 0))
+    east /= np.linalg.norm(east)
+    north = np.cross(up, east)
+    turns = 2 * np.pi * np.arange(_SIDES) / _SIDES
+    level = np.cos(turns)[:, None] * east + np.sin(turns)[:, None] * north
+    toward = math.cos(_ELEVATION) * level + math.sin(_ELEVATION) * up  # from the target to the camera
+    best = np.maximum(surface.normals @ toward.T, 0).sum(axis=0).argmax()
+    return _fitted(surface.points, toward[best], up, aspect)
+
+
+def _fitted(
+    points: NDArray[np.float64], toward: NDArray[np.float64], up: NDArray[np.float64], aspect: float
+) -> View:
+    """The nearest camera in a direction from which nearly all points are in the picture."""
+    right = np.cross(up, toward)
+    right /= np.linalg.norm(right)
+    above = np.cross(toward, right)
+    low, high = np.percentile(points, _SHARE, axis=0)
+    inside = points[((points >= low) & (points <= high)).all(axis=1)]
+    points = inside if len(inside) > 2 else points
+    x, y, z = points @ right, points @ above, points @ toward
+    tall = _FILLED * math.tan(FOV / 2)
+    wide = tall * aspect
+    # A camera at depth d sees |x − cx| ≤ wide (d − z): both sides touch where cx is between
+    distances = []
+    centre = []
+    for across, reach in ((x, wide), (y, tall)):
+        upper, lower = (across + reach * z).max(), (across - reach * z).min()
+        centre.append((upper + lower) / 2)
+        distances.append((upper - lower) / (2 * reach))
+    middle = float(np.median(z))
+    target = centre[0] * right + centre[1] * above + middle * toward
+    return View(target + (max(distances) - middle) * toward, target, up)
+
+
+def behind(T_world_camera: NDArray[np.float64], up: NDArray[np.float64], *, distance: float) -> View:
+    """From behind and above a scanner, looking where it looks.
+
+    Args:
+        T_world_camera: (4, 4), OpenCV axes.
+        distance: metres.
+    """
+    position, forward = T_world_camera[:3, 3], T_world_camera[:3, 2]
+    level = forward - (forward @ up) * up
+    length = float(np.linalg.norm(level))
+    level = level / length if length > 0.1 else -T_world_camera[:3, 1]
+    return View(position - distance * level + 0.7 * distance * up, position + distance * level, up)

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: MIT
+"""The tiles of a map in the scene of all browsers: the newest wins, and bytes a second are bounded."""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tsfusion.core.token_bucket import Bucket
+from tsfusion.geometry.mesh import Mesh
+from tsfusion.viewer import tile_glb
+from tsfusion.viewer.clipping import Clipping, Side
+from tsfusion.viewer.map_tiles import CELL, Key, MapTiles, Tile
+from tsfusion.viewer.vertex_colors import VertexColors
+
+if TYPE_CHECKING:
+    import viser
+
+PAUSE = 0.4  # seconds between two versions of a tile, at least
+_MARGIN = 1.0  # of a tile's edge that its triangles may reach beyond it
+
+
+class TileNodes:
+    """Sends tiles that have changed, whoever waits longest first.
+
+    Args:
+        max_bytes_per_second: of all tiles together, on average.
+    """
+
+    def __init__(
+        self,
+        scene: "viser.SceneApi",
+        tiles: MapTiles,
+        colors: VertexColors,
+        *,
+        max_bytes_per_second: float,
+        now: float,
+    ) -> None:
+        self._scene, self._tiles, self._colors = scene, tiles, colors
+        self._bucket = Bucket(max_bytes_per_second, now, burst=1.0)
+        self._waiting: dict[Key, None] = {}  # in the order in which they are sent
+        self._sent_at: dict[Key, float] = {}
+        self._sides: dict[Key, Side] = {}  # of what is in the scene
+        self._nodes: dict[Key, viser.GlbHandle] = {}
+        self._hidden: set[Key] = set()  # have changed while they were not to be seen
+        self.clipping = Clipping()
+        self.voxel_size = 1.0
+        self.bytes_sent = 0
+
+    @property
+    def are_waiting(self) -> bool:
+        """Whether tiles have yet to be sent."""
+        return bool(self._waiting)
+
+    def has(self, key: Key) -> bool:
+        """Whether the scene has a version of a tile."""
+        return key in self._nodes
+
+    def clear(self) -> None:
+        """Take everything out of the scene."""
+        for node in self._nodes.values():
+            node.remove()
+        for kept in (self._nodes, self._waiting, self._sent_at, self._sides, self._hidden):
+            kept.clear()
+
+    def changed(self, keys: Iterable[Key]) -> None:
+        """Note tiles that look different now."""
+        for key in keys:
+            self._waiting.setdefault(key)
+
+    def clip(self, clipping: Clipping) -> None:
+        """Hide what lies beyond, at once; tiles that are cut follow."""
+        self.clipping = clipping
+        for key, tile in list(self._tiles.tiles.items()):
+            side, shown = clipping.side(tile.bounds), self._sides.get(key)
+            node = self._nodes.get(key)
+            if side == "hidden":
+                if node is not None:
+                    node.visible = False
+            elif key in self._hidden or side == "part" or side != shown:
+                self._hidden.discard(key)
+                self.changed((key,))
+            elif node is not None:
+                node.visible = True
+
+    def send(self, now: float) -> int:
+        """Send what is due; the number of tiles that were."""
+        count = 0
+        for key in list(self._waiting):
+            if self._sent_at.get(key, -np.inf) + PAUSE > now:
+                continue
+            if self._bucket.wait(1.0, now) > 0:
+                break
+            del self._waiting[key]
+            size = self._send(key)
+            if size:
+                self._sent_at[key] = now
+                self._bucket.spend(size)
+                self.bytes_sent += size
+                count += 1
+        return count
+
+    def shown_mesh(self, key: Key, tile: Tile) -> Mesh:
+        """What is shown of a tile, in the colours that are shown."""
+        mesh = Mesh(tile.mesh.vertices, tile.mesh.faces, tile.mesh.normals, self._colors.colors(key, tile))
+        return mesh if self.clipping.side(tile.bounds) == "whole" else self.clipping.cut(mesh)
+
+    def _send(self, key: Key) -> int:
+        """Bring a tile into the scene as it is now; the bytes that takes."""
+        tile, node = self._tiles.tiles.get(key), self._nodes.get(key)
+        side = "hidden" if tile is None else self.clipping.side(tile.bounds)
+        if tile is None or side == "hidden":
+            if tile is None and node is not None:
+                self._nodes.pop(key).remove()
+                self._sides.pop(key, None)
+            elif node is not None:
+                node.visible = False
+            if tile is not None:
+                self._hidden.add(key)
+            return 0
+        mesh = self.shown_mesh(key, tile)
+        self._sides[key] = side
+        if not len(mesh.faces):
+            if node is not None:
+                node.visible = False
+            return 0
+        return self._put(key, mesh)
+
+    def _put(self, key: Key, mesh: Mesh) -> int:
+        edge = self._tiles.edge * CELL * self.voxel_size
+        corner = edge * (np.array(key, np.float64) - _MARGIN)
+        assert mesh.colors is not None
+        content = tile_glb.encode(mesh.vertices, mesh.faces, mesh.colors, corner, self.voxel_size)
+        node = self._nodes.get(key)
+        if node is None:
+            name = "/map/" + "_".join(map(str, key))
+            self._nodes[key] = self._scene.add_glb(name, content, cast_shadow=False, receive_shadow=False)
+        else:
+            node.glb_data = content
+            node.visible = True
+        return len(content)
