@@ -1,26 +1,239 @@
 # SPDX-License-Identifier: MIT
-"""The web server of a page: who may open it, from where."""
+"""The web server of a page: viser's, behind a door that says who may come in.
 
-from typing import TYPE_CHECKING
+viser's own listens for every Origin, takes another port when one is in use, and prints. So it is given a
+`websockets.asyncio.server.serve` of ours while it starts; where it does not use that, nothing is served.
+"""
+
+import asyncio
+import logging
+import socket
+import threading
+from collections import Counter
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager
+from functools import partial
+from http import HTTPStatus
+from importlib.util import find_spec
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+from tsfusion.core.errors import InvalidConfig, MissingDependency, TransportError
+from tsfusion.viewer.page_guard import PageGuard, Refusal, is_websocket
+from tsfusion.wire import sockets
 
 if TYPE_CHECKING:
-    pass
+    import viser
+    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.http11 import Request, Response
+
+LISTEN = "127.0.0.1:5558"  # the port after those of a server
+BROWSERS = 32  # at once
+KNOCKING = 64  # connections at once that are no browser yet; the oldest makes room for a new one
+_MAX_MESSAGE = 16 << 20  # bytes: a browser sends a picture of its page
+_OPEN_SECONDS = 10.0  # for a request and its answer
+_CLOSE_SECONDS = 1.0
+_START = threading.Lock()
+_INSTALL = "the live page needs viser; install it with: pip install '.[viewer]' in your clone of tsfusion"
+_FULL = f"{BROWSERS} browsers show this page already: close one"
+_MISFITS = (TypeError, ValueError, LookupError, AttributeError, OSError, RuntimeError)
+
+log = logging.getLogger(__name__)
+
+
+def check_installed() -> None:
+    """Raise MissingDependency where viser is not installed, without loading it."""
+    if find_spec("viser") is None:
+        raise MissingDependency(_INSTALL)
+
+
+def parse_place(text: str) -> tuple[str, int]:
+    """Host and port of `HOST:PORT`; an IPv6 address stands in brackets.
+
+    Raises:
+        InvalidConfig: for anything else.
+    """
+    try:
+        host, port = sockets.parse_address(f"tcp://{text}")
+    except InvalidConfig:
+        raise InvalidConfig(
+            f"a page listens at HOST:PORT, such as {LISTEN}, of IPv6 [::1]:5558, port 0 = a free one; "
+            f"got {text!r}"
+        ) from None
+    return host.replace("*", "0.0.0.0"), port
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A socket that listens there; port 0 = a free one.
+
+    Raises:
+        TransportError: when the port is taken, or there is no such address here.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    both = host == "::" and socket.has_dualstack_ipv6()
+    try:
+        return socket.create_server((host, port), family=family, dualstack_ipv6=both)
+    except OSError as error:
+        place = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        raise TransportError(
+            f"cannot show a page at {place}: {error.strerror or error}; choose another place, such as "
+            "127.0.0.1:0 (a free port), or end what has it"
+        ) from error
 
 
 class PageServer:
     """A running web server with an empty page.
 
+    Args:
+        host: where it listens; by default only this machine reaches it.
+        port: 0 = a free one.
+        token: needed to open the page; None = none on this machine, else a random one.
+
     Attributes:
         server: to fill the page with.
         url: to open it with.
+        refused: requests that were turned away, by reason: host, origin, token, full.
+
+    Raises:
+        MissingDependency: without viser.
+        InvalidConfig: for a bad token.
+        TransportError: when the port is taken, or viser cannot be guarded.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 0, *, token: str | None = None) -> None:
-        import viser
-
-        self.server: viser.ViserServer = viser.ViserServer(host=host, port=port, verbose=False)
-        self.url = f"http://{host}:{self.server.get_port()}"
+        check_installed()
+        self.refused: Counter[str] = Counter()
+        self._running: Server | None = None
+        self._is_closing = False
+        self._problem = "it starts in another way"
+        with ExitStack() as failed:
+            listener = failed.enter_context(listen(host, port))
+            self._guard = PageGuard(host, listener.getsockname()[1], token)
+            self.url = self._guard.url
+            self.server = self._start(listener)
+            failed.pop_all()
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
 
     def close(self) -> None:
         """End it, and every connection to it."""
-        self.server.stop()
+        if not self._is_closing:
+            self._is_closing = True
+            self.server.get_event_loop().call_soon_threadsafe(self._end_connections)
+            self.server.stop()
+
+    def _start(self, listener: socket.socket) -> "viser.ViserServer":
+        import rich
+        import viser
+        import websockets.asyncio.server as module
+
+        class Unshared(viser.ViserServer):
+            """A server that no page can ask for a tunnel to the world."""
+
+            def request_share_url(self, verbose: bool = True) -> str | None:
+                return None
+
+            def disconnect_share_url(self) -> None:
+                pass
+
+        rich.reconfigure(quiet=True)  # viser prints there, and stdout is the command's own
+        with _START:
+            usual = module.serve
+            module.serve = partial(self._serve, usual, listener)  # type: ignore[assignment, misc]
+            try:
+                server = Unshared(host="127.0.0.1", port=0, verbose=False)
+            finally:
+                module.serve = usual  # type: ignore[misc]
+        if self._running is None:
+            server.stop()
+            raise TransportError(
+                f"this version of viser cannot be guarded, so nothing is shown: {self._problem}"
+            )
+        return server
+
+    @asynccontextmanager
+    async def _serve(
+        self, usual: Any, listener: socket.socket, handler: Any, host: str, port: int, **options: Any
+    ) -> AsyncIterator[Any]:
+        """Stand in for `websockets.asyncio.server.serve`. Always yields: viser waits for that without end."""
+        asyncio.get_running_loop().set_exception_handler(_note_failure)
+        async with AsyncExitStack() as stack:
+            try:
+                guarded = options | self._guarded(options["process_request"])
+                running = await stack.enter_async_context(usual(handler, sock=listener, **guarded))
+                self._running = running
+            except _MISFITS as error:  # of another viser or websockets; `_start` tells
+                self._problem = repr(error)
+                running = SimpleNamespace(server=SimpleNamespace(sockets=()))
+            yield running
+
+    def _guarded(self, answer: "Callable[[ServerConnection, Request], Response | None]") -> dict[str, Any]:
+        """Options of a server that lets in whom the guard lets in.
+
+        Args:
+            answer: what viser answers to a request.
+        """
+        from websockets.asyncio.server import ServerConnection
+
+        page = self
+
+        class Knocking(ServerConnection):
+            """A connection that makes room: of those that are no browser yet, the oldest is ended."""
+
+            def connection_made(self, transport: asyncio.BaseTransport) -> None:
+                super().connection_made(transport)
+                links = [one for one in self.server.handlers if not one.transport.is_closing()]
+                waiting = [one for one in links if one.state.name != "OPEN"]
+                if page._is_closing:
+                    self.transport.abort()
+                elif len(waiting) > KNOCKING:
+                    waiting[0].transport.abort()
+
+        return {
+            "process_request": lambda one, request: self._refused(one, request) or answer(one, request),
+            "process_response": self._with_headers,
+            "create_connection": Knocking,
+            "server_header": None,
+            "max_size": _MAX_MESSAGE,
+            "open_timeout": _OPEN_SECONDS,
+            "close_timeout": _CLOSE_SECONDS,
+            "logger": _quiet_logger(),
+        }
+
+    def _refused(self, connection: "ServerConnection", request: "Request") -> "Response | None":
+        refusal = self._guard.refusal(request.path, request.headers)
+        if (
+            refusal is None
+            and is_websocket(request.headers)
+            and len(connection.server.connections) >= BROWSERS
+        ):
+            text = f"{BROWSERS} browsers show this page already: close one"
+            refusal = Refusal("full", HTTPStatus.SERVICE_UNAVAILABLE, text)
+        if refusal is None:
+            return None
+        self.refused[refusal.reason] += 1
+        peer = connection.remote_address or ("somewhere",)
+        log.warning("a browser at %s is turned away (%s): %s", peer[0], refusal.reason, refusal.text)
+        return connection.respond(refusal.status, f"{refusal.text}\n")
+
+    def _with_headers(self, connection: "ServerConnection", request: "Request", response: "Response") -> None:
+        if response.status_code == HTTPStatus.OK:
+            for name, value in self._guard.answer_headers(request.path, request.headers).items():
+                response.headers[name] = value
+
+    def _end_connections(self) -> None:
+        assert self._running is not None
+        for connection in self._running.handlers:
+            connection.transport.abort()
+
+
+def _quiet_logger() -> logging.Logger:
+    """A logger for connections, of which browsers and others may break as many as they like."""
+    made = logging.Logger(f"{__name__}.connections")
+    made.addHandler(logging.NullHandler())
+    made.addFilter(lambda record: record.getMessage() == "connection handler failed")
+    return made
+
+
+def _note_failure(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Log in a line what viser did not expect of a browser."""
+    log.warning("the page had an error: %s", context.get("exception") or context.get("message"))
