@@ -37,6 +37,7 @@ def run(
     on_ready: Callable[[Addresses], None] | None = None,
     *,
     volumes: Mapping[str, VolumeConfig] | None = None,
+    guest: str | None = None,
 ) -> int:
     """Serve until SIGTERM or SIGINT, then drain the journals into the maps and write checkpoints.
 
@@ -48,6 +49,7 @@ def run(
         volume: the settings of every map that has none of its own.
         on_ready: called once with the real addresses, when keyframes are accepted and kernels are warm.
         volumes: maps with settings of their own, opened at the start; so are those in the state folder.
+        guest: of a server with keys, a public key that may watch every map besides those in its list.
 
     Returns:
         The exit status: 0, or 1 when a checkpoint was not written.
@@ -61,7 +63,7 @@ def run(
         signals = stack.enter_context(_signals())
         try:
             gateway, watchdog, report = _open(
-                stack, server, {DEFAULT_MAP: volume, **(volumes or {})}, signals
+                stack, server, {DEFAULT_MAP: volume, **(volumes or {})}, signals, guest
             )
         except _StoppedAtStart:
             return 0
@@ -79,7 +81,11 @@ def run(
 
 
 def _open(
-    stack: ExitStack, server: ServerConfig, volumes: dict[str, VolumeConfig], signals: list[int]
+    stack: ExitStack,
+    server: ServerConfig,
+    volumes: dict[str, VolumeConfig],
+    signals: list[int],
+    guest: str | None,
 ) -> tuple[Gateway, Watchdog, "_ReadingReport"]:
     process.raise_file_limit()
     state = Path(server.state)
@@ -89,7 +95,7 @@ def _open(
             volumes.setdefault(name, volumes[DEFAULT_MAP])
     context: zmq.Context[Any] = zmq.Context()
     stack.callback(context.destroy, 0)  # an error in between must not wait for a socket that was left open
-    access = AccessControl(context, server.keys)
+    access = AccessControl(context, server.keys, guest=guest)
     stack.callback(access.close)
     ports = Ports(context, server, access.keys, grants_topics=lambda: access.limits_maps)
     stack.callback(ports.close)

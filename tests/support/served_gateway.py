@@ -59,7 +59,7 @@ class Served:
 
 
 @contextlib.contextmanager
-def serving_here(state: Path, **settings: Any) -> Iterator[Served]:
+def serving_here(state: Path, *, guest: str | None = None, **settings: Any) -> Iterator[Served]:
     """Start a gateway whose default map is open, and end it afterwards whatever happens."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(mock.patch.object(fuser_process, "COMMAND", COMMAND))
@@ -68,7 +68,7 @@ def serving_here(state: Path, **settings: Any) -> Iterator[Served]:
         server = ServerConfig(listen="tcp://127.0.0.1:0", state=str(state), **settings)
         context: zmq.Context[Any] = zmq.Context()
         stack.callback(context.term)
-        access = AccessControl(context, server.keys)
+        access = AccessControl(context, server.keys, guest=guest)
         stack.callback(access.close)
         ports = Ports(context, server, access.keys, grants_topics=lambda: access.limits_maps)
         stack.callback(ports.close)

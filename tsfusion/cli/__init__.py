@@ -32,6 +32,7 @@ from tsfusion.cli import (
     spool,
     status,
     verbs,
+    view,
 )
 from tsfusion.core.errors import TsfusionError
 
@@ -72,6 +73,10 @@ verbs.verb(
     app, "tsfusion ask tcp://server:5555 --at 1.2 0 0.5",
     "tsfusion ask out/latest/map.tsf room.pgm --slice 0.1 1.5 --up z", panel=OWN,
 )(ask.ask)  # fmt: skip
+verbs.verb(
+    app, "tsfusion view tcp://server:5555 --map yard", "tsfusion view out/latest --listen 127.0.0.1:0",
+    panel=OWN,
+)(view.view)  # fmt: skip
 app.add_typer(map.app, name="map", rich_help_panel=OWN)
 verbs.verb(
     app, "tsfusion ate out/latest/trajectory.txt groundtruth.txt",

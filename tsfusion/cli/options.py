@@ -104,6 +104,7 @@ ServerKey = Annotated[
     option("--server-key", "FILE|KEY", "That server's public key: a file, or the 40 characters.", rare=True),
 ]
 Json = Annotated[bool, option("--json", None, "Print JSON for a program to read.")]
+View = Annotated[str | None, option("--view", "[HOST:PORT]", "Show the map in a browser, while it grows.")]
 RunJson = Annotated[bool, option("--json", None, "Print run.json, for a program to read.", rare=True)]
 
 _rare_option = functools.partial(option, panel="Source", rare=True)

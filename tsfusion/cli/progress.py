@@ -55,6 +55,10 @@ class Quiet:
     def stage(self, text: str) -> None:
         """Show which part of the run begins."""
 
+    def say(self, text: str) -> None:
+        """Show a line that matters even to who wants no progress."""
+        typer.echo(text, err=True)
+
     def update(self, taken: int, fused: int, total: int | None, scan: "ScanState | None" = None) -> None:
         """Show the counts; see `Progress`."""
         if scan is None:
@@ -122,7 +126,10 @@ class Table(Quiet):
 
     def stage(self, text: str) -> None:
         self._draw()  # the last counts, for as long as the stage takes
-        self._console.print(f"[cyan]›[/] {text}", highlight=False)
+        self.say(text)
+
+    def say(self, text: str) -> None:
+        self._console.print(f"[cyan]›[/] {text}", highlight=False, soft_wrap=True)
 
     def show(self, rows: "list[_Row]") -> None:
         self._rows = rows

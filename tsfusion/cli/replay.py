@@ -51,6 +51,7 @@ def replay(
     up: options.UpDirection = None,
     keep_islands: options.KeepIslands = None,
     config: options.ConfigFile = None,
+    view: options.View = None,
     json: options.RunJson = False,
     **settings: Any,
 ) -> None:
@@ -76,7 +77,7 @@ def replay(
         chosen, connect, control=control, map=map_, key=key, server_key=server_key
     )
     _run(
-        dataset, out, overwrite=overwrite, json=json, volume=chosen.volume,
+        dataset, out, view=view, overwrite=overwrite, json=json, volume=chosen.volume,
         server=options.own_server(chosen, state), client=client, connect=connect, same_frame=same_frame,
         rate=rate, min_weight=settings["min_weight"], up=given_up, keep_islands=keep_islands,
     )  # fmt: skip
@@ -142,6 +143,7 @@ def demo(
         ),
     ] = None,
     config: options.ConfigFile = None,
+    view: options.View = None,
     json: options.RunJson = False,
     **settings: Any,
 ) -> None:
@@ -152,19 +154,20 @@ def demo(
     path, usual_count, usual_rate = ("tour", 90, 6.0) if world == "room" else (None, 40, 4.0)
     dataset = Synthetic(world, sensor=chosen.volume.sensor, count=count or usual_count, seed=seed, path=path)
     _run(
-        dataset, out, overwrite=overwrite, json=json, volume=chosen.volume,
+        dataset, out, view=view, overwrite=overwrite, json=json, volume=chosen.volume,
         client=options.client_settings(chosen), rate=rate or usual_rate, min_weight=settings["min_weight"],
     )  # fmt: skip
 
 
-def _run(dataset: "Dataset", out: Path | None, *, json: bool, **settings: Any) -> None:
-    from tsfusion.cli import output, progress, run_summary
+def _run(dataset: "Dataset", out: Path | None, *, view: str | None, json: bool, **settings: Any) -> None:
+    from tsfusion.cli import output, progress, run_page, run_summary
     from tsfusion.pipelines.replay import replay as run
 
     with progress.shown(quiet=json) as display:
-        result = run(dataset, out, progress=display, **settings)
+        result = run(dataset, out, viewer=run_page.beside(view, display), progress=display, **settings)
     if json:
         output.as_json(result)
     else:
         run_summary.print_replay(result)
+        run_page.print_again(view, result.folder, settings.get("connect"))
     run_summary.check(result)

@@ -94,6 +94,7 @@ def scan(
     up: options.UpDirection = None,
     keep_islands: options.KeepIslands = None,
     config: options.ConfigFile = None,
+    view: options.View = None,
     json: options.RunJson = False,
     **settings: Any,
 ) -> None:
@@ -110,7 +111,7 @@ def scan(
 
         options.refuse(context, ("same_frame",), "and --align exclude each other: one says that it is known")
         check_installed()
-    from tsfusion.cli import output, progress, run_summary
+    from tsfusion.cli import output, progress, run_page, run_summary
     from tsfusion.pipelines.scan import scan as run
 
     opened = _open(
@@ -131,12 +132,13 @@ def scan(
             opened, out, overwrite=overwrite, config=chosen.scan, volume=chosen.volume,
             server=options.own_server(chosen, state), client=client, connect=connect, spool=spool,
             same_frame=same_frame, align=align, min_weight=settings["min_weight"], up=given_up,
-            keep_islands=keep_islands, progress=display,
+            keep_islands=keep_islands, viewer=run_page.beside(view, display), progress=display,
         )  # fmt: skip
     if json:
         output.as_json(result)
     else:
         run_summary.print_scan(result, spool, connect)
+        run_page.print_again(view, result.folder, connect)
     run_summary.check(result)
 
 

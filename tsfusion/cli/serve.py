@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+from contextlib import closing, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,6 +18,8 @@ from tsfusion.cli import options
 
 if TYPE_CHECKING:
     from tsfusion.core.config import Config
+    from tsfusion.pipelines.viewer_child import ViewerChild
+    from tsfusion.wire.curve import ClientKeys
     from tsfusion.wire.sockets import Addresses
 
 log = logging.getLogger(__name__)
@@ -55,6 +58,7 @@ SERVER_OPTIONS: dict[str, Any] = {
 def serve(
     *,
     config: options.ConfigFile = None,
+    view: options.View = None,
     json: options.Json = False,
     until_eof: Annotated[bool, typer.Option("--until-eof", hidden=True)] = False,
     **settings: Any,
@@ -73,11 +77,22 @@ def serve(
     if until_eof:
         threading.Thread(target=_stop_at_eof, daemon=True).start()
 
-    def on_ready(addresses: "Addresses") -> None:
-        _announce(addresses, chosen.server.state, time.monotonic() - started, json)
-
     try:
-        return server.run(chosen.server, chosen.volume, on_ready, volumes=chosen.volumes())
+        page, guest = (None, None) if view is None else _page(view, chosen.server.keys, json)
+
+        def on_ready(addresses: "Addresses") -> None:
+            _announce(addresses, chosen.server.state, time.monotonic() - started, json)
+            if page is not None:
+                page.start(addresses.data, control=addresses.control, publish=addresses.publish, keys=guest)
+
+        with nullcontext() if page is None else closing(page):
+            return server.run(
+                chosen.server,
+                chosen.volume,
+                on_ready,
+                volumes=chosen.volumes(),
+                guest=None if guest is None else guest.public,
+            )
     except TsfusionError as error:
         if chosen.server.log_format == "text":
             raise
@@ -118,6 +133,24 @@ def _announce(addresses: "Addresses", state: str, seconds: float, json: bool) ->
             f"mesh updates {addresses.publish}, state {state}"
         )
     sys.stdout.flush()
+
+
+def _page(place: str, folder: str | None, json: bool) -> "tuple[ViewerChild, ClientKeys | None]":
+    """The live page of a server, and where that has a folder of keys, a pair that is the page's alone."""
+    from tsfusion.pipelines.viewer_child import ViewerChild
+    from tsfusion.wire.curve import ClientKeys, server_keys
+
+    def tell(url: str) -> None:
+        if json:
+            from tsfusion.cli import output
+
+            output.as_json({"page": url}, indent=None)
+        else:
+            typer.echo(f"page {url}")
+        sys.stdout.flush()
+
+    keys = None if folder is None else ClientKeys.drawn(server_keys(folder).public)
+    return ViewerChild(place, tell), keys
 
 
 def _stop_at_eof() -> None:

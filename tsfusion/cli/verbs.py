@@ -1,14 +1,20 @@
 # SPDX-License-Identifier: MIT
 """What every verb has in common: short help, examples, environment variables, renamed flags."""
 
+import re
 from collections.abc import Callable
 from typing import Annotated, Any, TypeVar
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from tsfusion.viewer import LISTEN
+
 PREFIX = "TSFUSION_"
 RENAMED = {"--max-keyframes": "--max-frames", "--poses": "--trajectory"}  # understood until version 0.3
+_VIEW = "--view"
+_PLACE = re.compile(r"(?:\[[\da-fA-F:.]+\]|localhost|\*|[\w-]+(?:\.[\w-]+)+):\d{1,5}", re.ASCII)
+_SHORTER = {"--show-completion": "Print what that would install."}  # Typer's own takes two lines
 _ALL = "tsfusion.help_all"  # in a context's notes: --help-all was asked for
 
 _Verb = TypeVar("_Verb", bound=Callable[..., Any])
@@ -23,6 +29,7 @@ class _ShortHelp:
             if param.param_type_name == "option":
                 param.show_envvar = False
                 param.metavar = "" if param.is_flag else param.metavar
+                param.help = _SHORTER.get(param.opts[0], param.help)
         return params
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
@@ -47,7 +54,9 @@ class Verb(_ShortHelp, TyperCommand):
         return params
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        return super().parse_args(ctx, [new for old in args for new in _renamed(old)])
+        words = [new for old in args for new in _renamed(old)]
+        has_page = any(param.opts == [_VIEW] and param.nargs == 1 for param in self.params)
+        return super().parse_args(ctx, _with_places(words) if has_page else words)
 
 
 def variable(flag: str) -> str:
@@ -88,6 +97,20 @@ HelpAll = Annotated[
     bool | None,
     typer.Option("--help-all", is_eager=True, callback=_show_all, help="Show the rare flags, too, and exit."),
 ]
+
+
+def _with_places(words: list[str]) -> list[str]:
+    """A command line in which each `--view` has a place: its next word, if that is one, else the usual place.
+
+    `--view PATH` means a PATH, and `--view camera:0` a camera.
+    """
+    found: list[str] = []
+    for word in words:
+        if found and found[-1] == _VIEW and _PLACE.fullmatch(word):
+            found[-1] = f"{_VIEW}={word}"
+        else:
+            found.append(word)
+    return [f"{_VIEW}={LISTEN}" if word == _VIEW else word for word in found]
 
 
 def _renamed(word: str) -> list[str]:

@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 
 
 KEPT_OUT = 60.0  # seconds; then a client that was kept out may try again
+GUEST = "(guest)"  # no client in a list can have this name
 
 
 class AccessControl:
@@ -27,12 +28,14 @@ class AccessControl:
 
     Args:
         folder: the folder that `tsfusion keys` made; None = no keys.
+        guest: public key that may watch every map, and send nothing, as long as this server runs.
 
     Raises:
         InvalidConfig: when the folder has no usable keys or allow-list.
     """
 
-    def __init__(self, context: "zmq.Context[Any]", folder: str | None) -> None:
+    def __init__(self, context: "zmq.Context[Any]", folder: str | None, *, guest: str | None = None) -> None:
+        self._guest = guest
         self.keys: ServerKeys | None = None  # the server's own pair, for its sockets; None without a folder
         self._allowed: AllowList | None = None
         self._zap: ZapHandler | None = None
@@ -81,6 +84,8 @@ class AccessControl:
         return client
 
     def _name_of(self, key: str) -> str | None:
+        if key == self._guest:
+            return GUEST
         name = None if self._allowed is None else self._allowed.name_of(key)
         return None if name is not None and self._is_kept_out(name) else name
 
@@ -98,7 +103,7 @@ class AccessControl:
 
     def maps_of(self, client: str) -> AllowedMaps:
         """The maps that the client of a name may use: without keys every map."""
-        return ALL_MAPS if self._allowed is None else self._allowed.maps_of(client)
+        return ALL_MAPS if self._allowed is None or client == GUEST else self._allowed.maps_of(client)
 
     def may_forget_all(self, client: str) -> bool:
         """Whether a client may forget keyframes of others, too: without keys everybody may."""

@@ -5,7 +5,7 @@ from collections import Counter
 
 import zmq
 
-from tsfusion.gateway.access_control import AccessControl
+from tsfusion.gateway.access_control import GUEST, AccessControl
 from tsfusion.gateway.client_routes import ClientRoutes
 from tsfusion.gateway.sessions import Sessions
 from tsfusion.wire.allowed_maps import AllowedMaps
@@ -30,13 +30,17 @@ class Admission:
         """The maps that a client may use."""
         return self._access.maps_of(client)
 
-    def denial_of_map(self, client: str, map_name: str) -> str:
-        """Why a client may not use a map, which is counted; empty = it may."""
+    def denial_of_map(self, client: str, map_name: str, *, sends: bool = False) -> str:
+        """Why a client may not use a map, which is counted; empty = it may.
+
+        Args:
+            sends: whether it is to send keyframes into it.
+        """
         maps = self._access.maps_of(client)
-        if map_name in maps:
+        if map_name in maps and not (sends and client == GUEST):
             return ""
         self.refused["forbidden"] += 1
-        return maps.denial(map_name)
+        return "this key may only watch" if client == GUEST else maps.denial(map_name)
 
     def owns(self, sessions: Sessions, key: bytes, client: str) -> bool:
         """Whether a client may go on with a session: no other client has journaled it, or is connected."""

@@ -242,7 +242,7 @@ class Gateway:
         if hello.version != messages.PROTOCOL_VERSION:
             speaks = f"the server speaks version {messages.PROTOCOL_VERSION} of the wire format"
             return "version", f"{speaks}, this client {hello.version}"
-        if forbidden := self._admission.denial_of_map(client, hello.map):
+        if forbidden := self._admission.denial_of_map(client, hello.map, sends=True):
             return "map", forbidden
         hosted = self.maps.greet(hello.map)
         if hosted is None and (why := self.maps.why_not(hello.map)):

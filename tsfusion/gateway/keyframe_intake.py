@@ -71,7 +71,7 @@ class KeyframeIntake:
         except Refused as error:
             self._refuse(error, client)
             return
-        if forbidden := self._admission.denial_of_map(client, header.map):
+        if forbidden := self._admission.denial_of_map(client, header.map, sends=True):
             self._refused["map"] += 1
             subject = logs.about(map=header.map, session=header.session, seq=header.seq, client=client)
             log.warning("a %s is refused: %s", header.kind, forbidden, extra=subject)

@@ -25,6 +25,7 @@ from tsfusion.pipelines import engine, map_growth, map_size, replay_results, run
 from tsfusion.pipelines.engine import AHEAD, Engine, Progress
 from tsfusion.pipelines.replay_results import ReplaySummary
 from tsfusion.pipelines.target_server import Target
+from tsfusion.pipelines.viewer_child import ViewerChild, showing
 
 log = logging.getLogger(__name__)
 
@@ -44,6 +45,7 @@ def replay(
     min_weight: float | None = None,
     up: Up | None = None,
     keep_islands: bool | None = None,
+    viewer: ViewerChild | None = None,
 ) -> ReplaySummary:
     """Send every keyframe of `dataset` to a server and leave the results in the folder `out`.
 
@@ -62,6 +64,7 @@ def replay(
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
         up: away from the ground, in the map's frame; None = it is found.
         keep_islands: see `mesh_files.write`.
+        viewer: shows the map while the run lasts.
 
     Raises:
         OutputError: `out` cannot be written (checked first), or the mesh is empty.
@@ -76,9 +79,12 @@ def replay(
         if connect is None:
             map_size.check_fits(first, volume)
         progress.stage(engine.STARTING if connect is None else f"connecting to {connect}")
-        with target_server.opened(
-            connect, work / ".scratch", volume=volume, client=client, server=server
-        ) as target:
+        with (
+            target_server.opened(
+                connect, work / ".scratch", volume=volume, client=client, server=server
+            ) as target,
+            showing(viewer, target),
+        ):
             # A recording leaves nothing out: `wait_turn` keeps the spool short, not the policy.
             sender = target.client(target.link.map, policy="spool_all", same_frame=same_frame)
             sender.connect()

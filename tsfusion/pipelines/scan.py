@@ -48,6 +48,7 @@ from tsfusion.pipelines.leftovers import ANSWER_SECONDS, Leftovers
 from tsfusion.pipelines.scan_alignment import ExistingMap
 from tsfusion.pipelines.scan_results import MapResult, ScanSummary
 from tsfusion.pipelines.target_server import Target
+from tsfusion.pipelines.viewer_child import ViewerChild, showing
 from tsfusion.scanner.keyframe_selection import KeyframeSelector
 from tsfusion.scanner.localization import registry
 from tsfusion.scanner.localization.localizer import Localizer
@@ -76,6 +77,7 @@ def scan(
     min_weight: float | None = None,
     up: Up | None = None,
     keep_islands: bool | None = None,
+    viewer: ViewerChild | None = None,
 ) -> ScanSummary:
     """Take a source's frames to its end, or until it is closed, and leave the results in the folder `out`.
 
@@ -98,6 +100,7 @@ def scan(
         min_weight: full-confidence samples a voxel needs to be meshed; None = the sensor's.
         up: away from the ground, in the map's frame; None = it is found.
         keep_islands: see `mesh_files.write`.
+        viewer: shows the map while the run lasts.
 
     Raises:
         SourceError: the sensor failed; what came before is in `out`.
@@ -122,9 +125,12 @@ def scan(
         stack.callback(getattr(localizer, "close", lambda: None))
         if own:
             progress.stage(engine.STARTING)
-        with target_server.opened(
-            connect, work / ".scratch", volume=volume, client=client, server=server, spools=Path(spool)
-        ) as target:
+        with (
+            target_server.opened(
+                connect, work / ".scratch", volume=volume, client=client, server=server, spools=Path(spool)
+            ) as target,
+            showing(viewer, target),
+        ):
             leftovers = Leftovers(target, given=localizer.absolute)
             leftovers.begin()
 

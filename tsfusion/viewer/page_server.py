@@ -19,6 +19,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from tsfusion.core.errors import InvalidConfig, MissingDependency, TransportError
+from tsfusion.viewer import LISTEN
 from tsfusion.viewer.page_guard import PageGuard, Refusal, is_websocket
 from tsfusion.wire import sockets
 
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
     from websockets.http11 import Request, Response
 
-LISTEN = "127.0.0.1:5558"  # the port after those of a server
 BROWSERS = 32  # at once
 KNOCKING = 64  # connections at once that are no browser yet; the oldest makes room for a new one
 _MAX_MESSAGE = 16 << 20  # bytes: a browser sends a picture of its page
@@ -75,8 +75,9 @@ def listen(host: str, port: int) -> socket.socket:
         return socket.create_server((host, port), family=family, dualstack_ipv6=both)
     except OSError as error:
         place = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        why = (error.strerror or str(error)).partition(" (while")[0]
         raise TransportError(
-            f"cannot show a page at {place}: {error.strerror or error}; choose another place, such as "
+            f"cannot show a page at {place}: {why}; choose another place, such as "
             "127.0.0.1:0 (a free port), or end what has it"
         ) from error
 

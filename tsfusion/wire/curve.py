@@ -63,6 +63,12 @@ class ClientKeys(Struct, frozen=True):
         socket.setsockopt_string(zmq.CURVE_SECRETKEY, self.secret)
         socket.setsockopt_string(zmq.CURVE_SERVERKEY, self.server)
 
+    @classmethod
+    def drawn(cls, server: str) -> "ClientKeys":
+        """A new pair, for a server with this public key; it is in no file."""
+        public, secret = (key.decode("ascii") for key in zmq.curve_keypair())
+        return cls(public, secret, server)
+
     def __repr__(self) -> str:
         return f"ClientKeys(public={self.public!r}, server={self.server!r})"
 

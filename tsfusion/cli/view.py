@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: MIT
+"""`tsfusion view`."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tsfusion.cli import options, verbs
+from tsfusion.viewer import LISTEN
+
+if TYPE_CHECKING:
+    from tsfusion.viewer.map_feed import MapFeed
+    from tsfusion.wire.curve import ClientKeys
+
+_ANSWER_SECONDS = 1.0  # for a server to say that it is there
+_SERVER = re.compile(r"[\w.-]+:\d{1,5}|\[[\da-fA-F:.]+\]:\d{1,5}", re.ASCII)
+_NICENESS = 10  # of a page beside a run
+
+
+def view(
+    context: typer.Context,
+    where: Annotated[
+        str | None,
+        typer.Argument(metavar="WHERE", help="tcp://HOST:PORT, a .tsf file, or a folder."),
+    ] = None,
+    *,
+    map_: options.Map = None,
+    truth: Annotated[
+        Path | None, options.option("--truth", "FILE", "Known surface, to colour by the error.")
+    ] = None,
+    listen: Annotated[
+        str,
+        options.option("--listen", "HOST:PORT", "Where the page is; port 0 = free.", envvar="TSFUSION_VIEW"),
+    ] = LISTEN,
+    token: Annotated[
+        str | None, options.option("--token", "TEXT", "Needed to open it; else by need, at random.")
+    ] = None,
+    no_browser: Annotated[
+        bool, options.option("--no-browser", None, "Open none; the address is printed anyway.")
+    ] = False,
+    control: options.Control = None,
+    key: options.Key = None,
+    server_key: options.ServerKey = None,
+    json: options.Json = False,
+    publish: Annotated[str | None, typer.Option("--publish", hidden=True)] = None,
+    from_parent: Annotated[bool, typer.Option("--from-parent", hidden=True)] = False,
+    help_all: verbs.HelpAll = None,
+) -> int:
+    """Show a map in a browser: as it grows on a server, or a saved one.
+
+    Prints the address of the page, and shows it until Ctrl-C. Without WHERE: the
+    server on this machine if one runs, else the newest run's map (out/latest).
+
+    Beyond this machine (--listen 0.0.0.0:5558) the address has a token in it.
+    """
+    from tsfusion.core import logs
+    from tsfusion.viewer.live_page import LivePage
+    from tsfusion.viewer.page_server import PageServer, check_installed, parse_place
+    from tsfusion.wire.curve import client_keys
+
+    logs.configure("text", "warning", "view")
+    keys = _keys_from_parent() if from_parent else client_keys(key, server_key)
+    check_installed()
+    target = _target(where, keys)
+    if isinstance(target, Path):
+        options.refuse(
+            context, ("control", "key", "server_key"), f"has no effect on {target}: it is no server"
+        )
+    else:
+        options.refuse(context, ("truth",), "has no effect on a live map: give it a saved one")
+    link = {"control": control, "publish": publish, "keys": keys}
+    with (
+        closing(PageServer(*parse_place(listen), token=token)) as page,
+        closing(_feed(target, map_, link)) as feed,
+        _stopped_by_signals() as stop,
+    ):
+        shown = LivePage(page.server, feed)
+        _announce(page.url, feed.title, json=json)
+        if not no_browser:
+            _open_browser(page.url)
+        shown.run(stop)
+    return 0
+
+
+def _target(where: str | None, keys: "ClientKeys | None") -> str | Path:
+    """The address of a server, or a path that exists."""
+    from tsfusion.core.errors import InvalidConfig
+    from tsfusion.core.output_folder import DEFAULT, LATEST
+    from tsfusion.wire.sockets import connect_address
+
+    if where is None:
+        return _usual_target(keys, Path(DEFAULT, LATEST))
+    if "://" in where:
+        return connect_address(where)
+    path = Path(where).expanduser()
+    if path.exists():
+        return path
+    if _SERVER.fullmatch(where):
+        return connect_address(f"tcp://{where}")
+    raise InvalidConfig(
+        f"{where} does not exist; expected a server such as tcp://127.0.0.1:5555, a map (.tsf), the folder "
+        "of a run, or that of a server's state"
+    )
+
+
+def _usual_target(keys: "ClientKeys | None", latest: Path) -> str | Path:
+    """The server on this machine, or the newest run."""
+    from tsfusion.core.config import ClientConfig
+    from tsfusion.core.errors import InvalidConfig, ServerUnreachable
+    from tsfusion.wire.queries import fetch_health
+
+    address = ClientConfig().address
+    try:
+        fetch_health(address, timeout=_ANSWER_SECONDS, keys=keys)
+        return address
+    except ServerUnreachable:
+        if latest.is_dir():
+            return latest
+    raise InvalidConfig(
+        f"nothing to show: no server answers at {address}, and there is no {latest}; name a server "
+        "(tcp://HOST:PORT), a map (.tsf) or a folder"
+    )
+
+
+def _feed(target: str | Path, map_: str | None, link: dict[str, Any]) -> "MapFeed":
+    if isinstance(target, Path):
+        from tsfusion.pipelines.viewed_maps import open_feed
+
+        return open_feed(target, map_name=map_)
+    from tsfusion.core.config import DEFAULT_MAP
+    from tsfusion.wire.map_watcher import MapWatcher
+
+    return MapWatcher(target, map_ or DEFAULT_MAP, **link)
+
+
+def _announce(url: str, title: str, *, json: bool) -> None:
+    if json:
+        from tsfusion.cli import output
+
+        output.as_json({"url": url, "shows": title}, indent=None)
+    else:
+        typer.echo(f"{url} shows {title} until Ctrl-C")
+    sys.stdout.flush()
+
+
+def _open_browser(url: str) -> None:
+    """Open a browser where there is a screen; what it prints is not ours."""
+    has_screen = sys.platform == "darwin" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+    if has_screen:
+        with suppress(OSError):
+            subprocess.Popen(
+                [sys.executable, "-m", "webbrowser", url],
+                stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            )  # fmt: skip
+
+
+@contextmanager
+def _stopped_by_signals() -> Iterator[threading.Event]:
+    """An event that Ctrl-C and SIGTERM set; the second Ctrl-C interrupts as usual."""
+    stop = threading.Event()
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def note(number: int, frame: FrameType | None) -> None:
+        stop.set()
+        for each, handler in before.items():
+            signal.signal(each, handler)
+
+    for number in before:
+        signal.signal(number, note)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _keys_from_parent() -> "ClientKeys | None":
+    """The keys that our parent writes; when it ends, so do we. What it does comes before what we do."""
+    import msgspec
+
+    from tsfusion.wire.curve import ClientKeys
+
+    os.nice(_NICENESS)
+    line = sys.stdin.readline()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    return msgspec.json.decode(line, type=ClientKeys | None)
+
+
+def _end_with_parent() -> None:
+    while os.read(sys.stdin.fileno(), 4096):  # unbuffered: no lock is held when the interpreter ends
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)

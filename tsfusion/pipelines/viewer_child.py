@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: MIT
+"""A live page beside a run: `tsfusion view` as a child process, which can break nothing."""
+
+import json
+import logging
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+
+import msgspec
+
+from tsfusion.core import process
+from tsfusion.core.config import DEFAULT_MAP
+from tsfusion.pipelines.target_server import Target
+from tsfusion.viewer.page_server import check_installed, listen, parse_place
+from tsfusion.wire import sockets
+from tsfusion.wire.curve import ClientKeys
+
+_COMMAND = (sys.executable, "-m", "tsfusion", "view", "--json", "--from-parent")
+_ANYWHERE = {"0.0.0.0": "127.0.0.1", "*": "127.0.0.1", "::": "::1"}  # how it is reached from here
+_END_SECONDS = 5.0
+_FOR_THE_VIEWER = ("TSFUSION_TOKEN", "TSFUSION_NO_BROWSER")
+
+log = logging.getLogger(__name__)
+
+
+class ViewerChild:
+    """A `tsfusion view` that ends with this process, however that ends.
+
+    Args:
+        place: HOST:PORT of the page.
+        tell: called in a thread with the page's address, once it can be opened.
+
+    Raises:
+        MissingDependency: without viser.
+        InvalidConfig: for a bad place.
+        TransportError: when the port is taken.
+    """
+
+    def __init__(self, place: str, tell: Callable[[str], None]) -> None:
+        check_installed()
+        listen(*parse_place(place)).close()
+        self._place = place
+        self._tell = tell
+        self._process: subprocess.Popen[str] | None = None
+        self._reader = threading.Thread(target=self._follow, name="page", daemon=True)
+        self._is_ending = False
+
+    def start(
+        self,
+        address: str,
+        *,
+        control: str | None = None,
+        publish: str | None = None,
+        map_name: str = DEFAULT_MAP,
+        keys: ClientKeys | None = None,
+    ) -> None:
+        """Show a map of the server that listens at `address`. What goes wrong is a warning, no error."""
+        places = {"--control": control, "--publish": publish}
+        flags = [f"{flag}={_reached(value)}" for flag, value in places.items() if value is not None]
+        flags += [f"--map={map_name}", f"--listen={self._place}"]
+        kept = {
+            key: value
+            for key, value in os.environ.items()
+            if not key.startswith("TSFUSION_") or key in _FOR_THE_VIEWER
+        }
+        try:
+            self._process = subprocess.Popen(
+                [
+                    sys.executable,
+                    "-m",
+                    "tsfusion",
+                    "view",
+                    _reached(address),
+                    *flags,
+                    "--json",
+                    "--from-parent",
+                ],
+                stdin=subprocess.PIPE,  # closes when we die, however we die: it then ends by itself
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                env=kept,
+                **process.OWN_GROUP,  # Ctrl-C is ours to handle
+            )
+            assert self._process.stdin is not None
+            self._process.stdin.write(json.dumps(keys and msgspec.to_builtins(keys)) + "\n")
+            self._process.stdin.flush()
+        except OSError as error:
+            log.warning("the page cannot be shown: %s; all else goes on", error.strerror)
+        if self._process is not None:
+            self._reader.start()
+
+    def close(self) -> None:
+        """End the page."""
+        self._is_ending = True
+        if self._process is None:
+            return
+        self._process.terminate()
+        try:
+            self._process.wait(_END_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+        self._reader.join(_END_SECONDS)
+        with suppress(OSError), self._process:  # closes its pipes
+            pass
+
+    def _follow(self) -> None:
+        """Pass on what it says, until it ends."""
+        child, why = self._process, ""
+        assert child is not None
+        assert child.stdout is not None
+        for line in map(str.strip, child.stdout):
+            if line.startswith('{"url"'):
+                self._tell(json.loads(line)["url"])
+            elif line.startswith("tsfusion: "):
+                why = line.removeprefix("tsfusion")
+            elif line:
+                log.warning("page: %s", line.removeprefix("tsfusion view: WARNING: "))
+        status = child.wait()
+        if not self._is_ending:
+            log.warning("the page has ended with status %d%s; all else goes on", status, why)
+
+
+def _reached(address: str) -> str:
+    """The address to connect to, of one that is listened at."""
+    host, port = sockets.parse_address(address)
+    return sockets.format_address(
+        {"0.0.0.0": "127.0.0.1", "*": "127.0.0.1", "::": "::1"}.get(host, host), port
+    )
+
+
+@contextmanager
+def showing(viewer: ViewerChild | None, target: Target) -> Iterator[None]:
+    """Show the map that a run sends to, until the end of the block."""
+    if viewer is None:
+        yield
+        return
+    link = target.link
+    try:
+        viewer.start(link.address, control=link.control, map_name=link.map, keys=target.keys)
+        yield
+    finally:
+        viewer.close()
