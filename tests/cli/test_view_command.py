@@ -3,13 +3,9 @@
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -17,8 +13,9 @@ from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 import pytest
-from command_processes import COMMAND, alive, descendants, environment, eventually, read_until, tsfusion
+from command_processes import alive, descendants, eventually, read_until, tsfusion
 from idle_fuser import COMMAND as IDLE_FUSER
+from live_pages import DEADLINE, address_of, ended, running, viewing
 
 from tsfusion.cli import verbs
 from tsfusion.cli import view as view_command
@@ -28,7 +25,6 @@ from tsfusion.viewer.page_server import listen
 from tsfusion.wire import key_folder
 from tsfusion.wire.queries import fetch_health
 
-DEADLINE = 60.0
 NOBODY = "tcp://127.0.0.1:9"
 _SERVE = f"""
 import sys
@@ -39,31 +35,6 @@ main()
 """
 
 
-@contextmanager
-def running(*command: object, **variables: str) -> Iterator["subprocess.Popen[str]"]:
-    """A process whose stdout and stderr are read apart, ended whatever happens."""
-    process = subprocess.Popen(
-        [*map(str, command)], text=True,
-        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        env={**environment(), "DISPLAY": "", "WAYLAND_DISPLAY": "", **variables},
-    )  # fmt: skip
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-def viewing(*arguments: object, **variables: str) -> Any:
-    return running(*COMMAND, "view", *arguments, **variables)
-
-
-def address_of(process: "subprocess.Popen[str]") -> str:
-    found = re.search(r"https?://[^\s\"]+", read_until(process, "http://", DEADLINE))
-    assert found is not None
-    return found[0]
-
-
 def status_of(url: str, **headers: str) -> int:
     try:
         with urlopen(Request(url, headers=headers), timeout=DEADLINE) as answer:
@@ -71,14 +42,6 @@ def status_of(url: str, **headers: str) -> int:
             return int(answer.status)
     except HTTPError as error:
         return error.code
-
-
-def ended(process: "subprocess.Popen[str]", number: int) -> tuple[int, float, str, str]:
-    """Status, seconds, and what was not read yet of stdout and stderr of a process that gets a signal."""
-    began = time.monotonic()
-    process.send_signal(number)
-    said, errors = process.communicate(timeout=DEADLINE)
-    return process.returncode, time.monotonic() - began, said, errors
 
 
 def test_a_page_is_announced_and_ends_by_ctrl_c() -> None:

@@ -59,8 +59,8 @@ class Browser:
                 return result
             self._note(answer)
 
-    def open(self, path: Path, *, width: int = 1200, height: int = 900, dark: bool = False) -> None:
-        """Show a file."""
+    def open(self, path: Path | str, *, width: int = 1200, height: int = 900, dark: bool = False) -> None:
+        """Show a file, or what is at a URL."""
         self.call(
             "Emulation.setDeviceMetricsOverride",
             width=width,
@@ -70,7 +70,7 @@ class Browser:
         )
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])
-        self.call("Page.navigate", url=path.absolute().as_uri())
+        self.call("Page.navigate", url=path if isinstance(path, str) else path.absolute().as_uri())
         self.wait("document.readyState === 'complete'")
 
     def evaluate(self, expression: str) -> Any:

@@ -156,15 +156,26 @@ def demo(
     _run(
         dataset, out, view=view, overwrite=overwrite, json=json, volume=chosen.volume,
         client=options.client_settings(chosen), rate=rate or usual_rate, min_weight=settings["min_weight"],
+        truth=f"synthetic:{world}",
     )  # fmt: skip
 
 
-def _run(dataset: "Dataset", out: Path | None, *, view: str | None, json: bool, **settings: Any) -> None:
+def _run(
+    dataset: "Dataset",
+    out: Path | None,
+    *,
+    view: str | None,
+    json: bool,
+    truth: str | None = None,
+    **settings: Any,
+) -> None:
     from tsfusion.cli import output, progress, run_page, run_summary
     from tsfusion.pipelines.replay import replay as run
 
     with progress.shown(quiet=json) as display:
-        result = run(dataset, out, viewer=run_page.beside(view, display), progress=display, **settings)
+        result = run(
+            dataset, out, viewer=run_page.beside(view, display, truth=truth), progress=display, **settings
+        )
     if json:
         output.as_json(result)
     else:

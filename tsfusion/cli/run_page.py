@@ -10,11 +10,12 @@ if TYPE_CHECKING:
     from tsfusion.pipelines.viewer_child import ViewerChild
 
 
-def beside(view: str | None, display: "Quiet") -> "ViewerChild | None":
+def beside(view: str | None, display: "Quiet", *, truth: str | None = None) -> "ViewerChild | None":
     """The page, whose address is shown where the run's progress is.
 
     Args:
         view: HOST:PORT; None = no page.
+        truth: known surface of the map; see `ViewerChild`.
 
     Raises:
         MissingDependency, InvalidConfig, TransportError: when it cannot be shown.
@@ -23,7 +24,7 @@ def beside(view: str | None, display: "Quiet") -> "ViewerChild | None":
         return None
     from tsfusion.pipelines.viewer_child import ViewerChild
 
-    return ViewerChild(view, lambda url: display.say(f"page {url}"))
+    return ViewerChild(view, lambda url: display.say(f"page {url}"), truth=truth)
 
 
 def print_again(view: str | None, folder: str, connect: str | None) -> None:

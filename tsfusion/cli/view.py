@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
+from functools import cache, partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,11 +20,16 @@ from tsfusion.cli import options, verbs
 from tsfusion.viewer import LISTEN
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from tsfusion.pipelines.measured_errors import Measure
     from tsfusion.viewer.map_feed import MapFeed
     from tsfusion.wire.curve import ClientKeys
 
 _ANSWER_SECONDS = 1.0  # for a server to say that it is there
 _SERVER = re.compile(r"[\w.-]+:\d{1,5}|\[[\da-fA-F:.]+\]:\d{1,5}", re.ASCII)
+_ERROR = "error [m]"  # as the page names it
 _NICENESS = 10  # of a page beside a run
 
 
@@ -36,7 +42,7 @@ def view(
     *,
     map_: options.Map = None,
     truth: Annotated[
-        Path | None, options.option("--truth", "FILE", "Known surface, to colour by the error.")
+        str | None, options.option("--truth", "FILE", "Known surface, to colour by the error.")
     ] = None,
     listen: Annotated[
         str,
@@ -76,15 +82,13 @@ def view(
         options.refuse(
             context, ("control", "key", "server_key"), f"has no effect on {target}: it is no server"
         )
-    else:
-        options.refuse(context, ("truth",), "has no effect on a live map: give it a saved one")
     link = {"control": control, "publish": publish, "keys": keys}
     with (
         closing(PageServer(*parse_place(listen), token=token)) as page,
         closing(_feed(target, map_, link)) as feed,
         _stopped_by_signals() as stop,
     ):
-        shown = LivePage(page.server, feed)
+        shown = LivePage(page.server, feed, measures=_measures(target, truth))
         _announce(page.url, feed.title, json=json)
         if not no_browser:
             _open_browser(page.url)
@@ -141,6 +145,29 @@ def _feed(target: str | Path, map_: str | None, link: dict[str, Any]) -> "MapFee
     from tsfusion.wire.map_watcher import MapWatcher
 
     return MapWatcher(target, map_ or DEFAULT_MAP, **link)
+
+
+def _measures(target: str | Path, truth: str | None) -> "dict[str, Measure]":
+    """What else the map can be coloured by: its error, where the truth is given, or a run has measured it."""
+    if truth is not None:
+        from tsfusion.pipelines.measured_errors import error_measure
+
+        return {_ERROR: error_measure(truth)}
+    if isinstance(target, Path) and (target / "error.npy").exists():
+        return {_ERROR: partial(_error_of_run, target)}
+    return {}
+
+
+@cache
+def _measure_of_run(folder: Path) -> "Measure":
+    from tsfusion.pipelines.measured_errors import error_measure
+
+    return error_measure(folder)
+
+
+def _error_of_run(folder: Path, points: "NDArray[np.float32]") -> "NDArray[np.float32]":
+    """The error of a run, whose mesh is read when it is asked for: that takes a while."""
+    return _measure_of_run(folder)(points)
 
 
 def _announce(url: str, title: str, *, json: bool) -> None:

@@ -33,6 +33,7 @@ class ViewerChild:
     Args:
         place: HOST:PORT of the page.
         tell: called in a thread with the page's address, once it can be opened.
+        truth: known surface of the map, as `tsfusion view --truth` takes it.
 
     Raises:
         MissingDependency: without viser.
@@ -40,10 +41,11 @@ class ViewerChild:
         TransportError: when the port is taken.
     """
 
-    def __init__(self, place: str, tell: Callable[[str], None]) -> None:
+    def __init__(self, place: str, tell: Callable[[str], None], *, truth: str | None = None) -> None:
         check_installed()
         listen(*parse_place(place)).close()
         self._place = place
+        self._truth = truth
         self._tell = tell
         self._process: subprocess.Popen[str] | None = None
         self._reader = threading.Thread(target=self._follow, name="page", daemon=True)
@@ -59,9 +61,14 @@ class ViewerChild:
         keys: ClientKeys | None = None,
     ) -> None:
         """Show a map of the server that listens at `address`. What goes wrong is a warning, no error."""
-        places = {"--control": control, "--publish": publish}
-        flags = [f"{flag}={_reached(value)}" for flag, value in places.items() if value is not None]
-        flags += [f"--map={map_name}", f"--listen={self._place}"]
+        given = {
+            "--control": control and _reached(control),
+            "--publish": publish and _reached(publish),
+            "--truth": self._truth,
+            "--map": map_name,
+            "--listen": self._place,
+        }
+        flags = [f"{flag}={value}" for flag, value in given.items() if value is not None]
         kept = {
             key: value
             for key, value in os.environ.items()

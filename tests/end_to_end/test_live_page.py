@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: MIT
+"""A live page in a real browser: its pixels, through corrections and restarts of server and page."""
+
+import re
+import signal
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import cv2
+import numpy as np
+from headless_browser import Browser, browser
+from keyframes_and_servers import DEADLINE, lasting_address, pose, serving, wall
+from live_pages import address_of, ended, viewing
+
+from tsfusion import Client
+
+RED, GREEN, BLUE = (230, 20, 20), (20, 200, 20), (30, 30, 230)
+TOKEN = {"TSFUSION_TOKEN": "open-sesame"}
+SIZE = {"width": 640, "height": 420}
+# Of three.js inside viser; and a browser's own words about a server that is away.
+_HARMLESS = re.compile(r"THREE\.Clock: This module has been|ERR_CONNECTION|WebSocket connection to")
+
+
+def painted(x: float, color: tuple[int, int, int]) -> Any:
+    """A wall of one colour, a good metre in front of a camera at x."""
+    keyframe = wall(T_world_camera=pose(x))
+    assert keyframe.color is not None
+    keyframe.color[:] = color
+    return keyframe
+
+
+class Seen:
+    """The pixels of a page."""
+
+    def __init__(self, page: Browser) -> None:
+        self._page = page
+
+    def where(self, color: tuple[int, int, int]) -> np.ndarray:
+        """(n, 2) row and column of the pixels that have about this hue."""
+        picture = cv2.imdecode(np.frombuffer(self._page.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+        hues, wanted = (cv2.cvtColor(one, cv2.COLOR_BGR2HSV) for one in (picture, np.uint8([[color[::-1]]])))
+        distance = np.abs(hues[..., 0].astype(int) - int(wanted[0, 0, 0]))
+        near = (np.minimum(distance, 180 - distance) < 12) & (hues[..., 1] > 120)
+        return np.argwhere(near & (hues[..., 2] > 40))
+
+    def until(self, reached: Callable[[], Any]) -> None:
+        end = time.monotonic() + DEADLINE
+        while not reached():
+            assert time.monotonic() < end, (self._page.evaluate("document.body.innerText"), self._page.errors)
+            time.sleep(0.2)
+
+    def shows(self, color: tuple[int, int, int]) -> bool:
+        return len(self.where(color)) > 300
+
+
+def test_a_page_follows_its_map_whatever_happens(tmp_path: Path) -> None:
+    address, state = lasting_address(), tmp_path / "state"
+    with ExitStack() as stack, browser() as page:
+        server = stack.enter_context(serving(state, listen=address))
+        viewer = stack.enter_context(viewing(address, "--listen", "127.0.0.1:0", **TOKEN))
+        url = address_of(viewer)
+        place = urlsplit(url).netloc
+        page.open(url, **SIZE)
+        page.wait("document.body.innerText.includes('Connected')")
+        seen = Seen(page)
+        client = stack.enter_context(Client(address, spool=tmp_path / "spool"))
+
+        red = client.send(painted(0.0, RED))
+        assert red is not None
+        seen.until(lambda: seen.shows(RED))
+        assert not seen.shows(GREEN)
+        client.send(painted(1.2, GREEN))
+        seen.until(lambda: seen.shows(RED) and seen.shows(GREEN))
+        before = np.sign(seen.where(RED).mean(0)[1] - seen.where(GREEN).mean(0)[1])
+        client.correct({red: pose(2.4)})
+        seen.until(lambda: np.sign(seen.where(RED).mean(0)[1] - seen.where(GREEN).mean(0)[1]) == -before)
+
+        server.kill()
+        stack.enter_context(serving(state, listen=address))
+        client.send(painted(3.6, BLUE))
+        seen.until(lambda: seen.shows(BLUE) and seen.shows(GREEN) and seen.shows(RED))
+
+        assert ended(viewer, signal.SIGTERM)[0] == 0
+        again = viewing(address, "--listen", place, **TOKEN)
+        viewer = stack.enter_context(again)
+        assert address_of(viewer) == url
+        client.correct({}, removed=[red])
+        seen.until(lambda: seen.shows(BLUE) and seen.shows(GREEN) and not seen.shows(RED))
+        assert ended(viewer, signal.SIGINT)[::2] == (0, "")
+
+        own = (f"http://{place}/", f"ws://{place}", f"blob:http://{place}/", "data:")
+        assert not {one for one in page.requests if not one.startswith(own)}
+        assert not [one for one in page.errors if not _HARMLESS.search(one)]
