@@ -1,19 +1,23 @@
 # SPDX-License-Identifier: MIT
 """Progress of a run: the same counts as a table on a terminal, as plain lines elsewhere, or not at all."""
 
+import io
 import logging
 import os
 import pty
+import re
 import subprocess
 import sys
 
 import pytest
 from command_processes import environment
+from msgspec import structs
+from rich.console import Console
 
-from tsfusion.cli import progress
-from tsfusion.cli.run_summary import explained
+from tsfusion.cli import progress, progress_rows
 from tsfusion.client import ClientStats
 from tsfusion.scanner.scanner import ScanState
+from tsfusion.wire.messages import explained
 
 STATS = ClientStats(
     sent=9, durable=8, fused=7, refused={}, rejected={"quota": 1}, skipped={}, waiting=1, waiting_bytes=5000,
@@ -25,42 +29,128 @@ LOST = ScanState(
 )  # fmt: skip
 
 
+GOING = structs.replace(STATS, sent=30, durable=30, fused=29, rejected={}, waiting=0, waiting_bytes=0)
+BEHIND = structs.replace(GOING, sent=41, durable=33, waiting=8, waiting_bytes=1_200_000)
+WELL = structs.replace(LOST, state="tracking", why="", loops=0, stats=GOING)
+
+
 @pytest.fixture
 def eager(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every update is shown."""
     monkeypatch.setattr(progress, "_LINE_INTERVAL", 0.0)
-    monkeypatch.setattr(progress, "_DRAW_INTERVAL", 0.0)
+
+
+class Clock:
+    """A clock that moves when it is told to."""
+
+    now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(progress_rows, "time", clock)
+    return clock
+
+
+def drawn(screen: progress_rows.Screen, width: int, *, color: bool = False, trouble: str = "") -> list[str]:
+    """The lines of a terminal that shows this."""
+    console = Console(
+        width=width, force_terminal=True, color_system="truecolor", no_color=not color, highlight=False,
+        file=io.StringIO(),
+    )  # fmt: skip
+    console.print(screen.table(width, trouble=trouble))
+    return console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+
+
+def words_of(lines: list[str]) -> list[str]:
+    """The same without colours and columns."""
+    return [" ".join(re.sub(r"\x1b\[[0-9;]*m", "", line).split()) for line in lines]
 
 
 @pytest.mark.usefixtures("eager")
 def test_plain_lines(capsys: pytest.CaptureFixture[str]) -> None:
     with progress.shown(quiet=False) as display:
         display.stage("scanning the room")
-        display.update(3, 2, 10)
-        display.update(30, 7, 60, LOST)
-        display.update(30, 7, None, LOST)
+        display.update(60, GOING)
+        display.update(60, STATS, scan=LOST)
+        display.update(None, STATS, scan=LOST, link="the server is gone")
     stage, replay, scan, endless = capsys.readouterr().err.splitlines()
     assert stage == "scanning the room …"
-    assert replay == "  keyframes 3 of 10, 0.0/s; fused 2 of 10, 0.0/s"
-    words = scan.strip().split("; ")
-    assert words[:2] == ["sensor lost: no texture", "2 loops closed"]
-    assert words[2].startswith("frames 30 of 60, ")
-    assert words[4:6] == ["to send 1 (5 kB)", "server 8 acknowledged, 7 fused, delay 41 ms"]
-    assert words[6:] == ["left out 1 × quota"]
-    assert "frames 30, " in endless
+    assert replay == ("✓ working · keeping up · lost 0 keyframes; sent 30 of 60; fused 29 of 60; waiting 1")
+    assert scan == (
+        "✗ sensor lost · keeping up · lost 1 keyframe; frames 30 of 60; keyframes 9; fused 7, delay 41 ms; "
+        "waiting 1, 1 to send, 5 kB; sensor lost: no texture; 2 loops closed; lost 1 × quota"
+    )
+    assert "; frames 30; " in endless
+    assert endless.endswith("; server the server is gone")
+
+
+@pytest.mark.parametrize("color", [True, False])
+@pytest.mark.parametrize("width", [80, 120])
+def test_a_table_answers_in_its_first_line_and_fits(width: int, color: bool, clock: Clock) -> None:
+    run = progress_rows.RunProgress()
+    run.screen(2500, structs.replace(GOING, sent=20, durable=20, fused=19), "", None)
+    clock.now += 2.0
+    replay = drawn(run.screen(2500, GOING, "", None), width, color=color)
+    clock.now += 2.0
+    behind = drawn(run.screen(2500, BEHIND, "", None), width, color=color)
+    lost = drawn(run.screen(2500, STATS, "", LOST), width, color=color)
+    assert words_of(replay)[0] == "✓ working · keeping up · lost 0 keyframes"
+    assert words_of(behind)[0] == "! working · behind by 12 keyframes, about 5 s · lost 0 keyframes"
+    assert words_of(lost)[0] == "✗ sensor lost · keeping up · lost 1 keyframe"
+    for lines in (replay, behind, lost):
+        plain = [re.sub(r"\x1b\[[0-9;]*m", "", line).rstrip() for line in lines]
+        assert max(map(len, plain)) <= width
+        assert len(plain) <= 8
+    assert ("\x1b[32m" in replay[0]) == color
+    assert words_of(replay)[1].startswith("sent 30 of 2500 5.0/s")
+    assert words_of(replay)[2].startswith("fused 29 of 2500 5.0/s 8 min left")
+    assert words_of(lost)[-2:] == ["sensor lost: no texture; 2 loops closed", "lost 1 × quota"]
+
+
+def test_columns_stay_while_figures_grow(clock: Clock) -> None:
+    run = progress_rows.RunProgress()
+    ends = set()
+    for sent in (1, 9, 80, 700, 6000):
+        clock.now += 1.0
+        counts = structs.replace(GOING, sent=sent, durable=sent, fused=sent)
+        ends.add(drawn(run.screen(9000, counts, "", None), 80)[1].index("of 9000"))
+    assert len(ends) == 1
+
+
+def test_what_stands_still_is_said(clock: Clock) -> None:
+    run = progress_rows.RunProgress()
+    run.screen(60, GOING, "", None)
+    clock.now += 7.0
+    assert str(run.screen(60, GOING, "", None).headline) == (
+        "✗ nothing fused for 7 s · keeping up · lost 0 keyframes"
+    )
+    moved = structs.replace(GOING, fused=30)
+    assert str(run.screen(60, moved, "", None).headline).startswith("✓ working")
+    clock.now += 70.0
+    assert str(run.screen(60, moved, "", None).headline).startswith("✓ working"), "nothing waits"
+    silent = drawn(run.screen(60, moved, "", WELL), 80, trouble="nothing came for 6 s")
+    assert words_of(silent)[0].startswith("✗ nothing came for 6 s · keeping up")
+    held = run.screen(60, moved, "the disk is full\x1b[2J", None)
+    assert str(held.headline).startswith("✗ the server takes nothing · ")
+    assert words_of(drawn(held, 80))[-1] == "server the disk is full\\x1b[2J"
 
 
 @pytest.mark.usefixtures("eager")
 def test_bytes_are_read_in_lines_too(capsys: pytest.CaptureFixture[str]) -> None:
     with progress.reading("checking a journal", quiet=False) as watch:
         watch(1_500_000, 3_000_000)
-    assert capsys.readouterr().err == "  checking a journal 1.5 MB of 3 MB, 0 B/s\n"
+    assert capsys.readouterr().err == "  checking a journal 1.5 MB of 3 MB\n"
 
 
 def test_quiet_is_silent(capsys: pytest.CaptureFixture[str]) -> None:
     with progress.shown(quiet=True) as display:
         display.stage("scanning the room")
-        display.update(3, 2, 10)
+        display.update(10, GOING)
     with progress.reading("checking a journal", quiet=True) as watch:
         watch(1, 2)
     assert capsys.readouterr().err == ""
@@ -77,9 +167,9 @@ def test_warnings_stand_above_the_table(capsys: pytest.CaptureFixture[str]) -> N
 
 def test_a_terminal_gets_bars_that_go_away() -> None:
     program = (
-        "from tsfusion.cli import progress; progress._DRAW_INTERVAL = 0\n"
+        "import time; from tsfusion.cli import progress, progress_rows\n"
         "with progress.shown(quiet=False) as display:\n"
-        "    display.stage('scanning the room'); display.update(3, 2, 10); display.update(10, 9, 10)\n"
+        "    display.stage('scanning the room'); display.show_steps('shots', 3, 10); time.sleep(1)\n"
         "print('the end')\n"
     )
     leader, follower = pty.openpty()

@@ -8,7 +8,7 @@ import typer
 
 from tsfusion.cli.output import counted, grouped, size
 from tsfusion.core.counts import count_of
-from tsfusion.wire.messages import SKIP_REASONS
+from tsfusion.wire.messages import explained
 
 if TYPE_CHECKING:
     from tsfusion.evaluation.trajectory_error import TrajectoryError
@@ -86,12 +86,6 @@ def _results(folder: str) -> str:
     rest = " ".join(name for name in files if not name.startswith("report"))
     report = f"\nreport     {folder}/report.html" if "report.html" in files else ""
     return f"results    {folder}/: {rest}{report}"
-
-
-def explained(counts: dict[str, int]) -> str:
-    """{"thinned": 2} → 2 × thinned (the map was too far behind)."""
-    named = {reason: f"{reason} ({SKIP_REASONS[reason]})" for reason in counts if reason in SKIP_REASONS}
-    return counted({named.get(reason, reason): count for reason, count in counts.items()})
 
 
 def mesh_lines(figures: dict[str, Any]) -> list[str]:

@@ -19,3 +19,11 @@ def size(count: float) -> str:
 def counted(counts: dict[str, int]) -> str:
     """{"spool": 2, "quota": 1} → 2 × spool; 1 × quota. Zeros are left out."""
     return "; ".join(f"{count} × {reason}" for reason, count in counts.items() if count)
+
+
+def span(seconds: float) -> str:
+    """7 s, 12 min, 5 h, 3 days."""
+    for name, size in (("days", 86_400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {name}"
+    return f"{seconds:.0f} s"

@@ -45,6 +45,22 @@ class ClientStats(Struct, frozen=True):
     corrections_refused: dict[str, int] = {}
     corrections_waiting: int = 0
 
+    @property
+    def settled(self) -> int:
+        """Sent keyframes that are in the map, or never will be."""
+        turned_away = sum(self.rejected.values()) + sum(self.refused.values())
+        return self.fused + turned_away + self.skipped.get("dropped", 0)
+
+    @property
+    def under_way(self) -> int:
+        """Keyframes that were taken, but are not settled: here, on their way, or waiting for the map."""
+        return max(self.sent - self.settled, self.waiting)
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """Keyframes that are not in the map and will not come into it: reason → count."""
+        return dict(Counter(self.refused) + Counter(self.rejected) + Counter(self.skipped))
+
 
 class Outcomes:
     """Counts of records by what became of them. For one thread at a time."""

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from msgspec import Struct
 
 from tsfusion.core import logs
+from tsfusion.core.readable_numbers import span
 
 log = logging.getLogger(__name__)
 
@@ -76,11 +77,3 @@ class ProblemTimes:
 
     def _since(self, problem: Problem, now: float) -> float:
         return self._began.get(problem.key, (problem, now))[1]
-
-
-def span(seconds: float) -> str:
-    """7 s, 12 min, 5 h, 3 days."""
-    for name, size in (("days", 86_400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.0f} {name}"
-    return f"{seconds:.0f} s"

@@ -36,14 +36,16 @@ class Progress(Protocol):
     def stage(self, text: str) -> None:
         """Announce the next part of the run."""
 
-    def update(self, taken: int, fused: int, total: int | None, scan: ScanState | None = None) -> None:
+    def update(
+        self, total: int | None, stats: ClientStats, *, link: str = "", scan: ScanState | None = None
+    ) -> None:
         """Show the counts; called often.
 
         Args:
-            taken: frames or keyframes taken from the source.
-            fused: keyframes in the map.
-            total: frames or keyframes of the source; None = nobody knows.
-            scan: of a scan: the sensor, the keyframes and the link.
+            total: frames of the source, without `scan` keyframes; None = nobody knows.
+            stats: of all clients together.
+            link: why the server takes no keyframes at the moment; empty = it does.
+            scan: of a scan: the sensor and its frames.
         """
 
 
@@ -75,11 +77,11 @@ class Engine:
 
     def wait_turn(self, ahead: int = AHEAD) -> None:
         """Wait until fewer than `ahead` keyframes are under way; raise TransportError when nothing moves."""
-        self._wait_map(lambda stats: stats.sent - _settled(stats) < ahead)
+        self._wait_map(lambda stats: stats.sent - stats.settled < ahead)
 
     def wait_fused(self) -> None:
         """Wait until each keyframe is in the map or turned away; raise TransportError when nothing moves."""
-        self._wait_map(lambda stats: not stats.waiting and _settled(stats) >= stats.sent)
+        self._wait_map(lambda stats: not stats.waiting and stats.settled >= stats.sent)
 
     def wait_settled(self, clients: Iterable[Client]) -> None:
         """Wait until each keyframe is at its newest pose; raise TransportError when nothing moves."""
@@ -116,7 +118,7 @@ class Engine:
             stats = self.check()
             if reached(stats):
                 return True
-            now = (stats.waiting, stats.durable + _settled(stats), stats.corrections_waiting)
+            now = (stats.waiting, stats.durable + stats.settled, stats.corrections_waiting)
             if now != last:
                 last, moved, logged = now, time.monotonic(), False
             elif time.monotonic() - moved > timeout:
@@ -125,9 +127,3 @@ class Engine:
                 log.warning("nothing moves: %s; waiting for at most %.0f s", why, timeout)
                 logged = True
             time.sleep(_POLL)
-
-
-def _settled(stats: ClientStats) -> int:
-    """Sent keyframes that are in the map, or never will be."""
-    turned_away = sum(stats.rejected.values()) + sum(stats.refused.values())
-    return stats.fused + turned_away + stats.skipped.get("dropped", 0)

@@ -92,7 +92,7 @@ def replay(
 
             def observe() -> ClientStats:
                 stats = sender.stats
-                progress.update(stats.sent, stats.fused, len(dataset))
+                progress.update(len(dataset), stats, link=sender.problem)
                 return stats
 
             running = Engine(target, observe, lambda: sender.problem)

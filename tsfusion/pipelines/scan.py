@@ -148,7 +148,7 @@ def scan(
 
             def observe() -> ClientStats:
                 state = scanner.state()
-                progress.update(state.frames, state.stats.fused, source.length, state)
+                progress.update(source.length, state.stats, link=state.link, scan=state)
                 return state.stats
 
             running = Engine(target, observe, lambda: scanner.state().link)

@@ -11,6 +11,7 @@ from msgspec import Meta, Struct
 
 from tsfusion.core.config import MapName
 from tsfusion.core.errors import DecodeError
+from tsfusion.core.readable_numbers import counted
 from tsfusion.wire.forgetting import Forgotten, Selection
 from tsfusion.wire.health import Health, MeshLayout, Status
 from tsfusion.wire.keyframe_times import Seq, Stamps
@@ -28,6 +29,12 @@ SKIP_REASONS = {
     "disk": "the spool's disk was full or failed",
 }
 Counts = dict[Annotated[str, Meta(max_length=32)], Annotated[int, Meta(ge=0)]]  # by reason
+
+
+def explained(counts: dict[str, int]) -> str:
+    """{"thinned": 2} → 2 × thinned (the map was too far behind)."""
+    named = {reason: f"{reason} ({SKIP_REASONS[reason]})" for reason in counts if reason in SKIP_REASONS}
+    return counted({named.get(reason, reason): count for reason, count in counts.items()})
 
 
 class Hello(Struct, frozen=True, tag="hello", omit_defaults=True):

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: MIT
+"""Figures of a run's progress: a headline, rows of counts that stay in their columns, and notes in words."""
+
+import time
+from collections import deque
+from typing import TYPE_CHECKING, NamedTuple
+
+from tsfusion.cli.output import size
+from tsfusion.core.counts import count_of
+from tsfusion.core.headline import Headline
+from tsfusion.core.logs import printable
+from tsfusion.core.readable_numbers import span
+from tsfusion.wire.messages import explained
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.text import Text
+
+    from tsfusion.client import ClientStats
+    from tsfusion.scanner.scanner import ScanState
+
+STILL = 5.0  # seconds in which nothing comes, or is fused, until that is said
+_RATE_SECONDS = 5.0  # over which rates are counted
+_FIRST_RATE = 1.0  # seconds until one is shown
+_WIDTHS = (9, 13, 8, 18)  # columns at least: name, amount, rate, note
+_BAR_WIDTHS = (8, 26)  # columns at least and at most
+_STYLES = {"good": "green", "notice": "yellow", "bad": "bold red"}
+
+
+class Row(NamedTuple):
+    """A name and figures; `share`: 0 to 1 of a bar, None = no bar."""
+
+    name: str
+    amount: str
+    rate: str = ""
+    note: str = ""
+    share: float | None = None
+
+    def __str__(self) -> str:
+        return f"{self.name} {', '.join(filter(None, (self.amount, self.rate, self.note)))}"
+
+
+class Note(NamedTuple):
+    """A name and words."""
+
+    name: str
+    text: str
+    alarm: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.name} {printable(self.text)}"
+
+
+class Screen(NamedTuple):
+    """What is shown at one moment; `headline` None = there are no keyframes."""
+
+    rows: list[Row] = []
+    notes: list[Note] = []
+    headline: Headline | None = None
+
+    def line(self) -> str:
+        """All of it on one line."""
+        begin = "  " if self.headline is None else f"{self.headline}; "
+        return begin + "; ".join(map(str, [*self.rows, *self.notes]))
+
+    def table(self, width: int, *, trouble: str = "") -> "RenderableType":
+        """All of it for a terminal of so many columns; `trouble`: what the headline does not know yet."""
+        from msgspec.structs import replace
+        from rich.console import Group
+
+        head = self.headline
+        if head is not None and trouble and not head.trouble:
+            head = replace(head, trouble=trouble)
+        top = [] if head is None else [styled(head)]
+        return Group(*top, *([_grid(self.rows, width)] if self.rows else []), *map(_in_words, self.notes))
+
+
+def styled(headline: Headline) -> "Text":
+    """A headline in colours, which only support its words."""
+    from rich.text import Text
+
+    mark, level = headline.mark
+    line = Text(f"{mark} ", style=_STYLES[level])
+    for number, (words, of_part) in enumerate(headline.parts):
+        line.append(" · " if number else "", style="dim").append(words, style=_STYLES[of_part])
+    return line
+
+
+class Rates:
+    """How much two counts grew a second, over the last seconds; None = too short a time to tell."""
+
+    def __init__(self) -> None:
+        self._samples: deque[tuple[float, int, int]] = deque()
+
+    def __call__(self, first: int, second: int) -> tuple[float | None, float | None]:
+        now = time.monotonic()
+        self._samples.append((now, first, second))
+        while now - self._samples[0][0] > _RATE_SECONDS:
+            self._samples.popleft()
+        then, first_then, second_then = self._samples[0]
+        seconds = now - then
+        if seconds < _FIRST_RATE:
+            return None, None
+        return (first - first_then) / seconds, (second - second_then) / seconds
+
+
+class RunProgress:
+    """Turns the counts of a run into what is shown of it."""
+
+    def __init__(self) -> None:
+        self._rates = Rates()
+        self._step: object = None
+        self._moved = 0.0  # time.monotonic(): a keyframe went a step further, or none was under way
+
+    def screen(self, total: int | None, stats: "ClientStats", link: str, scan: "ScanState | None") -> Screen:
+        """What is shown; arguments as of `Progress.update`."""
+        taken = stats.sent if scan is None else scan.frames
+        taking, fusing = self._rates(taken, stats.fused)
+        headline = Headline(
+            doing="working" if taken else "starting",
+            trouble=_trouble(link, scan) or self._standstill(stats),
+            waiting=stats.under_way,
+            rate=fusing or 0.0,
+            lost=sum(stats.left_out.values()),
+        )
+        to_send = f"{stats.waiting} to send, {size(stats.waiting_bytes)}" if stats.waiting else ""
+        if scan is None:
+            rows = [Row("sent", f"{taken}{_of(total)}", _rate(taking), "", _share(taken, total)),
+                    Row("fused", f"{stats.fused}{_of(total)}", _rate(fusing),
+                        _left(stats.fused, total, fusing), _share(stats.fused, total))]  # fmt: skip
+        else:
+            rows = [Row("frames", f"{taken}{_of(total)}", _rate(taking), _left(taken, total, taking),
+                        _share(taken, total)),
+                    Row("keyframes", str(sum(scan.selected.values()))),
+                    Row("fused", str(stats.fused), _rate(fusing), _delay(scan))]  # fmt: skip
+        return Screen(
+            [*rows, Row("waiting", str(stats.under_way), "", to_send)], _notes(stats, link, scan), headline
+        )
+
+    def _standstill(self, stats: "ClientStats") -> str:
+        """For how long keyframes have waited and none was fused; empty = they move, or none waits."""
+        now, step = time.monotonic(), (stats.settled, stats.durable, stats.corrections_waiting)
+        if step != self._step or not stats.under_way:
+            self._step, self._moved = step, now
+        return f"nothing fused for {span(now - self._moved)}" if now - self._moved > STILL else ""
+
+
+def byte_row(text: str, done: int, total: int, rates: Rates) -> Row:
+    """How much is read, after `text`."""
+    rate, _ = rates(done, 0)
+    shown = "" if rate is None else f"{size(rate)}/s"
+    return Row(text, f"{size(done)} of {size(total)}", shown, "", _share(done, total))
+
+
+def step_row(text: str, done: int, total: int) -> Row:
+    """How many steps are done, after `text`."""
+    return Row(text, f"{done}{_of(total)}", share=_share(done, total))
+
+
+def _trouble(link: str, scan: "ScanState | None") -> str:
+    """Why a run does not go on, in two or three words; the notes have the rest."""
+    if scan is not None and scan.state == "lost":
+        return "sensor lost"
+    if scan is not None and scan.state == "starting" and scan.why:
+        return "sensor not localised"
+    return "the server takes nothing" if link else ""
+
+
+def _notes(stats: "ClientStats", link: str, scan: "ScanState | None") -> list[Note]:
+    notes = [] if scan is None else [Note("sensor", _sensor(scan), scan.state == "lost")]
+    if stats.corrections_waiting:
+        moved = count_of(stats.corrections_waiting, "keyframe")
+        notes.append(Note("to move", f"{moved}, to corrected poses"))
+    if stats.left_out:
+        notes.append(Note("lost", explained(stats.left_out), alarm=True))
+    return [*notes, Note("server", link, alarm=True)] if link else notes
+
+
+def _sensor(state: "ScanState") -> str:
+    words = state.state if not state.why else f"{state.state}: {state.why}"
+    if state.submaps > 1:
+        words += f"; map {state.submap} ({state.submaps} so far)"
+    return words + (f"; {count_of(state.loops, 'loop')} closed" if state.loops else "")
+
+
+def _of(total: int | None) -> str:
+    return f" of {total}" if total else ""
+
+
+def _share(count: int, total: int | None) -> float | None:
+    return count / total if total else None
+
+
+def _rate(rate: float | None) -> str:
+    return "" if rate is None else f"{rate:.1f}/s"
+
+
+def _left(count: int, total: int | None, rate: float | None) -> str:
+    return f"{span((total - count) / rate)} left" if total and rate and count < total else ""
+
+
+def _delay(scan: "ScanState") -> str:
+    return "" if scan.keyframe_delay_ms is None else f"delay {scan.keyframe_delay_ms:.0f} ms"
+
+
+def _grid(rows: list[Row], width: int) -> "RenderableType":
+    """The rows in columns that do not move while the figures grow."""
+    from rich.progress_bar import ProgressBar
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    columns = list(zip(*((row.name, row.amount, row.rate, row.note) for row in rows), strict=True))
+    widths = [max(least, *map(len, texts)) for least, texts in zip(_WIDTHS, columns, strict=True)]
+    for least, align in zip(widths, ("left", "right", "right", "left"), strict=True):
+        grid.add_column(min_width=least, justify=align)  # type: ignore[arg-type]
+    least, most = _BAR_WIDTHS
+    bar = min(most, width - sum(widths) - 2 * len(widths))
+    for row in rows:
+        shown = row.share is not None and bar >= least
+        share = ProgressBar(1.0, row.share or 0.0, width=bar) if shown else ""
+        grid.add_row(Text(row.name, style="dim"), row.amount, row.rate, row.note, share)
+    return grid
+
+
+def _in_words(note: Note) -> "RenderableType":
+    """A name, and words beside it that begin below each other."""
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    grid.add_column(min_width=_WIDTHS[0])
+    grid.add_row(
+        Text(note.name, style="dim"), Text(printable(note.text), style="bold red" if note.alarm else "")
+    )
+    return grid
