@@ -16,6 +16,7 @@ from rich.console import Console
 
 from tsfusion.cli import progress, progress_rows
 from tsfusion.client import ClientStats
+from tsfusion.core import rates
 from tsfusion.scanner.scanner import ScanState
 from tsfusion.wire.messages import explained
 
@@ -52,7 +53,8 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr(progress_rows, "time", clock)
+    for module in (progress_rows, rates):
+        monkeypatch.setattr(module, "time", clock)
     return clock
 
 
@@ -145,6 +147,13 @@ def test_bytes_are_read_in_lines_too(capsys: pytest.CaptureFixture[str]) -> None
     with progress.reading("checking a journal", quiet=False) as watch:
         watch(1_500_000, 3_000_000)
     assert capsys.readouterr().err == "  checking a journal 1.5 MB of 3 MB\n"
+
+
+@pytest.mark.usefixtures("eager")
+def test_a_journal_is_fused_in_lines_too(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress.shown(quiet=False) as display:
+        display.show_fused(30, 29, 60)
+    assert capsys.readouterr().err == "  read 30 of 60; fused 29\n"
 
 
 def test_quiet_is_silent(capsys: pytest.CaptureFixture[str]) -> None:

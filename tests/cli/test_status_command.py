@@ -9,6 +9,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,6 +18,7 @@ from fake_server import saying, serving, status
 from health_snapshots import client, health, map_health
 from rich.console import Console
 
+from tsfusion.cli import status_screen
 from tsfusion.cli.health_poll import ServerSnapshot as Seen
 from tsfusion.cli.status_view import MAX_CLIENTS, render
 from tsfusion.core.errors import TransportError
@@ -27,12 +29,14 @@ from tsfusion.wire.messages import Command, Reply
 NOBODY = "tcp://127.0.0.1:9"
 
 
-def screen(told: Health | None, width: int = 160, **fields: Any) -> str:
+def screen(told: Health | None, width: int = 160, *, color: bool = False, **fields: Any) -> str:
     """The screen that shows this health, as text."""
     snapshot = Seen(address="tcp://host:5555", health=told, **fields)
-    console = Console(width=width, highlight=False)
+    console = Console(
+        width=width, highlight=False, force_terminal=color, color_system="standard" if color else None
+    )
     with console.capture() as captured:
-        console.print(render(snapshot))
+        console.print(render(snapshot, width))
     return captured.get()
 
 
@@ -44,10 +48,9 @@ def asking(here: Here) -> Here:
 
 def test_a_screen_shows_corrections_where_there_are_any() -> None:
     told = health(client("cart", corrections=3), client("drone"))
-    lines = [line.split() for line in screen(told).splitlines()]
-    assert next(words[-1] for words in lines if words[-1:] == ["tions"]) == "tions"
-    assert next(words[-1] for words in lines if words[:1] == ["cart"]) == "3"
-    assert "correc-" not in screen(health(client("drone")))
+    text = screen(told)
+    assert "3 × corrected" in next(line for line in text.splitlines() if line.startswith("cart"))
+    assert text.count("corrected") == 1
 
 
 def test_a_screen_shows_it_all() -> None:
@@ -63,24 +66,30 @@ def test_a_screen_shows_it_all() -> None:
         maps={"yard": yard, "shed": map_health(state="restarting", last_keyframe_s=None, rejected={})},
     )  # fmt: skip
     more = {"maps": {"yard": status(map="yard")}, "unavailable": {"shed": "the fuser restarts; ask again"}}
-    for width in (80, 160):
-        text = screen(told, width, **more)
+    for width in (80, 120, 160):
+        text = screen(told, width, rate=3.0, **more)
         lines = [" ".join(line.split()) for line in text.splitlines()]
-        assert lines[0] == "✗ map yard: the disk is full"
-        assert "tcp://host:5555 not ready up 1 h 2 min, gateway 62.9 MB, 9 duplicates" in lines
-        assert "keyframes keyframes delay, ms blocks memory journal last" in lines
-        assert "map state fused/all waiting mean/p95/max of 8³ MB MB ago" in lines
-        assert "yard busy 1191/1204 12 21/28/61 ±0.5 1234 10.5 3.1 2.0 s" in lines
-        assert "shed restarting 5/6 0 21/28/61 ±0.5 1234 10.5 3.1 –" in lines
-        if width > 80:  # the names of clients may be long
-            assert "keyframes keyframes keyframes received keyframes" in lines
-            assert "client session map state fused/all waiting left out MB held refused" in lines
-            assert "cart 1a2b3c4d yard connected 6/6 12 31 × thinned 3.1 disk 0" in lines
-            assert "- 1a2b3c4d default silent 7.5 s 6/6 0 3.1 3" in lines
-            assert "drone 1a2b3c4d default gone 3 min 10 s 6/6 0 3.1 0" in lines
+        assert lines[:2] == [
+            "✗ not ready · behind by 24 keyframes, about 8 s · lost 34 keyframes",
+            "✗ map yard: the disk is full",
+        ]
+        assert "tcp://host:5555 not ready up 62 min, gateway 62.9 MB, 9 duplicates" in lines
+        if width == 80:
+            assert "map state fused/all waiting lost ms, p95 MB ago" in lines
+            assert "yard busy 1191/1204 12 1 28 10.5 2 s" in lines
+            assert "shed restarting 5/6 0 0 28 10.5 –" in lines
+            assert "cart yard connected 6/6 12 31 31 × thinned; held: disk" in lines
+            assert "drone default gone 3 min 6/6 0 0" in lines
+            assert "1a2b3c4d default silent 8 s 6/6 0 2 2 × refused, 1 ×" in lines
+        else:
+            assert "map state fused/all waiting lost mean/p95/max MB of 8³ MB ago" in lines
+            assert "yard busy 1191/1204 12 1 21/28/61 ±0.5 10.5 1234 3.1 2 s" in lines
+            assert "shed restarting 5/6 0 0 21/28/61 ±0.5 10.5 1234 3.1 –" in lines
+            assert "cart 1a2b3c4d yard connected 6/6 12 31 3.1 31 × thinned; held: disk" in lines
+            assert "- 1a2b3c4d default silent 8 s 6/6 0 2 3.1 2 × refused, 1 × rejected" in lines
         assert "refused messages: 3 × gap, 1 × header" in lines
+        assert f"yard 0.04 m kinect 2 B {'1f' * 16}" in [line.split(" state/")[0] for line in lines]
     assert "map yard: 1 quarantined, 2 × the fuser restarted, rejected: 1 × MapFull" in text
-    assert f"map yard: hash {'1f' * 16}, voxel_size 0.04, sensor kinect, fuser 2 B at most" in text
     assert "map shed: hash and settings are not known now: the fuser restarts; ask again" in text
 
 
@@ -148,7 +157,10 @@ def test_ready_is_0(asking: Here) -> None:
     [
         (health(ready=False), "not ready"),
         (health(ready=False, problems=("map yard: the disk is full",)), "✗ map yard: the disk is full"),
-        (health(maps={"shed": map_health(), "yard": map_health(problem="stands still")}), "  ready  up 1 h"),
+        (
+            health(maps={"shed": map_health(), "yard": map_health(problem="stands still")}),
+            "  ready  up 62 min",
+        ),
     ],
 )
 def test_not_ready_is_3(told: Health, words: str, asking: Here) -> None:
@@ -295,14 +307,19 @@ def test_a_terminal_is_redrawn_until_ctrl_c_whatever_becomes_of_the_server() -> 
         os.close(follower)
         try:
             seen = _read_terminal(leader, lambda text: text.count("cart") >= 3)
-            assert "\x1b[" in seen
+            assert "\x1b[?1049h" in seen, "drawn on the terminal's other screen"
+            assert "\x1b[2K" not in seen, "no line is wiped: nothing flickers"
             gone.append(True)
             _read_terminal(leader, lambda text: text.count("no server answered") >= 2)
+            _read_terminal(leader, lambda text: "no answer for" in text and "as it was then" in text)
             gone.clear()
-            _read_terminal(leader, lambda text: "cart" in text)
+            _read_terminal(leader, lambda text: "keeping up" in text)
             process.send_signal(signal.SIGINT)
             rest = _read_terminal(leader, lambda text: "interrupted" in text)
+            left = rest.rpartition("\x1b[?1049l")[2]
             assert "\x1b[?25h" in rest, "the cursor is back"
+            assert "keeping up" in left, "the last state is left on the usual screen"
+            assert "cart" in left
             assert process.wait(DEADLINE) == 130
         finally:
             process.kill()
@@ -317,6 +334,74 @@ def _read_terminal(leader: int, enough: Callable[[str], bool]) -> str:
         assert time.monotonic() < deadline, text
         text += os.read(leader, 65536).decode(errors="replace")
     return text
+
+
+@pytest.mark.parametrize("color", [True, False])
+@pytest.mark.parametrize("width", [80, 120])
+def test_the_first_line_answers_in_words_and_nothing_wraps(width: int, color: bool) -> None:
+    busy = map_health(
+        state="busy", keyframes_durable=120_400, keyframes_fused=119_100, waiting=1300, rejected={},
+        map_bytes=12_345_000_000, quarantined=0,
+        delay_ms=Spread(count=9, mean=2100.0, p50=2000.0, p95=2800.0, p99=3000.0, max=6100.0),
+    )  # fmt: skip
+    told = health(client("cart", durable=120_400, fused=119_100), maps={"default": busy})
+    lines = screen(told, width, color=color, rate=10.0).splitlines()
+    plain = [re.sub(r"\x1b\[[0-9;]*m", "", line).rstrip() for line in lines]
+    assert plain[0] == "! working · behind by 1300 keyframes, about 2 min · lost 0 keyframes"
+    assert len(plain) == 8
+    assert max(map(len, plain)) <= width
+    assert ("\x1b[33m" in lines[0]) == color
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"last_keyframe_s": 3.0}, "✓ working · keeping up · lost 0 keyframes"),
+        ({"last_keyframe_s": None}, "✓ ready, nothing comes in · keeping up · lost 0 keyframes"),
+        ({"waiting": 2, "fusing_s": 7.0}, "✗ nothing fused for 7 s · keeping up · lost 0 keyframes"),
+        ({"rejected": {"MapFull": 1}}, "✗ working · keeping up · lost 1 keyframe"),
+        ({"problem": "the disk is full"}, "✗ does not work · keeping up · lost 0 keyframes"),
+    ],
+)
+def test_the_headline_of_a_server(fields: dict[str, Any], words: str) -> None:
+    told = health(maps={"default": map_health(**{"rejected": {}, "quarantined": 0, **fields})})
+    assert screen(told).splitlines()[0] == words
+
+
+def test_a_stall_that_began_before_is_seen_at_once(asking: Here) -> None:
+    told = health(maps={"yard": map_health(state="busy", waiting=3, fusing_s=50.0)})
+    with serving(saying(told)) as (control, asked):
+        done = asking(control, "--stall-after", 40)
+    assert done.returncode == 3
+    assert "✗ nothing fused for 50 s · " in done.stdout
+    assert len([command for command in asked if command.name == "health"]) == 2
+
+
+def test_a_silent_server_is_seen_before_the_question_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(status_screen, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    console = Console(width=80, height=24, highlight=False)
+
+    def seen() -> list[str]:
+        with console.capture() as captured:
+            console.print(shown.cut())
+        return captured.get().splitlines()
+
+    shown = status_screen.StatusScreen(console, "tcp://host:5555")
+    shown.ask()
+    shown.answer(Seen(address="tcp://host:5555", health=health(client("cart"))))
+    now[0] += 60.0
+    assert seen()[0].startswith("✗ working"), "the next question comes when it is due"
+    shown.ask()
+    now[0] += 0.5
+    assert seen()[0].startswith("✗ working")
+    now[0] += 1.5
+    assert seen()[:2] == ["✗ no answer for 62 s", "as it was then:"]
+    shown.fail("no server answered")
+    assert seen()[1:3] == ["✗ no server answered", "as it was then:"]
+    shown.answer(Seen(address="tcp://host:5555", health=health(*(client(f"cart{i}") for i in range(30)))))
+    assert len(seen()) == 24
+    assert re.fullmatch(r"\d+ lines more: a taller window shows them", seen()[-1])
 
 
 def test_errors_stay_errors() -> None:

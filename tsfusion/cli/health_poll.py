@@ -9,6 +9,7 @@ from msgspec import Struct
 
 from tsfusion.core.counts import count_of
 from tsfusion.core.errors import ServerUnreachable, TransportError
+from tsfusion.core.rates import Rates
 from tsfusion.wire.health import Health, MapHealth, Status
 from tsfusion.wire.queries import CommandRefused, fetch_health, fetch_status
 
@@ -26,7 +27,10 @@ class ServerSnapshot(Struct, frozen=True, kw_only=True):
     error: str = ""  # why it did not answer
     maps: dict[str, Status] = {}  # map → status of its fuser, where that answered
     unavailable: dict[str, str] = {}  # map → why its fuser's status is not known
-    stalled: dict[str, float] = {}  # map → seconds for which keyframes have waited there and none was fused
+    still: dict[str, float] = {}  # map → seconds for which keyframes have waited there and none was fused
+    stalled: dict[str, float] = {}  # the same, of maps where that is too long
+    rate: float = 0.0  # keyframes fused a second in the last seconds; 0 = not known
+    older: dict[str, Status] = {}  # map → last known status of a fuser that has too much to do to be asked
     missing: str = ""  # the map that was asked for and is not open; empty = it is, or none was asked for
     only: str = ""  # the map that was asked for; empty = all
 
@@ -94,6 +98,7 @@ class ServerWatcher:
         self._moved: dict[str, tuple[object, float]] = {}  # map → how far it was, since when
         self._statuses: dict[str, tuple[object, Status]] = {}  # map → how far it was, and its status then
         self._well = time.monotonic()
+        self._rates = Rates()
 
     def check_once(self) -> ServerSnapshot:
         """A snapshot; where keyframes wait, it takes until one is fused or `stall_after` is over.
@@ -141,7 +146,7 @@ class ServerWatcher:
 
     def _judge(self, health: Health) -> ServerSnapshot:
         now = time.monotonic()
-        stalled = {}
+        still = {}
         selected = self._selected(health)
         for name, one in selected.items():
             progress = (health.epoch, self._progress(one))
@@ -149,21 +154,26 @@ class ServerWatcher:
             if before != progress or not one.waiting:
                 since = now
             self._moved[name] = (progress, since)
-            if one.waiting and now - since >= self._stall_after:
-                stalled[name] = now - since
+            if one.waiting:
+                still[name] = max(now - since, one.fusing_s)  # it may have stood still before we came
+        rate, _ = self._rates(sum(one.keyframes_fused for one in selected.values()), 0)
         missing = self._only if self._only and not selected else ""
         return ServerSnapshot(
-            address=self._address, health=health, stalled=stalled, missing=missing, only=self._only
-        )
+            address=self._address, health=health, missing=missing, only=self._only,
+            rate=max(rate or 0.0, 0.0),
+            still=still, stalled={name: one for name, one in still.items() if one >= self._stall_after},
+        )  # fmt: skip
 
     def _with_maps(self, snapshot: ServerSnapshot, health: Health, *, always: bool) -> ServerSnapshot:
         deadline = time.monotonic() + self._timeout
         maps, unavailable = {}, {}
+        older: dict[str, Status] = {}
         for name, one in self._selected(health).items():
             version = (health.epoch, one.keyframes_durable, one.keyframes_fused)
             known, status = self._statuses.get(name, (None, None))
             if known != version or status is None:
                 if one.waiting and not always:
+                    older |= {name: status} if status is not None else {}
                     continue
                 timeout = max(deadline - time.monotonic(), _MIN_TIMEOUT)
                 try:
@@ -176,4 +186,4 @@ class ServerWatcher:
                     continue
             self._statuses[name] = (version, status)
             maps[name] = status
-        return msgspec.structs.replace(snapshot, maps=maps, unavailable=unavailable)
+        return msgspec.structs.replace(snapshot, maps=maps, unavailable=unavailable, older=older)

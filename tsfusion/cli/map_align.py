@@ -58,7 +58,7 @@ def align(
         maps = []
         for source in (first, second):
             display.stage(f"opening {source}")
-            maps.append(map_alignment.open_map(source, watch=display.update))
+            maps.append(map_alignment.open_map(source, watch=display.show_fused))
         display.stage(f"aligning {second} with {first}")
         found = map_alignment.align(*maps)
         merged: dict[str, Any] | None = None
@@ -78,7 +78,7 @@ def _merge(a: "AlignedMap", b: "AlignedMap", found: "Alignment", out: Path, disp
 
     volume = a.volume
     assert volume is not None  # it was opened here
-    done = map_alignment.merge(volume, b, np.array(found.T_a_b), watch=display.update)
+    done = map_alignment.merge(volume, b, np.array(found.T_a_b), watch=display.show_fused)
     volume.save(out)
     return {
         "path": str(out),

@@ -319,7 +319,7 @@ def _map(
         def watch(read: int, fused: int, total: int) -> None:
             if read == 1:
                 display.stage(f"fusing {source}")
-            display.update(read, fused, total)
+            display.show_fused(read, fused, total)
 
         def memory_for(saved: Path | None) -> int | None:
             return memory_bytes if saved is None else opened_maps.memory_for(saved, memory_bytes)

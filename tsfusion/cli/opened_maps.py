@@ -38,7 +38,7 @@ def opened(path: Path, map_name: str | None = None, *, quiet: bool) -> Iterator[
         def watch(done: int, total: int) -> None:
             if done == 1:
                 display.stage(f"fusing what the checkpoint of {path} lacks")
-            display.update(done, done, total)
+            display.show_fused(done, done, total)
 
         read = partial(display.show_bytes, JOURNAL)
         with saved_maps.opened(saved_maps.find(path, map_name), watch, read) as (file, left_out):

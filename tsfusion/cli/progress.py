@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from tsfusion.cli.progress_rows import STILL, Rates, RunProgress, Screen, byte_row, step_row
+from tsfusion.cli.progress_rows import STILL, RunProgress, Screen, byte_row, fused_rows, step_row
 from tsfusion.core.logs import printable
+from tsfusion.core.rates import Rates
 from tsfusion.core.readable_numbers import span
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class Quiet:
 
     def __init__(self) -> None:
         self._run = RunProgress()
-        self._byte_rates = Rates()
+        self._rates = Rates()
 
     def __enter__(self) -> "Quiet":
         return self
@@ -65,9 +66,13 @@ class Quiet:
         """Show the counts; see `Progress`."""
         self.show(self._run.screen(total, stats, link, scan))
 
+    def show_fused(self, read: int, fused: int, total: int) -> None:
+        """Show how many keyframes of a journal are read, and how many of those are in the map."""
+        self.show(Screen(fused_rows(read, fused, total, self._rates)))
+
     def show_bytes(self, text: str, done: int, total: int) -> None:
         """Show how much is read, after `text`."""
-        self.show(Screen([byte_row(text, done, total, self._byte_rates)]))
+        self.show(Screen([byte_row(text, done, total, self._rates)]))
 
     def show_steps(self, text: str, done: int, total: int) -> None:
         """Show how many steps are done, after `text`."""

@@ -2,13 +2,13 @@
 """Figures of a run's progress: a headline, rows of counts that stay in their columns, and notes in words."""
 
 import time
-from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
 from tsfusion.cli.output import size
 from tsfusion.core.counts import count_of
 from tsfusion.core.headline import Headline
 from tsfusion.core.logs import printable
+from tsfusion.core.rates import Rates
 from tsfusion.core.readable_numbers import span
 from tsfusion.wire.messages import explained
 
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from tsfusion.scanner.scanner import ScanState
 
 STILL = 5.0  # seconds in which nothing comes, or is fused, until that is said
-_RATE_SECONDS = 5.0  # over which rates are counted
-_FIRST_RATE = 1.0  # seconds until one is shown
 _WIDTHS = (9, 13, 8, 18)  # columns at least: name, amount, rate, note
 _BAR_WIDTHS = (8, 26)  # columns at least and at most
 _STYLES = {"good": "green", "notice": "yellow", "bad": "bold red"}
@@ -80,28 +78,10 @@ def styled(headline: Headline) -> "Text":
     from rich.text import Text
 
     mark, level = headline.mark
-    line = Text(f"{mark} ", style=_STYLES[level])
+    line = Text().append(f"{mark} ", style=_STYLES[level])
     for number, (words, of_part) in enumerate(headline.parts):
         line.append(" · " if number else "", style="dim").append(words, style=_STYLES[of_part])
     return line
-
-
-class Rates:
-    """How much two counts grew a second, over the last seconds; None = too short a time to tell."""
-
-    def __init__(self) -> None:
-        self._samples: deque[tuple[float, int, int]] = deque()
-
-    def __call__(self, first: int, second: int) -> tuple[float | None, float | None]:
-        now = time.monotonic()
-        self._samples.append((now, first, second))
-        while now - self._samples[0][0] > _RATE_SECONDS:
-            self._samples.popleft()
-        then, first_then, second_then = self._samples[0]
-        seconds = now - then
-        if seconds < _FIRST_RATE:
-            return None, None
-        return (first - first_then) / seconds, (second - second_then) / seconds
 
 
 class RunProgress:
@@ -143,6 +123,15 @@ class RunProgress:
         if step != self._step or not stats.under_way:
             self._step, self._moved = step, now
         return f"nothing fused for {span(now - self._moved)}" if now - self._moved > STILL else ""
+
+
+def fused_rows(read: int, fused: int, total: int, rates: Rates) -> list[Row]:
+    """How much of a journal is read, and fused."""
+    reading, fusing = rates(read, fused)
+    return [
+        Row("read", f"{read}{_of(total)}", _rate(reading), _left(read, total, reading), _share(read, total)),
+        Row("fused", str(fused), _rate(fusing)),
+    ]
 
 
 def byte_row(text: str, done: int, total: int, rates: Rates) -> Row:
@@ -218,7 +207,11 @@ def _grid(rows: list[Row], width: int) -> "RenderableType":
     bar = min(most, width - sum(widths) - 2 * len(widths))
     for row in rows:
         shown = row.share is not None and bar >= least
-        share = ProgressBar(1.0, row.share or 0.0, width=bar) if shown else ""
+        share = (
+            ProgressBar(1.0, row.share or 0.0, width=bar, complete_style="cyan", finished_style="green")
+            if shown
+            else ""
+        )
         grid.add_row(Text(row.name, style="dim"), row.amount, row.rate, row.note, share)
     return grid
 

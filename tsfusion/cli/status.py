@@ -10,8 +10,6 @@ import typer
 from tsfusion.cli import options, verbs
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
     from tsfusion.cli.health_poll import ServerSnapshot, ServerWatcher
 
 PLAIN_WIDTH = 160  # columns where there is no terminal
@@ -44,8 +42,9 @@ def status(
     Exit status, for health checks: 0 = ready; 1 = nobody answers; 2 = wrong usage; 3 = it answers, but is not
     ready, or a map takes or fuses nothing (it takes --stall-after seconds to be sure of that).
 
-    With --watch, a terminal is redrawn until Ctrl-C. Elsewhere a block of lines (with --json: a line) is
-    printed each time, until nobody answers (1) or the server was not ready for --stall-after seconds (3).
+    With --watch, a terminal is redrawn until Ctrl-C (130), which leaves the last state. Elsewhere a block of
+    lines (with --json: a line) is printed each time, until nobody answers (1) or the server was not ready for
+    --stall-after seconds (3).
     """
     from tsfusion.cli.health_poll import ServerWatcher
     from tsfusion.core.config import ClientConfig
@@ -75,30 +74,37 @@ def _repeat(watcher: "ServerWatcher", seconds: float, *, json: bool) -> int:
 
 
 def _redraw(watcher: "ServerWatcher", address: str, seconds: float) -> NoReturn:
-    """Draw the screen again and again until Ctrl-C, whatever becomes of the server."""
+    """Draw the screen again and again until Ctrl-C, whatever becomes of the server; leave its last state.
+
+    Lines are written over each other on the terminal's other screen, so that nothing flickers.
+    """
     from rich.console import Console
     from rich.live import Live
 
-    from tsfusion.cli.health_poll import ServerSnapshot
-    from tsfusion.cli.status_view import render
+    from tsfusion.cli.status_screen import StatusScreen
     from tsfusion.core.errors import TransportError
 
-    with Live(console=Console(highlight=False), auto_refresh=False) as live:
-        while True:
-            try:
-                snapshot = watcher.check_again()
-            except TransportError as error:
-                snapshot = ServerSnapshot(address=address, error=str(error))
-            live.update(render(snapshot), refresh=True)
-            time.sleep(seconds)
+    console = Console(highlight=False)
+    screen = StatusScreen(console, address)
+    try:
+        with Live(console=console, screen=True, get_renderable=screen.cut, refresh_per_second=2) as live:
+            while True:
+                screen.ask()
+                try:
+                    screen.answer(watcher.check_again())
+                except TransportError as error:
+                    screen.fail(str(error))
+                live.refresh()
+                time.sleep(seconds)
+    finally:
+        console.print(screen.whole())
 
 
 def _print(snapshot: "ServerSnapshot", *, json: bool, line: bool) -> None:
     from tsfusion.cli import output
-    from tsfusion.cli.status_view import render
 
     if not json:
-        typer.echo(_text(render(snapshot)))
+        typer.echo(_text(snapshot))
     elif line:
         output.as_json(snapshot.as_json(), indent=None)
     else:
@@ -106,11 +112,13 @@ def _print(snapshot: "ServerSnapshot", *, json: bool, line: bool) -> None:
     sys.stdout.flush()
 
 
-def _text(screen: "RenderableType") -> str:
+def _text(snapshot: "ServerSnapshot") -> str:
     """The screen as text for this terminal; without colours and wide where there is none."""
     from rich.console import Console
 
+    from tsfusion.cli.status_view import render
+
     console = Console(highlight=False, width=None if sys.stdout.isatty() else PLAIN_WIDTH)
     with console.capture() as captured:
-        console.print(screen)
+        console.print(render(snapshot, console.width))
     return "\n".join(line.rstrip() for line in captured.get().splitlines())

@@ -7,101 +7,143 @@ from rich.text import Text
 
 from tsfusion.cli.health_poll import ServerSnapshot
 from tsfusion.cli.output import size
+from tsfusion.cli.progress_rows import styled
 from tsfusion.core.logs import printable
-from tsfusion.wire.health import ClientHealth, Health, MapHealth, Status
+from tsfusion.core.readable_numbers import span
+from tsfusion.wire.health import ClientHealth, Health, MapHealth
+from tsfusion.wire.health_headline import headline, lost_of_client, lost_of_map
 from tsfusion.wire.keyframe_times import Spread
 
 MAX_CLIENTS = 40  # rows: the clients with the newest messages
+WIDE = 110  # columns from which on all figures are shown
 _STATE_STYLES = {"idle": "green", "busy": "green", "failed": "bold red"}
 
 
-def render(snapshot: ServerSnapshot) -> RenderableType:
-    """Problems first, then the server, its maps, its clients, and what it refused."""
-    parts: list[RenderableType] = [Text(f"✗ {printable(one)}", style="bold red") for one in snapshot.problems]
+def render(snapshot: ServerSnapshot, width: int, *, silent: float = 0.0) -> RenderableType:
+    """The whole in one line, then problems, the server, its maps, its clients, and what it refused.
+
+    Args:
+        width: columns of the terminal; below `WIDE` some figures are left out.
+        silent: seconds since the server's last answer, where one is missing; 0 = it answers.
+    """
+    parts: list[RenderableType] = []
+    if silent:
+        parts.append(Text(f"✗ no answer for {span(silent)}", style="bold red"))
+    elif snapshot.health is not None:
+        still = {**snapshot.still, **snapshot.stalled}
+        parts.append(styled(headline(snapshot.health, only=snapshot.only, rate=snapshot.rate, still=still)))
+    if silent and snapshot.health is not None:
+        parts += [_problem(snapshot.error)] if snapshot.error else []
+        parts.append(Text("as it was then:", style="dim"))
+    parts += map(_problem, snapshot.problems)
     if snapshot.health is None:
         return Group(*parts)
+    is_wide = width >= WIDE
     maps = {name: one for name, one in snapshot.health.maps.items() if snapshot.only in ("", name)}
-    parts += [_server(snapshot.address, snapshot.health), _maps(maps)]
+    parts += [_server(snapshot.address, snapshot.health), _maps(maps, is_wide=is_wide)]
     parts += [note for name, one in maps.items() for note in _notes(name, one)]
-    parts += [_details(name, status) for name, status in snapshot.maps.items()]
+    if clients := [one for one in snapshot.health.clients if snapshot.only in ("", one.map)]:
+        parts += _clients(clients, is_wide=is_wide)
+    if snapshot.health.refused:
+        parts.append(Text(f"refused messages: {_reasons(snapshot.health.refused)}", style="yellow"))
+    if snapshot.maps or snapshot.older:
+        parts.append(_settings(snapshot, is_wide=is_wide))
     parts += [
         Text(printable(f"map {name}: hash and settings are not known now: {why}"), style="yellow")
         for name, why in snapshot.unavailable.items()
     ]
-    if clients := [one for one in snapshot.health.clients if snapshot.only in ("", one.map)]:
-        parts += _clients(clients)
-    if snapshot.health.refused:
-        parts.append(Text(f"refused messages: {_reasons(snapshot.health.refused)}", style="yellow"))
     return Group(*parts)
+
+
+def _problem(text: str) -> Text:
+    return Text(f"✗ {printable(text)}", style="bold red")
 
 
 def _server(address: str, health: Health) -> Text:
     line = Text(f"{printable(address)}  ")
     line.append(*("ready", "bold green") if health.ready else ("not ready", "bold red"))
-    line.append(f"  up {_duration(health.uptime_s)}, gateway {size(health.rss_bytes)}")
+    line.append(f"  up {span(health.uptime_s)}, gateway {size(health.rss_bytes)}")
     if health.duplicates:
         line.append(f", {health.duplicates} duplicates")
     return line
 
 
-def _maps(maps: dict[str, MapHealth]) -> RenderableType:
+def _maps(maps: dict[str, MapHealth], *, is_wide: bool) -> RenderableType:
+    delay = ">delay, ms\nmean/p95/max" if is_wide else ">delay\nms, p95"
+    more = (">blocks\nof 8³", ">journal\nMB") if is_wide else ()
     table = _table(
-        "map", "state", ">keyframes\nfused/all", ">keyframes\nwaiting", ">delay, ms\nmean/p95/max",
-        ">blocks\nof 8³", ">memory\nMB", ">journal\nMB", ">last\nago",
+        "map", "state:10", ">keyframes\nfused/all:13", ">\nwaiting:7", ">\nlost:5", delay,
+        ">memory\nMB:6", *more, ">last\nago:6",
     )  # fmt: skip
     for name, one in maps.items():
         table.add_row(
             _plain(name), _plain(one.state, style=_STATE_STYLES.get(one.state, "yellow")),
-            f"{one.keyframes_fused}/{one.keyframes_durable}", _waiting(one.waiting),
-            _delay(one.delay_ms, one.delay_bound_ms), str(one.blocks), _megabytes(one.map_bytes),
-            _megabytes(one.journal_bytes), _duration(one.last_keyframe_s),
+            f"{one.keyframes_fused}/{one.keyframes_durable}", _count(one.waiting),
+            _count(lost_of_map(one), "bold red"), _delay(one.delay_ms, one.delay_bound_ms, is_wide=is_wide),
+            _megabytes(one.map_bytes), *((str(one.blocks), _megabytes(one.journal_bytes)) if is_wide else ()),
+            _span(one.last_keyframe_s),
         )  # fmt: skip
     return table
 
 
-def _clients(clients: list[ClientHealth]) -> list[RenderableType]:
-    corrects = any(one.corrections for one in clients)
-    refuses = any(one.refused or one.rejected for one in clients)
+def _clients(clients: list[ClientHealth], *, is_wide: bool) -> list[RenderableType]:
+    more = (">received\nMB:8",) if is_wide else ()
     table = _table(
-        "client", "session", "map", "state", ">keyframes\nfused/all", ">keyframes\nwaiting",
-        "keyframes\nleft out", ">received\nMB", "held", *([">keyframes\nrefused"] if refuses else ()),
-        *([">correc-\ntions"] if corrects else ()),
+        "client", *(["session"] if is_wide else []), "map", "state:10", ">keyframes\nfused/all:13",
+        ">\nwaiting:7", ">\nlost:5", *more, "",
     )  # fmt: skip
     latest = sorted(clients, key=lambda one: (one.state == "gone", one.heard_s))
     for one in latest[:MAX_CLIENTS]:
+        name = one.client or ("-" if is_wide else one.session)
         table.add_row(
-            _plain(one.client or "-"), _plain(one.session), _plain(one.map), _presence(one),
-            f"{one.fused}/{one.durable}", _waiting(one.waiting), Text(_reasons(one.skipped), style="yellow"),
-            _megabytes(one.received_bytes), _plain(one.held, style="yellow"),
-            *([_waiting(one.refused + one.rejected)] if refuses else ()),
-            *([str(one.corrections)] if corrects else ()),
+            _plain(name), *([_plain(one.session)] if is_wide else []), _plain(one.map), _presence(one),
+            f"{one.fused}/{one.durable}", _count(one.waiting), _count(lost_of_client(one), "bold red"),
+            *([_megabytes(one.received_bytes)] if is_wide else ()), _remarks(one),
             style="dim" if one.state == "gone" else "",
         )  # fmt: skip
-    more = len(latest) - MAX_CLIENTS
-    return [table, Text(f"and {more} more sessions")] if more > 0 else [table]
+    rest = len(latest) - MAX_CLIENTS
+    return [table, Text(f"and {rest} more sessions")] if rest > 0 else [table]
+
+
+def _remarks(one: ClientHealth) -> Text:
+    """Counts that are zero for a client that is well, and why nothing of it is taken."""
+    turned_away = {"refused": one.refused, "rejected": one.rejected}
+    words = [_reasons(one.skipped), _reasons({name: count for name, count in turned_away.items() if count})]
+    line = _plain("; ".join(filter(None, [*words, one.held and f"held: {one.held}"])), style="yellow")
+    if one.corrections:
+        line.append(f"{'; ' if line.plain else ''}{one.corrections} × corrected")
+    return line
 
 
 def _presence(one: ClientHealth) -> Text:
     """Whether a client is there; else for how long it has not been heard."""
     if one.state == "connected":
         return Text(one.state, style="green")
-    return Text(f"{one.state} {_duration(one.heard_s)}", style="yellow" if one.state == "silent" else "")
+    return Text(f"{one.state} {span(one.heard_s)}", style="yellow" if one.state == "silent" else "")
 
 
-def _details(name: str, status: Status) -> Text:
-    """The hash, settings and memory of a map, which only its fuser knows."""
-    volume = status.config.get("volume", {})
-    settings = ", ".join(f"{key} {volume[key]}" for key in ("voxel_size", "sensor") if key in volume)
-    peak = status.peak_rss_bytes.get("fuser", 0)
-    return _plain(
-        f"map {name}: hash {status.map_hash}, {settings}, fuser {size(peak)} at most, {status.state}"
+def _settings(snapshot: ServerSnapshot, *, is_wide: bool) -> RenderableType:
+    """The settings, memory and hash of each map, which only its fuser knows; no hash while it is busy."""
+    table = _table(
+        "map", ">voxel size", "sensor", ">fuser's memory", "hash", *(["folder"] if is_wide else [])
     )
+    for name, status in {**snapshot.older, **snapshot.maps}.items():
+        volume = status.config.get("volume", {})
+        peak = size(status.peak_rss_bytes.get("fuser", 0))
+        known = name in snapshot.maps
+        table.add_row(
+            _plain(name), f"{volume.get('voxel_size', '–')} m", _plain(str(volume.get("sensor", "–"))), peak,
+            _plain(status.map_hash if known else "(known when nothing waits)", style="" if known else "dim"),
+            *([_plain(status.state)] if is_wide else []),
+        )  # fmt: skip
+    return table
 
 
-def _delay(delay: Spread, bound_ms: float) -> str:
+def _delay(delay: Spread, bound_ms: float, *, is_wide: bool) -> str:
     if not delay.count:
         return "–"
-    return f"{delay.mean:.0f}/{delay.p95:.0f}/{delay.max:.0f} ±{bound_ms:.1g}"
+    whole = f"{delay.mean:.0f}/{delay.p95:.0f}/{delay.max:.0f} ±{bound_ms:.1g}"
+    return whole if is_wide else f"{delay.p95:.0f}"
 
 
 def _notes(name: str, one: MapHealth) -> list[Text]:
@@ -131,8 +173,8 @@ def _reasons(counts: dict[str, int]) -> str:
     return ", ".join(f"{count} × {printable(reason)}" for reason, count in sorted(counts.items()))
 
 
-def _waiting(count: int) -> Text:
-    return Text(str(count), style="yellow" if count else "")
+def _count(count: int, style: str = "yellow") -> Text:
+    return Text(str(count), style=style if count else "")
 
 
 def _megabytes(count: int) -> str:
@@ -140,25 +182,20 @@ def _megabytes(count: int) -> str:
     return f"{megabytes:.0f}" if megabytes >= 100 else f"{megabytes:.1f}"
 
 
-def _duration(seconds: float | None) -> str:
-    """3725 → 1 h 2 min."""
-    if seconds is None:
-        return "–"
-    minutes, hours, days = int(seconds // 60), int(seconds // 3600), int(seconds // 86400)
-    if days:
-        return f"{days} d {hours % 24} h"
-    if hours:
-        return f"{hours} h {minutes % 60} min"
-    return f"{minutes} min {int(seconds % 60)} s" if minutes else f"{seconds:.1f} s"
+def _span(seconds: float | None) -> str:
+    return "–" if seconds is None else span(seconds)
 
 
 def _table(*titles: str) -> Table:
-    """A table; a title that begins with `>` stands over numbers."""
+    """A table. A title that begins with `>` stands over figures; `:7` = at least so many columns."""
     table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 1, 0, 0))
     for title in titles:
+        words, _, least = title.removeprefix(">").partition(":")
+        is_figure = title.startswith(">")
         table.add_column(
-            title.removeprefix(">"), overflow="fold", justify="right" if title.startswith(">") else "left"
-        )
+            words, overflow="fold", justify="right" if is_figure else "left", no_wrap=is_figure,
+            min_width=int(least) if least else None,
+        )  # fmt: skip
     return table
 
 

@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: MIT
+"""How fast counts grow."""
+
+import time
+from collections import deque
+
+_WINDOW = 5.0  # seconds over which growth is counted
+_SHORTEST = 1.0  # seconds until there is a rate
+
+
+class Rates:
+    """How much two counts grew a second, over the last seconds; None = too short a time to tell."""
+
+    def __init__(self) -> None:
+        self._samples: deque[tuple[float, int, int]] = deque()
+
+    def __call__(self, first: int, second: int) -> tuple[float | None, float | None]:
+        """Take the counts of now, and return how much each grows a second."""
+        now = time.monotonic()
+        self._samples.append((now, first, second))
+        while len(self._samples) > 2 and now - self._samples[0][0] > _WINDOW:
+            self._samples.popleft()
+        then, first_then, second_then = self._samples[0]
+        seconds = now - then
+        if seconds < _SHORTEST:
+            return None, None
+        return (first - first_then) / seconds, (second - second_then) / seconds
