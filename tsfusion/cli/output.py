@@ -2,13 +2,24 @@
 """Results on stdout."""
 
 import json
+import sys
 from typing import Any
 
 import typer
 
 from tsfusion.core.readable_numbers import counted, grouped, size
+from tsfusion.core.terminal import fitted
 
-__all__ = ["as_json", "counted", "grouped", "size"]
+__all__ = ["as_json", "counted", "grouped", "size", "text"]
+
+
+def text(text: str, *, err: bool = False, indent: int = 2) -> None:
+    """Print text on stdout or stderr, broken between words where a terminal is narrower.
+
+    Args:
+        indent: columns before what follows the first part of a line.
+    """
+    typer.echo(fitted(text, sys.stderr if err else sys.stdout, indent=indent), err=err)
 
 
 def as_json(value: Any, *, indent: int | None = 2) -> None:

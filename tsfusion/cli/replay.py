@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tsfusion.cli import options
+from tsfusion.cli import options, output
 from tsfusion.core.counts import count_of
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def open_recording(path: Path, /, *, unpack: bool = False, **given: Any) -> "Dat
 
     dataset = open_dataset(path, unpack=unpack, **given)
     if not _is_synthetic(path):
-        typer.echo(f"found: {describe(dataset)}", err=True)
+        output.text(f"found: {describe(dataset)}", err=True, indent=7)
     return dataset
 
 
@@ -122,7 +122,7 @@ def _warn_of_disagreement(dataset: "Dataset") -> str | None:
     report = pose_check.check(dataset)
     wrong = report.text if report.verdict == "disagree" else None
     if wrong is not None or report.color is not None:
-        typer.echo(f"warning: {wrong or report.color}", err=True)
+        output.text(f"warning: {wrong or report.color}", err=True)
     return wrong
 
 
@@ -169,7 +169,7 @@ def _run(
     truth: str | None = None,
     **settings: Any,
 ) -> None:
-    from tsfusion.cli import output, progress, run_page, run_summary
+    from tsfusion.cli import progress, run_page, run_summary
     from tsfusion.pipelines.replay import replay as run
 
     with progress.shown(quiet=json) as display:

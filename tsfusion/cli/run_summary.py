@@ -4,8 +4,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-
+from tsfusion.cli import output
 from tsfusion.cli.output import counted, grouped, size
 from tsfusion.core.counts import count_of
 from tsfusion.wire.messages import explained
@@ -20,7 +19,8 @@ def print_replay(run: "ReplaySummary") -> None:
     """Print a replay in a few lines."""
     delay = run.delay_ms
     lines = [
-        f"keyframes  {run.keyframes_fused}/{run.keyframes_sent} fused in {run.seconds:.1f} s",
+        f"keyframes  {run.keyframes_fused}/{run.keyframes_sent} fused in {run.seconds:.1f} s, "
+        f"lost {sum(run.keyframes_rejected.values())}",
         f"delay      mean {delay.mean:.0f} ms, p50 {delay.p50:.0f}, p95 {delay.p95:.0f}, "
         f"p99 {delay.p99:.0f}, max {delay.max:.0f}; slope {run.delay_slope_ms_per_keyframe:+.2f} ms/keyframe",
         *mesh_lines(run.mesh),
@@ -38,7 +38,7 @@ def print_replay(run: "ReplaySummary") -> None:
             "from the known surface"
         )
     lines.append(_results(run.folder))
-    typer.echo("\n".join(lines))
+    output.text("\n".join(lines), indent=11)
 
 
 def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
@@ -53,7 +53,8 @@ def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
         f"frames     {result.frames_tracked}/{result.frames} localised by {result.localizer}, "
         f"{result.tracking_cpu_ms:.0f} CPU ms each{ended}",
         f"keyframes  {result.keyframes_sent} sent, {result.keyframes_durable} acknowledged, "
-        f"{result.keyframes_fused} fused ({counted(result.keyframes_by_rule)})",
+        f"{result.keyframes_fused} fused ({counted(result.keyframes_by_rule)}), "
+        f"lost {sum(result.keyframes_rejected.values())}",
         f"delay      mean {delay.mean:.0f} ms, p50 {delay.p50:.0f}, p95 {delay.p95:.0f}, max {delay.max:.0f}"
         if delay.count
         else "delay      not known: nothing was fused yet",
@@ -77,7 +78,7 @@ def print_scan(result: "ScanSummary", spool: Path, connect: str | None) -> None:
             f"mesh       tsfusion mesh {connect} {result.maps[0].name}.glb --map {result.maps[0].name}"
         )
     lines.append(_results(result.folder))
-    typer.echo("\n".join(lines))
+    output.text("\n".join(lines), indent=11)
 
 
 def _results(folder: str) -> str:

@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from tsfusion.core.config import LogFormat, LogLevel
+from tsfusion.core.terminal import fitted
 
 if TYPE_CHECKING:
     _Handler = logging.StreamHandler[Any]
@@ -141,6 +142,11 @@ class Stderr(_Handler):
         self._write(self._limiter.finished_periods())
         if self._limiter.allows(record):
             super().emit(record)
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record's line; text is broken between words where a terminal is narrower."""
+        line: str = super().format(record)
+        return fitted(line, self.stream) if isinstance(self.formatter, TextFormatter) else line
 
     def log_left_out(self) -> None:
         """Write the summaries of `Limiter.finished_periods`."""
