@@ -22,6 +22,7 @@ from tsfusion.gateway.metrics import Metrics
 from tsfusion.gateway.ports import Ports
 from tsfusion.journal import state_folder
 from tsfusion.wire import sockets
+from tsfusion.wire.health import Health
 from tsfusion.wire.sockets import Addresses
 
 log = logging.getLogger(__name__)
@@ -38,6 +39,7 @@ def run(
     *,
     volumes: Mapping[str, VolumeConfig] | None = None,
     guest: str | None = None,
+    on_health: Callable[[Health], None] = lambda _: None,
 ) -> int:
     """Serve until SIGTERM or SIGINT, then drain the journals into the maps and write checkpoints.
 
@@ -50,6 +52,7 @@ def run(
         on_ready: called once with the real addresses, when keyframes are accepted and kernels are warm.
         volumes: maps with settings of their own, opened at the start; so are those in the state folder.
         guest: of a server with keys, a public key that may watch every map besides those in its list.
+        on_health: called with the server's state about once a second.
 
     Returns:
         The exit status: 0, or 1 when a checkpoint was not written.
@@ -63,7 +66,7 @@ def run(
         signals = stack.enter_context(_signals())
         try:
             gateway, watchdog, report = _open(
-                stack, server, {DEFAULT_MAP: volume, **(volumes or {})}, signals, guest
+                stack, server, {DEFAULT_MAP: volume, **(volumes or {})}, signals, guest, on_health
             )
         except _StoppedAtStart:
             return 0
@@ -86,6 +89,7 @@ def _open(
     volumes: dict[str, VolumeConfig],
     signals: list[int],
     guest: str | None,
+    on_health: Callable[[Health], None],
 ) -> tuple[Gateway, Watchdog, "_ReadingReport"]:
     process.raise_file_limit()
     state = Path(server.state)
@@ -103,7 +107,7 @@ def _open(
     stack.callback(metrics.close)
     if server.metrics is not None:
         log.info("figures and health checks are at http://%s", metrics.serve(server.metrics))
-    gateway = Gateway(context, server, ports, access, metrics)
+    gateway = Gateway(context, server, ports, access, metrics, on_health=on_health)
     stack.callback(gateway.maps.close)
     watchdog = Watchdog()
     report = _ReadingReport(metrics, watchdog, signals)

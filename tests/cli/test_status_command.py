@@ -357,7 +357,7 @@ def test_the_first_line_answers_in_words_and_nothing_wraps(width: int, color: bo
     ("fields", "words"),
     [
         ({"last_keyframe_s": 3.0}, "✓ working · keeping up · lost 0 keyframes"),
-        ({"last_keyframe_s": None}, "✓ ready, nothing comes in · keeping up · lost 0 keyframes"),
+        ({"last_keyframe_s": None}, "✓ ready, no input · keeping up · lost 0 keyframes"),
         ({"waiting": 2, "fusing_s": 7.0}, "✗ nothing fused for 7 s · keeping up · lost 0 keyframes"),
         ({"rejected": {"MapFull": 1}}, "✗ working · keeping up · lost 1 keyframe"),
         ({"problem": "the disk is full"}, "✗ does not work · keeping up · lost 0 keyframes"),

@@ -81,8 +81,9 @@ def test_a_line_a_minute_while_something_happens(told: Told) -> None:
         assert told(health(client(), maps={"yard": map_health(**counts), "shed": old})) == []
     busy = map_health(keyframes_durable=612, keyframes_fused=600, waiting=12, checkpoints=1)
     assert told(health(client(), maps={"yard": busy, "shed": old})) == [
-        "INFO in 60 s: map yard: 612 keyframes received, 600 fused (10.0/s), delay p50 20 ms, p95 28 ms, "
-        "12 wait, 10 MB, checkpoint written; 1 client connected, gateway 63 MB"
+        "INFO working · behind by 12 keyframes, about 1 s · lost 2 keyframes; in 60 s: map yard: "
+        "612 keyframes received, 600 fused (10.0/s), delay p50 20 ms, p95 28 ms, "
+        "10 MB, checkpoint written; 1 client connected, gateway 63 MB"
     ]
     for _ in range(200):
         assert told(health(client(), maps={"yard": busy, "shed": old})) == []

@@ -7,7 +7,8 @@ import signal
 import sys
 import threading
 import time
-from contextlib import closing, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from tsfusion.core.config import Config
     from tsfusion.pipelines.viewer_child import ViewerChild
     from tsfusion.wire.curve import ClientKeys
+    from tsfusion.wire.health import Health
     from tsfusion.wire.sockets import Addresses
 
 log = logging.getLogger(__name__)
@@ -85,19 +87,33 @@ def serve(
             if page is not None:
                 page.start(addresses.data, control=addresses.control, publish=addresses.publish, keys=guest)
 
-        with nullcontext() if page is None else closing(page):
+        page_open = nullcontext() if page is None else closing(page)
+        with page_open, _shown_state(chosen.server.log_format) as show:
             return server.run(
                 chosen.server,
                 chosen.volume,
                 on_ready,
                 volumes=chosen.volumes(),
                 guest=None if guest is None else guest.public,
+                on_health=show,
             )
     except TsfusionError as error:
         if chosen.server.log_format == "text":
             raise
         log.critical("%s", error)  # the last line is a JSON object too
         return 1
+
+
+@contextmanager
+def _shown_state(log_format: str) -> "Iterator[Callable[[Health], None]]":
+    """A function that shows the server's state on the last line of the terminal, where there is one."""
+    if log_format != "text" or not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from tsfusion.cli.bottom_line import BottomLine
+
+    with BottomLine() as line:
+        yield line.show
 
 
 def _configuration(file: Path | None, settings: dict[str, Any]) -> "Config":
@@ -119,16 +135,16 @@ def _configuration(file: Path | None, settings: dict[str, Any]) -> "Config":
 
 
 def _announce(addresses: "Addresses", state: str, seconds: float, json: bool) -> None:
-    if json:
-        from tsfusion.cli import output
+    from tsfusion.cli import output
 
+    if json:
         fields = {
             "ready": True, "listen": addresses.data, "control": addresses.control,
             "publish": addresses.publish, "state": state, "seconds": round(seconds, 3),
         }  # fmt: skip
         output.as_json(fields, indent=None)
     else:
-        typer.echo(
+        output.text(
             f"ready in {seconds:.1f} s: keyframes {addresses.data}, control {addresses.control}, "
             f"mesh updates {addresses.publish}, state {state}"
         )

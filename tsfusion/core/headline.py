@@ -57,5 +57,10 @@ class Headline(Struct, frozen=True, kw_only=True):
         level = max((level for _, level in self.parts), key=list(_MARKS).index)
         return _MARKS[level], level
 
+    @property
+    def words(self) -> str:
+        """The three answers without the mark."""
+        return " · ".join(words for words, _ in self.parts)
+
     def __str__(self) -> str:
-        return f"{self.mark[0]} " + " · ".join(words for words, _ in self.parts)
+        return f"{self.mark[0]} {self.words}"

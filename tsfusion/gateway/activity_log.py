@@ -9,6 +9,7 @@ from tsfusion.core import logs
 from tsfusion.core.counts import count_of
 from tsfusion.gateway.client_routes import ABANDONED_AFTER
 from tsfusion.wire.health import ClientHealth, Health, MapHealth
+from tsfusion.wire.health_headline import headline
 from tsfusion.wire.messages import SKIP_REASONS
 
 log = logging.getLogger(__name__)
@@ -63,9 +64,13 @@ class ActivityLog:
         self._counted = {name: one for name, one in health.maps.items() if name in before}
         lines = [_progress(name, one, before[name], seconds) for name, one in self._counted.items()]
         if any(lines):
+            fused = sum(
+                one.keyframes_fused - before[name].keyframes_fused for name, one in self._counted.items()
+            )
             clients = sum(one.state == "connected" for one in health.clients)
             log.info(
-                "in %.0f s: %s; %s connected, gateway %.0f MB",
+                "%s; in %.0f s: %s; %s connected, gateway %.0f MB",
+                headline(health, rate=fused / seconds).words,
                 seconds,
                 "; ".join(filter(None, lines)),
                 count_of(clients, "client"),
@@ -84,7 +89,7 @@ def _progress(name: str, one: MapHealth, before: MapHealth, seconds: float) -> s
     saved = ", checkpoint written" if one.checkpoints > before.checkpoints else ""
     return (
         f"map {name}: {count_of(received, 'keyframe')} received, {fused} fused ({fused / seconds:.1f}/s)"
-        f"{took}, {one.waiting} wait, {one.map_bytes / 1e6:.0f} MB{saved}"
+        f"{took}, {one.map_bytes / 1e6:.0f} MB{saved}"
     )
 
 

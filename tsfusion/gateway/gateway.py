@@ -63,8 +63,11 @@ class Gateway:
         ports: Ports,
         access: AccessControl,
         metrics: Metrics,
+        *,
+        on_health: Callable[[Health], None] = lambda _: None,
     ) -> None:
         self.ports = ports
+        self._on_health = on_health
         self._server = server
         self._access = access
         self._metrics = metrics
@@ -166,6 +169,7 @@ class Gateway:
         self._problems.note(self._find_problems())
         self._metrics.health = health = self.health()
         self._activity.note(health)
+        self._on_health(health)
 
     # --- maps ---
 

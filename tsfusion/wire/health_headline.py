@@ -25,9 +25,11 @@ def headline(
     recent = [one.last_keyframe_s for one in maps.values() if one.last_keyframe_s is not None]
     waiting = sum(one.waiting for one in maps.values())
     waiting += sum(one.waiting for one in clients if one.state != "gone")
+    doing = "working" if waiting or min(recent, default=_RECENT) < _RECENT else "ready, no input"
+    starts = not health.ready and any(one.state == "opening" for one in maps.values())
     return Headline(
-        doing="working" if waiting or min(recent, default=_RECENT) < _RECENT else "ready, nothing comes in",
-        trouble=_trouble(health, maps, still or {}),
+        doing="starting" if starts else doing,
+        trouble="" if starts and not health.problems else _trouble(health, maps, still or {}),
         waiting=waiting,
         rate=rate,
         lost=sum(map(lost_of_map, maps.values())) + sum(map(lost_of_client, clients)),

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: MIT
+"""A server's state in words on the last line of its terminal, below the log that scrolls."""
+
+import os
+import sys
+from types import TracebackType
+
+from msgspec.structs import replace
+from rich.console import Console
+from rich.text import Text
+
+from tsfusion.cli.progress_rows import styled
+from tsfusion.core.counts import count_of
+from tsfusion.core.rates import Rates
+from tsfusion.wire.health import Health
+from tsfusion.wire.health_headline import headline
+
+_LEAST_ROWS = 6  # of a terminal that has a line to spare
+_SAVE, _RESTORE = "\x1b7", "\x1b8"  # the cursor's place
+
+
+class BottomLine:
+    """The last line of the terminal at stderr; the others are the only ones that scroll (DECSTBM).
+
+    So every process that writes there, a map's fuser too, writes above it. Nothing is shown where stderr is
+    no terminal, or another program is in its foreground.
+    """
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True, highlight=False)
+        self._rates = Rates()
+        self._rows = 0  # of the terminal when its last line was taken; 0 = it was not
+        self._was_ready = False
+
+    def __enter__(self) -> "BottomLine":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._rows:
+            self._write(f"{_SAVE}\x1b[r\x1b[{self._rows};1H\x1b[2K{_RESTORE}")
+            self._rows = 0
+
+    def show(self, health: Health) -> None:
+        """Show the newest state. Call it about once a second."""
+        if not self._is_ours():
+            return
+        columns, rows = os.get_terminal_size(sys.stderr.fileno())
+        if rows < _LEAST_ROWS:
+            return
+        if rows != self._rows:
+            # The line feed makes room where the cursor is on the last line; setting the bounds moves it away.
+            self._write(f"\n{_SAVE}\x1b[1;{rows - 1}r{_RESTORE}\x1b[1A")
+            self._rows = rows
+        line = self._words(health)
+        line.truncate(columns - 1, overflow="ellipsis")
+        with self._console.capture() as captured:
+            self._console.print(line, end="", soft_wrap=True)
+        self._write(f"{_SAVE}\x1b[{rows};1H\x1b[2K{captured.get()}{_RESTORE}")
+
+    def _words(self, health: Health) -> Text:
+        fused = sum(one.keyframes_fused for one in health.maps.values())
+        rate, _ = self._rates(fused, 0)
+        head = headline(health, rate=max(rate or 0.0, 0.0))
+        if self._was_ready and not health.ready and not health.problems:
+            head = replace(head, doing="ending", trouble="")
+        self._was_ready |= health.ready
+        scanners = count_of(sum(one.state == "connected" for one in health.clients), "scanner")
+        figures = f"   {max(rate or 0.0, 0.0):4.1f}/s, {fused} fused, {scanners}"
+        return styled(head).append(figures, style="dim")
+
+    def _is_ours(self) -> bool:
+        try:
+            return sys.stderr.isatty() and os.tcgetpgrp(sys.stderr.fileno()) == os.getpgrp()
+        except OSError:  # it has no terminal, or lost it
+            return False
+
+    def _write(self, text: str) -> None:
+        sys.stderr.write(text)  # at once: a terminal is not to see the half of it
+        sys.stderr.flush()
