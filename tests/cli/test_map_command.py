@@ -16,6 +16,7 @@ from corrected_maps import fresh_map
 from formula_scenes import volume_of
 from keyframes_and_servers import DEADLINE, pose, serving, wall
 from saved_maps import ANNA, BOB, correct, decoded, forget, make_map
+from small_recordings import first_views
 
 from tsfusion import Client, Volume
 from tsfusion.journal import state_folder
@@ -238,6 +239,7 @@ def test_convert_writes_slices_and_fields(here: Here, state: Path) -> None:
     assert len(grid.leaves) == len(np.load("field.npz")["blocks"])
     for flags, message in (
         (("a.vdb", "--up", "z"), "--up goes with --heights"),
+        (("a.vdb", "--above-floor"), "--above-floor goes with --heights"),
         (("a.ply", "--field", "distance"), "--field has no effect"),
         (("a.pgm", *how, "--field", "distance"), "write distances to"),
         (("a.npz", "--max-distance", 1), "--max-distance goes with"),
@@ -304,6 +306,26 @@ def test_a_map_of_no_server_is_resumed_for_given_poses(here: Here, tmp_path: Pat
     assert (session["last"], session["world"]) == (0, "")
     assert "--map" not in here("map", "resume", "map.tsf", "--state", "own", "--map", "No/Name").stdout
     assert not Path("own/maps/No").exists()
+
+
+def test_heights_above_the_floor(here: Here) -> None:
+    volume_of(first_views(6), voxel_size=0.06).save("room.tsf")
+    how = ("--heights", 0.2, 1.0, "--above-floor")
+    done = here("map", "convert", "room.tsf", "room.npz", *how)
+    assert done.returncode == 0, done.stderr
+    floor = float(np.load("room.npz")["floor"])
+    assert floor == pytest.approx(0, abs=0.02)
+    place = f"the floor, which is {abs(floor):.3f} m {'below' if floor < 0 else 'above'} the map's origin"
+    assert f"heights count from {place}; the map lies" in done.stderr
+    done = here("map", "convert", "room.tsf", "no.npz", "--heights", 100, 101, "--above-floor")
+    assert (done.returncode, "between 100 and 101 m above its floor" in done.stderr) == (1, True)
+    done = here("map", "convert", "room.tsf", "no.npz", *how, "--up", "-z")
+    assert (done.returncode, "no floor is found in this map" in done.stderr) == (1, True), done.stderr
+    done = here("ask", "room.tsf", "room.png", "--slice", 0.2, 1.0, "--above-floor")
+    assert f"between 0.2 and 1 m above {place}" in done.stdout
+    done = here("ask", "tcp://127.0.0.1:9", "no.png", "--slice", 0.2, 1.0, "--above-floor", "--up", "z")
+    assert (done.returncode, "--above-floor needs a saved map" in done.stderr) == (1, True)
+    assert not list(Path().glob("no.*"))
 
 
 def test_a_slice_beside_the_map_is_refused(here: Here) -> None:

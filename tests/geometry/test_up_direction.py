@@ -39,15 +39,15 @@ def scanned(path: Path, *, limit: int | None, voxel_size: float, **options: str)
 
 
 @pytest.mark.parametrize(
-    ("folder", "options", "limit", "voxel_size", "truth", "within"),
+    ("folder", "options", "limit", "voxel_size", "truth", "within", "below"),
     [
-        ("hololens", {}, 40, 0.04, (0, 1, 0), 1.0),  # its tracker finds gravity
-        ("icl_nuim_tum", {}, 3, 0.04, (0, -1, 0), 1.0),
-        ("open3d_rgbd", {}, 5, 0.04, (0, 1, 0), 1.0),
-        # A car's first camera, which is not level to the road by more than a few degrees
-        ("kitti_odometry", {"sequence": "06", "modality": "stereo"}, 3, 0.2, (0, -1, 0), 5.0),
-        ("kitti_odometry", {"sequence": "00", "modality": "lidar"}, 3, 0.2, (0, 0, 1), 3.0),
-        ("kitti07_lidar_keyframes", {}, 5, 0.2, (0, 0, 1), 3.0),
+        ("hololens", {}, 40, 0.04, (0, 1, 0), 1.0, 1.60),  # its tracker finds gravity
+        ("icl_nuim_tum", {}, 3, 0.04, (0, -1, 0), 1.0, 1.29),
+        ("open3d_rgbd", {}, 5, 0.04, (0, 1, 0), 1.0, None),
+        # A car's first camera, which is not level to the road by more than a few degrees, 1.65 m above it
+        ("kitti_odometry", {"sequence": "06", "modality": "stereo"}, 3, 0.2, (0, -1, 0), 5.0, 1.65),
+        ("kitti_odometry", {"sequence": "00", "modality": "lidar"}, 3, 0.2, (0, 0, 1), 3.0, 1.73),
+        ("kitti07_lidar_keyframes", {}, 5, 0.2, (0, 0, 1), 3.0, 1.73),
     ],
 )
 def test_the_floor_of_real_scans(
@@ -58,9 +58,15 @@ def test_the_floor_of_real_scans(
     voxel_size: float,
     truth: tuple,
     within: float,
+    below: float | None,
 ) -> None:
+    """`below`: metres from the sensors to the floor, by the car's drawing or by hand."""
     mesh, poses, sensor = scanned(data(folder), limit=limit, voxel_size=voxel_size, **options)
-    up = up_direction.find(mesh, held(poses, sensor))
+    sensors = held(poses, sensor)
+    up = up_direction.find(mesh, sensors)
+    if below is not None:
+        height = sensors.position @ up.direction - up_direction.floor_height(mesh, up, sensors)
+        assert height == pytest.approx(below, abs=0.12)
     assert up.found_by == "floor"
     assert degrees(up.direction, truth) < within
 
@@ -70,6 +76,9 @@ def test_a_kitchen_whose_cameras_look_down(data: Callable[[str], Path]) -> None:
     mesh, poses, sensor = scanned(data("7scenes/redkitchen"), limit=60, voxel_size=0.04)
     up = up_direction.find(mesh, held(poses, sensor))
     assert up.found_by == "floor"
+    sensors = held(poses, sensor)
+    height = up_direction.floor_height(mesh, up, sensors)
+    assert sensors.position @ up.direction - height == pytest.approx(1.40, abs=0.1), "not the worktop's"
     wall = up_direction._Surface(mesh)._plane(np.array((0.0, 0.46, -0.89)), np.True_)[0]
     assert degrees(up.direction, wall) == pytest.approx(90, abs=1.5)
 
@@ -119,7 +128,9 @@ def test_of_points_without_a_sensor_nobody_knows_the_axes() -> None:
 def test_a_turned_room(room: tuple[Mesh, list[np.ndarray]], seed: int) -> None:
     mesh, poses = room
     T = exp(np.append(np.zeros(3), np.random.default_rng(seed).normal(size=3)))
-    up = up_direction.find(turned(mesh, T), held([T @ pose for pose in poses]))
+    sensors = held([T @ pose for pose in poses])
+    up = up_direction.find(turned(mesh, T), sensors)
+    assert up_direction.floor_height(turned(mesh, T), up, sensors) == pytest.approx(0, abs=0.02)
     assert up.found_by == "floor"
     assert degrees(up.direction, T[:3, 2]) < 0.3
     assert degrees(up.to_y() @ up.direction, (0, 1, 0)) < 1e-4
@@ -137,6 +148,38 @@ def test_without_a_floor_the_cameras_decide() -> None:
     # Alone it may be a wall of a map whose z is up, or the floor of one whose y is up.
     turned_about = [pose @ exp(np.array((0, 0, 0, 0, 0, angle))) for angle in (0, 2.1, 4.2)]
     assert up_direction.find(mesh, held(turned_about)) == up_direction.find(mesh, HeldSensor())
+
+
+def level(height: float, side: float, *, tilt: float = 0.0) -> trimesh.Trimesh:
+    """A square that faces up, of small triangles."""
+    plate = trimesh.creation.box((side, side, 0.02))
+    plate.update_faces(plate.face_normals[:, 2] > 0.9)
+    plate = plate.subdivide_to_size(0.1)
+    plate.apply_transform(exp(np.array((0.0, 0, 0, 0, tilt, 0))))
+    plate.apply_translation((0, 0, height - 0.01))
+    return plate
+
+
+def mesh_of(*parts: trimesh.Trimesh) -> Mesh:
+    whole = trimesh.util.concatenate(parts)
+    vertices, normals = (np.asarray(of, np.float32) for of in (whole.vertices, whole.vertex_normals))
+    return Mesh(vertices, np.asarray(whole.faces, np.int32), normals)
+
+
+def test_the_floor_is_the_lowest_large_level() -> None:
+    up, pose = Up((0.0, 0.0, 1.0), "given"), np.eye(4)
+    pose[2, 3] = 1.5
+    floor, table, roof, spot = level(-0.3, 2.0), level(0.45, 3.0), level(2.5, 4.0), level(-1.0, 0.5)
+    for seen, expected in (
+        ((floor, table, roof, spot), -0.3),  # a table hides the most of it; specks below are none
+        ((table, roof), 0.45),
+        ((level(-0.3, 2.0, tilt=math.radians(1)), table), -0.3),
+        ((roof,), None),  # above the sensors
+    ):
+        height = up_direction.floor_height(mesh_of(*seen), up, held([pose]))
+        assert height == (None if expected is None else pytest.approx(expected, abs=0.03))
+    assert up_direction.floor_height(mesh_of(roof), up, HeldSensor()) == pytest.approx(2.5)
+    assert up_direction.floor_height(mesh_of(roof), Up((1.0, 0.0, 0.0), "given"), HeldSensor()) is None
 
 
 def test_without_cameras_walls_and_floor_look_alike(room: tuple[Mesh, list[np.ndarray]]) -> None:

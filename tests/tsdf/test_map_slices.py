@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Slices of a map are where things stand, follow the map exactly, and are read by map_server's rules."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
 from ruamel.yaml import YAML
+from small_recordings import first_views
 
 from tsfusion import OccupancySlice, Volume
 from tsfusion.core.errors import InvalidConfig, MapError, OutputError
 from tsfusion.geometry import up_direction
+from tsfusion.geometry.up_direction import Up
 
 RADIUS, VOXEL = 0.4, 0.04
 VIEWS = sphere_views(RADIUS, 12)
@@ -162,6 +165,28 @@ def test_up_is_found_or_asked_for(sphere: Volume, monkeypatch: pytest.MonkeyPatc
         sphere.occupancy_slice(0, 1)
     with pytest.raises(InvalidConfig, match="up must be"):
         sphere.occupancy_slice(0, 1, up="w")
+
+
+def test_heights_count_from_the_floor(tmp_path: Path) -> None:
+    shift = np.eye(4)
+    shift[2, 3] = -0.7
+    keyframes = [replace(one, T_world_camera=shift @ one.T_world_camera) for one in first_views(6)]
+    room = volume_of(keyframes, voxel_size=0.06)
+    found = room.occupancy_slice(0.2, 1.0, above_floor=True)
+    assert found.grid.floor == pytest.approx(-0.7, abs=0.02)
+    assert (found.grid.low, found.grid.high) == (found.grid.floor + 0.2, found.grid.floor + 1.0)
+    same = room.occupancy_slice(found.grid.low, found.grid.high)
+    assert same.grid.floor is None
+    assert (found.cells == same.cells).all()
+    text, _ = found.save(tmp_path / "room.yaml")
+    words = (
+        f"# What stands between 0.2 and 1 m above the floor, which is {-found.grid.floor:.3f} m below the "
+    )
+    assert text.read_text().startswith(words)
+    (arrays,) = room.distance_slice(0.2, 1.0, above_floor=True, up="z").save(tmp_path / "room.npz")
+    assert np.load(arrays)["floor"] == pytest.approx(found.grid.floor, abs=0.01)
+    with pytest.raises(MapError, match=r"no floor is found in this map: .* faces up, -y"):
+        room.occupancy_slice(0.2, 1.0, above_floor=True, up=Up((0.0, -0.7, 0.7), "given"))
 
 
 def test_slices_that_cannot_be_are_refused(sphere: Volume) -> None:

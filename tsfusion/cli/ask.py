@@ -54,6 +54,9 @@ def ask(
     resolution: Annotated[
         float | None, typer.Option(metavar="METRES", help="Edge of its cells; else a voxel's.")
     ] = None,
+    above_floor: Annotated[
+        bool, typer.Option("--above-floor", help="Its heights count from the floor (a saved map's).")
+    ] = False,
     up: Annotated[
         str | None, typer.Option(metavar="AXIS", help="Which way is up: z, -y, … or X,Y,Z.")
     ] = None,
@@ -104,7 +107,9 @@ def ask(
     if view is None:
         options.refuse(context, ("size", "intrinsics"), "has no effect without --view")
     if slice_ is None:
-        options.refuse(context, ("distances", "box", "resolution", "up"), "has no effect without --slice")
+        options.refuse(
+            context, ("distances", "box", "resolution", "above_floor", "up"), "has no effect without --slice"
+        )
     else:
         options.refuse(context, ("surface",), "has no effect on a slice: it is of the map as it was fused")
     how: dict[str, Any] = {"min_weight": min_weight}
@@ -113,6 +118,12 @@ def ask(
         if up is None and "://" in where:
             raise InvalidConfig("say which way is up in a live map, such as --up z or --up -y")
         how |= {"box": box, "resolution": resolution, "up": options.up_direction(up)}
+        if above_floor and "://" in where:
+            raise InvalidConfig(
+                "--above-floor needs a saved map, as the floor is looked for in all of it: ask the server's "
+                "state folder, which says where the floor is; add that height to LOW and HIGH here"
+            )
+        how |= {"above_floor": True} if above_floor else {}
         with _map(where, map_, link, quiet=json) as asked:
             question = asked.distance_slice if distances else asked.occupancy_slice
             _write_slice(question(*slice_, **how), file, json=json)
@@ -230,12 +241,15 @@ def _write_slice(answer: "Answered[Any]", out: Path, *, json: bool) -> None:
     shares = {name: float((found.cells == state).mean()) for name, state in names.items()}
     if json:
         figures = {"rows": rows, "columns": columns, "resolution_m": found.grid.resolution, **shares}
+        figures |= {} if found.grid.floor is None else {"floor_m": found.grid.floor}
         output.as_json({"files": list(map(str, files)), **figures, **_figures([answer])})
         return
     said = ", ".join(f"{100 * share:.0f} % {name}" for name, share in shares.items())
     if not getattr(found, "knows_free_space", True):
         said += " (fused without --space-carving: free space is known near surfaces alone)"
     cells = f"{columns}×{rows} cells of {found.grid.resolution:g} m"
+    if found.grid.floor is not None:
+        cells += f" between {found.grid.heights_in_words}"
     typer.echo(f"{' and '.join(map(str, files))}: {cells}, {said}; {_state([answer])}")
 
 

@@ -220,6 +220,7 @@ def convert(
     field: map_convert.Field = None,
     max_distance: map_convert.MaxDistance = None,
     heights: map_convert.Heights = None,
+    above_floor: map_convert.AboveFloor = False,
     box: map_convert.SliceBox = None,
     up: options.UpDirection = None,
     resolution: map_convert.Resolution = None,
@@ -239,7 +240,7 @@ def convert(
     from tsfusion.pipelines import mesh_files
 
     suffix, files = out.suffix.lower(), [out]
-    given = {"heights": heights, "box": box, "up": up, "resolution": resolution}
+    given = {"heights": heights, "above_floor": above_floor, "box": box, "up": up, "resolution": resolution}
     map_convert.check(out, dense=dense, field=field, max_distance=max_distance, given=given)
     volume = _load(path, map_, quiet=json)
     if heights is not None:

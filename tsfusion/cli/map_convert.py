@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 EXAMPLES = (
     "tsfusion map convert out/latest/map.tsf field.vdb --field distance",
-    "tsfusion map convert my-maps yard.yaml --map yard --heights 0.1 1.8 --up z",
+    "tsfusion map convert my-maps yard.yaml --map yard --heights 0.1 1.8 --above-floor",
 )
 _FORMATS = ".npz .zarr .vdb .tsf .ply .glb .obj .stl; slice: .yaml .pgm .png .npz"
 Out = Annotated[
@@ -36,6 +36,9 @@ Heights = Annotated[
 SliceBox = Annotated[
     tuple[float, float, float, float] | None,
     typer.Option("--box", metavar="U0 V0 U1 V1", help="Of a slice, metres; default: all."),
+]
+AboveFloor = Annotated[
+    bool, typer.Option("--above-floor", help="Count them from the floor; else from the map's origin.")
 ]
 Resolution = Annotated[float | None, typer.Option(metavar="METRES", help="Cell of a slice; default a voxel.")]
 
@@ -68,8 +71,9 @@ def check(
     if max_distance is not None and field != "distance":
         raise InvalidConfig("--max-distance goes with --field distance")
     for name, value in given.items():
-        if value is not None and not is_slice:
-            raise InvalidConfig(f"--{name} goes with --heights LOW HIGH: it is of a slice")
+        if value not in (None, False) and not is_slice:
+            flag = name.replace("_", "-")
+            raise InvalidConfig(f"--{flag} goes with --heights LOW HIGH: it is of a slice")
 
 
 def write_slice(
@@ -78,18 +82,22 @@ def write_slice(
     """Write a slice; returns the files."""
     from tsfusion.core.errors import OutputError
 
-    how = {name: given[name] for name in ("box", "resolution")} | {"up": options.up_direction(given["up"])}
+    how = {name: given[name] for name in ("box", "resolution", "above_floor")}
+    how["up"] = options.up_direction(given["up"])
     if field == "distance" and max_distance is not None:
         how["max_distance"] = max_distance
     found = volume.current_slice(*given["heights"], **how)
-    low, high = found.extent
+    floor = found.grid.floor
+    low, high = (one - (floor or 0.0) for one in found.extent)
     bottom, top = given["heights"]
     if bottom >= high or top <= low:
+        where = "its origin" if floor is None else "its floor"
         raise OutputError(
-            f"nothing of the map lies between {bottom:g} and {top:g} m above its origin; it lies between "
+            f"nothing of the map lies between {bottom:g} and {top:g} m above {where}; it lies between "
             f"{low:.2f} and {high:.2f} m: give other --heights"
         )
-    notes = [f"heights count from the map's origin; the map lies between {low:.2f} and {high:.2f} m"]
+    where = "the map's origin" if floor is None else f"the floor, {found.grid.floor_in_words}"
+    notes = [f"heights count from {where}; the map lies between {low:.2f} and {high:.2f} m"]
     if field != "distance" and not volume.config.space_carving:
         notes.append("the map was made without --space-carving: it knows free space near surfaces alone")
     for note in notes:

@@ -33,9 +33,10 @@ class SliceGrid:
     origin: tuple[float, float]  # metres: the corner of cell (0, 0)
     resolution: float  # metres: edge of a cell
     shape: tuple[int, int]  # rows, columns
-    low: float  # metres
+    low: float  # metres from the map's origin
     high: float
     axes: NDArray[np.float64]  # (3, 3)
+    floor: float | None = None  # height of the floor, metres from the map's origin; None = not looked for
 
     def cells_of(self, points: NDArray[np.floating]) -> NDArray[np.int64]:
         """(n, 3) points of the map, metres → (n, 2) row and column, which may lie outside."""
@@ -57,7 +58,22 @@ class SliceGrid:
         return {
             "origin": np.array(self.origin), "resolution": np.float64(self.resolution),
             "heights": np.array([self.low, self.high]), "axes": self.axes,
+            **({} if self.floor is None else {"floor": np.float64(self.floor)}),
         }  # fmt: skip
+
+    @property
+    def heights_in_words(self) -> str:
+        """Between which heights it is, and from where they count."""
+        if self.floor is None:
+            return f"{self.low:g} and {self.high:g} m"
+        low, high = self.low - self.floor, self.high - self.floor
+        return f"{low:.4g} and {high:.4g} m above the floor, {self.floor_in_words}"
+
+    @property
+    def floor_in_words(self) -> str:
+        """Where the floor is, once it was found."""
+        floor = self.floor or 0.0
+        return f"which is {abs(floor):.3f} m {'below' if floor < 0 else 'above'} the map's origin"
 
 
 @dataclass(frozen=True)
@@ -100,7 +116,7 @@ class OccupancySlice:
         grid = self.grid
         axes = "; ".join(" ".join(f"{one:.6f}" for one in row) for row in grid.axes.tolist())
         return (
-            f"# What stands between {grid.low:g} and {grid.high:g} m; p_slice = [{axes}] p_map\n"
+            f"# What stands between {grid.heights_in_words}; p_slice = [{axes}] p_map\n"
             f"image: {json.dumps(picture)}\nmode: trinary\nresolution: {grid.resolution!r}\n"
             f"origin: [{grid.origin[0]!r}, {grid.origin[1]!r}, 0.0]\nnegate: 0\n"
             f"occupied_thresh: {OCCUPIED_THRESH}\nfree_thresh: {FREE_THRESH}\n"

@@ -23,6 +23,7 @@ _LEVEL = math.cos(math.radians(8))  # of a direction, in which a normal is one o
 SAMPLE = 50_000  # triangles looked at
 _UPRIGHT = 0.5  # least length of the mean of the cameras' unit up vectors: less, and they were turned about
 _LEAST = 0.02  # share of the surface that a floor has at least
+_LARGE = 0.2  # share of the largest level plane that a floor has at least: what mirrors show is less
 _APART = math.cos(math.radians(30))  # of two directions that are not the same
 _SURE = 3.0  # how many times more surface faces up than any other way, where no camera is known
 _GRAIN = 2.0**-20  # of the sums of poses, metres or none: they are exact in any order
@@ -119,6 +120,11 @@ class HeldSensor:
         self._sums += other._sums
 
     @property
+    def is_known(self) -> bool:
+        """Whether any pose was added."""
+        return bool(self._sums[1, 3])
+
+    @property
     def up(self) -> NDArray[np.float64]:
         """(3,) mean of the directions away from the ground, if they were held upright: 0 to 1 long."""
         return self._mean(0)
@@ -167,6 +173,20 @@ def find(mesh: "Mesh", held: HeldSensor, *, given: Up | None = None) -> Up | Non
     return _up(held.up, "cameras") if floor is None else _up(floor, "floor")
 
 
+def floor_height(mesh: "Mesh", up: Up, held: HeldSensor) -> float | None:
+    """Height of the floor along `up` from the map's origin, metres.
+
+    The floor is the lowest of the large level surfaces that face up, below the mean place of the sensors:
+    at least a fifth as large as the largest one. Where the scan shows a table and no floor, it is the table.
+
+    Returns:
+        None where no such surface is large enough.
+    """
+    direction = np.array(up.direction)
+    below = float(held.position @ direction) if held.is_known else np.inf
+    return _Surface(mesh).lowest_level(direction, below)
+
+
 class _Surface:
     """A sample of a mesh's triangles: centres (n, 3), unit normals (n, 3), areas (n,) of sum 1."""
 
@@ -202,6 +222,25 @@ class _Surface:
             return None
         normal, share = self._plane(best, np.ones(len(self.area), bool))
         return _up(normal, "floor") if share >= _LEAST else None
+
+    def lowest_level(self, up: NDArray[np.float64], below: float) -> float | None:
+        """Height of the lowest of the large planes that face up, under a height; None = there is none."""
+        heights = self.points @ up
+        facing = np.flatnonzero((self.normals @ up > _LEVEL) & (heights < below))
+        if not len(facing):
+            return None
+        heights, area = heights[facing], self.area[facing]
+        at = np.floor((heights - heights.min()) / self.thickness).astype(np.int64)
+        # a plane at the border of two layers lies in both
+        layers = np.convolve(np.bincount(at, area), (1, 1))
+        if layers.max() < _LEAST:
+            return None
+        first = int(np.argmax(layers >= max(_LARGE * layers.max(), _LEAST)))
+        first += int(layers[first + 1 : first + 2].sum() > layers[first])
+        inside = np.flatnonzero((at == first) | (at == first - 1))
+        order = inside[np.argsort(heights[inside])]
+        middle = np.searchsorted(np.cumsum(area[order]), area[order].sum() / 2)
+        return float(heights[order[middle]])
 
     def _facing(self, directions: NDArray[np.float64], among: NDArray[np.bool_]) -> NDArray[np.float64]:
         """(m,) share of the surface whose normal is near each of (m, 3) directions."""

@@ -163,29 +163,34 @@ class AskableMap(ReadableMap):
         resolution: float | None = None,
         max_distance: float = 2.0,
         min_weight: float | None = None,
+        above_floor: bool = False,
         most_cells: int = map_slices.MOST_CELLS,
     ) -> CurrentSlice:
         """Occupancy and horizontal distances between two heights, which can follow the map.
 
         Args:
-            low, high: metres along `up` in the map's frame.
+            low, high: metres along `up` from the map's origin.
             box: u0, v0, u1, v1 in metres along the slice's own axes (`SliceGrid`; they are x and y where z is
                 up); None = around the whole map.
             up: away from the ground, such as `"z"`, `"-y"` or `"0,-0.9,0.1"`; None = it is found, for which
                 the map is meshed.
             resolution: metres, edge of a cell; None = the voxel size. A cell holds the least of its voxels.
             max_distance, min_weight: as for `distance_field`.
+            above_floor: count `low` and `high` from the floor, which is found (`up_direction.floor_height`);
+                `grid.floor` of the slice says where it lies.
             most_cells: with those around the box from which distances come; for more there is an error.
 
         Raises:
             InvalidConfig: for another box, or too many cells; MapError: for an empty map and no box, or when
-                nobody can tell which way is up.
+                nobody can tell which way is up, or where the floor is.
         """
+        direction, floor = self._level(up, above_floor=above_floor)
         return CurrentSlice(
             self._store,
             (low, high),
             box,
-            map_slices.axes_of(np.array(self._up(up).direction)),
+            map_slices.axes_of(np.array(direction)),
+            floor=floor,
             resolution=resolution,
             max_distance=max_distance,
             min_weight=self._checked_min_weight(min_weight),
@@ -293,14 +298,27 @@ class AskableMap(ReadableMap):
         """How often blocks have gone: cells that read them have changed, too, and no stamp says so."""
         return self._store.drops
 
-    def _up(self, given: Up | str | None) -> Up:
-        """Up as given, or found."""
+    def _level(
+        self, given: Up | str | None, *, above_floor: bool
+    ) -> tuple[tuple[float, float, float], float | None]:
+        """Up as given, or found; with `above_floor` also the floor's height."""
         if isinstance(given, str):
             given = up_direction.parse(given)
-        up = given or up_direction.find(self.extract_mesh(surface="raw"), self.held)
+        if given is not None and not above_floor:
+            return given.direction, None
+        mesh = self.extract_mesh(surface="raw")
+        up = given or up_direction.find(mesh, self.held)
         if up is None:
             raise MapError('nobody can tell which way is up in this map: give it, such as up="z" or up="-y"')
-        return up
+        if not above_floor:
+            return up.direction, None
+        floor = up_direction.floor_height(mesh, up, self.held)
+        if floor is None:
+            raise MapError(
+                f"no floor is found in this map: no large surface below the sensors faces up, {up.axis}; "
+                "count heights from the map's origin"
+            )
+        return up.direction, floor
 
     @property
     def _reading_bytes(self) -> int:

@@ -56,9 +56,10 @@ class CurrentSlice:
         max_distance: float,
         min_weight: float,
         knows_free_space: bool,
+        floor: float | None = None,
         most_cells: int = MOST_CELLS,
     ) -> None:
-        low, high = _checked_heights(heights)
+        low, high = (one + (floor or 0.0) for one in _checked_heights(heights))
         self._store, self._least = store, max(1, math.ceil(min_weight * WEIGHT_ONE))
         self._knows_free_space = knows_free_space
         edge = _checked_resolution(resolution, store.voxel_size)
@@ -69,7 +70,7 @@ class CurrentSlice:
         self._shape = rows, columns = _checked_shape(end - first + 2 * margin, most_cells)
         self.grid = SliceGrid(
             (float(first[1] * edge), float(first[0] * edge)), edge,
-            (rows - 2 * margin, columns - 2 * margin), low, high, axes,
+            (rows - 2 * margin, columns - 2 * margin), low, high, axes, floor,
         )  # fmt: skip
         self._across = math.ceil(edge / store.voxel_size - 1e-9)
         self._heights = max(1, round((high - low) / store.voxel_size))
