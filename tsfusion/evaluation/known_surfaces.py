@@ -2,6 +2,7 @@
 """Known surfaces (worlds of solids, reference meshes), and the error of a mesh against one."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any, Protocol
 
 import msgspec
@@ -55,13 +56,15 @@ class WorldSurface:
 
     def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """The world's distance, but of each column of points only to the solids that can be nearest."""
+        world = replace(self._world, upright=None)
+        points = self._world.turned(points)
         result = np.empty(len(points))
         column = np.floor(points[:, :2] / _COLUMN).astype(np.int64) @ (1 << 20, 1)
         order = np.argsort(column, kind="stable")
         for part in np.split(order, np.flatnonzero(np.diff(column[order])) + 1):
             if len(part):
-                solids = _candidates(self._world.solids, points[part])
-                result[part] = World(self._world.name, solids, {}).distance(points[part])
+                near = replace(world, solids=_candidates(world.solids, points[part]))
+                result[part] = near.distance(points[part])
         return result
 
     def normals(self, points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -11,8 +11,8 @@ import taichi.math as tm
 from tsfusion.kernels.synthetic_textures import solid_color
 
 # Kinds of solid, column 0. Centre: columns 1-3, half sizes: 4-6, yaw cosine and sine: 7-8,
-# material: 9, variant: 10.
-ROOM, BOX, SPHERE, CYLINDER, GROUND = 0, 1, 2, 3, 4
+# material: 9, variant: 10, share of the length at the top (PRISM): 11.
+ROOM, BOX, SPHERE, CYLINDER, GROUND, AXLE, PRISM = 0, 1, 2, 3, 4, 5, 6
 
 vec3 = ti.types.vector(3, ti.f64)
 
@@ -43,6 +43,28 @@ def quadric_ray(a, b, c):
         if inside > 0:
             root = ti.sqrt(inside)
             near, far = (-b - root) / a, (-b + root) / a
+    return near, far
+
+
+@ti.func
+def prism_slope(half, top):
+    """(k, c) of a prism's slanted ends, the planes |x| + k z = c."""
+    return half[0] * (1 - top) / (2 * half[2]), half[0] * (1 + top) / 2
+
+
+@ti.func
+def prism_ray(o, d, half, top):
+    """(entry, exit) of a ray through an origin-centred prism; entry > exit = missed."""
+    near, far = box_ray(o, d, half)
+    k, c = prism_slope(half, top)
+    for side in ti.static((-1, 1)):
+        speed, ahead = side * d[0] + k * d[2], c - side * o[0] - k * o[2]
+        if speed > 0:
+            far = ti.min(far, ahead / speed)
+        elif speed < 0:
+            near = ti.max(near, ahead / speed)
+        elif ahead < 0:
+            near, far = ti.f64(1e9), ti.f64(-1e9)
     return near, far
 
 
@@ -87,6 +109,16 @@ def solid_ray(solids: ti.template(), s, o_world, d_world):
         )
         bottom, top = box_ray(vec3(0, 0, o[2]), vec3(0, 0, d[2]), vec3(1, 1, half[2]))
         near, far = ti.max(near, bottom), ti.min(far, top)
+    elif kind == AXLE:
+        near, far = quadric_ray(
+            d[0] * d[0] + d[2] * d[2],
+            o[0] * d[0] + o[2] * d[2],
+            o[0] * o[0] + o[2] * o[2] - half[0] * half[0],
+        )
+        left, right = box_ray(vec3(0, o[1], 0), vec3(0, d[1], 0), vec3(1, half[1], 1))
+        near, far = ti.max(near, left), ti.min(far, right)
+    elif kind == PRISM:
+        near, far = prism_ray(o, d, half, solids[s, 11])
     elif d[2] < 0:
         near = -o[2] / d[2]
         far = near
@@ -114,6 +146,13 @@ def solid_distance(solids: ti.template(), s, p_world):
         radial = ti.sqrt(p[0] * p[0] + p[1] * p[1]) - half[0]
         outside = ti.sqrt(ti.max(radial, 0.0) ** 2 + ti.max(q[2], 0.0) ** 2)
         result = outside + ti.min(ti.max(radial, q[2]), 0.0)
+    elif kind == AXLE:
+        radial = ti.sqrt(p[0] * p[0] + p[2] * p[2]) - half[0]
+        outside = ti.sqrt(ti.max(radial, 0.0) ** 2 + ti.max(q[1], 0.0) ** 2)
+        result = outside + ti.min(ti.max(radial, q[1]), 0.0)
+    elif kind == PRISM:  # a bound from below next to its edges
+        k, c = prism_slope(half, solids[s, 11])
+        result = ti.max(q[1], q[2], (ti.abs(p[0]) + k * p[2] - c) / ti.sqrt(1 + k * k))
     return result
 
 
@@ -143,6 +182,22 @@ def solid_normal(solids: ti.template(), s, p_local):
         radial = ti.sqrt(p_local[0] * p_local[0] + p_local[1] * p_local[1])
         if radial - half[0] >= ti.abs(p_local[2]) - half[2]:
             normal = vec3(p_local[0] / radial, p_local[1] / radial, 0)
+        else:
+            normal = vec3(0, 0, tm.sign(p_local[2]))
+    elif kind == AXLE:
+        radial = ti.sqrt(p_local[0] * p_local[0] + p_local[2] * p_local[2])
+        if radial - half[0] >= ti.abs(p_local[1]) - half[1]:
+            normal = vec3(p_local[0] / radial, 0, p_local[2] / radial)
+        else:
+            normal = vec3(0, tm.sign(p_local[1]), 0)
+    elif kind == PRISM:
+        q = ti.abs(p_local) - half
+        k, c = prism_slope(half, solids[s, 11])
+        slanted = (ti.abs(p_local[0]) + k * p_local[2] - c) / ti.sqrt(1 + k * k)
+        if slanted >= ti.max(q[1], q[2]):
+            normal = tm.normalize(vec3(tm.sign(p_local[0]), 0, k))
+        elif q[1] > q[2]:
+            normal = vec3(0, tm.sign(p_local[1]), 0)
         else:
             normal = vec3(0, 0, tm.sign(p_local[2]))
     return normal
@@ -179,7 +234,7 @@ def cast(
     Args:
         T_world_sensor: (4, 4) float64.
         directions: (n, 3) float64, sensor frame; with z = 1 the distance is a depth.
-        solids: (m, 11) float64.
+        solids: (m, 12) float64.
         distance: (n,) float64, out: in units of the direction's length; 0 = nothing met.
         incidence: (n,) float64, out: |cosine| between ray and surface normal.
         color: (n, 3) uint8 BGR, out; of no rows = no colour wanted.

@@ -6,19 +6,29 @@ A world is the union of its solids; the renderer casts rays at the same table.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tsfusion.geometry import se3
 
-Solids = NDArray[np.float64]  # (m, 11): kind, centre xyz, half sizes xyz, cos yaw, sin yaw, material, variant
+# (m, 12): kind, centre xyz, half sizes xyz, cos yaw, sin yaw, material, variant, top
+Solids = NDArray[np.float64]
 
 # As in kernels/synthetic_raycast.py, which cannot be imported without Taichi; a test compares them.
-ROOM, BOX, SPHERE, CYLINDER, GROUND = range(5)
+# AXLE: a cylinder along y. PRISM: a box whose ends x shrink upwards, to `top` of their length.
+ROOM, BOX, SPHERE, CYLINDER, GROUND, AXLE, PRISM = range(7)
 INTERIOR, WOOD, MARBLE, STRIPES, ROAD, PAVEMENT, FACADE, PAINT, METAL, BARK, LEAVES, GLASS, PLAIN = range(13)
 
 _CHUNK = 1 << 16  # points measured at once
+
+
+class Ground(Protocol):
+    """Ground that is no solid of the table."""
+
+    def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signed distance: (n, 3) metres in the solids' axes → (n,), positive above."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,24 +36,31 @@ class World:
     """Solids and the sensor's path."""
 
     name: str
-    solids: Solids  # (m, 11) float64, metres
+    solids: Solids  # (m, 12) float64, metres
     # `paths[name](index, count)` → (4, 4) T_world_camera, OpenCV axes; the first is the usual one
     paths: dict[str, Callable[[int, int], NDArray[np.float64]]]
     # Frames of the whole usual path when a person walks it, near enough for a scanner to follow
     steps: int = 40
+    ground: Ground | None = None
+    # (3, 3) rotation of the world's points into the axes of the solids (z up) and the ground; None = none
+    upright: NDArray[np.float64] | None = None
 
     def distance(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Signed distance to the nearest surface: (n, 3) metres → (n,) float64, negative inside solids.
 
         Exact outside every solid; inside it is exact where solids do not overlap.
         """
-        points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-        result = np.full(len(points), np.inf)
+        points = self.turned(np.asarray(points, dtype=np.float64).reshape(-1, 3))
+        result = np.full(len(points), np.inf) if self.ground is None else self.ground.distance(points)
         for start in range(0, len(points), _CHUNK):
             part = slice(start, start + _CHUNK)
             for solid in self.solids:
                 np.minimum(result[part], _distance(solid, points[part]), out=result[part])
         return result
+
+    def turned(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The world's points (n, 3) in the axes of its solids."""
+        return points if self.upright is None else points @ self.upright.T
 
     def near(self, position: NDArray[np.float64], reach: float) -> Solids:
         """The solids that begin within `reach` metres of `position`."""
@@ -98,9 +115,10 @@ def solid(
     *,
     yaw: float = 0.0,
     variant: int = 0,
+    top: float = 1.0,
 ) -> list[float]:
     """One row of the table."""
-    return [kind, *center, *half, np.cos(yaw), np.sin(yaw), material, variant]
+    return [kind, *center, *half, np.cos(yaw), np.sin(yaw), material, variant, top]
 
 
 def look_at(position: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -217,6 +235,10 @@ def _distance(row: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[
     q = np.abs(p) - half
     if kind == CYLINDER:
         q = np.stack([np.hypot(p[:, 0], p[:, 1]) - half[0], q[:, 2]], axis=1)
+    elif kind == AXLE:
+        q = np.stack([np.hypot(p[:, 0], p[:, 2]) - half[0], q[:, 1]], axis=1)
+    elif kind == PRISM:
+        q = np.stack([_trapezoid(np.abs(p[:, 0]), p[:, 2], half, row[11]), q[:, 1]], axis=1)
     result: NDArray[np.float64] = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
     if kind == GROUND:
         result = p[:, 2]
@@ -224,4 +246,19 @@ def _distance(row: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[
         result = np.linalg.norm(p, axis=1) - half[0]
     elif kind == ROOM:
         result = -q.max(axis=1)
+    return result
+
+
+def _trapezoid(
+    x: NDArray[np.float64], z: NDArray[np.float64], half: NDArray[np.float64], top: float
+) -> NDArray[np.float64]:
+    """Signed distance to a symmetric trapezoid, at x >= 0: half[0] long below, `top` of it above."""
+    length = half[0] * np.where(z < 0, 1.0, top)
+    ends = np.stack([x - np.minimum(x, length), np.abs(z) - half[2]])
+    corner = np.array([half[0] * top, half[2]])
+    side = np.array([half[0] * (top - 1), 2 * half[2]])
+    share = np.clip((corner[0] - x) * side[0] + (corner[1] - z) * side[1], 0, side @ side) / (side @ side)
+    slope = np.stack([x - corner[0] + side[0] * share, z - corner[1] + side[1] * share])
+    away = np.sqrt(np.minimum((ends**2).sum(axis=0), (slope**2).sum(axis=0)))
+    result: NDArray[np.float64] = np.where((slope[0] < 0) & (ends[1] < 0), -away, away)
     return result
